@@ -1,0 +1,1 @@
+"""An estimation bench: which estimator to trust with nonlinear measurements."""

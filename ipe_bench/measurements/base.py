@@ -1,0 +1,211 @@
+"""What a measurement model is: parameters in, readings out, with names, units and the order in which readings arrive.
+
+A new model is a frozen dataclass that derives from `Measurement` and writes `simulate`; everything else has a default.
+Noise, priors and estimators are left to their own rooms.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.linalg import Array
+
+_COMPLEX_STEP = 1e-100
+_CENTRAL_STEP = float(np.finfo(float).eps ** (1 / 3))
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One unknown. Inside, its value is a multiple of `size` `unit`s; at the surface it is shown in `unit`."""
+
+    name: str
+    unit: str = ""
+    size: float = 1.0
+    group: str = ""
+    """Parameters of one group share a panel in figures; empty: the name is the group."""
+
+
+class Measurement(ABC):
+    """A model z = h(x) + v, without the noise v.
+
+    x is (trials, n) in multiples of the parameters' sizes, h(x) is (trials, m) in `reading_unit`, and a trial's
+    readings depend on that trial's x alone, bit for bit. n parameters, m readings, m > n.
+    """
+
+    name: ClassVar[str] = ""
+    """The name of the model in tables; the class name in lower case where it is empty."""
+    analytic: ClassVar[bool] = False
+    """True where `simulate` accepts complex x and is analytic in it: the Jacobian is then a complex step."""
+    reading_unit: str = ""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "name" not in cls.__dict__:
+            cls.name = cls.__name__.lower()
+
+    @property
+    @abstractmethod
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The n unknowns, in the order of x."""
+
+    @property
+    @abstractmethod
+    def index(self) -> Mapping[str, Sequence[Any]]:
+        """What each of the m readings is: columns such as case, time, axis, each with m entries."""
+
+    @abstractmethod
+    def simulate(self, x: Array) -> Array:
+        """The error-free readings h(x): (trials, n) -> (trials, m)."""
+
+    @property
+    def nominal(self) -> Array:
+        """The point x0 (n,) about which the model is linearised and the prior is centred."""
+        return np.zeros(self.n)
+
+    @property
+    def epochs(self) -> tuple[NDArray[np.intp], ...] | None:
+        """The rows of z that arrive at each epoch, in order of arrival; None where readings have no order."""
+        return None
+
+    @property
+    def offset(self) -> Array:
+        """What the instruments show (m,) where h(x) is zero; read-outs are quantised with it added."""
+        return np.zeros(self.m)
+
+    @property
+    def n(self) -> int:
+        return len(self.parameters)
+
+    @cached_property
+    def m(self) -> int:
+        return len(next(iter(self.index.values())))
+
+    @cached_property
+    def sizes(self) -> Array:
+        """The physical size (n,) of one unit of x, in each parameter's own unit."""
+        return np.array([p.size for p in self.parameters])
+
+    def jacobian(self, x: Array) -> Array:
+        """dh/dx at each trial: (trials, n) -> (trials, m, n); complex step where analytic, else central differences."""
+        return differentiate(self.simulate, x, analytic=self.analytic)
+
+    def linearization(self) -> Array:
+        """The matrix H (m, n) of eq. (1) about the nominal point."""
+        return self.jacobian(self.nominal[None])[0]
+
+    def rows(self, stop: int) -> NDArray[np.intp]:
+        """The rows of z that have arrived after `stop` epochs, ascending."""
+        if self.epochs is None:
+            raise ValueError(f"{self.name} has no epochs")
+        return np.sort(np.concatenate(self.epochs[:stop]))
+
+    def simulate_until(self, x: Array, stop: int) -> Array:
+        """h(x) in `rows(stop)` alone; models that arrive in time stop computing there."""
+        return self.simulate(x)[:, self.rows(stop)]
+
+    def jacobian_until(self, x: Array, stop: int) -> Array:
+        """dh/dx in `rows(stop)` alone."""
+        return self.jacobian(x)[:, self.rows(stop)]
+
+    def suited_to(self, error_scale: float) -> Measurement:
+        """This model, accurate enough for parameters of that error scale (an integration step, say)."""
+        del error_scale
+        return self
+
+
+@dataclass(frozen=True)
+class Restricted(Measurement):
+    """Some readings of a model: those of the first epochs, or those that are not missing."""
+
+    whole: Measurement
+    kept: tuple[int, ...]
+    """Rows of the whole model's z, ascending."""
+    stop: int | None = None
+    """Where the rows all lie within the first `stop` epochs: nothing later is computed."""
+
+    @classmethod
+    def until(cls, whole: Measurement, stop: int) -> Restricted:
+        """The readings of the first `stop` epochs."""
+        return cls(whole, tuple(whole.rows(stop).tolist()), stop)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return self.whole.parameters
+
+    @property
+    def index(self) -> Mapping[str, Sequence[Any]]:
+        return {name: [column[i] for i in self.kept] for name, column in self.whole.index.items()}
+
+    @property
+    def nominal(self) -> Array:
+        return self.whole.nominal
+
+    @property
+    def offset(self) -> Array:
+        return self.whole.offset[self._rows]
+
+    @cached_property
+    def m(self) -> int:
+        return len(self.kept)
+
+    @property
+    def epochs(self) -> tuple[NDArray[np.intp], ...] | None:
+        """The whole model's epochs that still have readings, renumbered."""
+        if self.whole.epochs is None:
+            return None
+        place = np.full(self.whole.m, -1)
+        place[self._rows] = np.arange(self.m)
+        renumbered = (place[epoch] for epoch in self.whole.epochs[: self.stop])
+        return tuple(kept for rows in renumbered if len(kept := rows[rows >= 0]))
+
+    @cached_property
+    def _rows(self) -> NDArray[np.intp]:
+        return np.array(self.kept, dtype=np.intp)
+
+    @cached_property
+    def _among_arrived(self) -> NDArray[np.intp]:
+        """Where the kept rows stand in what the whole model returns."""
+        if self.stop is None:
+            return self._rows
+        return np.searchsorted(self.whole.rows(self.stop), self._rows)
+
+    def simulate(self, x: Array) -> Array:
+        z = self.whole.simulate(x) if self.stop is None else self.whole.simulate_until(x, self.stop)
+        return z[:, self._among_arrived]
+
+    def jacobian(self, x: Array) -> Array:
+        J = self.whole.jacobian(x) if self.stop is None else self.whole.jacobian_until(x, self.stop)
+        return J[:, self._among_arrived]
+
+    def linearization(self) -> Array:
+        return self.whole.linearization()[self._rows]
+
+    def suited_to(self, error_scale: float) -> Measurement:
+        return Restricted(self.whole.suited_to(error_scale), self.kept, self.stop)
+
+
+def differentiate(h: Any, x: Array, *, analytic: bool) -> Array:
+    """dh/dx (trials, m, n) of a batched function h at x (trials, n), all directions in one call of h.
+
+    Analytic functions: complex step, exact to round-off (Squire and Trapp, SIAM Review 40, 1998). Others: central
+    differences with a step of eps^(1/3) in units of the parameter, or of its value where that is larger.
+    """
+    trials, n = x.shape
+    if analytic:
+        steps = np.eye(n) * _COMPLEX_STEP * 1j
+        z = h((x[:, None, :] + steps).reshape(trials * n, n))
+        return np.ascontiguousarray(np.imag(z).reshape(trials, n, -1).swapaxes(1, 2)) / _COMPLEX_STEP
+    size = _CENTRAL_STEP * np.maximum(1.0, np.abs(x))
+    above, below = x + size, x - size
+    steps = np.eye(n)[None] * (above - below)[:, None, :] / 2
+    points = np.stack([x[:, None] + steps, x[:, None] - steps])
+    z = h(points.reshape(-1, n)).reshape(2, trials, n, -1)
+    width = (np.diagonal(points[0], axis1=1, axis2=2) - np.diagonal(points[1], axis1=1, axis2=2))[:, :, None]
+    return np.ascontiguousarray(((z[0] - z[1]) / width).swapaxes(1, 2))

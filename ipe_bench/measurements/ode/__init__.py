@@ -1,0 +1,1 @@
+"""Measurement models defined by ordinary differential equations, on a compiled batched integrator."""

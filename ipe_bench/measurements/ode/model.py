@@ -1,0 +1,141 @@
+"""Measurement models whose readings are taken from the solution of ordinary differential equations.
+
+The author writes the right-hand side once, in plain arithmetic; the batched compiled integrator and the exact Jacobian
+come from it. Recording and compilation are in `trace` and `kernel`.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.linalg import Array
+from ipe_bench.measurements.base import Measurement
+from ipe_bench.measurements.ode.kernel import Recording, integrate, record
+
+_COMPLEX_STEP = 1e-100
+
+
+class OdeMeasurement(Measurement):
+    """Readings of y' = rhs(t, y, p, c) at given times, for one or more cases that share the parameters.
+
+    p are the parameters in SI units, c the constants of a case. `start`, `rhs` and `read` use + - * / ** and NumPy's
+    elementary functions on the entries of their arguments, and nothing that asks for a value (no if, no comparison).
+    z has C order over (case, time, output).
+    """
+
+    states: ClassVar[int]
+    """Number of state variables."""
+    outputs: ClassVar[tuple[str, ...]]
+    """The names of what is read at each time."""
+    step: float | None
+    """The longest integration step in seconds; each interval between readings is divided evenly."""
+
+    @property
+    @abstractmethod
+    def times(self) -> Array:
+        """The times of the readings (times,) in seconds after the start at 0, ascending."""
+
+    @property
+    def cases(self) -> Array:
+        """The constants of each case: (cases, constants). One case without constants unless overridden."""
+        return np.zeros((1, 0))
+
+    @property
+    def si_sizes(self) -> Array:
+        """The size (n,) of one unit of x in SI units."""
+        return self.sizes
+
+    @abstractmethod
+    def start(self, p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
+        """The state at time 0."""
+
+    @abstractmethod
+    def rhs(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
+        """The time derivative of the state."""
+
+    @abstractmethod
+    def read(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
+        """What the instruments show of the state, one entry per output."""
+
+    @property
+    def index(self) -> Mapping[str, Sequence[Any]]:
+        cases, times, outputs = np.meshgrid(
+            np.arange(1, len(self.cases) + 1), self.times, np.arange(len(self.outputs)), indexing="ij"
+        )
+        return {
+            "case": cases.ravel().tolist(),
+            "time [s]": times.ravel().tolist(),
+            "output": [self.outputs[i] for i in outputs.ravel()],
+        }
+
+    @cached_property
+    def epochs(self) -> tuple[NDArray[np.intp], ...]:
+        """One epoch per time, with the readings of all cases and outputs."""
+        rows = np.arange(self.m).reshape(len(self.cases), len(self.times), len(self.outputs))
+        return tuple(np.ascontiguousarray(rows[:, k]).ravel() for k in range(len(self.times)))
+
+    def simulate(self, x: Array) -> Array:
+        return self.simulate_until(x, len(self.times))
+
+    def simulate_until(self, x: Array, stop: int) -> Array:
+        p, c = self._lanes(x)
+        return self._integrate(self._plain, self._start(p, c), np.concatenate([p, c], axis=1), stop)[..., 0]
+
+    def jacobian(self, x: Array) -> Array:
+        return self.jacobian_until(x, len(self.times))
+
+    def jacobian_until(self, x: Array, stop: int) -> Array:
+        """dh/dx by the variational equations, integrated by the same compiled formula as the readings."""
+        trials, n = x.shape
+        p, c = self._lanes(np.repeat(x, n, axis=0))
+        direction = np.repeat(np.tile(np.eye(n), (trials, 1)), len(self.cases), axis=0) * self.si_sizes
+        y = self._start(p + 1j * _COMPLEX_STEP * direction, c)
+        y0 = np.concatenate([np.real(y), np.imag(y) / _COMPLEX_STEP], axis=1)
+        inputs = np.concatenate([p, c, direction, np.zeros_like(c)], axis=1)
+        z = self._integrate(self._tangent, np.ascontiguousarray(y0), inputs, stop)[..., 1]
+        return np.ascontiguousarray(z.reshape(trials, n, -1).swapaxes(1, 2))
+
+    def _lanes(self, x: Array) -> tuple[Array, Array]:
+        """Parameters and constants of every initial value problem: each trial in each case."""
+        p = np.repeat(x * self.si_sizes, len(self.cases), axis=0)
+        return p, np.tile(self.cases, (len(x), 1))
+
+    def _start(self, p: NDArray[Any], c: Array) -> NDArray[Any]:
+        return np.stack(np.broadcast_arrays(*self.start(list(p.T), list(c.T)), p[:, 0])[:-1], axis=1)
+
+    def _integrate(self, recording: Recording, y0: Array, inputs: Array, stop: int) -> Array:
+        """(trials, readings, 1 or 2): the readings, and their tangents where the recording carries them."""
+        if self.step is None:
+            raise ValueError(f"{self.name}: the integration step is not chosen yet; see suited_to")
+        times = self.times[:stop]
+        substeps = np.ceil(np.diff(times, prepend=0.0) / self.step - 1e-9).astype(np.int64)
+        out = integrate(recording, y0, inputs, 0.0, times, np.maximum(substeps, 1))
+        readings = len(self.cases) * stop * len(self.outputs)
+        parts = out.reshape(len(out), stop, -1, len(self.outputs))
+        return np.ascontiguousarray(parts.swapaxes(2, 3)).reshape(-1, readings, parts.shape[2])
+
+    @cached_property
+    def _plain(self) -> Recording:
+        return self._record(tangents=False)
+
+    @cached_property
+    def _tangent(self) -> Recording:
+        return self._record(tangents=True)
+
+    def _record(self, *, tangents: bool) -> Recording:
+        n = self.n
+
+        def rhs(t: Any, y: Sequence[Any], p: Sequence[Any]) -> Sequence[Any]:
+            return self.rhs(t, y, p[:n], p[n:])
+
+        def read(t: Any, y: Sequence[Any], p: Sequence[Any]) -> Sequence[Any]:
+            return self.read(t, y, p[:n], p[n:])
+
+        inputs = n + self.cases.shape[1]
+        return record(rhs, read, self.states, inputs, len(self.outputs), tangents=tangents)

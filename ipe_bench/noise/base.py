@@ -1,0 +1,29 @@
+"""What a noise is: it adds errors to simulated readings, and states the covariance R that estimators assume."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ipe_bench.linalg import Array, Covariance
+
+
+class Noise(ABC):
+    """Errors of readings. A new noise is a frozen dataclass that writes `corrupt` and `covariance`."""
+
+    name: ClassVar[str] = ""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "name" not in cls.__dict__:
+            cls.name = cls.__name__.lower()
+
+    @abstractmethod
+    def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
+        """The readings z (m,) of one trial, given the error-free h (m,) and what the instruments show besides it."""
+
+    @abstractmethod
+    def covariance(self, m: int) -> Covariance:
+        """R of m readings, as the estimators assume it."""

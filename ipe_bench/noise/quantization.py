@@ -1,0 +1,34 @@
+"""Read-outs rounded to a step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ipe_bench.linalg import Array, Covariance
+from ipe_bench.noise.base import Noise
+
+_UNIFORM_DEVIATION = 1 / np.sqrt(12)
+
+
+@dataclass(frozen=True)
+class Quantization(Noise):
+    """z = step * round((offset + h) / step) - offset: the instruments' whole read-out is rounded, not its error.
+
+    Rounding the difference instead would give equal errors in cases that differ in sign alone. The error is taken to be
+    uniform, R = step^2 / 12, unless `deviation` states it. With `dither` a uniform error of one step is added before
+    rounding and taken off again: then the error is uniform and independent of h, which at small h it otherwise is not.
+    """
+
+    step: float
+    """In the unit of the readings."""
+    deviation: float | None = None
+    dither: bool = False
+
+    def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
+        shift = self.step * (rng.random(h.shape) - 0.5) if self.dither else 0.0
+        return self.step * np.round((offset + h + shift) / self.step) - offset - shift
+
+    def covariance(self, m: int) -> Covariance:
+        return Covariance(np.full(m, self.deviation or self.step * _UNIFORM_DEVIATION))

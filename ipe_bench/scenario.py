@@ -1,0 +1,101 @@
+"""A scenario: what is measured, how noisily, and what the truth is drawn from. It draws trials, and never estimates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ipe_bench.errors import UserError
+from ipe_bench.linalg import Array, Covariance
+from ipe_bench.measurements.base import Measurement
+from ipe_bench.noise.base import Noise
+from ipe_bench.prior.gaussian import Gaussian as Prior
+
+
+@dataclass(frozen=True)
+class Problem:
+    """All that an estimator may know besides the readings: the model, R, and the prior. The truth is not in it."""
+
+    measurement: Measurement
+    R: Covariance
+    prior_deviation: Array | None = None
+    """Standard deviation (n,) of the parameters about the nominal point; None where no prior is known."""
+
+    @property
+    def x0(self) -> Array:
+        return self.measurement.nominal
+
+    @cached_property
+    def H(self) -> Array:
+        """H (m, n) of eq. (1)."""
+        return self.measurement.linearization()
+
+    @property
+    def P0(self) -> Array:
+        """Covariance (n, n) of the prior."""
+        if self.prior_deviation is None:
+            raise ValueError(f"{self.measurement.name} has no prior")
+        return np.diag(self.prior_deviation**2)
+
+
+@dataclass(frozen=True)
+class Trials:
+    """Consecutive trials of a scenario: truth x (trials, n) and readings z (trials, m)."""
+
+    start: int
+    x: Array
+    z: Array
+
+    @property
+    def stop(self) -> int:
+        return self.start + len(self.x)
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Everything that determines the trials. `truth` simulates the readings where it differs from what estimators
+    assume (a finer step, a richer model); its first parameters are those of `measurement`."""
+
+    measurement: Measurement
+    noise: Noise
+    prior: Prior
+    error_scale: float
+    seed: int = 0
+    truth: Measurement | None = None
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.error_scale) and self.error_scale > 0):
+            raise UserError(f"error_scale={self.error_scale}: give a number above 0")
+        if self.seed < 0:
+            raise UserError(f"seed={self.seed}: give a whole number from 0 up")
+        object.__setattr__(self, "measurement", self.measurement.suited_to(self.error_scale))
+        if self.truth is not None:
+            object.__setattr__(self, "truth", self.truth.suited_to(self.error_scale))
+
+    @cached_property
+    def problem(self) -> Problem:
+        """What the estimators are told."""
+        model = self.measurement
+        deviation = self.prior.deviation(model.n, self.error_scale)
+        return Problem(model, self.noise.covariance(model.m), deviation)
+
+    def draw(self, start: int, stop: int) -> Trials:
+        """Trials start to stop. Trial t has random streams of its own, so it is the same in whatever block it is drawn.
+
+        One seed gives the same draws, in units of the error scale, at every error scale.
+        """
+        truth = self.truth or self.measurement
+        streams = [_streams(self.seed, trial) for trial in range(start, stop)]
+        x = np.stack([self.prior.draw(truth.nominal, self.error_scale, rng) for rng, _ in streams])
+        h = truth.simulate(x)
+        z = np.stack([self.noise.corrupt(h[i], truth.offset, rng) for i, (_, rng) in enumerate(streams)])
+        return Trials(start, x[:, : self.measurement.n], z)
+
+
+def _streams(seed: int, trial: int) -> tuple[np.random.Generator, np.random.Generator]:
+    """Independent random streams for a trial's parameters and for its noise."""
+    sequence = np.random.SeedSequence(seed, spawn_key=(trial,))
+    parameters, noise = (np.random.Generator(np.random.Philox(s)) for s in sequence.spawn(2))
+    return parameters, noise

@@ -1,0 +1,19 @@
+"""Fixed-point iteration, eqs. (16) and (17)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ipe_bench.solvers.base import Solver, State, System
+
+
+@dataclass(frozen=True)
+class FixedPoint(Solver):
+    """x <- x - F(x), which is x0 + H+ (z - h(x0) - N(x)), eq. (17).
+
+    Converges linearly where g(x) = x - F(x) contracts, eqs. (15) and (18).
+    """
+
+    def step(self, system: System, state: State) -> State:
+        x = state.x - state.F
+        return State(x, system.F(x))

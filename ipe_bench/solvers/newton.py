@@ -1,0 +1,16 @@
+"""Newton's method, eqs. (20) to (22)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ipe_bench.solvers.base import Solver, State, System
+
+
+@dataclass(frozen=True)
+class Newton(Solver):
+    """x <- x - J(x)^-1 F(x). Converges quadratically near a root with regular J, eq. (23)."""
+
+    def step(self, system: System, state: State) -> State:
+        x = state.x - system.solve(system.J(state.x), state.F)
+        return State(x, system.F(x))

@@ -1,0 +1,31 @@
+"""How a trial ended."""
+
+from enum import IntEnum
+
+
+class Status(IntEnum):
+    """The last word on one trial; its `reason` explains it to a reader of the tables."""
+
+    reason: str
+
+    def __new__(cls, value: int, reason: str) -> "Status":
+        member = int.__new__(cls, value)
+        member._value_ = value
+        member.reason = reason
+        return member
+
+    RUNNING = -1, "not finished"
+    CONVERGED = 0, "the estimating equation holds within the tolerance"
+    STALLED = 1, "the steps became tiny before the estimating equation held"
+    MAX_ITERATIONS = 2, "the iteration limit was reached"
+    DIVERGED = 3, "the iterate left every region where the model makes sense"
+    NONFINITE = 4, "a reading or an estimate overflowed or was not a number"
+    SINGULAR = 5, "a linear system had no unique solution"
+    BUDGET = 6, "the budget of simulations was used up"
+    TIMEOUT = 7, "the time limit was reached"
+    ERROR = 8, "the estimator or the model raised an exception"
+
+    @property
+    def label(self) -> str:
+        """The name in tables: lower case."""
+        return self.name.lower()
