@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.errors import UserError
 from ipe_bench.estimation import Estimates, Estimator, describe_exception
-from ipe_bench.linalg import Array, Mask, inverse, multiply, pseudo_inverse, solve
+from ipe_bench.linalg import Array, Mask, finite, inverse, multiply, pseudo_inverse, solve
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.scenario import Problem
 from ipe_bench.solvers.base import Solver, State
@@ -283,7 +283,7 @@ def sandwich(system: FrozenSystem, problem: Problem, x: Array) -> Array:
     Not counted as cost: it is part of the report, not of the search.
     """
     uncounted = dataclasses.replace(system, model=Counted(problem.measurement, Tally.zeros(len(system.rows))))
-    usable = np.isfinite(x).all(axis=1)
+    usable = finite(x)
     inverse_slope = np.full((len(x), x.shape[1], x.shape[1]), np.nan)
     if usable.any():
         inverse_slope[usable], _ = inverse(uncounted.subset(usable).J(x[usable]))

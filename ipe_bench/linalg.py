@@ -17,6 +17,11 @@ Array: TypeAlias = NDArray[Any]
 Mask: TypeAlias = NDArray[Any]
 
 
+def finite(a: Array) -> Mask:
+    """Which trials (trials,) of a (trials, ...) are finite throughout."""
+    return np.asarray(np.isfinite(a).all(axis=tuple(range(1, a.ndim))))
+
+
 def multiply(A: Array, x: Array) -> Array:
     """A x for each trial: A (..., p, q), x (trials, q) -> (trials, p)."""
     return np.matmul(A, x[..., None])[..., 0]
@@ -39,7 +44,7 @@ def inverse(A: Array) -> tuple[Array, Mask]:
 
 
 def _solve_columns(A: Array, b: Array) -> tuple[Array, Mask]:
-    usable = np.isfinite(A).all(axis=(1, 2)) & np.isfinite(b).all(axis=(1, 2))
+    usable = finite(A) & finite(b)
     x = np.full(b.shape, np.nan)
     try:
         x[usable] = np.linalg.solve(A[usable], b[usable])
@@ -49,7 +54,7 @@ def _solve_columns(A: Array, b: Array) -> tuple[Array, Mask]:
                 x[i] = np.linalg.solve(A[i], b[i])
             except np.linalg.LinAlgError:
                 continue
-    return x, ~np.isfinite(x).all(axis=(1, 2))
+    return x, ~finite(x)
 
 
 def quadratic_form(P_inverse: Array, e: Array) -> Array:
@@ -114,7 +119,7 @@ def pseudo_inverse(H: Array, R: Covariance) -> tuple[Array, Mask]:
     Flags the trials whose H has not full column rank to working precision; their H+ is NaN.
     """
     Hw = R.whiten_jacobian(H)
-    usable = np.isfinite(Hw).all(axis=(1, 2))
+    usable = finite(Hw)
     Q, U = np.linalg.qr(np.where(usable[:, None, None], Hw, 0.0))
     diagonal = np.abs(np.diagonal(U, axis1=1, axis2=2))
     floor = np.finfo(float).eps * max(H.shape[1:]) * np.linalg.norm(U, axis=(1, 2))

@@ -70,28 +70,29 @@ class Scenario:
             raise UserError(f"error_scale={self.error_scale}: give a number above 0")
         if self.seed < 0:
             raise UserError(f"seed={self.seed}: give a whole number from 0 up")
-        object.__setattr__(self, "measurement", self.measurement.suited_to(self.error_scale))
-        if self.truth is not None:
-            object.__setattr__(self, "truth", self.truth.suited_to(self.error_scale))
 
     @cached_property
     def problem(self) -> Problem:
         """What the estimators are told."""
-        model = self.measurement
-        deviation = self.prior.deviation(model.n, self.error_scale)
-        return Problem(model, self.noise.covariance(model.m), deviation)
+        model = self.measurement.suited_to(self.error_scale)
+        return Problem(model, self.noise.covariance(model.m), self.prior.deviation(model.n, self.error_scale))
+
+    @cached_property
+    def simulator(self) -> Measurement:
+        """The model that the readings come from."""
+        return self.problem.measurement if self.truth is None else self.truth.suited_to(self.error_scale)
 
     def draw(self, start: int, stop: int) -> Trials:
         """Trials start to stop. Trial t has random streams of its own, so it is the same in whatever block it is drawn.
 
         One seed gives the same draws, in units of the error scale, at every error scale.
         """
-        truth = self.truth or self.measurement
+        model = self.simulator
         streams = [_streams(self.seed, trial) for trial in range(start, stop)]
-        x = np.stack([self.prior.draw(truth.nominal, self.error_scale, rng) for rng, _ in streams])
-        h = truth.simulate(x)
-        z = np.stack([self.noise.corrupt(h[i], truth.offset, rng) for i, (_, rng) in enumerate(streams)])
-        return Trials(start, x[:, : self.measurement.n], z)
+        x = np.stack([self.prior.draw(model.nominal, self.error_scale, rng) for rng, _ in streams])
+        h = model.simulate(x)
+        z = np.stack([self.noise.corrupt(h[i], model.offset, rng) for i, (_, rng) in enumerate(streams)])
+        return Trials(start, x[:, : self.problem.measurement.n], z)
 
 
 def _streams(seed: int, trial: int) -> tuple[np.random.Generator, np.random.Generator]:

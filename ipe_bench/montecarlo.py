@@ -1,0 +1,148 @@
+"""Trials through estimators: draws a block of a scenario, lets estimators loose on it, and scores what they return.
+
+A block is a range of trials; its result depends on nothing but the scenario, the estimator and the range. Storing,
+distributing and summarising blocks is left to other rooms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.stats import chi2
+
+from ipe_bench.estimation import Equation, Estimates, Estimator, estimate_safely
+from ipe_bench.ipe import FrozenSystem, find_roots, frozen_covariance, linear_deviation
+from ipe_bench.linalg import Array, information, inverse, pseudo_inverse, quadratic_form
+from ipe_bench.scenario import Problem, Scenario, Trials
+from ipe_bench.solvers.newton import Newton
+from ipe_bench.statuses import Status
+
+GATE = 1e-6
+"""A success lies inside the ellipsoid that all but this share of efficient estimates lie in."""
+SAME_ROOT = 1e-3
+"""Two roots closer than this, in standard deviations of the Cramér-Rao bound, are one."""
+HISTORIES = 20
+"""Trials whose iterates are kept: the first ones of a scenario."""
+
+Columns = dict[str, Array]
+
+
+@dataclass(frozen=True)
+class Block:
+    """Trials of a scenario with what the truth says of them: bounds and reference roots, computed when needed."""
+
+    scenario: Scenario
+    trials: Trials
+
+    @classmethod
+    def draw(cls, scenario: Scenario, start: int, stop: int) -> Block:
+        with np.errstate(all="ignore"):
+            return cls(scenario, scenario.draw(start, stop))
+
+    @property
+    def problem(self) -> Problem:
+        return self.scenario.problem
+
+    @cached_property
+    def crlb_information(self) -> Array:
+        """J' R^-1 J at the truth (trials, n, n): the inverse of the Cramér-Rao bound."""
+        with np.errstate(all="ignore"):
+            return information(self.problem.measurement.jacobian(self.trials.x), self.problem.R)
+
+    @cached_property
+    def bayes_information(self) -> Array:
+        """J' R^-1 J + P0^-1 at the truth: the inverse of the Bayesian bound."""
+        deviation = self.problem.prior_deviation
+        return self.crlb_information + (0.0 if deviation is None else np.diag(deviation**-2.0))
+
+    @cached_property
+    def crlb_deviation(self) -> Array:
+        """Standard deviations (trials, n) of the Cramér-Rao bound at the truth."""
+        return _deviations(inverse(self.crlb_information)[0])
+
+    def truth_columns(self) -> Columns:
+        """The truth and its bounds, in multiples of the parameters' units."""
+        names = [p.name for p in self.problem.measurement.parameters]
+        bayes = _deviations(inverse(self.bayes_information)[0])
+        return {
+            "trial": np.arange(self.trials.start, self.trials.stop),
+            **_by_parameter("x", names, self.trials.x),
+            **_by_parameter("crlb", names, self.crlb_deviation),
+            **_by_parameter("bayes", names, bayes),
+        }
+
+    @cached_property
+    def _roots(self) -> dict[Equation, Array]:
+        return {}
+
+    def reference_root(self, equation: Equation) -> Array:
+        """The root (trials, n) that an estimating equation reaches from the truth; NaN where it reaches none."""
+        if equation not in self._roots:
+            with np.errstate(all="ignore"):
+                self._roots[equation] = _root_from(self.problem, self.trials, equation)
+        return self._roots[equation]
+
+    def estimate(self, estimator: Estimator) -> tuple[Estimates, Columns]:
+        """What an estimator makes of the block, and its score."""
+        history = self.trials.start < HISTORIES
+        estimates = estimate_safely(estimator, self.problem, self.trials.z, history=history)
+        with np.errstate(all="ignore"):
+            return estimates, self.score(estimator, estimates)
+
+    def score(self, estimator: Estimator, estimates: Estimates) -> Columns:
+        """Each trial's error, cost, status and distances, as columns."""
+        model = self.problem.measurement
+        names = [p.name for p in model.parameters]
+        error = estimates.x - self.trials.x
+        converged = estimates.status == Status.CONVERGED
+        bound = self.bayes_information if "prior" in estimator.needs else self.crlb_information
+        distance = quadratic_form(bound, error)
+        solved = converged & np.isfinite(error).all(axis=1)
+        if estimator.equation is not None:
+            apart = np.abs(estimates.x - self.reference_root(estimator.equation)) / self.crlb_deviation
+            solved &= apart.max(axis=1) <= SAME_ROOT
+        trials = len(error)
+        P = estimates.covariance
+        nees = np.full(trials, np.nan) if P is None else quadratic_form(inverse(P)[0], error)
+        deviation = np.full(error.shape, np.nan) if P is None else _deviations(P)
+        return {
+            "trial": np.arange(self.trials.start, self.trials.stop),
+            **_by_parameter("error", names, error),
+            **_by_parameter("deviation", names, deviation),
+            "status": np.array([Status(s).label for s in estimates.status], dtype=object),
+            "message": np.array([estimates.messages.get(i, "") for i in range(trials)], dtype=object),
+            "iterations": estimates.iterations,
+            "simulations": estimates.simulations,
+            "jacobians": estimates.jacobians,
+            "time_s": estimates.seconds,
+            "crlb_distance": quadratic_form(self.crlb_information, error),
+            "nees": nees,
+            "solved": solved,
+            "success": np.isfinite(distance) & (distance <= chi2.isf(GATE, model.n)),
+            **{f"extra_{name}": values for name, values in estimates.extras.items()},
+        }
+
+
+def linear_bound(problem: Problem) -> Array:
+    """Standard deviations (n,) of eq. (5): what the linear LSE would reach if h were linear."""
+    H_plus, _ = pseudo_inverse(problem.H[None], problem.R)
+    return _deviations(frozen_covariance(H_plus, problem))[0]
+
+
+def _root_from(problem: Problem, trials: Trials, equation: Equation) -> Array:
+    if equation != "frozen":
+        raise NotImplementedError(equation)
+    system = FrozenSystem.at_nominal(problem, trials.z)
+    deviation = linear_deviation(system, problem)
+    roots = find_roots(system, Newton(), trials.x, deviation, tolerance=1e-6, max_iterations=20)
+    return np.where((roots.status == Status.CONVERGED)[:, None], roots.x, np.nan)
+
+
+def _deviations(P: Array) -> Array:
+    return np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+
+
+def _by_parameter(prefix: str, names: list[str], values: Array) -> Columns:
+    return {f"{prefix}_{name}": np.ascontiguousarray(values[:, i]) for i, name in enumerate(names)}
