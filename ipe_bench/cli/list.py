@@ -1,0 +1,55 @@
+"""`ipe-bench list [GROUP] [-v]`: what there is to choose from, and where it comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.table import Table
+
+from ipe_bench import plugins
+from ipe_bench.components import construct, unknown
+from ipe_bench.errors import UserError
+from ipe_bench.measurements.base import Measurement
+
+
+def main(arguments: Sequence[str]) -> int:
+    """One line per option; with -v the parameters and the readings file of each measurement."""
+    verbose = any(a in ("-v", "--verbose") for a in arguments)
+    names = [a for a in arguments if not a.startswith("-")]
+    known = plugins.groups()
+    for name in names:
+        if name not in known:
+            raise UserError(f"{name}: {unknown(name, known, 'group')}")
+    console = Console()
+    for group in names or known:
+        table = Table(title=group, title_justify="left", title_style="bold", box=None, pad_edge=False, expand=False)
+        for heading in ("option", "what it is", "from"):
+            table.add_column(heading, overflow="fold", no_wrap=heading == "option")
+        chosen = plugins.options(group)
+        for option in chosen:
+            table.add_row(option.name, option.summary, option.source.origin)
+        console.print(table)
+        console.print()
+        if verbose and group == "measurement":
+            for option in chosen:
+                _describe_measurement(console, option)
+    return 0
+
+
+def _describe_measurement(console: Console, option: plugins.Option) -> None:
+    from omegaconf import OmegaConf
+
+    model = construct(OmegaConf.to_container(OmegaConf.load(option.path)), "measurement")
+    assert isinstance(model, Measurement)
+    from ipe_bench.readings import header
+
+    table = Table(title=f"measurement={option.name}", title_justify="left", box=None, pad_edge=False)
+    for heading in ("parameter", "size", "unit"):
+        table.add_column(heading, justify="right" if heading == "size" else "left")
+    for parameter in model.parameters:
+        table.add_row(parameter.name, f"{parameter.size:g}", parameter.unit)
+    console.print(table)
+    console.print(f"readings={{FILE}}: {model.m} rows, header: {','.join(header(model))}", highlight=False)
+    first = ",".join(str(column[0]) for column in model.index.values())
+    console.print(f"first row: {first},<reading>\n", highlight=False)

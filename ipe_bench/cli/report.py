@@ -1,0 +1,33 @@
+"""`ipe-bench report DIR...`: tables, figures and report from what is stored."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from ipe_bench.errors import UserError
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Aggregates the directories; the report goes to the first, or to output=DIR."""
+    outputs = [a.removeprefix("output=") for a in arguments if a.startswith("output=")]
+    directories = [Path(a) for a in arguments if not a.startswith("output=")]
+    if not directories:
+        raise UserError("report: name at least one directory of results, such as outputs/paper")
+    for directory in directories:
+        if not (directory / "trials").is_dir():
+            raise UserError(f"{directory}: holds no results (there is no folder trials in it)")
+    return show(directories, Path(outputs[0]) if outputs else directories[0])
+
+
+def show(directories: Sequence[Path], output: Path) -> int:
+    """Writes the report, prints its table and where things are; returns the exit code."""
+    from ipe_bench.statistics import summarize
+
+    console = Console()
+    frame = summarize(directories)
+    frame.to_csv(output / "summary.csv", index=False)
+    console.print(frame[frame["parameter"] == "all"].to_string())
+    return 0

@@ -1,0 +1,169 @@
+"""`ipe-bench run`: composes the config with Hydra, computes what is missing, and shows what is known."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
+
+from ipe_bench import plugins
+from ipe_bench.api import compute
+from ipe_bench.cli.config import CONFIG_ERRORS, Job, assemble, explain, prepare, rewrite
+from ipe_bench.cli.progress import shown_progress
+from ipe_bench.cli.report import show
+from ipe_bench.errors import UserError
+
+_FLAGS_WITH_VALUE = {"--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--config-path", "-cp"}
+_FLAGS_WITH_VALUE |= {"--config-dir", "-cd", "--experimental-rerun"}
+_INFO_TOPICS = {"all", "config", "defaults", "defaults-tree", "plugins", "searchpath"}
+
+
+class Outcome:
+    """What the jobs of this invocation came to; Hydra hands nothing back from a sweep."""
+
+    def __init__(self) -> None:
+        self.started = False
+        self.multirun = False
+        self.jobs = 0
+        self.outputs: dict[Path, None] = {}
+        self.failures: list[str] = []
+        self.mistakes: dict[str, None] = {}
+
+
+_outcome = Outcome()
+
+
+class Watch(Callback):
+    """Learns from Hydra which folder is being filled, also when a launcher runs the jobs elsewhere."""
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        _outcome.started = True
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        _outcome.started = _outcome.multirun = True
+        output = OmegaConf.select(config, "output")
+        if output is not None:
+            _outcome.outputs[Path(output)] = None
+
+    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
+        _outcome.jobs += 1
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Runs Hydra on the arguments; then aggregates and shows the folders that were filled."""
+    global _outcome
+    _outcome = Outcome()
+    flags, overrides = hoist(arguments)
+    _refuse_sweep_over_experiments(overrides)
+    prepare()
+    _complete_without_subcommand()
+    # Hydra would print config errors itself, badly, and exit with 1.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    sys.argv = ["ipe-bench", *flags, *rewrite(overrides)]
+    try:
+        hydra.main(version_base="1.3", config_path=str(plugins.own_conf()), config_name="config")(task)()
+    except CONFIG_ERRORS as error:
+        raise explain(error) from error
+    if not _outcome.started:
+        return 0
+    if _outcome.multirun and not _outcome.jobs and not _outcome.mistakes:
+        raise UserError("the sweep has no jobs: check the patterns in its lists")
+    for failure in _outcome.failures:
+        print(f"ipe-bench: failed: {failure}", file=sys.stderr)
+    code = 1 if _outcome.failures else 0
+    for output in _outcome.outputs:
+        if (output / "trials").is_dir():
+            code = max(code, show([output], output))
+    if _outcome.mistakes:
+        raise UserError("; ".join(_outcome.mistakes))
+    return code
+
+
+def task(config: DictConfig) -> None:
+    """One job: a scenario under its estimators. A mistake in one job of a sweep does not stop the others."""
+    hydra_config = HydraConfig.get()
+    try:
+        job = assemble(config, hydra_config.runtime.choices)
+        if config.write_readings is not None:
+            write_trial(job, Path(config.write_readings), config.write_readings_trial)
+            return
+        with shown_progress(_title(job)) as watch:
+            failures = compute(
+                [job.scenario],
+                job.estimators,
+                job.trials,
+                job.output,
+                execution=job.execution,
+                block_size=job.block_size,
+                watch=watch,
+            )
+    except CONFIG_ERRORS as error:
+        _outcome.mistakes[str(explain(error))] = None
+    except UserError as error:
+        _outcome.mistakes[str(error)] = None
+    else:
+        _outcome.failures += failures
+        _outcome.outputs[Path(job.output)] = None
+
+
+def _title(job: Job) -> str:
+    scenario = job.scenario
+    return f"{scenario.measurement.name}, error scale {scenario.error_scale:g}, seed {scenario.seed}"
+
+
+def write_trial(job: Job, path: Path, trial: int) -> None:
+    """Writes the simulated readings of one trial, and its true parameters beside them."""
+    from ipe_bench.readings import write_readings, write_truth
+
+    if trial < 0:
+        raise UserError(f"write_readings_trial={trial}: give a whole number from 0 up")
+    drawn = job.scenario.draw(trial, trial + 1)
+    model = job.scenario.measurement
+    truth = path.with_name(f"{path.stem}.truth.csv")
+    write_readings(path, model, drawn.z[0])
+    write_truth(truth, model, drawn.x[0])
+    print(f"Readings of trial {trial}: {path}\nTrue parameters:     {truth}")
+
+
+def hoist(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Flags and overrides apart: Hydra's parser wants all flags before or after all overrides."""
+    flags: list[str] = []
+    overrides: list[str] = []
+    waiting = list(arguments)
+    while waiting:
+        argument = waiting.pop(0)
+        if not argument.startswith("-"):
+            overrides.append(argument)
+            continue
+        flags.append(argument)
+        takes_next = argument in _FLAGS_WITH_VALUE
+        takes_next |= argument in ("--info", "-i") and bool(waiting) and waiting[0] in _INFO_TOPICS
+        takes_next |= argument in ("-sc", "--shell-completion") and bool(waiting)
+        if takes_next and waiting:
+            flags.append(waiting.pop(0))
+    return flags, overrides
+
+
+def _refuse_sweep_over_experiments(overrides: Sequence[str]) -> None:
+    for override in overrides:
+        key, _, value = override.partition("=")
+        if key.lstrip("+") == "experiment" and "," in value:
+            raise UserError(f"{override}: a sweep over experiments would ignore their own sweeps; run them one by one")
+
+
+def _complete_without_subcommand() -> None:
+    """Hydra completes the words after the program's name; ours has the subcommand in between."""
+    line = os.environ.get("COMP_LINE")
+    if line is None:
+        return
+    program, _, rest = line.partition(" run ")
+    if rest or line.endswith(" run "):
+        os.environ["COMP_LINE"] = f"{program} {rest}"
+        os.environ["COMP_POINT"] = str(len(os.environ["COMP_LINE"]))

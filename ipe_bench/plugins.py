@@ -1,0 +1,142 @@
+"""Finds plugins: installed distributions, and the folders `plugins/*/` of the working folder.
+
+A plugin is a Python package with a `conf` folder inside that mirrors the groups of ours. Installed plugins state the
+package in the entry-point group `ipe_bench.plugins`; a plugin in a folder needs nothing but to be there.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.metadata
+import importlib.util
+import os
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from ipe_bench.components import register_package
+from ipe_bench.errors import UserError
+
+ENTRY_POINTS = "ipe_bench.plugins"
+ESTIMATOR_GROUPS = ("solver", "baseline")
+_PACKAGE_HEADER = re.compile(r"^#\s*@package\s+(\S+)", re.MULTILINE)
+_LAYOUT = ("config", "experiment")
+"""What `conf/` has besides groups of components."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where options come from: ipe-bench itself or a plugin."""
+
+    name: str
+    conf: Path
+    origin: str
+    """For people: the distribution or the folder."""
+
+
+@dataclass(frozen=True)
+class Option:
+    """One choice in a config group."""
+
+    group: str
+    name: str
+    path: Path
+    source: Source
+
+    @property
+    def summary(self) -> str:
+        """The first line of comment in the file that is not a header."""
+        for line in self.path.read_text(encoding="utf-8").splitlines():
+            if line.startswith("#") and not _PACKAGE_HEADER.match(line):
+                return line.lstrip("# ").strip()
+        return ""
+
+    @property
+    def package(self) -> str | None:
+        """Where in the config the option lands, where its header says so."""
+        found = _PACKAGE_HEADER.search(self.path.read_text(encoding="utf-8"))
+        return found.group(1) if found else None
+
+
+def own_conf() -> Path:
+    """The folder of our configs: inside the installed package, or beside it in a checkout."""
+    package = Path(__file__).resolve().parent
+    for folder in (package / "conf", package.parent / "conf"):
+        if (folder / "config.yaml").is_file():
+            return folder
+    raise FileNotFoundError("the configs of ipe-bench are neither in the package nor beside it; install it again")
+
+
+@functools.cache
+def sources() -> tuple[Source, ...]:
+    """Ours first, then the installed plugins, then the folders `plugins/*/`; their packages become importable."""
+    found = [Source("ipe-bench", own_conf(), "built in"), *_installed(), *_in_folders(Path.cwd() / "plugins")]
+    unique = {source.name: source for source in reversed(found)}
+    return tuple(s for s in found if unique[s.name] is s)
+
+
+def _installed() -> Iterator[Source]:
+    for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
+        spec = importlib.util.find_spec(entry.value)
+        if spec is None or not spec.submodule_search_locations:
+            raise UserError(f"plugin {entry.name}: there is no package {entry.value}; install the plugin again")
+        register_package(entry.value.split(".")[0])
+        version = f" {entry.dist.version}" if entry.dist else ""
+        conf = Path(spec.submodule_search_locations[0]) / "conf"
+        yield Source(entry.value, conf, f"{entry.dist.name if entry.dist else entry.name}{version}")
+
+
+def _in_folders(folder: Path) -> Iterator[Source]:
+    if not folder.is_dir():
+        return
+    for plugin in sorted(folder.iterdir()):
+        for conf in sorted(plugin.glob("*/conf")):
+            package = conf.parent.name
+            if not (conf.parent / "__init__.py").is_file():
+                continue
+            _make_importable(plugin)
+            register_package(package)
+            yield Source(package, conf, f"plugins/{plugin.name}")
+
+
+def _make_importable(folder: Path) -> None:
+    """Puts the folder on the import path of this process and of the workers it starts."""
+    path = str(folder.resolve())
+    if path not in sys.path:
+        sys.path.append(path)
+    inherited = [p for p in os.environ.get("PYTHONPATH", "").split(os.pathsep) if p]
+    if path not in inherited:
+        os.environ["PYTHONPATH"] = os.pathsep.join([*inherited, path])
+
+
+def options(group: str | None = None) -> list[Option]:
+    """All options of a group, or of all groups.
+
+    Raises:
+        UserError: two sources offer one option, of which the second would silently never run; or an estimator's file
+            lacks the header that puts it among the estimators.
+    """
+    found: dict[tuple[str, str], Option] = {}
+    for source in sources():
+        for path in sorted(source.conf.rglob("*.yaml")):
+            relative = path.relative_to(source.conf).with_suffix("")
+            if len(relative.parts) < 2:
+                continue
+            option = Option(relative.parts[0], "/".join(relative.parts[1:]), path, source)
+            known = found.setdefault((option.group, option.name), option)
+            if known is not option:
+                raise UserError(
+                    f"{option.group}={option.name}: both {known.source.origin} and {source.origin} offer it; "
+                    "rename one of the two files"
+                )
+            header = f"estimators.{Path(option.name).name}"
+            if option.group in ESTIMATOR_GROUPS and option.package != header:
+                raise UserError(f"{path}: its first line must be '# @package {header}', or it would never run")
+    return [o for o in found.values() if group is None or o.group == group]
+
+
+def groups() -> list[str]:
+    """The config groups that hold options."""
+    return sorted({option.group for option in options()})
