@@ -22,8 +22,6 @@ from ipe_bench.errors import UserError
 ENTRY_POINTS = "ipe_bench.plugins"
 ESTIMATOR_GROUPS = ("solver", "baseline")
 _PACKAGE_HEADER = re.compile(r"^#\s*@package\s+(\S+)", re.MULTILINE)
-_LAYOUT = ("config", "experiment")
-"""What `conf/` has besides groups of components."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +117,7 @@ def options(group: str | None = None) -> list[Option]:
             lacks the header that puts it among the estimators.
     """
     found: dict[tuple[str, str], Option] = {}
+    labels: dict[str, Option] = {}
     for source in sources():
         for path in sorted(source.conf.rglob("*.yaml")):
             relative = path.relative_to(source.conf).with_suffix("")
@@ -131,9 +130,14 @@ def options(group: str | None = None) -> list[Option]:
                     f"{option.group}={option.name}: both {known.source.origin} and {source.origin} offer it; "
                     "rename one of the two files"
                 )
-            header = f"estimators.{Path(option.name).name}"
-            if option.group in ESTIMATOR_GROUPS and option.package != header:
-                raise UserError(f"{path}: its first line must be '# @package {header}', or it would never run")
+            if option.group in ESTIMATOR_GROUPS:
+                label = Path(option.name).name
+                if option.package != f"estimators.{label}":
+                    raise UserError(f"{path}: its first line must be '# @package estimators.{label}', or it never runs")
+                if labels.setdefault(label, option) is not option:
+                    raise UserError(
+                        f"{path}: {labels[label].path} is called {label} too, and only one of them would run"
+                    )
     return [o for o in found.values() if group is None or o.group == group]
 
 

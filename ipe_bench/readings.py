@@ -82,7 +82,7 @@ def read_readings(path: Path, model: Measurement) -> Array:
         seen[place] = number
         z[place] = _reading(cells.get(wanted[-1], ""), f"readings={path}: row {number}, column {wanted[-1]}")
     if len(seen) < model.m:
-        absent = next(label for label, place in places.items() if place not in seen)
+        absent = next(label for i, label in enumerate(zip(*model.index.values(), strict=True)) if i not in seen)
         said = ", ".join(f"{name}={value}" for name, value in zip(model.index, absent, strict=True))
         raise UserError(
             f"readings={path}: has {len(seen)} of {model.m} rows; the first absent one is {said} "

@@ -86,14 +86,13 @@ def rewrite(overrides: Sequence[str]) -> list[str]:
     return [re.sub(r"^(\+?)truth_measurement=", r"\1measurement@truth_measurement=", o) for o in overrides]
 
 
-def assemble(config: DictConfig, choices: Mapping[str, Any]) -> Job:
-    """The scenario, the estimators and the execution that a composed config describes.
-
-    `choices` is what was chosen in each group. Raises UserError by key.
-    """
-    _check_choices(choices)
+def assemble(config: DictConfig) -> Job:
+    """The scenario, the estimators and the execution that a composed config describes; UserError by key."""
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(plain, dict)
+    for key in plain:
+        if key not in Schema.__dataclass_fields__:
+            raise UserError(f"{key}: {unknown(str(key), Schema.__dataclass_fields__, 'key')}")
     parts = {key: construct(plain[key], key) for key in ("measurement", "noise", "prior", "execution")}
     truth = plain["truth_measurement"]
     scenario = Scenario(
@@ -115,23 +114,24 @@ def assemble(config: DictConfig, choices: Mapping[str, Any]) -> Job:
     return Job(scenario, estimators, parts["execution"], plain["trials"], plain["block_size"], plain["output"])
 
 
-def _check_choices(choices: Mapping[str, Any]) -> None:
-    """Refuses what Hydra would silently merge."""
-    chosen: dict[str, str] = {}
-    for group in plugins.ESTIMATOR_GROUPS:
-        for name in choices.get(group) or []:
-            if name in chosen:
-                other = chosen[name]
-                remedy = f"+{group}@estimators.{name}_2={name} runs it a second time under another label"
-                raise UserError(
-                    f"{group}={name}: is chosen twice ({other} and {group}), which would run once; {remedy}"
-                )
-            chosen[name] = group
+def refuse_silent_traps(overrides: Sequence[str]) -> None:
+    """Refuses what Hydra would take without a word and not do: see each message."""
+    for override in overrides:
+        key, _, value = override.partition("=")
+        group = key.lstrip("+")
+        if group == "experiment" and "," in value:
+            raise UserError(f"{override}: a sweep over experiments would ignore their own sweeps; run them one by one")
+        if group in plugins.ESTIMATOR_GROUPS and value.startswith("["):
+            names = [name.strip() for name in value.strip("[]").split(",")]
+            for name in names:
+                if names.count(name) > 1:
+                    remedy = f"+{group}@estimators.{name}_2={name} runs it again under a label of its own"
+                    raise UserError(f"{override}: {name} stands there twice and would run once; {remedy}")
 
 
 def explain(error: Exception) -> UserError:
     """A config error of Hydra or OmegaConf as one line with the remedy."""
-    text = str(error)
+    text = "\n".join(str(e) for e in (error, error.__cause__) if e is not None)
     missing = re.search(r"Could not find '([^']+)'|In '[^']*': Could not find '([^']+)'", text)
     if missing:
         group, _, name = (missing.group(1) or missing.group(2)).partition("/")
@@ -142,7 +142,7 @@ def explain(error: Exception) -> UserError:
         name = no_group.group(1)
         if name == "experiment":
             return UserError("experiment: is added, not overridden; write +experiment=NAME")
-        known = [*Schema.__dataclass_fields__, *plugins.groups()]
+        known = {*Schema.__dataclass_fields__, *plugins.groups()}
         key = name.split(".")[0]
         if key in known:
             return UserError(f"{name}: there is no such key; see `ipe-bench run --cfg job` for those there are")
@@ -152,6 +152,5 @@ def explain(error: Exception) -> UserError:
     if value and full_key:
         kind = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false"}
         return UserError(f"{full_key.group(1)}={value.group(1)}: give {kind.get(value.group(2), value.group(2))}")
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    lines += [f"({cause})" for cause in [error.__cause__] if cause is not None and str(cause) not in text]
+    lines = dict.fromkeys(line.strip() for line in text.splitlines() if line.strip())
     return UserError(" ".join(line for line in lines if not line.startswith("object_type=")))

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ipe_bench import plugins
+from ipe_bench.cli import console
 from ipe_bench.components import construct, unknown
 from ipe_bench.errors import UserError
 from ipe_bench.measurements.base import Measurement
@@ -21,7 +22,7 @@ def main(arguments: Sequence[str]) -> int:
     for name in names:
         if name not in known:
             raise UserError(f"{name}: {unknown(name, known, 'group')}")
-    console = Console()
+    out = console()
     for group in names or known:
         table = Table(title=group, title_justify="left", title_style="bold", box=None, pad_edge=False, expand=False)
         for heading in ("option", "what it is", "from"):
@@ -29,15 +30,15 @@ def main(arguments: Sequence[str]) -> int:
         chosen = plugins.options(group)
         for option in chosen:
             table.add_row(option.name, option.summary, option.source.origin)
-        console.print(table)
-        console.print()
+        out.print(table)
+        out.print()
         if verbose and group == "measurement":
             for option in chosen:
-                _describe_measurement(console, option)
+                _describe_measurement(out, option)
     return 0
 
 
-def _describe_measurement(console: Console, option: plugins.Option) -> None:
+def _describe_measurement(out: Console, option: plugins.Option) -> None:
     from omegaconf import OmegaConf
 
     model = construct(OmegaConf.to_container(OmegaConf.load(option.path)), "measurement")
@@ -49,7 +50,7 @@ def _describe_measurement(console: Console, option: plugins.Option) -> None:
         table.add_column(heading, justify="right" if heading == "size" else "left")
     for parameter in model.parameters:
         table.add_row(parameter.name, f"{parameter.size:g}", parameter.unit)
-    console.print(table)
-    console.print(f"readings={{FILE}}: {model.m} rows, header: {','.join(header(model))}", highlight=False)
+    out.print(table)
+    out.print(f"readings={{FILE}}: {model.m} rows, header: {','.join(header(model))}", highlight=False)
     first = ",".join(str(column[0]) for column in model.index.values())
-    console.print(f"first row: {first},<reading>\n", highlight=False)
+    out.print(f"first row: {first},<reading>\n", highlight=False)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-
+from ipe_bench.cli import console
 from ipe_bench.errors import UserError
 
 
@@ -26,8 +25,8 @@ def show(directories: Sequence[Path], output: Path) -> int:
     """Writes the report, prints its table and where things are; returns the exit code."""
     from ipe_bench.statistics import summarize
 
-    console = Console()
+    out = console()
     frame = summarize(directories)
     frame.to_csv(output / "summary.csv", index=False)
-    console.print(frame[frame["parameter"] == "all"].to_string())
+    out.print(frame[frame["parameter"] == "all"].to_string())
     return 0

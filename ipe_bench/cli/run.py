@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from ipe_bench import plugins
 from ipe_bench.api import compute
-from ipe_bench.cli.config import CONFIG_ERRORS, Job, assemble, explain, prepare, rewrite
+from ipe_bench.cli.config import CONFIG_ERRORS, Job, assemble, explain, prepare, refuse_silent_traps, rewrite
 from ipe_bench.cli.progress import shown_progress
 from ipe_bench.cli.report import show
 from ipe_bench.errors import UserError
@@ -61,7 +60,7 @@ def main(arguments: Sequence[str]) -> int:
     global _outcome
     _outcome = Outcome()
     flags, overrides = hoist(arguments)
-    _refuse_sweep_over_experiments(overrides)
+    refuse_silent_traps(overrides)
     prepare()
     _complete_without_subcommand()
     # Hydra would print config errors itself, badly, and exit with 1.
@@ -88,9 +87,8 @@ def main(arguments: Sequence[str]) -> int:
 
 def task(config: DictConfig) -> None:
     """One job: a scenario under its estimators. A mistake in one job of a sweep does not stop the others."""
-    hydra_config = HydraConfig.get()
     try:
-        job = assemble(config, hydra_config.runtime.choices)
+        job = assemble(config)
         if config.write_readings is not None:
             write_trial(job, Path(config.write_readings), config.write_readings_trial)
             return
@@ -149,13 +147,6 @@ def hoist(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
         if takes_next and waiting:
             flags.append(waiting.pop(0))
     return flags, overrides
-
-
-def _refuse_sweep_over_experiments(overrides: Sequence[str]) -> None:
-    for override in overrides:
-        key, _, value = override.partition("=")
-        if key.lstrip("+") == "experiment" and "," in value:
-            raise UserError(f"{override}: a sweep over experiments would ignore their own sweeps; run them one by one")
 
 
 def _complete_without_subcommand() -> None:

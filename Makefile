@@ -1,0 +1,34 @@
+# Two commands do everything: `make run` and `make test`. Both set up .venv first where it is missing.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: run test slow lint bench clean
+
+run: .venv/ready
+	$(BIN)/ipe-bench run +experiment=paper
+
+test: .venv/ready
+	$(BIN)/pytest
+
+# What takes minutes: Monte Carlo, end-to-end and browser checks.
+slow: .venv/ready
+	$(BIN)/pytest -m "slow or browser"
+
+lint: .venv/ready
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+bench: .venv/ready
+	$(BIN)/pytest tests/benchmarks --benchmark-only --benchmark-columns=min,median,ops
+
+.venv/ready: pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \
+		{ echo "ipe-bench needs Python 3.11 to 3.13: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 2; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[test,lint,dask]"
+	@touch $@
+
+clean:
+	rm -rf .venv
