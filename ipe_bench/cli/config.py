@@ -132,9 +132,9 @@ def refuse_silent_traps(overrides: Sequence[str]) -> None:
 def explain(error: Exception) -> UserError:
     """A config error of Hydra or OmegaConf as one line with the remedy."""
     text = "\n".join(str(e) for e in (error, error.__cause__) if e is not None)
-    missing = re.search(r"Could not find '([^']+)'|In '[^']*': Could not find '([^']+)'", text)
+    missing = re.search(r"Could not (?:find|load) '([^']+)'", text)
     if missing:
-        group, _, name = (missing.group(1) or missing.group(2)).partition("/")
+        group, _, name = missing.group(1).partition("/")
         known = [option.name for option in plugins.options(group)]
         return UserError(f"{group}={name}: {unknown(name, known, 'option')}")
     no_group = re.search(r"Could not override '([^']+)'", text)

@@ -51,6 +51,6 @@ def _describe_measurement(out: Console, option: plugins.Option) -> None:
     for parameter in model.parameters:
         table.add_row(parameter.name, f"{parameter.size:g}", parameter.unit)
     out.print(table)
-    out.print(f"readings={{FILE}}: {model.m} rows, header: {','.join(header(model))}", highlight=False)
+    out.print(f"readings={{FILE}}: {model.m} rows, header: {','.join(header(model))}", markup=False)
     first = ",".join(str(column[0]) for column in model.index.values())
-    out.print(f"first row: {first},<reading>\n", highlight=False)
+    out.print(f"first row: {first},<reading>\n", markup=False)

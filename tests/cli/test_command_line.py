@@ -1,0 +1,203 @@
+"""The command line end to end: what it computes, and one clear line for every mistake."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ipe_bench import plugins
+from ipe_bench.cli.main import main
+
+ROOT = Path(__file__).parents[2]
+
+
+def ipe_bench(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "ipe_bench", *arguments],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+
+
+@pytest.fixture
+def in_process(monkeypatch, capsys):
+    """Runs the command in this process: quicker, for commands that end before any work."""
+    for variable in ("HYDRA_FULL_ERROR", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        monkeypatch.setenv(variable, "1")
+
+    def run(arguments: list[str], folder: Path) -> tuple[int, str]:
+        monkeypatch.chdir(folder)
+        monkeypatch.setattr(sys, "argv", ["ipe-bench"])
+        plugins.sources.cache_clear()
+        code = main(arguments)
+        return code, capsys.readouterr().err
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def readings(tmp_path_factory) -> Path:
+    """Readings of one simulated trial."""
+    folder = tmp_path_factory.mktemp("readings")
+    result = ipe_bench("run", "error_scale=10", "write_readings=trial.csv", folder=folder)
+    assert result.returncode == 0, result.stderr
+    return folder / "trial.csv"
+
+
+def test_a_sweep_leaves_tables_figures_and_a_report(tmp_path):
+    result = ipe_bench("run", "-m", "error_scale=1,10", "trials=20", folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / "outputs/run/summary.csv").is_file()
+    assert "fixed_point" in result.stdout
+    again = ipe_bench("run", "-m", "error_scale=1,10", "trials=20", folder=tmp_path)
+    assert again.stderr.count("nothing left to compute") == 2
+
+
+def test_estimates_from_a_file_find_the_parameters_that_made_it(readings):
+    import re
+
+    result = ipe_bench("estimate", f"readings={readings}", "error_scale=10", folder=readings.parent)
+    assert result.returncode == 0, result.stderr
+    truth = {
+        name: float(value)
+        for name, _, value in (
+            line.split(",") for line in readings.with_name("trial.truth.csv").read_text().splitlines()[1:]
+        )
+    }
+    for name, value in truth.items():
+        row = next(line for line in result.stdout.splitlines() if line.startswith(name))
+        estimate, error = map(float, re.search(r"(\S+) ± (\S+)", row).groups())
+        assert abs(estimate - value) < 5 * error
+
+
+MISTAKES = {
+    "unknown estimator": (["run", "solver=[newtn]"], "solver=newtn: there is no such option; did you mean newton?"),
+    "unknown measurement": (["run", "measurement=gims"], "did you mean gins?"),
+    "unknown key": (["run", "eror_scale=1"], "did you mean error_scale?"),
+    "unknown option": (["run", "estimators.fixed_point.tolerence=1"], "estimators.fixed_point.tolerence"),
+    "negative scale": (["run", "error_scale=-1"], "error_scale=-1.0: give a number above 0"),
+    "zero scale": (["run", "error_scale=0"], "error_scale=0.0: give a number above 0"),
+    "no trials": (["run", "trials=0"], "trials=0: give a whole number above 0"),
+    "text for a number": (["run", "trials=many"], "trials=many: give a whole number"),
+    "no estimator": (["run", "solver=[]", "baseline=[]"], "there is no estimator"),
+    "chosen twice": (["run", "solver=[newton,newton]"], "newton stands there twice"),
+    "foreign target": (["run", "noise._target_=os.system"], "only classes of these packages"),
+    "two experiments": (["run", "-m", "+experiment=paper,paper"], "run them one by one"),
+    "added key": (["run", "+trails=3"], "did you mean trials?"),
+    "unknown command": (["rum"], "did you mean run?"),
+    "unknown group": (["list", "solvers"], "did you mean solver?"),
+    "no directory": (["report", "nowhere"], "holds no results"),
+    "no readings": (["estimate"], "readings: is not given"),
+    "absent readings": (["estimate", "readings=absent.csv"], "absent.csv: there is no such file"),
+}
+
+
+@pytest.mark.parametrize("case", MISTAKES)
+def test_a_mistake_is_one_line_with_exit_code_2(tmp_path, in_process, case):
+    arguments, expected = MISTAKES[case]
+    code, error = in_process(arguments, tmp_path)
+    assert code == 2
+    assert expected in error
+    assert len(error.strip().splitlines()) == 1
+    assert not (tmp_path / "outputs").exists() or not list((tmp_path / "outputs").rglob("*.parquet"))
+
+
+def test_a_sweep_whose_patterns_match_nothing_says_so(tmp_path):
+    result = ipe_bench("run", "-m", "solver=glob(nothing*)", folder=tmp_path)
+    assert result.returncode == 2
+    assert "the sweep has no jobs" in result.stderr
+
+
+SPOILED = {
+    "239 rows": (lambda lines: [*lines[:9], *lines[10:]], "has 239 of 240 rows; the first absent one is case=1"),
+    "NaN": (lambda lines: [*lines[:5], "1,9.0,vx,NaN", *lines[6:]], "row 6, column reading [m/s]: NaN is no reading"),
+    "text": (
+        lambda lines: [*lines[:5], "1,9.0,vx,fast", *lines[6:]],
+        "row 6, column reading [m/s]: 'fast' is no number",
+    ),
+    "column": (lambda lines: [lines[0].replace("axis", "axes"), *lines[1:]], "column axis is missing"),
+    "unit": (lambda lines: [lines[0].replace("m/s", "ft/s"), *lines[1:]], "column reading [ft/s]: the unit must be"),
+    "duplicate": (lambda lines: [*lines[:6], lines[5], *lines[6:]], "stands in row 6 already"),
+    "foreign row": (lambda lines: [*lines, "5,3.0,vx,1.0"], "has no reading case=5"),
+    "empty": (lambda lines: [], "is empty"),
+}
+
+
+@pytest.mark.parametrize("case", SPOILED)
+def test_a_spoiled_readings_file_is_named_by_row_and_column(readings, tmp_path, in_process, case):
+    spoil, expected = SPOILED[case]
+    path = tmp_path / "spoiled.csv"
+    path.write_text("\n".join(spoil(readings.read_text().splitlines())))
+    code, error = in_process(["estimate", f"readings={path}"], tmp_path)
+    assert code == 2
+    assert expected in error
+    assert len(error.strip().splitlines()) == 1
+
+
+def test_a_missing_reading_is_an_empty_cell(readings, tmp_path):
+    lines = readings.read_text().splitlines()
+    path = tmp_path / "missing.csv"
+    path.write_text("\n".join([*lines[:5], "1,9.0,vx,", *lines[6:]]))
+    result = ipe_bench("estimate", f"readings={path}", "error_scale=10", folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert " 228 " in result.stdout
+
+
+def test_nothing_is_overwritten(readings):
+    before = readings.read_text()
+    result = ipe_bench("run", f"write_readings={readings}", folder=readings.parent)
+    assert result.returncode == 2
+    assert "is not overwritten" in result.stderr
+    assert readings.read_text() == before
+
+
+def test_hydras_own_flags_work_after_run(tmp_path):
+    assert "error_scale: 5.0" in ipe_bench("run", "error_scale=5", "--cfg", "job", folder=tmp_path).stdout
+    assert ipe_bench("run", "--info", "searchpath", folder=tmp_path).returncode == 0
+    completed = ipe_bench(
+        "-sc", "query=bash", folder=tmp_path, COMP_LINE="ipe-bench run measurement=gi", COMP_POINT="28"
+    )
+    assert "measurement=gins" in completed.stdout
+
+
+LOADED = """
+import sys
+from ipe_bench.cli.main import main
+main(["--help"])
+print(sorted(m for m in ("pandas", "seaborn", "filterpy", "numba", "hydra") if m in sys.modules))
+"""
+
+
+def test_help_is_quick_to_load_and_names_the_commands():
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    result = subprocess.run([sys.executable, "-c", LOADED], env=environment, capture_output=True, text=True, check=True)
+    assert "ipe-bench estimate" in result.stdout
+    assert result.stdout.strip().endswith("[]")
+
+
+def test_plugins_in_the_working_folder_are_found_and_run(tmp_path):
+    (tmp_path / "plugins").symlink_to(ROOT / "plugins")
+    listed = ipe_bench("list", "solver", folder=tmp_path)
+    assert "plugins/relaxed_fixed_point" in listed.stdout
+    result = ipe_bench("run", "solver=[relaxed]", "baseline=[]", "trials=5", folder=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "relaxed" in result.stdout
+
+
+def test_a_plugin_without_its_header_or_with_a_taken_name_is_refused(tmp_path):
+    conf = tmp_path / "plugins/mine/mine/conf/solver"
+    conf.mkdir(parents=True)
+    (tmp_path / "plugins/mine/mine/__init__.py").touch()
+    (conf / "lost.yaml").write_text("_target_: mine.Lost\n")
+    assert "first line must be" in ipe_bench("list", folder=tmp_path).stderr
+    (conf / "lost.yaml").unlink()
+    (conf / "newton.yaml").write_text("# @package estimators.newton\n_target_: mine.Newton\n")
+    assert "rename one of the two" in ipe_bench("list", folder=tmp_path).stderr

@@ -1,0 +1,48 @@
+"""Small models with known answers, shared by the tests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from ipe_bench.linalg import Array
+from ipe_bench.measurements import Measurement, Parameter
+
+
+@dataclass(frozen=True)
+class Bent(Measurement):
+    """h(x) = A x + bend * (A x)^2: linear where bend is 0, with a Jacobian in closed form."""
+
+    bend: float = 0.0
+    seed: int = 7
+    count: int = 12
+
+    analytic = True
+    reading_unit = "m"
+
+    @property
+    def A(self) -> Array:
+        return np.random.default_rng(self.seed).normal(size=(self.count, 3))
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return Parameter("a", "m", 1.0), Parameter("b", "m", 2.0), Parameter("c", "m", 0.5)
+
+    @property
+    def index(self):
+        return {"number": list(range(1, self.count + 1))}
+
+    @property
+    def epochs(self):
+        return tuple(np.arange(i, i + 3) for i in range(0, self.count, 3))
+
+    def simulate(self, x: Array) -> Array:
+        y = np.matmul(self.A, x[..., None])[..., 0]
+        return y + self.bend * y**2
+
+
+@pytest.fixture
+def bent():
+    return Bent

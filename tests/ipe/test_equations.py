@@ -1,0 +1,161 @@
+"""Eqs. (2), (5), (11) = (19), (15), (17), (18) and (24) as identities, on random systems."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import Bent
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from ipe_bench.baselines import LinearLSE
+from ipe_bench.errors import UserError
+from ipe_bench.ipe import IPE, FrozenSystem, frozen_covariance, sandwich
+from ipe_bench.linalg import Covariance
+from ipe_bench.scenario import Problem
+from ipe_bench.solvers import FixedPoint, Newton
+from ipe_bench.statuses import Status
+
+SIGMA = 0.3
+seeds = st.integers(0, 2**32 - 1)
+vectors = arrays(float, 3, elements=st.floats(-5, 5))
+
+
+def problem_of(bend: float = 0.0, seed: int = 7, sigma: float = SIGMA) -> Problem:
+    model = Bent(bend, seed)
+    return Problem(model, Covariance(np.full(model.m, sigma)), np.ones(3))
+
+
+@given(seeds, vectors)
+@settings(deadline=None, max_examples=30)
+def test_linear_lse_is_the_normal_equation_of_eq_2(seed, x):
+    problem = problem_of(seed=seed)
+    A = problem.measurement.A
+    z = A @ x + np.random.default_rng(seed).normal(size=len(A))
+    estimates = LinearLSE().estimate(problem, z[None])
+    np.testing.assert_allclose(estimates.x[0], np.linalg.lstsq(A, z, rcond=None)[0], atol=1e-9)
+
+
+@given(seeds)
+@settings(deadline=None, max_examples=30)
+def test_covariance_of_the_linear_lse_is_eq_5(seed):
+    problem = problem_of(seed=seed)
+    A = problem.measurement.A
+    P = LinearLSE().estimate(problem, np.zeros((1, len(A)))).covariance
+    np.testing.assert_allclose(P[0], SIGMA**2 * np.linalg.inv(A.T @ A), rtol=1e-8, atol=1e-12)
+
+
+@given(seeds, vectors, st.floats(-0.1, 0.1))
+@settings(deadline=None, max_examples=30)
+def test_eq_19_is_eq_11_with_the_nonlinear_term_of_eq_24(seed, x, bend):
+    problem = problem_of(bend, seed)
+    model, A = problem.measurement, problem.measurement.A
+    z = np.random.default_rng(seed).normal(size=model.m)
+    H_plus = np.linalg.inv(A.T @ A) @ A.T
+    N = model.simulate(x[None])[0] - A @ x  # eq. (24)
+    expected = x - H_plus @ (z - N)  # eq. (19)
+    F = FrozenSystem.at_nominal(problem, z[None]).F(x[None])[0]
+    np.testing.assert_allclose(F, expected, atol=1e-8)
+
+
+def test_a_root_of_F_solves_eq_11():
+    problem = problem_of(bend=0.02)
+    model, A = problem.measurement, problem.measurement.A
+    z = model.simulate(np.array([[1.0, -0.5, 0.8]])) + 0.01
+    x = IPE(Newton(), tolerance=1e-12).estimate(problem, z).x[0]
+    N = model.simulate(x[None])[0] - A @ x
+    np.testing.assert_allclose(x, np.linalg.pinv(A) @ (z[0] - N), atol=1e-11)
+
+
+def test_fixed_point_iterates_are_those_of_eqs_16_and_17():
+    problem = problem_of(bend=0.02)
+    model, A = problem.measurement, problem.measurement.A
+    z = model.simulate(np.array([[1.0, -0.5, 0.8]]))
+    history = IPE(FixedPoint()).estimate(problem, z, history=True).history[0]
+    H_plus = np.linalg.pinv(A)
+    x = H_plus @ z[0]
+    for iterate in history[:4]:
+        np.testing.assert_allclose(iterate, x, atol=1e-12)
+        x = H_plus @ (z[0] - (model.simulate(x[None])[0] - A @ x))
+
+
+def test_error_stays_below_the_bound_of_eq_18_on_a_contraction():
+    problem = problem_of(bend=0.004)
+    model = problem.measurement
+    truth = np.array([0.6, -0.4, 0.5])
+    estimates = IPE(FixedPoint(), tolerance=1e-13).estimate(problem, model.simulate(truth[None]), history=True)
+    history = estimates.history[0]
+    H_plus = np.linalg.pinv(model.A)
+    # K of eq. (15) over the box that holds the iterates, on a grid of its corners.
+    low, high = history.min(axis=0), history.max(axis=0)
+    corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
+    slopes = np.eye(3) - np.matmul(H_plus, model.jacobian(corners))
+    K = 3 * np.abs(slopes).max()
+    assert K < 1
+    first = np.abs(history[1] - history[0]).max()
+    errors = np.abs(history - estimates.x[0]).max(axis=1)
+    assert (errors[:-1] <= K ** np.arange(len(history) - 1) / (1 - K) * first + 1e-14).all()
+
+
+def test_sandwich_is_the_spread_of_the_roots():
+    problem = problem_of(bend=0.03, sigma=0.01)
+    model, truth = problem.measurement, np.array([[1.0, -0.5, 0.8]])
+    rng = np.random.default_rng(3)
+    z = model.simulate(truth) + 0.01 * rng.standard_normal((40_000, model.m))
+    estimates = IPE(Newton()).estimate(problem, z)
+    assert (estimates.status == Status.CONVERGED).all()
+    system = FrozenSystem.at_nominal(problem, model.simulate(truth))
+    P = sandwich(system, problem, truth)[0]
+    np.testing.assert_allclose(np.cov(estimates.x.T), P, atol=4 * np.sqrt(2 / 40_000) * np.abs(P).max())
+    assert np.trace(P) > np.trace(frozen_covariance(system.H_plus, problem)[0]) * 0.1
+
+
+def test_a_batch_equals_its_trials_one_by_one_bit_for_bit():
+    problem = problem_of(bend=0.05)
+    z = np.random.default_rng(1).normal(size=(37, problem.measurement.m)) * 2
+    for solver in (FixedPoint(), Newton()):
+        whole = IPE(solver, max_iterations=15).estimate(problem, z)
+        for i in range(len(z)):
+            alone = IPE(solver, max_iterations=15).estimate(problem, z[i : i + 1])
+            np.testing.assert_array_equal(whole.x[i], alone.x[0])
+            np.testing.assert_array_equal(whole.covariance[i], alone.covariance[0])
+            assert whole.status[i] == alone.status[0]
+            assert whole.simulations[i] == alone.simulations[0]
+
+
+def test_counts_are_per_trial():
+    problem = problem_of(bend=0.0)
+    estimates = IPE(FixedPoint()).estimate(problem, np.ones((2, problem.measurement.m)))
+    # h(x0) for the start, and one evaluation that finds F to be zero there.
+    assert estimates.iterations.tolist() == [0, 0]
+    assert estimates.simulations.tolist() == [2.0, 2.0]
+
+
+def test_divergence_and_overflow_are_statuses_and_disturb_no_other_trial():
+    problem = problem_of(bend=0.5)
+    calm = problem.measurement.simulate(np.array([[0.01, 0.02, 0.01]]))
+    wild = np.full((1, problem.measurement.m), -1e6)
+    both = IPE(FixedPoint()).estimate(problem, np.concatenate([calm, wild]))
+    assert Status(both.status[0]) is Status.CONVERGED
+    assert Status(both.status[1]) in (Status.DIVERGED, Status.NONFINITE)
+    np.testing.assert_array_equal(both.x[0], IPE(FixedPoint()).estimate(problem, calm).x[0])
+
+
+def test_the_budget_of_simulations_ends_a_trial():
+    problem = problem_of(bend=0.05)
+    z = problem.measurement.simulate(np.array([[1.0, 1.0, -1.0]]))
+    estimates = IPE(FixedPoint(), tolerance=1e-14, budget=4).estimate(problem, z)
+    assert Status(estimates.status[0]) is Status.BUDGET
+    assert estimates.simulations[0] == 4
+
+
+def test_parameters_that_cannot_be_told_apart_are_refused():
+    class Twins(Bent):
+        def simulate(self, x):
+            return super().simulate(np.stack([x[:, 0] + x[:, 1], 0 * x[:, 1], x[:, 2]], axis=1))
+
+    model = Twins()
+    problem = Problem(model, Covariance(np.ones(model.m)), np.ones(3))
+    with pytest.raises(UserError, match="full column rank"):
+        IPE(FixedPoint()).estimate(problem, np.ones((1, model.m)))

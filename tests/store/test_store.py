@@ -1,0 +1,176 @@
+"""What is stored is found again, what is missing is computed, and no half file is ever read."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from conftest import Bent
+
+from ipe_bench import Scenario, run
+from ipe_bench.api import compute
+from ipe_bench.baselines import LinearLSE
+from ipe_bench.ipe import IPE
+from ipe_bench.noise import Gaussian
+from ipe_bench.prior import Gaussian as Prior
+from ipe_bench.solvers import FixedPoint, Newton
+from ipe_bench.store import Cell, Store
+
+
+def scenario(**changes) -> Scenario:
+    return Scenario(Bent(0.02), Gaussian(0.1), Prior(), **{"error_scale": 1.0, **changes})
+
+
+def rows(store: Store, cell: Cell) -> dict:
+    tables = sorted((p.start, p.table()) for p in store.pieces() if p.key == cell.key)
+    names = [n for n in tables[0][1].column_names if n != "time_s"]
+    return {n: np.concatenate([t[n].to_numpy(zero_copy_only=False) for _, t in tables]) for n in names}
+
+
+class Counting:
+    """Watches how many blocks a run computes."""
+
+    def __init__(self) -> None:
+        self.tasks = None
+
+    def __call__(self, progress) -> None:
+        self.tasks = progress.tasks
+
+
+def blocks_of(*args, **kwargs) -> int:
+    counting = Counting()
+    compute(*args, watch=counting, **kwargs)
+    return counting.tasks
+
+
+def test_a_second_run_computes_nothing_and_more_trials_only_the_difference(tmp_path):
+    estimators = {"linear_lse": LinearLSE()}
+    assert blocks_of([scenario()], estimators, 20, tmp_path, block_size=10) == 2
+    assert blocks_of([scenario()], estimators, 20, tmp_path, block_size=10) == 0
+    assert blocks_of([scenario()], estimators, 30, tmp_path, block_size=10) == 1
+
+
+def test_one_more_estimator_computes_only_itself(tmp_path):
+    compute([scenario()], {"linear_lse": LinearLSE()}, 20, tmp_path)
+    before = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "trials").iterdir()}
+    compute([scenario()], {"linear_lse": LinearLSE(), "fixed_point": IPE(FixedPoint())}, 20, tmp_path)
+    after = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "trials").iterdir()}
+    assert len(after) == len(before) + 1
+    assert before.items() <= after.items()
+
+
+@pytest.mark.parametrize("block_size", [1, 7, 100])
+def test_trials_are_the_same_bits_for_any_block_size(tmp_path, block_size):
+    estimators = {"newton": IPE(Newton())}
+    compute([scenario()], estimators, 23, tmp_path / "whole", block_size=23)
+    compute([scenario()], estimators, 23, tmp_path / "cut", block_size=block_size)
+    cell = Cell(scenario(), "newton", IPE(Newton()))
+    whole, cut = (rows(Store(tmp_path / name), cell) for name in ("whole", "cut"))
+    for name in whole:
+        np.testing.assert_array_equal(whole[name], cut[name])
+
+
+def test_the_key_follows_every_constant(tmp_path):
+    keys = {
+        Cell(s, "newton", e).key
+        for s in (
+            scenario(),
+            scenario(error_scale=2.0),
+            scenario(seed=1),
+            Scenario(Bent(0.03), Gaussian(0.1), Prior(), 1.0),
+        )
+        for e in (IPE(Newton()), IPE(Newton(), tolerance=1e-7))
+    }
+    assert len(keys) == 8
+    assert Cell(scenario(), "newton", IPE(Newton())).key == Cell(scenario(), "newton", IPE(Newton())).key
+
+
+def test_a_changed_source_makes_another_key(tmp_path):
+    code = """
+from dataclasses import dataclass
+from ipe_bench.solvers import FixedPoint
+
+@dataclass(frozen=True)
+class Mine(FixedPoint):
+    pass
+"""
+    script = (
+        "from ipe_bench.components import fingerprint\nfrom mine import Mine\nprint(fingerprint([Mine()])['source'])\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+
+    def digest(source: str) -> str:
+        (tmp_path / "mine.py").write_text(source)
+        return subprocess.run(
+            [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+        ).stdout
+
+    assert digest(code) != digest(code + "\nFACTOR = 2\n")
+    assert digest(code) == digest(code)
+
+
+def test_a_truncated_file_is_set_aside_and_computed_again(tmp_path):
+    estimators = {"linear_lse": LinearLSE()}
+    compute([scenario()], estimators, 10, tmp_path)
+    cell = Cell(scenario(), "linear_lse", LinearLSE())
+    path = next((tmp_path / "trials").glob(f"{cell.key}-*.parquet"))
+    whole = rows(Store(tmp_path), cell)
+    path.write_bytes(path.read_bytes()[:200])
+    compute([scenario()], estimators, 10, tmp_path)
+    assert path.with_suffix(".damaged").is_file()
+    for name, values in rows(Store(tmp_path), cell).items():
+        np.testing.assert_array_equal(values, whole[name])
+
+
+def test_the_footer_says_what_the_file_holds(tmp_path):
+    compute([scenario()], {"linear_lse": LinearLSE()}, 10, tmp_path)
+    footers = [piece.footer() for piece in Store(tmp_path).pieces()]
+    assert {f["names"]["estimator"] for f in footers} == {"truth", "linear_lse"}
+    assert all(f["identity"]["scenario"]["measurement"]["bend"] == 0.02 for f in footers)
+    assert all(set(f["versions"]) >= {"ipe_bench"} for f in footers)
+
+
+def test_a_raising_estimator_is_a_status_and_the_others_are_complete(tmp_path):
+    from ipe_bench.estimation import Estimator
+
+    class Broken(Estimator):
+        def estimate(self, problem, z, *, history=False):
+            raise RuntimeError("out of order")
+
+    from dataclasses import dataclass
+
+    frame = run(
+        scenario(), {"linear_lse": LinearLSE(), "broken": dataclass(frozen=True)(Broken)()}, 10, output=tmp_path
+    )
+    rates = frame[frame["parameter"] == "all"].set_index("estimator")["converged"]
+    assert rates["linear_lse"] == 1.0
+    assert rates["broken"] == 0.0
+    table = next(p.table() for p in Store(tmp_path).pieces() if p.footer()["names"]["estimator"] == "broken")
+    assert set(table["status"].to_pylist()) == {"error"}
+    assert set(table["message"].to_pylist()) == {"RuntimeError: out of order"}
+
+
+@pytest.mark.slow
+def test_killed_and_run_again_it_ends_as_if_never_killed(tmp_path):
+    command = [sys.executable, "-m", "ipe_bench", "run", "error_scale=33", "trials=600", "block_size=20"]
+    reference, killed = tmp_path / "reference", tmp_path / "killed"
+    subprocess.run([*command, f"output={reference}"], check=True, capture_output=True)
+    expected = {p.name for p in (reference / "trials").iterdir()}
+    for wait in (4.0, 5.0):
+        process = subprocess.Popen([*command, f"output={killed}"], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        time.sleep(wait)
+        os.kill(process.pid, signal.SIGKILL)
+        process.communicate()
+    subprocess.run([*command, f"output={killed}"], check=True, capture_output=True)
+    assert {p.name for p in (killed / "trials").glob("*.parquet")} == expected
+    for name in expected:
+        ours, theirs = (pq.read_table(d / "trials" / name) for d in (killed, reference))
+        assert ours.drop_columns("time_s" if "time_s" in ours.column_names else []).equals(
+            theirs.drop_columns("time_s" if "time_s" in theirs.column_names else [])
+        )
