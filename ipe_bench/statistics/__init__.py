@@ -1,5 +1,6 @@
 """Statistics: what the stored trials say about the estimators."""
 
+from ipe_bench.statistics.analysis import Analysis, analyse
 from ipe_bench.statistics.summary import summarize
 
-__all__ = ["summarize"]
+__all__ = ["Analysis", "analyse", "summarize"]

@@ -1,92 +1,295 @@
-"""`summary.csv`: a row per scenario, estimator and parameter, plus the parameter `all`."""
+"""`summary.csv`: a row per scenario, estimator and parameter, plus the parameter `all`.
+
+Shares are of all trials; bias, std, rmse, crlb, efficiency and NEES are over solved trials, the same set for each;
+medians, quantiles and coverage are over all trials, what is not finite counting as infinite.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import beta
+from scipy.stats import chi2, norm
 
 from ipe_bench.linalg import Array
-from ipe_bench.store import TRUTH, Store
+from ipe_bench.statistics.collect import ALWAYS_COLUMNS, Collection, Group, collect
+from ipe_bench.statistics.intervals import bootstrap_rms, clopper_pearson, nees_limits, quantile
+from ipe_bench.statuses import Status
 
 ALL = "all"
 """The row over all parameters: root mean square of error over bound."""
+STATISTICS = (
+    "trials",
+    "converged",
+    "solved",
+    "success",
+    "success_low",
+    "success_high",
+    "false_root",
+    "bias",
+    "std",
+    "rmse",
+    "rmse_low",
+    "rmse_high",
+    "rmse_common",
+    "linear_bound",
+    "crlb",
+    "bayes_bound",
+    "rmse_over_linear_bound",
+    "efficiency",
+    "median_abs_error",
+    "q95_abs_error",
+    "nees",
+    "nees_low",
+    "nees_high",
+    "coverage95",
+    "iterations_median",
+    "iterations_p95",
+    "simulations_median",
+    "time_median_s",
+)
+SCALARS = ("status", "solved", "success", "iterations", "simulations", "time_s", "nees", "crlb_distance")
+
+
+@dataclass(frozen=True)
+class Sample:
+    """All trials of one group, seeds one after another; errors and deviations in multiples of the parameters' sizes."""
+
+    group: Group
+    ids: Array
+    """(trials, 2): seed and trial."""
+    error: Array
+    deviation: Array
+    crlb: Array
+    bayes: Array
+    scalars: Mapping[str, Array]
+    """Per trial, by the names in `SCALARS`, with message and extras where they were asked for."""
+
+    @classmethod
+    def load(cls, collection: Collection, group: Group, *, optional: Sequence[str] = ()) -> Sample:
+        names = [p["name"] for p in group.footer["parameters"]]
+        vectors = [f"{kind}_{name}" for kind in ("error", "deviation") for name in names]
+        bounds = [f"{kind}_{name}" for kind in ("crlb", "bayes") for name in names]
+        parts: list[dict[str, Array]] = []
+        for cell, truth in group.cells:
+            rows = collection.load(cell, [*vectors, *SCALARS], optional)
+            rows["seed"] = np.full(len(rows["trial"]), cell.seed)
+            known = None if truth is None else collection.load(truth, bounds)
+            for name in bounds:
+                rows[name] = _aligned(rows["trial"], known, name)
+            parts.append(rows)
+        joined = {key: np.concatenate([p[key] for p in parts]) for key in parts[0] if all(key in p for p in parts)}
+
+        def matrix(kind: str) -> Array:
+            return np.stack([joined.pop(f"{kind}_{name}") for name in names], axis=1).astype(float, copy=False)
+
+        ids = np.stack([joined.pop("seed"), joined.pop("trial")], axis=1).astype(np.int64)
+        for name in ("solved", "success"):
+            joined[name] = joined[name].astype(bool)
+        return cls(group, ids, matrix("error"), matrix("deviation"), matrix("crlb"), matrix("bayes"), joined)
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def parameters(self) -> Sequence[Mapping[str, Any]]:
+        return self.group.footer["parameters"]
+
+    @cached_property
+    def linear_bound(self) -> Array:
+        return np.array(self.group.footer["linear_bound"], dtype=float)
+
+    @cached_property
+    def solved(self) -> Array:
+        return self.scalars["solved"]
+
+    @cached_property
+    def converged(self) -> Array:
+        return self.scalars["status"] == Status.CONVERGED.label
+
+    @cached_property
+    def normalised(self) -> Array:
+        """Errors over the linear bound (trials, n)."""
+        return self.error / self.linear_bound
+
+    @property
+    def reports_covariance(self) -> bool:
+        return bool(np.isfinite(self.deviation).any())
+
+
+def _aligned(trial: Array, known: Mapping[str, Array] | None, name: str) -> Array:
+    """A column of the truth in the order of the estimates' trials; NaN where the truth is missing."""
+    if known is None or len(known["trial"]) == 0:
+        return np.full(len(trial), np.nan)
+    at = np.minimum(np.searchsorted(known["trial"], trial), len(known["trial"]) - 1)
+    return np.where(known["trial"][at] == trial, known[name][at], np.nan)
 
 
 def summarize(directories: Sequence[Path | str]) -> pd.DataFrame:
     """The tidy summary of everything stored under the directories; empty where there is nothing."""
-    groups: dict[tuple[Any, ...], list[tuple[dict[str, Any], pd.DataFrame]]] = {}
-    truths: dict[tuple[Any, ...], pd.DataFrame] = {}
-    for directory in directories:
-        for piece in Store(directory).pieces():
-            footer = piece.footer()
-            frame = piece.table().to_pandas()
-            names = footer["names"]
-            scenario = tuple(names[k] for k in ("measurement", "noise", "error_scale", "seed"))
-            if names["estimator"] == TRUTH:
-                truths[scenario] = pd.concat([truths[scenario], frame]) if scenario in truths else frame
-            else:
-                group = (names["measurement"], names["noise"], names["error_scale"], names["estimator"])
-                groups.setdefault(group, []).append((footer, frame.assign(seed=names["seed"])))
+    collection = collect(directories)
     rows: list[dict[str, Any]] = []
-    for (measurement, noise, error_scale, estimator), parts in groups.items():
-        footer = parts[0][0]
-        frame = pd.concat([f for _, f in parts])
-        head = {"measurement": measurement, "noise": noise, "error_scale": error_scale, "estimator": estimator}
-        rows += [head | row for row in _rows(footer, frame)]
-    return pd.DataFrame(rows)
+    for groups in collection.scenarios.values():
+        common = common_trials(collection, groups)
+        for group in groups:
+            rows += summary_rows(Sample.load(collection, group), common)
+    return to_frame(rows)
 
 
-def _rows(footer: dict[str, Any], frame: pd.DataFrame) -> list[dict[str, Any]]:
-    names = [p["name"] for p in footer["parameters"]]
-    bound = np.array(footer["linear_bound"])
-    error = frame[[f"error_{name}" for name in names]].to_numpy()
-    solved = frame["solved"].to_numpy()
-    success = int(frame["success"].sum())
-    trials = len(frame)
+def to_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Rows as a table, columns in the order that readers know."""
+    frame = pd.DataFrame(list(rows))
+    if frame.empty:
+        return pd.DataFrame(columns=[*ALWAYS_COLUMNS, "parameter", "unit", *STATISTICS])
+    keys = [c for c in frame.columns if c not in (*STATISTICS, "parameter", "unit")]
+    first = [c for c in ("measurement", "noise") if c in keys]
+    last = ["error_scale", "estimator"]
+    middle = [c for c in keys if c not in (*first, *last) and not c.startswith("estimator.")]
+    options = [c for c in keys if c.startswith("estimator.")]
+    return frame[[*first, *middle, *last, *options, "parameter", "unit", *STATISTICS]]
+
+
+def common_trials(collection: Collection, groups: Sequence[Group]) -> Array:
+    """The (seed, trial) pairs, sorted, that every estimator of a scenario solved, as one number each."""
+    common: Array | None = None
+    for group in groups:
+        parts = []
+        for cell, _ in group.cells:
+            rows = collection.load(cell, ["solved"])
+            trial = rows["trial"][rows["solved"].astype(bool)].astype(np.int64)
+            parts.append(identifier(np.stack([np.full(len(trial), cell.seed, dtype=np.int64), trial], axis=1)))
+        mine = np.unique(np.concatenate(parts))
+        common = mine if common is None else np.intersect1d(common, mine, assume_unique=True)
+    return np.empty(0, dtype=np.int64) if common is None else common
+
+
+def identifier(ids: Array) -> Array:
+    """One number per (seed, trial)."""
+    return ids[:, 0] * (1 << 40) + ids[:, 1]
+
+
+def summary_rows(sample: Sample, common: Array) -> list[dict[str, Any]]:
+    """The rows of one scenario under one estimator; `common` are the trials that all its rivals solved as well."""
+    group, solved = sample.group, sample.solved
+    trials, n = sample.error.shape
+    if trials == 0:
+        return []
+    head = dict(group.columns) | {"estimator": group.estimator} | dict(group.options)
+    success = int(sample.scalars["success"].sum())
     low, high = clopper_pearson(success, trials)
-    shared = {
+    shares = {
         "trials": trials,
-        "converged": float((frame["status"] == "converged").mean()),
+        "converged": float(sample.converged.mean()),
         "solved": float(solved.mean()),
         "success": success / trials,
         "success_low": low,
         "success_high": high,
-        "iterations_median": float(frame["iterations"].median()),
-        "simulations_median": float(frame["simulations"].median()),
-        "time_median_s": float(frame["time_s"].median()),
+        "false_root": float((sample.converged & ~solved).mean()),
+        "iterations_median": quantile(sample.scalars["iterations"], 0.5),
+        "iterations_p95": quantile(sample.scalars["iterations"], 0.95),
+        "simulations_median": quantile(sample.scalars["simulations"], 0.5),
+        "time_median_s": quantile(sample.scalars["time_s"], 0.5),
     }
+    shared_by_all = np.isin(identifier(sample.ids), common)
+    one = _per_parameter(sample, shared_by_all)
+    bayesian = group.footer["bound"] == "bayes"
     rows = []
-    for i, parameter in enumerate(footer["parameters"]):
-        rows.append(
-            {"parameter": parameter["name"], "unit": parameter["unit"], **shared}
-            | _errors(error[solved][:, [i]], bound[[i]], parameter["size"])
-        )
+    for i, parameter in enumerate(sample.parameters):
+        size = float(parameter["size"])
+        physical = {key: float(values[i]) * size for key, values in one.items() if key not in _PURE}
+        pure = {key: float(one[key][i]) for key in _PURE}
+        row = {"parameter": parameter["name"], "unit": parameter["unit"], **shares, **physical, **pure}
+        row["rmse_over_linear_bound"] = row["rmse"] / row["linear_bound"]
+        row["efficiency"] = _ratio(row["bayes_bound" if bayesian else "crlb"], row["rmse"])
+        rows.append(head | row)
+    over_bound = {
+        key: _rms(one[key] / sample.linear_bound)
+        for key in ("bias", "std", "rmse", "rmse_common", "crlb", "bayes_bound")
+    }
+    squares = np.mean(np.where(solved[:, None], sample.normalised, 0.0) ** 2, axis=1, keepdims=True)
+    rms_low, rms_high = bootstrap_rms(squares, solved)
+    size_of_trial = np.sqrt(np.mean(sample.normalised**2, axis=1))
+    nees_low, nees_high = nees_limits(int(solved.sum()) * n)
+    nees = sample.scalars["nees"]
+    reports = sample.reports_covariance
     rows.append(
-        {"parameter": ALL, "unit": "bound", **shared} | _errors(error[solved] / bound, np.ones(len(bound)), 1.0)
+        head
+        | {"parameter": ALL, "unit": "linear bound", **shares, **over_bound}
+        | {
+            "rmse_low": float(rms_low[0]),
+            "rmse_high": float(rms_high[0]),
+            "linear_bound": 1.0,
+            "rmse_over_linear_bound": over_bound["rmse"],
+            "efficiency": _ratio(over_bound["bayes_bound" if bayesian else "crlb"], over_bound["rmse"]),
+            "median_abs_error": quantile(size_of_trial, 0.5),
+            "q95_abs_error": quantile(size_of_trial, 0.95),
+            "nees": float(np.mean(nees[solved]) / n) if reports and solved.any() else np.nan,
+            "nees_low": nees_low if reports else np.nan,
+            "nees_high": nees_high if reports else np.nan,
+            "coverage95": float((nees <= chi2.ppf(0.95, n)).mean()) if reports else np.nan,
+        }
     )
     return rows
 
 
-def _errors(error: Array, bound: Array, size: float) -> dict[str, float]:
-    if len(error) == 0:
-        return {"rmse": np.nan, "linear_bound": float(bound[0] * size), "rmse_over_linear_bound": np.nan}
-    rmse = float(np.sqrt(np.mean(error**2)))
+_PURE = ("nees", "nees_low", "nees_high", "coverage95")
+"""Statistics without a unit."""
+
+
+def _per_parameter(sample: Sample, shared_by_all: Array) -> dict[str, Array]:
+    """Every statistic of each parameter (n,), in multiples of its size."""
+    solved, error = sample.solved, sample.error
+    trials, n = error.shape
+    count = int(solved.sum())
+    nothing = np.full(n, np.nan)
+    used = error if count == trials else error[solved]
+    squares = np.where(solved[:, None], error, 0.0) ** 2
+    low, high = bootstrap_rms(squares, solved)
+    reports = sample.reports_covariance
+    if reports:
+        with np.errstate(all="ignore"):
+            ratio = np.abs(error) / sample.deviation
+        nees = np.mean(ratio[solved] ** 2, axis=0) if count else nothing
+        coverage = (ratio <= norm.isf(0.025)).mean(axis=0)
+        limits = nees_limits(count)
+    else:
+        nees = coverage = nothing
+        limits = (np.nan, np.nan)
     return {
-        "bias": float(np.mean(error) * size),
-        "rmse": rmse * size,
-        "linear_bound": float(bound[0] * size),
-        "rmse_over_linear_bound": rmse / float(bound[0]),
+        "bias": used.mean(axis=0) if count else nothing,
+        "std": used.std(axis=0, ddof=1) if count > 1 else nothing,
+        "rmse": _root_mean(error, solved),
+        "rmse_low": low,
+        "rmse_high": high,
+        "rmse_common": _root_mean(error, solved & shared_by_all),
+        "linear_bound": sample.linear_bound,
+        "crlb": _root_mean(sample.crlb, solved),
+        "bayes_bound": _root_mean(sample.bayes, solved),
+        "median_abs_error": np.array([quantile(np.abs(error[:, i]), 0.5) for i in range(n)]),
+        "q95_abs_error": np.array([quantile(np.abs(error[:, i]), 0.95) for i in range(n)]),
+        "nees": nees,
+        "nees_low": np.full(n, limits[0]),
+        "nees_high": np.full(n, limits[1]),
+        "coverage95": coverage,
     }
 
 
-def clopper_pearson(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
-    """The exact confidence interval of a share (Clopper and Pearson, Biometrika 26, 1934)."""
-    tail = (1 - level) / 2
-    low = beta.ppf(tail, successes, trials - successes + 1) if successes else 0.0
-    high = beta.isf(tail, successes + 1, trials - successes) if successes < trials else 1.0
-    return float(low), float(high)
+def _root_mean(values: Array, used: Array) -> Array:
+    """Root mean square (n,) over the trials used; NaN where there are none."""
+    if not used.any():
+        return np.full(values.shape[1], np.nan)
+    chosen = values if used.all() else values[used]
+    return np.sqrt(np.mean(chosen**2, axis=0))
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _ratio(a: float, b: float) -> float:
+    return a / b if b > 0 else float("nan")

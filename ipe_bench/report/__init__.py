@@ -1,0 +1,58 @@
+"""The report: tables, figures and one page, rebuilt from what is stored."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["ReportResult", "write_report"]
+
+
+@dataclass(frozen=True)
+class ReportResult:
+    """What `write_report` made."""
+
+    summary: pd.DataFrame
+    summary_path: Path
+    tables: tuple[Path, ...]
+    figures: tuple[Path, ...]
+    report: Path
+    problems: tuple[str, ...]
+    """One line per piece that is missing, stale, failed, foreign or damaged; the exit code is 1 where there is any."""
+
+
+def write_report(directories: Sequence[Path | str], output: Path | str) -> ReportResult:
+    """Writes summary.csv, tables/, figures/ and report.html under `output` from what is stored in the directories.
+
+    Raises:
+        UserError: a directory does not exist.
+    """
+    from ipe_bench.report.figures import draw_all
+    from ipe_bench.report.html import render_page
+    from ipe_bench.report.tables import write_tables
+    from ipe_bench.statistics.analysis import analyse
+    from ipe_bench.store import write_atomically
+
+    analysis = analyse(directories)
+    output = Path(output)
+    output.mkdir(parents=True, exist_ok=True)
+    summary_path = output / "summary.csv"
+    write_atomically(summary_path, lambda temporary: analysis.summary.to_csv(temporary, index=False))
+    tables = write_tables(analysis, output / "tables")
+    folder = output / "figures"
+    folder.mkdir(exist_ok=True)
+    figures: list[Path] = []
+    shown = []
+    for drawing in draw_all(analysis):
+        png, pdf = drawing.save(folder)
+        figures += [png, pdf]
+        shown.append((drawing.name, drawing.title, drawing.caption, png.read_bytes()))
+    page = render_page(analysis, shown)
+    report = output / "report.html"
+    write_atomically(report, lambda temporary: temporary.write_text(page, encoding="utf-8"))
+    return ReportResult(analysis.summary, summary_path, tables, tuple(figures), report, analysis.problems)

@@ -1,0 +1,80 @@
+"""The look of an estimator, the same in every figure: a colour, a marker and a dash that can be told apart in grey."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+# Okabe and Ito's palette (Color Universal Design, 2008), its yellow and black replaced by colours that show on white
+# paper; ordered so that neighbours differ in lightness too.
+COLORS = ("#0072B2", "#E69F00", "#D55E00", "#56B4E9", "#009E73", "#CC79A7", "#882255", "#777777", "#332288")
+MARKERS = ("o", "s", "D", "^", "v", "P", "X", "<", ">", "p", "h")
+DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1, 1.5)), (0, (5, 2, 1, 2)))
+REFERENCE = "linear_lse"
+"""The estimator that others are held against: black and crossed, whoever else is there."""
+BOUND_COLOR = "#444444"
+
+
+@dataclass(frozen=True)
+class Look:
+    """How one estimator is drawn."""
+
+    color: str
+    marker: str
+    dash: Any
+
+    @property
+    def line(self) -> dict[str, Any]:
+        """Arguments of a line with markers."""
+        return {
+            "color": self.color,
+            "marker": self.marker,
+            "linestyle": self.dash,
+            "markersize": 5.5,
+            "markeredgecolor": "white",
+            "markeredgewidth": 0.6,
+            "linewidth": 1.6,
+        }
+
+
+def looks(estimators: Sequence[str]) -> dict[str, Look]:
+    """A look per label; 9 colours, 11 markers and 4 dashes have no common divisor that would make two alike soon."""
+    result: dict[str, Look] = {}
+    rest = [e for e in estimators if e != REFERENCE]
+    if REFERENCE in estimators:
+        result[REFERENCE] = Look("#000000", "X", (0, (5, 2)))
+    for i, label in enumerate(rest):
+        dash = DASHES[(i // len(COLORS)) % len(DASHES)]
+        result[label] = Look(COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)], dash)
+    return {label: result[label] for label in estimators}
+
+
+@contextmanager
+def house_style() -> Iterator[None]:
+    """Fonts, grid and sizes of all figures."""
+    import matplotlib as mpl
+    import seaborn as sns
+
+    settings: dict[Any, Any] = {
+        **sns.axes_style("whitegrid"),
+        **sns.plotting_context("paper", font_scale=1.05),
+        "font.family": "DejaVu Sans",
+        "font.sans-serif": ["DejaVu Sans"],
+        "axes.titlesize": 9.5,
+        "axes.labelsize": 9,
+        "legend.fontsize": 8.5,
+        "legend.frameon": False,
+        "xtick.labelsize": 8,
+        "ytick.labelsize": 8,
+        "axes.edgecolor": "#888888",
+        "grid.color": "#e3e3e3",
+        "grid.linewidth": 0.6,
+        "figure.dpi": 150,
+        "savefig.dpi": 150,
+        "pdf.fonttype": 42,
+        "svg.hashsalt": "ipe-bench",
+    }
+    with mpl.rc_context(settings):
+        yield

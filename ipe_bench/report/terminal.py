@@ -1,0 +1,108 @@
+"""The summary as a table in the terminal, readable in 100 columns."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from ipe_bench.statistics.summary import ALL, STATISTICS
+
+if TYPE_CHECKING:
+    from rich.console import Group
+
+_HEADINGS = ("trials", "solved", "success", "rmse/bound", "95 %", "NEES", "iter", "sims", "time")
+_NOT_SETTINGS = {*STATISTICS, "parameter", "unit", "estimator", "error_scale"}
+
+
+def render(summary: pd.DataFrame) -> Group:
+    """One table per setting (measurement, noise, and every option that differs), a section per error scale."""
+    from rich import box
+    from rich.console import Group
+    from rich.markup import escape
+    from rich.table import Table
+    from rich.text import Text
+
+    rows = summary[summary["parameter"] == ALL] if len(summary) else summary
+    if rows.empty:
+        return Group(Text("nothing is stored yet"))
+    columns = [c for c in rows.columns if c not in _NOT_SETTINGS and not c.startswith("estimator.")]
+    parts: list[Any] = []
+    for values, part in rows.groupby(columns, dropna=False, sort=False):
+        named = dict(zip(columns, values if isinstance(values, tuple) else (values,), strict=True))
+        title = ", ".join(str(v) if k in ("measurement", "noise") else f"{k}={v}" for k, v in named.items())
+        counts = part["trials"].unique()
+        alike = len(counts) == 1
+        if alike:
+            title += f": {counts[0]} trials per row"
+        table = Table(
+            title=escape(title),
+            title_justify="left",
+            title_style="bold",
+            box=box.SIMPLE_HEAD,
+            padding=(0, 1),
+            pad_edge=False,
+            collapse_padding=True,
+        )
+        table.add_column("scale", justify="right", no_wrap=True)
+        table.add_column("estimator", overflow="fold", min_width=12)
+        for name in _HEADINGS[alike:]:
+            table.add_column(name, justify="right", no_wrap=True)
+        for scale, block in part.groupby("error_scale", sort=False):
+            for i, (_, row) in enumerate(block.iterrows()):
+                table.add_row(f"{scale:g}" if i == 0 else "", escape(str(row["estimator"])), *_cells(row)[alike:])
+            table.add_section()
+        parts.append(table)
+    note = (
+        "rmse/bound: root mean square error of the solved trials over the linear bound, all parameters, with its 95 %"
+        " bootstrap interval. solved, success: of all trials. NEES: 1 where the reported covariance is right."
+        " iter, sims, time: medians per trial."
+    )
+    return Group(*parts, Text(note, style="dim"))
+
+
+def _cells(row: Any) -> list[str]:
+    return [
+        f"{int(row['trials'])}",
+        percent(row["solved"]),
+        percent(row["success"]),
+        short(row["rmse_over_linear_bound"]),
+        f"{short(row['rmse_low'])}-{short(row['rmse_high'])}" if math.isfinite(row["rmse_low"]) else "-",
+        short(row["nees"]),
+        short(row["iterations_median"]),
+        short(row["simulations_median"]),
+        duration(row["time_median_s"]),
+    ]
+
+
+def percent(share: float) -> str:
+    """A share in per cent; 100 and 0 only where it is all or none."""
+    if not math.isfinite(share):
+        return "-"
+    value = 100 * share
+    if 0 < value < 0.1 or 99.9 < value < 100:
+        return "<0.1 %" if value < 1 else ">99.9 %"
+    return f"{value:.0f} %" if value in (0, 100) else f"{value:.1f} %"
+
+
+def short(value: float) -> str:
+    """About four figures."""
+    if not math.isfinite(value):
+        return "inf" if value == math.inf else "-"
+    if value == int(value) and abs(value) < 1000:
+        return str(int(value))
+    if abs(value) >= 1e6 or 0 < abs(value) < 1e-3:
+        return f"{value:.1e}"
+    if abs(value) >= 100:
+        return f"{value:,.0f}"
+    return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"
+
+
+def duration(seconds: float) -> str:
+    if not math.isfinite(seconds):
+        return "-"
+    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
+        if seconds >= size:
+            return f"{seconds / size:#.3g}".rstrip(".") + f" {unit}"
+    return f"{seconds / 1e-6:.2g} µs"

@@ -1,0 +1,79 @@
+"""Intervals: how far a share, a root mean square error or a NEES may lie from its true value by chance."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from scipy.stats import beta, chi2
+
+from ipe_bench.linalg import Array
+
+LEVEL = 0.95
+RESAMPLES = 1000
+LARGEST_SAMPLE = 2000
+"""Above this many trials, groups of consecutive trials are resampled in their place."""
+
+
+def clopper_pearson(successes: int, trials: int, level: float = LEVEL) -> tuple[float, float]:
+    """The exact confidence interval of a share (Clopper and Pearson, Biometrika 26, 1934)."""
+    tail = (1 - level) / 2
+    low = beta.ppf(tail, successes, trials - successes + 1) if successes else 0.0
+    high = beta.isf(tail, successes + 1, trials - successes) if successes < trials else 1.0
+    return float(low), float(high)
+
+
+def bootstrap_rms(squares: Array, used: Array, level: float = LEVEL) -> tuple[Array, Array]:
+    """Percentile bootstrap interval of the root mean square over the trials used, per column.
+
+    squares is (trials, k), used (trials,) boolean. Trials are drawn with replacement (Efron and Tibshirani, An
+    Introduction to the Bootstrap, 1993, ch. 13), used or not, so the number of used ones varies as it would; the draws
+    are the same for every estimator. Of more than `LARGEST_SAMPLE` trials, groups of consecutive ones are drawn, which
+    is as good since trials are independent.
+    """
+    trials, k = squares.shape
+    if not used.any():
+        return np.full(k, np.nan), np.full(k, np.nan)
+    weighted = np.where(used[:, None], squares, 0.0)
+    count = used.astype(float)
+    if trials > LARGEST_SAMPLE:
+        edges = np.linspace(0, trials, LARGEST_SAMPLE, endpoint=False).astype(int)
+        weighted, count = np.add.reduceat(weighted, edges), np.add.reduceat(count, edges)
+    draws = _draws(len(count))
+    n = draws @ count
+    with np.errstate(all="ignore"):
+        rms = np.sqrt((draws @ weighted)[n > 0] / n[n > 0, None])
+    tail = (1 - level) / 2
+    low, high = np.quantile(rms, [tail, 1 - tail], axis=0)
+    return low, high
+
+
+@lru_cache(maxsize=4)
+def _draws(size: int) -> Array:
+    """How often each of `size` things is drawn in each resample: (RESAMPLES, size)."""
+    rng = np.random.Generator(np.random.Philox(size))
+    return rng.multinomial(size, np.full(size, 1 / size), size=RESAMPLES).astype(float)
+
+
+def nees_limits(degrees: int, level: float = LEVEL) -> tuple[float, float]:
+    """Where a mean NEES over n lies when the reported covariance is right: chi-square quantiles over their degrees.
+
+    `degrees` is trials times parameters (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and
+    Navigation, 2001, sec. 5.4.2).
+    """
+    if degrees == 0:
+        return np.nan, np.nan
+    tail = (1 - level) / 2
+    return float(chi2.ppf(tail, degrees) / degrees), float(chi2.isf(tail, degrees) / degrees)
+
+
+def quantile(values: Array, q: float) -> float:
+    """Quantile of non-negative numbers where non-finite ones count as infinite (linear between order statistics)."""
+    if len(values) == 0:
+        return float("nan")
+    values = np.where(np.isfinite(values), values, np.inf)
+    position = (len(values) - 1) * q
+    low, high = int(np.floor(position)), int(np.ceil(position))
+    ordered = np.partition(values, (low, high))
+    a, b = float(ordered[low]), float(ordered[high])
+    return a if a == b or position == low else a + (b - a) * (position - low)
