@@ -267,7 +267,7 @@ def fit_probability(minima: Minima, readings: int) -> Array:
 
 
 def report(minima: Minima, tally: Tally, readings: int) -> Estimates:
-    """What an estimator hands back: covariance (J' R^-1 J)^-1, with P0^-1 inside where the prior counts, and the fit."""
+    """What an estimator hands back: covariance (J' R^-1 J)^-1, with P0^-1 where the prior counts, and the fit."""
     return Estimates(
         x=minima.x,
         status=minima.status,

@@ -13,10 +13,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from ipe_bench.estimation import Equation, Estimates, Estimator, estimate_safely
-from ipe_bench.ipe import FrozenSystem, find_roots, frozen_covariance, linear_deviation
+from ipe_bench.ipe import frozen_covariance
 from ipe_bench.linalg import Array, information, inverse, pseudo_inverse, quadratic_form
+from ipe_bench.roots import frozen_root, least_squares_root
 from ipe_bench.scenario import Problem, Scenario, Trials
-from ipe_bench.solvers.newton import Newton
 from ipe_bench.statuses import Status
 
 GATE = 1e-6
@@ -132,12 +132,11 @@ def linear_bound(problem: Problem) -> Array:
 
 
 def _root_from(problem: Problem, trials: Trials, equation: Equation) -> Array:
-    if equation != "frozen":
-        raise NotImplementedError(equation)
-    system = FrozenSystem.at_nominal(problem, trials.z)
-    deviation = linear_deviation(system, problem)
-    roots = find_roots(system, Newton(), trials.x, deviation, tolerance=1e-6, max_iterations=20)
-    return np.where((roots.status == Status.CONVERGED)[:, None], roots.x, np.nan)
+    if equation == "frozen":
+        found = frozen_root(problem, trials.z, trials.x)
+    else:
+        found = least_squares_root(problem, trials.z, trials.x, prior=equation == "map")
+    return np.where((found.status == Status.CONVERGED)[:, None], found.x, np.nan)
 
 
 def _deviations(P: Array) -> Array:

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from ipe_bench.ipe import FrozenSystem, Roots, find_roots, linear_deviation
 from ipe_bench.least_squares import Damping, Minima, Objective, minimize
 from ipe_bench.linalg import Array

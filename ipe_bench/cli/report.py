@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,10 +24,14 @@ def main(arguments: Sequence[str]) -> int:
 
 def show(directories: Sequence[Path], output: Path) -> int:
     """Writes the report, prints its table and where things are; returns the exit code."""
-    from ipe_bench.statistics import summarize
+    from ipe_bench.report import write_report
+    from ipe_bench.report.terminal import render
 
+    result = write_report(directories, output)
     out = console()
-    frame = summarize(directories)
-    frame.to_csv(output / "summary.csv", index=False)
-    out.print(frame[frame["parameter"] == "all"].to_string())
-    return 0
+    out.print(render(result.summary))
+    for problem in result.problems:
+        print(f"ipe-bench: {problem}", file=sys.stderr)
+    out.print(f"\nSummary  {result.summary_path}\nTables   {output / 'tables'}\nFigures  {output / 'figures'}")
+    out.print(f"Report   {result.report}")
+    return 1 if result.problems else 0
