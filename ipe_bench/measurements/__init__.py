@@ -1,6 +1,25 @@
 """Measurement models: what a parameter vector makes the instruments read. Config group `measurement`."""
 
+from ipe_bench.measurements.bearings import Bearings
 from ipe_bench.measurements.base import Measurement, Parameter, Restricted
 from ipe_bench.measurements.gins import Gins
+from ipe_bench.measurements.lotka_volterra import LotkaVolterra
+from ipe_bench.measurements.nist import Nist
+from ipe_bench.measurements.ode.model import OdeMeasurement
+from ipe_bench.measurements.polynomial import Polynomial
+from ipe_bench.measurements.ranging import Ranging
+from ipe_bench.measurements.triad import Triad
 
-__all__ = ["Gins", "Measurement", "Parameter", "Restricted"]
+__all__ = [
+    "Bearings",
+    "Gins",
+    "LotkaVolterra",
+    "Measurement",
+    "Nist",
+    "OdeMeasurement",
+    "Parameter",
+    "Polynomial",
+    "Ranging",
+    "Restricted",
+    "Triad",
+]

@@ -33,6 +33,8 @@ class OdeMeasurement(Measurement):
     """Number of state variables."""
     outputs: ClassVar[tuple[str, ...]]
     """The names of what is read at each time."""
+    time_unit: ClassVar[str] = "s"
+    """The unit of `times`, `step` and t."""
     step: float | None
     """The longest integration step in seconds; each interval between readings is divided evenly."""
 
@@ -70,7 +72,7 @@ class OdeMeasurement(Measurement):
         )
         return {
             "case": cases.ravel().tolist(),
-            "time [s]": times.ravel().tolist(),
+            f"time [{self.time_unit}]": times.ravel().tolist(),
             "output": [self.outputs[i] for i in outputs.ravel()],
         }
 

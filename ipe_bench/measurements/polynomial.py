@@ -1,0 +1,68 @@
+"""A polynomial model with knobs for its size and the strength of its nonlinearity: for teaching and for tests."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.polynomial.chebyshev import chebvander
+from numpy.typing import NDArray
+
+from ipe_bench.errors import UserError
+from ipe_bench.linalg import Array
+from ipe_bench.measurements.base import Measurement, Parameter
+
+
+@dataclass(frozen=True)
+class Polynomial(Measurement):
+    """h_k(x) = u_k + s u_k^2 / 2 + s^2 u_k^3 / 6 with u = H x: a linear model that a cubic bends.
+
+    H holds Chebyshev polynomials T_0 ... T_(n-1) at m equally spaced times from -1 to 1, so it is well conditioned. At
+    s = 0 the model is linear. The cubic is the Taylor polynomial of (exp(s u) - 1) / s; it grows monotonically, so one
+    reading fixes one u, and N(x) = s u^2 / 2 + s^2 u^3 / 6 in the words of eq. (24). Each reading is an epoch.
+    """
+
+    unknowns: int = 4
+    """n, the number of parameters."""
+    count: int = 40
+    """m, the number of readings."""
+    strength: float = 0.02
+    """s, by how much the readings bend per unit of x."""
+
+    analytic = True
+
+    def __post_init__(self) -> None:
+        if self.unknowns < 1 or self.count <= self.unknowns:
+            raise UserError(f"count={self.count}: give more readings than unknowns, and at least one unknown")
+        if not np.isfinite(self.strength):
+            raise UserError(f"strength={self.strength}: give a finite number; 0 is the linear model")
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return tuple(Parameter(f"c{i}", group="coefficients") for i in range(self.unknowns))
+
+    @cached_property
+    def times(self) -> Array:
+        """Where the polynomials are read (m,)."""
+        return np.linspace(-1.0, 1.0, self.count)
+
+    @cached_property
+    def matrix(self) -> Array:
+        """H (m, n)."""
+        return chebvander(self.times, self.unknowns - 1)
+
+    @property
+    def index(self) -> Mapping[str, Sequence[Any]]:
+        return {"time": self.times.tolist()}
+
+    @cached_property
+    def epochs(self) -> tuple[NDArray[np.intp], ...]:
+        return tuple(np.arange(self.m)[:, None])
+
+    def simulate(self, x: Array) -> Array:
+        u = np.einsum("kj,tj->tk", self.matrix, x)
+        su = self.strength * u
+        return u * (1.0 + su / 2.0 * (1.0 + su / 3.0))

@@ -1,0 +1,105 @@
+"""Calibration of three accelerometers or magnetometers by the magnitude of what they measure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.errors import UserError
+from ipe_bench.linalg import Array
+from ipe_bench.measurements.base import Measurement, Parameter
+
+_PAIRS = ((0, 1), (0, 2), (1, 2))
+
+
+def attitudes() -> Array:
+    """26 directions (26, 3): towards the faces, edges and corners of a cube."""
+    corners = [v for v in product((-1.0, 0.0, 1.0), repeat=3) if any(v)]
+    return np.array([np.array(v) / np.linalg.norm(v) for v in corners])
+
+
+@dataclass(frozen=True)
+class Triad(Measurement):
+    """The magnitude |(I + E)(r_k - b)| of the vector that a triad with outputs r_k was exposed to in attitude k.
+
+    b is the bias; E is symmetric, with scale-factor errors on its diagonal and misalignments beside it. A rotation of
+    the whole triad does not change a magnitude, so it is not among the parameters. The reading of attitude k is the
+    magnitude that a reference states: a scalar magnetometer, or the local gravity. Outputs r_k are taken to be exact,
+    with their noise counted in the readings. Each attitude is an epoch.
+
+    Parameters: three biases in `unit`, three scale-factor errors in ppm, three misalignments in mrad. A bias of b bends
+    the magnitude by b^2 / (2 field): 1.25e-5 of the field at error scale 1, to be compared with a noise of 1e-5.
+
+    Source: Merayo, Brauer, Primdahl, Petersen, Nielsen, Scalar calibration of vector magnetometers, Measurement Science
+    and Technology 11, 2000.
+    """
+
+    outputs: Sequence[Sequence[float]] | None = None
+    """Outputs r_k of the triad (attitudes, 3) in `unit`; None: a field of `field` in 26 directions."""
+    field: float = 1.0
+    """The magnitude about which sizes are chosen, in `unit`."""
+    unit: str = "g"
+    bias_size: float = 5e-3
+    """What one unit of error is: of a bias, as a fraction of `field`,"""
+    scale_size: float = 5e-3
+    """of a scale factor,"""
+    misalignment_size: float = 5e-3
+    """of a misalignment in rad."""
+    bias: Sequence[float] = (0.0, 0.0, 0.0)
+    """The presumed bias in `unit`, and below the presumed errors of scale (1) and alignment (rad): the nominal point."""
+    scale: Sequence[float] = (0.0, 0.0, 0.0)
+    misalignment: Sequence[float] = (0.0, 0.0, 0.0)
+
+    analytic = True
+
+    def __post_init__(self) -> None:
+        if self.outputs is not None and (np.shape(self.outputs)[1:] != (3,) or len(self.outputs) < 10):
+            raise UserError("outputs: give three numbers for each of at least 10 attitudes")
+
+    @property
+    def reading_unit(self) -> str:
+        return self.unit
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (
+            *(Parameter(f"b{a}", self.unit, self.bias_size * self.field, "bias") for a in "xyz"),
+            *(Parameter(f"k{a}", "ppm", 1e6 * self.scale_size, "scale factor") for a in "xyz"),
+            *(Parameter(f"m{a}", "mrad", 1e3 * self.misalignment_size, "misalignment") for a in ("xy", "xz", "yz")),
+        )
+
+    @cached_property
+    def _plain_sizes(self) -> Array:
+        """Sizes (9,) with scale factors and misalignments as plain numbers."""
+        return self.sizes * np.repeat([1.0, 1e-6, 1e-3], 3)
+
+    @cached_property
+    def nominal(self) -> Array:
+        return np.concatenate([self.bias, self.scale, self.misalignment]) / self._plain_sizes
+
+    @cached_property
+    def _outputs(self) -> Array:
+        return self.field * attitudes() if self.outputs is None else np.asarray(self.outputs, dtype=float)
+
+    @property
+    def index(self) -> Mapping[str, Sequence[Any]]:
+        return {"attitude": list(range(1, len(self._outputs) + 1))}
+
+    @cached_property
+    def epochs(self) -> tuple[NDArray[np.intp], ...]:
+        return tuple(np.arange(self.m)[:, None])
+
+    def simulate(self, x: Array) -> Array:
+        p = (x * self._plain_sizes)[:, :, None]
+        d = [self._outputs[:, i] - p[:, i] for i in range(3)]
+        corrected = [(1.0 + p[:, 3 + i]) * d[i] for i in range(3)]
+        for k, (i, j) in enumerate(_PAIRS):
+            corrected[i] = corrected[i] + p[:, 6 + k] * d[j]
+            corrected[j] = corrected[j] + p[:, 6 + k] * d[i]
+        return np.sqrt(corrected[0] ** 2 + corrected[1] ** 2 + corrected[2] ** 2)
