@@ -1,7 +1,7 @@
 """Measurement models: what a parameter vector makes the instruments read. Config group `measurement`."""
 
-from ipe_bench.measurements.bearings import Bearings
 from ipe_bench.measurements.base import Measurement, Parameter, Restricted
+from ipe_bench.measurements.bearings import Bearings
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.lotka_volterra import LotkaVolterra
 from ipe_bench.measurements.nist import Nist

@@ -29,11 +29,11 @@ class Bearings(Measurement):
     Electronic Systems 17, 1981). Estimators that linearise at the nominal point then say that H lacks rank.
     """
 
-    legs: Sequence[Sequence[float]] = ((900.0, 90.0, 6.0), (900.0, 330.0, 6.0))
+    legs: tuple[tuple[float, float, float], ...] = ((900.0, 90.0, 6.0), (900.0, 330.0, 6.0))
     """The observer's legs: duration in s, course in degrees from north, speed in m/s."""
     interval: float = 60.0
     """Time between bearings in s; the first is taken at time 0."""
-    target: Sequence[float] = (3000.0, 5000.0, -3.0, 1.0)
+    target: tuple[float, float, float, float] = (3000.0, 5000.0, -3.0, 1.0)
     """The presumed target (east and north in m, in m/s): the nominal point."""
     position_size: float = 250.0
     """What one unit of error is: of each coordinate in m,"""

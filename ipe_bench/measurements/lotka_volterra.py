@@ -1,27 +1,29 @@
-"""Predators and prey: the worked example of a model defined by ordinary differential equations."""
+"""Predators and prey, the worked example of a model that is defined by differential equations (see `ode`)."""
 
 from dataclasses import dataclass
-from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 
 from ipe_bench.measurements.base import Parameter
 from ipe_bench.measurements.ode.model import OdeMeasurement
 
+_VALUES = {"birth": 0.55, "hunting": 0.028, "death": 0.8, "growth": 0.024, "prey": 34.0, "predators": 5.9}
+
 
 @dataclass(frozen=True)
 class LotkaVolterra(OdeMeasurement):
-    """Hares and lynxes in thousands, read once a year; values after Carpenter's case study of the Hudson Bay pelts (2018)."""
+    """Hares and lynxes read once a year, in thousands; one unit of error is 2 % of each rate and of each start.
+
+    The values are those of the Hudson's Bay pelts (Carpenter, Predator-Prey Population Dynamics, Stan case study, 2018).
+    """
 
     years: int = 20
     step: float | None = 0.125
-    states, outputs, time_unit, reading_unit = 2, ("prey", "predator"), "year", "thousand"
-    values: ClassVar = {"birth": 0.55, "hunting": 0.028, "death": 0.8, "growth": 0.024, "prey": 34.0, "predator": 5.9}
-    parameters: ClassVar = tuple(Parameter(name, size=0.02 * value) for name, value in values.items())
-    nominal: ClassVar = np.full(6, 50.0)
+    states, outputs, time_unit, reading_unit = 2, ("prey", "predators"), "year", "thousand"
+    parameters = tuple(Parameter(name, size=0.02 * value) for name, value in _VALUES.items())  # type: ignore[assignment]
+    nominal = np.full(6, 50.0)  # type: ignore[assignment]
 
-    @cached_property
+    @property
     def times(self):
         return np.arange(1.0, self.years + 1)
 
@@ -29,8 +31,8 @@ class LotkaVolterra(OdeMeasurement):
         return p[4], p[5]
 
     def rhs(self, t, y, p, c):
-        prey, predator = y
-        return p[0] * prey - p[1] * prey * predator, p[3] * prey * predator - p[2] * predator
+        meetings = y[0] * y[1]
+        return p[0] * y[0] - p[1] * meetings, p[3] * meetings - p[2] * y[1]
 
     def read(self, t, y, p, c):
         return y

@@ -33,13 +33,13 @@ class Ranging(Measurement):
     all beacons; each round is an epoch. A range of rho bends by d^2 / (2 rho) for a position error d across it: 0.05 m
     at error scale 1 with the beacons given here, to be compared with a noise of 0.1 m.
 
-    Source: Kaplan and Hegarty, Understanding GPS, 2nd ed., section 2.4; the closed form of the same problem is Bancroft,
-    An algebraic solution of the GPS equations, IEEE Transactions on Aerospace and Electronic Systems 21, 1985.
+    Source: Kaplan and Hegarty, Understanding GPS, 2nd ed., section 2.4. The problem has a closed form: Bancroft, An
+    algebraic solution of the GPS equations, IEEE Transactions on Aerospace and Electronic Systems 21, 1985.
     """
 
-    beacons: Sequence[Sequence[float]] = _BEACONS
+    beacons: tuple[tuple[float, float, float], ...] = _BEACONS
     """East, north, up of each beacon in m."""
-    position: Sequence[float] = (0.0, 0.0, 0.0)
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The presumed position of the receiver in m: the nominal point."""
     rounds: int = 3
     position_size: float = 10.0

@@ -40,7 +40,7 @@ class Triad(Measurement):
     and Technology 11, 2000.
     """
 
-    outputs: Sequence[Sequence[float]] | None = None
+    outputs: tuple[tuple[float, float, float], ...] | None = None
     """Outputs r_k of the triad (attitudes, 3) in `unit`; None: a field of `field` in 26 directions."""
     field: float = 1.0
     """The magnitude about which sizes are chosen, in `unit`."""
@@ -51,10 +51,10 @@ class Triad(Measurement):
     """of a scale factor,"""
     misalignment_size: float = 5e-3
     """of a misalignment in rad."""
-    bias: Sequence[float] = (0.0, 0.0, 0.0)
-    """The presumed bias in `unit`, and below the presumed errors of scale (1) and alignment (rad): the nominal point."""
-    scale: Sequence[float] = (0.0, 0.0, 0.0)
-    misalignment: Sequence[float] = (0.0, 0.0, 0.0)
+    bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The presumed bias in `unit`, then errors of scale (plain numbers) and alignment (rad): the nominal point."""
+    scale: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    misalignment: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     analytic = True
 

@@ -40,7 +40,7 @@ class Certified:
 
 @cache
 def _tables() -> dict[str, dict[str, Any]]:
-    return json.loads(files(__package__).joinpath("data.json").read_text(encoding="utf-8"))
+    return json.loads(files("ipe_bench.measurements.nist").joinpath("data.json").read_text(encoding="utf-8"))
 
 
 def datasets() -> tuple[str, ...]:

@@ -1,0 +1,118 @@
+"""Errors that remember the last one, and errors that readings share."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ipe_bench.errors import UserError
+from ipe_bench.linalg import Array, Covariance
+from ipe_bench.noise.base import Noise
+
+
+@dataclass(frozen=True)
+class Colored(Noise):
+    """First-order autoregressive noise, stationary: v_k = correlation v_(k-1) + sqrt(1 - correlation^2) deviation e_k.
+
+    The readings are `channels` instruments in turn, each with a series of its own; after `length` readings of each the
+    series start anew. GINS has 2 channels (the axes) and a length of 30 (the times of a case). `assumed` is what
+    estimators are told: `white`, R = deviation^2 I, which is the mistake that the paper warns of; or `full`, the truth.
+    """
+
+    deviation: float
+    """Standard deviation of each reading, in the unit of the readings."""
+    correlation: float = 0.5
+    """Of successive readings of one instrument."""
+    channels: int = 1
+    length: int | None = None
+    """Readings per instrument in one series; None: all of them."""
+    assumed: Literal["white", "full"] = "white"
+
+    def __post_init__(self) -> None:
+        if not -1 < self.correlation < 1:
+            raise UserError(f"correlation={self.correlation}: give a number between -1 and 1")
+        if self.channels < 1 or (self.length is not None and self.length < 1):
+            raise UserError(f"channels={self.channels}, length={self.length}: give whole numbers above 0")
+        if self.assumed not in ("white", "full"):
+            raise UserError(f"assumed={self.assumed}: choose white or full")
+
+    def _series(self, m: int) -> tuple[int, int, int]:
+        """How m readings divide: (series after one another, length, channels)."""
+        length = m // self.channels if self.length is None else self.length
+        if length == 0 or m % (length * self.channels):
+            raise UserError(f"channels={self.channels}, length={self.length}: {m} readings do not divide into these")
+        return m // (length * self.channels), length, self.channels
+
+    def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
+        e = rng.standard_normal(self._series(len(h)))
+        v = np.empty_like(e)
+        v[:, 0] = e[:, 0]
+        fresh = np.sqrt(1 - self.correlation**2)
+        for k in range(1, e.shape[1]):
+            v[:, k] = self.correlation * v[:, k - 1] + fresh * e[:, k]
+        return h + self.deviation * v.ravel()
+
+    def covariance(self, m: int) -> Covariance:
+        repeats, length, channels = self._series(m)
+        if self.assumed == "white":
+            return Covariance(np.full(m, self.deviation))
+        apart = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
+        one = np.kron(self.correlation**apart, np.eye(channels))
+        return Covariance(np.linalg.cholesky(self.deviation**2 * np.kron(np.eye(repeats), one)))
+
+
+@dataclass(frozen=True)
+class Correlated(Noise):
+    """Gaussian errors of any covariance R.
+
+    Either `matrix` is R, in squared units of the readings; or readings of one standard deviation come in blocks of
+    `block` that follow one another and share an error, such that two of a block have the given correlation. `assumed`
+    is what estimators are told: `full`, R itself; or `white`, its diagonal.
+    """
+
+    deviation: float = 1.0
+    """Standard deviation of each reading, in the unit of the readings."""
+    correlation: float = 0.5
+    """Of two readings of one block."""
+    block: int | None = None
+    """Readings per block; None: all are one."""
+    matrix: tuple[tuple[float, ...], ...] | None = None
+    """R (m, m); where it is given, the three options above play no part."""
+    assumed: Literal["white", "full"] = "full"
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.correlation < 1:
+            raise UserError(f"correlation={self.correlation}: give a number from 0 to below 1")
+        if self.block is not None and self.block < 1:
+            raise UserError(f"block={self.block}: give a whole number above 0")
+        if self.assumed not in ("white", "full"):
+            raise UserError(f"assumed={self.assumed}: choose white or full")
+
+    def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
+        return h + _factor(self, len(h)) @ rng.standard_normal(len(h))
+
+    def covariance(self, m: int) -> Covariance:
+        full = Covariance(_factor(self, m))
+        return full if self.assumed == "full" else Covariance(full.deviations)
+
+
+@functools.lru_cache(maxsize=8)
+def _factor(noise: Correlated, m: int) -> Array:
+    """The lower Cholesky factor (m, m) of R."""
+    if noise.matrix is None:
+        block = m if noise.block is None else noise.block
+        if m % block:
+            raise UserError(f"block={block}: {m} readings do not divide into such blocks")
+        one = (1 - noise.correlation) * np.eye(block) + noise.correlation
+        R = noise.deviation**2 * np.kron(np.eye(m // block), one)
+    else:
+        R = np.array(noise.matrix, dtype=float)
+        if R.shape != (m, m) or not np.allclose(R, R.T):
+            raise UserError(f"matrix: give a symmetric matrix of {m} x {m} numbers")
+    try:
+        return np.linalg.cholesky(R)
+    except np.linalg.LinAlgError:
+        raise UserError("matrix: is no covariance: it is not positive definite") from None
