@@ -14,7 +14,7 @@ _VALUES = {"birth": 0.55, "hunting": 0.028, "death": 0.8, "growth": 0.024, "prey
 class LotkaVolterra(OdeMeasurement):
     """Hares and lynxes read once a year, in thousands; one unit of error is 2 % of each rate and of each start.
 
-    The values are those of the Hudson's Bay pelts (Carpenter, Predator-Prey Population Dynamics, Stan case study, 2018).
+    The values are those of the Hudson's Bay pelts (Carpenter, Predator-Prey Population Dynamics, Stan, 2018).
     """
 
     years: int = 20

@@ -29,7 +29,7 @@ class Polynomial(Measurement):
     """n, the number of parameters."""
     count: int = 40
     """m, the number of readings."""
-    strength: float = 0.02
+    strength: float = 0.005
     """s, by how much the readings bend per unit of x."""
 
     analytic = True

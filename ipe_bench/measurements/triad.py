@@ -34,7 +34,7 @@ class Triad(Measurement):
     with their noise counted in the readings. Each attitude is an epoch.
 
     Parameters: three biases in `unit`, three scale-factor errors in ppm, three misalignments in mrad. A bias of b bends
-    the magnitude by b^2 / (2 field): 1.25e-5 of the field at error scale 1, to be compared with a noise of 1e-5.
+    the magnitude by b^2 / (2 field): 2e-6 of the field at error scale 1, to be compared with a noise of 1e-5.
 
     Source: Merayo, Brauer, Primdahl, Petersen, Nielsen, Scalar calibration of vector magnetometers, Measurement Science
     and Technology 11, 2000.
@@ -45,11 +45,11 @@ class Triad(Measurement):
     field: float = 1.0
     """The magnitude about which sizes are chosen, in `unit`."""
     unit: str = "g"
-    bias_size: float = 5e-3
+    bias_size: float = 2e-3
     """What one unit of error is: of a bias, as a fraction of `field`,"""
-    scale_size: float = 5e-3
+    scale_size: float = 2e-3
     """of a scale factor,"""
-    misalignment_size: float = 5e-3
+    misalignment_size: float = 2e-3
     """of a misalignment in rad."""
     bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The presumed bias in `unit`, then errors of scale (plain numbers) and alignment (rad): the nominal point."""
