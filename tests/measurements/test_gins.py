@@ -1,0 +1,120 @@
+"""The gimballed INS: closed forms, other integrators, and the reference values of its linear bound."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ipe_bench.measurements import Gins
+from scipy.integrate import DOP853, solve_ivp
+
+STEP = 0.075 * 0.3048
+LINEAR_BOUND = [
+    0.001105, 0.001321, 0.01559, 0.01560, 0.002182, 0.001645, 0.001446, 0.001660, 0.001549, 0.001558, 0.001663
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def gins():
+    return Gins().suited_to(100.0)
+
+
+def draw(scale, trials=2, seed=0):
+    return scale * np.random.default_rng(seed).normal(size=(trials, 11))
+
+
+def test_zero_parameters_give_zero_readings(gins):
+    assert (gins.simulate(np.zeros((3, 11))) == 0.0).all()
+
+
+def test_an_accelerometer_bias_swings_at_the_schuler_period():
+    # Without Earth rate the platform is a pendulum: v = b / w sin(w t), w^2 = g / R.
+    model = Gins(earth_rate=0.0, injected_ft_per_s=0.0, step=60.0)
+    frequency = np.sqrt(model.gravity / model.earth_radius)
+    assert 2 * np.pi / frequency / 60 == pytest.approx(84.45, abs=0.005)
+    x = np.zeros((2, 11))
+    x[0, 0] = x[1, 1] = 1.0
+    velocity = model.simulate(x).reshape(2, 4, 30, 2)
+    expected = 1e-4 * model.gravity / frequency * np.sin(frequency * model.times)
+    for axis in range(2):
+        np.testing.assert_allclose(velocity[axis, :, :, axis], np.tile(expected, (4, 1)), atol=1e-7)
+        np.testing.assert_allclose(velocity[axis, :, :, 1 - axis], 0.0, atol=1e-7)
+
+
+def test_an_injected_velocity_swings_likewise():
+    # The error-free system is what the read-out shows where h is zero.
+    model = Gins(earth_rate=0.0, injected_ft_per_s=1.0, step=60.0)
+    swing = 0.3048 * np.cos(np.sqrt(model.gravity / model.earth_radius) * model.times)
+    np.testing.assert_allclose(model.offset.reshape(4, 30, 2)[0, :, 0], swing, atol=1e-7)
+    np.testing.assert_allclose(model.offset.reshape(4, 30, 2)[3, :, 1], -swing, atol=1e-7)
+
+
+@pytest.mark.parametrize("scale", [1.0, 33.0, 100.0])
+def test_readings_agree_with_an_adaptive_integrator(scale):
+    model = Gins().suited_to(scale)
+    x = draw(scale, 1, seed=int(scale))
+    z = model.simulate(x).reshape(4, 30, 2)
+    for p, sign in ((list(x[0] * model.si_sizes), 1.0), ([0.0] * 11, -1.0)):
+        for k, c in enumerate(model.cases[:2]):
+            solution = solve_ivp(
+                lambda t, y, p=p, c=c: model.rhs(t, y, p, c),
+                (0.0, model.times[-1]),
+                model.start(p, c),
+                "DOP853",
+                t_eval=model.times,
+                rtol=1e-12,
+                atol=1e-12,
+            )
+            z[k] -= sign * solution.y[:2].T
+    assert np.abs(z[:2]).max() < 1e-6
+
+
+@pytest.mark.parametrize("scale", [300.0, 600.0, 1000.0, 2000.0])
+def test_the_step_keeps_its_promise_at_large_errors(scale):
+    model = Gins().suited_to(scale)
+    x = draw(scale, 100, seed=5)
+    finer = replace(model, step=model.step / 3)
+    assert np.abs(model.simulate(x) - finer.simulate(x)).max() < 1e-6
+
+
+def test_the_jacobian_is_that_of_the_same_formula_in_complex_arithmetic(gins):
+    x = draw(33.0, 1, seed=2)[0]
+    J = gins.jacobian(x[None])[0].reshape(4, 30, 2, 11)
+    for k in (0, 3):
+        p = list(((x + 1e-100j * np.eye(11)) * gins.si_sizes).T)
+        y = np.stack([np.broadcast_to(v, 11) + 0j for v in gins.start(p, gins.cases[k])])
+        for i in range(30):
+            slopes = []
+            for s in range(12):
+                at = y + 180.0 * sum((DOP853.A[s, j] * slopes[j] for j in range(s)), np.zeros_like(y))
+                slopes.append(np.array(gins.rhs(0.0, list(at), p, gins.cases[k])))
+            y = y + 180.0 * sum(DOP853.B[s] * slopes[s] for s in range(12))
+            exact = y[:2].imag / 1e-100
+            assert np.abs(J[k, i] - exact).max() < 1e-9 * np.abs(exact).max()
+
+
+def test_the_linear_bound_is_the_reference(gins):
+    H = gins.linearization()
+    deviation = np.sqrt(np.diag(np.linalg.inv(H.T @ H))) * STEP / np.sqrt(12)
+    np.testing.assert_allclose(deviation, LINEAR_BOUND, rtol=5e-4)
+    assert np.linalg.cond(H) == pytest.approx(19.99, abs=0.01)
+
+
+def test_columns_of_h_are_readings_at_unit_inputs(gins):
+    assert (gins.linearization().T == gins.simulate(np.eye(11))).all()
+
+
+def test_bits_do_not_depend_on_the_batch_or_on_the_number_of_threads(gins, monkeypatch):
+    x = draw(100.0, 40, seed=3)
+    z, J = gins.simulate(x), gins.jacobian(x)
+    for threads in ("1", "2", "3"):
+        monkeypatch.setenv("IPE_BENCH_THREADS", threads)
+        assert (np.concatenate([gins.simulate(x[i : i + 1]) for i in range(40)]) == z).all()
+        assert (np.concatenate([gins.jacobian(x[i : i + 13]) for i in range(0, 40, 13)]) == J).all()
+
+
+def test_epochs_are_the_times_with_all_cases_and_axes(gins):
+    index = gins.index
+    assert len(gins.epochs) == 30
+    for k, rows in enumerate(gins.epochs):
+        assert len(rows) == 8
+        assert {index["time [min]"][i] for i in rows} == {3.0 * (k + 1)}

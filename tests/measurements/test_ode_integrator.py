@@ -1,0 +1,139 @@
+"""The compiled integrator: order, exact tangents, and bits that depend on nothing but the trial."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from ipe_bench.measurements import OdeMeasurement, Parameter
+from ipe_bench.measurements.base import differentiate
+from scipy.integrate import DOP853
+
+
+@dataclass(frozen=True)
+class Pulse(OdeMeasurement):
+    """y' = a y cos t, y(0) = b, whose solution is b exp(a sin t)."""
+
+    step: float | None = 1.0
+    states, outputs = 1, ("y",)
+    parameters = (Parameter("a", size=0.5), Parameter("b", size=2.0))
+
+    @property
+    def times(self):
+        return np.array([0.5, 4.0, 6.0])
+
+    def start(self, p, c):
+        return (p[1],)
+
+    def rhs(self, t, y, p, c):
+        return (p[0] * y[0] * np.cos(t),)
+
+    def read(self, t, y, p, c):
+        return y
+
+    def solution(self, x):
+        a, b = (x * self.sizes).T[:, :, None]
+        return b * np.exp(a * np.sin(self.times))
+
+
+@dataclass(frozen=True)
+class Cases(Pulse):
+    """The same, with a factor to the rate and an amount to add, that differ between two cases; two outputs."""
+
+    outputs = ("y", "rate")
+
+    @property
+    def cases(self):
+        return np.array([[1.0, 0.0], [-2.0, 0.25]])
+
+    def rhs(self, t, y, p, c):
+        return (c[0] * p[0] * y[0] * np.cos(t) + c[1],)
+
+    def read(self, t, y, p, c):
+        return y[0], self.rhs(t, y, p, c)[0]
+
+
+def rk8(model, x, step):
+    """The model's readings by a plain loop over steps and stages, for one x that may be complex."""
+    p = list(x * model.si_sizes)
+    z = []
+    for c in model.cases:
+        t, y = 0.0, np.array(model.start(p, c)) + 0 * p[0]
+        for end in model.times:
+            count = max(1, int(np.ceil((end - t) / step - 1e-9)))
+            h, began = (end - t) / count, t
+            for s in range(count):
+                k = []
+                for i in range(12):
+                    slope = sum((DOP853.A[i, j] * k[j] for j in range(i)), np.zeros_like(y))
+                    k.append(np.array(model.rhs(began + s * h + DOP853.C[i] * h, y + h * slope, p, c)))
+                y = y + h * sum(DOP853.B[i] * k[i] for i in range(12))
+            t = end
+            z.extend(model.read(t, y, p, c))
+    return np.array(z).reshape(len(model.cases), len(model.times), -1).ravel()
+
+
+def test_the_solution_is_of_eighth_order():
+    x = np.array([[4.0, 0.7]])
+    errors = [np.abs(Pulse(step).simulate(x) - Pulse().solution(x)).max() for step in (0.5, 0.25, 0.125)]
+    orders = np.log2(np.divide(errors[:-1], errors[1:]))
+    assert ((orders > 7.5) & (orders < 9.5)).all()
+
+
+@pytest.mark.parametrize("model", [Pulse(0.5), Cases(0.5)])
+def test_readings_and_jacobian_are_those_of_a_plain_loop_with_the_same_coefficients(model):
+    rng = np.random.default_rng(1)
+    x = rng.normal(size=(3, 2))
+    J = model.jacobian(x)
+    for row, z, slope in zip(x, model.simulate(x), J, strict=True):
+        np.testing.assert_allclose(z, rk8(model, row, model.step), rtol=1e-13, atol=1e-14)
+        for j, direction in enumerate(np.eye(2)):
+            exact = np.imag(rk8(model, row + 1e-100j * direction, model.step)) / 1e-100
+            np.testing.assert_allclose(slope[:, j], exact, rtol=1e-11, atol=1e-13)
+
+
+def test_the_jacobian_agrees_with_differences():
+    x = np.array([[1.0, 1.0], [-0.5, 2.0]])
+    model = Cases(0.5)
+    np.testing.assert_allclose(model.jacobian(x), differentiate(model.simulate, x, analytic=False), atol=1e-8)
+
+
+def test_readings_are_ordered_by_case_time_and_output():
+    index = Cases().index
+    assert index["case"] == [1] * 6 + [2] * 6
+    assert index["time [s]"][:4] == [0.5, 0.5, 4.0, 4.0]
+    assert index["output"][:3] == ["y", "rate", "y"]
+    assert [rows.tolist() for rows in Cases().epochs][1] == [2, 3, 8, 9]
+
+
+def test_a_prefix_of_the_epochs_is_the_same_bits():
+    model, x = Cases(0.5), np.random.default_rng(2).normal(size=(5, 2))
+    for stop in (1, 2):
+        assert (model.simulate_until(x, stop) == model.simulate(x)[:, model.rows(stop)]).all()
+        assert (model.jacobian_until(x, stop) == model.jacobian(x)[:, model.rows(stop)]).all()
+
+
+def test_bits_do_not_depend_on_the_batch_or_on_the_number_of_threads(monkeypatch):
+    model, x = Cases(0.5), np.random.default_rng(3).normal(size=(70, 2))
+    z, J = model.simulate(x), model.jacobian(x)
+    for threads in ("1", "2", "5"):
+        monkeypatch.setenv("IPE_BENCH_THREADS", threads)
+        for size in (1, 7, 33, 70):
+            parts = [slice(i, i + size) for i in range(0, 70, size)]
+            assert (np.concatenate([model.simulate(x[part]) for part in parts]) == z).all()
+            assert (np.concatenate([model.jacobian(x[part]) for part in parts]) == J).all()
+
+
+def test_a_trial_that_overflows_leaves_its_neighbours_alone():
+    x = np.array([[1.0, 1.0], [1e4, 1.0], [1.0, 2.0]])
+    z = Pulse(0.5).simulate(x)
+    assert not np.isfinite(z[1]).all()
+    assert (z[[0, 2]] == Pulse(0.5).simulate(x[[0, 2]])).all()
+
+
+def test_a_wrong_number_of_derivatives_is_refused():
+    class Wrong(Pulse):
+        def rhs(self, t, y, p, c):
+            return y[0], y[0]
+
+    with pytest.raises(ValueError, match="rhs returns 2 values where 1 are declared"):
+        Wrong().simulate(np.ones((1, 2)))
