@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from ipe_bench.errors import UserError
 from ipe_bench.measurements import Nist
 from ipe_bench.measurements.base import differentiate
@@ -37,7 +38,7 @@ def test_certified_parameters_reproduce_the_certified_residuals_and_deviations(d
     reached = score(model, x, least_squares_covariance(model, x))
     assert reached.parameters == 11.0
     if dataset == "Lanczos1":
-        # Its residuals are 1e-13 and its parameters near 1: eleven printed digits cannot reproduce their sum of squares.
+        # Residuals of 1e-13 from parameters near 1: eleven printed digits cannot reproduce their squares.
         residuals = model.readings - model.simulate(x[None])[0]
         assert np.abs(residuals).max() < 1e-10
         return
@@ -84,5 +85,5 @@ def test_digits_are_the_fewest_over_the_parameters_capped_and_zero_where_wrong()
 
 @pytest.mark.parametrize(("field", "options"), [("dataset", {"dataset": "misra"}), ("start", {"start": 3})])
 def test_mistakes_are_named(field, options):
-    with pytest.raises(UserError, match=f"^{field}="):
+    with pytest.raises(UserError, match=rf"^{field}="):
         Nist(**{"dataset": "Misra1a", **options})

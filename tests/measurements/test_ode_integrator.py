@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scipy.integrate import DOP853
+
 from ipe_bench.measurements import OdeMeasurement, Parameter
 from ipe_bench.measurements.base import differentiate
-from scipy.integrate import DOP853
 
 
 @dataclass(frozen=True)
@@ -135,5 +136,5 @@ def test_a_wrong_number_of_derivatives_is_refused():
         def rhs(self, t, y, p, c):
             return y[0], y[0]
 
-    with pytest.raises(ValueError, match="rhs returns 2 values where 1 are declared"):
+    with pytest.raises(ValueError, match=r"rhs returns 2 values where 1 are declared"):
         Wrong().simulate(np.ones((1, 2)))

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+
 from ipe_bench.measurements.ode.trace import Graph, emit, tangent
 
 FUNCTIONS = {
@@ -69,13 +70,13 @@ def test_equal_expressions_are_computed_once_and_constants_are_folded():
 
 def test_a_branch_on_an_unknown_value_is_refused_with_the_remedy():
     a = Graph().input("a")
-    with pytest.raises(TypeError, match="without if"):
+    with pytest.raises(TypeError, match=r"without if"):
         _ = 1.0 if a > 0 else 0.0
 
 
 def test_an_unsupported_function_is_refused_by_name():
     a = Graph().input("a")
-    with pytest.raises(TypeError, match="floor"):
+    with pytest.raises(TypeError, match=r"floor"):
         np.floor(a)
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
-from ipe_bench.measurements.ode.trace import Graph, emit, tangent
+from ipe_bench.measurements.ode.trace import Expression, Graph, emit, tangent
 
 WIDTH = 16
 """Lanes that advance together: two registers of eight doubles."""
@@ -48,30 +48,30 @@ class Recording:
     source: str
 
 
-def record(
-    rhs: Arithmetic, read: Arithmetic, states: int, inputs: int, outputs: int, *, tangents: bool = False
-) -> Recording:
-    """Records `rhs(t, y, p)` and `read(t, y, p)`, with a tangent of the state carried along if asked for.
+def record(rhs: Arithmetic, read: Arithmetic, states: int, inputs: int, outputs: int, *, varying: int = 0) -> Recording:
+    """Records `rhs(t, y, p)` and `read(t, y, p)`, or their derivative along a direction of the first `varying` inputs.
 
-    y has `states` entries, p has `inputs` and what is read has `outputs`. With a tangent each of them is followed by as
-    many derivatives along one direction: the variational equations are integrated as part of the system itself, so the
-    derivative is that of the numerical solution, exact to round-off.
+    y has `states` entries, p has `inputs` and what is read has `outputs`. For a derivative the tangents of the state
+    follow y, the direction follows p, and the tangents of the outputs are read in place of the outputs. The variational
+    equations are integrated as part of the system itself, so the derivative is that of the numerical solution, exact to
+    round-off.
     """
     graph = Graph()
-    copies = 2 if tangents else 1
     t = graph.input("t")
-    y = graph.inputs("y", states * copies)
-    p = graph.inputs("p", inputs * copies)
-    direction = dict(zip(y[:states] + p[:inputs], y[states:] + p[inputs:], strict=True)) if tangents else {}
+    y = graph.inputs("y", states * 2 if varying else states)
+    p = graph.inputs("p", inputs + varying)
+    direction = dict(zip(y[:states] + p[:varying], y[states:] + p[inputs:], strict=True)) if varying else {}
 
-    def with_tangent(function: Arithmetic, count: int, name: str) -> tuple[str, list[str]]:
-        values = [graph.apply("add", v, 0.0) for v in function(t, y[:states], p[:inputs])]
-        if len(values) != count:
-            raise ValueError(f"{name} returns {len(values)} values where {count} are declared")
-        return emit(values + (tangent(values, direction) if tangents else []))
+    def values(function: Arithmetic, count: int, name: str) -> list[Expression]:
+        result = [graph.apply("add", v, 0.0) for v in function(t, y[:states], p[:inputs])]
+        if len(result) != count:
+            raise ValueError(f"{name} returns {len(result)} values where {count} are declared")
+        return result
 
-    source = _source(len(y), len(p), with_tangent(rhs, states, "rhs"), with_tangent(read, outputs, "read"))
-    return Recording(len(y), len(p), outputs * copies, source)
+    slope, shown = values(rhs, states, "rhs"), values(read, outputs, "read")
+    if varying:
+        slope, shown = slope + tangent(slope, direction), tangent(shown, direction)
+    return Recording(len(y), len(p), outputs, _source(len(y), len(p), emit(slope), emit(shown)))
 
 
 def _source(states: int, inputs: int, rhs: tuple[str, list[str]], read: tuple[str, list[str]]) -> str:
@@ -90,7 +90,7 @@ def _source(states: int, inputs: int, rhs: tuple[str, list[str]], read: tuple[st
         stages.append(f"        {slopes}, = rhs(t + {_C[s]!r} * h, {', '.join(at + p)})\n")
     ends = [f"        y[{i * WIDTH} + lane] = {combine(i, [(f'b{s}', s) for s in used])}\n" for i in range(states)]
     load = "".join(f"        {name} = y[{i * WIDTH} + lane]\n" for i, name in enumerate(y + p))
-    store = "".join(f"        out[{i * WIDTH} + lane] = {term}\n" for i, term in enumerate(read[1]))
+    store = "".join(f"        out[place[lane] + {i} * stride] = {term}\n" for i, term in enumerate(read[1]))
     constants = "".join(f"    a{s}_{j} = h * {_A[s][j]!r}\n" for s, j in nonzero)
     constants += "".join(f"    b{s} = h * {_B[s]!r}\n" for s in used)
     fast = "nogil=True, cache=True, error_model='numpy', fastmath={'contract', 'nsz'}"
@@ -98,6 +98,7 @@ def _source(states: int, inputs: int, rhs: tuple[str, list[str]], read: tuple[st
 
 import math
 
+import numpy as np
 from numba import njit
 
 
@@ -112,20 +113,23 @@ def step(t, h, y):
 {load}{"".join(stages)}{"".join(ends)}
 
 @njit({fast})
-def read(t, y, out):
+def read(t, y, place, stride, out):
     for lane in range({WIDTH}):
 {load}{read[0].replace("    ", "        ")}{store}
 
 @njit({fast})
-def integrate(y, start, times, substeps, out):
+def integrate(y, start, times, substeps, first, stride, out):
+    place = np.empty({WIDTH}, np.int64)
     for group in range(y.shape[0]):
         t = start
+        place[:] = first[group]
         for k in range(times.shape[0]):
             h = (times[k] - t) / substeps[k]
             for s in range(substeps[k]):
                 step(t + s * h, h, y[group])
             t = times[k]
-            read(t, y[group], out[group, k])
+            read(t, y[group], place, stride, out)
+            place += {len(read[1])} * stride
 '''
 
 
@@ -174,31 +178,33 @@ def integrate(
     recording: Recording,
     y0: NDArray[np.float64],
     p: NDArray[np.float64],
-    start: float,
     times: NDArray[np.float64],
     substeps: NDArray[np.int64],
-) -> NDArray[np.float64]:
-    """Integrates every lane and reads it at every time.
+    out: NDArray[np.float64],
+    first: NDArray[np.int64],
+    stride: int = 1,
+) -> None:
+    """Integrates every lane from time 0 and reads it at every time.
 
-    y0 (lanes, states) and p (lanes, inputs) at time `start`; `substeps[k]` equal steps lead to `times[k]`.
-    Returns (lanes, times, outputs).
+    y0 (lanes, states), p (lanes, inputs); `substeps[k]` equal steps lead to `times[k]`. What is read of lane i goes to
+    `out.flat` at `first[i]`, `first[i] + stride` and so on, in order of time and output: where it is wanted, because
+    moving it later costs as much as a third of the integration.
     """
-    lanes = len(y0)
-    groups = -(-lanes // WIDTH)
+    groups = -(-len(y0) // WIDTH)
     run = _load(recording.source).integrate
     y = _in_groups(np.concatenate([y0, p], axis=1), groups)
-    out = np.empty((groups, len(times), recording.outputs * WIDTH))
+    # The lanes that fill up the last group repeat its last lane, to the same place.
+    place = first[np.minimum(np.arange(groups * WIDTH), len(first) - 1)].reshape(groups, WIDTH)
+    flat = out.reshape(-1)
     workers = min(threads(), groups)
     if workers == 1:
-        run(y, start, times, substeps, out)
-    else:
-        # More pieces than threads, so that a core slowed by other work does not hold up the rest.
-        pieces = np.array_split(np.arange(groups), min(groups, 4 * workers))
-        bounds = [(int(piece[0]), int(piece[-1]) + 1) for piece in pieces]
-        pool = _pool(workers, os.getpid())
-        list(pool.map(lambda b: run(y[b[0] : b[1]], start, times, substeps, out[b[0] : b[1]]), bounds))
-    out = out.reshape(groups, len(times), recording.outputs, WIDTH).transpose(0, 3, 1, 2)
-    return out.reshape(groups * WIDTH, len(times), -1)[:lanes]
+        run(y, 0.0, times, substeps, place, stride, flat)
+        return
+    # More pieces than threads, so that a core slowed by other work does not hold up the rest.
+    bounds = np.linspace(0, groups, min(groups, 4 * workers) + 1).astype(int)
+    pieces = [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    pool = _pool(workers, os.getpid())
+    list(pool.map(lambda piece: run(y[piece], 0.0, times, substeps, place[piece], stride, flat), pieces))
 
 
 def _in_groups(values: NDArray[np.float64], groups: int) -> NDArray[np.float64]:

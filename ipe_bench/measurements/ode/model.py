@@ -19,6 +19,8 @@ from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.ode.kernel import Recording, integrate, record
 
 _COMPLEX_STEP = 1e-100
+_BLOCK = 256
+"""Trials whose derivatives are integrated together: few enough to stay in the cache."""
 
 
 class OdeMeasurement(Measurement):
@@ -87,21 +89,34 @@ class OdeMeasurement(Measurement):
 
     def simulate_until(self, x: Array, stop: int) -> Array:
         p, c = self._lanes(x)
-        return self._integrate(self._plain, self._start(p, c), np.concatenate([p, c], axis=1), stop)[..., 0]
+        per_case = stop * len(self.outputs)
+        z = np.empty((len(x), len(self.cases) * per_case))
+        first = per_case * np.arange(len(p))
+        self._integrate(self._plain, self._start(p, c), np.concatenate([p, c], axis=1), stop, z, first)
+        return z
 
     def jacobian(self, x: Array) -> Array:
         return self.jacobian_until(x, len(self.times))
 
     def jacobian_until(self, x: Array, stop: int) -> Array:
         """dh/dx by the variational equations, integrated by the same compiled formula as the readings."""
+        J = np.empty((len(x), len(self.cases) * stop * len(self.outputs), self.n))
+        for begin in range(0, len(x), _BLOCK):
+            block = slice(begin, begin + _BLOCK)
+            self._differentiate(x[block], stop, J[block])
+        return J
+
+    def _differentiate(self, x: Array, stop: int, J: Array) -> None:
+        """Fills J (trials, readings, n): a lane for each trial, direction and case."""
         trials, n = x.shape
         p, c = self._lanes(np.repeat(x, n, axis=0))
         direction = np.repeat(np.tile(np.eye(n), (trials, 1)), len(self.cases), axis=0) * self.si_sizes
         y = self._start(p + 1j * _COMPLEX_STEP * direction, c)
         y0 = np.concatenate([np.real(y), np.imag(y) / _COMPLEX_STEP], axis=1)
-        inputs = np.concatenate([p, c, direction, np.zeros_like(c)], axis=1)
-        z = self._integrate(self._tangent, np.ascontiguousarray(y0), inputs, stop)[..., 1]
-        return np.ascontiguousarray(z.reshape(trials, n, -1).swapaxes(1, 2))
+        inputs = np.concatenate([p, c, direction], axis=1)
+        shape = (trials, len(self.cases), stop * len(self.outputs), n)
+        first = np.arange(J.size).reshape(shape)[:, :, 0].swapaxes(1, 2).ravel()
+        self._integrate(self._tangent, y0, inputs, stop, J, first, stride=n)
 
     def _lanes(self, x: Array) -> tuple[Array, Array]:
         """Parameters and constants of every initial value problem: each trial in each case."""
@@ -111,26 +126,31 @@ class OdeMeasurement(Measurement):
     def _start(self, p: NDArray[Any], c: Array) -> NDArray[Any]:
         return np.stack(np.broadcast_arrays(*self.start(list(p.T), list(c.T)), p[:, 0])[:-1], axis=1)
 
-    def _integrate(self, recording: Recording, y0: Array, inputs: Array, stop: int) -> Array:
-        """(trials, readings, 1 or 2): the readings, and their tangents where the recording carries them."""
+    def _integrate(
+        self,
+        recording: Recording,
+        y0: Array,
+        inputs: Array,
+        stop: int,
+        out: Array,
+        first: NDArray[np.int64],
+        stride: int = 1,
+    ) -> None:
         if self.step is None:
             raise ValueError(f"{self.name}: the integration step is not chosen yet; see suited_to")
-        times = self.times[:stop]
+        times = np.asarray(self.times[:stop], dtype=float)
         substeps = np.ceil(np.diff(times, prepend=0.0) / self.step - 1e-9).astype(np.int64)
-        out = integrate(recording, y0, inputs, 0.0, times, np.maximum(substeps, 1))
-        readings = len(self.cases) * stop * len(self.outputs)
-        parts = out.reshape(len(out), stop, -1, len(self.outputs))
-        return np.ascontiguousarray(parts.swapaxes(2, 3)).reshape(-1, readings, parts.shape[2])
+        integrate(recording, y0, inputs, times, np.maximum(substeps, 1), out, first, stride)
 
     @cached_property
     def _plain(self) -> Recording:
-        return self._record(tangents=False)
+        return self._record(varying=0)
 
     @cached_property
     def _tangent(self) -> Recording:
-        return self._record(tangents=True)
+        return self._record(varying=self.n)
 
-    def _record(self, *, tangents: bool) -> Recording:
+    def _record(self, *, varying: int) -> Recording:
         n = self.n
 
         def rhs(t: Any, y: Sequence[Any], p: Sequence[Any]) -> Sequence[Any]:
@@ -140,4 +160,4 @@ class OdeMeasurement(Measurement):
             return self.read(t, y, p[:n], p[n:])
 
         inputs = n + self.cases.shape[1]
-        return record(rhs, read, self.states, inputs, len(self.outputs), tangents=tangents)
+        return record(rhs, read, self.states, inputs, len(self.outputs), varying=varying)

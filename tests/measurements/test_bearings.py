@@ -1,0 +1,73 @@
+"""Bearings-only motion analysis: what is published about its observability."""
+
+import numpy as np
+import pytest
+
+from ipe_bench.errors import UserError
+from ipe_bench.ipe import IPE
+from ipe_bench.linalg import Covariance
+from ipe_bench.measurements import Bearings
+from ipe_bench.scenario import Problem
+from ipe_bench.solvers import Newton
+
+STRAIGHT = ((1800.0, 90.0, 6.0),)
+
+
+def problem(model):
+    return Problem(model, Covariance(np.full(model.m, 0.5)))
+
+
+def test_bearings_are_clockwise_from_north():
+    model = Bearings()
+    x = model.nominal + np.random.default_rng(0).normal(size=(10, 4))
+    east, north, v_east, v_north = (x * model.sizes).T[:, :, None]
+    sight = east + v_east * model.times - model.observer[:, 0], north + v_north * model.times - model.observer[:, 1]
+    expected = np.rad2deg(np.arctan2(*sight))
+    apart = (model.simulate(x) - expected + 180.0) % 360.0 - 180.0
+    np.testing.assert_allclose(apart, 0.0, atol=1e-11)
+
+
+def test_bearings_do_not_jump_where_the_target_crosses_north_or_south():
+    for target in ((-600.0, 9000.0, 3.0, 0.0), (600.0, -9000.0, -3.0, 0.0)):
+        model = Bearings(target=target)
+        assert np.abs(np.diff(model.simulate(model.nominal[None])[0])).max() < 20.0
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0, 10.0])
+def test_on_one_leg_every_scaled_relative_motion_has_the_same_bearings(factor):
+    model = Bearings(legs=STRAIGHT)
+    own = np.array([0.0, 0.0, 6.0, 0.0])
+    truth = np.array([*model.target])
+    x = np.stack([truth, own + factor * (truth - own)]) / model.sizes
+    z = model.simulate(x)
+    np.testing.assert_allclose(z[0], z[1], atol=1e-9)
+
+
+def test_without_a_manoeuvre_the_problem_is_refused_as_unobservable():
+    model = Bearings(legs=STRAIGHT)
+    assert np.linalg.matrix_rank(model.linearization(), tol=1e-9) == 3
+    with pytest.raises(UserError, match=r"H has not full column rank"):
+        IPE(Newton()).estimate(problem(model), model.simulate(model.nominal[None]))
+
+
+def test_a_manoeuvre_along_the_line_of_sight_is_not_enough():
+    # Nardone and Aidala 1981: the observer accelerates, but the bearing stays what it would have been.
+    model = Bearings(legs=((900.0, 0.0, 3.0), (900.0, 0.0, 9.0)), target=(0.0, 20000.0, 0.0, -2.0))
+    assert np.linalg.matrix_rank(model.linearization(), tol=1e-9) < 4
+    with pytest.raises(UserError, match=r"H has not full column rank"):
+        IPE(Newton()).estimate(problem(model), model.simulate(model.nominal[None]))
+
+
+def test_a_turn_makes_it_observable():
+    model = Bearings()
+    assert np.linalg.matrix_rank(model.linearization(), tol=1e-9) == 4
+    x = model.nominal + np.random.default_rng(1).normal(size=(20, 4))
+    estimates = IPE(Newton(), tolerance=1e-9).estimate(problem(model), model.simulate(x))
+    assert (estimates.status == 0).all()
+    np.testing.assert_allclose(estimates.x, x, atol=1e-7)
+
+
+@pytest.mark.parametrize("options", [{"interval": 0.0}, {"legs": ((1.0, 2.0),)}, {"target": (1.0, 2.0)}])
+def test_mistakes_are_named(options):
+    with pytest.raises(UserError, match=rf"^{next(iter(options))}"):
+        Bearings(**options)

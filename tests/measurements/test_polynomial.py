@@ -1,0 +1,46 @@
+"""The polynomial model has its nonlinear part in closed form."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ipe_bench.errors import UserError
+from ipe_bench.ipe import FrozenSystem
+from ipe_bench.linalg import Covariance
+from ipe_bench.measurements import Polynomial
+from ipe_bench.scenario import Problem
+
+
+@given(
+    n=st.integers(1, 6),
+    extra=st.integers(1, 20),
+    strength=st.floats(-0.5, 0.5),
+    seed=st.integers(0, 10_000),
+)
+def test_the_nonlinear_part_is_as_documented(n, extra, strength, seed):
+    model = Polynomial(n, n + extra, strength)
+    x = np.random.default_rng(seed).normal(size=(3, n))
+    u = x @ model.linearization().T
+    np.testing.assert_allclose(model.linearization(), model.matrix, atol=1e-15)
+    np.testing.assert_allclose(
+        model.simulate(x) - u, strength * u**2 / 2 + strength**2 * u**3 / 6, atol=1e-12 * (1 + np.abs(u).max() ** 3)
+    )
+
+
+def test_without_strength_it_is_linear_and_the_truth_is_the_root():
+    model = Polynomial(3, 10, 0.0)
+    x = np.random.default_rng(0).normal(size=(4, 3))
+    system = FrozenSystem.at_nominal(Problem(model, Covariance(np.ones(10))), model.simulate(x))
+    np.testing.assert_allclose(system.F(np.zeros((4, 3))), -x, atol=1e-14)
+
+
+def test_readings_grow_with_u_whatever_the_strength():
+    model = Polynomial(1, 5, 0.7)
+    z = model.simulate(np.linspace(-30.0, 30.0, 400)[:, None])
+    assert (np.diff(z, axis=0) > 0).all()
+
+
+def test_fewer_readings_than_unknowns_are_refused():
+    with pytest.raises(UserError, match=r"^count=4"):
+        Polynomial(4, 4)

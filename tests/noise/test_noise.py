@@ -1,0 +1,135 @@
+"""Noises have the statistics that they state."""
+
+import numpy as np
+import pytest
+
+from ipe_bench.errors import UserError
+from ipe_bench.noise import Colored, Correlated, Gaussian, NoNoise, Outliers, Quantization, StudentT
+
+TRIALS = 4000
+
+
+def errors(noise, m=40, h=None, offset=None):
+    """Errors (trials, m) of readings h."""
+    rng = np.random.default_rng(11)
+    h = np.zeros(m) if h is None else h
+    offset = np.zeros(m) if offset is None else offset
+    return np.stack([noise.corrupt(h, offset, rng) for _ in range(TRIALS)]) - h
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [
+        Gaussian(0.3),
+        StudentT(0.3, 5.0),
+        Outliers(0.3, share=0.1, factor=5.0, assumed="total"),
+        Colored(0.3, 0.8, channels=2, length=10, assumed="full"),
+        Colored(0.3, -0.5),
+        Correlated(0.3, 0.6, block=8),
+    ],
+    ids=lambda noise: type(noise).__name__,
+)
+def test_the_sample_variance_is_what_estimators_are_told(noise):
+    v = errors(noise)
+    told = noise.covariance(40).matrix()
+    assert np.abs(v.mean(axis=0)).max() < 5 * 0.55 / np.sqrt(TRIALS)
+    assert np.mean(v**2) == pytest.approx(np.mean(np.diag(told)), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [
+        Colored(0.3, 0.8, channels=2, length=10, assumed="full"),
+        Correlated(0.3, 0.6, block=8),
+        Correlated(matrix=((2.0, -0.5, 0.1), (-0.5, 1.0, 0.3), (0.1, 0.3, 0.5))),
+    ],
+    ids=["colored", "blocks", "matrix"],
+)
+def test_the_sample_covariance_is_the_full_r(noise):
+    m = 3 if isinstance(noise, Correlated) and noise.matrix else 40
+    R = noise.covariance(m).matrix()
+    deviation = np.sqrt(np.diag(R))
+    sample = np.cov(errors(noise, m).T) / np.outer(deviation, deviation)
+    assert np.abs(sample - R / np.outer(deviation, deviation)).max() < 6 / np.sqrt(TRIALS)
+
+
+def test_coloured_noise_runs_along_the_times_of_each_channel():
+    R = Colored(2.0, 0.5, channels=2, length=3, assumed="full").covariance(12).matrix() / 4.0
+    assert R[0, 1] == 0.0  # two instruments at one time
+    assert R[0, 2] == pytest.approx(0.5)  # one instrument, one time later
+    assert R[0, 4] == pytest.approx(0.25)
+    assert R[4, 6] == pytest.approx(0.0)  # the next series starts anew
+
+
+def test_whitening_with_the_full_r_makes_coloured_noise_white():
+    noise = Colored(0.3, 0.9, assumed="full")
+    white = noise.covariance(40).whiten(errors(noise))
+    assert np.abs(np.cov(white.T) - np.eye(40)).max() < 6 / np.sqrt(TRIALS)
+
+
+def test_what_is_told_is_an_option():
+    assert (Colored(0.3, 0.9).covariance(4).factor == 0.3).all()
+    np.testing.assert_allclose(Correlated(0.3, 0.9, assumed="white").covariance(4).factor, 0.3)
+    assert (Outliers(0.3, 0.5, 10.0).covariance(4).factor == 0.3).all()
+    assert Outliers(0.3, 0.5, 3.0, "total").covariance(1).factor == pytest.approx(0.3 * np.sqrt(5.0))
+
+
+def test_students_tails_are_heavy_and_outliers_are_as_many_as_stated():
+    v = errors(StudentT(1.0, 3.0))
+    assert np.mean(np.abs(v) > 5.0) > 50 * 5.7e-7
+    v = errors(Outliers(1.0, share=0.05, factor=1e6))
+    assert np.mean(np.abs(v) > 100.0) == pytest.approx(0.05, abs=0.003)
+
+
+def test_quantisation_rounds_the_whole_read_out():
+    step, offset = 0.02286, np.linspace(-450.0, 450.0, 40) * 1.0001
+    h = np.linspace(-3.0, 3.0, 40)
+    z = Quantization(step).corrupt(h, offset, np.random.default_rng(0))
+    steps = (offset + z) / step
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
+    assert np.abs(z - h).max() <= step / 2 * (1 + 1e-9)
+
+
+def test_equal_readings_beside_different_read_outs_are_rounded_apart():
+    # Rounding h alone would give all of them one error, and would correlate the cases of a model.
+    v = Quantization(1.0).corrupt(np.full(40, 0.3), np.linspace(0.0, 1.0, 40), np.random.default_rng(0)) - 0.3
+    assert np.ptp(v) > 0.9
+
+
+def test_quantisation_errors_are_uniform_with_variance_step_squared_over_twelve():
+    rng = np.random.default_rng(0)
+    h = rng.uniform(-100, 100, 20000)
+    v = Quantization(0.5).corrupt(h, np.zeros_like(h), rng) - h
+    assert np.var(v) == pytest.approx(0.5**2 / 12, rel=0.03)
+    assert Quantization(0.5).covariance(1).factor == pytest.approx(0.5 / np.sqrt(12))
+    assert Quantization(0.5, deviation=0.5).covariance(1).factor == 0.5
+
+
+def test_dither_makes_the_error_of_a_constant_reading_uniform():
+    constant = np.full(40, 0.1)
+    assert np.ptp(errors(Quantization(1.0), h=constant)) == 0.0
+    v = errors(Quantization(1.0, dither=True), h=constant)
+    assert np.var(v) == pytest.approx(1 / 12, rel=0.02)
+    assert abs(v.mean()) < 0.005
+
+
+def test_no_noise_adds_nothing_while_r_stays_nominal():
+    assert (errors(NoNoise(0.3), h=np.arange(40.0)) == 0.0).all()
+    assert (NoNoise(0.3).covariance(2).factor == 0.3).all()
+
+
+@pytest.mark.parametrize(
+    ("make", "key"),
+    [
+        (lambda: StudentT(1.0, 2.0), "degrees_of_freedom=2.0"),
+        (lambda: Outliers(1.0, share=1.5), "share=1.5"),
+        (lambda: Colored(1.0, 1.0), "correlation=1.0"),
+        (lambda: Colored(1.0, 0.5, channels=3).covariance(10), "channels=3"),
+        (lambda: Correlated(1.0, 0.5, block=7).covariance(10), "block=7"),
+        (lambda: Correlated(matrix=((1.0, 2.0), (2.0, 1.0))).covariance(2), "matrix"),
+        (lambda: Correlated(matrix=((1.0,),)).covariance(2), "matrix"),
+    ],
+)
+def test_mistakes_are_named(make, key):
+    with pytest.raises(UserError, match=rf"^{key}"):
+        make()
