@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib.util
+import itertools
 import os
 import sys
 import tempfile
@@ -202,7 +203,7 @@ def integrate(
         return
     # More pieces than threads, so that a core slowed by other work does not hold up the rest.
     bounds = np.linspace(0, groups, min(groups, 4 * workers) + 1).astype(int)
-    pieces = [slice(a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    pieces = [slice(a, b) for a, b in itertools.pairwise(bounds)]
     pool = _pool(workers, os.getpid())
     list(pool.map(lambda piece: run(y[piece], 0.0, times, substeps, place[piece], stride, flat), pieces))
 
