@@ -67,12 +67,30 @@ def own_conf() -> Path:
     raise FileNotFoundError("the configs of ipe-bench are neither in the package nor beside it; install it again")
 
 
+_added: dict[Path, None] = {}
+"""Folders of plugins besides those in `plugins/`."""
+
+
 @functools.cache
 def sources() -> tuple[Source, ...]:
     """Ours first, then the installed plugins, then the folders `plugins/*/`; their packages become importable."""
-    found = [Source("ipe-bench", own_conf(), "built in"), *_installed(), *_in_folders(Path.cwd() / "plugins")]
-    unique = {source.name: source for source in reversed(found)}
-    return tuple(s for s in found if unique[s.name] is s)
+    plugins = Path("plugins")
+    folders = sorted(plugins.resolve().iterdir()) if plugins.is_dir() else []
+    found = [Source("ipe-bench", own_conf(), "built in"), *_installed()]
+    for folder in dict.fromkeys([*folders, *_added]):
+        found += _in_folder(folder)
+    unique: dict[str, Source] = {}
+    for source in found:
+        # A plugin that is installed from its folder is found twice.
+        unique.setdefault(source.name, source)
+    return tuple(unique.values())
+
+
+def add_folder(folder: Path) -> bool:
+    """Makes the plugin in a folder known, wherever it is; False where there is none."""
+    _added[folder.resolve()] = None
+    sources.cache_clear()
+    return bool(list(_in_folder(folder.resolve())))
 
 
 def _installed() -> Iterator[Source]:
@@ -86,17 +104,13 @@ def _installed() -> Iterator[Source]:
         yield Source(entry.value, conf, f"{entry.dist.name if entry.dist else entry.name}{version}")
 
 
-def _in_folders(folder: Path) -> Iterator[Source]:
-    if not folder.is_dir():
-        return
-    for plugin in sorted(folder.iterdir()):
-        for conf in sorted(plugin.glob("*/conf")):
-            package = conf.parent.name
-            if not (conf.parent / "__init__.py").is_file():
-                continue
-            _make_importable(plugin)
+def _in_folder(folder: Path) -> Iterator[Source]:
+    for conf in sorted(folder.glob("*/conf")):
+        package = conf.parent.name
+        if (conf.parent / "__init__.py").is_file():
+            _make_importable(folder)
             register_package(package)
-            yield Source(package, conf, f"plugins/{plugin.name}")
+            yield Source(package, conf, f"{folder.parent.name}/{folder.name}")
 
 
 def _make_importable(folder: Path) -> None:

@@ -16,6 +16,8 @@ ipe-bench: which estimator to trust with nonlinear measurements
   ipe-bench estimate readings=FILE.csv            parameters from real readings
   ipe-bench report DIR [DIR ...]                  tables, figures and report of what is stored
   ipe-bench list [GROUP] [-v]                     what there is to choose from
+  ipe-bench new KIND NAME                         a working plugin to start from, in plugins/NAME
+  ipe-bench check plugins/NAME                    whether a plugin keeps its promises
 
 Exit codes: 0 done; 1 done, but some pieces failed or are missing; 2 a mistake in what was asked for.
 """
@@ -25,6 +27,8 @@ COMMANDS = {
     "estimate": "ipe_bench.cli.estimate",
     "report": "ipe_bench.cli.report",
     "list": "ipe_bench.cli.list",
+    "check": "ipe_bench.cli.check",
+    "new": "ipe_bench.cli.new",
 }
 
 

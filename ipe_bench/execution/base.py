@@ -5,7 +5,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
+
+from ipe_bench.naming import Named
 
 
 @dataclass(frozen=True)
@@ -18,15 +20,8 @@ class Outcome:
     failure: str | None = None
 
 
-class Execution(ABC):
+class Execution(Named, ABC):
     """Where tasks run. A new execution is a frozen dataclass that writes `run`."""
-
-    name: ClassVar[str] = ""
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        if "name" not in cls.__dict__:
-            cls.name = cls.__name__.lower()
 
     @abstractmethod
     def run(self, work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[Outcome]:

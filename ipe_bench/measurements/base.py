@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.linalg import Array
+from ipe_bench.naming import Named
 
 _COMPLEX_STEP = 1e-100
 _CENTRAL_STEP = float(np.finfo(float).eps ** (1 / 3))
@@ -32,23 +33,16 @@ class Parameter:
     """Parameters of one group share a panel in figures; empty: the name is the group."""
 
 
-class Measurement(ABC):
+class Measurement(Named, ABC):
     """A model z = h(x) + v, without the noise v.
 
     x is (trials, n) in multiples of the parameters' sizes, h(x) is (trials, m) in `reading_unit`, and a trial's
     readings depend on that trial's x alone, bit for bit. n parameters, m readings, m > n.
     """
 
-    name: ClassVar[str] = ""
-    """The name of the model in tables; the class name in lower case where it is empty."""
     analytic: ClassVar[bool] = False
     """True where `simulate` accepts complex x and is analytic in it: the Jacobian is then a complex step."""
     reading_unit: str = ""
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        if "name" not in cls.__dict__:
-            cls.name = cls.__name__.lower()
 
     @property
     @abstractmethod

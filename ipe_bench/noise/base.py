@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar
 
 import numpy as np
 
 from ipe_bench.linalg import Array, Covariance
+from ipe_bench.naming import Named
 
 
-class Noise(ABC):
+class Noise(Named, ABC):
     """Errors of readings. A new noise is a frozen dataclass that writes `corrupt` and `covariance`."""
-
-    name: ClassVar[str] = ""
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        if "name" not in cls.__dict__:
-            cls.name = cls.__name__.lower()
 
     @abstractmethod
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:

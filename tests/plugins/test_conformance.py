@@ -1,0 +1,137 @@
+"""Our own components pass the checks that plugins are given, and the checks catch what they are for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from ipe_bench import plugins
+from ipe_bench.components import construct
+from ipe_bench.conformance import check_component
+from ipe_bench.estimation import Estimates, Estimator
+from ipe_bench.ipe import IPE
+from ipe_bench.linalg import Covariance
+from ipe_bench.measurements import Polynomial
+from ipe_bench.noise import Gaussian, Noise
+from ipe_bench.solvers import Newton
+from ipe_bench.statuses import Status
+
+GROUPS = ("measurement", "noise", "prior", "solver", "baseline")
+OURS = [o for o in plugins.options() if o.group in GROUPS and o.source.name == "ipe-bench"]
+
+
+def component(option: plugins.Option):
+    config = OmegaConf.to_container(OmegaConf.load(option.path), resolve=True)
+    return construct(config, option.package or option.group)
+
+
+def complaints(component) -> str:
+    return "; ".join(f.complaint for f in check_component("mine", component) if f.complaint)
+
+
+@pytest.mark.parametrize("option", OURS, ids=lambda o: f"{o.group}={o.name}")
+def test_every_option_of_ours_keeps_its_promises(option):
+    assert not complaints(component(option))
+
+
+class Faulty(Estimator):
+    """Newton's estimate with one fault."""
+
+    def estimate(self, problem, z, *, history=False):
+        return self.spoil(IPE(Newton()).estimate(problem, z, history=history), z)
+
+    def spoil(self, estimates: Estimates, z) -> Estimates:
+        return estimates
+
+
+@dataclass(frozen=True)
+class Leaning(Faulty):
+    def spoil(self, estimates, z):
+        estimates.x = estimates.x + 1e-9 * len(z)
+        return estimates
+
+
+@dataclass(frozen=True)
+class Boasting(Faulty):
+    def spoil(self, estimates, z):
+        estimates.status[:] = Status.CONVERGED
+        return estimates
+
+
+@dataclass(frozen=True)
+class Wrong(Faulty):
+    def spoil(self, estimates, z):
+        estimates.x = estimates.x + 1.0
+        return estimates
+
+
+@dataclass(frozen=True)
+class Free(Faulty):
+    def spoil(self, estimates, z):
+        estimates.simulations[:] = 0
+        estimates.jacobians[:] = 0
+        return estimates
+
+
+@dataclass(frozen=True)
+class Scribbling(Faulty):
+    def spoil(self, estimates, z):
+        z += 1.0
+        return estimates
+
+
+@dataclass
+class Thawed(Faulty):
+    pass
+
+
+@dataclass(frozen=True)
+class Mislabelled(Polynomial):
+    @property
+    def index(self):
+        return {"time": [0.0] * self.count}
+
+
+@dataclass(frozen=True)
+class Slanted(Polynomial):
+    def jacobian(self, x):
+        return super().jacobian(x) * 1.01
+
+
+@dataclass(frozen=True)
+class Forgetful(Noise):
+    def corrupt(self, h, offset, rng):
+        return h + np.random.default_rng().standard_normal(h.shape)
+
+    def covariance(self, m):
+        return Covariance(np.ones(m))
+
+
+@pytest.mark.parametrize(
+    ("faulty", "complaint"),
+    [
+        (Leaning(), "trial 0 differs"),
+        (Boasting(), "NaN readings counts as converged"),
+        (Wrong(), "standard deviations of the bound"),
+        (Free(), "not counted"),
+        (Scribbling(), "the readings have changed"),
+        (Thawed(), "frozen=True"),
+        (Mislabelled(), "two readings have one label"),
+        (Slanted(), "off by"),
+        (Forgetful(), "besides the stream"),
+        (42, "neither"),
+    ],
+    ids=lambda value: type(value).__name__ if not isinstance(value, str) else "",
+)
+def test_a_fault_is_found(faulty, complaint):
+    assert complaint in complaints(faulty)
+
+
+def test_a_fault_in_one_check_leaves_the_others_ok():
+    findings = list(check_component("mine", Free()))
+    assert sum(bool(f.complaint) for f in findings) == 1
+    assert not complaints(IPE(Newton()))
+    assert not complaints(Gaussian(1.0))
