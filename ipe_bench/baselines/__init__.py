@@ -1,5 +1,10 @@
 """Baselines: estimators that are not IPE. Config group `baseline`."""
 
+from ipe_bench.baselines.ckf import CKF
+from ipe_bench.baselines.ekf import EKF
+from ipe_bench.baselines.enkf import EnKF
+from ipe_bench.baselines.iterated_ekf import IteratedEKF
 from ipe_bench.baselines.linear_lse import LinearLSE
+from ipe_bench.baselines.ukf import UKF
 
-__all__ = ["LinearLSE"]
+__all__ = ["CKF", "EKF", "UKF", "EnKF", "IteratedEKF", "LinearLSE"]

@@ -1,0 +1,53 @@
+"""The extended Kalman filter, filterpy's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ipe_bench.baselines.sequential import Sequential, Track, squared_innovation
+from ipe_bench.linalg import Array
+
+
+@dataclass(frozen=True)
+class EKF(Sequential):
+    """Each epoch's readings linearised at the estimate so far (Bar-Shalom et al., 10.3). filterpy updates P in Joseph's
+    form, (I - K H) P (I - K H)' + K R K', which stays positive definite where the prior is much wider than R."""
+
+    slopes = True
+
+    def track(self, P0: Array, Q: Array, z: Array) -> EKFTrack:
+        return EKFTrack(P0, Q)
+
+
+class EKFTrack(Track):
+    """filterpy's ExtendedKalmanFilter on one trial."""
+
+    def __init__(self, P0: Array, Q: Array) -> None:
+        from filterpy.kalman import ExtendedKalmanFilter
+
+        n = len(P0)
+        self.filter = ExtendedKalmanFilter(dim_x=n, dim_z=1)
+        # The default x is a column, with which a vector of readings broadcasts to a matrix and no error.
+        self.filter.x = np.zeros(n)
+        self.filter.P, self.filter.Q = P0, Q
+
+    @property
+    def x(self) -> Array:
+        return self.filter.x
+
+    @property
+    def P(self) -> Array:
+        return self.filter.P
+
+    def predict(self) -> None:
+        self.filter.predict()
+
+    def points(self) -> Array:
+        return self.filter.x[None]
+
+    def update(self, z: Array, h: Array, H: Array | None) -> bool:
+        self.filter.update(z, HJacobian=lambda _: H, Hx=lambda _: h[0], R=np.eye(len(z)))
+        self.nis += squared_innovation(self.filter.y, self.filter.SI)
+        return True

@@ -1,0 +1,94 @@
+"""The ensemble Kalman filter, filterpy's."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from threading import Lock
+
+import numpy as np
+
+from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric
+from ipe_bench.errors import UserError
+from ipe_bench.linalg import Array
+
+
+@dataclass(frozen=True)
+class EnKF(Sequential):
+    """An ensemble of states with perturbed readings (Evensen 1994; Crassidis and Junkins, 2nd ed., 4.5).
+
+    Without process noise the ensemble keeps within the span of its first draw, and P carries a sampling error of about
+    sqrt(2 / members): more members than parameters are needed, and many more for a P to be believed.
+    """
+
+    members: int = 100
+    seed: int = 0
+    """A trial's random stream depends on this and on its readings: on nothing else in the batch."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.members < 2:
+            raise UserError(f"members={self.members}: give a whole number above 1")
+        if self.seed < 0:
+            raise UserError(f"seed={self.seed}: give a whole number from 0 up")
+
+    def track(self, P0: Array, Q: Array, z: Array) -> EnKFTrack:
+        digest = hashlib.sha256(np.ascontiguousarray(z, dtype=float).tobytes()).digest()
+        stream = np.random.Philox(np.random.SeedSequence([self.seed, *np.frombuffer(digest, dtype=np.uint32).tolist()]))
+        return EnKFTrack(P0, Q, self.members, stream)
+
+
+class EnKFTrack(Track):
+    """filterpy's EnsembleKalmanFilter on one trial, with a random stream of its own."""
+
+    def __init__(self, P0: Array, Q: Array, members: int, stream: np.random.BitGenerator) -> None:
+        from filterpy.kalman import EnsembleKalmanFilter
+
+        self.stream = stream
+        with _drawing_from(stream):
+            x = np.zeros(len(P0))
+            self.filter = EnsembleKalmanFilter(x=x, P=P0, dim_z=1, dt=1.0, N=members, hx=None, fx=lambda x, dt: x)
+        self.filter.Q = Q
+
+    @property
+    def x(self) -> Array:
+        return self.filter.x
+
+    @property
+    def P(self) -> Array:
+        return self.filter.P
+
+    def predict(self) -> None:
+        with _drawing_from(self.stream):
+            self.filter.predict()
+
+    def points(self) -> Array:
+        return self.filter.sigmas
+
+    def update(self, z: Array, h: Array, H: Array | None) -> bool:
+        f = self.filter
+        f.hx = in_turn(h)
+        f._mean_z = np.zeros(len(z))  # filterpy draws the perturbations about it; epochs differ in length
+        with _drawing_from(self.stream):
+            f.update(z, R=np.eye(len(z)))
+        f.P = symmetric(f.P)
+        self.nis += squared_innovation(z - h.mean(axis=0), f.SI)
+        return True
+
+
+_GLOBAL_STATE = Lock()
+
+
+@contextmanager
+def _drawing_from(stream: np.random.BitGenerator) -> Iterator[None]:
+    """Lends NumPy's global generator, which filterpy draws from, another stream, and puts back what was there."""
+    with _GLOBAL_STATE:
+        generator, state = np.random.get_bit_generator(), np.random.get_state(legacy=False)  # noqa: NPY002
+        np.random.set_bit_generator(stream)
+        try:
+            yield
+        finally:
+            np.random.set_bit_generator(generator)
+            np.random.set_state(state)  # noqa: NPY002

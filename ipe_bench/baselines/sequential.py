@@ -1,0 +1,285 @@
+"""Filters: the parameters as a random constant, the readings epoch by epoch, the linear algebra filterpy's own.
+
+All trials of a batch advance together: what the model would read at every trial's points of an epoch is one batched
+call, and each trial's filterpy object is then given its share of the answer. A filter says where it wants to be read
+(`Track`); the loop over epochs, the counting and the failures are here.
+"""
+
+from __future__ import annotations
+
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgWarning
+
+from ipe_bench.errors import UserError
+from ipe_bench.estimation import Estimates, Estimator, Need, describe_exception
+from ipe_bench.ipe import Counted, Tally
+from ipe_bench.linalg import Array, Covariance
+from ipe_bench.measurements.base import Measurement, Restricted
+from ipe_bench.scenario import Problem
+from ipe_bench.statuses import Status
+
+_POINTS_AT_ONCE = 8192
+"""Points of one call of the model: bounds the memory that a large ensemble takes."""
+
+
+class Track(ABC):
+    """One trial's filter. The state x is the parameters' distance from the nominal point in prior deviations, and the
+    readings are whitened (R = I), so that P starts near the unit matrix whatever the parameters' units."""
+
+    nis: float = 0.0
+    """The squared innovations y' S^-1 y, summed over the epochs so far."""
+
+    @property
+    @abstractmethod
+    def x(self) -> Array:
+        """The estimate (n,)."""
+
+    @property
+    @abstractmethod
+    def P(self) -> Array:
+        """Its covariance (n, n)."""
+
+    @abstractmethod
+    def predict(self) -> None:
+        """Brings the state from one epoch to the next: the parameters stay, the process noise comes on top."""
+
+    @abstractmethod
+    def points(self) -> Array:
+        """The states (points, n) at which this epoch's readings are wanted."""
+
+    @abstractmethod
+    def update(self, z: Array, h: Array, H: Array | None) -> bool:
+        """Takes in the readings z (m,), given h (points, m) and, for filters with slopes, dh/dx (m, n) at the points.
+
+        Returns False where the filter wants to be read again at new points before it is done with this epoch.
+        """
+
+
+@dataclass(frozen=True)
+class Sequential(Estimator):
+    """What all filters have in common. A new filter is a frozen dataclass that says how a trial's `Track` begins.
+
+    Reports filterpy's P, and as `extras["nis"]` the trial's squared innovations over their number: 1 on average where
+    the filter is consistent (`ipe_bench.consistency.mean_limits` has the limits).
+    """
+
+    prior_inflation: float = 1.0
+    """The filter's prior deviations over the scenario's: in life a prior is never exact."""
+    process_noise: float = 0.0
+    """Standard deviation of the parameters' random walk from one epoch to the next, in prior deviations (before
+    inflation). The parameters are constants, so anything above 0 makes the filter forget."""
+
+    needs: ClassVar[frozenset[Need]] = frozenset({"epochs", "prior"})
+    slopes: ClassVar[bool] = False
+    """True where `Track.update` wants dh/dx; then there is one point per trial."""
+
+    def __post_init__(self) -> None:
+        if not self.prior_inflation > 0:
+            raise UserError(f"prior_inflation={self.prior_inflation}: give a number above 0")
+        if not self.process_noise >= 0:
+            raise UserError(f"process_noise={self.process_noise}: give 0 or a number above")
+
+    @abstractmethod
+    def track(self, P0: Array, Q: Array, z: Array) -> Track:
+        """The filter of one trial before its first reading, at x = 0 with covariance P0 (n, n) and process noise Q
+        (n, n) per epoch. z (m,) are all readings of the trial: for a random stream that is the trial's own, and for
+        nothing else."""
+
+    def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
+        for need in self.missing(problem):
+            raise UserError(f"measurement={problem.measurement.name}: has no {need}, which a filter needs")
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            # SciPy warns of an ill-conditioned S, which R's smallness beside a wide prior explains.
+            warnings.simplefilter("ignore", LinAlgWarning)
+            return _Run(self, problem, z).estimates(history=history)
+
+
+class _Run:
+    """One batch on its way through the epochs."""
+
+    def __init__(self, filter: Sequential, problem: Problem, z: Array) -> None:
+        self.filter, self.problem, self.z = filter, problem, z
+        trials, n = len(z), problem.measurement.n
+        self.d = np.asarray(problem.prior_deviation, dtype=float)
+        self.tally = Tally.zeros(trials)
+        self.epochs = list(_arrivals(problem))
+        self.status = np.full(trials, Status.RUNNING, dtype=np.int8)
+        self.messages: dict[int, str] = {}
+        self.iterates = [[np.zeros(n)] for _ in range(trials)]
+        self.tracks: dict[int, Track] = {}
+        for i in range(trials):
+            if np.isfinite(z[i]).all():
+                self.attempt(i, self.begin)
+            else:
+                # filterpy would go on with x = NaN and no error.
+                row = int(np.flatnonzero(~np.isfinite(z[i]))[0])
+                self.end(i, Status.NONFINITE, f"reading {row + 1} is not a finite number")
+
+    @property
+    def going(self) -> list[int]:
+        return [int(i) for i in np.flatnonzero(self.status == Status.RUNNING)]
+
+    def begin(self, trial: int) -> None:
+        I = np.eye(self.problem.measurement.n)  # noqa: E741  the field's letter for the unit matrix
+        P0, Q = self.filter.prior_inflation**2 * I, self.filter.process_noise**2 * I
+        self.tracks[trial] = self.filter.track(P0, Q, self.z[trial])
+
+    def end(self, trial: int, status: Status, message: str | None = None) -> None:
+        self.status[trial] = status
+        if message:
+            self.messages[trial] = message
+
+    def attempt(self, trial: int, action: Callable[[int], Any]) -> Any:
+        """`action(trial)`; an exception ends this trial and no other."""
+        try:
+            return action(trial)
+        except np.linalg.LinAlgError as error:
+            self.end(trial, Status.SINGULAR, describe_exception(error))
+        except Exception as error:
+            self.end(trial, Status.ERROR, describe_exception(error))
+        return True
+
+    def estimates(self, *, history: bool) -> Estimates:
+        for epoch in self.epochs:
+            for trial in self.going:
+                self.attempt(trial, lambda t: self.tracks[t].predict())
+            waiting = self.going
+            while waiting:
+                waiting = self.advance(epoch, waiting)
+            for trial in self.going:
+                track = self.tracks[trial]
+                self.iterates[trial].append(track.x.copy())
+                if not (np.isfinite(track.x).all() and np.isfinite(track.P).all()):
+                    self.end(trial, Status.NONFINITE, f"the filter's state overflowed at epoch {epoch.number}")
+        for trial in self.going:
+            self.end(trial, Status.CONVERGED)
+        return self.collect(history=history)
+
+    def advance(self, epoch: _Epoch, waiting: list[int]) -> list[int]:
+        """Reads the model at the points of the waiting trials and hands each its share; returns who waits still."""
+        asked = {t: points for t in waiting if (points := self.attempt(t, lambda t: self.tracks[t].points())) is not True}
+        trials = np.array(list(asked), dtype=np.intp)
+        if not len(trials):
+            return []
+        s = np.stack(list(asked.values()))
+        x = self.problem.x0 + s * self.d
+        h, H = epoch.read(x, trials, self.tally, slopes=self.filter.slopes)
+        if H is not None:
+            H = H * self.d
+        again = []
+        for i, trial in enumerate(trials.tolist()):
+            if trial in self.tally.messages:
+                self.end(trial, Status.ERROR, self.tally.messages[trial])
+            elif not (np.isfinite(h[i]).all() and (H is None or np.isfinite(H[i]).all())):
+                self.end(trial, Status.NONFINITE, f"the model overflowed at epoch {epoch.number}")
+            else:
+                z = epoch.whitened(self.z[trial])
+                slope = None if H is None else H[i]
+                done = self.attempt(trial, lambda t, z=z, i=i, H=slope: self.tracks[t].update(z, h[i], H))
+                if not done:
+                    again.append(trial)
+        return again
+
+    def collect(self, *, history: bool) -> Estimates:
+        trials, n = len(self.z), self.problem.measurement.n
+        finished = self.status == Status.CONVERGED
+        covariance = np.full((trials, n, n), np.nan)
+        nis = np.full(trials, np.nan)
+        for trial in np.flatnonzero(finished):
+            track = self.tracks[int(trial)]
+            P = track.P * self.d * self.d[:, None]
+            covariance[trial] = (P + P.T) / 2
+            nis[trial] = track.nis / self.z.shape[1]
+        iterates = [self.problem.x0 + np.array(rows) * self.d for rows in self.iterates]
+        return Estimates(
+            x=np.array([rows[-1] for rows in iterates]).reshape(trials, n),
+            status=self.status,
+            covariance=covariance,
+            iterations=np.array([len(rows) - 1 for rows in iterates], dtype=np.int64),
+            simulations=self.tally.simulations,
+            jacobians=self.tally.jacobians,
+            messages=self.messages,
+            history=iterates if history else None,
+            extras={"nis": nis},
+        )
+
+
+@dataclass(frozen=True)
+class _Epoch:
+    """The readings that arrive together, as a model of their own that computes nothing later."""
+
+    number: int
+    model: Measurement
+    rows: NDArray[np.intp]
+    R: Covariance
+    share: float
+    """The cost of this model's readings over that of all."""
+
+    def whitened(self, z: Array) -> Array:
+        return self.R.whiten(z[self.rows])
+
+    def read(
+        self, x: Array, trials: NDArray[np.intp], tally: Tally, *, slopes: bool
+    ) -> tuple[Array, Array | None]:
+        """Whitened h (trials, points, m) at x (trials, points, n), and dh/dx (trials, m, n) where it is asked for."""
+        points, n = x.shape[1:]
+        model = Counted(self.model, tally, self.share * points)
+        pieces = np.array_split(np.arange(len(trials)), -(-len(trials) * points // _POINTS_AT_ONCE))
+        h = [self.R.whiten(model.simulate(x[p].reshape(-1, n), np.repeat(trials[p], points))) for p in pieces]
+        h = np.concatenate(h).reshape(len(trials), points, -1)
+        if not slopes:
+            return h, None
+        return h, np.concatenate([self.R.whiten_jacobian(model.jacobian(x[p, 0], trials[p])) for p in pieces])
+
+
+def _arrivals(problem: Problem) -> Iterator[_Epoch]:
+    """The epochs in order of arrival."""
+    model = problem.measurement
+    assert model.epochs is not None
+    # A model some of whose readings are missing is measured through the whole one, which can stop early.
+    whole, kept = (model.whole, np.array(model.kept)) if isinstance(model, Restricted) else (model, np.arange(model.m))
+    stop, arrived = 0, np.empty(0, dtype=np.intp)
+    assert whole.epochs is not None
+    for number, rows in enumerate(model.epochs, start=1):
+        rows = np.sort(rows)
+        while not np.isin(kept[rows], arrived).all():
+            stop += 1
+            arrived = whole.rows(stop)
+        _refuse_correlation(problem.R, rows)
+        part = Restricted(whole, tuple(kept[rows].tolist()), stop)
+        yield _Epoch(number, part, rows, problem.R.restricted(rows), stop / len(whole.epochs))
+
+
+def _refuse_correlation(R: Covariance, rows: NDArray[np.intp]) -> None:
+    if R.factor.ndim == 1:
+        return
+    across = R.matrix()[rows]
+    across[:, rows] = 0.0
+    if across.any():
+        raise UserError("noise: its errors are correlated between epochs, which a filter cannot use; choose a batch "
+                        "estimator")
+
+
+def squared_innovation(y: Array, S_inverse: Array) -> float:
+    """y' S^-1 y, as a row or as a column as filterpy has it: chi-square with m degrees where the filter is consistent
+    (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4)."""
+    y = y.ravel()
+    return float(y @ S_inverse @ y)
+
+
+def symmetric(P: Array) -> Array:
+    """(P + P') / 2: what rounding took from P - K S K'."""
+    return (P + P.T) / 2
+
+
+def in_turn(h: Array) -> Callable[[Any], Array]:
+    """A stand-in for hx: the rows of h one after another, since filterpy asks for its points in their order."""
+    rows = iter(h)
+    return lambda _: next(rows)
