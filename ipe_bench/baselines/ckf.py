@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric
+from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric, turned
 from ipe_bench.linalg import Array
 
 
@@ -23,7 +23,7 @@ class CKFTrack(Track):
 
     It takes moments as mean(X X') - x x', which loses what x is larger than its deviation, squared. So the filter's
     state is the distance from a reference that moves to the estimate after each epoch, and its readings are distances
-    from those at the points' mean: the same filter, with nothing to cancel.
+    from the points' mean: the same filter, with nothing to cancel.
     """
 
     def __init__(self, P0: Array, Q: Array) -> None:
@@ -55,11 +55,11 @@ class CKFTrack(Track):
 
     def update(self, z: Array, h: Array, H: Array | None) -> bool:
         f = self.filter
-        centre = h.mean(axis=0)
-        f.hx = in_turn(h - centre)
+        z, h = turned(z, h)
+        f.hx = in_turn(h)
         f.sigmas_h = np.empty_like(h)
         # A flat z would make x a matrix: filterpy's x is a column here.
-        f.update((z - centre)[:, None], R=np.eye(len(z)))
+        f.update(z[:, None], R=np.eye(len(z)))
         f.P = symmetric(f.P)
         self.nis += squared_innovation(f.y, f.SI)
         self.reference = self.reference + f.x[:, 0]

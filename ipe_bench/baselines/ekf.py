@@ -48,6 +48,14 @@ class EKFTrack(Track):
         return self.filter.x[None]
 
     def update(self, z: Array, h: Array, H: Array | None) -> bool:
-        self.filter.update(z, HJacobian=lambda _: H, Hx=lambda _: h[0], R=np.eye(len(z)))
+        assert H is not None
+        z, h, H = turned_by_slopes(z, h[0], H, self.filter.P)
+        self.filter.update(z, HJacobian=lambda _: H, Hx=lambda _: h, R=np.eye(len(z)))
         self.nis += squared_innovation(self.filter.y, self.filter.SI)
         return True
+
+
+def turned_by_slopes(z: Array, h: Array, H: Array, P: Array) -> tuple[Array, Array, Array]:
+    """White readings z and h (m,) and their slopes H (m, n) along the principal axes of H P H' (see `turned`)."""
+    axes = np.linalg.eigh(H @ P @ H.T)[1][:, ::-1].T
+    return axes @ z, axes @ h, axes @ H

@@ -10,7 +10,7 @@ from threading import Lock
 
 import numpy as np
 
-from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric
+from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric, turned
 from ipe_bench.errors import UserError
 from ipe_bench.linalg import Array
 
@@ -69,12 +69,13 @@ class EnKFTrack(Track):
 
     def update(self, z: Array, h: Array, H: Array | None) -> bool:
         f = self.filter
+        z, h = turned(z, h)
         f.hx = in_turn(h)
         f._mean_z = np.zeros(len(z))  # filterpy draws the perturbations about it; epochs differ in length
         with _drawing_from(self.stream):
             f.update(z, R=np.eye(len(z)))
         f.P = symmetric(f.P)
-        self.nis += squared_innovation(z - h.mean(axis=0), f.SI)
+        self.nis += squared_innovation(z, f.SI)  # the turned h has mean 0
         return True
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.baselines.ekf import EKFTrack
+from ipe_bench.baselines.ekf import EKFTrack, turned_by_slopes
 from ipe_bench.baselines.sequential import Sequential, squared_innovation
 from ipe_bench.errors import UserError
 from ipe_bench.linalg import Array
@@ -52,7 +52,8 @@ class IteratedEKFTrack(EKFTrack):
         f, at = self.filter, self.filter.x
         f.x, f.P = f.x_prior, f.P_prior
         # What the readings linearised at the last estimate say at the prior mean.
-        f.update(z, HJacobian=lambda _: H, Hx=lambda x: h[0] + H @ (x - at), R=np.eye(len(z)))
+        z, h, H = turned_by_slopes(z, h[0] + H @ (f.x - at), H, f.P)
+        f.update(z, HJacobian=lambda _: H, Hx=lambda _: h, R=np.eye(len(z)))
         self.iteration += 1
         if self.iteration == 1:
             # The innovation of the prediction; later ones have seen z.

@@ -274,6 +274,17 @@ def squared_innovation(y: Array, S_inverse: Array) -> float:
     return float(y @ S_inverse @ y)
 
 
+def turned(z: Array, h: Array) -> tuple[Array, Array]:
+    """The readings z (m,) and h (points, m) less the points' mean, along the principal axes of the points' spread.
+
+    White readings stay white when turned, and the filter is the same; but S is then close to diagonal, so its inverse
+    and P - K S K' keep their digits where a wide prior makes S as ill-conditioned as 1e10.
+    """
+    centre = h.mean(axis=0)
+    axes = np.linalg.svd(h - centre, full_matrices=len(h) < len(z))[2]
+    return axes @ (z - centre), (h - centre) @ axes.T
+
+
 def symmetric(P: Array) -> Array:
     """(P + P') / 2: what rounding took from P - K S K'."""
     return (P + P.T) / 2

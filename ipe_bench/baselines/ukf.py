@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric
+from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric, turned
 from ipe_bench.errors import UserError
 from ipe_bench.linalg import Array
 
@@ -69,6 +69,7 @@ class UKFTrack(Track):
 
     def update(self, z: Array, h: Array, H: Array | None) -> bool:
         f = self.filter
+        z, h = turned(z, h)
         f.update(z, R=np.eye(len(z)), hx=in_turn(h))
         f.P = symmetric(f.P)
         self.nis += squared_innovation(f.y, f.SI)
