@@ -4,7 +4,8 @@ from ipe_bench.baselines.ckf import CKF
 from ipe_bench.baselines.ekf import EKF
 from ipe_bench.baselines.enkf import EnKF
 from ipe_bench.baselines.iterated_ekf import IteratedEKF
+from ipe_bench.baselines.least_squares import LeastSquares
 from ipe_bench.baselines.linear_lse import LinearLSE
 from ipe_bench.baselines.ukf import UKF
 
-__all__ = ["CKF", "EKF", "UKF", "EnKF", "IteratedEKF", "LinearLSE"]
+__all__ = ["CKF", "EKF", "UKF", "EnKF", "IteratedEKF", "LeastSquares", "LinearLSE"]
