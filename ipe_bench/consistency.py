@@ -14,8 +14,8 @@ from scipy.stats import beta, chi2, norm
 
 from ipe_bench.linalg import Array, solve
 
-GATE = 1 - 1e-6
-"""The quantile of chi-square beyond which a trial lies outside what its estimator reports."""
+GATE = 1e-6
+"""A trial lies outside what its estimator reports where chance would put this share of trials."""
 TOLERATED = 0.01
 """Share of trials outside their own gate above which an estimator is named diverged but confident."""
 
@@ -23,21 +23,22 @@ Verdict = Literal["consistent", "pessimistic", "optimistic", "diverged but confi
 
 
 def nees(error: Array, P: Array) -> Array:
-    """The normalised estimation error squared e' P^-1 e / n of each trial (trials,): 1 on average where P is right.
+    """The normalised estimation error squared e' P^-1 e of each trial (trials,): chi-square with n degrees where the
+    reported P is right.
 
-    error (trials, n) and the reported covariance P (trials, n, n). Infinite where a finite P is singular and the error
-    is not 0 or where the error is not finite; NaN where no P is reported.
+    error (trials, n) and P (trials, n, n). Infinite where P is no covariance (not positive definite) or the error is
+    not finite; NaN where no P is reported.
     """
-    n = error.shape[1]
-    # Scaled by the deviations first: parameters' units must not decide what is singular.
-    deviation = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-    with np.errstate(all="ignore"):
-        e, C = error / deviation, P / (deviation[:, :, None] * deviation[:, None, :])
-        x, unsolved = solve(C, np.where(np.isfinite(e), e, 0.0))
-        value = np.einsum("ti,ti->t", e, x) / n
     reported = np.isfinite(P).all(axis=(1, 2))
-    value = np.where(unsolved | ~np.isfinite(value) | (value < 0), np.inf, value)
-    return np.where(reported, value, np.nan)
+    with np.errstate(all="ignore"):
+        # Scaled by the deviations first: parameters' units must not decide what is singular.
+        deviation = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+        e, C = error / deviation, P / (deviation[:, :, None] * deviation[:, None, :])
+    usable = np.isfinite(e).all(axis=1) & np.isfinite(C).all(axis=(1, 2))
+    C = np.where(usable[:, None, None], C, np.eye(error.shape[1]))
+    x, singular = solve(C, np.where(usable[:, None], e, 0.0))
+    usable &= ~singular & (np.linalg.eigvalsh(C)[:, 0] > 0)
+    return np.where(reported, np.where(usable, np.einsum("ti,ti->t", e, x), np.inf), np.nan)
 
 
 def mean_limits(degrees: float, trials: int, level: float = 0.95) -> tuple[float, float]:
@@ -45,14 +46,14 @@ def mean_limits(degrees: float, trials: int, level: float = 0.95) -> tuple[float
 
     NEES has n degrees per trial, NIS as many as the trial has readings.
     """
-    if trials < 1:
+    if trials < 1 or degrees < 1:
         return np.nan, np.nan
     tail = (1 - level) / 2
     low, high = chi2.ppf([tail, 1 - tail], degrees * trials) / (degrees * trials)
     return float(low), float(high)
 
 
-def share_limits(count: int, trials: int, level: float = 0.95) -> tuple[float, float]:
+def clopper_pearson(count: int, trials: int, level: float = 0.95) -> tuple[float, float]:
     """Clopper-Pearson limits of a probability of which `count` in `trials` was seen."""
     if trials < 1:
         return np.nan, np.nan
@@ -68,7 +69,7 @@ def coverage(error: Array, deviation: Array, level: float = 0.95) -> tuple[Array
     with np.errstate(invalid="ignore"):
         inside = np.abs(error) <= norm.ppf((1 + level) / 2) * deviation
     counts = inside.sum(axis=0)
-    limits = np.array([share_limits(int(count), len(error)) for count in counts]).reshape(-1, 2)
+    limits = np.array([clopper_pearson(int(count), len(error)) for count in counts]).reshape(-1, 2)
     return counts / max(1, len(error)), limits.T
 
 
@@ -77,7 +78,7 @@ class Consistency:
     """What an estimator's own covariance is worth, over the trials in which it reported one."""
 
     trials: int
-    """Trials with a finite estimate and covariance."""
+    """Trials in which it reported one."""
     nees: float
     """Mean NEES over n."""
     nees_low: float
@@ -105,25 +106,22 @@ class Consistency:
         return "pessimistic" if self.nees < self.nees_low else "consistent"
 
 
-def assess(error: Array, P: Array, *, nis: Array | None = None, readings: int = 0, level: float = 0.95) -> Consistency:
-    """Compares errors (trials, n) with the covariances (trials, n, n) reported beside them.
+def assess(nees: Array, n: int, *, nis: Array | None = None, readings: int = 0, level: float = 0.95) -> Consistency:
+    """Judges an estimator of n parameters by the NEES (trials,) of its trials, as `nees` returns them.
 
-    `nis` (trials,) is the NIS over the number of `readings`, of filters. Trials that reported no covariance, or ended
-    without a finite estimate, made no claim and are left out; statuses tell of them.
+    `nis` (trials,) is the NIS over the number of `readings`, as filters report it. A trial whose NEES is NaN made no
+    claim and is left out; its status tells of it.
     """
-    n = error.shape[1]
-    claimed = np.isfinite(error).all(axis=1) & np.isfinite(P).all(axis=(1, 2))
-    values = nees(error[claimed], P[claimed])
-    trials = len(values)
-    beyond = int(np.sum(values > chi2.ppf(GATE, n) / n))
-    limits = mean_limits(n, trials, level)
-    shares = share_limits(beyond, trials, level)
-    mean = float(values.mean()) if trials else np.nan
-    nis_mean, nis_limits = np.nan, (np.nan, np.nan)
-    if nis is not None and readings:
-        known = nis[np.isfinite(nis)]
-        nis_mean = float(known.mean()) if len(known) else np.nan
-        nis_limits = mean_limits(readings, len(known), level)
+    claims = nees[~np.isnan(nees)]
+    trials = len(claims)
+    beyond = int(np.sum(claims > chi2.isf(GATE, n)))
+    nis = np.empty(0) if nis is None else nis[np.isfinite(nis)]
     return Consistency(
-        trials, mean, *limits, beyond / trials if trials else np.nan, *shares, nis_mean, nis_limits[0], nis_limits[1]
+        trials,
+        float(claims.mean() / n) if trials else np.nan,
+        *mean_limits(n, trials, level),
+        beyond / trials if trials else np.nan,
+        *clopper_pearson(beyond, trials, level),
+        float(nis.mean()) if len(nis) else np.nan,
+        *mean_limits(readings, len(nis), level),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,7 @@ class CKFTrack(Track):
 
         n = len(P0)
         self.reference = np.zeros(n)
-        self.filter = CubatureKalmanFilter(dim_x=n, dim_z=1, dt=1.0, hx=None, fx=lambda x, dt: x)
+        self.filter: Any = CubatureKalmanFilter(dim_x=n, dim_z=1, dt=1.0, hx=None, fx=lambda x, dt: x)
         self.filter.x, self.filter.P, self.filter.Q = np.zeros((n, 1)), P0, Q
 
     @property

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from threading import Lock
+from typing import Any
 
 import numpy as np
 
@@ -49,7 +50,7 @@ class EnKFTrack(Track):
         self.stream = stream
         with _drawing_from(stream):
             x = np.zeros(len(P0))
-            self.filter = EnsembleKalmanFilter(x=x, P=P0, dim_z=1, dt=1.0, N=members, hx=None, fx=lambda x, dt: x)
+            self.filter: Any = EnsembleKalmanFilter(x=x, P=P0, dim_z=1, dt=1.0, N=members, hx=None, fx=lambda x, dt: x)
         self.filter.Q = Q
 
     @property
@@ -85,11 +86,12 @@ _GLOBAL_STATE = Lock()
 @contextmanager
 def _drawing_from(stream: np.random.BitGenerator) -> Iterator[None]:
     """Lends NumPy's global generator, which filterpy draws from, another stream, and puts back what was there."""
+    shared: Any = np.random  # NumPy's stubs do not know the two functions below
     with _GLOBAL_STATE:
-        generator, state = np.random.get_bit_generator(), np.random.get_state(legacy=False)  # noqa: NPY002
-        np.random.set_bit_generator(stream)
+        generator, state = shared.get_bit_generator(), shared.get_state(legacy=False)
+        shared.set_bit_generator(stream)
         try:
             yield
         finally:
-            np.random.set_bit_generator(generator)
-            np.random.set_state(state)  # noqa: NPY002
+            shared.set_bit_generator(generator)
+            shared.set_state(state)

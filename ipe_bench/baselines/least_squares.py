@@ -45,8 +45,8 @@ class LeastSquares(Estimator):
     max_nfev: int | None = None
     """Evaluations of h after which the trial ends as max_iterations; None: SciPy's limit, 100 n."""
     tolerance: float = 1e-4
-    """Largest Gauss-Newton step still to go, in reported deviations, of a converged trial. SciPy cannot get below about 1e-5: it watches the
-    cost, which is flat there."""
+    """Largest Gauss-Newton step still to go, in reported deviations, of a converged trial. SciPy cannot promise less
+    than about 1e-5: it watches the cost, which is flat there."""
 
     def __post_init__(self) -> None:
         for key, choices in (("method", _METHODS), ("start", _STARTS), ("loss", _LOSSES)):
@@ -87,6 +87,7 @@ class LeastSquares(Estimator):
         """One trial, as a batch of one."""
         from scipy.optimize import least_squares
 
+        jacobian: Any = residuals.J  # SciPy's stubs know its finite differences only
         x, status, message, covariance = residuals.start, Status.ERROR, None, None
         try:
             if not np.isfinite(residuals.r(x)).all():
@@ -95,7 +96,7 @@ class LeastSquares(Estimator):
                 found = least_squares(
                     residuals.r,
                     x,
-                    residuals.J,
+                    jac=jacobian,
                     method=self.method,
                     ftol=self.ftol,
                     xtol=self.xtol,

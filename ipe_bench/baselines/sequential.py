@@ -164,7 +164,9 @@ class _Run:
 
     def advance(self, epoch: _Epoch, waiting: list[int]) -> list[int]:
         """Reads the model at the points of the waiting trials and hands each its share; returns who waits still."""
-        asked = {t: points for t in waiting if (points := self.attempt(t, lambda t: self.tracks[t].points())) is not True}
+        asked = {
+            t: points for t in waiting if (points := self.attempt(t, lambda t: self.tracks[t].points())) is not True
+        }
         trials = np.array(list(asked), dtype=np.intp)
         if not len(trials):
             return []
@@ -225,9 +227,7 @@ class _Epoch:
     def whitened(self, z: Array) -> Array:
         return self.R.whiten(z[self.rows])
 
-    def read(
-        self, x: Array, trials: NDArray[np.intp], tally: Tally, *, slopes: bool
-    ) -> tuple[Array, Array | None]:
+    def read(self, x: Array, trials: NDArray[np.intp], tally: Tally, *, slopes: bool) -> tuple[Array, Array | None]:
         """Whitened h (trials, points, m) at x (trials, points, n), and dh/dx (trials, m, n) where it is asked for."""
         points, n = x.shape[1:]
         model = Counted(self.model, tally, self.share * points)
@@ -263,8 +263,9 @@ def _refuse_correlation(R: Covariance, rows: NDArray[np.intp]) -> None:
     across = R.matrix()[rows]
     across[:, rows] = 0.0
     if across.any():
-        raise UserError("noise: its errors are correlated between epochs, which a filter cannot use; choose a batch "
-                        "estimator")
+        raise UserError(
+            "noise: its errors are correlated between epochs, which a filter cannot use; choose a batch estimator"
+        )
 
 
 def squared_innovation(y: Array, S_inverse: Array) -> float:
