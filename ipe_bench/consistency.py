@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from scipy.stats import beta, chi2, norm
 
-from ipe_bench.linalg import Array, solve
+from ipe_bench.linalg import Array, Mask, solve
 
 GATE = 1e-6
 """A trial lies outside what its estimator reports where chance would put this share of trials."""
@@ -34,10 +34,10 @@ def nees(error: Array, P: Array) -> Array:
         # Scaled by the deviations first: parameters' units must not decide what is singular.
         deviation = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
         e, C = error / deviation, P / (deviation[:, :, None] * deviation[:, None, :])
-    usable = np.isfinite(e).all(axis=1) & np.isfinite(C).all(axis=(1, 2))
+    usable: Mask = np.asarray(np.isfinite(e).all(axis=1) & np.isfinite(C).all(axis=(1, 2)))
     C = np.where(usable[:, None, None], C, np.eye(error.shape[1]))
     x, singular = solve(C, np.where(usable[:, None], e, 0.0))
-    usable &= ~singular & (np.linalg.eigvalsh(C)[:, 0] > 0)
+    usable = usable & ~singular & (np.linalg.eigvalsh(C)[:, 0] > 0)
     return np.where(reported, np.where(usable, np.einsum("ti,ti->t", e, x), np.inf), np.nan)
 
 

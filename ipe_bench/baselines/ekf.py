@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.baselines.sequential import Sequential, Track, squared_innovation
+from ipe_bench.baselines.sequential import Sequential, Track, refuse_overflow, squared_innovation
 from ipe_bench.linalg import Array
 
 
@@ -57,5 +57,7 @@ class EKFTrack(Track):
 
 def turned_by_slopes(z: Array, h: Array, H: Array, P: Array) -> tuple[Array, Array, Array]:
     """White readings z and h (m,) and their slopes H (m, n) along the principal axes of H P H' (see `turned`)."""
-    axes = np.linalg.eigh(H @ P @ H.T)[1][:, ::-1].T
+    S = H @ P @ H.T
+    refuse_overflow(S)
+    axes = np.linalg.eigh(S)[1][:, ::-1].T
     return axes @ z, axes @ h, axes @ H

@@ -27,6 +27,7 @@ from ipe_bench.statuses import Status
 
 _POINTS_AT_ONCE = 8192
 """Points of one call of the model: bounds the memory that a large ensemble takes."""
+_LARGEST = 1e150
 
 
 class Track(ABC):
@@ -81,9 +82,9 @@ class Sequential(Estimator):
     """True where `Track.update` wants dh/dx; then there is one point per trial."""
 
     def __post_init__(self) -> None:
-        if not self.prior_inflation > 0:
+        if not 0 < self.prior_inflation < np.inf:
             raise UserError(f"prior_inflation={self.prior_inflation}: give a number above 0")
-        if not self.process_noise >= 0:
+        if not 0 <= self.process_noise < np.inf:
             raise UserError(f"process_noise={self.process_noise}: give 0 or a number above")
 
     @abstractmethod
@@ -137,14 +138,16 @@ class _Run:
             self.messages[trial] = message
 
     def attempt(self, trial: int, action: Callable[[int], Any]) -> Any:
-        """`action(trial)`; an exception ends this trial and no other."""
+        """`action(trial)`; an exception ends this trial and no other, and the result is None."""
         try:
             return action(trial)
         except np.linalg.LinAlgError as error:
             self.end(trial, Status.SINGULAR, describe_exception(error))
+        except OverflowError as error:
+            self.end(trial, Status.NONFINITE, describe_exception(error))
         except Exception as error:
             self.end(trial, Status.ERROR, describe_exception(error))
-        return True
+        return None
 
     def estimates(self, *, history: bool) -> Estimates:
         for epoch in self.epochs:
@@ -164,13 +167,12 @@ class _Run:
 
     def advance(self, epoch: _Epoch, waiting: list[int]) -> list[int]:
         """Reads the model at the points of the waiting trials and hands each its share; returns who waits still."""
-        asked = {
-            t: points for t in waiting if (points := self.attempt(t, lambda t: self.tracks[t].points())) is not True
-        }
-        trials = np.array(list(asked), dtype=np.intp)
-        if not len(trials):
+        wanted = {t: self.attempt(t, lambda t: self.tracks[t].points()) for t in waiting}
+        wanted = {t: points for t, points in wanted.items() if points is not None}
+        if not wanted:
             return []
-        s = np.stack(list(asked.values()))
+        trials = np.array(list(wanted), dtype=np.intp)
+        s = np.stack(list(wanted.values()))
         x = self.problem.x0 + s * self.d
         h, H = epoch.read(x, trials, self.tally, slopes=self.filter.slopes)
         if H is not None:
@@ -185,7 +187,7 @@ class _Run:
                 z = epoch.whitened(self.z[trial])
                 slope = None if H is None else H[i]
                 done = self.attempt(trial, lambda t, z=z, i=i, H=slope: self.tracks[t].update(z, h[i], H))
-                if not done:
+                if done is False:
                     again.append(trial)
         return again
 
@@ -231,12 +233,15 @@ class _Epoch:
         """Whitened h (trials, points, m) at x (trials, points, n), and dh/dx (trials, m, n) where it is asked for."""
         points, n = x.shape[1:]
         model = Counted(self.model, tally, self.share * points)
-        pieces = np.array_split(np.arange(len(trials)), -(-len(trials) * points // _POINTS_AT_ONCE))
+        count = min(len(trials), -(-len(trials) * points // _POINTS_AT_ONCE))
+        pieces = np.array_split(np.arange(len(trials)), count)
         h = [self.R.whiten(model.simulate(x[p].reshape(-1, n), np.repeat(trials[p], points))) for p in pieces]
-        h = np.concatenate(h).reshape(len(trials), points, -1)
+        # In C order whatever the model returned: BLAS rounds otherwise where the strides are other.
+        h = np.ascontiguousarray(np.concatenate(h)).reshape(len(trials), points, -1)
         if not slopes:
             return h, None
-        return h, np.concatenate([self.R.whiten_jacobian(model.jacobian(x[p, 0], trials[p])) for p in pieces])
+        H = [self.R.whiten_jacobian(model.jacobian(x[p, 0], trials[p])) for p in pieces]
+        return h, np.ascontiguousarray(np.concatenate(H))
 
 
 def _arrivals(problem: Problem) -> Iterator[_Epoch]:
@@ -282,8 +287,16 @@ def turned(z: Array, h: Array) -> tuple[Array, Array]:
     and P - K S K' keep their digits where a wide prior makes S as ill-conditioned as 1e10.
     """
     centre = h.mean(axis=0)
-    axes = np.linalg.svd(h - centre, full_matrices=len(h) < len(z))[2]
-    return axes @ (z - centre), (h - centre) @ axes.T
+    spread = h - centre
+    refuse_overflow(spread)
+    axes = np.linalg.svd(spread, full_matrices=len(h) < len(z))[2]
+    return axes @ (z - centre), spread @ axes.T
+
+
+def refuse_overflow(a: Array) -> None:
+    """LAPACK need not come back from an infinite matrix, and a filter needs the squares of what it is given."""
+    if not np.abs(a).max() < _LARGEST:
+        raise OverflowError("what the filter is to take in is beyond the range of numbers")
 
 
 def symmetric(P: Array) -> Array:

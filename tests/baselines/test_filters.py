@@ -1,0 +1,343 @@
+"""The filters against closed forms, against the batch answer on GINS, and against themselves one trial at a time."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from linear_models import Linear, LinearGins, linear_map
+from scipy.stats import chi2
+
+from ipe_bench.baselines import CKF, EKF, UKF, EnKF, IteratedEKF
+from ipe_bench.baselines.ekf import EKFTrack
+from ipe_bench.baselines.sequential import Sequential
+from ipe_bench.consistency import mean_limits, nees
+from ipe_bench.errors import UserError
+from ipe_bench.linalg import Covariance, information, inverse, multiply, quadratic_form
+from ipe_bench.measurements.base import Restricted
+from ipe_bench.measurements.gins import Gins
+from ipe_bench.noise import Gaussian, Quantization
+from ipe_bench.prior import Gaussian as Prior
+from ipe_bench.scenario import Problem, Scenario
+from ipe_bench.statuses import Status
+
+FILTERS: list[Sequential] = [EKF(), IteratedEKF(), UKF(), CKF(), EnKF(members=30)]
+KALMAN = [f for f in FILTERS if not isinstance(f, EnKF)]
+FOOT = 0.3048
+
+
+def label(estimator: object) -> str:
+    return type(estimator).__name__
+
+
+def deviations(P):
+    return np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
+
+
+def gins(scale: float, trials: int, seed: int = 0):
+    scenario = Scenario(Gins(), Quantization(0.075 * FOOT), Prior(), scale, seed)
+    return scenario.problem, scenario.draw(0, trials)
+
+
+def maximum_a_posteriori(problem: Problem, z, x):
+    """The MAP of each trial and its covariance, by Gauss-Newton from x."""
+    assert problem.prior_deviation is not None
+    P0_inverse = np.diag(problem.prior_deviation**-2.0)
+    for _ in range(8):
+        J = problem.R.whiten_jacobian(problem.measurement.jacobian(x))
+        r = problem.R.whiten(z - problem.measurement.simulate(x))
+        P = inverse(np.matmul(J.swapaxes(1, 2), J) + P0_inverse)[0]
+        gradient = multiply(J.swapaxes(1, 2), r) - multiply(P0_inverse, x - problem.x0)
+        x = x + multiply(P, gradient)
+    assert np.all(np.abs(multiply(P, gradient)) < 1e-6 * deviations(P))
+    return x, P
+
+
+# Against closed forms
+
+
+@pytest.mark.parametrize("scale", [1.0, 10.0])
+@pytest.mark.parametrize(
+    ("estimator", "apart"), [(EKF(), 1e-8), (IteratedEKF(), 1e-8), (UKF(), 1e-6), (CKF(), 1e-6)], ids=str
+)
+@pytest.mark.parametrize("model", [Linear(), LinearGins()], ids=label)
+def test_on_a_linear_model_a_filter_is_the_batch_map(model, estimator, apart, scale):
+    scenario = Scenario(model, Gaussian(0.0066), Prior(), scale)
+    problem, trials = scenario.problem, scenario.draw(0, 5)
+    x, P = linear_map(problem, model.matrix, trials.z)
+    found = estimator.estimate(problem, trials.z)
+    assert (found.status == Status.CONVERGED).all()
+    assert np.abs((found.x - x) / deviations(P)).max() < apart
+    assert np.abs((found.covariance - P) / np.outer(deviations(P), deviations(P))).max() < apart
+
+
+@pytest.mark.parametrize("estimator", KALMAN, ids=label)
+def test_inflation_widens_the_prior(estimator):
+    scenario = Scenario(Linear(), Gaussian(1.0), Prior(), 0.5)
+    problem, trials = scenario.problem, scenario.draw(0, 3)
+    x, P = linear_map(problem, Linear().matrix, trials.z, inflation=3.0)
+    found = replace(estimator, prior_inflation=3.0).estimate(problem, trials.z)
+    assert found.x == pytest.approx(x, abs=1e-8)
+    assert found.covariance[0] == pytest.approx(P, abs=1e-8)
+
+
+@pytest.mark.parametrize("estimator", KALMAN, ids=label)
+def test_process_noise_is_added_before_each_epoch(estimator):
+    """Two readings of one constant that walks: the scalar Kalman filter by hand."""
+    model = Linear(sizes=(1, 1, 1), unknowns=2)
+    d, q, R = 2.0, 0.3, 0.5**2
+    problem = Problem(model, Covariance(np.full(3, np.sqrt(R))), np.full(2, d))
+    z = np.array([[1.0, -2.0, 4.0]])
+    x, P = problem.x0, np.eye(2) * d**2
+    for (row,) in model.epochs:
+        P = P + np.eye(2) * (q * d) ** 2
+        H = model.matrix[[row]]
+        K = P @ H.T / (H @ P @ H.T + R)
+        x, P = x + K @ (z[0, [row]] - H @ x), P - K @ H @ P
+    found = replace(estimator, process_noise=q).estimate(problem, z)
+    assert found.x[0] == pytest.approx(x, abs=1e-9)
+    assert found.covariance[0] == pytest.approx(P, abs=1e-9)
+
+
+def test_ensemble_tends_to_the_kalman_filter():
+    scenario = Scenario(Linear(), Gaussian(1.0), Prior(), 1.0)
+    problem, trials = scenario.problem, scenario.draw(0, 4)
+    x, P = linear_map(problem, Linear().matrix, trials.z)
+    apart = []
+    for members in (100, 6400):
+        found = EnKF(members=members).estimate(problem, trials.z)
+        apart.append(np.sqrt(np.mean(((found.x - x) / deviations(P)) ** 2)))
+    assert apart[1] < 5 / np.sqrt(6400)
+    assert apart[1] < apart[0] / 2
+
+
+@pytest.mark.parametrize("estimator", FILTERS, ids=label)
+def test_readings_correlated_within_an_epoch(estimator):
+    model = Linear(sizes=(3, 4), unknowns=2)
+    R = np.eye(7)
+    for rows in model.epochs:
+        R[np.ix_(rows, rows)] += 0.8
+    problem = Problem(model, Covariance(np.linalg.cholesky(R)), np.ones(2))
+    z = np.linspace(-2.0, 3.0, 7)[None]
+    x, P = linear_map(problem, model.matrix, z)
+    found = (replace(estimator, members=4000) if isinstance(estimator, EnKF) else estimator).estimate(problem, z)
+    apart = 0.1 if isinstance(estimator, EnKF) else 1e-9
+    assert np.abs((found.x[0] - x[0]) / deviations(P)).max() < apart
+
+
+def test_readings_correlated_between_epochs_are_refused():
+    model = Linear(sizes=(3, 4), unknowns=2)
+    problem = Problem(model, Covariance(np.linalg.cholesky(np.eye(7) + 0.1)), np.ones(2))
+    with pytest.raises(UserError, match="correlated between epochs"):
+        EKF().estimate(problem, np.zeros((1, 7)))
+
+
+@pytest.mark.parametrize("estimator", FILTERS, ids=label)
+def test_nis_is_chi_square_on_a_linear_model(estimator):
+    """The innovations of a Kalman filter are white, so their squares over m have the limits of chi-square."""
+    model = Linear()
+    scenario = Scenario(model, Gaussian(0.7), Prior(), 1.0)
+    found = estimator.estimate(scenario.problem, scenario.draw(0, 200).z)
+    low, high = mean_limits(model.m, 200, 0.999)
+    if isinstance(estimator, EnKF):  # 30 members make a poor S
+        low, high = 0.8 * low, 1.2 * high
+    assert low < found.extras["nis"].mean() < high
+
+
+# On GINS
+
+
+@pytest.mark.parametrize("estimator", KALMAN, ids=label)
+def test_gins_at_scale_10_is_near_the_map_and_consistent(estimator):
+    problem, trials = gins(10.0, 80)
+    x, P = maximum_a_posteriori(problem, trials.z, trials.x)
+    found = estimator.estimate(problem, trials.z)
+    assert np.sqrt(np.mean(((found.x - x) / deviations(P)) ** 2)) < 0.02
+    low, high = mean_limits(11, 80, 0.999)
+    assert low < nees(found.x - trials.x, found.covariance).mean() / 11 < high
+    low, high = mean_limits(240, 80, 0.999)
+    assert low < found.extras["nis"].mean() < high
+
+
+def success(estimator, problem, trials):
+    """The share of trials inside the gate of the Bayesian bound."""
+    J = problem.measurement.jacobian(trials.x)
+    bound = information(J, problem.R) + np.diag(problem.prior_deviation**-2.0)
+    found = estimator.estimate(problem, trials.z)
+    return np.mean(quadratic_form(bound, found.x - trials.x) <= chi2.isf(1e-6, 11))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scale", "extended", "iterated"),
+    [(300.0, (0.32, 0.45), (0.99, 1.0)), (600.0, (0.02, 0.08), (0.93, 1.0)), (1000.0, (0.0, 0.03), (0.72, 0.9))],
+)
+def test_where_linearising_once_fails_and_iterating_holds(scale, extended, iterated):
+    problem, trials = gins(scale, 400)
+    assert extended[0] <= success(EKF(), problem, trials) <= extended[1]
+    assert iterated[0] <= success(IteratedEKF(), problem, trials) <= iterated[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("estimator", "seconds"), [(EKF(), 20.0), (UKF(), 30.0)], ids=["ekf", "ukf"])
+def test_a_thousand_gins_trials_in_time(estimator, seconds):
+    problem, trials = gins(10.0, 1000)
+    began = time.perf_counter()
+    found = estimator.estimate(problem, trials.z)
+    assert time.perf_counter() - began < seconds
+    assert (found.status == Status.CONVERGED).all()
+
+
+# The contract
+
+
+@pytest.mark.parametrize("estimator", FILTERS, ids=label)
+def test_a_batch_is_its_trials_one_by_one_bit_for_bit(estimator):
+    model = Gins(readings_per_case=4)
+    scenario = Scenario(model, Quantization(0.075 * FOOT), Prior(), 30.0)
+    problem, z = scenario.problem, scenario.draw(0, 7).z
+    together = estimator.estimate(problem, z, history=True)
+    assert together.history is not None
+    for i in range(len(z)):
+        alone = estimator.estimate(problem, z[[i]], history=True)
+        assert alone.history is not None
+        for name in ("x", "status", "covariance", "iterations", "simulations", "jacobians"):
+            assert np.array_equal(getattr(alone, name)[0], getattr(together, name)[i], equal_nan=True), name
+        assert alone.extras["nis"][0] == together.extras["nis"][i]
+        assert np.array_equal(alone.history[0], together.history[i])
+
+
+@pytest.mark.parametrize("estimator", FILTERS, ids=label)
+def test_history_holds_the_estimate_after_each_epoch(estimator):
+    scenario = Scenario(Linear(), Gaussian(1.0), Prior(), 1.0)
+    found = estimator.estimate(scenario.problem, scenario.draw(0, 3).z, history=True)
+    assert (found.iterations == 4).all()
+    for x, rows in zip(found.x, found.history, strict=True):
+        assert rows.shape == (5, 4)
+        assert np.array_equal(rows[0], Linear().nominal)
+        assert np.array_equal(rows[-1], x)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "simulations", "jacobians"),
+    [(EKF(), 1, 1), (IteratedEKF(), 2, 2), (UKF(), 9, 0), (CKF(), 8, 0), (EnKF(members=30), 30, 0)],
+    ids=label,
+)
+def test_a_prefix_costs_its_share(estimator, simulations, jacobians):
+    """(1 + 2 + 3 + 4) / 4 evaluations per point. On a linear model the iterated EKF looks twice, to see it is done."""
+    scenario = Scenario(Linear(), Gaussian(1.0), Prior(), 1.0)
+    found = estimator.estimate(scenario.problem, scenario.draw(0, 3).z)
+    assert found.simulations == pytest.approx(2.5 * simulations)
+    assert found.jacobians == pytest.approx(2.5 * jacobians)
+
+
+@pytest.mark.parametrize("kept", [tuple(range(11)), (0, 2, 3, 5, 6, 7, 9)], ids=["all readings", "some missing"])
+def test_nothing_is_computed_beyond_the_epoch_at_hand(kept):
+    whole = Linear()
+    model = whole if len(kept) == whole.m else Restricted(whole, kept)
+    problem = Problem(model, Covariance(np.ones(model.m)), np.ones(4))
+    z = np.random.default_rng(1).standard_normal((2, model.m))
+    found = UKF().estimate(problem, z)
+    assert whole.stops == [k for k, rows in enumerate(whole.epochs, start=1) if set(rows) & set(kept)]
+    x, _ = linear_map(problem, whole.matrix[list(kept)], z)
+    assert found.x == pytest.approx(x, abs=1e-9)
+
+
+@dataclass(frozen=True)
+class Fragile(Linear):
+    """Raises above 1e6 and overflows below -1e6."""
+
+    def simulate_until(self, x, stop):
+        if (x[:, 0] > 1e6).any():
+            raise FloatingPointError("too far")
+        h = super().simulate_until(x, stop)
+        h[x[:, 0] < -1e6] = np.inf
+        return h
+
+
+@dataclass(frozen=True)
+class Brittle(EKF):
+    """Its matrices are singular where the first reading is 7."""
+
+    def track(self, P0, Q, z):
+        return BrittleTrack(P0, Q) if z[0] == 7.0 else super().track(P0, Q, z)
+
+
+class BrittleTrack(EKFTrack):
+    def update(self, z, h, H):
+        raise np.linalg.LinAlgError("singular matrix")
+
+
+@pytest.mark.parametrize("estimator", [*FILTERS, Brittle()], ids=label)
+def test_a_trial_that_fails_has_a_status_and_disturbs_no_other(estimator):
+    model = Fragile()
+    problem = Problem(model, Covariance(np.ones(model.m)), np.ones(4))
+    good = np.random.default_rng(1).standard_normal((2, model.m))
+    raising = (model.matrix @ [1e8, 0, 0, 0])[None]
+    missing = good[[0]].copy()
+    missing[0, 4] = np.nan
+    rows = [good[[0]], raising, -raising, missing, good[[1]]]
+    expected = [Status.CONVERGED, Status.ERROR, Status.NONFINITE, Status.NONFINITE, Status.CONVERGED]
+    if isinstance(estimator, Brittle):
+        good[1, 0] = 7.0
+        rows[-1], expected[-1] = good[[1]], Status.SINGULAR
+    found = estimator.estimate(problem, np.concatenate(rows))
+    assert [Status(s) for s in found.status] == expected
+    assert found.messages[1] == "FloatingPointError: too far"
+    assert found.messages[3] == "reading 5 is not a finite number"
+    assert set(found.messages) == {i for i, s in enumerate(expected) if s != Status.CONVERGED}
+    for i in np.flatnonzero(found.status == Status.CONVERGED):
+        alone = estimator.estimate(problem, rows[i])
+        assert np.array_equal(found.x[i], alone.x[0])
+        assert np.array_equal(found.covariance[i], alone.covariance[0])
+
+
+def test_a_huge_reading_overflows_into_a_status():
+    model = Linear()
+    problem = Problem(model, Covariance(np.ones(model.m)), np.ones(4))
+    for estimator in FILTERS:
+        found = estimator.estimate(problem, np.full((1, model.m), 1e308))
+        assert found.status[0] != Status.CONVERGED
+
+
+@pytest.mark.parametrize("estimator", FILTERS, ids=label)
+def test_needs_epochs_and_a_prior(estimator):
+    model = Linear()
+    problem = Problem(model, Covariance(np.ones(model.m)))
+    assert estimator.missing(problem) == ["prior"]
+    with pytest.raises(UserError, match="has no prior"):
+        estimator.estimate(problem, np.zeros((1, model.m)))
+
+
+@pytest.mark.parametrize(
+    ("kind", "option"),
+    [
+        (EKF, {"prior_inflation": 0.0}),
+        (EKF, {"process_noise": -1.0}),
+        (IteratedEKF, {"max_iterations": 0}),
+        (IteratedEKF, {"tolerance": 0.0}),
+        (UKF, {"alpha": 0.0}),
+        (UKF, {"kappa": -3.0}),
+        (EnKF, {"members": 1}),
+        (EnKF, {"seed": -1}),
+    ],
+)
+def test_a_wrong_option_is_named(kind, option):
+    ((key, value),) = option.items()
+    with pytest.raises(UserError, match=f"^{key}={value}: give"):
+        kind(**option)
+
+
+def test_the_ensemble_leaves_the_global_random_state_alone():
+    scenario = Scenario(Linear(), Gaussian(1.0), Prior(), 1.0)
+    problem, z = scenario.problem, scenario.draw(0, 2).z
+    np.random.seed(1)  # noqa: NPY002
+    expected = np.random.standard_normal(5)  # noqa: NPY002
+    np.random.seed(1)  # noqa: NPY002
+    first = np.random.standard_normal(1)  # noqa: NPY002  leaves the second number of a pair waiting
+    once = EnKF(members=10).estimate(problem, z)
+    assert np.array_equal(np.concatenate([first, np.random.standard_normal(4)]), expected)  # noqa: NPY002
+    assert np.array_equal(once.x, EnKF(members=10).estimate(problem, z).x)
+    assert not np.array_equal(once.x, EnKF(members=10, seed=1).estimate(problem, z).x)
