@@ -63,9 +63,10 @@ def test_ukf_wants_the_hx_of_each_epoch():
 
 
 def test_ukf_with_a_small_alpha_loses_digits():
-    scenario = Scenario(LinearGins(), Gaussian(0.0066), Prior(), 10.0)
+    model = LinearGins()
+    scenario = Scenario(model, Gaussian(0.0066), Prior(), 10.0)
     problem, z = scenario.problem, scenario.draw(0, 5).z
-    x, P = linear_map(problem, LinearGins().matrix, z)
+    x, P = linear_map(problem, model.matrix, z)
     near, far = (UKF(alpha=a).estimate(problem, z) for a in (0.1, 1e-3))
     deviation = np.sqrt(np.diag(P))
     apart = np.abs((near.x - x) / deviation).max()

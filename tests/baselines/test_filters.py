@@ -151,13 +151,13 @@ def test_nis_is_chi_square_on_a_linear_model(estimator):
 
 @pytest.mark.parametrize("estimator", KALMAN, ids=label)
 def test_gins_at_scale_10_is_near_the_map_and_consistent(estimator):
-    problem, trials = gins(10.0, 80)
+    problem, trials = gins(10.0, 50)
     x, P = maximum_a_posteriori(problem, trials.z, trials.x)
     found = estimator.estimate(problem, trials.z)
     assert np.sqrt(np.mean(((found.x - x) / deviations(P)) ** 2)) < 0.02
-    low, high = mean_limits(11, 80, 0.999)
+    low, high = mean_limits(11, 50, 0.999)
     assert low < nees(found.x - trials.x, found.covariance).mean() / 11 < high
-    low, high = mean_limits(240, 80, 0.999)
+    low, high = mean_limits(240, 50, 0.999)
     assert low < found.extras["nis"].mean() < high
 
 
@@ -183,10 +183,11 @@ def test_where_linearising_once_fails_and_iterating_holds(scale, extended, itera
 @pytest.mark.slow
 @pytest.mark.parametrize(("estimator", "seconds"), [(EKF(), 20.0), (UKF(), 30.0)], ids=["ekf", "ukf"])
 def test_a_thousand_gins_trials_in_time(estimator, seconds):
+    """In CPU seconds of all threads together, which other work on the machine does not change by much."""
     problem, trials = gins(10.0, 1000)
-    began = time.perf_counter()
+    began = time.process_time()
     found = estimator.estimate(problem, trials.z)
-    assert time.perf_counter() - began < seconds
+    assert time.process_time() - began < seconds
     assert (found.status == Status.CONVERGED).all()
 
 
