@@ -18,7 +18,7 @@ class IteratedEKF(Sequential):
     epoch's readings and the prior that the earlier epochs left (Bell and Cathey, IEEE TAC 38, 1993)."""
 
     max_iterations: int = 20
-    """Linearisations per epoch."""
+    """Linearisations per epoch; one that has not settled by then goes on from where it is."""
     tolerance: float = 1e-3
     """Largest change of a parameter, in deviations of the updated P, at which an epoch is done."""
 
