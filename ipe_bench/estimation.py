@@ -118,6 +118,8 @@ def estimate_safely(estimator: Estimator, problem: Problem, z: Array, *, history
     try:
         with np.errstate(all="ignore"):
             estimates = estimator.estimate(problem, z, history=history)
+    except MemoryError:
+        raise  # says something of the machine, not of the trial: the block fails and is tried again another day
     except Exception as error:
         if len(z) == 1:
             return Estimates.failed(1, problem.measurement.n, describe_exception(error))
@@ -134,6 +136,8 @@ def one_by_one(trials: Iterable[Any], estimate: Any, n: int) -> Estimates:
         began = time.perf_counter()
         try:
             part = estimate(trial)
+        except MemoryError:
+            raise
         except Exception as error:
             part = Estimates.failed(1, n, describe_exception(error))
         part.seconds = np.array([time.perf_counter() - began])

@@ -66,6 +66,8 @@ class Counted:
     ) -> Array:
         try:
             return function(x)
+        except MemoryError:
+            raise
         except Exception:
             result = np.full((len(x), *shape), np.nan)
             for i, row in enumerate(rows):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ipe_bench.estimation import Equation, Estimates, Estimator, estimate_safely
 from ipe_bench.ipe import frozen_covariance
@@ -120,7 +120,7 @@ class Block:
             "crlb_distance": quadratic_form(self.crlb_information, error),
             "nees": nees,
             "solved": solved,
-            "success": np.isfinite(distance) & (distance <= chi2.isf(GATE, model.n)),
+            "success": np.isfinite(distance) & (distance <= chdtri(model.n, GATE)),
             **{f"extra_{name}": values for name, values in estimates.extras.items()},
         }
 

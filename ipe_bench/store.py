@@ -7,30 +7,42 @@ under its name complete or not at all.
 
 from __future__ import annotations
 
+import contextlib
+import datetime
 import hashlib
 import json
+import logging
 import os
 import socket
+import tempfile
+import time
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ipe_bench.components import canonical_json, describe, fingerprint
+from ipe_bench.errors import StorageError, UserError
 from ipe_bench.estimation import Estimator
+from ipe_bench.execution.base import Failure
 from ipe_bench.linalg import Array
 from ipe_bench.montecarlo import linear_bound
 from ipe_bench.scenario import Scenario
+
+log = logging.getLogger(__name__)
 
 SCHEMA = 1
 FOOTER = b"ipe_bench"
 TRUTH = "truth"
 """Stands in place of an estimator's label in the files that hold the truth and its bounds."""
+_ABANDONED_S = 3600.0
+"""A file that somebody began to write so long ago will not be finished."""
 
 
 @dataclass(frozen=True)
@@ -136,6 +148,28 @@ class Store:
         self.trials = self.directory / "trials"
         self.histories = self.directory / "histories"
         self.runs = self.directory / "runs"
+        self.failed = self.directory / "failed"
+
+    def prepare(self) -> None:
+        """Makes sure that results can be written, and clears away what writers that were killed left half done.
+
+        Raises:
+            UserError: they cannot.
+        """
+        try:
+            self.trials.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self.trials):
+                pass
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise UserError(
+                f"output={self.directory}: cannot be written to ({reason}); choose another folder"
+            ) from None
+        for folder in (self.trials, self.histories, self.runs, self.failed):
+            for path in folder.glob(".*.tmp"):
+                with contextlib.suppress(OSError):
+                    if time.time() - path.stat().st_mtime > _ABANDONED_S:
+                        path.unlink()
 
     def pieces(self) -> Iterator[Piece]:
         """All stored files with a name of ours, in order of name."""
@@ -146,15 +180,7 @@ class Store:
 
     def missing(self, cell: Cell, trials: int) -> list[tuple[int, int]]:
         """The ranges of trials 0 to `trials` that no stored file of this cell covers."""
-        covered = sorted((p.start, p.stop) for p in self._pieces_of(cell))
-        gaps, reached = [], 0
-        for start, stop in covered:
-            if start > reached:
-                gaps.append((reached, min(start, trials)))
-            reached = max(reached, stop)
-            if reached >= trials:
-                return gaps
-        return [*gaps, (reached, trials)]
+        return gaps([(p.start, p.stop) for p in self._pieces_of(cell)], 0, trials)
 
     def _pieces_of(self, cell: Cell) -> Iterator[Piece]:
         for path in self.trials.glob(f"{cell.key}-*.parquet"):
@@ -165,37 +191,114 @@ class Store:
                 piece.footer()
             except DamagedFile:
                 # Set aside, never deleted: it is computed again under its own name.
-                path.rename(path.with_suffix(".damaged"))
+                aside = path.with_suffix(".damaged")
+                with contextlib.suppress(FileNotFoundError):  # another run may have done so at this moment
+                    path.rename(aside)
+                log.warning("%s: is damaged; set aside as %s and computed again", path, aside.name)
                 continue
             yield piece
 
     def write(self, cell: Cell, start: int, stop: int, columns: Mapping[str, Array]) -> Path:
         """Stores the rows of trials start to stop."""
-        return self._write(self.trials / f"{cell.key}-{start}-{stop}.parquet", cell, columns)
+        path = self._write(self.trials / f"{cell.key}-{start}-{stop}.parquet", cell, columns)
+        with contextlib.suppress(OSError):
+            (self.failed / f"{cell.key}-{start}-{stop}.json").unlink()
+        return path
+
+    def has(self, cell: Cell, start: int, stop: int) -> bool:
+        """Whether exactly this block of this cell is stored."""
+        return (self.trials / f"{cell.key}-{start}-{stop}.parquet").is_file()
+
+    def write_failure(self, cell: Cell, start: int, stop: int, failure: Failure) -> Path:
+        """States that these trials could not be computed, and why; the next run tries them again."""
+        record = {
+            "key": cell.key,
+            "identity_key": cell.footer["identity_key"],
+            "names": cell.footer["names"],
+            "start": start,
+            "stop": stop,
+            "status": failure.status,
+            "message": failure.message,
+            "detail": failure.detail,
+            "when": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            "host": socket.gethostname(),
+        }
+        path = self.failed / f"{cell.key}-{start}-{stop}.json"
+        return self._write_json(path, record)
+
+    def failures(self) -> list[dict[str, Any]]:
+        """What could not be computed and has not been computed since; see `write_failure`."""
+        records = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(self.failed.glob("*.json"))]
+        ranges: dict[str, list[tuple[int, int]]] = {}
+        for piece in self.pieces():
+            ranges.setdefault(piece.key, []).append((piece.start, piece.stop))
+        return [r for r in records if gaps(ranges.get(r["key"], []), r["start"], r["stop"])]
 
     def write_history(self, cell: Cell, columns: Mapping[str, Array]) -> Path:
         """Stores the iterates of the first trials."""
         return self._write(self.histories / f"{cell.key}.parquet", cell, columns)
 
     def _write(self, path: Path, cell: Cell, columns: Mapping[str, Array]) -> Path:
-        table = pa.table(dict(columns)).replace_schema_metadata({FOOTER: canonical_json(cell.footer)})
+        arrays = [_arrow(values) for values in columns.values()]
+        table = pa.Table.from_arrays(arrays, names=list(columns), metadata={FOOTER: canonical_json(cell.footer)})
         write_atomically(path, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
         return path
 
     def write_run(self, identifier: str, record: Mapping[str, Any]) -> Path:
         """States, before any work, what a run is going to compute."""
         path = self.runs / f"{identifier}.json"
+        return self._write_json(path, record)
+
+    def _write_json(self, path: Path, record: Mapping[str, Any]) -> Path:
         text = json.dumps(record, indent=1, default=str)
         write_atomically(path, lambda temporary: temporary.write_text(text + "\n", encoding="utf-8"))
         return path
 
 
+def _arrow(values: Array) -> pa.Array:
+    """A column as Arrow stores it. `pa.array` would import pandas, a second that a worker can do without."""
+    values = np.ascontiguousarray(values)
+    if values.dtype == object:
+        texts = [str(value).encode() for value in values]
+        ends = np.cumsum([0, *(len(text) for text in texts)], dtype=np.int32)
+        return pa.Array.from_buffers(
+            pa.string(), len(values), [None, pa.py_buffer(ends.tobytes()), pa.py_buffer(b"".join(texts))]
+        )
+    if values.dtype == bool:
+        bits = np.packbits(values, bitorder="little")
+        return pa.Array.from_buffers(pa.bool_(), len(values), [None, pa.py_buffer(bits.tobytes())])
+    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, pa.py_buffer(values.tobytes())])
+
+
+def gaps(covered: Iterable[tuple[int, int]], start: int, stop: int) -> list[tuple[int, int]]:
+    """The parts of the range start to stop that no covered range holds."""
+    found, reached = [], start
+    for first, last in sorted(covered):
+        if first >= stop or reached >= stop:
+            break
+        if first > reached:
+            found.append((reached, first))
+        reached = max(reached, last)
+    return [*found, (reached, stop)] if reached < stop else found
+
+
 def write_atomically(path: Path, write: Any) -> None:
-    """Calls `write(temporary path)` in the same folder and renames the result: readers see all of it or nothing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Calls `write(temporary path)` in the same folder and renames the result: readers see all of it or nothing.
+
+    Raises:
+        StorageError: the disk is full, or the folder cannot be written to any more.
+    """
     temporary = path.with_name(f".{path.name}.{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}.tmp")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         write(temporary)
         os.replace(temporary, path)
+    except OSError as error:
+        reason = error.strerror if error.errno is None else os.strerror(error.errno)
+        raise StorageError(
+            f"{path.parent}: cannot be written to any more ({reason or error}); what was stored before is whole, "
+            "and the same command goes on from there"
+        ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)

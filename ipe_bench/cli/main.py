@@ -15,17 +15,19 @@ ipe-bench: which estimator to trust with nonlinear measurements
   ipe-bench run -m error_scale=1,10,100 seed=1,2  sweeps; any Hydra flag works after run (--cfg job, --info, ...)
   ipe-bench estimate readings=FILE.csv            parameters from real readings
   ipe-bench report DIR [DIR ...]                  tables, figures and report of what is stored
+  ipe-bench status DIR [DIR ...]                  what is done, missing, failed and stale there
   ipe-bench list [GROUP] [-v]                     what there is to choose from
   ipe-bench new KIND NAME                         a working plugin to start from, in plugins/NAME
   ipe-bench check plugins/NAME                    whether a plugin keeps its promises
 
-Exit codes: 0 done; 1 done, but some pieces failed or are missing; 2 a mistake in what was asked for.
+Exit codes: 0 done; 1 done, but some pieces failed or are missing; 2 a mistake in what was asked for; 130 Ctrl-C.
 """
 
 COMMANDS = {
     "run": "ipe_bench.cli.run",
     "estimate": "ipe_bench.cli.estimate",
     "report": "ipe_bench.cli.report",
+    "status": "ipe_bench.cli.status",
     "list": "ipe_bench.cli.list",
     "check": "ipe_bench.cli.check",
     "new": "ipe_bench.cli.new",
@@ -50,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     from ipe_bench.components import unknown
-    from ipe_bench.errors import UserError
+    from ipe_bench.errors import StorageError, UserError
 
     try:
         if command not in COMMANDS:
@@ -59,6 +61,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except UserError as error:
         print(f"ipe-bench: {error}", file=sys.stderr)
         return 2
+    except StorageError as error:
+        print(f"ipe-bench: {error}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("ipe-bench: stopped; what was computed is kept, and the same command goes on from there", file=sys.stderr)
         return 130

@@ -1,36 +1,117 @@
-"""A progress bar over the blocks of a job; plain lines where the output is no terminal."""
+"""Progress of a job: a bar with rate and time left on a terminal, a plain line now and then elsewhere."""
 
 from __future__ import annotations
 
+import logging
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, ProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
+from rich.progress import Task as BarTask
+from rich.text import Text
 
-from ipe_bench.api import Progress, Watcher
+from ipe_bench.schedule import Progress, Watcher
+
+LINE_EVERY_S = 10.0
 
 
 @contextmanager
 def shown_progress(title: str) -> Iterator[Watcher]:
-    """Yields what `compute` is to call after each task."""
-    console = Console(stderr=True)
+    """Yields what `compute` is to call. Warnings of ipe-bench are shown above the bar meanwhile."""
+    console = Console(stderr=True, highlight=False)
+    handler = _Lines(console)
+    logger = logging.getLogger("ipe_bench")
+    logger.addHandler(handler)
+    try:
+        if console.is_terminal:
+            with _bar(console) as bar:
+                yield _bar_watcher(bar, title)
+        else:
+            yield _line_watcher(console, title)
+    finally:
+        logger.removeHandler(handler)
+
+
+class _Lines(logging.Handler):
+    """Prints warnings through the console that also draws the bar, so that neither spoils the other."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__(logging.WARNING)
+        self.console = console
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.console.print(f"ipe-bench: {record.getMessage()}", markup=False, soft_wrap=True)
+
+
+class _Rate(ProgressColumn):
+    def render(self, task: BarTask) -> Text:
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{_rounded(speed)} estimates/s")
+
+
+def _bar(console: Console) -> Bar:
     columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("blocks"),
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=24),
+        TextColumn("{task.fields[state]}"),
+        _Rate(),
         TimeElapsedColumn(),
+        TextColumn("left"),
         TimeRemainingColumn(),
     )
-    with Bar(*columns, console=console, disable=not console.is_terminal) as bar:
-        line = bar.add_task(title, total=None)
+    return Bar(*columns, console=console, speed_estimate_period=60.0)
 
-        def watch(progress: Progress) -> None:
-            bar.update(line, total=progress.tasks, completed=progress.done)
-            if not console.is_terminal and progress.done == progress.tasks:
-                done = f"{progress.tasks} blocks computed" if progress.tasks else "nothing left to compute"
-                console.print(f"{title}: {done}", highlight=False)
 
-        yield watch
+def _bar_watcher(bar: Bar, title: str) -> Watcher:
+    line = bar.add_task(title, total=None, state="")
+
+    def watch(progress: Progress) -> None:
+        state = f"block {progress.done}/{progress.tasks}"
+        if progress.failures:
+            state += f", {len(progress.failures)} failed"
+        if not progress.tasks:
+            state = "nothing left to compute"
+        # A job without estimators to run still has its truth to store: then blocks stand in for trials.
+        total, done = (progress.total, progress.trials) if progress.total else (progress.tasks, progress.done)
+        bar.update(line, total=total or 1, completed=done if total else 1, state=state)
+
+    return watch
+
+
+def _line_watcher(console: Console, title: str) -> Watcher:
+    began = spoken = time.monotonic()
+
+    def say(text: str) -> None:
+        console.print(f"{title}: {text}", markup=False, soft_wrap=True)
+
+    def watch(progress: Progress) -> None:
+        nonlocal spoken
+        now = time.monotonic()
+        if not progress.tasks:
+            say("nothing left to compute")
+        elif progress.done == progress.tasks:
+            failed = f", {len(progress.failures)} failed" if progress.failures else ""
+            rate = progress.total / max(now - began, 1e-9)
+            say(f"{progress.tasks} blocks{failed} in {_duration(now - began)}, {_rounded(rate)} estimates/s")
+        elif now - spoken >= LINE_EVERY_S and progress.trials:
+            spoken = now
+            rate = progress.trials / (now - began)
+            left = _duration((progress.total - progress.trials) / rate)
+            say(f"block {progress.done}/{progress.tasks}, {_rounded(rate)} estimates/s, {left} left")
+
+    return watch
+
+
+def _rounded(rate: float) -> str:
+    return f"{rate:.0f}" if rate >= 10 else f"{rate:.2g}"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from collections.abc import Sequence
@@ -9,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from ipe_bench import plugins
@@ -17,7 +20,8 @@ from ipe_bench.api import compute
 from ipe_bench.cli.config import CONFIG_ERRORS, Job, assemble, explain, prepare, refuse_silent_traps, rewrite
 from ipe_bench.cli.progress import shown_progress
 from ipe_bench.cli.report import show
-from ipe_bench.errors import UserError
+from ipe_bench.errors import StorageError, UserError
+from ipe_bench.execution import Serial
 
 _FLAGS_WITH_VALUE = {"--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--config-path", "-cp"}
 _FLAGS_WITH_VALUE |= {"--config-dir", "-cd", "--experimental-rerun"}
@@ -34,6 +38,8 @@ class Outcome:
         self.outputs: dict[Path, None] = {}
         self.failures: list[str] = []
         self.mistakes: dict[str, None] = {}
+        self.storage: StorageError | None = None
+        """Nothing can be stored any more: the remaining jobs are not begun."""
 
 
 _outcome = Outcome()
@@ -70,6 +76,10 @@ def main(arguments: Sequence[str]) -> int:
         hydra.main(version_base="1.3", config_path=str(plugins.own_conf()), config_name="config")(task)()
     except CONFIG_ERRORS as error:
         raise explain(error) from error
+    except OSError as error:  # Hydra writes its own files before our task is called
+        raise _explain_os_error(error) from error
+    if _outcome.storage is not None:
+        raise _outcome.storage
     if not _outcome.started:
         return 0
     if _outcome.multirun and not _outcome.jobs and not _outcome.mistakes:
@@ -87,6 +97,8 @@ def main(arguments: Sequence[str]) -> int:
 
 def task(config: DictConfig) -> None:
     """One job: a scenario under its estimators. A mistake in one job of a sweep does not stop the others."""
+    if _outcome.storage is not None:
+        return
     try:
         job = assemble(config)
         if config.write_readings is not None:
@@ -98,7 +110,7 @@ def task(config: DictConfig) -> None:
                 job.estimators,
                 job.trials,
                 job.output,
-                execution=job.execution,
+                execution=Serial() if _launched_elsewhere() else job.execution,
                 block_size=job.block_size,
                 watch=watch,
             )
@@ -106,9 +118,26 @@ def task(config: DictConfig) -> None:
         _outcome.mistakes[str(explain(error))] = None
     except UserError as error:
         _outcome.mistakes[str(error)] = None
+    except StorageError as error:
+        _outcome.storage = error
     else:
         _outcome.failures += failures
         _outcome.outputs[Path(job.output)] = None
+
+
+def _launched_elsewhere() -> bool:
+    """Whether a launcher plugin of Hydra (joblib, submitit) runs the jobs: then the cores are its to share out."""
+    launcher = HydraConfig.get().launcher
+    return HydraConfig.get().mode == RunMode.MULTIRUN and not launcher["_target_"].endswith(".BasicLauncher")
+
+
+def _explain_os_error(error: OSError) -> Exception:
+    where, reason = error.filename or "output", error.strerror or str(error)
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return StorageError(f"{where}: {reason}; what was stored before is whole, and the same command goes on")
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST):
+        return UserError(f"output: {where} cannot be written to ({reason}); choose another folder with output=")
+    return error
 
 
 def _title(job: Job) -> str:

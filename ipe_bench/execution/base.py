@@ -1,28 +1,73 @@
-"""What an execution is: it runs tasks somewhere and hands back, in any order, how each of them ended."""
+"""What an execution is: it runs tasks somewhere and tells, in any order, how each of them gets on and ends."""
 
 from __future__ import annotations
 
+import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
+from ipe_bench.errors import StorageError, UserError
 from ipe_bench.naming import Named
+
+Work = Callable[[Any], Iterable[Any]]
+"""Does a task in steps: what it yields after each step is handed on, and proves that it is alive."""
+
+FATAL = (UserError, StorageError)
+"""Exceptions that concern the whole run: they end it, where any other is a failure of one task."""
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """How one task ended: its result, or the message of what stopped it."""
+class Failure:
+    """Why a task did not end well."""
+
+    status: Literal["error", "timeout", "died"]
+    """It raised; it exceeded a time limit; or the process that it ran in ended."""
+    message: str
+    detail: str = ""
+    """The traceback, where there is one."""
+
+    @classmethod
+    def of(cls, error: BaseException) -> Failure:
+        lines = str(error).splitlines()
+        message = f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+        return cls("error", message, "".join(traceback.format_exception(error)))
+
+
+@dataclass(frozen=True)
+class Event:
+    """News of one task: a step was done, or it ended."""
 
     index: int
     """The task's place in the sequence that was given."""
-    result: Any = None
-    failure: str | None = None
+    step: Any = None
+    ended: bool = False
+    failure: Failure | None = None
 
 
 class Execution(Named, ABC):
     """Where tasks run. A new execution is a frozen dataclass that writes `run`."""
 
     @abstractmethod
-    def run(self, work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[Outcome]:
-        """Yields an outcome per task as soon as it ends; an exception in `work` is a failure of its task alone."""
+    def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
+        """Yields an event per step, and one with `ended` per task; an exception in `work` fails its task alone.
+
+        Closing the iterator, or an exception of `FATAL`, stops what is under way.
+        """
+
+    def warm_up(self, work: Work, tasks: int) -> None:  # noqa: B027
+        """Starts what takes time to start before so many tasks can run, without waiting for it. May be left out."""
+
+
+def check_limits(workers: int | None, block_timeout_s: float | None, memory_limit_gb: float | None) -> None:
+    """Refuses limits that make no sense.
+
+    Raises:
+        UserError: naming the option.
+    """
+    if workers is not None and workers < 1:
+        raise UserError(f"workers={workers}: give a whole number above 0, or null")
+    for option, value in (("block_timeout_s", block_timeout_s), ("memory_limit_gb", memory_limit_gb)):
+        if value is not None and not value > 0:
+            raise UserError(f"{option}={value}: give a number above 0, or null for no limit")

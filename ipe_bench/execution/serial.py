@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ipe_bench.estimation import describe_exception
-from ipe_bench.execution.base import Execution, Outcome
+from ipe_bench.execution.base import FATAL, Event, Execution, Failure, Work
 
 
 @dataclass(frozen=True)
 class Serial(Execution):
-    """Runs tasks in this process; compiled models still use every core."""
+    """Runs tasks in this process; compiled models still use every core.
 
-    def run(self, work: Callable[[Any], Any], tasks: Sequence[Any]) -> Iterator[Outcome]:
+    Nothing stands between an estimator and this process: one that never returns, or ends the process, ends the run.
+    """
+
+    def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
         for index, task in enumerate(tasks):
+            failure = None
             try:
-                yield Outcome(index, work(task))
+                for step in work(task):
+                    yield Event(index, step)
+            except FATAL:
+                raise
             except Exception as error:
-                yield Outcome(index, failure=describe_exception(error))
+                failure = Failure.of(error)
+            yield Event(index, ended=True, failure=failure)

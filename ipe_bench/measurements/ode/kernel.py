@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
+from ipe_bench.machine import cores
 from ipe_bench.measurements.ode.trace import Expression, Graph, emit, tangent
 
 WIDTH = 16
@@ -167,7 +168,7 @@ def _load(source: str) -> ModuleType:
 def threads() -> int:
     """Threads that one integration may use: `IPE_BENCH_THREADS`, else every core of this process."""
     chosen = os.environ.get("IPE_BENCH_THREADS")
-    return max(1, int(chosen)) if chosen else len(os.sched_getaffinity(0))
+    return max(1, int(chosen)) if chosen else cores()
 
 
 @functools.cache

@@ -1,0 +1,70 @@
+"""Estimators and tasks that misbehave in every way that a plugin can; a module, so that workers can import it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ipe_bench.estimation import Estimates, Estimator
+
+
+@dataclass(frozen=True)
+class Rogue(Estimator):
+    """Estimates nothing but zeros, or does what it says; `until` names a file from whose existence on it behaves."""
+
+    does: Literal["behave", "sleep", "exit", "sys_exit", "kill", "memory", "raise", "shape"]
+    until: str = ""
+
+    def estimate(self, problem, z, *, history=False):
+        n = problem.measurement.n
+        if not (self.until and Path(self.until).exists()):
+            if self.until and self.does == "kill":
+                Path(self.until).touch()
+            self.misbehave()
+            if self.does == "shape":
+                n += 1
+        return Estimates(np.zeros((len(z), n)), np.zeros(len(z), dtype=np.int8))
+
+    def misbehave(self):
+        match self.does:
+            case "sleep":
+                time.sleep(3600)
+            case "exit":
+                os._exit(7)
+            case "sys_exit":
+                raise SystemExit(3)
+            case "kill":
+                os.kill(os.getpid(), signal.SIGKILL)
+            case "memory":
+                hog = []
+                while True:
+                    hog.append(np.ones(1_000_000))
+            case "raise":
+                raise ArithmeticError("rogue")
+
+
+def surroundings(task):
+    """What a worker sees: its process, its BLAS threads, and the threads that compiled models may use."""
+    from threadpoolctl import threadpool_info
+
+    from ipe_bench.measurements.ode.kernel import threads
+
+    np.linalg.inv(np.eye(3))
+    yield os.getpid(), [pool["num_threads"] for pool in threadpool_info()], threads()
+
+
+def square(task):
+    yield from (task * i for i in range(3))
+    if task == 2:
+        raise ValueError("two\nis refused")
+
+
+def doze(task):
+    yield os.getpid()
+    time.sleep(3600)

@@ -1,0 +1,292 @@
+"""Whatever happens to the parts of a run, the other parts are complete, and have the same bits everywhere."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rogues
+from conftest import Bent
+from rogues import Rogue
+
+from ipe_bench import Scenario, run
+from ipe_bench.api import compute
+from ipe_bench.baselines import LinearLSE
+from ipe_bench.errors import StorageError, UserError  # noqa: F401
+from ipe_bench.execution import Dask, Event, Failure, Processes, Serial
+from ipe_bench.ipe import IPE
+from ipe_bench.noise import Gaussian
+from ipe_bench.prior import Gaussian as Prior
+from ipe_bench.solvers import Newton
+from ipe_bench.statistics.inventory import take_inventory
+from ipe_bench.store import Store
+
+GOOD = {"linear_lse": LinearLSE(), "newton": IPE(Newton())}
+
+
+def scenario(**changes) -> Scenario:
+    return Scenario(Bent(0.02), Gaussian(0.1), Prior(), **{"error_scale": 1.0, **changes})
+
+
+def stored(directory: Path) -> dict[str, np.ndarray]:
+    """Every number that a run stored, timings aside, by file and column."""
+    numbers = {}
+    for piece in Store(directory).pieces():
+        table = piece.table()
+        for name in table.column_names:
+            if name != "time_s":
+                numbers[f"{piece.path.name}:{name}"] = table[name].to_numpy()
+    return numbers
+
+
+def assert_same(first: dict, second: dict) -> None:
+    assert first.keys() == second.keys()
+    for name in first:
+        np.testing.assert_array_equal(first[name], second[name], name)
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    # One that has ended and that nobody has waited for is no longer running.
+    status = Path(f"/proc/{pid}/stat")
+    return not (status.exists() and status.read_text().rpartition(")")[2].split()[0] == "Z")
+
+
+def gone_within(seconds: float, pid: int) -> bool:
+    end = time.monotonic() + seconds
+    while alive(pid) and time.monotonic() < end:
+        time.sleep(0.02)
+    return not alive(pid)
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory) -> dict[str, np.ndarray]:
+    folder = tmp_path_factory.mktemp("serial")
+    assert compute([scenario()], GOOD, 40, folder, execution=Serial(), block_size=10) == ()
+    return stored(folder)
+
+
+def test_processes_compute_the_same_bits_as_one_process(tmp_path, reference):
+    assert compute([scenario()], GOOD, 40, tmp_path, execution=Processes(2), block_size=10) == ()
+    assert_same(stored(tmp_path), reference)
+
+
+@pytest.mark.slow
+def test_dask_computes_the_same_bits_as_one_process(tmp_path, reference):
+    pytest.importorskip("distributed")
+    assert compute([scenario()], GOOD, 40, tmp_path, execution=Dask(2), block_size=10) == ()
+    assert_same(stored(tmp_path), reference)
+
+
+@pytest.mark.parametrize("execution", [Processes(2), pytest.param(Dask(2), marks=pytest.mark.slow)], ids=repr)
+def test_a_run_completes_when_a_worker_is_killed(tmp_path, reference, execution):
+    rogue = {"killer": Rogue("kill", until=str(tmp_path / "killed"))}
+    assert compute([scenario()], {**rogue, **GOOD}, 40, tmp_path, execution=execution, block_size=10) == ()
+    assert (tmp_path / "killed").exists()
+    there = stored(tmp_path)
+    assert_same({name: there[name] for name in reference}, reference)
+    assert take_inventory(tmp_path).complete
+
+
+@pytest.mark.parametrize(
+    ("does", "limits", "message"),
+    [
+        ("exit", {}, "exit code 7"),
+        ("sys_exit", {}, "SystemExit: 3"),
+        pytest.param("kill", {}, "SIGKILL", marks=pytest.mark.slow),
+        ("shape", {}, "ValueError"),
+        ("sleep", {"block_timeout_s": 0.5}, "block_timeout_s=0.5"),
+        pytest.param(
+            *("memory", {"memory_limit_gb": 1.0}, "MemoryError"),
+            marks=pytest.mark.skipif(sys.platform != "linux", reason="limits memory on Linux only"),
+        ),
+    ],
+)
+def test_one_estimator_that_fails_loses_nothing_but_itself(tmp_path, reference, does, limits, message):
+    estimators = {"rogue": Rogue(does), **GOOD}
+    (failure,) = compute([scenario()], estimators, 10, tmp_path, execution=Processes(1, **limits))
+    assert message in failure
+    assert "rogue" in failure
+    assert_same(stored(tmp_path), {name: values for name, values in reference.items() if "-0-10." in name})
+    rogue = next(cell for cell in take_inventory(tmp_path).cells if cell.names["estimator"] == "rogue")
+    assert (rogue.done, rogue.failed, rogue.missing) == (0, 10, 0)
+
+
+def test_an_exception_in_an_estimator_is_a_status_and_no_failure(tmp_path):
+    assert compute([scenario()], {"rogue": Rogue("raise")}, 5, tmp_path, execution=Processes(1)) == ()
+    table = next(p.table() for p in Store(tmp_path).pieces() if "status" in p.table().column_names)
+    assert set(table["status"].to_pylist()) == {"error"}
+    assert set(table["message"].to_pylist()) == {"ArithmeticError: rogue"}
+
+
+def test_what_failed_is_tried_again_by_the_next_run(tmp_path):
+    estimators = {"rogue": Rogue("exit", until=str(tmp_path / "repaired"))}
+    assert len(compute([scenario()], estimators, 10, tmp_path, execution=Processes(1))) == 1
+    assert len(Store(tmp_path).failures()) == 1
+    (tmp_path / "repaired").touch()
+    assert compute([scenario()], estimators, 10, tmp_path, execution=Processes(1)) == ()
+    assert Store(tmp_path).failures() == []
+    assert list((tmp_path / "failed").iterdir()) == []
+
+
+def test_a_worker_has_one_thread_in_blas_and_one_in_compiled_models():
+    events = list(Processes(2).run(rogues.surroundings, range(4)))
+    seen = [event.step for event in events if not event.ended]
+    assert len(seen) == 4
+    assert os.getpid() not in {pid for pid, _, _ in seen}
+    assert all(set(pools) == {1} and threads == 1 for _, pools, threads in seen)
+
+
+@pytest.mark.parametrize("execution", [Serial(), Processes(2)], ids=repr)
+def test_steps_come_in_order_and_an_exception_fails_its_task_alone(execution):
+    events = list(execution.run(rogues.square, [1, 2, 3]))
+    for index, task in enumerate([1, 2, 3]):
+        mine = [event for event in events if event.index == index]
+        assert [event.step for event in mine[:-1]] == [0, task, 2 * task]
+        assert mine[-1].ended
+        failure = mine[-1].failure
+        assert (None if failure is None else failure.message) == ("ValueError: two" if task == 2 else None)
+
+
+def test_workers_serve_the_next_run():
+    pids = [{e.step[0] for e in Processes(1).run(rogues.surroundings, [0]) if not e.ended} for _ in range(2)]
+    assert pids[0] == pids[1]
+
+
+def test_stopping_a_run_ends_its_workers():
+    events = Processes(1).run(rogues.doze, [0])
+    pid = next(events).step
+    assert alive(pid)
+    events.close()  # type: ignore[attr-defined]
+    assert gone_within(5, pid)
+
+
+def test_workers_end_when_their_parent_is_killed(tmp_path):
+    code = "import rogues; from ipe_bench.execution import Processes\n"
+    code += "for event in Processes(1).run(rogues.doze, [0]): print(event.step, flush=True)"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, env=environment(), text=True) as parent:
+        assert parent.stdout is not None
+        pid = int(parent.stdout.readline())
+        assert alive(pid)
+        parent.kill()
+    assert gone_within(5, pid)
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+
+
+def test_a_folder_that_cannot_be_written_to_is_refused_before_any_work(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match=r"output=.*choose another folder"):
+        compute([scenario()], GOOD, 10, tmp_path / "file" / "results")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files with POSIX means")
+@pytest.mark.parametrize("execution", ["Serial()", pytest.param("Processes(1)", marks=pytest.mark.slow)])
+def test_a_full_disk_ends_the_run_with_one_line_and_no_half_files(tmp_path, execution):
+    code = f"""
+import resource, sys
+sys.path[:0] = {sys.path!r}
+from test_execution import *
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+try:
+    compute([scenario()], GOOD, 500, {str(tmp_path)!r}, execution={execution})
+except StorageError as error:
+    assert "cannot be written to any more" in str(error) and "\\n" not in str(error)
+    sys.exit(42)
+"""
+    assert subprocess.run([sys.executable, "-c", code], env=environment(), check=False).returncode == 42
+    for piece in Store(tmp_path).pieces():
+        piece.table()
+    assert [path for path in tmp_path.rglob("*") if path.suffix == ".tmp"] == []
+
+
+@pytest.mark.parametrize(
+    ("options", "key"),
+    [
+        ({"workers": 0}, "workers=0"),
+        ({"block_timeout_s": 0.0}, "block_timeout_s"),
+        ({"memory_limit_gb": -1.0}, "memory"),
+    ],
+)
+@pytest.mark.parametrize("kind", [Processes, Dask])
+def test_limits_that_make_no_sense_are_refused(kind, options, key):
+    with pytest.raises(UserError, match=key):
+        kind(**options)
+
+
+def test_source_that_changed_since_the_run_began_is_not_mixed_in(tmp_path, monkeypatch):
+    import ipe_bench.schedule as schedule
+
+    monkeypatch.setattr(schedule, "fingerprint", lambda parts: {"versions": {}, "source": "other"})
+    failures = compute([scenario()], {"linear_lse": LinearLSE()}, 10, tmp_path, execution=Serial())
+    assert len(failures) == 2
+    assert "numerical source" in failures[0]
+    assert list(Store(tmp_path).pieces()) == []
+
+
+@pytest.mark.slow
+def test_two_runs_at_once_in_one_directory_agree(tmp_path, reference):
+    code = f"""
+import sys
+sys.path[:0] = {sys.path!r}
+from test_execution import *
+assert compute([scenario()], GOOD, 40, {str(tmp_path)!r}, execution=Processes(2), block_size=10) == ()
+"""
+    runs = [subprocess.Popen([sys.executable, "-c", code], env=environment()) for _ in range(2)]
+    assert [one.wait() for one in runs] == [0, 0]
+    assert_same(stored(tmp_path), reference)
+    assert take_inventory(tmp_path).complete
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="kills with POSIX signals")
+def test_a_run_that_is_killed_and_resumed_has_the_summary_of_one_that_was_not(tmp_path):
+    code = f"""
+import sys
+sys.path[:0] = {sys.path!r}
+from test_execution import *
+scenarios = [scenario(error_scale=s) for s in (0.1, 1.0, 3.0)]
+compute(scenarios, GOOD, 2000, {str(tmp_path)!r}, execution=Processes(2), block_size=20)
+"""
+    killed = 0
+    for wait in (2.5, 3.0, 3.5, None):
+        one = subprocess.Popen([sys.executable, "-c", code], env=environment())
+        try:
+            assert one.wait(wait) == 0
+        except subprocess.TimeoutExpired:
+            one.send_signal(signal.SIGKILL)
+            one.wait()
+            killed += 1
+    assert killed > 0
+    scenarios = [scenario(error_scale=s) for s in (0.1, 1.0, 3.0)]
+    resumed = run(scenarios, GOOD, 2000, output=tmp_path)
+    whole = run(scenarios, GOOD, 2000, block_size=500)
+    columns = [c for c in whole.columns if not c.startswith("time")]
+    assert resumed[columns].equals(whole[columns])
+
+
+def test_a_missing_dask_is_said_in_a_line(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(UserError, match=r"pip install"):
+        list(Dask(workers=3).run(rogues.square, [1]))
+
+
+def test_a_failure_keeps_one_line_and_the_traceback():
+    try:
+        raise KeyError("first\nsecond")
+    except KeyError as error:
+        failure = Failure.of(error)
+    assert "\n" not in failure.message
+    assert "test_execution" in failure.detail
+    assert Event(0, ended=True, failure=failure).failure is failure

@@ -1,0 +1,79 @@
+"""What is done, failed, missing and stale adds up, whatever the order in which it came about."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from conftest import Bent
+from hypothesis import given
+from hypothesis import strategies as st
+
+import ipe_bench.components
+from ipe_bench import Scenario
+from ipe_bench.api import compute
+from ipe_bench.baselines import LinearLSE
+from ipe_bench.cli.status import main as status
+from ipe_bench.errors import UserError
+from ipe_bench.noise import Gaussian
+from ipe_bench.prior import Gaussian as Prior
+from ipe_bench.statistics.inventory import take_inventory
+from ipe_bench.store import Store, gaps
+
+SCENARIO = Scenario(Bent(0.02), Gaussian(0.1), Prior(), 1.0)
+ESTIMATORS = {"linear_lse": LinearLSE()}
+RANGES = st.lists(st.tuples(st.integers(0, 40), st.integers(1, 20)).map(lambda r: (r[0], r[0] + r[1])))
+
+
+@given(RANGES, st.integers(0, 30), st.integers(0, 30))
+def test_gaps_are_what_no_range_holds(covered, start, length):
+    held = np.zeros(200, dtype=bool)
+    for first, last in covered:
+        held[first:last] = True
+    expected = [t for t in range(start, start + length) if not held[t]]
+    found = gaps(covered, start, start + length)
+    assert [t for first, last in found for t in range(first, last)] == expected
+    assert all(first < last for first, last in found)
+
+
+def test_a_complete_run_is_complete(tmp_path, capsys):
+    compute([SCENARIO], ESTIMATORS, 20, tmp_path, block_size=10)
+    inventory = take_inventory(tmp_path)
+    assert inventory.complete
+    assert [(c.names["estimator"], c.expected, c.done) for c in inventory.cells] == [
+        ("truth", 20, 20),
+        ("linear_lse", 20, 20),
+    ]
+    assert status([str(tmp_path)]) == 0
+    assert "complete" in capsys.readouterr().out
+
+
+def test_a_block_that_is_gone_is_missing_and_a_cut_one_is_damaged(tmp_path, capsys):
+    compute([SCENARIO], ESTIMATORS, 30, tmp_path, block_size=10)
+    gone, cut, *_ = sorted(Store(tmp_path).pieces(), key=lambda p: (p.key, p.start))
+    gone.path.unlink()
+    cut.path.write_bytes(cut.path.read_bytes()[:100])
+    inventory = take_inventory(tmp_path)
+    assert inventory.damaged == (cut.path,)
+    assert sorted((c.done, c.missing, c.failed) for c in inventory.cells) == [(10, 20, 0), (30, 0, 0)]
+    assert status([str(tmp_path)]) == 1
+    assert "damaged" in capsys.readouterr().out
+    compute([SCENARIO], ESTIMATORS, 30, tmp_path, block_size=10)
+    assert take_inventory(tmp_path).complete
+    assert cut.path.with_suffix(".damaged").exists()
+
+
+def test_results_of_other_source_are_stale_and_not_done(tmp_path, monkeypatch):
+    compute([SCENARIO], ESTIMATORS, 20, tmp_path)
+    original = ipe_bench.components.fingerprint
+    changed = lambda parts: {**original(parts), "source": "a fix"}  # noqa: E731
+    monkeypatch.setattr("ipe_bench.store.fingerprint", changed)
+    monkeypatch.setattr("ipe_bench.schedule.fingerprint", changed)
+    compute([dataclasses.replace(SCENARIO)], ESTIMATORS, 10, tmp_path)
+    assert [(c.expected, c.done, c.stale) for c in take_inventory(tmp_path).cells] == [(10, 10, 20), (10, 10, 20)]
+
+
+def test_a_folder_without_results_is_a_mistake(tmp_path):
+    with pytest.raises(UserError, match="holds no results"):
+        take_inventory(tmp_path)
