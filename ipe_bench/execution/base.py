@@ -56,7 +56,7 @@ class Execution(Named, ABC):
         Closing the iterator, or an exception of `FATAL`, stops what is under way.
         """
 
-    def warm_up(self, work: Work, tasks: int) -> None:  # noqa: B027
+    def warm_up(self, work: Work, tasks: int) -> None:
         """Starts what takes time to start before so many tasks can run, without waiting for it. May be left out."""
 
 
