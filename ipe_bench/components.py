@@ -203,6 +203,11 @@ def fingerprint(components: Iterable[Any]) -> dict[str, Any]:
     return {"versions": {p: package_version(p) for p in packages}, "source": digest.hexdigest()[:16]}
 
 
+def class_modules(component: Any) -> set[str]:
+    """The modules of the classes of a component and of the components inside it."""
+    return {cls.__module__ for cls in _classes(component)}
+
+
 def _classes(component: Any) -> list[type]:
     """The class of a component and of the components inside it."""
     if isinstance(component, tuple | list):

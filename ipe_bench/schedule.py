@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from ipe_bench.components import fingerprint
+from ipe_bench.components import class_modules, fingerprint
 from ipe_bench.execution.base import FATAL, Execution, Failure
 from ipe_bench.montecarlo import HISTORIES, Block
 from ipe_bench.scenario import Scenario
@@ -39,6 +39,12 @@ class Task:
     cells: tuple[Cell, ...]
     start: int
     stop: int
+
+    @property
+    def trusted(self) -> bool:
+        """Whether it runs nothing but our own code, which neither ends the process nor hangs."""
+        parts = [part for cell in self.cells for part in (cell.scenario, cell.estimator) if part is not None]
+        return all(name.startswith("ipe_bench.") for name in class_modules(parts))
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from ipe_bench import Scenario, run
 from ipe_bench.api import compute
 from ipe_bench.baselines import LinearLSE
 from ipe_bench.errors import StorageError, UserError  # noqa: F401
-from ipe_bench.execution import Dask, Event, Failure, Processes, Serial
+from ipe_bench.execution import Auto, Dask, Event, Failure, Processes, Serial
 from ipe_bench.ipe import IPE
 from ipe_bench.noise import Gaussian
 from ipe_bench.prior import Gaussian as Prior
@@ -155,6 +156,28 @@ def test_steps_come_in_order_and_an_exception_fails_its_task_alone(execution):
         assert mine[-1].ended
         failure = mine[-1].failure
         assert (None if failure is None else failure.message) == ("ValueError: two" if task == 2 else None)
+
+
+@dataclass(frozen=True)
+class Errand:
+    """A task that says whether it is trusted."""
+
+    trusted: bool
+
+
+@pytest.mark.parametrize(
+    ("tasks", "options", "here"),
+    [
+        ([Errand(True)], {}, True),
+        ([Errand(False)], {}, False),
+        ([Errand(True)] * 2, {}, False),
+        ([Errand(True)], {"block_timeout_s": 60.0}, False),
+    ],
+)
+def test_auto_starts_workers_only_where_they_are_of_use(tasks, options, here):
+    seen = [event.step for event in Auto(2, **options).run(rogues.surroundings, tasks) if not event.ended]
+    assert len(seen) == len(tasks)
+    assert ({pid for pid, _, _ in seen} == {os.getpid()}) == here
 
 
 def test_workers_serve_the_next_run():
