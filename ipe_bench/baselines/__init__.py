@@ -6,6 +6,7 @@ from ipe_bench.baselines.enkf import EnKF
 from ipe_bench.baselines.iterated_ekf import IteratedEKF
 from ipe_bench.baselines.least_squares import LeastSquares
 from ipe_bench.baselines.linear_lse import LinearLSE
+from ipe_bench.baselines.multiscale_lm import MultiscaleLM
 from ipe_bench.baselines.ukf import UKF
 
-__all__ = ["CKF", "EKF", "UKF", "EnKF", "IteratedEKF", "LeastSquares", "LinearLSE"]
+__all__ = ["CKF", "EKF", "UKF", "EnKF", "IteratedEKF", "LeastSquares", "LinearLSE", "MultiscaleLM"]

@@ -1,0 +1,82 @@
+"""Levenberg-Marquardt under two scalings of the parameters, of which the better minimum counts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ipe_bench.errors import UserError
+from ipe_bench.estimation import Estimates, Estimator
+from ipe_bench.least_squares import Damping, Minima, Objective, minimize, report
+from ipe_bench.linalg import Array
+from ipe_bench.scenario import Problem
+
+
+@dataclass(frozen=True)
+class MultiscaleLM(Estimator):
+    """Least squares for hard starts: minimised twice from the nominal point, and the lower minimum kept.
+
+    Damping pulls a step towards short ones, and what is short depends on the scaling. Marquardt's (column norms of J,
+    growing) does not care for units but may run along a parameter that the readings hardly see at the start; parameters
+    in multiples of their size, which a model states for this very purpose, do not, but they bend the path where a
+    parameter ends far from its size. The two fail in different places. Steps by QR, to a tolerance near round-off.
+    Costs about twice as much as one Levenberg-Marquardt.
+    """
+
+    max_iterations: int = 1000
+    """Of each of the two minimisations."""
+    tolerance: float = 1e-10
+    """Largest Gauss-Newton step in standard deviations of the local bound."""
+    damping: float = 1e-4
+    """The first damping factor, relative to the squared norm of J."""
+
+    equation = "least_squares"
+
+    def __post_init__(self) -> None:
+        if self.max_iterations < 1:
+            raise UserError(f"max_iterations={self.max_iterations}: give a whole number above 0")
+        if not self.tolerance > 0:
+            raise UserError(f"tolerance={self.tolerance}: give a number above 0")
+        if not self.damping > 0:
+            raise UserError(f"damping={self.damping}: give a number above 0")
+
+    def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
+        objective = Objective.of(problem, z, prior=False)
+        start = np.broadcast_to(problem.x0, (len(z), problem.measurement.n))
+        size = 1.0 / np.linalg.norm(problem.R.whiten_jacobian(problem.H))
+        best: Minima | None = None
+        for metric in (np.full(len(problem.x0), size), None):
+            found = minimize(
+                objective,
+                start,
+                damping=Damping(self.damping, metric),
+                tolerance=self.tolerance,
+                max_iterations=self.max_iterations,
+                history=history,
+            )
+            best = found if best is None else _better(best, found)
+        assert best is not None
+        return report(best, objective.model.tally, z.shape[1])
+
+
+def _better(first: Minima, second: Minima) -> Minima:
+    """For each trial the minimum that fits better; the first where they fit alike to round-off."""
+    costs = [np.where(np.isfinite(m.chi_square), m.chi_square, np.inf) for m in (first, second)]
+    # Without a finite fit anywhere the first keeps its status.
+    improves = costs[1] < costs[0] * (1 - 1e-12)
+
+    def choose(a: Array, b: Array) -> Array:
+        return np.where(improves.reshape(-1, *[1] * (a.ndim - 1)), b, a)
+
+    history = None
+    if first.history is not None and second.history is not None:
+        history = [b if yes else a for a, b, yes in zip(first.history, second.history, improves, strict=True)]
+    return Minima(
+        x=choose(first.x, second.x),
+        status=choose(first.status, second.status),
+        iterations=first.iterations + second.iterations,
+        history=history,
+        information=choose(first.information, second.information),
+        chi_square=choose(first.chi_square, second.chi_square),
+    )
