@@ -98,6 +98,8 @@ def check(
     if not estimators:
         mistakes.append("there is no estimator; choose with solver= and baseline=")
     for scenario in scenarios:
+        if scenario.noise.real and trials != 1:
+            mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
         for label, estimator in estimators.items():
             for need in estimator.missing(scenario.problem):
                 name = scenario.measurement.name

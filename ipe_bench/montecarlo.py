@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import chdtri
 
+from ipe_bench.errors import UserError
 from ipe_bench.estimation import Equation, Estimates, Estimator, estimate_safely
 from ipe_bench.ipe import frozen_covariance
 from ipe_bench.linalg import Array, information, inverse, pseudo_inverse, quadratic_form
@@ -133,7 +134,11 @@ def linear_bound(problem: Problem) -> Array:
 
 def _root_from(problem: Problem, trials: Trials, equation: Equation) -> Array:
     if equation == "frozen":
-        found = frozen_root(problem, trials.z, trials.x)
+        try:
+            found = frozen_root(problem, trials.z, trials.x)
+        except UserError:
+            # H lacks rank, so there is no such equation; the estimators that solve it say so.
+            return np.full(trials.x.shape, np.nan)
     else:
         found = least_squares_root(problem, trials.z, trials.x, prior=equation == "map")
     return np.where((found.status == Status.CONVERGED)[:, None], found.x, np.nan)

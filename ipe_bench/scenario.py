@@ -56,7 +56,11 @@ class Trials:
 @dataclass(frozen=True)
 class Scenario:
     """Everything that determines the trials. `truth` simulates the readings where it differs from what estimators
-    assume (a finer step, a richer model); its first parameters are those of `measurement`."""
+    assume (a finer step, a richer model); its first parameters are those of `measurement`.
+
+    With a noise that is `real` nothing is drawn: the one trial is the readings that come with the measurement, and its
+    truth is their certified answer.
+    """
 
     measurement: Measurement
     noise: Noise
@@ -70,10 +74,17 @@ class Scenario:
             raise UserError(f"error_scale={self.error_scale}: give a number above 0")
         if self.seed < 0:
             raise UserError(f"seed={self.seed}: give a whole number from 0 up")
+        if self.noise.real and self.measurement.recorded is None:
+            raise UserError(
+                f"noise=certified: measurement={self.measurement.name} comes with no readings of its own; choose "
+                "another noise, or one of measurement=nist/..."
+            )
 
     @cached_property
     def problem(self) -> Problem:
         """What the estimators are told."""
+        if self.noise.real:
+            return recorded_problem(self.measurement)
         model = self.measurement.suited_to(self.error_scale)
         return Problem(model, self.noise.covariance(model.m), self.prior.deviation(model.n, self.error_scale))
 
@@ -87,12 +98,27 @@ class Scenario:
 
         One seed gives the same draws, in units of the error scale, at every error scale.
         """
+        if self.noise.real:
+            return _recorded_trial(self.measurement, start, stop)
         model = self.simulator
         streams = [_streams(self.seed, trial) for trial in range(start, stop)]
         x = np.stack([self.prior.draw(model.nominal, self.error_scale, rng) for rng, _ in streams])
         h = model.simulate(x)
         z = np.stack([self.noise.corrupt(h[i], model.offset, rng) for i, (_, rng) in enumerate(streams)])
         return Trials(start, x[:, : self.problem.measurement.n], z)
+
+
+def recorded_problem(measurement: Measurement) -> Problem:
+    """What the estimators are told of the readings that come with a model: no prior, for none was drawn from."""
+    assert measurement.recorded is not None
+    return Problem(measurement, measurement.recorded.R)
+
+
+def _recorded_trial(measurement: Measurement, start: int, stop: int) -> Trials:
+    if (start, stop) != (0, 1):
+        raise UserError("noise=certified: has one trial; set trials=1")
+    assert measurement.recorded is not None
+    return Trials(0, measurement.recorded.x[None], measurement.recorded.z[None])
 
 
 def _streams(seed: int, trial: int) -> tuple[np.random.Generator, np.random.Generator]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
@@ -15,6 +16,7 @@ from ipe_bench.cli import console
 from ipe_bench.cli.config import CONFIG_ERRORS, Job, assemble, explain, prepare, refuse_silent_traps, rewrite
 from ipe_bench.errors import UserError
 from ipe_bench.fit import Fit, fit
+from ipe_bench.noise import Certified
 from ipe_bench.readings import read_readings
 from ipe_bench.statuses import Status
 
@@ -32,11 +34,16 @@ def main(arguments: Sequence[str]) -> int:
         job = assemble(config)
     except CONFIG_ERRORS as error:
         raise explain(error) from error
-    if config.readings is None:
+    recorded = job.scenario.measurement.recorded
+    if config.readings is not None:
+        problem = job.scenario.problem
+        z = read_readings(Path(config.readings), problem.measurement)
+    elif recorded is not None:
+        job = replace(job, scenario=replace(job.scenario, noise=Certified()))
+        problem, z = job.scenario.problem, recorded.z
+    else:
         raise UserError("readings: is not given; write readings=FILE (see `ipe-bench list measurement -v`)")
     check([job.scenario], job.estimators, trials=1)
-    problem = job.scenario.problem
-    z = read_readings(Path(config.readings), problem.measurement)
     fits = fit(problem, z, job.estimators)
     _show(console(), job, fits)
     return 0 if any(f.status is Status.CONVERGED for f in fits) else 1

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.linalg import Array
+from ipe_bench.linalg import Array, Covariance
 from ipe_bench.naming import Named
 
 _COMPLEX_STEP = 1e-100
@@ -31,6 +31,18 @@ class Parameter:
     size: float = 1.0
     group: str = ""
     """Parameters of one group share a panel in figures; empty: the name is the group."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Real readings that come with a model, and what is known of their answer."""
+
+    z: Array
+    """The readings (m,)."""
+    R: Covariance
+    """Their covariance, as far as it is known."""
+    x: Array
+    """The answer (n,) that somebody certifies, in multiples of the parameters' sizes."""
 
 
 class Measurement(Named, ABC):
@@ -107,6 +119,11 @@ class Measurement(Named, ABC):
     def jacobian_until(self, x: Array, stop: int) -> Array:
         """dh/dx in `rows(stop)` alone."""
         return self.jacobian(x)[:, self.rows(stop)]
+
+    @property
+    def recorded(self) -> Recorded | None:
+        """Real readings that come with this model; None where it has none."""
+        return None
 
     def suited_to(self, error_scale: float) -> Measurement:
         """This model, accurate enough for parameters of that error scale (an integration step, say)."""

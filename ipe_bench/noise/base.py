@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from ipe_bench.naming import Named
 
 class Noise(Named, ABC):
     """Errors of readings. A new noise is a frozen dataclass that writes `corrupt` and `covariance`."""
+
+    real: ClassVar[bool] = False
+    """True where readings are not simulated at all, but are those that come with the model."""
 
     @abstractmethod
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:

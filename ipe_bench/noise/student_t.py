@@ -22,7 +22,6 @@ class StudentT(Noise):
     """Standard deviation of the errors, in the unit of the readings."""
     degrees_of_freedom: float = 3.0
     """Above 2, for a finite variance; the smaller, the heavier the tails."""
-    name = "student_t"
 
     def __post_init__(self) -> None:
         if not self.degrees_of_freedom > 2:

@@ -32,6 +32,7 @@ def write_report(directories: Sequence[Path | str], output: Path | str) -> Repor
     Raises:
         UserError: a directory does not exist.
     """
+    from ipe_bench.report.certified import without_certified, write_certified
     from ipe_bench.report.figures import draw_all
     from ipe_bench.report.html import render_page
     from ipe_bench.report.tables import write_tables
@@ -43,12 +44,12 @@ def write_report(directories: Sequence[Path | str], output: Path | str) -> Repor
     output.mkdir(parents=True, exist_ok=True)
     summary_path = output / "summary.csv"
     write_atomically(summary_path, lambda temporary: analysis.summary.to_csv(temporary, index=False))
-    tables = write_tables(analysis, output / "tables")
+    tables = write_tables(analysis, output / "tables") + write_certified(analysis.collection, output / "tables")
     folder = output / "figures"
     folder.mkdir(exist_ok=True)
     figures: list[Path] = []
     shown = []
-    for drawing in draw_all(analysis):
+    for drawing in draw_all(without_certified(analysis)):
         png, pdf = drawing.save(folder)
         figures += [png, pdf]
         shown.append((drawing.name, drawing.title, drawing.caption, png.read_bytes()))

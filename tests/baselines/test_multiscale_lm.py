@@ -10,7 +10,7 @@ from ipe_bench.measurements import Bearings, Nist
 from ipe_bench.measurements.nist import datasets, score
 from ipe_bench.noise import Gaussian
 from ipe_bench.prior import Gaussian as Prior
-from ipe_bench.scenario import Problem, Scenario
+from ipe_bench.scenario import Scenario, recorded_problem
 
 ESTIMATOR = MultiscaleLM()
 HARD = ("BoxBOD", "MGH10", "MGH17", "Eckerle4", "Bennett5")
@@ -19,8 +19,8 @@ HARD = ("BoxBOD", "MGH10", "MGH17", "Eckerle4", "Bennett5")
 def certified_digits(dataset, start):
     model = Nist(dataset, start)
     with np.errstate(all="ignore"):
-        estimates = ESTIMATOR.estimate(Problem(model, model.covariance), model.readings[None])
-    return score(model, estimates.x[0], estimates.covariance[0])
+        estimates = ESTIMATOR.estimate(recorded_problem(model), model.readings[None])
+    return score(model, estimates.x[0], np.sqrt(np.diag(estimates.covariance[0])))
 
 
 @pytest.mark.parametrize("dataset", HARD)

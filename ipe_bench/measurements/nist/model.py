@@ -18,7 +18,7 @@ import numpy as np
 
 from ipe_bench.errors import UserError
 from ipe_bench.linalg import Array, Covariance
-from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.measurements.base import Measurement, Parameter, Recorded
 from ipe_bench.measurements.nist.formulas import FORMULAS
 
 _PREDICTORS: dict[str, tuple[str, ...]] = {"Nelson": ("time", "temperature")}
@@ -122,10 +122,12 @@ class Nist(Measurement):
             return FORMULAS[self.dataset](b, *self.predictors)
 
     @property
-    def covariance(self) -> Covariance:
-        """R as estimators assume it: independent readings of the certified residual deviation.
+    def recorded(self) -> Recorded:
+        """The readings with the certified answer, and R for independent readings of the certified residual deviation.
 
-        The deviation moves no least-squares estimate: it only says what a small gradient is. Standard deviations are
+        That deviation moves no least-squares estimate: it only says what a small gradient is. Standard deviations are
         scored with the residual variance of the fit itself, see `score`.
         """
-        return Covariance(np.full(self.m, self.certified.residual_deviation))
+        certified = self.certified
+        R = Covariance(np.full(self.m, certified.residual_deviation))
+        return Recorded(self.readings, R, certified.parameters / self.sizes)

@@ -35,20 +35,20 @@ def digits(value: Array | float, certified: Array | float) -> float:
     return min(lre, CERTIFIED_DIGITS) if lre >= 1.0 else 0.0
 
 
-def score(model: Nist, x: Array, covariance: Array | None) -> Digits:
-    """Compares an estimate x (n,) in multiples of sizes, and its covariance (n, n) if it has one, with the certified.
+def score(model: Nist, x: Array, deviation: Array | None) -> Digits:
+    """Compares an estimate x (n,) and its standard deviations (n,), if any, both in multiples of sizes, with NIST's.
 
-    An estimator is told R = sigma^2 I with NIST's residual deviation as sigma, and states its covariance for that R.
-    NIST's deviations rest on the residual variance of the fit, rss / (m - n), so that is put in the place of sigma^2.
+    An estimator is told R = sigma^2 I with NIST's residual deviation as sigma, and states its deviations for that R.
+    NIST's rest on the residual variance of the fit, rss / (m - n), so that is put in the place of sigma^2.
     """
     certified = model.certified
     with np.errstate(all="ignore"):
         residuals = model.readings - model.simulate(x[None])[0]
         rss = float(residuals @ residuals)
         deviations = np.full(model.n, np.nan)
-        if covariance is not None:
+        if deviation is not None:
             scale = np.sqrt(rss / certified.degrees_of_freedom) / certified.residual_deviation
-            deviations = np.sqrt(np.diagonal(covariance)) * model.sizes * scale
+            deviations = deviation * model.sizes * scale
     return Digits(
         digits(x * model.sizes, certified.parameters),
         digits(deviations, certified.deviations),

@@ -1,0 +1,37 @@
+"""Tables of runs on certified readings; such runs have one trial and no error scale, so figures leave them out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from ipe_bench.statistics.analysis import Analysis
+from ipe_bench.statistics.certified import certified_averages, certified_table
+from ipe_bench.statistics.collect import Collection
+from ipe_bench.store import write_atomically
+
+
+def write_certified(collection: Collection, folder: Path) -> tuple[Path, ...]:
+    """Writes certified.csv and certified_averages.csv; nothing where no run had certified readings."""
+    table = certified_table(collection)
+    if table.empty:
+        return ()
+    paths = []
+    for name, data in (("certified", table), ("certified_averages", certified_averages(table))):
+        path = folder / f"{name}.csv"
+        content = data.to_csv(index=False, float_format="%.2f")
+        write_atomically(path, lambda temporary, content=content: temporary.write_text(content, encoding="utf-8"))
+        paths.append(path)
+    return tuple(paths)
+
+
+def without_certified(analysis: Analysis) -> Analysis:
+    """The analysis of the simulated trials alone."""
+    groups = tuple(g for g in analysis.collection.groups if g.columns["noise"] != "certified")
+    if len(groups) == len(analysis.collection.groups):
+        return analysis
+    tables = {
+        name: table[table["noise"] != "certified"] if "noise" in table else table
+        for name, table in (("summary", analysis.summary), ("by_group", analysis.by_group))
+    }
+    return replace(analysis, collection=replace(analysis.collection, groups=groups), **tables)
