@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import DOP853
 
-from ipe_bench.measurements import OdeMeasurement, Parameter
+from ipe_bench.measurements import OdeMeasurement, Parameter, ode
 from ipe_bench.measurements.base import differentiate
 
 
@@ -138,3 +138,15 @@ def test_a_wrong_number_of_derivatives_is_refused():
 
     with pytest.raises(ValueError, match=r"rhs returns 2 values where 1 are declared"):
         Wrong().simulate(np.ones((1, 2)))
+
+
+def test_the_example_in_the_docs_of_ode_works():
+    source = "\n".join(line[4:] for line in ode.__doc__.splitlines() if line.startswith("    "))
+    scope = {"np": np, "dataclass": dataclass, "OdeMeasurement": OdeMeasurement, "Parameter": Parameter}
+    exec(source, scope)
+    pendulum = scope["Pendulum"]()
+    x = pendulum.nominal[None] + np.array([[0.0, 0.0], [1.0, 2.0]])
+    z = pendulum.simulate(x)
+    # A pendulum of 1 m that swings by half a radian takes 2.0382 s (series of the elliptic integral): a turning point.
+    assert z[0, 3] == pytest.approx(0.5 * np.cos(2 * np.pi / 2.0382 * 2.0), abs=2e-3)
+    np.testing.assert_allclose(pendulum.jacobian(x), differentiate(pendulum.simulate, x, analytic=False), atol=1e-8)

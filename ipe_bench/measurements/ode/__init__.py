@@ -1,1 +1,40 @@
-"""Measurement models defined by ordinary differential equations, on a compiled batched integrator."""
+"""Measurement models defined by ordinary differential equations, on a compiled batched integrator.
+
+A model is one class, here a pendulum of unknown length and damping that is released from half a radian:
+
+    @dataclass(frozen=True)
+    class Pendulum(OdeMeasurement):
+        step: float | None = 0.05                              # longest integration step, in the unit of the times
+        states, outputs, reading_unit = 2, ("angle",), "rad"
+
+        @property
+        def parameters(self):                                  # x counts in these sizes
+            return Parameter("length", "m", 0.01), Parameter("damping", "1/s", 0.01)
+
+        @property
+        def nominal(self):                                     # about 1 m and no damping
+            return np.array([100.0, 0.0])
+
+        @property
+        def times(self):                                       # readings are taken then; the start is at 0
+            return np.arange(0.5, 10.5, 0.5)
+
+        def start(self, p, c):                                 # p: the parameters, length and damping
+            return 0.5, 0.0
+
+        def rhs(self, t, y, p, c):
+            angle, rate = y
+            return rate, -9.80665 / p[0] * np.sin(angle) - p[1] * rate
+
+        def read(self, t, y, p, c):
+            return (y[0],)
+
+`start`, `rhs` and `read` are called with unknown quantities in place of numbers, once, and what they do is recorded:
+they may use + - * / **, NumPy's sin cos tan arctan exp log sqrt sinh cosh tanh, loops of fixed length, and anything
+else that does not ask for a value (no if, no comparison, no array of floats filled with results). From the recording
+come machine code for whole batches and the exact Jacobian; nothing else is to be written. `cases` adds experiments that
+share the parameters and differ in constants c, and `si_sizes` the sizes of parameters that are shown in other units.
+
+The method is of eighth order at a fixed step: halve `step` and look at how far the readings move, until they move less
+than the noise by some orders of magnitude. `lotka_volterra` is a small model of this kind, `gins` a large one.
+"""
