@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.errors import UserError
 from ipe_bench.estimation import Estimates, Estimator, describe_exception
-from ipe_bench.linalg import Array, Mask, finite, inverse, multiply, pseudo_inverse, solve
+from ipe_bench.linalg import Array, Covariance, Mask, finite, inverse, multiply, pseudo_inverse, solve
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.scenario import Problem
 from ipe_bench.solvers.base import Solver, State
@@ -116,6 +116,12 @@ class FrozenSystem:
     def subset(self, kept: Mask) -> FrozenSystem:
         H_plus = self.H_plus if len(self.H_plus) == 1 else self.H_plus[kept]
         return FrozenSystem(self.model, H_plus, self.z[kept], self.rows[kept])
+
+    def relinearized(self, x: Array, R: Covariance) -> FrozenSystem:
+        """The same readings with H+ of dh/dx at x (trials, n), for each trial its own; a deficient one is singular."""
+        H_plus, deficient = pseudo_inverse(self.model.jacobian(x, self.rows), R)
+        self.model.tally.singular[self.rows[deficient]] = True
+        return FrozenSystem(self.model, H_plus, self.z, self.rows)
 
 
 @dataclass

@@ -24,7 +24,7 @@ _FAR = 1e8
 _TINY_STEP = 1e-3
 """Steps below this share of the tolerance, while the gradient is above it, mean a stall."""
 _LARGEST_DAMPING = 1e30
-_ROUND_OFF = 1e-10
+_ROUND_OFF = 1e-8
 """A predicted decrease below this share of the objective cannot be seen in the objective any more."""
 
 
@@ -110,6 +110,9 @@ class _Factored:
 
     @classmethod
     def of(cls, J: Array, r: Array) -> _Factored:
+        missing = max(J.shape[2] - J.shape[1], 0)
+        # Fewer readings than parameters: rows of zeros keep U square, and deficient.
+        J, r = np.pad(J, ((0, 0), (0, missing), (0, 0))), np.pad(r, ((0, 0), (0, missing)))
         usable = finite(J) & finite(r)
         Q, U = np.linalg.qr(np.where(usable[:, None, None], J, 0.0))
         columns = np.sqrt(np.sum(U**2, axis=1))
@@ -267,7 +270,7 @@ def fit_probability(minima: Minima, readings: int) -> Array:
 
 
 def report(minima: Minima, tally: Tally, readings: int) -> Estimates:
-    """What an estimator hands back: covariance (J' R^-1 J)^-1, with P0^-1 where the prior counts, and the fit."""
+    """What an estimator hands back: the covariance is (J' R^-1 J)^-1, with P0^-1 inside where the prior counts."""
     return Estimates(
         x=minima.x,
         status=minima.status,

@@ -3,10 +3,23 @@
 from ipe_bench.baselines.ckf import CKF
 from ipe_bench.baselines.ekf import EKF
 from ipe_bench.baselines.enkf import EnKF
+from ipe_bench.baselines.gauss_newton import GaussNewton, LevenbergMarquardt, MapLM
 from ipe_bench.baselines.iterated_ekf import IteratedEKF
 from ipe_bench.baselines.least_squares import LeastSquares
 from ipe_bench.baselines.linear_lse import LinearLSE
 from ipe_bench.baselines.multiscale_lm import MultiscaleLM
 from ipe_bench.baselines.ukf import UKF
 
-__all__ = ["CKF", "EKF", "UKF", "EnKF", "IteratedEKF", "LeastSquares", "LinearLSE", "MultiscaleLM"]
+__all__ = [
+    "CKF",
+    "EKF",
+    "UKF",
+    "EnKF",
+    "GaussNewton",
+    "IteratedEKF",
+    "LeastSquares",
+    "LevenbergMarquardt",
+    "LinearLSE",
+    "MapLM",
+    "MultiscaleLM",
+]

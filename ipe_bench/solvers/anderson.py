@@ -1,0 +1,60 @@
+"""Anderson acceleration of the fixed-point iteration (Walker and Ni, SIAM J. Numer. Anal. 49, 2011)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ipe_bench.errors import UserError
+from ipe_bench.linalg import Array, multiply
+from ipe_bench.solvers.base import Solver, State, System
+
+_DEPENDENT = 1e-12
+"""Differences of F that are the same to this share are taken for one."""
+
+
+@dataclass(frozen=True)
+class AndersonState(State):
+    """The last `depth` differences of x and of F, each (trials, n, depth), newest first; zero where there are fewer."""
+
+    dx: Array
+    dF: Array
+
+
+@dataclass(frozen=True)
+class Anderson(Solver):
+    """x <- g(x) - sum of gamma_j times the j-th last difference of g, where gamma minimises |F - dF gamma|.
+
+    The fixed-point step g(x) = x - F(x) corrected by what the last `depth` steps say of the slope: no Jacobian, one
+    evaluation a step. Depth 1 is a secant method; depth n is one of Broyden's.
+    """
+
+    depth: int = 5
+
+    def __post_init__(self) -> None:
+        if self.depth < 1:
+            raise UserError(f"depth={self.depth}: give a whole number above 0")
+
+    def init(self, system: System, x: Array, F: Array) -> AndersonState:
+        none = np.zeros((*x.shape, min(self.depth, x.shape[1])))
+        return AndersonState(x, F, none, none)
+
+    def step(self, system: System, state: State) -> AndersonState:
+        assert isinstance(state, AndersonState)
+        gamma = _least_squares(state.dF, state.F)
+        x = state.x - state.F - multiply(state.dx - state.dF, gamma)
+        F = system.F(x)
+        return AndersonState(x, F, _push(state.dx, x - state.x), _push(state.dF, F - state.F))
+
+
+def _push(memory: Array, newest: Array) -> Array:
+    return np.concatenate([newest[:, :, None], memory[:, :, :-1]], axis=2)
+
+
+def _least_squares(A: Array, b: Array) -> Array:
+    """The shortest gamma that minimises |b - A gamma|, of columns scaled to length one: A (trials, n, depth)."""
+    length = np.linalg.norm(A, axis=1)
+    length = np.where((length > 0) & np.isfinite(length), length, np.inf)
+    scaled = np.nan_to_num(A / length[:, None, :], nan=0.0, posinf=0.0, neginf=0.0)
+    return multiply(np.linalg.pinv(scaled, rcond=_DEPENDENT), b) / length

@@ -1,0 +1,56 @@
+"""Broyden's method, the quasi-Newton method of Burden and Faires, Numerical Analysis, chapter 10, algorithm 10.2."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ipe_bench.errors import UserError
+from ipe_bench.linalg import Array, multiply
+from ipe_bench.solvers.base import Solver, State, System
+
+
+@dataclass(frozen=True)
+class BroydenState(State):
+    """`B` (trials, n, n) stands for J(x)^-1."""
+
+    B: Array
+
+
+@dataclass(frozen=True)
+class Broyden(Solver):
+    """x <- x - B F(x), where B is the inverse Jacobian as the steps so far have shown it ("good" Broyden).
+
+    The least change of the Jacobian that satisfies the secant equation is of rank one, so the Sherman-Morrison formula
+    updates its inverse: no Jacobian after the first, no linear system, superlinear convergence.
+    """
+
+    initial: Literal["jacobian", "identity"] = "jacobian"
+    """B at the start: J(x)^-1, or I, which makes the first step one of fixed-point iteration and needs no Jacobian."""
+
+    def __post_init__(self) -> None:
+        if self.initial not in ("jacobian", "identity"):
+            raise UserError(f"initial={self.initial}: choose jacobian or identity")
+
+    def init(self, system: System, x: Array, F: Array) -> BroydenState:
+        n = x.shape[1]
+        columns = np.broadcast_to(np.eye(n), (len(x), n, n))
+        if self.initial == "identity":
+            return BroydenState(x, F, columns)
+        J = system.J(x)
+        return BroydenState(x, F, np.stack([system.solve(J, columns[:, i]) for i in range(n)], axis=2))
+
+    def step(self, system: System, state: State) -> BroydenState:
+        assert isinstance(state, BroydenState)
+        s = -multiply(state.B, state.F)
+        x = state.x + s
+        F = system.F(x)
+        By = multiply(state.B, F - state.F)
+        sB = multiply(state.B.swapaxes(1, 2), s)
+        scale = np.einsum("ti,ti->t", s, By)
+        # s'By = 0 would make the new Jacobian singular: the old one is kept for a step.
+        usable = np.abs(scale) > np.finfo(float).eps * np.einsum("ti,ti->t", s, s)
+        change = (s - By)[:, :, None] * sB[:, None, :] / np.where(usable, scale, np.inf)[:, None, None]
+        return BroydenState(x, F, state.B + change)

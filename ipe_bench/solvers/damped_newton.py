@@ -1,0 +1,51 @@
+"""Newton's method with a line search (Dennis and Schnabel, Numerical Methods for Unconstrained Optimization, 6.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ipe_bench.errors import UserError
+from ipe_bench.linalg import Array
+from ipe_bench.solvers.base import Solver, State, System
+
+
+@dataclass(frozen=True)
+class DampedNewton(Solver):
+    """x <- x - t J(x)^-1 F(x) with t = 1, 1/2, 1/4, ... until |F| has decreased by enough (Armijo's rule).
+
+    Newton's method near a root. A trial whose |F| decreases for no t stays where it is, and has stalled.
+    """
+
+    decrease: float = 1e-4
+    """The share of the decrease that the slope promises which is enough."""
+    halvings: int = 30
+
+    def __post_init__(self) -> None:
+        if not 0 < self.decrease < 1:
+            raise UserError(f"decrease={self.decrease}: give a number between 0 and 1")
+        if self.halvings < 0:
+            raise UserError(f"halvings={self.halvings}: give a whole number from 0 up")
+
+    def step(self, system: System, state: State) -> State:
+        direction = -system.solve(system.J(state.x), state.F)
+        size = _norm(state.F)
+        t = np.ones(len(size))
+        F = system.F(state.x + direction)
+        # A singular trial has no direction to search along: its NaN goes back to the driver at once.
+        searching = np.isfinite(direction).all(axis=1)
+        for _ in range(self.halvings):
+            searching &= ~(_norm(F) <= (1 - self.decrease * t) * size)
+            if not searching.any():
+                break
+            t[searching] /= 2
+            shorter = state.x[searching] + t[searching, None] * direction[searching]
+            F[searching] = system.subset(searching).F(shorter)
+        failed = searching & ~(_norm(F) < size)
+        t = np.where(failed, 0.0, t)
+        return State(state.x + t[:, None] * direction, np.where(failed[:, None], state.F, F))
+
+
+def _norm(F: Array) -> Array:
+    return np.linalg.norm(F, axis=1)

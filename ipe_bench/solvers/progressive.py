@@ -1,0 +1,195 @@
+"""Progressive IPE: warm-started, re-linearised and damped, on a data window that grows as a filter sees the data."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.errors import UserError
+from ipe_bench.estimation import Estimates, Estimator
+from ipe_bench.ipe import Counted, Tally
+from ipe_bench.least_squares import Damping, Minima, Objective, fit_probability, minimize, report
+from ipe_bench.linalg import Array, Mask, finite
+from ipe_bench.measurements.base import Restricted
+from ipe_bench.scenario import Problem
+from ipe_bench.statuses import Status
+
+
+@dataclass(frozen=True)
+class Progressive(Estimator):
+    """The least-squares estimate, reached from far away.
+
+    A short stretch of data is nearly linear in the parameters, so its fit is easy to find; it starts the fit of a
+    window `growth` times as long, and so on to all data. In the windows the prior counts, as it does for a filter, and damps
+    in its own metric (lambda |(dx) / prior_deviation|^2); Marquardt's scaling fails there, since an early window leaves
+    some parameters nearly free. The last pass, on all data, is plain least squares without the prior.
+
+    The chi-square test of the residuals is the estimator's own verdict, extras `fit_p`. A trial that fails it at
+    `fit_level` is started again with windows that grow more slowly (the root of the growth each time), without the
+    prior and damped in the metric of the parameters' own units; the best fit of all attempts counts.
+
+    Without a prior (none known, or `use_prior: false`) the first attempt is already like that. Without epochs there are
+    no windows: a pass with the prior, where there is one, then Levenberg-Marquardt with Marquardt's scaling on all
+    data, and restarts from points around the nominal one.
+    """
+
+    growth: float = 2.0
+    """Each window has about this many times the epochs of the one before; the first has one epoch."""
+    use_prior: bool = True
+    prior_inflation: float = 1.0
+    """Times the prior's standard deviations."""
+    damping: float = 1.0
+    """lambda at the start of every window."""
+    window_tolerance: float = 0.1
+    """Where a window's fit is good enough: the Gauss-Newton step in standard deviations."""
+    window_iterations: int = 10
+    max_iterations: int = 60
+    """Steps of the last pass."""
+    tolerance: float = 1e-6
+    """Of the last pass: the Gauss-Newton step in standard deviations of the local bound."""
+    restarts: int = 3
+    fit_level: float = 1e-6
+    """Residuals less probable than this are taken for those of a wrong minimum."""
+    budget: float | None = None
+    """Simulations that a trial may cost, a Jacobian counting n and a window its share; None: no limit."""
+
+    equation = "least_squares"
+
+    def __post_init__(self) -> None:
+        if not self.growth > 1:
+            raise UserError(f"growth={self.growth}: give a number above 1")
+        for name in ("prior_inflation", "damping", "window_tolerance", "tolerance"):
+            if not getattr(self, name) > 0:
+                raise UserError(f"{name}={getattr(self, name)}: give a number above 0")
+
+    def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
+        search = _Search(self, problem, z, Tally.zeros(len(z)), history)
+        best = search.attempt(0, np.arange(len(z)))
+        for k in range(1, self.restarts + 1):
+            suspect = self._suspect(best, search.tally, z)
+            if not suspect.any():
+                break
+            again = search.attempt(k, np.flatnonzero(suspect))
+            better = suspect.copy()
+            better[suspect] = _is_better(again, _rows(best, suspect))
+            _replace(best, better, _rows(again, better[suspect]))
+        return report(best, search.tally, z.shape[1])
+
+    def _suspect(self, best: Minima, tally: Tally, z: Array) -> Mask:
+        """The trials that another attempt may help: (trials,)."""
+        spent = tally.simulations + best.x.shape[1] * tally.jacobians
+        hopeless = ~finite(z) | np.isin(np.arange(len(z)), list(tally.messages))
+        affordable = spent < (np.inf if self.budget is None else self.budget)
+        fits = (best.status == Status.CONVERGED) & (fit_probability(best, z.shape[1]) >= self.fit_level)
+        return ~fits & ~hopeless & affordable
+
+
+@dataclass(frozen=True)
+class _Search:
+    """The attempts at one batch, which share its tally."""
+
+    options: Progressive
+    problem: Problem
+    z: Array
+    tally: Tally
+    history: bool
+
+    def attempt(self, k: int, rows: NDArray[np.intp]) -> Minima:
+        """The k-th attempt for the trials `rows`: window after window, then all data."""
+        options, problem = self.options, self.problem
+        known = problem.prior_deviation if options.use_prior and k == 0 else None
+        prior = None if known is None else known * options.prior_inflation
+        in_windows = problem.measurement.epochs is not None
+        metric = prior if prior is not None else np.ones(problem.measurement.n) if in_windows else None
+        damping = Damping(options.damping, metric)
+        x = np.repeat(problem.x0[None] if in_windows else self._start(k)[None], len(rows), axis=0)
+        passes: list[Minima] = []
+        for objective in self._windows(k, rows, prior):
+            passes.append(self._minimize(objective, x, damping, options.window_tolerance, options.window_iterations))
+            x = passes[-1].x
+        whole = Objective(Counted(problem.measurement, self.tally), problem.R, self.z[rows], rows, problem.x0)
+        passes.append(self._minimize(whole, x, damping, options.tolerance, options.max_iterations))
+        return _in_sequence(passes)
+
+    def _windows(self, k: int, rows: NDArray[np.intp], prior: Array | None) -> Iterator[Objective]:
+        """The objectives of the growing windows; all data are left to the last pass."""
+        problem, model = self.problem, self.problem.measurement
+        if model.epochs is None:
+            if prior is not None:
+                yield Objective(Counted(model, self.tally), problem.R, self.z[rows], rows, problem.x0, prior)
+            return
+        epochs = len(model.epochs)
+        for stop in window_stops(epochs, self.options.growth ** (0.5**k)):
+            arrived = model.rows(stop)
+            window = Counted(Restricted.until(model, stop), self.tally, stop / epochs)
+            z = self.z[np.ix_(rows, arrived)]
+            yield Objective(window, problem.R.restricted(arrived), z, rows, problem.x0, prior)
+
+    def _minimize(self, objective: Objective, x: Array, damping: Damping, tolerance: float, limit: int) -> Minima:
+        budget = np.inf if self.options.budget is None else self.options.budget
+        return minimize(
+            objective,
+            x,
+            damping=damping,
+            tolerance=tolerance,
+            max_iterations=limit,
+            budget=budget,
+            history=self.history,
+        )
+
+    def _start(self, k: int) -> Array:
+        """Where attempt k starts without windows: the nominal point, then points around it, the same for all trials."""
+        x0, deviation = self.problem.x0, self.problem.prior_deviation
+        if k == 0:
+            return x0
+        spread = deviation if deviation is not None else np.where(x0 == 0, 1.0, np.abs(x0))
+        return x0 + spread * np.random.Generator(np.random.Philox(k)).standard_normal(len(x0))
+
+
+def window_stops(epochs: int, growth: float) -> list[int]:
+    """How many epochs each window has, the last one short of all: 1, 2, 4, 8, 16 of 30 for growth 2."""
+    lengths = itertools.takewhile(lambda length: length < epochs, (growth**i for i in itertools.count()))
+    return sorted({round(length) for length in lengths} - {epochs})
+
+
+def _in_sequence(passes: list[Minima]) -> Minima:
+    """The last pass, with the iterations and iterates of all of them."""
+    last = passes[-1]
+    last.iterations = np.sum([p.iterations for p in passes], axis=0)
+    if last.history is not None:
+        histories = [p.history for p in passes if p.history is not None]
+        last.history = [
+            np.concatenate([parts[0], *(part[1:] for part in parts[1:])]) for parts in zip(*histories, strict=True)
+        ]
+    return last
+
+
+def _is_better(new: Minima, old: Minima) -> Mask:
+    """Where a new attempt counts rather than the old one: it converged and fits better, or the old one had no end."""
+    converged = new.status == Status.CONVERGED
+    fits_better = ~(new.chi_square >= old.chi_square)
+    return converged & (fits_better | (old.status != Status.CONVERGED))
+
+
+def _rows(minima: Minima, kept: Mask) -> Minima:
+    history = None if minima.history is None else [h for h, keep in zip(minima.history, kept, strict=True) if keep]
+    return Minima(
+        minima.x[kept],
+        minima.status[kept],
+        minima.iterations[kept],
+        history,
+        minima.information[kept],
+        minima.chi_square[kept],
+    )
+
+
+def _replace(minima: Minima, where: Mask, by: Minima) -> None:
+    for name in ("x", "status", "iterations", "information", "chi_square"):
+        getattr(minima, name)[where] = getattr(by, name)
+    if minima.history is not None and by.history is not None:
+        for row, iterates in zip(np.flatnonzero(where), by.history, strict=True):
+            minima.history[row] = iterates

@@ -1,0 +1,61 @@
+"""Steepest descent on |F|^2, Burden and Faires, Numerical Analysis, chapter 10, algorithm 10.3."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ipe_bench.linalg import Array, multiply
+from ipe_bench.solvers.base import Solver, State, System
+
+_HALVINGS = 40
+
+
+@dataclass(frozen=True)
+class SteepestDescent(Solver):
+    """x <- x - alpha d along the gradient of g = |F|^2, alpha by quadratic interpolation of g at 0, alpha/2 and alpha.
+
+    The book's first trial step has length one, which presumes variables of order one; here it is as long as F, the step
+    of fixed-point iteration. Slow near a root, but g decreases from anywhere; where it no longer does, a local minimum
+    of g that is no root, the step is zero and the trial has stalled.
+    """
+
+    def step(self, system: System, state: State) -> State:
+        x, g = state.x, _squared(state.F)
+        gradient = multiply(system.J(x).swapaxes(1, 2), state.F)
+        length = np.linalg.norm(gradient, axis=1)
+        d = gradient * (np.sqrt(g) / np.where(length > 0, length, 1.0))[:, None]
+
+        # alpha_3: halved until g is below its value at the start.
+        alpha = np.ones(len(x))
+        F = system.F(x - d)
+        for _ in range(_HALVINGS):
+            uphill = ~(_squared(F) < g)
+            if not uphill.any():
+                break
+            alpha[uphill] /= 2
+            F[uphill] = system.subset(uphill).F(x[uphill] - alpha[uphill, None] * d[uphill])
+        downhill = _squared(F) < g
+        alpha = np.where(downhill, alpha, 0.0)
+        F = np.where(downhill[:, None], F, state.F)
+
+        # alpha_0: the minimum of the parabola through g at 0, alpha_2 = alpha_3 / 2 and alpha_3.
+        if downhill.any():
+            rows = system.subset(downhill)
+            x_d, d_d, a3, g1, g3 = x[downhill], d[downhill], alpha[downhill], g[downhill], _squared(F[downhill])
+            a2 = a3 / 2
+            h1 = (_squared(rows.F(x_d - a2[:, None] * d_d)) - g1) / a2
+            h2 = (g3 - g1 - h1 * a2) / (a3 - a2)
+            h3 = (h2 - h1) / a3
+            a0 = (a2 - h1 / np.where(h3 > 0, h3, np.inf)) / 2
+            a0 = np.where(h3 > 0, a0, a3)
+            F0 = rows.F(x_d - a0[:, None] * d_d)
+            better = _squared(F0) < g3
+            alpha[downhill] = np.where(better, a0, a3)
+            F[downhill] = np.where(better[:, None], F0, F[downhill])
+        return State(x - alpha[:, None] * d, F)
+
+
+def _squared(F: Array) -> Array:
+    return np.einsum("ti,ti->t", F, F)
