@@ -22,8 +22,8 @@ class Relinearized(Estimator):
     """Any solver on F(x) = H_k+ (h(x) - z), with H_k = dh/dx at the estimate x_k that the round before has reached.
 
     Where F(x_k) = 0 at its own linearisation, the gradient J' R^-1 (h - z) of least squares vanishes: the estimate is
-    no longer a root of the frozen equation but the least-squares minimum, and its covariance is the Cramer-Rao bound. With
-    one inner step of fixed-point iteration a round is a Gauss-Newton step; more of them save Jacobians.
+    no longer a root of the frozen equation but the least-squares minimum, and its covariance is the Cramer-Rao bound.
+    With one inner step of fixed-point iteration a round is a Gauss-Newton step; more of them save Jacobians.
     """
 
     solver: Solver = FixedPoint()  # noqa: RUF009 (frozen)
