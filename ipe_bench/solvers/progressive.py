@@ -25,8 +25,8 @@ class Progressive(Estimator):
 
     A short stretch of data is nearly linear in the parameters, so its fit is easy to find; it starts the fit of a
     window `growth` times as long, and so on to all data. In the windows the prior counts, as it does for a filter, and
-    damps in its own metric (lambda |(dx) / prior_deviation|^2); Marquardt's scaling fails there, since an early window leaves
-    some parameters nearly free. The last pass, on all data, is plain least squares without the prior.
+    damps in its own metric, lambda |dx / prior_deviation|^2; Marquardt's scaling fails there, since an early window
+    leaves some parameters nearly free. The last pass, on all data, is plain least squares without the prior.
 
     The chi-square test of the residuals is the estimator's own verdict, extras `fit_p`. A trial that fails it at
     `fit_level` is started again with windows that grow more slowly (the root of the growth each time), without the
