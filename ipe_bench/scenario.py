@@ -56,7 +56,8 @@ class Trials:
 @dataclass(frozen=True)
 class Scenario:
     """Everything that determines the trials. `truth` simulates the readings where it differs from what estimators
-    assume (a finer step, a richer model); its first parameters are those of `measurement`.
+    assume (a finer step, a richer model); its parameters and readings are those of `measurement`, and whatever else
+    acts on the readings is drawn by its `nuisance_deviation`.
 
     With a noise that is `real` nothing is drawn: the one trial is the readings that come with the measurement, and its
     truth is their certified answer.
@@ -78,6 +79,12 @@ class Scenario:
             raise UserError(
                 f"noise=certified: measurement={self.measurement.name} comes with no readings of its own; choose "
                 "another noise, or one of measurement=nist/..."
+            )
+        if self.truth is not None and (self.truth.n, self.truth.m) != (self.measurement.n, self.measurement.m):
+            raise UserError(
+                f"truth_measurement={self.truth.name}: has {self.truth.n} parameters and {self.truth.m} readings, "
+                f"measurement={self.measurement.name} has {self.measurement.n} and {self.measurement.m}; choose a "
+                "truth with the same parameters and readings"
             )
 
     @cached_property
@@ -103,9 +110,16 @@ class Scenario:
         model = self.simulator
         streams = [_streams(self.seed, trial) for trial in range(start, stop)]
         x = np.stack([self.prior.draw(model.nominal, self.error_scale, rng) for rng, _ in streams])
-        h = model.simulate(x)
+        deviation = model.nuisance_deviation
+        if len(deviation):
+            # After the parameters, from the same stream: a richer truth keeps the parameters of the trial.
+            h = model.simulate(
+                np.column_stack([x, [deviation * rng.standard_normal(len(deviation)) for rng, _ in streams]])
+            )
+        else:
+            h = model.simulate(x)
         z = np.stack([self.noise.corrupt(h[i], model.offset, rng) for i, (_, rng) in enumerate(streams)])
-        return Trials(start, x[:, : self.problem.measurement.n], z)
+        return Trials(start, x, z)
 
 
 def recorded_problem(measurement: Measurement) -> Problem:

@@ -3,6 +3,7 @@
 from ipe_bench.measurements.base import Measurement, Parameter, Restricted
 from ipe_bench.measurements.bearings import Bearings
 from ipe_bench.measurements.gins import Gins
+from ipe_bench.measurements.gins_richer import RicherGins
 from ipe_bench.measurements.lotka_volterra import LotkaVolterra
 from ipe_bench.measurements.nist import Nist
 from ipe_bench.measurements.ode.model import OdeMeasurement
@@ -21,5 +22,6 @@ __all__ = [
     "Polynomial",
     "Ranging",
     "Restricted",
+    "RicherGins",
     "Triad",
 ]

@@ -76,6 +76,16 @@ class Measurement(Named, ABC):
         return np.zeros(self.n)
 
     @property
+    def nuisance_deviation(self) -> Array:
+        """Standard deviations (k,) of what else acts on the readings where this is a truth richer than what estimators
+        assume: none by default.
+
+        A scenario draws k such numbers from N(0, deviation^2) in each trial, whatever the error scale, and hands them
+        to `simulate` as further columns of x behind the n parameters.
+        """
+        return np.zeros(0)
+
+    @property
     def epochs(self) -> tuple[NDArray[np.intp], ...] | None:
         """The rows of z that arrive at each epoch, in order of arrival; None where readings have no order."""
         return None

@@ -105,8 +105,9 @@ class Gins(OdeMeasurement):
         vx, vy, u, e, c = y[0], y[1], y[2:5], y[5:8], y[8:11]
         bx, by, kx, ky = p[:4]
         f = self.specific_force(t, u, p)
-        ax = (1.0 + kx) * f[0] + bx
-        ay = (1.0 + ky) * f[1] + by
+        fx, fy = self.sensed(f, p)
+        ax = (1.0 + kx) * fx + bx
+        ay = (1.0 + ky) * fy + by
         curvature = 1.0 / self.earth_radius
         transport = (-vy * curvature, vx * curvature, 0.0)
         command = [self.earth_rate * ci + rho for ci, rho in zip(c, transport, strict=True)]
@@ -124,6 +125,10 @@ class Gins(OdeMeasurement):
     def specific_force(self, t: Any, u: Sequence[Any], p: Sequence[Any]) -> Sequence[Any]:
         """Specific force in platform axes, m/s^2."""
         return [self.gravity * ui for ui in u]
+
+    def sensed(self, f: Sequence[Any], p: Sequence[Any]) -> tuple[Any, Any]:
+        """What the accelerometers x and y respond to, before scale factor and bias, m/s^2."""
+        return f[0], f[1]
 
     def drift(self, t: Any, f: Sequence[Any], p: Sequence[Any]) -> Sequence[Any]:
         """Drift rate of the platform about its axes, rad/s."""
