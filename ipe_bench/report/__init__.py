@@ -35,25 +35,26 @@ def write_report(directories: Sequence[Path | str], output: Path | str) -> Repor
     from ipe_bench.report.certified import without_certified, write_certified
     from ipe_bench.report.figures import draw_all
     from ipe_bench.report.html import render_page
-    from ipe_bench.report.tables import write_tables
+    from ipe_bench.report.tables import all_tables, write_tables
     from ipe_bench.statistics.analysis import analyse
     from ipe_bench.store import write_atomically
 
     analysis = analyse(directories)
     output = Path(output)
-    output.mkdir(parents=True, exist_ok=True)
+    folder = output / "figures"
+    folder.mkdir(parents=True, exist_ok=True)
     summary_path = output / "summary.csv"
     write_atomically(summary_path, lambda temporary: analysis.summary.to_csv(temporary, index=False))
-    tables = write_tables(analysis, output / "tables") + write_certified(analysis.collection, output / "tables")
-    folder = output / "figures"
-    folder.mkdir(exist_ok=True)
+    tables = all_tables(analysis)
+    table_paths = write_tables(analysis, tables, output / "tables")
+    table_paths += write_certified(analysis.collection, output / "tables")
     figures: list[Path] = []
     shown = []
     for drawing in draw_all(without_certified(analysis)):
         png, pdf = drawing.save(folder)
         figures += [png, pdf]
         shown.append((drawing.name, drawing.title, drawing.caption, png.read_bytes()))
-    page = render_page(analysis, shown)
+    page = render_page(analysis, tables, shown)
     report = output / "report.html"
     write_atomically(report, lambda temporary: temporary.write_text(page, encoding="utf-8"))
-    return ReportResult(analysis.summary, summary_path, tables, tuple(figures), report, analysis.problems)
+    return ReportResult(analysis.summary, summary_path, table_paths, tuple(figures), report, analysis.problems)

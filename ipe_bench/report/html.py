@@ -6,24 +6,29 @@ import base64
 import json
 from collections.abc import Sequence
 from importlib import resources
+from typing import Any
 
 from ipe_bench import __version__
-from ipe_bench.report import tables
+from ipe_bench.report.definitions import DEFINITIONS
 from ipe_bench.report.headline import headline
+from ipe_bench.report.tables import Table
 from ipe_bench.statistics.analysis import Analysis
+from ipe_bench.statistics.collect import Run
 
 Shown = tuple[str, str, str, bytes]
 """Name, title, caption and PNG of a figure."""
+MOST_ROWS = 2000
+"""Rows of one table on the page; its CSV file has all."""
+MOST_RUNS = 20
 
 
-def render_page(analysis: Analysis, figures: Sequence[Shown]) -> str:
+def render_page(analysis: Analysis, tables: Sequence[Table], figures: Sequence[Shown]) -> str:
     """The page as text."""
     from jinja2 import Environment, StrictUndefined
 
     source = resources.files("ipe_bench.report").joinpath("templates/report.html.j2").read_text(encoding="utf-8")
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     collection = analysis.collection
-    shown_tables = [] if analysis.summary.empty else [tables.overview(analysis)]
     return environment.from_string(source).render(
         version=__version__,
         headline=headline(analysis),
@@ -31,21 +36,41 @@ def render_page(analysis: Analysis, figures: Sequence[Shown]) -> str:
         expected=collection.expected,
         complete=collection.complete,
         problems=collection.problems,
-        tables=shown_tables,
+        tables=[_table(t) for t in tables],
         figures=[
             {"name": name, "title": title, "caption": caption, "data": base64.b64encode(png).decode()}
             for name, title, caption, png in figures
         ],
-        endings=analysis.endings.to_dict("records"),
-        runs=[
-            {
-                "started": run.started,
-                "name": run.path.name,
-                "commit": run.record.get("git_commit"),
-                "versions": run.record.get("versions") or {},
-                "machine": run.record.get("machine") or {},
-                "text": json.dumps({k: v for k, v in run.record.items() if k != "cells"}, indent=1),
-            }
-            for run in collection.runs
-        ],
+        nothing_failed=analysis.endings.empty and not analysis.summary.empty,
+        runs=[_run(run) for run in collection.runs[-MOST_RUNS:][::-1]],
+        older_runs=max(0, len(collection.runs) - MOST_RUNS),
+        definitions=DEFINITIONS,
     )
+
+
+def _table(table: Table) -> dict[str, Any]:
+    rows = list(table.rows)
+    return {
+        "name": table.name,
+        "title": table.title,
+        "caption": table.caption,
+        "columns": table.columns,
+        "rows": rows[:MOST_ROWS],
+        "cut": max(0, len(rows) - MOST_ROWS),
+    }
+
+
+def _run(run: Run) -> dict[str, Any]:
+    record = run.record
+    config = {key: record[key] for key in ("config", "scenarios", "estimators") if key in record}
+    machine = record.get("machine") or {}
+    facts = {
+        "started": run.started,
+        "trials": record.get("trials"),
+        "cells": len(record.get("cells", ())),
+        "git commit": record.get("git_commit") or "unknown",
+        "source": record.get("source"),
+        "machine": ", ".join(f"{k} {v}" for k, v in machine.items()) if isinstance(machine, dict) else machine,
+        "versions": ", ".join(f"{k} {v}" for k, v in (record.get("versions") or {}).items()),
+    }
+    return {"name": run.path.name, "facts": facts, "config": json.dumps(config, indent=1, ensure_ascii=False)}

@@ -10,7 +10,7 @@ from typing import Any
 # Okabe and Ito's palette (Color Universal Design, 2008), its yellow and black replaced by colours that show on white
 # paper; ordered so that neighbours differ in lightness too.
 COLORS = ("#0072B2", "#E69F00", "#D55E00", "#56B4E9", "#009E73", "#CC79A7", "#882255", "#777777", "#332288")
-MARKERS = ("o", "s", "D", "^", "v", "P", "X", "<", ">", "p", "h")
+MARKERS = ("o", "s", "D", "^", "v", "P", "*", "<", ">", "p", "h")
 DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1, 1.5)), (0, (5, 2, 1, 2)))
 REFERENCE = "linear_lse"
 """The estimator that others are held against: black and crossed, whoever else is there."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from ipe_bench.report.words import duration, percent, short
 from ipe_bench.statistics.summary import ALL, STATISTICS
 
 if TYPE_CHECKING:
@@ -74,35 +75,3 @@ def _cells(row: Any) -> list[str]:
         short(row["simulations_median"]),
         duration(row["time_median_s"]),
     ]
-
-
-def percent(share: float) -> str:
-    """A share in per cent; 100 and 0 only where it is all or none."""
-    if not math.isfinite(share):
-        return "-"
-    value = 100 * share
-    if 0 < value < 0.1 or 99.9 < value < 100:
-        return "<0.1 %" if value < 1 else ">99.9 %"
-    return f"{value:.0f} %" if value in (0, 100) else f"{value:.1f} %"
-
-
-def short(value: float) -> str:
-    """About four figures."""
-    if not math.isfinite(value):
-        return "inf" if value == math.inf else "-"
-    if value == int(value) and abs(value) < 1000:
-        return str(int(value))
-    if abs(value) >= 1e6 or 0 < abs(value) < 1e-3:
-        return f"{value:.1e}"
-    if abs(value) >= 100:
-        return f"{value:,.0f}"
-    return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"
-
-
-def duration(seconds: float) -> str:
-    if not math.isfinite(seconds):
-        return "-"
-    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
-        if seconds >= size:
-            return f"{seconds / size:#.3g}".rstrip(".") + f" {unit}"
-    return f"{seconds / 1e-6:.2g} µs"

@@ -3,23 +3,38 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from ipe_bench.linalg import Array
 from ipe_bench.statistics.collect import Collection, Group, collect
-from ipe_bench.statistics.intervals import bootstrap_rms
-from ipe_bench.statistics.summary import Sample, common_trials, summary_rows, to_frame
+from ipe_bench.statistics.comparisons import (
+    Outcomes,
+    Ranking,
+    capped_error,
+    compare_pairs,
+    leaders,
+    rank_over_scenarios,
+)
+from ipe_bench.statistics.intervals import bootstrap_rms, quantile, quantiles
+from ipe_bench.statistics.profiles import Profiles, distances_to_limit, iterations_to_limit
+from ipe_bench.statistics.summary import Sample, common_trials, identifier, summary_rows, to_frame
 from ipe_bench.statuses import Status
+
+PROBABILITIES = np.unique(np.concatenate([np.linspace(0, 1, 101), [0.001, 0.005, 0.025, 0.975, 0.995, 0.999]]))
+"""Where the distribution of errors is tabulated."""
+NIS = "extra_nis"
+"""Where filters report their normalised innovations squared."""
 
 
 @dataclass(frozen=True)
 class Analysis:
-    """Tables that figures, tables and the page are drawn from; all but `summary` have the same scenario columns."""
+    """Tables that figures, tables and the page are drawn from. Each starts with the scenario's columns."""
 
     collection: Collection
     summary: pd.DataFrame
@@ -27,6 +42,18 @@ class Analysis:
     """Root mean square of error over linear bound per group of parameters, with its bootstrap interval."""
     endings: pd.DataFrame
     """How trials ended that did not converge: status, message, number, and the first such trial."""
+    pairs: pd.DataFrame
+    """Every pair of estimators on every scenario; see `comparisons.Pair`."""
+    scores: pd.DataFrame
+    """Per scenario and estimator: capped mean error, its rank, whether it leads significantly, and median costs."""
+    ranking: Ranking | None
+    profiles: Profiles
+    distributions: Mapping[tuple[tuple[Any, ...], str], Array]
+    """By scenario and estimator, the quantiles of the Mahalanobis error at `PROBABILITIES`."""
+    correlations: Mapping[tuple[tuple[Any, ...], str], Array]
+    """By scenario and estimator, the correlation of the parameters' errors over solved trials."""
+    convergence: Mapping[tuple[tuple[Any, ...], str], list[Array]]
+    """By scenario and estimator, per stored trial, each iterate's distance from the last in standard deviations."""
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -49,18 +76,85 @@ def analyse(directories: Sequence[Path | str]) -> Analysis:
     rows: list[dict[str, Any]] = []
     by_group: list[dict[str, Any]] = []
     endings: list[dict[str, Any]] = []
-    for groups in collection.scenarios.values():
+    pairs: list[dict[str, Any]] = []
+    scores: list[dict[str, Any]] = []
+    ranked: list[dict[str, float]] = []
+    profiles = Profiles()
+    distributions: dict[Any, Array] = {}
+    correlations: dict[Any, Array] = {}
+    convergence: dict[Any, list[Array]] = {}
+    for scenario, groups in collection.scenarios.items():
         common = common_trials(collection, groups)
+        outcomes: dict[str, Outcomes] = {}
+        mine: dict[str, dict[str, Any]] = {}
+        n = 1
         for group in groups:
-            sample = Sample.load(collection, group, optional=["message"])
+            sample = Sample.load(collection, group, optional=["message", "jacobians", NIS])
+            if len(sample) == 0:
+                continue
+            n = sample.error.shape[1]
             rows += summary_rows(sample, common)
             by_group += _group_rows(sample)
             endings += _ending_rows(sample)
-    return Analysis(collection, to_frame(rows), pd.DataFrame(by_group), pd.DataFrame(endings))
+            where = (scenario, group.estimator)
+            outcomes[group.estimator] = one = outcomes_of(sample)
+            distributions[where] = quantiles(one.distance, PROBABILITIES)
+            correlations[where] = _correlation(sample)
+            steps = _convergence(collection, group, sample)
+            if steps:
+                convergence[where] = [d for d, _ in steps]
+            mine[group.estimator] = head(group) | {
+                "capped_error": capped_error(one, n),
+                "cost_median": quantile(one.cost, 0.5),
+                "cost_to_limit_median": quantile(np.array([c for _, c in steps]), 0.5),
+                "histories": len(steps),
+            }
+            if NIS in sample.scalars:
+                values = sample.scalars[NIS]
+                mine[group.estimator][NIS] = float(np.mean(values[np.isfinite(values)])) if len(values) else np.nan
+        compared = compare_pairs(outcomes)
+        scored = {label: row["capped_error"] for label, row in mine.items()}
+        ahead = leaders(scored, compared)
+        pairs += [dict(zip(_scenario_names(groups), scenario, strict=True)) | asdict(p) for p in compared]
+        scores += [row | {"leads": label in ahead} for label, row in mine.items()]
+        ranked.append(scored)
+        profiles.add(outcomes)
+    return Analysis(
+        collection,
+        to_frame(rows),
+        pd.DataFrame(by_group),
+        pd.DataFrame(endings),
+        pd.DataFrame(pairs),
+        pd.DataFrame(scores),
+        rank_over_scenarios(ranked),
+        profiles,
+        distributions,
+        correlations,
+        convergence,
+    )
 
 
 def head(group: Group) -> dict[str, Any]:
     return dict(group.columns) | {"estimator": group.estimator}
+
+
+def _scenario_names(groups: Sequence[Group]) -> list[str]:
+    return list(groups[0].columns)
+
+
+def outcomes_of(sample: Sample) -> Outcomes:
+    """What comparisons and profiles need of a sample, by ascending seed and trial."""
+    ids = identifier(sample.ids)
+    distance = np.sqrt(sample.scalars["crlb_distance"])
+    distance[~np.isfinite(distance)] = np.inf
+    cost = sample.scalars["simulations"].astype(float)
+    if "jacobians" in sample.scalars:
+        cost = cost + sample.error.shape[1] * sample.scalars["jacobians"]
+    success = sample.scalars["success"]
+    if np.all(ids[1:] > ids[:-1]):
+        return Outcomes(ids, distance, success, cost)
+    order = np.argsort(ids, kind="stable")
+    return Outcomes(ids[order], distance[order], success[order], cost[order])
 
 
 def _group_rows(sample: Sample) -> list[dict[str, Any]]:
@@ -71,11 +165,11 @@ def _group_rows(sample: Sample) -> list[dict[str, Any]]:
     rows = []
     solved = sample.solved
     squares = np.where(solved[:, None], sample.normalised, 0.0) ** 2
-    for name, which in members.items():
-        mean = squares[:, which].mean(axis=1, keepdims=True)
-        low, high = bootstrap_rms(mean, solved)
-        rmse = float(np.sqrt(mean[solved].mean())) if solved.any() else np.nan
-        rows.append(head(sample.group) | {"group": name, "rmse": rmse, "low": low[0], "high": high[0]})
+    means = np.stack([squares[:, which].mean(axis=1) for which in members.values()], axis=1)
+    lows, highs = bootstrap_rms(means, solved)
+    for i, name in enumerate(members):
+        rmse = float(np.sqrt(means[solved, i].mean())) if solved.any() else np.nan
+        rows.append(head(sample.group) | {"group": name, "rmse": rmse, "low": lows[i], "high": highs[i]})
     return rows
 
 
@@ -89,19 +183,61 @@ def _ending_rows(sample: Sample) -> list[dict[str, Any]]:
         ending = (str(sample.scalars["status"][i]), message)
         counts[ending] += 1
         first.setdefault(ending, f"seed {sample.ids[i, 0]}, trial {sample.ids[i, 1]}")
-    return [
-        head(sample.group)
-        | {
-            "status": status,
-            "message": message or _reason(status),
-            "trials": count,
-            "share": count / len(sample),
-            "first": first[status, message],
-        }
-        for (status, message), count in counts.most_common(20)
+    shown = counts.most_common(MESSAGES)
+    rest = sum(counts.values()) - sum(count for _, count in shown)
+    result = [
+        {"status": status, "message": message or _reason(status), "trials": count, "first": first[status, message]}
+        for (status, message), count in shown
     ]
+    if rest:
+        result.append({"status": "others", "message": "further messages, each rarer", "trials": rest, "first": ""})
+    return [head(sample.group) | row | {"share": row["trials"] / len(sample)} for row in result]
+
+
+MESSAGES = 20
+"""Different messages of one estimator on one scenario that are listed one by one."""
 
 
 def _reason(status: str) -> str:
     reasons = {s.label: s.reason for s in Status}
     return reasons.get(status, "")
+
+
+def _correlation(sample: Sample) -> Array:
+    """(n, n); NaN where an error does not vary or there are too few trials."""
+    used = sample.error[sample.solved]
+    n = sample.error.shape[1]
+    if len(used) < 3:
+        return np.full((n, n), np.nan)
+    # Errors over their bounds first: parameters may differ by many orders of magnitude.
+    centred = (used - used.mean(axis=0)) / sample.linear_bound
+    covariance = centred.T @ centred
+    deviation = np.sqrt(np.diag(covariance))
+    with np.errstate(all="ignore"):
+        return covariance / np.outer(deviation, deviation)
+
+
+def _convergence(collection: Collection, group: Group, sample: Sample) -> list[tuple[Array, float]]:
+    """Of each converged trial with a stored history: distances from the last iterate, and the cost of coming close.
+
+    The cost of iterate k is taken as its share (k + 1) / (iterates) of the trial's whole cost.
+    """
+    names = [p["name"] for p in sample.parameters]
+    columns = [f"x_{name}" for name in names]
+    result: list[tuple[Array, float]] = []
+    for cell, _ in group.cells:
+        rows = collection.load_history(cell, [*columns, "iteration"])
+        if rows is None:
+            continue
+        x = np.stack([rows[c] for c in columns], axis=1)
+        for trial in np.unique(rows["trial"]):
+            at = np.flatnonzero((sample.ids[:, 0] == cell.seed) & (sample.ids[:, 1] == trial))
+            history = x[rows["trial"] == trial]
+            if len(at) == 0 or not sample.converged[at[0]] or len(history) < 2:
+                continue
+            distances = distances_to_limit(history, sample.crlb[at[0]])
+            cost = float(sample.scalars["simulations"][at[0]])
+            if "jacobians" in sample.scalars:
+                cost += len(names) * float(sample.scalars["jacobians"][at[0]])
+            result.append((distances, cost * (iterations_to_limit(distances) + 1) / len(history)))
+    return result

@@ -156,6 +156,20 @@ class Collection:
             result[name] = values if whole else values[order]
         return result | {"trial": trial}
 
+    def load_history(self, cell: StoredCell, columns: Sequence[str]) -> dict[str, Array] | None:
+        """The iterates of a cell's first trials in order; None where none are stored."""
+        for directory in self.directories:
+            path = Store(directory).histories / f"{cell.key}.parquet"
+            if not path.is_file():
+                continue
+            table = _read(Piece(path, cell.key, 0, 0), ["trial", *columns])
+            if isinstance(table, str) or any(c not in table.column_names for c in ("trial", *columns)):
+                reason = table if isinstance(table, str) else "a column is missing"
+                self.problem(f"{path}: damaged: {reason}; left out")
+                continue
+            return {name: table[name].to_numpy() for name in table.column_names}
+        return None
+
 
 def _read(piece: Piece, names: list[str] | None) -> pa.Table | str:
     """The table without its metadata, so that tables join; what is wrong where it cannot be read."""

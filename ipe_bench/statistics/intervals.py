@@ -69,11 +69,22 @@ def nees_limits(degrees: int, level: float = LEVEL) -> tuple[float, float]:
 
 def quantile(values: Array, q: float) -> float:
     """Quantile of non-negative numbers where non-finite ones count as infinite (linear between order statistics)."""
+    return float(quantiles(values, np.array([q]))[0])
+
+
+def quantiles(values: Array, q: Array) -> Array:
+    """Several quantiles at once; see `quantile`."""
     if len(values) == 0:
-        return float("nan")
-    values = np.where(np.isfinite(values), values, np.inf)
+        return np.full(len(q), np.nan)
+    ordered = np.where(np.isfinite(values), values, np.inf)
     position = (len(values) - 1) * q
-    low, high = int(np.floor(position)), int(np.ceil(position))
-    ordered = np.partition(values, (low, high))
-    a, b = float(ordered[low]), float(ordered[high])
-    return a if a == b or position == low else a + (b - a) * (position - low)
+    low, high = np.floor(position).astype(int), np.ceil(position).astype(int)
+    if len(q) > 4:
+        ordered.sort()
+    else:
+        ordered.partition(np.unique(np.concatenate([low, high])))
+    a, b, part = ordered[low], ordered[high], position - low
+    # Between two infinite values, and at a value itself, nothing is interpolated: inf - inf is not a number.
+    step = np.zeros(len(q))
+    np.subtract(b, a, out=step, where=(a < b) & (part > 0))
+    return a + step * np.where(part > 0, part, 0.0)

@@ -18,7 +18,7 @@ from scipy.stats import chi2, norm
 
 from ipe_bench.linalg import Array
 from ipe_bench.statistics.collect import ALWAYS_COLUMNS, Collection, Group, collect
-from ipe_bench.statistics.intervals import bootstrap_rms, clopper_pearson, nees_limits, quantile
+from ipe_bench.statistics.intervals import bootstrap_rms, clopper_pearson, nees_limits, quantile, quantiles
 from ipe_bench.statuses import Status
 
 ALL = "all"
@@ -250,6 +250,7 @@ def _per_parameter(sample: Sample, shared_by_all: Array) -> dict[str, Array]:
     used = error if count == trials else error[solved]
     squares = np.where(solved[:, None], error, 0.0) ** 2
     low, high = bootstrap_rms(squares, solved)
+    middle, tail = np.array([quantiles(np.abs(column), np.array([0.5, 0.95])) for column in error.T]).T
     reports = sample.reports_covariance
     if reports:
         with np.errstate(all="ignore"):
@@ -270,8 +271,8 @@ def _per_parameter(sample: Sample, shared_by_all: Array) -> dict[str, Array]:
         "linear_bound": sample.linear_bound,
         "crlb": _root_mean(sample.crlb, solved),
         "bayes_bound": _root_mean(sample.bayes, solved),
-        "median_abs_error": np.array([quantile(np.abs(error[:, i]), 0.5) for i in range(n)]),
-        "q95_abs_error": np.array([quantile(np.abs(error[:, i]), 0.95) for i in range(n)]),
+        "median_abs_error": middle,
+        "q95_abs_error": tail,
         "nees": nees,
         "nees_low": np.full(n, limits[0]),
         "nees_high": np.full(n, limits[1]),

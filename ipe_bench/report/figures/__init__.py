@@ -2,48 +2,31 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
 
+from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import house_style, looks
 from ipe_bench.statistics.analysis import Analysis
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """A figure with its file name, its title and a caption that says what is seen."""
-
-    name: str
-    title: str
-    caption: str
-    figure: Figure
-
-    def save(self, folder: Path) -> tuple[Path, Path]:
-        """Writes PNG and PDF; no file is ever seen half written."""
-        paths = []
-        # The layout is worked out once; every further save would repeat it.
-        self.figure.draw_without_rendering()
-        self.figure.set_layout_engine("none")
-        for suffix, nothing in ((".png", "Software"), (".pdf", "CreationDate")):
-            path = folder / f"{self.name}{suffix}"
-            temporary = folder / f".{self.name}{suffix}.{os.getpid()}.tmp"
-            self.figure.savefig(temporary, format=suffix[1:], dpi=150, metadata={nothing: None})
-            os.replace(temporary, path)
-            paths.append(path)
-        return paths[0], paths[1]
+__all__ = ["Drawing", "draw_all"]
 
 
 def draw_all(analysis: Analysis) -> Iterator[Drawing]:
     """Every figure that the data allow, in the order of the report."""
-    from ipe_bench.report.figures import error_scale
+    from ipe_bench.report.figures import (
+        consistency,
+        convergence,
+        correlation,
+        cost,
+        distributions,
+        error_scale,
+        profiles,
+        ranks,
+        success,
+    )
 
     look = looks(analysis.collection.estimators)
+    rooms = (error_scale, success, distributions, consistency, convergence, cost, profiles, ranks, correlation)
     with house_style():
-        for module in (error_scale,):
-            yield from module.draw(analysis, look)
+        for room in rooms:
+            yield from room.draw(analysis, look)

@@ -1,0 +1,58 @@
+"""Numbers as readers write them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+
+def plain(value: Any) -> str:
+    """A number without needless zeros."""
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def percent(share: float) -> str:
+    """A share in per cent; 100 and 0 only where it is all or none."""
+    if not math.isfinite(share):
+        return "-"
+    value = 100 * share
+    if 0 < value < 0.1 or 99.9 < value < 100:
+        return "<0.1 %" if value < 1 else ">99.9 %"
+    return f"{value:.0f} %" if value in (0, 100) else f"{value:.1f} %"
+
+
+def short(value: float) -> str:
+    """About four figures."""
+    if not math.isfinite(value):
+        return "inf" if value == math.inf else "-"
+    if value == int(value) and abs(value) < 1000:
+        return str(int(value))
+    if abs(value) >= 1e6 or 0 < abs(value) < 1e-3:
+        return f"{value:.1e}"
+    if abs(value) >= 100:
+        return f"{value:,.0f}"
+    return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"
+
+
+def precise(value: float) -> str:
+    """Four significant figures, for physical units of any size."""
+    if not math.isfinite(value):
+        return "inf" if value == math.inf else "-"
+    return f"{value:.4g}"
+
+
+def duration(seconds: float) -> str:
+    """Seconds in the unit that suits them."""
+    if not math.isfinite(seconds):
+        return "-"
+    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
+        if seconds >= size:
+            return f"{seconds / size:#.3g}".rstrip(".") + f" {unit}"
+    return f"{seconds / 1e-6:.2g} µs"
+
+
+def p_value(p: float) -> str:
+    """A probability; very small ones by their order."""
+    if not math.isfinite(p):
+        return "-"
+    return f"{p:.3f}" if p >= 1e-3 else f"{p:.0e}" if p > 1e-300 else "<1e-300"

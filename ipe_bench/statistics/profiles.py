@@ -1,0 +1,69 @@
+"""What accuracy costs: performance and data profiles, and the cost of coming close to an estimator's own limit.
+
+The cost of a trial is its number of simulations, a Jacobian counting n; a trial without success costs infinitely much.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ipe_bench.linalg import Array
+from ipe_bench.statistics.comparisons import Outcomes, common
+
+CLOSE = 0.05
+"""An iterate within this many standard deviations of the last one is as good as the last one."""
+RATIOS = np.unique(np.round(np.geomspace(1, 1000, 181), 6))
+BUDGETS = np.unique(np.round(np.geomspace(1, 100_000, 301)))
+
+
+@dataclass
+class Profiles:
+    """Counts over all scenarios; `add` takes one scenario after another, so that trials need not be kept."""
+
+    trials: dict[str, int] = field(default_factory=dict)
+    within_ratio: dict[str, Array] = field(default_factory=dict)
+    within_budget: dict[str, Array] = field(default_factory=dict)
+
+    def add(self, outcomes: Mapping[str, Outcomes]) -> None:
+        paired = common(outcomes)
+        costs = {label: np.where(one.success, one.cost, np.inf) for label, one in paired.items()}
+        if not costs:
+            return
+        best = np.full(len(next(iter(costs.values()))), np.inf)
+        for cost in costs.values():
+            best = np.minimum(best, cost)
+        for label, cost in costs.items():
+            solved = np.isfinite(cost)
+            # A cost of nothing (nobody simulates) is the best there is.
+            ratio = np.divide(cost[solved], best[solved], out=np.ones(int(solved.sum())), where=best[solved] > 0)
+            self.trials[label] = self.trials.get(label, 0) + len(cost)
+            self._count(self.within_ratio, label, ratio, RATIOS * (1 + 1e-9))
+            self._count(self.within_budget, label, cost[solved], BUDGETS)
+
+    def _count(self, counts: dict[str, Array], label: str, values: Array, limits: Array) -> None:
+        within = np.searchsorted(np.sort(values), limits, side="right")
+        counts[label] = counts.get(label, 0) + within
+
+    def performance(self, label: str) -> Array:
+        """Share of trials solved at a cost of at most `RATIOS` times the cheapest estimator's (Dolan and Moré, Math.
+        Program. 91, 2002)."""
+        return self.within_ratio[label] / max(1, self.trials[label])
+
+    def data(self, label: str) -> Array:
+        """Share of trials solved within `BUDGETS` simulations (Moré and Wild, SIAM J. Optim. 20, 2009)."""
+        return self.within_budget[label] / max(1, self.trials[label])
+
+
+def distances_to_limit(history: Array, deviation: Array) -> Array:
+    """Largest component of each iterate's (iterates, n) distance from the last one, in standard deviations (n,)."""
+    with np.errstate(invalid="ignore"):
+        return np.abs((history - history[-1]) / deviation).max(axis=1)
+
+
+def iterations_to_limit(distances: Array) -> int:
+    """The first iterate from which on all are within `CLOSE` of the last."""
+    far = np.flatnonzero(~(distances <= CLOSE))
+    return int(far[-1]) + 1 if len(far) else 0

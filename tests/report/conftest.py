@@ -1,0 +1,138 @@
+"""A headless Chromium, driven through its DevTools pipe: no further package, no port, no network."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import fcntl
+import json
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from synthetic_store import Synthetic
+
+FLAGS = (
+    "--headless=new --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking"
+    " --disable-component-update --disable-sync --disable-dev-shm-usage --hide-scrollbars --remote-debugging-pipe"
+).split()
+
+
+class Page:
+    """One tab: `go`, `run` JavaScript, `screenshot`, `pdf`; `messages` holds console errors and exceptions."""
+
+    def __init__(self, read: int, write: int) -> None:
+        self.reader, self.write = os.fdopen(read, "rb", buffering=0), write
+        self.rest = b""
+        self.count = 0
+        self.session: str | None = None
+        self.messages: list[str] = []
+        self.requests: list[str] = []
+        self.loaded = False
+        target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        self.session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self.call(f"{domain}.enable")
+
+    def call(self, method: str, **parameters: Any) -> Any:
+        self.count += 1
+        message: dict[str, Any] = {"id": self.count, "method": method, "params": parameters}
+        if self.session:
+            message["sessionId"] = self.session
+        os.write(self.write, json.dumps(message).encode() + b"\0")
+        while True:
+            answer = self._next()
+            if answer.get("id") == self.count:
+                assert "error" not in answer, answer
+                return answer["result"]
+
+    def _next(self) -> dict[str, Any]:
+        while b"\0" not in self.rest:
+            chunk = self.reader.read(1 << 20)
+            assert chunk, "Chromium went away"
+            self.rest += chunk
+        line, self.rest = self.rest.split(b"\0", 1)
+        event = json.loads(line)
+        method, parameters = event.get("method"), event.get("params", {})
+        if method == "Page.loadEventFired":
+            self.loaded = True
+        elif method == "Runtime.exceptionThrown":
+            self.messages.append(str(parameters["exceptionDetails"].get("text")))
+        elif method == "Runtime.consoleAPICalled":
+            self.messages.append(f"{parameters['type']}: {parameters['args']}")
+        elif method == "Log.entryAdded":
+            self.messages.append(parameters["entry"]["text"])
+        elif method == "Page.javascriptDialogOpening":
+            self.messages.append(f"dialog: {parameters['message']}")
+        elif method == "Network.requestWillBeSent":
+            self.requests.append(parameters["request"]["url"])
+        return event
+
+    def go(self, path: Path, width: int = 1280, height: int = 900, *, phone: bool = False) -> None:
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
+        self.loaded = False
+        self.call("Page.navigate", url=path.resolve().as_uri())
+        while not self.loaded:
+            self._next()
+
+    def run(self, script: str) -> Any:
+        result = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in result, result
+        return result["result"].get("value")
+
+    def screenshot(self, path: Path, *, whole: bool = False) -> None:
+        answer = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)
+        path.write_bytes(base64.b64decode(answer["data"]))
+
+    def pdf(self) -> bytes:
+        answer = self.call("Page.printToPDF", preferCSSPageSize=True, printBackground=True)
+        return base64.b64decode(answer["data"])
+
+
+@contextlib.contextmanager
+def chromium(program: str) -> Iterator[Page]:
+    """Starts Chromium with its pipe on descriptors 3 and 4, and ends it."""
+    # Chromium reads descriptor 3 and writes 4: ours are kept above, so that the shell's redirections cannot meet them.
+    low = [*os.pipe(), *os.pipe()]
+    to_read, to_write, from_read, from_write = (fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, 10) for fd in low)
+    for fd in low:
+        os.close(fd)
+    with tempfile.TemporaryDirectory(prefix="ipe-bench-chromium-", ignore_cleanup_errors=True) as profile:
+        script = f'exec "$@" 3<&{to_read} 4>&{from_write} {to_read}<&- {from_write}>&-'
+        command = ["bash", "-c", script, "bash", program, *FLAGS, f"--user-data-dir={profile}"]
+        process = subprocess.Popen(
+            command, pass_fds=(to_read, from_write), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        os.close(to_read)
+        os.close(from_write)
+        page = None
+        try:
+            page = Page(from_read, to_write)
+            yield page
+        finally:
+            process.terminate()
+            process.wait(timeout=30)
+            os.close(to_write)
+            if page is not None:
+                page.reader.close()
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Page]:
+    """A page of a headless Chromium; skips where there is none."""
+    program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if program is None or shutil.which("bash") is None:
+        pytest.skip("there is no Chromium")
+    with chromium(program) as page:
+        yield page
+
+
+@pytest.fixture
+def synthetic(tmp_path: Path) -> Synthetic:
+    """An empty store to fill."""
+    return Synthetic(tmp_path / "store")
