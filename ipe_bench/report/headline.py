@@ -46,7 +46,8 @@ def headline(analysis: Analysis) -> str:
                 f"The linear estimate is off by {short(at['rmse_over_linear_bound'])} times that bound at scale"
                 f" {plain(at['error_scale'])}, and succeeds there in {percent(at['success'])} of trials."
             )
-    return " ".join(sentences)
+    # A number and its sign stay on one line.
+    return " ".join(sentences).replace(" %", "\u00a0%")
 
 
 def best_estimator(analysis: Analysis, scenarios: pd.DataFrame | None = None) -> str:

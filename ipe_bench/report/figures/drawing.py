@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from ipe_bench.store import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -22,14 +23,17 @@ class Drawing:
 
     def save(self, folder: Path) -> tuple[Path, Path]:
         """Writes PNG and PDF; no file is ever seen half written."""
-        paths = []
-        # The layout is worked out once; every further save would repeat it.
-        self.figure.draw_without_rendering()
-        self.figure.set_layout_engine("none")
-        for suffix, nothing in ((".png", "Software"), (".pdf", "CreationDate")):
-            path = folder / f"{self.name}{suffix}"
-            temporary = folder / f".{self.name}{suffix}.{os.getpid()}.tmp"
-            self.figure.savefig(temporary, format=suffix[1:], dpi=150, metadata={nothing: None})
-            os.replace(temporary, path)
-            paths.append(path)
-        return paths[0], paths[1]
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.backends.backend_pdf import FigureCanvasPdf
+
+        # Layout once and one drawing per file: `savefig` would draw everything five times.
+        engine = self.figure.get_layout_engine()
+        if engine is not None:
+            engine.execute(self.figure)
+            self.figure.set_layout_engine("none")
+        png, pdf = (folder / f"{self.name}{suffix}" for suffix in (".png", ".pdf"))
+        write_atomically(png, lambda path: FigureCanvasAgg(self.figure).print_png(path, metadata={"Software": None}))
+        write_atomically(
+            pdf, lambda path: FigureCanvasPdf(self.figure).print_pdf(path, metadata={"CreationDate": None})
+        )
+        return png, pdf

@@ -1,0 +1,210 @@
+"""The report is complete, says what the data say, and shows hostile names without obeying them."""
+
+from __future__ import annotations
+
+import io
+import re
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+
+import numpy as np
+import pandas as pd
+import pytest
+from rich.console import Console
+from synthetic_store import Synthetic
+
+from ipe_bench.report import write_report
+from ipe_bench.report.figures.ranks import cliques
+from ipe_bench.report.headline import headline
+from ipe_bench.report.style import looks
+from ipe_bench.report.tables import all_tables, escape, latex, markdown
+from ipe_bench.report.terminal import render
+from ipe_bench.report.words import duration, percent, short
+from ipe_bench.statistics import analyse
+
+HOSTILE = "<script>alert(1)</script>"
+
+
+def fill(store: Synthetic, labels=("linear_lse", "one", "two"), scales=(1.0, 10.0, 100.0), trials=80, **model) -> None:
+    """A linear estimate that is worse the larger the scale, and others that reach the bound."""
+    rng = np.random.default_rng(0)
+    for scale in scales:
+        scenario = store.scenario(error_scale=scale, **model)
+        base = 0.1 * rng.normal(size=(trials, scenario.measurement.n))
+        for i, label in enumerate(labels):
+            factor = scale if label == "linear_lse" else 1.0 + 0.05 * i
+            store.add(scenario, label, factor * base, simulations=1.0 + 3 * i, iterations=i)
+    store.record(trials)
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    store = Synthetic(tmp_path_factory.mktemp("report") / "store")
+    fill(store)
+    return write_report([store.directory], store.directory)
+
+
+def test_everything_is_written(result):
+    assert result.problems == ()
+    stored = pd.read_csv(result.summary_path)
+    pd.testing.assert_frame_equal(stored, result.summary, check_exact=False, rtol=1e-12)
+    names = {p.name for p in result.figures}
+    expected = ("figure_2", "error_against_scale", "success_against_scale", "error_distributions", "consistency")
+    for name in (*expected, "cost_against_accuracy", "profiles", "critical_difference", "correlation"):
+        assert {f"{name}.png", f"{name}.pdf"} <= names
+    assert {p.name for p in result.tables} >= {"overview.csv", "overview.md", "overview.tex", "comparisons.tex"}
+    for path in (*result.figures, *result.tables, result.report):
+        assert path.stat().st_size > 100
+    assert not list(result.report.parent.rglob("*.tmp"))
+
+
+def test_the_page_stands_alone_and_says_the_headline(result):
+    page = result.report.read_text(encoding="utf-8")
+    assert not re.search(r"""(src|href)\s*=\s*["'](?!data:|#)""", page)
+    assert "http" not in re.sub(r"base64,[^\"]*", "", page)
+    sentence = headline(analyse([result.report.parent]))
+    assert sentence in page.replace("&#39;", "'")
+
+
+def test_the_headline_is_computed_from_the_data(synthetic):
+    fill(synthetic)
+    rows = analyse([synthetic.directory])
+    total = rows.summary[rows.summary["parameter"] == "all"].set_index(["estimator", "error_scale"])
+    sentence = headline(rows).replace("\u00a0", " ")
+    assert "At error scales 1 to 100, one succeeds in" in sentence
+    value = total.loc[("linear_lse", 100.0), "rmse_over_linear_bound"]
+    assert f"off by {short(value)} times" in sentence
+
+
+def test_nothing_stored_gives_a_page_that_says_so(tmp_path):
+    result = write_report([tmp_path], tmp_path / "out")
+    assert "Nothing is stored yet" in result.report.read_text(encoding="utf-8")
+    assert result.figures == ()
+    assert len(result.problems) == 1
+
+
+def test_the_table_in_the_terminal_fits_100_columns(synthetic):
+    fill(synthetic, labels=("linear_lse", "fixed_point", "a_rather_long_label_of_an_estimator"))
+    rows = analyse([synthetic.directory]).summary
+    out = io.StringIO()
+    Console(file=out, width=100).print(render(rows))
+    lines = out.getvalue().splitlines()
+    assert max(map(len, lines)) <= 100
+    text = out.getvalue()
+    assert "…" not in text
+    assert text.count("fixed_point") == 3
+
+
+def test_hostile_names_are_shown_and_not_run(synthetic):
+    fill(synthetic, labels=("linear_lse", HOSTILE, "$x_1$ & \\frac{a}{b} | *b*"), names=(HOSTILE, "_b%", "c#~^\u03b1"))
+    result = write_report([synthetic.directory], synthetic.directory / "out")
+    page = result.report.read_text(encoding="utf-8")
+    assert HOSTILE not in page
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
+
+    class Tags(HTMLParser):
+        count = 0
+
+        def handle_starttag(self, tag, attrs):
+            self.count += tag == "script"
+
+    tags = Tags()
+    tags.feed(page)
+    assert tags.count == 1
+    out = io.StringIO()
+    Console(file=out, width=120).print(render(result.summary))
+    assert "<script>" in out.getvalue()
+    for path in result.tables:
+        if path.suffix == ".md":
+            assert "<script>" not in path.read_text(encoding="utf-8")
+
+
+def test_markdown_rows_have_as_many_cells_as_their_head(synthetic):
+    fill(synthetic, labels=("a|b", "c"))
+    for table in all_tables(analyse([synthetic.directory])):
+        lines = [line for line in markdown(table).splitlines() if line.startswith("|")]
+        assert len({len(re.findall(r"(?<!\\)\|", line)) for line in lines}) == 1
+
+
+def test_latex_escapes_every_special_character():
+    text = escape("a_b & 50 % $x$ {y} #1 ~ ^ \\ < > µ 中")
+    assert re.sub(r"\\([&%$#{}_]|[a-zA-Z]+)", "", text).count("$") == 0
+    assert r"\&" in text
+    assert r"\texttt{U+4E2D}" in text
+
+
+@pytest.mark.slow
+def test_latex_tables_compile(synthetic, tmp_path):
+    program = shutil.which("pdflatex")
+    if program is None:
+        pytest.skip("there is no pdflatex")
+    fill(synthetic, labels=("linear_lse", HOSTILE, "$x_1$ & \\frac{a}{b} 中 µ"), names=(HOSTILE, "_b%", "c#~^"))
+    tables = all_tables(analyse([synthetic.directory]))
+    body = "\n\n".join(latex(t) for t in tables)
+    packages = "booktabs,longtable,siunitx,amsmath"
+    (tmp_path / "t.tex").write_text(
+        "\\documentclass[landscape]{article}\\usepackage[T1]{fontenc}\\usepackage{" + packages + "}"
+        "\\begin{document}\\tiny\n" + body + "\\end{document}",
+        encoding="utf-8",
+    )
+    command = [program, "-interaction=nonstopmode", "-halt-on-error", "t.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, errors="replace", timeout=300)
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert (tmp_path / "t.pdf").stat().st_size > 1000
+
+
+def test_estimators_keep_their_look_and_no_two_look_alike():
+    labels = ["linear_lse", *(f"e{i}" for i in range(25))]
+    look = looks(labels)
+    assert list(look) == labels
+    assert len({(one.color, one.marker, str(one.dash)) for one in look.values()}) == len(labels)
+    # In grey, marker and dash alone must tell the first ones apart.
+    assert len({(one.marker, str(one.dash)) for one in list(look.values())[:10]}) == 10
+
+
+def test_bars_join_ranks_within_the_critical_difference():
+    assert cliques([1.0, 2.0, 3.0, 4.0], 1.5) == [(0, 1), (1, 2), (2, 3)]
+    assert cliques([1.0, 2.0, 3.0], 5.0) == [(0, 2)]
+    assert cliques([1.0, 3.0], 1.0) == []
+
+
+def test_numbers_are_written_for_readers():
+    assert [percent(v) for v in (1.0, 0.9999, 0.974, 0.0, 0.0001, float("nan"))] == [
+        "100 %",
+        ">99.9 %",
+        "97.4 %",
+        "0 %",
+        "<0.1 %",
+        "-",
+    ]
+    assert [short(v) for v in (1.00234, 14520.3, 3.0, float("inf"))] == ["1.002", "14,520", "3", "inf"]
+    assert [duration(v) for v in (2.0, 0.0123, 9.4e-6)] == ["2.00 s", "12.3 ms", "9.40 µs"]
+
+
+@pytest.mark.slow
+def test_ten_million_rows_take_less_than_two_gibibytes(tmp_path):
+    """20 estimators, 5 scenarios: the figure for time is in the log, memory is bounded here."""
+    store = Synthetic(tmp_path / "store")
+    names = tuple(f"p{i}" for i in range(4))
+    rng = np.random.default_rng(0)
+    trials = 100_000
+    for k in range(5):
+        scenario = store.scenario(error_scale=10.0**k, names=names)
+        base = 0.1 * rng.normal(size=(trials, 4))
+        for i in range(20):
+            solved = rng.random(trials) < 0.99
+            store.add(scenario, f"e{i:02d}", base * (1 + 0.02 * i), block=25_000, solved=solved)
+    store.record(trials)
+    script = (
+        "import resource, sys, time; from ipe_bench.report import write_report; began = time.time();"
+        f"r = write_report([{str(store.directory)!r}], {str(tmp_path / 'out')!r}); assert not r.problems;"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, time.time() - began)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=600)
+    memory, seconds = map(float, done.stdout.split())
+    print(f"{memory:.2f} GiB, {seconds:.0f} s")
+    assert memory < 2.0
+    # Three minutes on two free cores; the machine of a test may be shared.
+    assert seconds < 360

@@ -1,0 +1,184 @@
+"""Whatever lies in a directory is used or named, and nothing is touched."""
+
+import json
+import shutil
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from synthetic_store import Pretender
+
+from ipe_bench.errors import UserError
+from ipe_bench.statistics import analyse
+from ipe_bench.statistics.collect import collect, config_leaves, differing, merge_ranges
+from ipe_bench.store import FOOTER
+
+
+@pytest.fixture
+def filled(synthetic):
+    rng = np.random.default_rng(0)
+    scenario = synthetic.scenario()
+    for label in ("one", "two"):
+        synthetic.add(scenario, label, 0.1 * rng.normal(size=(60, 3)), block=20)
+    synthetic.record(60)
+    return synthetic
+
+
+def pieces(store, label="one"):
+    cell = next(c for c in store.cells.values() if c.label == label)
+    return sorted(store.store.trials.glob(f"{cell.key}-*.parquet"))
+
+
+def test_a_complete_directory_has_no_problems(filled):
+    collection = collect([filled.directory])
+    assert collection.problems == []
+    assert (collection.complete, collection.expected) == (3, 3)
+
+
+def test_missing_trials_are_counted_per_cell(filled):
+    pieces(filled)[1].unlink()
+    collection = collect([filled.directory])
+    assert (collection.complete, collection.expected) == (2, 3)
+    (line,) = collection.problems
+    assert line.startswith("missing: one on repeated, gaussian, error scale 1")
+    assert "40 of 60 expected trials" in line
+
+
+def test_a_cell_that_was_never_computed_is_missing(filled):
+    for path in pieces(filled, "two"):
+        path.unlink()
+    (line,) = collect([filled.directory]).problems
+    assert "two on" in line
+    assert "0 of 60" in line
+
+
+@pytest.mark.parametrize("keep", [0, 10, 500, -9])
+def test_a_truncated_file_is_named_skipped_and_left_alone(filled, keep):
+    path = pieces(filled)[0]
+    content = path.read_bytes()[:keep]
+    path.write_bytes(content)
+    analysis = analyse([filled.directory])
+    assert any(str(path) in line and "damaged" in line for line in analysis.problems)
+    assert path.read_bytes() == content
+    rows = analysis.summary[analysis.summary["parameter"] == "all"].set_index("estimator")
+    assert rows.loc["one", "trials"] == 40
+    assert rows.loc["two", "trials"] == 60
+
+
+def test_damaged_data_behind_an_intact_footer_is_named(filled):
+    path = pieces(filled)[0]
+    content = bytearray(path.read_bytes())
+    content[4:600] = bytes(596)
+    path.write_bytes(content)
+    analysis = analyse([filled.directory])
+    assert any(str(path) in line and "damaged" in line for line in analysis.problems)
+
+
+def test_foreign_files_are_named_and_skipped(filled):
+    trials = filled.store.trials
+    pq.write_table(pa.table({"x": [1.0]}), trials / "weather.parquet")
+    pq.write_table(pa.table({"x": [1.0]}), trials / "0123456789abcdef-0-1.parquet")
+    pq.write_table(
+        pa.table({"x": [1.0]}).replace_schema_metadata({FOOTER: b'{"a": 1}'}), trials / "0123456789abcdef-1-2.parquet"
+    )
+    shutil.copy(pieces(filled)[0], trials / "fedcba9876543210-0-20.parquet")
+    (filled.store.runs / "note.json").write_text("[1, 2]")
+    analysis = analyse([filled.directory])
+    assert sum("foreign" in line for line in analysis.problems) == 5
+    assert (analysis.summary["trials"] == 60).all()
+    assert (trials / "weather.parquet").exists()
+
+
+def test_a_file_with_fewer_rows_than_its_name_says_is_damaged(filled):
+    path = pieces(filled)[0]
+    table = pq.read_table(path)
+    pq.write_table(table.slice(0, 5), path)
+    assert any("has 5 of 20 rows" in line for line in collect([filled.directory]).problems)
+
+
+def test_stale_results_are_named_and_never_mixed_in(filled):
+    # The same identity under another key, as other code would have stored it.
+    for path in pieces(filled):
+        table = pq.read_table(path)
+        footer = json.loads(table.schema.metadata[FOOTER])
+        key = "aaaaaaaaaaaaaaaa"
+        footer |= {"key": key, "source": "old"}
+        at = table.column_names.index("error_a")
+        table = table.set_column(at, "error_a", pa.array(np.full(table.num_rows, 1e9)))
+        table = table.replace_schema_metadata({FOOTER: json.dumps(footer).encode()})
+        pq.write_table(table, path.with_name(path.name.replace(footer["key"], key).replace(path.name[:16], key)))
+    analysis = analyse([filled.directory])
+    (line,) = analysis.problems
+    assert line.startswith("stale: one on repeated")
+    assert "60 trials" in line
+    assert analysis.summary["rmse"].max() < 1e3
+
+
+def test_failures_that_a_run_recorded_are_shown(filled):
+    filled.record(60, "again", failures=["trials 0 to 20: MemoryError"])
+    assert any("failed: trials 0 to 20: MemoryError" in line for line in collect([filled.directory]).problems)
+
+
+def test_a_directory_that_is_not_there_is_the_users_mistake(tmp_path):
+    with pytest.raises(UserError, match="no such directory"):
+        collect([tmp_path / "nowhere"])
+
+
+def test_an_empty_directory_says_so(tmp_path):
+    (line,) = collect([tmp_path]).problems
+    assert "holds no results" in line
+
+
+def test_the_truth_being_absent_is_a_problem_and_not_a_crash(filled):
+    for path in pieces(filled, "truth"):
+        path.unlink()
+    analysis = analyse([filled.directory])
+    assert any("the truth" in line for line in analysis.problems)
+    assert analysis.summary["crlb"].isna().all()
+    assert analysis.summary["rmse"].notna().all()
+
+
+def test_leaves_that_differ_are_found_at_any_depth():
+    def scenario(step, truth=None, latitude=36.0):
+        return {
+            "_target_": "a.Scenario",
+            "noise": {"_target_": "a.Quantization", "step": step},
+            "measurement": {"_target_": "a.Gins", "latitude_deg": latitude, "list": [1, 2]},
+            "truth": truth,
+        }
+
+    assert differing([scenario(1), scenario(1)]) == []
+    assert differing([scenario(1), scenario(2)]) == ["noise.step"]
+    assert differing([scenario(1), scenario(1, latitude=40.0)]) == ["measurement.latitude_deg"]
+    fine = {"_target_": "a.Gins", "step": 1.0}
+    coarse = {"_target_": "a.Gins", "step": 9.0}
+    assert differing([scenario(1), scenario(1, fine)]) == ["truth"]
+    assert differing([scenario(1), scenario(1, fine), scenario(1, coarse)]) == ["truth", "truth.step"]
+
+
+def test_options_of_different_classes_are_not_compared():
+    one = {"noise": {"_target_": "a.Quantization", "step": 1}}
+    two = {"noise": {"_target_": "a.Gaussian", "deviation": 1}}
+    assert differing([one, two]) == ["noise"]
+    assert config_leaves(two)["noise"][1] == "a.Gaussian"
+
+
+def test_the_name_of_a_component_is_not_repeated_as_its_class(synthetic):
+    from dataclasses import replace
+
+    from ipe_bench.noise import Quantization
+
+    scenario = synthetic.scenario()
+    e = 0.1 * np.random.default_rng(0).normal(size=(30, 3))
+    synthetic.add(scenario, "one", e)
+    cell = replace(scenario, noise=Quantization(0.7))
+    synthetic.bound = lambda s: np.full(3, 0.1)
+    synthetic.add(cell, "one", e, estimator=Pretender())
+    (first, second) = collect([synthetic.directory]).groups
+    assert list(first.columns) == ["measurement", "noise", "error_scale"]
+    assert {first.columns["noise"], second.columns["noise"]} == {"gaussian", "quantization"}
+
+
+def test_ranges_merge():
+    assert merge_ranges([(5, 7), (0, 3), (2, 5), (9, 10)]) == ((0, 7), (9, 10))
