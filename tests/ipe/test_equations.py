@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import Bent
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from small_models import Bent
 
 from ipe_bench.baselines import LinearLSE
 from ipe_bench.errors import UserError

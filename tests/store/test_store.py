@@ -11,7 +11,7 @@ import time
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from conftest import Bent
+from small_models import Bent
 
 from ipe_bench import Scenario, run
 from ipe_bench.api import compute

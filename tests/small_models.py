@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pytest
 
 from ipe_bench.linalg import Array
 from ipe_bench.measurements import Measurement, Parameter
@@ -41,8 +40,3 @@ class Bent(Measurement):
     def simulate(self, x: Array) -> Array:
         y = np.matmul(self.A, x[..., None])[..., 0]
         return y + self.bend * y**2
-
-
-@pytest.fixture
-def bent():
-    return Bent
