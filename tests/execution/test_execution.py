@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rogues
-from conftest import Bent
 from rogues import Rogue
+from small_models import Bent
 
 from ipe_bench import Scenario, run
 from ipe_bench.api import compute

@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from conftest import Bent
 from hypothesis import given
 from hypothesis import strategies as st
+from small_models import Bent
 
 import ipe_bench.components
 from ipe_bench import Scenario
