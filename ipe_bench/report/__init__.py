@@ -50,7 +50,8 @@ def write_report(directories: Sequence[Path | str], output: Path | str) -> Repor
     table_paths += write_certified(analysis.collection, output / "tables")
     figures: list[Path] = []
     shown = []
-    for drawing in draw_all(without_certified(analysis)):
+    pictured = without_certified(analysis)
+    for drawing in draw_all(pictured) if pictured.collection.groups else ():
         png, pdf = drawing.save(folder)
         figures += [png, pdf]
         shown.append((drawing.name, drawing.title, drawing.caption, png.read_bytes()))

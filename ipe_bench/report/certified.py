@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
+
+import pandas as pd
 
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.certified import certified_averages, certified_table
@@ -30,8 +33,10 @@ def without_certified(analysis: Analysis) -> Analysis:
     groups = tuple(g for g in analysis.collection.groups if g.columns["noise"] != "certified")
     if len(groups) == len(analysis.collection.groups):
         return analysis
-    tables = {
-        name: table[table["noise"] != "certified"] if "noise" in table else table
-        for name, table in (("summary", analysis.summary), ("by_group", analysis.by_group))
+    held = {f.name: getattr(analysis, f.name) for f in fields(analysis)}
+    tables: dict[str, Any] = {
+        name: table[table["noise"] != "certified"]
+        for name, table in held.items()
+        if isinstance(table, pd.DataFrame) and "noise" in table
     }
     return replace(analysis, collection=replace(analysis.collection, groups=groups), **tables)
