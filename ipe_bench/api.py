@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import os
 import platform
 import subprocess
 import tempfile
@@ -12,11 +11,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ipe_bench import __version__
 from ipe_bench.components import describe, fingerprint
 from ipe_bench.errors import UserError
 from ipe_bench.estimation import Estimator
 from ipe_bench.execution import Execution, Serial
+from ipe_bench.machine import cores, library_versions
 from ipe_bench.scenario import Scenario
 from ipe_bench.schedule import RunLog, Watcher, perform, plan, work_through
 from ipe_bench.store import Cell, Store
@@ -124,21 +123,14 @@ def _write_record(store: Store, scenarios: Sequence[Scenario], estimators: Mappi
         "scenarios": [describe(s) for s in scenarios],
         "estimators": {label: describe(e) for label, e in estimators.items()},
         "cells": [{"key": c.key, "identity_key": c.footer["identity_key"], "names": c.footer["names"]} for c in cells],
-        "versions": _versions(),
-        "machine": {"host": platform.node(), "system": platform.platform(), "cores": os.cpu_count()},
+        "libraries": library_versions(),
+        "machine": {"host": platform.node(), "system": platform.platform(), "cores": cores()},
         "git_commit": _git_commit(),
         **fingerprint([*scenarios, *estimators.values()]),
     }
     identifier = f"{now:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}"
     store.write_run(identifier, record)
     return identifier
-
-
-def _versions() -> dict[str, str]:
-    import importlib.metadata as metadata
-
-    names = ("numpy", "scipy", "numba", "filterpy", "hydra-core", "pandas", "pyarrow", "seaborn", "matplotlib")
-    return {"python": platform.python_version(), "ipe-bench": __version__} | {n: metadata.version(n) for n in names}
 
 
 def _git_commit() -> str | None:

@@ -200,6 +200,7 @@ def fingerprint(components: Iterable[Any]) -> dict[str, Any]:
     for module in sorted(modules):
         digest.update(module.encode())
         digest.update(_source_of(module))
+        digest.update(_data_of(module))
     return {"versions": {p: package_version(p) for p in packages}, "source": digest.hexdigest()[:16]}
 
 
@@ -267,6 +268,15 @@ def _is_module(name: str) -> bool:
         return importlib.util.find_spec(name) is not None
     except ModuleNotFoundError:
         return False
+
+
+@functools.cache
+def _data_of(module: str) -> bytes:
+    """The JSON files beside a module: tables that it computes with."""
+    spec = importlib.util.find_spec(module)
+    if spec is None or spec.origin is None:
+        return b""
+    return b"".join(path.read_bytes() for path in sorted(Path(spec.origin).parent.glob("*.json")))
 
 
 @functools.cache

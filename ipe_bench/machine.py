@@ -2,10 +2,32 @@
 
 from __future__ import annotations
 
+import functools
+import importlib.metadata
 import os
+import platform
+
+_LIBRARIES = (
+    "numpy",
+    "scipy",
+    "numba",
+    "llvmlite",
+    "filterpy",
+    "hydra-core",
+    "pandas",
+    "pyarrow",
+    "seaborn",
+    "matplotlib",
+)
 
 
 def cores() -> int:
     """Cores that this process may use: fewer than there are where an affinity mask says so."""
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+@functools.cache
+def library_versions() -> dict[str, str]:
+    """Python and the libraries that results depend on, with their versions."""
+    return {"python": platform.python_version()} | {name: importlib.metadata.version(name) for name in _LIBRARIES}

@@ -32,6 +32,7 @@ from ipe_bench.errors import StorageError, UserError
 from ipe_bench.estimation import Estimator
 from ipe_bench.execution.base import Failure
 from ipe_bench.linalg import Array
+from ipe_bench.machine import library_versions
 from ipe_bench.montecarlo import linear_bound
 from ipe_bench.scenario import Scenario
 
@@ -77,6 +78,7 @@ class Cell:
             "identity": self.identity,
             "identity_key": _digest(self.identity),
             **self.made_by,
+            "libraries": library_versions(),
             "names": {
                 "measurement": model.name,
                 "noise": scenario.noise.name,

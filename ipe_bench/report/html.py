@@ -71,6 +71,6 @@ def _run(run: Run) -> dict[str, Any]:
         "git commit": record.get("git_commit") or "unknown",
         "source": record.get("source"),
         "machine": ", ".join(f"{k} {v}" for k, v in machine.items()) if isinstance(machine, dict) else machine,
-        "versions": ", ".join(f"{k} {v}" for k, v in (record.get("versions") or {}).items()),
+        "versions": ", ".join(f"{k} {v}" for k, v in (record.get("libraries") or {}).items()),
     }
     return {"name": run.path.name, "facts": facts, "config": json.dumps(config, indent=1, ensure_ascii=False)}
