@@ -24,6 +24,8 @@ _FAR = 1e8
 _TINY_STEP = 1e-3
 """Steps below this share of the tolerance, while the gradient is above it, mean a stall."""
 _LARGEST_DAMPING = 1e30
+_FIXED = 1e-9
+"""A prior deviation of zero is taken for this share of the largest."""
 _ROUND_OFF = 1e-8
 """A predicted decrease below this share of the objective cannot be seen in the objective any more."""
 
@@ -43,9 +45,8 @@ class Objective:
     def of(cls, problem: Problem, z: Array, *, prior: bool, inflation: float = 1.0) -> Objective:
         """The objective of all readings z (trials, m); with the prior, its deviations times `inflation`."""
         model = Counted(problem.measurement, Tally.zeros(len(z)))
-        deviation = problem.prior_deviation if prior else None
-        scaled = None if deviation is None else deviation * inflation
-        return cls(model, problem.R, z, np.arange(len(z)), problem.x0, scaled)
+        deviation = prior_deviation(problem, inflation) if prior else None
+        return cls(model, problem.R, z, np.arange(len(z)), problem.x0, deviation)
 
     @property
     def readings(self) -> int:
@@ -68,6 +69,14 @@ class Objective:
 
     def subset(self, kept: Mask) -> Objective:
         return dataclasses.replace(self, z=self.z[kept], rows=self.rows[kept])
+
+
+def prior_deviation(problem: Problem, inflation: float) -> Array | None:
+    """The prior's standard deviations (n,) times `inflation`; a parameter that the prior fixes is nearly fixed."""
+    deviation = problem.prior_deviation
+    if deviation is None:
+        return None
+    return inflation * np.maximum(deviation, _FIXED * deviation.max())
 
 
 @dataclass(frozen=True)

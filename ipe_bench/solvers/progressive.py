@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ipe_bench.errors import UserError
 from ipe_bench.estimation import Estimates, Estimator
 from ipe_bench.ipe import Counted, Tally
-from ipe_bench.least_squares import Damping, Minima, Objective, fit_probability, minimize, report
+from ipe_bench.least_squares import Damping, Minima, Objective, fit_probability, minimize, prior_deviation, report
 from ipe_bench.linalg import Array, Mask, finite
 from ipe_bench.measurements.base import Restricted
 from ipe_bench.scenario import Problem
@@ -101,8 +101,7 @@ class _Search:
     def attempt(self, k: int, rows: NDArray[np.intp]) -> Minima:
         """The k-th attempt for the trials `rows`: window after window, then all data."""
         options, problem = self.options, self.problem
-        known = problem.prior_deviation if options.use_prior and k == 0 else None
-        prior = None if known is None else known * options.prior_inflation
+        prior = prior_deviation(problem, options.prior_inflation) if options.use_prior and k == 0 else None
         in_windows = problem.measurement.epochs is not None
         metric = prior if prior is not None else np.ones(problem.measurement.n) if in_windows else None
         damping = Damping(options.damping, metric)
