@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ipe_bench.ipe import FrozenSystem, frozen_covariance, sandwich
-from ipe_bench.linalg import Array, Mask, information, inverse, multiply
+from ipe_bench.linalg import Array, Mask, finite, information, inverse, multiply
 from ipe_bench.scenario import Problem
 from ipe_bench.statuses import Status
 
@@ -36,7 +36,7 @@ def contraction(problem: Problem, x: Array) -> Contraction:
     """
     z = np.zeros((len(x), problem.measurement.m))
     slope = np.eye(x.shape[1]) - FrozenSystem.at_nominal(problem, z).J(x)
-    bad = ~np.isfinite(slope).all(axis=(1, 2))
+    bad = ~finite(slope)
     radius = np.abs(np.linalg.eigvals(np.where(bad[:, None, None], 0.0, slope))).max(axis=1)
     size = np.abs(slope)
     return Contraction(
@@ -58,7 +58,7 @@ class FixedPointBound:
     @property
     def holds(self) -> bool:
         """Whether no iterate is farther from the root than the bound (and round-off) allows."""
-        return bool((self.error <= self.bound + 1e-12 * (1.0 + self.error[0])).all())
+        return bool(np.all(self.error <= self.bound + 1e-12 * (1.0 + self.error.max())))
 
 
 def fixed_point_bound(iterates: Array, root: Array, K: float) -> FixedPointBound:

@@ -110,7 +110,8 @@ class FrozenSystem:
 
     def solve(self, A: Array, b: Array) -> Array:
         x, singular = solve(A, b)
-        self.model.tally.singular[self.rows[singular]] = True
+        # What is not finite is none of A's doing: the driver finds it in F.
+        self.model.tally.singular[self.rows[singular & finite(A) & finite(b)]] = True
         return x
 
     def subset(self, kept: Mask) -> FrozenSystem:
@@ -119,8 +120,9 @@ class FrozenSystem:
 
     def relinearized(self, x: Array, R: Covariance) -> FrozenSystem:
         """The same readings with H+ of dh/dx at x (trials, n), for each trial its own; a deficient one is singular."""
-        H_plus, deficient = pseudo_inverse(self.model.jacobian(x, self.rows), R)
-        self.model.tally.singular[self.rows[deficient]] = True
+        J = self.model.jacobian(x, self.rows)
+        H_plus, deficient = pseudo_inverse(J, R)
+        self.model.tally.singular[self.rows[deficient & finite(J)]] = True
         return FrozenSystem(self.model, H_plus, self.z, self.rows)
 
 
@@ -174,8 +176,8 @@ def find_roots(
         spent = tally.simulations[system.rows] + n * tally.jacobians[system.rows]
         status = np.select(
             [
-                tally.singular[system.rows],
                 np.isin(system.rows, list(tally.messages)),
+                tally.singular[system.rows],
                 ~np.isfinite(residual),
                 residual <= tolerance,
                 residual > _FAR * begun,
@@ -183,8 +185,8 @@ def find_roots(
                 spent >= budget,
             ],
             [
-                Status.SINGULAR,
                 Status.ERROR,
+                Status.SINGULAR,
                 Status.NONFINITE,
                 Status.CONVERGED,
                 Status.DIVERGED,

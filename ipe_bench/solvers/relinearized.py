@@ -9,7 +9,7 @@ import numpy as np
 
 from ipe_bench.errors import UserError
 from ipe_bench.estimation import Estimates, Estimator
-from ipe_bench.ipe import FrozenSystem, find_roots, linear_deviation
+from ipe_bench.ipe import Counted, FrozenSystem, Tally, find_roots, linear_deviation
 from ipe_bench.linalg import Array, finite, information, inverse
 from ipe_bench.scenario import Problem
 from ipe_bench.solvers.base import Solver
@@ -56,7 +56,7 @@ class Relinearized(Estimator):
             x = x - frozen.F(x)
         status = np.full(trials, Status.RUNNING, np.int8)
         iterations = np.zeros(trials, np.int64)
-        iterates = [x[i : i + 1] for i in range(trials)]
+        iterates = [row[None] for row in x.copy()]
         budget = np.inf if self.budget is None else self.budget
         for _ in range(self.max_iterations):
             rows = np.flatnonzero(status == Status.RUNNING)
@@ -83,9 +83,10 @@ class Relinearized(Estimator):
             on = np.isin(roots.status, [Status.CONVERGED, Status.STALLED, Status.MAX_ITERATIONS]) & ~at_once
             status[rows] = np.where(on, Status.RUNNING, roots.status)
         status[status == Status.RUNNING] = Status.MAX_ITERATIONS
+        # For the report alone, so not counted; the model may raise where a trial has ended.
         J = np.full((trials, problem.measurement.m, n), np.nan)
         usable = finite(x)
-        J[usable] = problem.measurement.jacobian(x[usable])
+        J[usable] = Counted(problem.measurement, Tally.zeros(trials)).jacobian(x[usable], np.flatnonzero(usable))
         return Estimates(
             x=x,
             status=status,

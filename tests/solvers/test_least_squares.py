@@ -1,0 +1,245 @@
+"""Batch least squares, re-linearised and progressive IPE against SciPy, closed forms and the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from conftest import Bent
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+
+from ipe_bench.baselines import GaussNewton, LevenbergMarquardt, MapLM
+from ipe_bench.errors import UserError
+from ipe_bench.ipe import IPE
+from ipe_bench.linalg import Array, Covariance, information, inverse, quadratic_form
+from ipe_bench.measurements import Gins, Polynomial
+from ipe_bench.noise import Gaussian, Quantization
+from ipe_bench.prior import Gaussian as Prior
+from ipe_bench.roots import least_squares_root
+from ipe_bench.scenario import Problem, Scenario
+from ipe_bench.solvers import FixedPoint, Newton, Progressive, Relinearized
+from ipe_bench.solvers.progressive import window_stops
+from ipe_bench.statuses import Status
+
+LEAST_SQUARES = [
+    GaussNewton(),
+    GaussNewton(damping=1e-3),
+    LevenbergMarquardt(),
+    Relinearized(),
+    Relinearized(Newton()),
+    Progressive(),
+    Progressive(use_prior=False),
+]
+ALL = [*LEAST_SQUARES, MapLM()]
+
+
+def gins(scale: float, trials: int = 20):
+    scenario = Scenario(Gins(), Quantization(0.02286), Prior(), scale)
+    return scenario.problem, scenario.draw(0, trials)
+
+
+def crlb(problem: Problem, x: Array) -> Array:
+    return inverse(information(problem.measurement.jacobian(x), problem.R))[0]
+
+
+def deviations(P: Array) -> Array:
+    return np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+
+
+@pytest.mark.parametrize("estimator", LEAST_SQUARES, ids=repr)
+def test_the_minimum_is_that_of_scipy(estimator):
+    scenario = Scenario(Polynomial(strength=0.02), Gaussian(0.1), Prior(), 3.0)
+    problem, trials = scenario.problem, scenario.draw(0, 6)
+    estimates = estimator.estimate(problem, trials.z)
+    assert (estimates.status == Status.CONVERGED).all()
+    for x, P, z in zip(estimates.x, estimates.covariance, trials.z, strict=True):
+
+        def residual(x, z=z):
+            return problem.R.whiten(problem.measurement.simulate(x[None])[0] - z)
+
+        found = least_squares(residual, problem.x0, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-12)
+        assert np.abs(x - found.x).max() < 1e-6
+        np.testing.assert_allclose(P, np.linalg.inv(found.jac.T @ found.jac), rtol=1e-4)
+
+
+@pytest.mark.parametrize("estimator", ALL, ids=repr)
+def test_a_batch_equals_its_trials_one_by_one(estimator):
+    problem, trials = gins(400.0, 8)
+    with np.errstate(all="ignore"):
+        batch = estimator.estimate(problem, trials.z)
+        single = [estimator.estimate(problem, z[None]) for z in trials.z]
+    for name in ("x", "status", "covariance", "simulations", "jacobians", "iterations"):
+        np.testing.assert_array_equal(getattr(batch, name), np.concatenate([getattr(s, name) for s in single]), name)
+
+
+def test_map_on_a_linear_model_is_the_bayesian_closed_form():
+    problem = Problem(Bent(), Covariance(np.full(12, 0.3)), np.array([0.5, 2.0, 1.0]))
+    A = problem.measurement.A
+    z = np.random.default_rng(3).normal(size=(4, 12))
+    estimates = MapLM(prior_inflation=3.0).estimate(problem, z)
+    P = np.linalg.inv(A.T @ A / 0.09 + np.diag((3.0 * problem.prior_deviation) ** -2.0))
+    np.testing.assert_allclose(estimates.x, z @ A @ P.T / 0.09, atol=1e-6)
+    np.testing.assert_allclose(estimates.covariance, np.broadcast_to(P, (4, 3, 3)), rtol=1e-9)
+
+
+def test_a_parameter_that_the_prior_fixes_stays_where_it_is():
+    problem = Problem(Bent(0.01), Covariance(np.full(12, 0.3)), np.array([1.0, 0.0, 1.0]))
+    z = np.random.default_rng(3).normal(size=(4, 12))
+    estimates = MapLM().estimate(problem, z)
+    assert (estimates.status == Status.CONVERGED).all()
+    np.testing.assert_allclose(estimates.x[:, 1], 0.0, atol=1e-6)
+
+
+def test_one_inner_fixed_point_step_is_gauss_newton():
+    problem, trials = gins(100.0, 5)
+    rounds = Relinearized(FixedPoint(), inner_iterations=1).estimate(problem, trials.z, history=True)
+    steps = GaussNewton().estimate(problem, trials.z, history=True)
+    for a, b, P in zip(rounds.history, steps.history, steps.covariance, strict=True):
+        k = min(len(a), len(b))
+        assert k >= 3
+        assert (np.abs(a[:k] - b[:k]) / np.sqrt(np.diag(P))).max() < 1e-5
+
+
+def test_relinearized_ipe_is_least_squares_at_scale_200():
+    problem, trials = gins(200.0, 100)
+    estimates = Relinearized().estimate(problem, trials.z)
+    root = least_squares_root(problem, trials.z, trials.x, prior=False)
+    deviation = deviations(crlb(problem, trials.x))
+    apart = np.abs(estimates.x - root.x) / deviation
+    solved = (estimates.status == Status.CONVERGED) & (apart.max(axis=1) < 1e-3)
+    assert solved.mean() > 0.95
+    assert np.sqrt(np.mean(apart[solved] ** 2)) < 0.01
+
+
+def test_frozen_ipe_is_not_least_squares_at_scale_200():
+    problem, trials = gins(200.0, 20)
+    frozen = IPE(Newton()).estimate(problem, trials.z)
+    root = least_squares_root(problem, trials.z, trials.x, prior=False)
+    converged = frozen.status == Status.CONVERGED
+    apart = np.abs(frozen.x - root.x) / deviations(crlb(problem, trials.x))
+    assert np.median(apart[converged].max(axis=1)) > 0.1
+
+
+@pytest.mark.parametrize(
+    "estimator", [Progressive(), Progressive(prior_inflation=10.0), Progressive(use_prior=False)], ids=repr
+)
+def test_progressive_ipe_succeeds_at_scale_600_within_250_simulations(estimator):
+    problem, trials = gins(600.0, 40)
+    estimates = estimator.estimate(problem, trials.z)
+    distance = quadratic_form(information(problem.measurement.jacobian(trials.x), problem.R), estimates.x - trials.x)
+    assert (distance < chi2.isf(1e-6, 11)).all()
+    assert (estimates.extras["fit_p"] > 1e-6).all()
+    assert np.median(estimates.simulations + 11 * estimates.jacobians) <= 250
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scale", "share"), [(1000.0, 1.0), (3000.0, 0.98)])
+def test_progressive_ipe_from_far_away(scale, share):
+    problem, trials = gins(scale, 250)
+    estimates = Progressive().estimate(problem, trials.z)
+    distance = quadratic_form(information(problem.measurement.jacobian(trials.x), problem.R), estimates.x - trials.x)
+    success = distance < chi2.isf(1e-6, 11)
+    assert success.mean() >= share
+    # Its own verdict is right.
+    np.testing.assert_array_equal(estimates.extras["fit_p"] > 1e-6, success)
+    assert np.median(estimates.simulations + 11 * estimates.jacobians) <= 250
+
+
+def test_the_test_of_the_fit_is_uniform_where_the_model_holds():
+    scenario = Scenario(Polynomial(), Gaussian(0.1), Prior(), 3.0)
+    p = Progressive().estimate(scenario.problem, scenario.draw(0, 500).z).extras["fit_p"]
+    assert abs(p.mean() - 0.5) < 0.07
+    assert 0.06 < (p < 0.1).mean() < 0.14
+
+
+@dataclass(frozen=True)
+class _Sinusoid(Polynomial):
+    """cos and sin of a frequency: minima beyond number, no epochs."""
+
+    unknowns: int = 1
+    analytic = True
+    epochs = None
+
+    def simulate(self, x: Array) -> Array:
+        return np.sin(3.0 * (x + 0.5) * (self.times + 2.0))
+
+
+def test_without_epochs_restarts_find_the_minimum_that_fits():
+    problem = Problem(_Sinusoid(), Covariance(np.full(40, 0.05)), None)
+    rng = np.random.default_rng(5)
+    truth = rng.uniform(-1.0, 1.0, (30, 1))
+    z = problem.measurement.simulate(truth) + 0.05 * rng.standard_normal((30, 40))
+    once = Progressive(restarts=0).estimate(problem, z)
+    again = Progressive(restarts=30).estimate(problem, z)
+
+    def right(estimates):
+        return np.abs(estimates.x - truth)[:, 0] < 0.05
+
+    assert right(again).sum() > right(once).sum()
+    np.testing.assert_array_equal(again.extras["fit_p"] > 1e-6, right(again))
+
+
+def test_windows_are_geometric_and_end_short_of_all_data():
+    assert window_stops(30, 2.0) == [1, 2, 4, 8, 16]
+    assert window_stops(32, 2.0) == [1, 2, 4, 8, 16]
+    assert window_stops(1, 2.0) == []
+    assert set(window_stops(30, 2.0)) < set(window_stops(30, 2.0**0.5))
+
+
+def test_histories_join_the_windows():
+    problem, trials = gins(50.0, 3)
+    estimates = Progressive().estimate(problem, trials.z, history=True)
+    for iterates, count, x in zip(estimates.history, estimates.iterations, estimates.x, strict=True):
+        assert iterates.shape == (count + 1, 11)
+        assert (iterates[0] == 0).all()
+        assert (iterates[-1] == x).all()
+
+
+class _Raising(Bent):
+    def simulate(self, x: Array) -> Array:
+        if (np.abs(np.real(x[:, 0])) > 20).any():
+            raise ArithmeticError("too far")
+        return super().simulate(x)
+
+
+@pytest.mark.parametrize("estimator", ALL, ids=repr)
+def test_a_trial_that_fails_has_a_status_and_disturbs_no_other(estimator):
+    problem = Problem(_Raising(0.01), Covariance(np.full(12, 0.1)), np.array([10.0, 10.0, 10.0]))
+    x = np.random.default_rng(2).normal(size=(6, 3))
+    z = Bent(0.01).simulate(x)
+    bad = z.copy()
+    bad[1] = np.nan
+    bad[3] = Bent(0.01).simulate(np.array([[1e5, 0.0, 0.0]]))[0]
+    with np.errstate(all="ignore"):
+        alone = estimator.estimate(problem, z)
+        mixed = estimator.estimate(problem, bad)
+    others = [0, 2, 4, 5]
+    np.testing.assert_array_equal(mixed.x[others], alone.x[others])
+    assert (mixed.status[others] == Status.CONVERGED).all()
+    assert mixed.status[1] == Status.NONFINITE
+    assert mixed.status[3] == Status.ERROR
+    assert mixed.messages == {3: "ArithmeticError: too far"}
+
+
+def test_a_flat_direction_is_singular_for_gauss_newton():
+    class Flat(Bent):
+        def simulate(self, x: Array) -> Array:
+            return super().simulate(x * np.array([1.0, 1.0, 0.0]))
+
+    problem = Problem(Flat(), Covariance(np.full(12, 0.1)), None)
+    for estimator in (GaussNewton(start="nominal"), LevenbergMarquardt()):
+        estimates = estimator.estimate(problem, np.ones((2, 12)))
+        assert (estimates.status == Status.SINGULAR).all()
+    with pytest.raises(UserError, match="column rank"):
+        GaussNewton().estimate(problem, np.ones((2, 12)))
+
+
+@pytest.mark.parametrize(
+    ("cls", "options"),
+    [(GaussNewton, {"start": "home"}), (Progressive, {"growth": 1.0}), (Relinearized, {"inner_iterations": 0})],
+)
+def test_impossible_options_are_named(cls, options):
+    with pytest.raises(UserError, match=f"^{next(iter(options))}="):
+        cls(**options)

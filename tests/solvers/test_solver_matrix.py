@@ -1,0 +1,190 @@
+"""Every solver on every system: roots where theory promises them, the right status where there are none."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ipe_bench.diagnostics import order_of_convergence
+from ipe_bench.ipe import IPE, find_roots
+from ipe_bench.measurements import Gins, Polynomial
+from ipe_bench.noise import Gaussian, NoNoise, Quantization
+from ipe_bench.prior import Gaussian as Prior
+from ipe_bench.roots import frozen_root
+from ipe_bench.scenario import Scenario
+from ipe_bench.solvers import Anderson, Broyden, DampedNewton, FixedPoint, Newton, SteepestDescent
+from ipe_bench.statuses import Status
+
+sys.path.insert(0, str(Path(__file__).parent))
+from systems import BurdenFaires, Cubic, NoRoot, Rosenbrock, Temperamental, system_of
+
+ALL = [FixedPoint(), Newton(), Broyden(), Broyden("identity"), SteepestDescent(), Anderson(2), DampedNewton()]
+WITH_SLOPE = [Newton(), Broyden(), DampedNewton(), SteepestDescent()]
+
+
+def roots_of(model, solver, starts, *, tolerance=1e-9, max_iterations=2000, history=False):
+    starts = np.atleast_2d(np.asarray(starts, dtype=float))
+    system = system_of(model, len(starts))
+    with np.errstate(all="ignore"):
+        roots = find_roots(
+            system,
+            solver,
+            starts,
+            np.ones(model.n),
+            tolerance=tolerance,
+            max_iterations=max_iterations,
+            history=history,
+        )
+    return roots, system.model.tally
+
+
+@pytest.mark.parametrize("solver", ALL, ids=repr)
+def test_every_solver_finds_the_root_of_a_contraction(solver):
+    starts = np.random.default_rng(0).uniform(-1, 1, (20, 2))
+    roots, _ = roots_of(Cubic(), solver, starts)
+    assert (roots.status == Status.CONVERGED).all()
+    np.testing.assert_allclose(roots.x, 0.0, atol=1e-8)
+
+
+@pytest.mark.parametrize("solver", WITH_SLOPE, ids=repr)
+@pytest.mark.parametrize(
+    ("model", "start", "root"),
+    [(BurdenFaires(), (0.1, 0.1, -0.1), (0.5, 0.0, -np.pi / 6)), (Rosenbrock(), (-1.2, 1.0), (1.0, 1.0))],
+    ids=["burden_faires", "rosenbrock"],
+)
+def test_textbook_systems_have_their_roots(solver, model, start, root):
+    limit = 200000 if isinstance(solver, SteepestDescent) else 200
+    roots, _ = roots_of(model, solver, start, tolerance=1e-6, max_iterations=limit)
+    assert roots.status[0] == Status.CONVERGED
+    np.testing.assert_allclose(roots.x[0], root, atol=1e-4)
+
+
+def test_newton_and_broyden_reproduce_the_tables_of_burden_and_faires():
+    newton, _ = roots_of(BurdenFaires(), Newton(), (0.1, 0.1, -0.1), history=True)
+    broyden, _ = roots_of(BurdenFaires(), Broyden(), (0.1, 0.1, -0.1), history=True)
+    # Tables 10.3 and 10.4 (ninth edition).
+    np.testing.assert_allclose(newton.history[0][1], [0.4998696728, 0.0194668485, -0.5215204718], atol=5e-10)
+    np.testing.assert_allclose(newton.history[0][2], [0.5000142403, 0.0015885914, -0.5235569638], atol=5e-10)
+    np.testing.assert_allclose(broyden.history[0][2], [0.4999863754, 0.0087378393, -0.5231745744], atol=5e-10)
+
+
+@pytest.mark.parametrize("solver", ALL, ids=repr)
+def test_gins_at_scale_10_converges_to_the_root_near_the_truth(solver):
+    scenario = Scenario(Gins(), Quantization(0.02286), Prior(), 10.0)
+    trials = scenario.draw(0, 12)
+    estimates = IPE(solver).estimate(scenario.problem, trials.z)
+    root = frozen_root(scenario.problem, trials.z, trials.x)
+    deviation = np.sqrt(np.diagonal(estimates.covariance, axis1=1, axis2=2))
+    assert (estimates.status == Status.CONVERGED).all()
+    assert (root.status == Status.CONVERGED).all()
+    assert (np.abs(estimates.x - root.x) / deviation).max() < 1e-4
+
+
+@pytest.mark.parametrize("solver", ALL, ids=repr)
+def test_without_noise_the_truth_of_a_polynomial_is_the_root(solver):
+    scenario = Scenario(Polynomial(), NoNoise(1e-3), Prior(), 5.0)
+    trials = scenario.draw(0, 10)
+    estimates = IPE(solver, max_iterations=1000).estimate(scenario.problem, trials.z)
+    assert (estimates.status == Status.CONVERGED).all()
+    np.testing.assert_allclose(estimates.x, trials.x, atol=1e-8)
+
+
+@pytest.mark.parametrize("solver", ALL, ids=repr)
+def test_a_batch_equals_its_trials_one_by_one(solver):
+    scenario = Scenario(Polynomial(strength=0.05), Gaussian(0.1), Prior(), 10.0)
+    trials = scenario.draw(0, 12)
+    with np.errstate(all="ignore"):
+        batch = IPE(solver).estimate(scenario.problem, trials.z)
+        single = [IPE(solver).estimate(scenario.problem, z[None]) for z in trials.z]
+    np.testing.assert_array_equal(batch.x, np.concatenate([s.x for s in single]))
+    np.testing.assert_array_equal(batch.status, np.concatenate([s.status for s in single]))
+    np.testing.assert_array_equal(batch.simulations, np.concatenate([s.simulations for s in single]))
+
+
+def _orders(solver, model, start, root, **options):
+    roots, _ = roots_of(model, solver, start, tolerance=1e-13, history=True, **options)
+    return order_of_convergence(roots.history[0], np.asarray(root), floor=1e-14)
+
+
+def test_fixed_point_is_linear_with_the_spectral_radius_as_rate():
+    found = _orders(FixedPoint(), Cubic(), (0.5, -0.3), (0.0, 0.0), max_iterations=60)
+    slope = np.eye(2) - np.array([[1.2, 0.3], [-0.2, 0.9]])
+    radius = np.abs(np.linalg.eigvals(slope)).max()
+    used = found.errors[found.errors > 1e-13]
+    decrease = (used[-1] / used[5]) ** (1 / (len(used) - 6))
+    assert abs(decrease - radius) < 0.06
+
+
+@pytest.mark.parametrize("solver", [Newton(), DampedNewton()], ids=repr)
+def test_newton_is_quadratic(solver):
+    found = _orders(solver, BurdenFaires(), (0.1, 0.1, -0.1), (0.5, 0.0, -np.pi / 6))
+    assert 1.9 < found.order < 2.1
+
+
+@pytest.mark.parametrize("solver", [Broyden(), Broyden("identity"), Anderson(2)], ids=repr)
+def test_quasi_newton_is_superlinear(solver):
+    """Ratios of successive errors go to zero, those of fixed-point iteration stay where they are."""
+    start, root = (0.8, -0.5), (0.0, 0.0)
+    fast, slow = (_orders(s, Cubic(), start, root, max_iterations=60).errors for s in (solver, FixedPoint()))
+    fast, slow = fast[fast > 1e-14], slow[slow > 1e-14]
+    assert fast[-1] / fast[-2] < 0.1 * slow[-1] / slow[-2]
+    assert len(fast) < len(slow) / 1.5
+
+
+@pytest.mark.parametrize("solver", [DampedNewton(), SteepestDescent()], ids=repr)
+def test_where_f_only_has_a_minimum_descent_stalls(solver):
+    roots, _ = roots_of(NoRoot(), solver, [(2.0, 1.0)], max_iterations=5000)
+    assert roots.status[0] in (Status.STALLED, Status.SINGULAR)
+    assert abs(roots.x[0, 0]) < 1e-3
+
+
+def test_a_steepest_descent_that_still_descends_has_not_stalled():
+    roots, _ = roots_of(Rosenbrock(), SteepestDescent(), [(-1.2, 1.0)], max_iterations=50)
+    assert roots.status[0] == Status.MAX_ITERATIONS
+
+
+@pytest.mark.parametrize("solver", [Newton(), Broyden(), DampedNewton()], ids=repr)
+def test_a_singular_slope_is_named(solver):
+    roots, _ = roots_of(NoRoot(), solver, [(0.0, 1.0)])
+    assert roots.status[0] == Status.SINGULAR
+
+
+def test_an_expansion_ends_as_diverged_or_nonfinite():
+    roots, _ = roots_of(Rosenbrock(), FixedPoint(), [(-1.2, 1.0)])
+    assert roots.status[0] in (Status.DIVERGED, Status.NONFINITE)
+
+
+@pytest.mark.parametrize("solver", ALL, ids=repr)
+def test_a_trial_that_fails_has_a_status_and_disturbs_no_other(solver):
+    good = np.random.default_rng(1).uniform(-1, 1, (4, 2))
+    starts = np.concatenate([good[:2], [[200.0, 0.0], [-200.0, 0.0], [50.0, 0.0]], good[2:]])
+    mixed, tally = roots_of(Temperamental(), solver, starts, max_iterations=100)
+    alone, _ = roots_of(Temperamental(), solver, good, max_iterations=100)
+    kept = [0, 1, 5, 6]
+    np.testing.assert_array_equal(mixed.x[kept], alone.x)
+    np.testing.assert_array_equal(mixed.status[kept], alone.status)
+    assert (alone.status == Status.CONVERGED).all()
+    assert mixed.status[2] == Status.ERROR
+    assert tally.messages[2] == "ArithmeticError: too hot"
+    assert mixed.status[3] in (Status.NONFINITE, Status.SINGULAR)  # infinite, so of no slope either
+    if solver in (Newton(), Broyden(), DampedNewton()):
+        assert mixed.status[4] == Status.SINGULAR
+
+
+def test_the_budget_ends_a_trial():
+    scenario = Scenario(Polynomial(strength=0.05), Gaussian(0.1), Prior(), 5.0)
+    trials = scenario.draw(0, 5)
+    estimates = IPE(Newton(), tolerance=1e-15, budget=12.0).estimate(scenario.problem, trials.z)
+    assert set(estimates.status) <= {Status.BUDGET, Status.CONVERGED}
+    assert (estimates.simulations + 4 * estimates.jacobians <= 12 + 5).all()
+
+
+def test_a_jacobian_free_solver_evaluates_none():
+    scenario = Scenario(Polynomial(), Gaussian(0.1), Prior(), 5.0)
+    trials = scenario.draw(0, 5)
+    for solver in (FixedPoint(), Broyden("identity"), Anderson()):
+        assert (IPE(solver).estimate(scenario.problem, trials.z).jacobians == 0).all()
+    assert (IPE(Broyden()).estimate(scenario.problem, trials.z).jacobians == 1).all()
