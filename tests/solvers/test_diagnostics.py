@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from conftest import Bent
+from small_models import Bent
 
 from ipe_bench.diagnostics import (
     contraction,

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from conftest import Bent
 from scipy.optimize import least_squares
 from scipy.stats import chi2
+from small_models import Bent
 
 from ipe_bench.baselines import GaussNewton, LevenbergMarquardt, MapLM
 from ipe_bench.errors import UserError

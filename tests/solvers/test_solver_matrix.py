@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from square_systems import BurdenFaires, Cubic, NoRoot, Rosenbrock, Temperamental, system_of
 
 from ipe_bench.diagnostics import order_of_convergence
 from ipe_bench.ipe import IPE, find_roots
@@ -17,9 +15,6 @@ from ipe_bench.roots import frozen_root
 from ipe_bench.scenario import Scenario
 from ipe_bench.solvers import Anderson, Broyden, DampedNewton, FixedPoint, Newton, SteepestDescent
 from ipe_bench.statuses import Status
-
-sys.path.insert(0, str(Path(__file__).parent))
-from systems import BurdenFaires, Cubic, NoRoot, Rosenbrock, Temperamental, system_of
 
 ALL = [FixedPoint(), Newton(), Broyden(), Broyden("identity"), SteepestDescent(), Anderson(2), DampedNewton()]
 WITH_SLOPE = [Newton(), Broyden(), DampedNewton(), SteepestDescent()]
