@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 from ipe_bench.components import canonical_json
 from ipe_bench.errors import UserError
 from ipe_bench.linalg import Array
-from ipe_bench.store import FOOTER, SCHEMA, TRUTH, DamagedFile, Piece, Store
+from ipe_bench.store import FOOTER, SCHEMA, TRUTH, DamagedFile, Piece, Store, gaps
 
 TARGET = "_target_"
 NAMED = ("measurement", "noise", "prior")
@@ -269,8 +269,6 @@ def _find_runs(store: Store, collection: Collection) -> list[Run]:
             collection.problem(f"{path}: foreign: is not a record of a run; left out")
             continue
         runs.append(Run(path, record))
-        for failure in record.get("failures", ()):
-            collection.problem(f"{path}: failed: {failure}")
     return runs
 
 
@@ -318,15 +316,43 @@ def _written(cell: StoredCell) -> float:
 
 
 def _report_missing(cells: Sequence[StoredCell], collection: Collection) -> None:
+    """Counts the trials that runs announced: there, failed (somebody tried, in vain), or missing."""
     there = {cell.key: cell for cell in cells}
+    failures = _failures(collection)
     for key, trials, names in _expected(collection.runs).values():
         collection.expected += 1
         covered = there[key].covered if key in there else ()
-        count = sum(max(0, min(stop, trials) - start) for start, stop in covered)
-        if count >= trials:
+        lacking = gaps(covered, 0, trials)
+        if not lacking:
             collection.complete += 1
-        else:
-            collection.problem(f"missing: {describe_names(names)}: {count} of {trials} expected trials are there")
+            continue
+        failed = failures.get(key, [])
+        untried = _count(
+            g for start, stop in lacking for g in gaps([(f["start"], f["stop"]) for f in failed], start, stop)
+        )
+        there_now = trials - _count(lacking)
+        for line in dict.fromkeys(f"{f['status']}: {f['message']}" for f in failed):
+            count = _count(lacking) - untried
+            collection.problem(f"failed: {describe_names(names)}: {count} of {trials} expected trials: {line}")
+        if untried:
+            collection.problem(f"missing: {describe_names(names)}: {there_now} of {trials} expected trials are there")
+
+
+def _failures(collection: Collection) -> dict[str, list[dict[str, Any]]]:
+    """By key: what could not be computed, whether or not it was since."""
+    result: dict[str, list[dict[str, Any]]] = {}
+    for directory in collection.directories:
+        for path in sorted(Store(directory).failed.glob("*.json")):
+            try:
+                record = json.loads(path.read_text(encoding="utf-8"))
+                whole = record.keys() >= {"key", "status", "message"} and int(record["start"]) < int(record["stop"])
+            except (OSError, ValueError, KeyError, TypeError, AttributeError):
+                whole, record = False, {}
+            if whole:
+                result.setdefault(record["key"], []).append(record)
+            else:
+                collection.problem(f"{path}: foreign: is not a record of a failure; left out")
+    return result
 
 
 def describe_names(names: Mapping[str, Any]) -> str:

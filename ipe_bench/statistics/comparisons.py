@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest, chi2, friedmanchisquare, studentized_range, wilcoxon
@@ -110,8 +111,8 @@ def signed_rank(d: Array) -> float:
     # An infinite difference ranks above all finite ones; how far above does not matter to ranks.
     finite = np.abs(d[np.isfinite(d)])
     d = np.where(np.isfinite(d), d, np.sign(d) * (2 * finite.max(initial=1.0)))
-    _, p = wilcoxon(d)
-    return float(p)
+    result: Any = wilcoxon(d)
+    return float(result.pvalue)
 
 
 def mcnemar(only_first: int, only_second: int) -> float:

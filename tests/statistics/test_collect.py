@@ -10,6 +10,7 @@ import pytest
 from synthetic_store import Pretender
 
 from ipe_bench.errors import UserError
+from ipe_bench.execution.base import Failure
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.collect import collect, config_leaves, differing, merge_ranges
 from ipe_bench.store import FOOTER
@@ -115,9 +116,18 @@ def test_stale_results_are_named_and_never_mixed_in(filled):
     assert analysis.summary["rmse"].max() < 1e3
 
 
-def test_failures_that_a_run_recorded_are_shown(filled):
-    filled.record(60, "again", failures=["trials 0 to 20: MemoryError"])
-    assert any("failed: trials 0 to 20: MemoryError" in line for line in collect([filled.directory]).problems)
+def test_failed_blocks_are_told_from_missing_ones(filled):
+    first, second, _ = pieces(filled)
+    first.unlink()
+    second.unlink()
+    cell = next(c for c in filled.cells.values() if c.label == "one")
+    start, stop = map(int, first.stem.split("-")[1:])
+    filled.store.write_failure(cell, start, stop, Failure("error", "MemoryError: too large", ""))
+    failed, missing = collect([filled.directory]).problems
+    assert failed.startswith("failed: one on")
+    assert "20 of 60 expected trials: error: MemoryError: too large" in failed
+    assert missing.startswith("missing: one on")
+    assert "20 of 60 expected trials are there" in missing
 
 
 def test_a_directory_that_is_not_there_is_the_users_mistake(tmp_path):

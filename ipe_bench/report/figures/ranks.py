@@ -13,7 +13,7 @@ from ipe_bench.statistics.analysis import Analysis
 
 def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
     ranking = analysis.ranking
-    if ranking is None or len(ranking.mean_ranks) < 3:
+    if ranking is None or len(ranking.mean_ranks) < 3 or not look.keys() >= ranking.mean_ranks.keys():
         return
     ordered = sorted(ranking.mean_ranks, key=lambda label: ranking.mean_ranks[label])
     k, difference = len(ordered), ranking.critical_difference
