@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from ipe_bench.report.words import duration, percent, short
+from ipe_bench.report.words import compact, duration, percent, short
 from ipe_bench.statistics.summary import ALL, STATISTICS
 
 if TYPE_CHECKING:
@@ -69,9 +69,9 @@ def _cells(row: Any) -> list[str]:
         percent(row["solved"]),
         percent(row["success"]),
         short(row["rmse_over_linear_bound"]),
-        f"{short(row['rmse_low'])}-{short(row['rmse_high'])}" if math.isfinite(row["rmse_low"]) else "-",
+        f"{compact(row['rmse_low'])}-{compact(row['rmse_high'])}" if math.isfinite(row["rmse_low"]) else "-",
         short(row["nees"]),
         short(row["iterations_median"]),
         short(row["simulations_median"]),
-        duration(row["time_median_s"]),
+        duration(row["time_median_s"], 2),
     ]

@@ -34,6 +34,19 @@ def short(value: float) -> str:
     return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"
 
 
+def compact(value: float) -> str:
+    """Three figures in at most five characters where that can be: thousands as k, millions as M."""
+    if not math.isfinite(value):
+        return "inf" if value == math.inf else "-"
+    rounded = float(f"{value:.2e}")
+    if rounded == 0 or not 1e-2 <= abs(rounded) < 1e9:
+        return f"{value:.1e}" if rounded else "0"
+    size, letter = next((s, u) for s, u in ((1e6, "M"), (1e3, "k"), (1.0, ""), (1e-9, "")) if abs(rounded) >= s)
+    size = 1.0 if size < 1 else size
+    decimals = max(0, 2 - math.floor(math.log10(abs(rounded) / size) + 1e-9))
+    return f"{rounded / size:.{decimals}f}{letter}"
+
+
 def precise(value: float) -> str:
     """Four significant figures, for physical units of any size."""
     if not math.isfinite(value):
@@ -41,14 +54,17 @@ def precise(value: float) -> str:
     return f"{value:.4g}"
 
 
-def duration(seconds: float) -> str:
+def duration(seconds: float, figures: int = 3) -> str:
     """Seconds in the unit that suits them."""
     if not math.isfinite(seconds):
         return "-"
-    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
-        if seconds >= size:
-            return f"{seconds / size:#.3g}".rstrip(".") + f" {unit}"
-    return f"{seconds / 1e-6:.2g} µs"
+    if seconds <= 0:
+        return "0 s"
+    rounded = float(f"{seconds:.{figures - 1}e}")
+    size, unit = next(((s, u) for s, u in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")) if rounded >= s), (1e-9, "ns"))
+    value = rounded / size
+    decimals = max(0, figures - 1 - math.floor(math.log10(value) + 1e-9))
+    return f"{value:.{decimals}f} {unit}"
 
 
 def p_value(p: float) -> str:

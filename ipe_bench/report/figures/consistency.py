@@ -57,8 +57,8 @@ def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
                 axes[2].plot(x, mine["extra_nis"], label=common.text(label), **there[label].line)
             common.bound_line(axes[2], 1.0, "honest covariance")
             common.decades(axes[2], np.append(nis["extra_nis"], 1.0))
-            axes[2].set_title("NIS per reading, all trials")
-            axes[2].set_ylabel("mean normalised innovation squared")
+            axes[2].set_title("NIS over readings, all trials")
+            axes[2].set_ylabel("mean NIS")
         for ax in axes:
             common.scale_axis(ax, setting.scales)
         common.legend_below(fig, axes[:1])

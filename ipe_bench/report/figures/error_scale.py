@@ -95,25 +95,25 @@ def _all_estimators(setting: Setting, total: Setting, look: Mapping[str, Look]) 
     rows = setting.rows
     look = {label: one for label, one in look.items() if label in set(rows["estimator"])}
     names = list(dict.fromkeys(rows["group"]))
-    shown = names if len(names) <= 8 else []
-    fig, axes = common.panels(len(shown) + 2, extra=0.4 + 0.2 * (len(look) / 5))
-    ends = np.append(rows[["low", "high"]].to_numpy(), 1.0)
+    # One group alone, or too many to show, are shown by all parameters together.
+    shown = names if 2 <= len(names) <= 8 else [ALL]
+    fig, axes = common.panels(len(shown) + 1, extra=0.4 + 0.2 * (len(look) / 5))
+    ends = np.concatenate([rows[["low", "high"]].to_numpy().ravel(), total.rows["rmse_high"].to_numpy(), [1.0]])
     for name, ax in zip(shown, axes, strict=False):
-        for label, mine in common.by_estimator(rows[rows["group"] == name], look):
+        part = rows[rows["group"] == name]
+        if name == ALL:
+            part = total.rows.rename(columns={"rmse_low": "low", "rmse_high": "high"})
+        for label, mine in common.by_estimator(part, look):
             x = mine["error_scale"] * common.dodge(look, label, setting.scales)
             common.curve(ax, x, mine["rmse"], mine["low"], mine["high"], look[label], label)
         common.decades(ax, ends)
-        ax.set_title(common.text(name))
-    whole, near = axes[len(shown) :]
-    for ax in (whole, near):
-        for label, mine in common.by_estimator(total.rows, look):
-            x = mine["error_scale"] * common.dodge(look, label, setting.scales)
-            y = mine["rmse"].to_numpy()
-            if ax is near:
-                y = np.where(y <= NEAR, y, np.nan)
-            common.curve(ax, x, y, mine["rmse_low"], mine["rmse_high"], look[label], label)
-    common.decades(whole, np.append(total.rows[["rmse_low", "rmse_high"]].to_numpy(), 1.0))
-    whole.set_title("all parameters")
+        ax.set_title("all parameters" if name == ALL else common.text(name))
+    near = axes[-1]
+    for label, mine in common.by_estimator(total.rows, look):
+        x = mine["error_scale"] * common.dodge(look, label, setting.scales)
+        y = mine["rmse"].to_numpy()
+        y = np.where(y <= NEAR, y, np.nan)
+        common.curve(near, x, y, mine["rmse_low"], mine["rmse_high"], look[label], label)
     near.set_title(f"all parameters, up to {common.plain(NEAR)} bounds")
     highs = total.rows["rmse_high"].to_numpy()
     highs = highs[np.isfinite(highs) & (total.rows["rmse"].to_numpy() <= NEAR)]
@@ -122,7 +122,7 @@ def _all_estimators(setting: Setting, total: Setting, look: Mapping[str, Look]) 
         common.bound_line(ax, 1.0, "linear bound")
         common.scale_axis(ax, setting.scales)
         ax.set_ylabel("rms error / linear bound")
-    common.legend_below(fig, axes[-2:])
+    common.legend_below(fig, axes)
     top = total.rows[total.rows["error_scale"] == max(setting.scales)]
     seen = [f"{e} {v:.3g}" for e, v in zip(top["estimator"], top["rmse"], strict=True) if np.isfinite(v)]
     caption = (
