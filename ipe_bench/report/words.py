@@ -7,7 +7,9 @@ from typing import Any
 
 
 def plain(value: Any) -> str:
-    """A number without needless zeros."""
+    """A number without needless zeros; a dash for what is not there."""
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return "-"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 

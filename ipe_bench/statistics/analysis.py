@@ -45,15 +45,15 @@ class Analysis:
     pairs: pd.DataFrame
     """Every pair of estimators on every scenario; see `comparisons.Pair`."""
     scores: pd.DataFrame
-    """Per scenario and estimator: capped mean error, its rank, whether it leads significantly, and median costs."""
+    """Per scenario (numbered) and estimator: capped mean error, whether it leads significantly, and median costs."""
     ranking: Ranking | None
     profiles: Profiles
-    distributions: Mapping[tuple[tuple[Any, ...], str], Array]
-    """By scenario and estimator, the quantiles of the Mahalanobis error at `PROBABILITIES`."""
-    correlations: Mapping[tuple[tuple[Any, ...], str], Array]
-    """By scenario and estimator, the correlation of the parameters' errors over solved trials."""
-    convergence: Mapping[tuple[tuple[Any, ...], str], list[Array]]
-    """By scenario and estimator, per stored trial, each iterate's distance from the last in standard deviations."""
+    distributions: Mapping[tuple[int, str], Array]
+    """By number of scenario and estimator, the quantiles of the Mahalanobis error at `PROBABILITIES`."""
+    correlations: Mapping[tuple[int, str], Array]
+    """By number of scenario and estimator, the correlation of the parameters' errors over solved trials."""
+    convergence: Mapping[tuple[int, str], list[Array]]
+    """By number of scenario and estimator, each stored trial's distances of iterates from the last, in deviations."""
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -83,7 +83,7 @@ def analyse(directories: Sequence[Path | str]) -> Analysis:
     distributions: dict[Any, Array] = {}
     correlations: dict[Any, Array] = {}
     convergence: dict[Any, list[Array]] = {}
-    for scenario, groups in collection.scenarios.items():
+    for number, (scenario, groups) in enumerate(collection.scenarios.items()):
         common = common_trials(collection, groups)
         outcomes: dict[str, Outcomes] = {}
         mine: dict[str, dict[str, Any]] = {}
@@ -96,7 +96,7 @@ def analyse(directories: Sequence[Path | str]) -> Analysis:
             rows += summary_rows(sample, common)
             by_group += _group_rows(sample)
             endings += _ending_rows(sample)
-            where = (scenario, group.estimator)
+            where = (number, group.estimator)
             outcomes[group.estimator] = one = outcomes_of(sample)
             distributions[where] = quantiles(one.distance, PROBABILITIES)
             correlations[where] = _correlation(sample)
@@ -104,6 +104,7 @@ def analyse(directories: Sequence[Path | str]) -> Analysis:
             if steps:
                 convergence[where] = [d for d, _ in steps]
             mine[group.estimator] = head(group) | {
+                "scenario": number,
                 "capped_error": capped_error(one, n),
                 "cost_median": quantile(one.cost, 0.5),
                 "cost_to_limit_median": quantile(np.array([c for _, c in steps]), 0.5),

@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 from rich.console import Console
 from synthetic_store import Synthetic
 
+from ipe_bench.noise import Quantization
 from ipe_bench.report import write_report
 from ipe_bench.report.figures.ranks import cliques
 from ipe_bench.report.headline import headline
@@ -211,3 +213,20 @@ def test_ten_million_rows_take_less_than_two_gibibytes(tmp_path):
     assert memory < 2.0
     # Three minutes on two free cores; the machine of a test may be shared.
     assert seconds < 360
+
+
+def test_settings_that_differ_have_figures_of_their_own(synthetic, tmp_path):
+    rng = np.random.default_rng(1)
+    gaussian = [synthetic.scenario(sigma=s, error_scale=e) for s in (0.2, 0.4) for e in (1.0, 10.0)]
+    quantized = [replace(s, noise=Quantization(0.7)) for s in gaussian[:2]]
+    synthetic.bound = lambda scenario: np.full(3, 0.1)
+    for scenario in (*gaussian, *quantized):
+        for label in ("linear_lse", "one", "two"):
+            synthetic.add(scenario, label, 0.1 * rng.normal(size=(40, 3)))
+    result = write_report([synthetic.directory], tmp_path / "out")
+    names = {p.stem for p in result.figures}
+    settings = ("gaussian-0.2", "gaussian-0.4", "quantization")
+    for kind in ("figure_2", "success_against_scale", "error_distributions", "correlation", "consistency"):
+        assert {n for n in names if n.startswith(f"{kind}_")} == {f"{kind}_{s}" for s in settings}
+    page = re.sub(r'base64,[^"]*', "", result.report.read_text(encoding="utf-8"))
+    assert not re.search(r"\bnan\b", page)

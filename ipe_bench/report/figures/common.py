@@ -31,12 +31,14 @@ class Setting:
     """What its figures' file names end in; empty where there is one setting."""
     label: str
     rows: pd.DataFrame
-    key: tuple[Any, ...]
-    """The values of the setting's columns."""
 
     @property
     def scales(self) -> list[float]:
         return sorted({float(s) for s in self.rows["error_scale"]})
+
+    def scenario(self, scale: float) -> int:
+        """The number of the scenario at that error scale, where the rows are those of `Analysis.scores`."""
+        return int(self.rows.loc[self.rows["error_scale"] == scale, "scenario"].iloc[0])
 
 
 def settings(frame: pd.DataFrame, columns: Sequence[str]) -> list[Setting]:
@@ -45,17 +47,20 @@ def settings(frame: pd.DataFrame, columns: Sequence[str]) -> list[Setting]:
         return []
     groups = list(frame.groupby(list(columns), dropna=False, sort=False))
     varying = [c for c in columns if len(set(frame[c].astype(str))) > 1]
-    result = []
-    for number, (key, rows) in enumerate(groups[:MOST_SETTINGS], 1):
-        values = key if isinstance(key, tuple) else (key,)
-        named = dict(zip(columns, values, strict=True))
-        shown = [str(named[c]) for c in columns if c in ("measurement", "noise")]
-        shown += [f"{c}={plain(named[c])}" for c in varying if c not in ("measurement", "noise")]
-        suffix = "" if len(groups) == 1 else f"_{number}_" + slug("_".join(plain(named[c]) for c in varying))
+    result: list[Setting] = []
+    for number, (values, rows) in enumerate(groups[:MOST_SETTINGS], 1):
+        key: tuple[Any, ...] = values if isinstance(values, tuple) else (values,)
+        # An option that this setting does not have is not spoken of.
+        named = {c: v for c, v in zip(columns, key, strict=True) if not pd.isna(v)}
+        shown = [str(named[c]) for c in ("measurement", "noise") if c in named]
+        shown += [f"{c}={plain(named[c])}" for c in varying if c in named and c not in ("measurement", "noise")]
+        suffix = "" if len(groups) == 1 else "_" + slug("_".join(plain(named[c]) for c in varying if c in named))
+        if any(suffix == other.suffix for other in result):
+            suffix += f"_{number}"
         label = ", ".join(shown)
         if number == MOST_SETTINGS < len(groups):
             label += f" ({len(groups) - number} further settings are in the tables)"
-        result.append(Setting(suffix, label, rows, values))
+        result.append(Setting(suffix, label, rows))
     return result
 
 

@@ -25,7 +25,7 @@ def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
         there = {label: one for label, one in look.items() if label in set(setting.rows["estimator"])}
         nis = None
         if nis_of is not None:
-            nis = next((s.rows[s.rows["extra_nis"].notna()] for s in nis_of if s.key == setting.key), None)
+            nis = next((s.rows[s.rows["extra_nis"].notna()] for s in nis_of if s.label == setting.label), None)
             nis = nis if nis is not None and len(nis) else None
         fig, axes = common.panels(2 if nis is None else 3, height=3.0, extra=0.3 + 0.2 * len(there) / 5)
         nees, coverage = axes[:2]

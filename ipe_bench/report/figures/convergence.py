@@ -22,11 +22,11 @@ def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
     for setting in common.settings(analysis.scores, analysis.setting_columns):
         there = {}
         for label, one in look.items():
-            mine = [analysis.convergence.get(((*setting.key, s), label), []) for s in setting.scales]
+            mine = [analysis.convergence.get((setting.scenario(s), label), []) for s in setting.scales]
             # A direct estimate has a start and an end, and nothing between: there is no convergence to see.
             if any(len(d) > 2 for part in mine for d in part):
                 there[label] = one
-        scales = [s for s in setting.scales if any(((*setting.key, s), e) in analysis.convergence for e in there)]
+        scales = [s for s in setting.scales if any((setting.scenario(s), e) in analysis.convergence for e in there)]
         scales = common.spread(scales)
         if not there or not scales:
             continue
@@ -35,7 +35,7 @@ def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
         for scale, ax in zip(scales, axes, strict=True):
             longest = 1
             for label in there:
-                distances = analysis.convergence.get(((*setting.key, scale), label))
+                distances = analysis.convergence.get((setting.scenario(scale), label))
                 if not distances:
                     continue
                 table = _padded(distances)

@@ -24,7 +24,7 @@ def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
         if not 2 <= len(names) <= MOST_PARAMETERS:
             continue
         scale = max(setting.scales)
-        where = (*setting.key, scale)
+        where = setting.scenario(scale)
         best = best_estimator(analysis, setting.rows)
         shown = [e for e in dict.fromkeys([REFERENCE, best]) if (where, e) in analysis.correlations]
         tables = {e: analysis.correlations[where, e] for e in shown}

@@ -24,7 +24,7 @@ def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
         medians = {}
         for scale, ax in zip(scales, axes, strict=True):
             for label in there:
-                values = analysis.distributions.get(((*setting.key, scale), label))
+                values = analysis.distributions.get((setting.scenario(scale), label))
                 if values is None:
                     continue
                 medians[scale, label] = values[np.searchsorted(PROBABILITIES, 0.5)]
