@@ -204,6 +204,9 @@ def collect(directories: Sequence[Path | str]) -> Collection:
         store = Store(path)
         found = _find_pieces(store, stored, collection)
         records = _find_runs(store, collection)
+        for failure in store.failures():
+            where = f"{describe_names(failure['names'])}, trials {failure['start']} to {failure['stop']}"
+            collection.problem(f"failed: {where}: {failure['message']}")
         runs += records
         if not found and not records:
             collection.problem(f"{path}: holds no results of ipe-bench")
