@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import functools
 import platform
 import subprocess
 import tempfile
@@ -125,7 +126,7 @@ def _write_record(store: Store, scenarios: Sequence[Scenario], estimators: Mappi
         "cells": [{"key": c.key, "identity_key": c.footer["identity_key"], "names": c.footer["names"]} for c in cells],
         "libraries": library_versions(),
         "machine": {"host": platform.node(), "system": platform.platform(), "cores": cores()},
-        "git_commit": _git_commit(),
+        "git_commit": _git_commit(Path.cwd()),
         **fingerprint([*scenarios, *estimators.values()]),
     }
     identifier = f"{now:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}"
@@ -133,10 +134,11 @@ def _write_record(store: Store, scenarios: Sequence[Scenario], estimators: Mappi
     return identifier
 
 
-def _git_commit() -> str | None:
-    """The commit of the working folder, where it is in a repository."""
+@functools.cache
+def _git_commit(folder: Path) -> str | None:
+    """The commit of the folder, where it is in a repository; asked once per process, as a sweep records it per job."""
     command = ["git", "rev-parse", "HEAD"]
     try:
-        return subprocess.run(command, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
+        return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None
