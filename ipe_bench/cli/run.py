@@ -25,6 +25,7 @@ from ipe_bench.execution import Serial
 
 _FLAGS_WITH_VALUE = {"--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--config-path", "-cp"}
 _FLAGS_WITH_VALUE |= {"--config-dir", "-cd", "--experimental-rerun"}
+_OWN_LAUNCHER = ".BasicLauncher"
 _INFO_TOPICS = {"all", "config", "defaults", "defaults-tree", "plugins", "searchpath"}
 
 
@@ -34,6 +35,8 @@ class Outcome:
     def __init__(self) -> None:
         self.started = False
         self.multirun = False
+        self.elsewhere = False
+        """Jobs run in other processes, from which nothing but an exception or a file comes back."""
         self.jobs = 0
         self.outputs: dict[Path, None] = {}
         self.failures: list[str] = []
@@ -53,6 +56,7 @@ class Watch(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         _outcome.started = _outcome.multirun = True
+        _outcome.elsewhere = not config.hydra.launcher["_target_"].endswith(_OWN_LAUNCHER)
         output = OmegaConf.select(config, "output")
         if output is not None:
             _outcome.outputs[Path(output)] = None
@@ -82,7 +86,7 @@ def main(arguments: Sequence[str]) -> int:
         raise _outcome.storage
     if not _outcome.started:
         return 0
-    if _outcome.multirun and not _outcome.jobs and not _outcome.mistakes:
+    if _outcome.multirun and not _outcome.elsewhere and not _outcome.jobs and not _outcome.mistakes:
         raise UserError("the sweep has no jobs: check the patterns in its lists")
     for failure in _outcome.failures:
         print(f"ipe-bench: failed: {failure}", file=sys.stderr)
@@ -115,10 +119,16 @@ def task(config: DictConfig) -> None:
                 watch=watch,
             )
     except CONFIG_ERRORS as error:
+        if _launched_elsewhere():
+            raise explain(error) from None
         _outcome.mistakes[str(explain(error))] = None
     except UserError as error:
+        if _launched_elsewhere():
+            raise
         _outcome.mistakes[str(error)] = None
     except StorageError as error:
+        if _launched_elsewhere():
+            raise
         _outcome.storage = error
     else:
         _outcome.failures += failures
@@ -128,7 +138,7 @@ def task(config: DictConfig) -> None:
 def _launched_elsewhere() -> bool:
     """Whether a launcher plugin of Hydra (joblib, submitit) runs the jobs: then the cores are its to share out."""
     launcher = HydraConfig.get().launcher
-    return HydraConfig.get().mode == RunMode.MULTIRUN and not launcher["_target_"].endswith(".BasicLauncher")
+    return HydraConfig.get().mode == RunMode.MULTIRUN and not launcher["_target_"].endswith(_OWN_LAUNCHER)
 
 
 def _explain_os_error(error: OSError) -> Exception:
