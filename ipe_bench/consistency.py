@@ -44,7 +44,8 @@ def nees(error: Array, P: Array) -> Array:
 def mean_limits(degrees: float, trials: int, level: float = 0.95) -> tuple[float, float]:
     """Where the mean over `trials` of chi-square / degrees lies with probability `level`, if all is consistent.
 
-    NEES has n degrees per trial, NIS as many as the trial has readings.
+    NEES has n degrees per trial, NIS as many as the trial has readings (Bar-Shalom, Li and Kirubarajan, Estimation with
+    Applications to Tracking and Navigation, 2001, sec. 5.4.2).
     """
     if trials < 1 or degrees < 1:
         return np.nan, np.nan
@@ -54,7 +55,10 @@ def mean_limits(degrees: float, trials: int, level: float = 0.95) -> tuple[float
 
 
 def clopper_pearson(count: int, trials: int, level: float = 0.95) -> tuple[float, float]:
-    """Clopper-Pearson limits of a probability of which `count` in `trials` was seen."""
+    """The exact confidence interval of a share of which `count` in `trials` was seen.
+
+    Clopper and Pearson, Biometrika 26, 1934.
+    """
     if trials < 1:
         return np.nan, np.nan
     tail = (1 - level) / 2

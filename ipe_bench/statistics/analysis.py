@@ -89,7 +89,7 @@ def analyse(directories: Sequence[Path | str]) -> Analysis:
         mine: dict[str, dict[str, Any]] = {}
         n = 1
         for group in groups:
-            sample = Sample.load(collection, group, optional=["message", "jacobians", NIS])
+            sample = Sample.load(collection, group, optional=["message", NIS])
             if len(sample) == 0:
                 continue
             n = sample.error.shape[1]
@@ -148,9 +148,7 @@ def outcomes_of(sample: Sample) -> Outcomes:
     ids = identifier(sample.ids)
     distance = np.sqrt(sample.scalars["crlb_distance"])
     distance[~np.isfinite(distance)] = np.inf
-    cost = sample.scalars["simulations"].astype(float)
-    if "jacobians" in sample.scalars:
-        cost = cost + sample.error.shape[1] * sample.scalars["jacobians"]
+    cost = sample.cost
     success = sample.scalars["success"]
     if np.all(ids[1:] > ids[:-1]):
         return Outcomes(ids, distance, success, cost)
@@ -237,8 +235,6 @@ def _convergence(collection: Collection, group: Group, sample: Sample) -> list[t
             if len(at) == 0 or not sample.converged[at[0]] or len(history) < 2:
                 continue
             distances = distances_to_limit(history, sample.crlb[at[0]])
-            cost = float(sample.scalars["simulations"][at[0]])
-            if "jacobians" in sample.scalars:
-                cost += len(names) * float(sample.scalars["jacobians"][at[0]])
+            cost = float(sample.cost[at[0]])
             result.append((distances, cost * (iterations_to_limit(distances) + 1) / len(history)))
     return result

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from scipy.stats import beta, chi2
 
 from ipe_bench.linalg import Array
 
@@ -13,14 +12,6 @@ LEVEL = 0.95
 RESAMPLES = 1000
 LARGEST_SAMPLE = 2000
 """Above this many trials, groups of consecutive trials are resampled in their place."""
-
-
-def clopper_pearson(successes: int, trials: int, level: float = LEVEL) -> tuple[float, float]:
-    """The exact confidence interval of a share (Clopper and Pearson, Biometrika 26, 1934)."""
-    tail = (1 - level) / 2
-    low = beta.ppf(tail, successes, trials - successes + 1) if successes else 0.0
-    high = beta.isf(tail, successes + 1, trials - successes) if successes < trials else 1.0
-    return float(low), float(high)
 
 
 def bootstrap_rms(squares: Array, used: Array, level: float = LEVEL) -> tuple[Array, Array]:
@@ -53,18 +44,6 @@ def _draws(size: int) -> Array:
     """How often each of `size` things is drawn in each resample: (RESAMPLES, size)."""
     rng = np.random.Generator(np.random.Philox(size))
     return rng.multinomial(size, np.full(size, 1 / size), size=RESAMPLES).astype(float)
-
-
-def nees_limits(degrees: int, level: float = LEVEL) -> tuple[float, float]:
-    """Where a mean NEES over n lies when the reported covariance is right: chi-square quantiles over their degrees.
-
-    `degrees` is trials times parameters (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and
-    Navigation, 2001, sec. 5.4.2).
-    """
-    if degrees == 0:
-        return np.nan, np.nan
-    tail = (1 - level) / 2
-    return float(chi2.ppf(tail, degrees) / degrees), float(chi2.isf(tail, degrees) / degrees)
 
 
 def quantile(values: Array, q: float) -> float:

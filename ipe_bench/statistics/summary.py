@@ -16,9 +16,10 @@ import numpy as np
 import pandas as pd
 from scipy.stats import chi2, norm
 
+from ipe_bench.consistency import clopper_pearson, mean_limits
 from ipe_bench.linalg import Array
 from ipe_bench.statistics.collect import ALWAYS_COLUMNS, Collection, Group, collect
-from ipe_bench.statistics.intervals import bootstrap_rms, clopper_pearson, nees_limits, quantile, quantiles
+from ipe_bench.statistics.intervals import bootstrap_rms, quantile, quantiles
 from ipe_bench.statuses import Status
 
 ALL = "all"
@@ -53,7 +54,7 @@ STATISTICS = (
     "simulations_median",
     "time_median_s",
 )
-SCALARS = ("status", "solved", "success", "iterations", "simulations", "time_s", "nees", "crlb_distance")
+SCALARS = ("status", "solved", "success", "iterations", "simulations", "jacobians", "time_s", "nees", "crlb_distance")
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,11 @@ class Sample:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    @property
+    def cost(self) -> Array:
+        """Simulations per trial (trials,), a Jacobian counting as many as there are parameters."""
+        return self.scalars["simulations"] + self.error.shape[1] * self.scalars["jacobians"]
 
     @property
     def parameters(self) -> Sequence[Mapping[str, Any]]:
@@ -192,7 +198,7 @@ def summary_rows(sample: Sample, common: Array) -> list[dict[str, Any]]:
         "false_root": float((sample.converged & ~solved).mean()),
         "iterations_median": quantile(sample.scalars["iterations"], 0.5),
         "iterations_p95": quantile(sample.scalars["iterations"], 0.95),
-        "simulations_median": quantile(sample.scalars["simulations"], 0.5),
+        "simulations_median": quantile(sample.cost, 0.5),
         "time_median_s": quantile(sample.scalars["time_s"], 0.5),
     }
     shared_by_all = np.isin(identifier(sample.ids), common)
@@ -214,7 +220,7 @@ def summary_rows(sample: Sample, common: Array) -> list[dict[str, Any]]:
     squares = np.mean(np.where(solved[:, None], sample.normalised, 0.0) ** 2, axis=1, keepdims=True)
     rms_low, rms_high = bootstrap_rms(squares, solved)
     size_of_trial = np.sqrt(np.mean(sample.normalised**2, axis=1))
-    nees_low, nees_high = nees_limits(int(solved.sum()) * n)
+    nees_low, nees_high = mean_limits(n, int(solved.sum()))
     nees = sample.scalars["nees"]
     reports = sample.reports_covariance
     rows.append(
@@ -257,7 +263,7 @@ def _per_parameter(sample: Sample, shared_by_all: Array) -> dict[str, Array]:
             ratio = np.abs(error) / sample.deviation
         nees = np.mean(ratio[solved] ** 2, axis=0) if count else nothing
         coverage = (ratio <= norm.isf(0.025)).mean(axis=0)
-        limits = nees_limits(count)
+        limits = mean_limits(1, count)
     else:
         nees = coverage = nothing
         limits = (np.nan, np.nan)

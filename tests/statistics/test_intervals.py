@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from ipe_bench.statistics.intervals import bootstrap_rms, clopper_pearson, nees_limits, quantile, quantiles
+from ipe_bench.consistency import clopper_pearson, mean_limits
+from ipe_bench.statistics.intervals import bootstrap_rms, quantile, quantiles
 
 
 @pytest.mark.parametrize("p", [0.01, 0.3, 0.5, 0.97])
@@ -55,7 +56,7 @@ def test_bootstrap_interval_covers_the_truth_in_95_per_cent_of_repeats(trials):
 
 def test_nees_of_honest_covariance_lies_within_its_limits_19_times_in_20():
     rng = np.random.default_rng(3)
-    low, high = nees_limits(50 * 4)
+    low, high = mean_limits(4, 50)
     means = (rng.normal(size=(4000, 50, 4)) ** 2).mean(axis=(1, 2))
     assert ((means >= low) & (means <= high)).mean() == pytest.approx(0.95, abs=0.015)
 
