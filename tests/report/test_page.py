@@ -51,7 +51,7 @@ def heading(page, table: str, title: str) -> int:
 
 
 def click(page, table: str, index: int) -> None:
-    page.run(f"document.querySelectorAll('#table-{table} th button')[{index}].click()")
+    page.run(f"document.querySelectorAll('#table-{table} th [role=button]')[{index}].click()")
 
 
 def test_there_are_no_errors_no_dialogs_and_no_requests(desktop):
