@@ -23,7 +23,9 @@ class ReportResult:
     figures: tuple[Path, ...]
     report: Path
     problems: tuple[str, ...]
-    """One line per piece that is missing, stale, failed, foreign or damaged; the exit code is 1 where there is any."""
+    """One line per piece that is missing, failed, foreign or damaged; the exit code is 1 where there is any."""
+    stale: tuple[str, ...]
+    """One line per piece that older code computed, which is left out."""
 
 
 def write_report(directories: Sequence[Path | str], output: Path | str) -> ReportResult:
@@ -58,4 +60,6 @@ def write_report(directories: Sequence[Path | str], output: Path | str) -> Repor
     page = render_page(analysis, tables, shown)
     report = output / "report.html"
     write_atomically(report, lambda temporary: temporary.write_text(page, encoding="utf-8"))
-    return ReportResult(analysis.summary, summary_path, table_paths, tuple(figures), report, analysis.problems)
+    return ReportResult(
+        analysis.summary, summary_path, table_paths, tuple(figures), report, analysis.problems, analysis.stale
+    )

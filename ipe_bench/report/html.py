@@ -35,7 +35,7 @@ def render_page(analysis: Analysis, tables: Sequence[Table], figures: Sequence[S
         directories=[str(d) for d in collection.directories],
         expected=collection.expected,
         complete=collection.complete,
-        problems=collection.problems,
+        problems=[*collection.problems, *collection.stale],
         tables=[_table(t) for t in tables],
         figures=[
             {"name": name, "title": title, "caption": caption, "data": base64.b64encode(png).decode()}

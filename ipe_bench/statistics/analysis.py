@@ -60,6 +60,10 @@ class Analysis:
         return tuple(self.collection.problems)
 
     @property
+    def stale(self) -> tuple[str, ...]:
+        return tuple(self.collection.stale)
+
+    @property
     def setting_columns(self) -> list[str]:
         """The columns that tell scenarios apart, but for the error scale."""
         first = self.collection.groups[0].columns if self.collection.groups else {}

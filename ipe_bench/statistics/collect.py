@@ -1,6 +1,6 @@
 """From directories to what is stored in them: which cells there are, which trials of them, and what is wrong.
 
-A stored piece is used, or named in `Collection.problems`; nothing is guessed, mixed or deleted. What the numbers mean
+A stored piece is used, or named in `Collection.problems` or `Collection.stale`; nothing is guessed, mixed or deleted. What the numbers mean
 is left to `statistics.summary`.
 """
 
@@ -107,6 +107,9 @@ class Collection:
     groups: tuple[Group, ...] = ()
     runs: tuple[Run, ...] = ()
     problems: list[str] = field(default_factory=list)
+    """What is missing, failed, foreign or damaged."""
+    stale: list[str] = field(default_factory=list)
+    """What older code computed: left out, and no problem where the present code has computed it again."""
     expected: int = 0
     """Cells that the records of runs announce."""
     complete: int = 0
@@ -204,9 +207,6 @@ def collect(directories: Sequence[Path | str]) -> Collection:
         store = Store(path)
         found = _find_pieces(store, stored, collection)
         records = _find_runs(store, collection)
-        for failure in store.failures():
-            where = f"{describe_names(failure['names'])}, trials {failure['start']} to {failure['stop']}"
-            collection.problem(f"failed: {where}: {failure['message']}")
         runs += records
         if not found and not records:
             collection.problem(f"{path}: holds no results of ipe-bench")
@@ -307,7 +307,7 @@ def _leave_out_stale(cells: Sequence[StoredCell], collection: Collection) -> lis
                 current.append(cell)
             else:
                 versions = ", ".join(f"{p} {v}" for p, v in cell.footer.get("versions", {}).items())
-                collection.problem(
+                collection.stale.append(
                     f"stale: {describe_names(cell.footer['names'])}: {_count(cell.covered)} trials were computed by"
                     f" other code ({versions}, source {cell.footer.get('source')}, key {cell.key}); left out"
                 )

@@ -110,7 +110,8 @@ def test_stale_results_are_named_and_never_mixed_in(filled):
         table = table.replace_schema_metadata({FOOTER: json.dumps(footer).encode()})
         pq.write_table(table, path.with_name(path.name.replace(footer["key"], key).replace(path.name[:16], key)))
     analysis = analyse([filled.directory])
-    (line,) = analysis.problems
+    assert not analysis.problems
+    (line,) = analysis.stale
     assert line.startswith("stale: one on repeated")
     assert "60 trials" in line
     assert analysis.summary["rmse"].max() < 1e3
