@@ -34,7 +34,7 @@ class Progressive(Estimator):
 
     Without a prior (none known, or `use_prior: false`) the first attempt is already like that. Without epochs there are
     no windows: a pass with the prior, where there is one, then Levenberg-Marquardt with Marquardt's scaling on all
-    data, and restarts from points around the nominal one.
+    data, restarted once with damping in the parameters' sizes and then from points around the nominal one.
     """
 
     growth: float = 2.0
@@ -103,8 +103,7 @@ class _Search:
         options, problem = self.options, self.problem
         prior = prior_deviation(problem, options.prior_inflation) if options.use_prior and k == 0 else None
         in_windows = problem.measurement.epochs is not None
-        metric = prior if prior is not None else np.ones(problem.measurement.n) if in_windows else None
-        damping = Damping(options.damping, metric)
+        damping = Damping(options.damping, self._metric(k, prior))
         x = np.repeat(problem.x0[None] if in_windows else self._start(k)[None], len(rows), axis=0)
         passes: list[Minima] = []
         for objective in self._windows(k, rows, prior):
@@ -140,10 +139,22 @@ class _Search:
             history=self.history,
         )
 
+    def _metric(self, k: int, prior: Array | None) -> Array | None:
+        """What damping measures steps by in attempt k; None: Marquardt's scaling."""
+        if prior is not None:
+            return prior
+        problem = self.problem
+        if problem.measurement.epochs is not None:
+            return np.ones(problem.measurement.n)
+        if k == 1:
+            # The parameters' own sizes, scaled as a whole to the readings: this and Marquardt's fail in other places.
+            return np.full(problem.measurement.n, 1.0 / np.linalg.norm(problem.R.whiten_jacobian(problem.H)))
+        return None
+
     def _start(self, k: int) -> Array:
-        """Where attempt k starts without windows: the nominal point, then points around it, the same for all trials."""
+        """Where attempt k starts without windows: twice the nominal point, then points around it."""
         x0, deviation = self.problem.x0, self.problem.prior_deviation
-        if k == 0:
+        if k <= 1:
             return x0
         spread = deviation if deviation is not None else np.where(x0 == 0, 1.0, np.abs(x0))
         return x0 + spread * np.random.Generator(np.random.Philox(k)).standard_normal(len(x0))

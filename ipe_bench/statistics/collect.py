@@ -1,7 +1,7 @@
 """From directories to what is stored in them: which cells there are, which trials of them, and what is wrong.
 
-A stored piece is used, or named in `Collection.problems` or `Collection.stale`; nothing is guessed, mixed or deleted. What the numbers mean
-is left to `statistics.summary`.
+A stored piece is used, or named in `Collection.problems` or `Collection.stale`; nothing is guessed, mixed or deleted.
+What the numbers mean is left to `statistics.summary`.
 """
 
 from __future__ import annotations
