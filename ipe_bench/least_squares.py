@@ -96,8 +96,8 @@ class Damping:
 class Minima(Roots):
     """Where the minimisation of each trial ended, with what is known of the objective there."""
 
-    information: Array
-    """J' R^-1 J (trials, n, n), plus P0^-1 where the prior counts."""
+    covariance: Array
+    """(J' R^-1 J)^-1 (trials, n, n), with P0^-1 inside where the prior counts; NaN where it does not exist."""
     chi_square: Array
     """|R^-1/2 (h(x) - z)|^2 (trials,), of the readings alone."""
 
@@ -245,7 +245,9 @@ def minimize(
         going = now == Status.RUNNING
         done = ~going
         if done.any():
-            result.information[active[done]] = np.matmul(local.U[done].swapaxes(1, 2), local.U[done])
+            # U^-1 U^-T: inverting U'U would lose twice the digits, and with them the sign of a variance.
+            inverse_U, _ = inverse(local.U[done])
+            result.covariance[active[done]] = np.matmul(inverse_U, inverse_U.swapaxes(1, 2))
             result.chi_square[active[done]] = _squared(r[done, : objective.readings])
         if not going.any():
             break
@@ -283,7 +285,7 @@ def report(minima: Minima, tally: Tally, readings: int) -> Estimates:
     return Estimates(
         x=minima.x,
         status=minima.status,
-        covariance=inverse(minima.information)[0],
+        covariance=minima.covariance,
         iterations=minima.iterations,
         simulations=tally.simulations.copy(),
         jacobians=tally.jacobians.copy(),

@@ -66,6 +66,6 @@ def least_squares_root(problem: Problem, z: Array, x_start: Array, *, prior: boo
     if rest.any():
         again = Objective.of(problem, z[rest], prior=prior)
         careful = minimize(again, x_start[rest], damping=Damping(1e-3), tolerance=_TOLERANCE, max_iterations=100)
-        for name in ("x", "status", "iterations", "information", "chi_square"):
+        for name in ("x", "status", "iterations", "covariance", "chi_square"):
             getattr(minima, name)[rest] = getattr(careful, name)
     return minima

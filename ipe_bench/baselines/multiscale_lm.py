@@ -77,6 +77,6 @@ def _better(first: Minima, second: Minima) -> Minima:
         status=choose(first.status, second.status),
         iterations=first.iterations + second.iterations,
         history=history,
-        information=choose(first.information, second.information),
+        covariance=choose(first.covariance, second.covariance),
         chi_square=choose(first.chi_square, second.chi_square),
     )

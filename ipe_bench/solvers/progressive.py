@@ -192,13 +192,13 @@ def _rows(minima: Minima, kept: Mask) -> Minima:
         minima.status[kept],
         minima.iterations[kept],
         history,
-        minima.information[kept],
+        minima.covariance[kept],
         minima.chi_square[kept],
     )
 
 
 def _replace(minima: Minima, where: Mask, by: Minima) -> None:
-    for name in ("x", "status", "iterations", "information", "chi_square"):
+    for name in ("x", "status", "iterations", "covariance", "chi_square"):
         getattr(minima, name)[where] = getattr(by, name)
     if minima.history is not None and by.history is not None:
         for row, iterates in zip(np.flatnonzero(where), by.history, strict=True):
