@@ -8,7 +8,7 @@ run: .venv/ready
 	$(BIN)/ipe-bench run +experiment=paper
 
 test: .venv/ready
-	$(BIN)/pytest
+	$(BIN)/pytest -n auto --dist worksteal
 
 # What takes minutes: Monte Carlo, end-to-end and browser checks.
 slow: .venv/ready

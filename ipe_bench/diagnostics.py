@@ -35,12 +35,17 @@ def contraction(problem: Problem, x: Array) -> Contraction:
     Lengths are in multiples of the parameters' units; K and the infinity norm depend on the units, the radius does not.
     """
     z = np.zeros((len(x), problem.measurement.m))
-    slope = np.eye(x.shape[1]) - FrozenSystem.at_nominal(problem, z).J(x)
+    return contraction_of(FrozenSystem.at_nominal(problem, z).J(x))
+
+
+def contraction_of(J_F: Array) -> Contraction:
+    """The contraction where dF/dx = H+ J is J_F (trials, n, n)."""
+    slope = np.eye(J_F.shape[1]) - J_F
     bad = ~finite(slope)
     radius = np.abs(np.linalg.eigvals(np.where(bad[:, None, None], 0.0, slope))).max(axis=1)
     size = np.abs(slope)
     return Contraction(
-        K=x.shape[1] * size.max(axis=(1, 2)),
+        K=slope.shape[1] * size.max(axis=(1, 2)),
         infinity_norm=size.sum(axis=2).max(axis=1),
         spectral_radius=np.where(bad, np.nan, radius),
     )
@@ -99,11 +104,16 @@ def order_of_convergence(iterates: Array, root: Array, deviation: Array | float 
     below `floor` are round-off and left out.
     """
     errors = np.abs((iterates - root) / deviation).max(axis=1)
+    return Order(errors, orders_of(errors, floor))
+
+
+def orders_of(errors: Array, floor: float = 1e-9) -> Array:
+    """log(e_(k+1) / e_k) / log(e_k / e_(k-1)) of successive errors (iterates,), where they decrease above the floor."""
     e = errors[: int(np.argmax(errors <= floor)) if (errors <= floor).any() else len(errors)]
     with np.errstate(divide="ignore", invalid="ignore"):
         orders = np.log(e[2:] / e[1:-1]) / np.log(e[1:-1] / e[:-2])
     decreasing = (e[2:] < e[1:-1]) & (e[1:-1] < e[:-2])
-    return Order(errors, orders[decreasing])
+    return orders[decreasing]
 
 
 @dataclass(frozen=True)

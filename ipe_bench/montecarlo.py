@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import chdtri
 
+from ipe_bench.diagnostics import contraction_of
 from ipe_bench.errors import UserError
 from ipe_bench.estimation import Equation, Estimates, Estimator, estimate_safely
 from ipe_bench.ipe import frozen_covariance
@@ -47,10 +48,16 @@ class Block:
         return self.scenario.problem
 
     @cached_property
+    def jacobian(self) -> Array:
+        """dh/dx at the truth (trials, m, n)."""
+        with np.errstate(all="ignore"):
+            return self.problem.measurement.jacobian(self.trials.x)
+
+    @cached_property
     def crlb_information(self) -> Array:
         """J' R^-1 J at the truth (trials, n, n): the inverse of the Cramér-Rao bound."""
         with np.errstate(all="ignore"):
-            return information(self.problem.measurement.jacobian(self.trials.x), self.problem.R)
+            return information(self.jacobian, self.problem.R)
 
     @cached_property
     def bayes_information(self) -> Array:
@@ -64,14 +71,19 @@ class Block:
         return _deviations(inverse(self.crlb_information)[0])
 
     def truth_columns(self) -> Columns:
-        """The truth and its bounds, in multiples of the parameters' units."""
+        """The truth and its bounds, in multiples of the parameters' units, and the contraction of eq. (15) there."""
         names = [p.name for p in self.problem.measurement.parameters]
         bayes = _deviations(inverse(self.bayes_information)[0])
+        H_plus, _ = pseudo_inverse(self.problem.H[None], self.problem.R)
+        contracts = contraction_of(np.matmul(H_plus, self.jacobian))
         return {
             "trial": np.arange(self.trials.start, self.trials.stop),
             **_by_parameter("x", names, self.trials.x),
             **_by_parameter("crlb", names, self.crlb_deviation),
             **_by_parameter("bayes", names, bayes),
+            "contraction_K": contracts.K,
+            "contraction_norm": contracts.infinity_norm,
+            "contraction_radius": contracts.spectral_radius,
         }
 
     @cached_property

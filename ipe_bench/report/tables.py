@@ -80,7 +80,7 @@ def all_tables(analysis: Analysis) -> list[Table]:
     """Every table that the data allow, in the order of the report."""
     if analysis.summary.empty:
         return []
-    tables = [overview(analysis), costs(analysis), comparisons(analysis), ranks(analysis)]
+    tables = [overview(analysis), costs(analysis), contraction(analysis), comparisons(analysis), ranks(analysis)]
     tables += [parameters(analysis), endings(analysis)]
     return [t for t in tables if t is not None]
 
@@ -135,17 +135,40 @@ def costs(analysis: Analysis) -> Table:
         column("simulations", rows["simulations_median"], short),
         column("with Jacobians", scores["cost_median"], short),
         column("to 0.05 σ of limit", scores["cost_to_limit_median"], short),
+        column("order", scores["order_median"], short),
         column("histories", scores["histories"], lambda v: f"{v:d}"),
         column("time", rows["time_median_s"], duration),
     ]
-    names = [*analysis.setting_columns, "error_scale", "estimator", "cost_median", "cost_to_limit_median", "histories"]
+    names = [*analysis.setting_columns, "error_scale", "estimator"]
+    names += ["cost_median", "cost_to_limit_median", "order_median", "histories"]
     data = rows[["iterations_median", "iterations_p95", "simulations_median", "time_median_s"]]
     caption = (
         "Medians per trial over all trials. With Jacobians: a Jacobian counts as many simulations as there are"
         " parameters. To 0.05 σ of limit: cost until all further iterates are within 0.05 standard deviations of the"
-        " last one, over the converged trials with a stored history."
+        " last one, over the converged trials with a stored history. Order: the last observed order of convergence of"
+        " these trials, 1 linear and 2 quadratic."
     )
     return Table("costs", "Costs", caption, columns, pd.concat([scores[names], data], axis=1))
+
+
+def contraction(analysis: Analysis) -> Table | None:
+    """Whether theory promises that the fixed-point iteration converges, eq. (15)."""
+    rows = analysis.contraction
+    if rows.empty:
+        return None
+    columns = _head(analysis, rows)
+    for name, title in (("K", "K"), ("norm", "infinity norm"), ("radius", "spectral radius")):
+        columns += [
+            column(f"{title}, median", rows[f"contraction_{name}_median"], short),
+            column("largest", rows[f"contraction_{name}_max"], short),
+            column("below 1", rows[f"contraction_{name}_below_1"], percent),
+        ]
+    caption = (
+        "Of g' = I - H⁺J at the truth, over all trials. K of eq. (15) below 1, or the infinity norm below 1, in a whole"
+        " neighbourhood is sufficient for fixed-point iteration to converge there; the spectral radius below 1 is"
+        " necessary and sufficient close to the root, and is the rate at which the error shrinks."
+    )
+    return Table("contraction", "Contraction", caption, columns, rows)
 
 
 def comparisons(analysis: Analysis) -> Table | None:

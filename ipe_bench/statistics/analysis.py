@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ipe_bench.diagnostics import orders_of
 from ipe_bench.linalg import Array
 from ipe_bench.statistics.collect import Collection, Group, collect
 from ipe_bench.statistics.comparisons import (
@@ -54,6 +55,8 @@ class Analysis:
     """By number of scenario and estimator, the correlation of the parameters' errors over solved trials."""
     convergence: Mapping[tuple[int, str], list[Array]]
     """By number of scenario and estimator, each stored trial's distances of iterates from the last, in deviations."""
+    contraction: pd.DataFrame
+    """Per scenario, how much the fixed-point iteration contracts at the truth; empty where no file says so."""
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -87,11 +90,13 @@ def analyse(directories: Sequence[Path | str]) -> Analysis:
     distributions: dict[Any, Array] = {}
     correlations: dict[Any, Array] = {}
     convergence: dict[Any, list[Array]] = {}
+    contraction: list[dict[str, Any]] = []
     for number, (scenario, groups) in enumerate(collection.scenarios.items()):
         common = common_trials(collection, groups)
         outcomes: dict[str, Outcomes] = {}
         mine: dict[str, dict[str, Any]] = {}
         n = 1
+        contraction += _contraction_rows(collection, groups[0])
         for group in groups:
             sample = Sample.load(collection, group, optional=["message", NIS])
             if len(sample) == 0:
@@ -113,6 +118,7 @@ def analyse(directories: Sequence[Path | str]) -> Analysis:
                 "cost_median": quantile(one.cost, 0.5),
                 "cost_to_limit_median": quantile(np.array([c for _, c in steps]), 0.5),
                 "histories": len(steps),
+                "order_median": quantile(np.array([o[-1] for d, _ in steps if len(o := orders_of(d))]), 0.5),
             }
             if NIS in sample.scalars:
                 values = sample.scalars[NIS]
@@ -136,6 +142,7 @@ def analyse(directories: Sequence[Path | str]) -> Analysis:
         distributions,
         correlations,
         convergence,
+        pd.DataFrame(contraction),
     )
 
 
@@ -174,6 +181,22 @@ def _group_rows(sample: Sample) -> list[dict[str, Any]]:
         rmse = float(np.sqrt(means[solved, i].mean())) if solved.any() else np.nan
         rows.append(head(sample.group) | {"group": name, "rmse": rmse, "low": lows[i], "high": highs[i]})
     return rows
+
+
+_CONTRACTION = ("contraction_K", "contraction_norm", "contraction_radius")
+
+
+def _contraction_rows(collection: Collection, group: Group) -> list[dict[str, Any]]:
+    """Median and largest contraction constants over the scenario's trials, and how often they promise convergence."""
+    parts = [collection.load(truth, (), _CONTRACTION) for _, truth in group.cells if truth is not None]
+    if not parts or any(name not in part for part in parts for name in _CONTRACTION):
+        return []
+    row: dict[str, Any] = {k: v for k, v in head(group).items() if k != "estimator"}
+    for name in _CONTRACTION:
+        values = np.concatenate([part[name] for part in parts])
+        row |= {f"{name}_median": quantile(values, 0.5), f"{name}_max": quantile(values, 1.0)}
+        row[f"{name}_below_1"] = float((values < 1).mean())
+    return [row]
 
 
 def _ending_rows(sample: Sample) -> list[dict[str, Any]]:

@@ -17,6 +17,7 @@ from ipe_bench.diagnostics import (
 from ipe_bench.ipe import IPE
 from ipe_bench.linalg import Covariance
 from ipe_bench.measurements import Gins, Polynomial
+from ipe_bench.montecarlo import Block
 from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.prior import Gaussian as Prior
 from ipe_bench.roots import frozen_root
@@ -131,3 +132,15 @@ def test_a_convergence_curve_keeps_what_has_finished():
     found = convergence(histories, np.zeros((3, 1)), np.array([2.0]))
     assert found.iteration.tolist() == [0, 1, 2]
     assert found.median.tolist() == [2.0, 2.0, 1.0]
+
+
+def test_stored_contraction_is_that_of_the_model_at_the_truth():
+    scenario = Scenario(Polynomial(strength=0.02), Gaussian(0.01), Prior(), 1.0)
+    block = Block.draw(scenario, 0, 5)
+    columns = block.truth_columns()
+    model = scenario.measurement
+    slope = np.eye(4) - np.linalg.pinv(model.matrix) @ model.jacobian(block.trials.x)
+    np.testing.assert_allclose(columns["contraction_K"], 4 * np.abs(slope).max(axis=(1, 2)), rtol=1e-9)
+    np.testing.assert_allclose(columns["contraction_norm"], np.abs(slope).sum(axis=2).max(axis=1), rtol=1e-9)
+    radius = [np.abs(np.linalg.eigvals(s)).max() for s in slope]
+    np.testing.assert_allclose(columns["contraction_radius"], radius, rtol=1e-7)
