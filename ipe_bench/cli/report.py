@@ -29,7 +29,7 @@ def show(directories: Sequence[Path], output: Path) -> int:
 
     result = write_report(directories, output)
     out = console()
-    out.print(render(result.summary))
+    out.print(render(result.summary, result.certified))
     for problem in (*result.problems, *result.stale):
         print(f"ipe-bench: {problem}", file=sys.stderr)
     out.print(f"\nSummary  {result.summary_path}\nTables   {output / 'tables'}\nFigures  {output / 'figures'}")

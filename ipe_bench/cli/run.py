@@ -151,8 +151,12 @@ def _explain_os_error(error: OSError) -> Exception:
 
 
 def _title(job: Job) -> str:
+    """What a job is about, for its progress bar: the option that was chosen, and what is drawn."""
     scenario = job.scenario
-    return f"{scenario.measurement.name}, error scale {scenario.error_scale:g}, seed {scenario.seed}"
+    chosen = HydraConfig.get().runtime.choices.get("measurement", scenario.measurement.name)
+    if scenario.noise.real:
+        return str(chosen)
+    return f"{chosen}, error scale {scenario.error_scale:g}, seed {scenario.seed}"
 
 
 def write_trial(job: Job, path: Path, trial: int) -> None:

@@ -26,6 +26,8 @@ class ReportResult:
     """One line per piece that is missing, failed, foreign or damaged; the exit code is 1 where there is any."""
     stale: tuple[str, ...]
     """One line per piece that older code computed, which is left out."""
+    certified: pd.DataFrame
+    """Mean correct digits per estimator and start, on certified readings; empty where there are none."""
 
 
 def write_report(directories: Sequence[Path | str], output: Path | str) -> ReportResult:
@@ -49,7 +51,8 @@ def write_report(directories: Sequence[Path | str], output: Path | str) -> Repor
     write_atomically(summary_path, lambda temporary: analysis.summary.to_csv(temporary, index=False))
     tables = all_tables(analysis)
     table_paths = write_tables(analysis, tables, output / "tables")
-    table_paths += write_certified(analysis.collection, output / "tables")
+    certified_paths, certified = write_certified(analysis.collection, output / "tables")
+    table_paths += certified_paths
     figures: list[Path] = []
     shown = []
     pictured = without_certified(analysis)
@@ -61,5 +64,12 @@ def write_report(directories: Sequence[Path | str], output: Path | str) -> Repor
     report = output / "report.html"
     write_atomically(report, lambda temporary: temporary.write_text(page, encoding="utf-8"))
     return ReportResult(
-        analysis.summary, summary_path, table_paths, tuple(figures), report, analysis.problems, analysis.stale
+        analysis.summary,
+        summary_path,
+        table_paths,
+        tuple(figures),
+        report,
+        analysis.problems,
+        analysis.stale,
+        certified,
     )

@@ -14,18 +14,20 @@ from ipe_bench.statistics.collect import Collection
 from ipe_bench.store import write_atomically
 
 
-def write_certified(collection: Collection, folder: Path) -> tuple[Path, ...]:
-    """Writes certified.csv and certified_averages.csv; nothing where no run had certified readings."""
+def write_certified(collection: Collection, folder: Path) -> tuple[tuple[Path, ...], pd.DataFrame]:
+    """Writes certified.csv and certified_averages.csv; returns their paths and the averages, empty where no run had
+    certified readings."""
     table = certified_table(collection)
+    averages = certified_averages(table)
     if table.empty:
-        return ()
+        return (), averages
     paths = []
-    for name, data in (("certified", table), ("certified_averages", certified_averages(table))):
+    for name, data in (("certified", table), ("certified_averages", averages)):
         path = folder / f"{name}.csv"
         content = data.to_csv(index=False, float_format="%.2f")
         write_atomically(path, lambda temporary, content=content: temporary.write_text(content, encoding="utf-8"))
         paths.append(path)
-    return tuple(paths)
+    return tuple(paths), averages
 
 
 def without_certified(analysis: Analysis) -> Analysis:
