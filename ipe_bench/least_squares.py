@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from ipe_bench.estimation import Estimates
 from ipe_bench.ipe import Counted, Roots, Tally
@@ -277,7 +277,7 @@ def fit_probability(minima: Minima, readings: int) -> Array:
     """The chi-square test of the fit (trials,): how probable residuals at least this large are if the model holds, R is
     right and the minimum is the global one."""
     n = minima.x.shape[1]
-    return chi2.sf(minima.chi_square, max(readings - n, 1))
+    return chdtrc(max(readings - n, 1), minima.chi_square)
 
 
 def report(minima: Minima, tally: Tally, readings: int) -> Estimates:

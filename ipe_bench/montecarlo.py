@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtrc, chdtri
 
 from ipe_bench.diagnostics import contraction_of
 from ipe_bench.errors import UserError
 from ipe_bench.estimation import Equation, Estimates, Estimator, estimate_safely
-from ipe_bench.ipe import frozen_covariance
+from ipe_bench.ipe import Counted, Tally, frozen_covariance
 from ipe_bench.linalg import Array, information, inverse, pseudo_inverse, quadratic_form
 from ipe_bench.roots import frozen_root, least_squares_root
 from ipe_bench.scenario import Problem, Scenario, Trials
@@ -104,6 +104,13 @@ class Block:
         with np.errstate(all="ignore"):
             return estimates, self.score(estimator, estimates)
 
+    def _fit_probability(self, x: Array) -> Array:
+        """The chi-square test of the residuals at x (trials, n): the chance of ones at least this large if the model
+        and R are right; NaN where there are none. It needs no truth, so whoever estimates can ask for it too."""
+        model = Counted(self.problem.measurement, Tally.zeros(len(x)))
+        r = self.problem.R.whiten(self.trials.z - model.simulate(x, np.arange(len(x))))
+        return chdtrc(model.measurement.m - model.measurement.n, np.sum(r**2, axis=1))
+
     def score(self, estimator: Estimator, estimates: Estimates) -> Columns:
         """Each trial's error, cost, status and distances, as columns."""
         model = self.problem.measurement
@@ -132,6 +139,7 @@ class Block:
             "time_s": estimates.seconds,
             "crlb_distance": quadratic_form(self.crlb_information, error),
             "nees": nees,
+            "fit_p": self._fit_probability(estimates.x),
             "solved": solved,
             "success": np.isfinite(distance) & (distance <= chdtri(model.n, GATE)),
             **{f"extra_{name}": values for name, values in estimates.extras.items()},

@@ -63,6 +63,11 @@ DEFINITIONS: tuple[tuple[str, str], ...] = (
         "Share of trials whose truth lies inside the estimator's own 95 % ellipsoid; per parameter, interval.",
     ),
     (
+        "misfit",
+        "Share of trials whose residuals fail the chi-square test: |R^-1/2 (z - h(x))|² is larger than it would be in"
+        " 0.1 % of trials if model and noise were right. It needs no truth, so it is known for real readings too.",
+    ),
+    (
         "Mahalanobis error",
         "sqrt(e' J' R⁻¹ J e): the error in standard deviations of the Cramér-Rao bound, about √n when efficient.",
     ),

@@ -114,11 +114,13 @@ def overview(analysis: Analysis) -> Table:
         column("NEES / n", rows["nees"], short),
         interval("NEES limits", rows["nees_low"], rows["nees_high"], short),
         column("coverage", rows["coverage95"], percent),
+        column("misfit", rows["misfit"], lambda v: percent(v) if math.isfinite(v) else "-"),
     ]
     caption = (
         "Shares are of all trials. rmse / bound: root mean square over parameters of error over linear bound, on the"
-        " trials that the estimator solved; common: on those that every estimator solved. Bold: the smallest capped"
-        " mean error and those that do not differ significantly from it (Wilcoxon, Holm, 5 %), where any other does."
+        " trials that the estimator solved; common: on those that every estimator solved. misfit: trials whose"
+        " residuals fail the chi-square test at 0.1 %. Bold: the smallest capped mean error and those that do not"
+        " differ significantly from it (Wilcoxon, Holm, 5 %), where any other does."
     )
     return Table("overview", "Overview", caption, columns, rows)
 
@@ -133,7 +135,6 @@ def costs(analysis: Analysis) -> Table:
         column("iterations", rows["iterations_median"], short),
         column("95 % of trials", rows["iterations_p95"], short),
         column("simulations", rows["simulations_median"], short),
-        column("with Jacobians", scores["cost_median"], short),
         column("to 0.05 σ of limit", scores["cost_to_limit_median"], short),
         column("order", scores["order_median"], short),
         column("histories", scores["histories"], lambda v: f"{v:d}"),
@@ -143,7 +144,7 @@ def costs(analysis: Analysis) -> Table:
     names += ["cost_median", "cost_to_limit_median", "order_median", "histories"]
     data = rows[["iterations_median", "iterations_p95", "simulations_median", "time_median_s"]]
     caption = (
-        "Medians per trial over all trials. With Jacobians: a Jacobian counts as many simulations as there are"
+        "Medians per trial over all trials. A Jacobian counts as many simulations as there are"
         " parameters. To 0.05 σ of limit: cost until all further iterates are within 0.05 standard deviations of the"
         " last one, over the converged trials with a stored history. Order: the last observed order of convergence of"
         " these trials, 1 linear and 2 quadratic."

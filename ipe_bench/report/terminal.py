@@ -13,7 +13,7 @@ from ipe_bench.statistics.summary import ALL, STATISTICS
 if TYPE_CHECKING:
     from rich.console import Group
 
-_HEADINGS = ("trials", "solved", "success", "rmse/bound", "95 %", "NEES", "iter", "sims", "time")
+_HEADINGS = ("trials", "solved", "success", "rmse/bound", "95 %", "NEES", "misfit", "sims", "time")
 _NOT_SETTINGS = {*STATISTICS, "parameter", "unit", "estimator", "error_scale"}
 
 
@@ -36,7 +36,7 @@ def render(summary: pd.DataFrame, certified: pd.DataFrame | None = None) -> Grou
     parts: list[Any] = []
     for values, part in rows.groupby(columns, dropna=False, sort=False):
         named = dict(zip(columns, values if isinstance(values, tuple) else (values,), strict=True))
-        title = ", ".join(str(v) if k in ("measurement", "noise") else f"{k}={v}" for k, v in named.items())
+        title = ", ".join(str(v) if k in ("measurement", "noise") else f"{k}={v}" for k, v in named.items() if _says(v))
         counts = part["trials"].unique()
         alike = len(counts) == 1
         if alike:
@@ -62,9 +62,15 @@ def render(summary: pd.DataFrame, certified: pd.DataFrame | None = None) -> Grou
     note = (
         "rmse/bound: root mean square error of the solved trials over the linear bound, all parameters, with its 95 %"
         " bootstrap interval. solved, success: of all trials. NEES: 1 where the reported covariance is right."
-        " iter, sims, time: medians per trial."
+        " misfit: trials whose residuals fail the chi-square test at 0.1 %. sims, time: medians per trial, a"
+        " Jacobian counting as one simulation per parameter."
     )
     return Group(*digits, *parts, Text(note, style="dim"))
+
+
+def _says(value: Any) -> bool:
+    """Whether a setting is worth a place in a title: not where it is absent or zero."""
+    return not (isinstance(value, float) and (math.isnan(value) or value == 0.0))
 
 
 def _digits(averages: pd.DataFrame) -> list[Any]:
@@ -100,7 +106,7 @@ def _cells(row: Any) -> list[str]:
         short(row["rmse_over_linear_bound"]),
         f"{compact(row['rmse_low'])}-{compact(row['rmse_high'])}" if math.isfinite(row["rmse_low"]) else "-",
         short(row["nees"]),
-        short(row["iterations_median"]),
+        percent(row["misfit"]) if math.isfinite(row["misfit"]) else "-",
         short(row["simulations_median"]),
         duration(row["time_median_s"], 2),
     ]

@@ -49,11 +49,15 @@ STATISTICS = (
     "nees_low",
     "nees_high",
     "coverage95",
+    "misfit",
     "iterations_median",
     "iterations_p95",
     "simulations_median",
     "time_median_s",
 )
+MISFIT_LEVEL = 1e-3
+"""Residuals less probable than this are noticed: the model does not fit."""
+FIT = "fit_p"
 SCALARS = ("status", "solved", "success", "iterations", "simulations", "jacobians", "time_s", "nees", "crlb_distance")
 
 
@@ -78,7 +82,7 @@ class Sample:
         bounds = [f"{kind}_{name}" for kind in ("crlb", "bayes") for name in names]
         parts: list[dict[str, Array]] = []
         for cell, truth in group.cells:
-            rows = collection.load(cell, [*vectors, *SCALARS], optional)
+            rows = collection.load(cell, [*vectors, *SCALARS], (*optional, FIT))
             rows["seed"] = np.full(len(rows["trial"]), cell.seed)
             known = None if truth is None else collection.load(truth, bounds)
             for name in bounds:
@@ -196,6 +200,8 @@ def summary_rows(sample: Sample, common: Array) -> list[dict[str, Any]]:
         "success_low": low,
         "success_high": high,
         "false_root": float((sample.converged & ~solved).mean()),
+        # Residuals that are not finite are no fit.
+        "misfit": float((~(sample.scalars[FIT] >= MISFIT_LEVEL)).mean()) if FIT in sample.scalars else np.nan,
         "iterations_median": quantile(sample.scalars["iterations"], 0.5),
         "iterations_p95": quantile(sample.scalars["iterations"], 0.95),
         "simulations_median": quantile(sample.cost, 0.5),
