@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import functools
 import platform
 import subprocess
 import tempfile
 import uuid
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +21,7 @@ from ipe_bench.execution import Execution, Serial
 from ipe_bench.machine import cores, library_versions
 from ipe_bench.scenario import Scenario
 from ipe_bench.schedule import RunLog, Watcher, perform, plan, work_through
-from ipe_bench.store import Cell, Store
+from ipe_bench.store import TRUTH, Cell, Store
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,7 +42,8 @@ def run(
     """Runs every estimator on the same trials of every scenario and summarises what is known of them.
 
     `estimators` maps labels to estimators. What `output` holds already is not computed again; without `output` nothing
-    is kept. Returns the tidy summary: a row per scenario, estimator and parameter, plus the parameter `all`.
+    is kept. Returns the tidy summary: a row per scenario, estimator and parameter, plus the parameter `all`. What could
+    not be computed is left out, with a warning that says why.
 
     Raises:
         UserError: what was asked for cannot be computed; nothing has been computed then.
@@ -48,12 +51,12 @@ def run(
     from ipe_bench.statistics import summarize
 
     scenarios = [scenarios] if isinstance(scenarios, Scenario) else list(scenarios)
-    if output is None:
-        with tempfile.TemporaryDirectory(prefix="ipe-bench-") as folder:
-            compute(scenarios, estimators, trials, folder, execution=execution, block_size=block_size, watch=watch)
-            return summarize([folder])
-    compute(scenarios, estimators, trials, output, execution=execution, block_size=block_size, watch=watch)
-    return summarize([output])
+    with contextlib.ExitStack() as stack:
+        folder = output or stack.enter_context(tempfile.TemporaryDirectory(prefix="ipe-bench-"))
+        options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
+        for failure in compute(scenarios, estimators, trials, folder, **options):
+            warnings.warn(f"failed: {failure}", stacklevel=2)
+        return summarize([folder])
 
 
 def compute(
@@ -95,6 +98,8 @@ def check(
         mistakes.append(f"block_size={block_size}: give a whole number above 0")
     if not scenarios:
         mistakes.append("there is no scenario; give at least one")
+    if TRUTH in estimators:
+        mistakes.append(f"estimators.{TRUTH}: is what the truth itself is stored under; choose another label")
     if not estimators:
         mistakes.append("there is no estimator; choose with solver= and baseline=")
     for scenario in scenarios:

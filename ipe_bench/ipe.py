@@ -10,7 +10,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.errors import UserError
+from ipe_bench.errors import UserError, require_counts, require_positive
 from ipe_bench.estimation import Estimates, Estimator, describe_exception
 from ipe_bench.linalg import Array, Covariance, Mask, finite, inverse, multiply, pseudo_inverse, solve
 from ipe_bench.measurements.base import Measurement
@@ -21,7 +21,7 @@ from ipe_bench.statuses import Status
 S = TypeVar("S", bound=State)
 
 _FAR = 1e8
-"""An iterate this many times farther from x0 than the start, in residual or in distance, has diverged."""
+"""Where the residual is this many times larger than at the start, the iteration has diverged."""
 _TINY_STEP = 1e-3
 """Steps below this share of the tolerance, while F is above it, mean a stall."""
 
@@ -238,10 +238,8 @@ class IPE(Estimator):
     def __post_init__(self) -> None:
         if self.start not in ("linear_lse", "nominal"):
             raise UserError(f"start={self.start}: choose linear_lse or nominal")
-        if not self.tolerance > 0:
-            raise UserError(f"tolerance={self.tolerance}: give a number above 0")
-        if self.max_iterations < 1:
-            raise UserError(f"max_iterations={self.max_iterations}: give a whole number above 0")
+        require_positive(self, "tolerance", "budget")
+        require_counts(self, "max_iterations")
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         system = FrozenSystem.at_nominal(problem, z)

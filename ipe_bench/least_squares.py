@@ -71,7 +71,7 @@ class Objective:
         return dataclasses.replace(self, z=self.z[kept], rows=self.rows[kept])
 
 
-def prior_deviation(problem: Problem, inflation: float) -> Array | None:
+def prior_deviation(problem: Problem, inflation: float = 1.0) -> Array | None:
     """The prior's standard deviations (n,) times `inflation`; a parameter that the prior fixes is nearly fixed."""
     deviation = problem.prior_deviation
     if deviation is None:

@@ -12,10 +12,12 @@ from functools import cached_property
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
+from ipe_bench.consistency import nees
 from ipe_bench.diagnostics import contraction_of
 from ipe_bench.errors import UserError
 from ipe_bench.estimation import Equation, Estimates, Estimator, estimate_safely
 from ipe_bench.ipe import Counted, Tally, frozen_covariance
+from ipe_bench.least_squares import prior_deviation
 from ipe_bench.linalg import Array, information, inverse, pseudo_inverse, quadratic_form
 from ipe_bench.roots import frozen_root, least_squares_root
 from ipe_bench.scenario import Problem, Scenario, Trials
@@ -62,7 +64,7 @@ class Block:
     @cached_property
     def bayes_information(self) -> Array:
         """J' R^-1 J + P0^-1 at the truth: the inverse of the Bayesian bound."""
-        deviation = self.problem.prior_deviation
+        deviation = prior_deviation(self.problem)
         return self.crlb_information + (0.0 if deviation is None else np.diag(deviation**-2.0))
 
     @cached_property
@@ -87,15 +89,19 @@ class Block:
         }
 
     @cached_property
-    def _roots(self) -> dict[Equation, Array]:
+    def _roots(self) -> dict[tuple[Equation, float], Array]:
         return {}
 
-    def reference_root(self, equation: Equation) -> Array:
-        """The root (trials, n) that an estimating equation reaches from the truth; NaN where it reaches none."""
-        if equation not in self._roots:
+    def reference_root(self, equation: Equation, inflation: float = 1.0) -> Array:
+        """The root (trials, n) that an estimating equation reaches from the truth; NaN where it reaches none.
+
+        `inflation` widens the prior of the equation `map`.
+        """
+        key = (equation, inflation)
+        if key not in self._roots:
             with np.errstate(all="ignore"):
-                self._roots[equation] = _root_from(self.problem, self.trials, equation)
-        return self._roots[equation]
+                self._roots[key] = _root_from(self.problem, self.trials, equation, inflation)
+        return self._roots[key]
 
     def estimate(self, estimator: Estimator) -> tuple[Estimates, Columns]:
         """What an estimator makes of the block, and its score."""
@@ -121,11 +127,14 @@ class Block:
         distance = quadratic_form(bound, error)
         solved = converged & np.isfinite(error).all(axis=1)
         if estimator.equation is not None:
-            apart = np.abs(estimates.x - self.reference_root(estimator.equation)) / self.crlb_deviation
+            # An estimator that scales its prior solves an equation of its own.
+            inflation = getattr(estimator, "prior_inflation", 1.0) if estimator.equation == "map" else 1.0
+            root = self.reference_root(estimator.equation, inflation)
+            apart = np.abs(estimates.x - root) / self.crlb_deviation
             solved &= apart.max(axis=1) <= SAME_ROOT
         trials = len(error)
         P = estimates.covariance
-        nees = np.full(trials, np.nan) if P is None else quadratic_form(inverse(P)[0], error)
+        squared = np.full(trials, np.nan) if P is None else nees(error, P)
         deviation = np.full(error.shape, np.nan) if P is None else _deviations(P)
         return {
             "trial": np.arange(self.trials.start, self.trials.stop),
@@ -138,7 +147,7 @@ class Block:
             "jacobians": estimates.jacobians,
             "time_s": estimates.seconds,
             "crlb_distance": quadratic_form(self.crlb_information, error),
-            "nees": nees,
+            "nees": squared,
             "fit_p": self._fit_probability(estimates.x),
             "solved": solved,
             "success": np.isfinite(distance) & (distance <= chdtri(model.n, GATE)),
@@ -152,7 +161,7 @@ def linear_bound(problem: Problem) -> Array:
     return _deviations(frozen_covariance(H_plus, problem))[0]
 
 
-def _root_from(problem: Problem, trials: Trials, equation: Equation) -> Array:
+def _root_from(problem: Problem, trials: Trials, equation: Equation, inflation: float) -> Array:
     if equation == "frozen":
         try:
             found = frozen_root(problem, trials.z, trials.x)
@@ -160,7 +169,8 @@ def _root_from(problem: Problem, trials: Trials, equation: Equation) -> Array:
             # H lacks rank, so there is no such equation; the estimators that solve it say so.
             return np.full(trials.x.shape, np.nan)
     else:
-        found = least_squares_root(problem, trials.z, trials.x, prior=equation == "map")
+        prior = inflation if equation == "map" else None
+        found = least_squares_root(problem, trials.z, trials.x, prior=prior)
     return np.where((found.status == Status.CONVERGED)[:, None], found.x, np.nan)
 
 

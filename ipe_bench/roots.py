@@ -55,16 +55,17 @@ def frozen_root(problem: Problem, z: Array, x_start: Array) -> Roots:
     return roots
 
 
-def least_squares_root(problem: Problem, z: Array, x_start: Array, *, prior: bool) -> Minima:
-    """The minimum of |h(x) - z| in the metric of R next to x_start (trials, n), with the prior's term if `prior` (MAP).
+def least_squares_root(problem: Problem, z: Array, x_start: Array, *, prior: float | None) -> Minima:
+    """The minimum of |h(x) - z| in the metric of R next to x_start (trials, n); MAP where `prior` says by how much to
+    widen the prior's deviations.
 
     Gauss-Newton; Levenberg-Marquardt for the trials where that fails.
     """
-    objective = Objective.of(problem, z, prior=prior)
+    objective = Objective.of(problem, z, prior=prior is not None, inflation=prior or 1.0)
     minima = minimize(objective, x_start, damping=None, tolerance=_TOLERANCE, max_iterations=20)
     rest = minima.status != Status.CONVERGED
     if rest.any():
-        again = Objective.of(problem, z[rest], prior=prior)
+        again = Objective.of(problem, z[rest], prior=prior is not None, inflation=prior or 1.0)
         careful = minimize(again, x_start[rest], damping=Damping(1e-3), tolerance=_TOLERANCE, max_iterations=100)
         for name in ("x", "status", "iterations", "covariance", "chi_square"):
             getattr(minima, name)[rest] = getattr(careful, name)

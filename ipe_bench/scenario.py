@@ -13,6 +13,9 @@ from ipe_bench.measurements.base import Measurement
 from ipe_bench.noise.base import Noise
 from ipe_bench.prior.gaussian import Gaussian as Prior
 
+_SEEDS = 1 << 23
+"""Seeds there are: seed and trial share one 64-bit number where trials are matched."""
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -72,9 +75,9 @@ class Scenario:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.error_scale) and self.error_scale > 0):
-            raise UserError(f"error_scale={self.error_scale}: give a number above 0")
-        if self.seed < 0:
-            raise UserError(f"seed={self.seed}: give a whole number from 0 up")
+            raise UserError(f"error_scale={self.error_scale}: give a finite number above 0")
+        if not 0 <= self.seed < _SEEDS:
+            raise UserError(f"seed={self.seed}: give a whole number from 0 to {_SEEDS - 1}")
         if self.noise.real and self.measurement.recorded is None:
             raise UserError(
                 f"noise=certified: measurement={self.measurement.name} comes with no readings of its own; choose "

@@ -127,6 +127,17 @@ class Piece:
         except (pa.ArrowException, OSError, KeyError, ValueError) as error:
             raise DamagedFile(self.path, error) from error
 
+    def check(self) -> None:
+        """Reads all of it.
+
+        Raises:
+            DamagedFile: it is truncated, not one of ours, or does not hold the rows that its name states.
+        """
+        self.footer()
+        rows = self.table().num_rows
+        if rows != self.stop - self.start:
+            raise DamagedFile(self.path, ValueError(f"{rows} rows"))
+
     def table(self, columns: Sequence[str] | None = None) -> pa.Table:
         try:
             return pq.read_table(self.path, columns=columns)
@@ -190,7 +201,7 @@ class Store:
             if piece is None:
                 continue
             try:
-                piece.footer()
+                piece.check()
             except DamagedFile:
                 # Set aside, never deleted: it is computed again under its own name.
                 aside = path.with_suffix(".damaged")

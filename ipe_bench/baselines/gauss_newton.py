@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from ipe_bench.errors import UserError
+from ipe_bench.errors import UserError, require_counts, require_positive
 from ipe_bench.estimation import Estimates, Estimator
 from ipe_bench.ipe import FrozenSystem
 from ipe_bench.least_squares import Damping, Objective, minimize, report
@@ -31,10 +31,8 @@ class _Batch(Estimator):
     def __post_init__(self) -> None:
         if self.start not in ("linear_lse", "nominal"):
             raise UserError(f"start={self.start}: choose linear_lse or nominal")
-        if not self.tolerance > 0:
-            raise UserError(f"tolerance={self.tolerance}: give a number above 0")
-        if self.max_iterations < 1:
-            raise UserError(f"max_iterations={self.max_iterations}: give a whole number above 0")
+        require_positive(self, "tolerance", "budget")
+        require_counts(self, "max_iterations")
 
     def _minimize(self, objective: Objective, problem: Problem, damping: Damping | None, history: bool) -> Estimates:
         z, tally = objective.z, objective.model.tally
@@ -68,8 +66,7 @@ class GaussNewton(_Batch):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.damping is not None and not self.damping > 0:
-            raise UserError(f"damping={self.damping}: give a number above 0, or null")
+        require_positive(self, "damping")
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         damping = None if self.damping is None else Damping(self.damping)
@@ -88,8 +85,7 @@ class LevenbergMarquardt(_Batch):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.damping > 0:
-            raise UserError(f"damping={self.damping}: give a number above 0")
+        require_positive(self, "damping")
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         return self._minimize(Objective.of(problem, z, prior=False), problem, Damping(self.damping), history)
@@ -113,9 +109,7 @@ class MapLM(_Batch):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("damping", "prior_inflation"):
-            if not getattr(self, name) > 0:
-                raise UserError(f"{name}={getattr(self, name)}: give a number above 0")
+        require_positive(self, "damping", "prior_inflation")
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         objective = Objective.of(problem, z, prior=True, inflation=self.prior_inflation)

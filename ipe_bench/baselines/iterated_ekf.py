@@ -8,7 +8,7 @@ import numpy as np
 
 from ipe_bench.baselines.ekf import EKFTrack, turned_by_slopes
 from ipe_bench.baselines.sequential import Sequential, squared_innovation
-from ipe_bench.errors import UserError
+from ipe_bench.errors import require_counts, require_positive
 from ipe_bench.linalg import Array
 
 
@@ -26,10 +26,8 @@ class IteratedEKF(Sequential):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.max_iterations < 1:
-            raise UserError(f"max_iterations={self.max_iterations}: give a whole number above 0")
-        if not self.tolerance > 0:
-            raise UserError(f"tolerance={self.tolerance}: give a number above 0")
+        require_counts(self, "max_iterations")
+        require_positive(self, "tolerance")
 
     def track(self, P0: Array, Q: Array, z: Array) -> IteratedEKFTrack:
         return IteratedEKFTrack(P0, Q, self.max_iterations, self.tolerance)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.errors import UserError
+from ipe_bench.errors import require_counts, require_positive
 from ipe_bench.estimation import Estimates, Estimator
 from ipe_bench.least_squares import Damping, Minima, Objective, minimize, report
 from ipe_bench.linalg import Array
@@ -34,12 +34,8 @@ class MultiscaleLM(Estimator):
     equation = "least_squares"
 
     def __post_init__(self) -> None:
-        if self.max_iterations < 1:
-            raise UserError(f"max_iterations={self.max_iterations}: give a whole number above 0")
-        if not self.tolerance > 0:
-            raise UserError(f"tolerance={self.tolerance}: give a number above 0")
-        if not self.damping > 0:
-            raise UserError(f"damping={self.damping}: give a number above 0")
+        require_counts(self, "max_iterations")
+        require_positive(self, "tolerance", "damping")
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         objective = Objective.of(problem, z, prior=False)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ipe_bench.errors import require_positive
 from ipe_bench.linalg import Array, Covariance
 from ipe_bench.noise.base import Noise
 
@@ -15,6 +16,9 @@ class Gaussian(Noise):
     """z = h + v with independent v of the given standard deviation, in the unit of the readings."""
 
     deviation: float
+
+    def __post_init__(self) -> None:
+        require_positive(self, "deviation")
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         return h + self.deviation * rng.standard_normal(h.shape)
@@ -29,6 +33,9 @@ class NoNoise(Noise):
 
     deviation: float
     name = "none"
+
+    def __post_init__(self) -> None:
+        require_positive(self, "deviation")
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         return h

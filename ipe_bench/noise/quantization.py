@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ipe_bench.errors import require_positive
 from ipe_bench.linalg import Array, Covariance
 from ipe_bench.noise.base import Noise
 
@@ -25,6 +26,9 @@ class Quantization(Noise):
     """In the unit of the readings."""
     deviation: float | None = None
     dither: bool = False
+
+    def __post_init__(self) -> None:
+        require_positive(self, "step", "deviation")
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         shift = self.step * (rng.random(h.shape) - 0.5) if self.dither else 0.0

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.errors import UserError
+from ipe_bench.errors import UserError, require_counts, require_positive
 from ipe_bench.estimation import Estimates, Estimator
 from ipe_bench.ipe import Counted, Tally
 from ipe_bench.least_squares import Damping, Minima, Objective, fit_probability, minimize, prior_deviation, report
@@ -62,9 +62,11 @@ class Progressive(Estimator):
     def __post_init__(self) -> None:
         if not self.growth > 1:
             raise UserError(f"growth={self.growth}: give a number above 1")
-        for name in ("prior_inflation", "damping", "window_tolerance", "tolerance"):
-            if not getattr(self, name) > 0:
-                raise UserError(f"{name}={getattr(self, name)}: give a number above 0")
+        require_positive(self, "prior_inflation", "damping", "window_tolerance", "tolerance", "budget")
+        require_counts(self, "window_iterations", "max_iterations")
+        require_counts(self, "restarts", least=0)
+        if not 0 <= self.fit_level < 1:
+            raise UserError(f"fit_level={self.fit_level}: give a probability from 0 to below 1")
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         search = _Search(self, problem, z, Tally.zeros(len(z)), history)

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from ipe_bench.errors import UserError
+from ipe_bench.errors import UserError, require_counts, require_positive
 from ipe_bench.estimation import Estimates, Estimator
 from ipe_bench.ipe import Counted, FrozenSystem, Tally, find_roots, linear_deviation
 from ipe_bench.linalg import Array, finite, information, inverse
@@ -42,11 +42,8 @@ class Relinearized(Estimator):
     def __post_init__(self) -> None:
         if self.start not in ("linear_lse", "nominal"):
             raise UserError(f"start={self.start}: choose linear_lse or nominal")
-        if not self.tolerance > 0:
-            raise UserError(f"tolerance={self.tolerance}: give a number above 0")
-        for name in ("inner_iterations", "max_iterations"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name}={getattr(self, name)}: give a whole number above 0")
+        require_positive(self, "tolerance", "budget")
+        require_counts(self, "inner_iterations", "max_iterations")
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         frozen = FrozenSystem.at_nominal(problem, z)

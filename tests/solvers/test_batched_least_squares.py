@@ -105,7 +105,7 @@ def test_one_inner_fixed_point_step_is_gauss_newton():
 def test_relinearized_ipe_is_least_squares_at_scale_200():
     problem, trials = gins(200.0, 100)
     estimates = Relinearized().estimate(problem, trials.z)
-    root = least_squares_root(problem, trials.z, trials.x, prior=False)
+    root = least_squares_root(problem, trials.z, trials.x, prior=None)
     deviation = deviations(crlb(problem, trials.x))
     apart = np.abs(estimates.x - root.x) / deviation
     solved = (estimates.status == Status.CONVERGED) & (apart.max(axis=1) < 1e-3)
@@ -116,7 +116,7 @@ def test_relinearized_ipe_is_least_squares_at_scale_200():
 def test_frozen_ipe_is_not_least_squares_at_scale_200():
     problem, trials = gins(200.0, 20)
     frozen = IPE(Newton()).estimate(problem, trials.z)
-    root = least_squares_root(problem, trials.z, trials.x, prior=False)
+    root = least_squares_root(problem, trials.z, trials.x, prior=None)
     converged = frozen.status == Status.CONVERGED
     apart = np.abs(frozen.x - root.x) / deviations(crlb(problem, trials.x))
     assert np.median(apart[converged].max(axis=1)) > 0.1

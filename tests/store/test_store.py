@@ -115,13 +115,16 @@ class Mine(FixedPoint):
     assert digest(code) == digest(code)
 
 
-def test_a_truncated_file_is_set_aside_and_computed_again(tmp_path):
+@pytest.mark.parametrize("damage", ["truncated", "flipped"])
+def test_a_damaged_file_is_set_aside_and_computed_again(tmp_path, damage):
     estimators = {"linear_lse": LinearLSE()}
     compute([scenario()], estimators, 10, tmp_path)
     cell = Cell(scenario(), "linear_lse", LinearLSE())
     path = next((tmp_path / "trials").glob(f"{cell.key}-*.parquet"))
     whole = rows(Store(tmp_path), cell)
-    path.write_bytes(path.read_bytes()[:200])
+    data = path.read_bytes()
+    flipped = data[:4] + bytes(b ^ 255 for b in data[4:200]) + data[200:]
+    path.write_bytes(data[:200] if damage == "truncated" else flipped)
     compute([scenario()], estimators, 10, tmp_path)
     assert path.with_suffix(".damaged").is_file()
     for name, values in rows(Store(tmp_path), cell).items():
