@@ -40,8 +40,9 @@ def main(arguments: Sequence[str]) -> int:
     except CONFIG_ERRORS as error:
         raise explain(error) from error
     named = any(a.lstrip("+").startswith(("name=", "output=")) for a in arguments)
+    name = _measurement_name(arguments, job)
     if not named:
-        config.name = f"estimate-{job.scenario.measurement.name.replace('/', '-')}"
+        config.name = f"estimate-{name.replace('/', '-')}"
         job = replace(job, output=config.output)
     job, z = _readings(config, job)
     problem = job.scenario.problem
@@ -52,11 +53,19 @@ def main(arguments: Sequence[str]) -> int:
     command = _command(config, job)
     folder = claim(Path(job.output), command, elsewhere=not named)
     fits = fit(problem, z, job.estimators)
-    files = write_fits(folder, job.scenario.measurement, z, fits, command, _provenance(config, job))
+    files = write_fits(
+        folder, job.scenario.measurement, z, fits, command, {"measurement": name, **_provenance(config, job)}
+    )
     out = console()
-    out.print(render(job.scenario.measurement, fits, out.width))
+    out.print(render(name, job.scenario.measurement, fits, out.width))
     out.print(f"\nIn {folder}: {', '.join(path.name for path in files)}", markup=False, soft_wrap=True)
     return 0 if any(f.status is Status.CONVERGED for f in fits) else 1
+
+
+def _measurement_name(arguments: Sequence[str], job: Job) -> str:
+    """The option that was chosen (nist/misra1a), which says more than the class."""
+    chosen = [a.partition("=")[2] for a in arguments if a.startswith("measurement=")]
+    return chosen[-1] if chosen else job.scenario.measurement.name
 
 
 def _readings(config: DictConfig, job: Job) -> tuple[Job, Array]:

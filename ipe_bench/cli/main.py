@@ -7,6 +7,8 @@ import os
 import sys
 from collections.abc import Sequence
 
+from ipe_bench.cli.usage import USAGE
+
 HELP = """\
 ipe-bench: which estimator to trust with nonlinear measurements
 
@@ -20,6 +22,7 @@ ipe-bench: which estimator to trust with nonlinear measurements
   ipe-bench new KIND NAME                         a working plugin to start from, in plugins/NAME
   ipe-bench check plugins/NAME                    whether a plugin keeps its promises
 
+`ipe-bench COMMAND --help` says more of one command.
 Exit codes: 0 done; 1 done, but some pieces failed or are missing; 2 a mistake in what was asked for; 130 Ctrl-C.
 """
 
@@ -47,6 +50,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     # Shell completion asks the bare program; only `run` has anything to complete.
     command = "run" if arguments[0] in ("-sc", "--shell-completion") else arguments.pop(0)
+
+    if command in USAGE and any(a in ("-h", "--help") for a in arguments):
+        print(USAGE[command], end="")
+        return 0
 
     # Batched linear algebra is small per trial: more BLAS threads only get in each other's way.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):

@@ -28,7 +28,9 @@ _FIGURES = tuple(f"{name}{suffix}" for name in ("residuals", "ellipses") for suf
 _MOST_OUTLIERS = 8
 _FEW = 0.05
 """Above this share of outliers it is the model that is wrong, and a list of readings says nothing."""
+_ALIKE = 0.02
 _NARROW = 90
+"""Columns of a terminal below which the table of verdicts goes without the residual deviation."""
 
 
 def claim(folder: Path, command: Any, *, elsewhere: bool) -> Path:
@@ -73,13 +75,14 @@ def write_fits(
 ) -> list[Path]:
     """Writes the results of fits of the readings z (m,); each file appears whole or not at all. Returns the files.
 
-    `command` tells one command from another (see `claim`); `provenance` is added to the JSON file.
+    `command` tells one command from another (see `claim`); `provenance` is added to the JSON file and overrides what
+    stands there of the same name.
     """
     from ipe_bench.report.figures.fit import draw_fits
 
     result = folder / RESULT
     # First, since it says whose folder this is.
-    text = json.dumps({"schema": SCHEMA, "command": command, **provenance, **_described(model, z, fits)}, indent=1)
+    text = json.dumps({"schema": SCHEMA, "command": command, **_described(model, z, fits), **provenance}, indent=1)
     write_atomically(result, lambda path: path.write_text(text + "\n", encoding="utf-8"))
     table = folder / RESIDUALS
 
@@ -182,16 +185,19 @@ def with_error(value: float, error: float) -> str:
     return f"{value:.{figures}e} ± {error:.1e}"
 
 
-def render(model: Measurement, fits: Sequence[Fit], width: int) -> Group:
-    """The tables for a terminal of that width: as many estimators side by side as there is room for."""
+def render(name: str, model: Measurement, fits: Sequence[Fit], width: int) -> Group:
+    """The tables for a terminal of that width: as many estimators side by side as there is room for.
+
+    `name` is what the model is called in the title.
+    """
     from rich.console import Group
 
-    parts = [*_estimates(model, fits, width), _verdicts(fits, width), _notes(fits, width)]
+    parts = [*_estimates(name, model, fits, width), _verdicts(fits, width), _notes(fits, width)]
     parts += _outliers(model, fits)
     return Group(*parts)
 
 
-def _estimates(model: Measurement, fits: Sequence[Fit], width: int) -> Iterator[Any]:
+def _estimates(name: str, model: Measurement, fits: Sequence[Fit], width: int) -> Iterator[Any]:
     from rich.markup import escape
     from rich.table import Table
 
@@ -205,7 +211,7 @@ def _estimates(model: Measurement, fits: Sequence[Fit], width: int) -> Iterator[
         while stop < len(columns) and widths[stop] <= room:
             room -= widths[stop]
             stop += 1
-        title = f"{model.name}: estimate ± standard error" if start == 0 else None
+        title = f"{escape(name)}: estimate ± standard error" if start == 0 else None
         table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False, padding=(0, 1))
         table.add_column("parameter", no_wrap=True)
         table.add_column("unit", no_wrap=True)
@@ -263,7 +269,11 @@ def _outliers(model: Measurement, fits: Sequence[Fit]) -> Iterator[Any]:
     yield Text(f"Outliers: normalised residual beyond ±{told[0].outlier_limit:.2f}", style="bold")
     for i in sorted(rows, key=lambda i: -largest[i])[:_MOST_OUTLIERS]:
         where = ", ".join(f"{k}={v}" for k, v in labels[i].items())
-        who = [f"{f.label} {f.normalised[i]:.1f}" for f in told if f.outliers[i]]
-        yield Text(f"  {where}: {', '.join(who)}")
+        values = {f.label: float(f.normalised[i]) for f in told if f.outliers[i]}
+        if max(values.values()) - min(values.values()) < _ALIKE * largest[i]:
+            others = f" ({len(values)} estimators)" if len(values) > 1 else f" ({next(iter(values))})"
+            yield Text(f"  {where}: {next(iter(values.values())):.1f}{others}")
+        else:
+            yield Text(f"  {where}: {', '.join(f'{label} {value:.1f}' for label, value in values.items())}")
     if len(rows) > _MOST_OUTLIERS:
         yield Text(f"  and {len(rows) - _MOST_OUTLIERS} others: see {RESIDUALS}")

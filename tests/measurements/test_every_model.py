@@ -1,0 +1,72 @@
+"""Every model under every estimator that can be applied to it: at small error scale, all efficient ones are efficient."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+from scipy.stats import norm
+
+from ipe_bench import plugins
+from ipe_bench.api import run
+from ipe_bench.cli.config import assemble, prepare
+from ipe_bench.components import construct
+from ipe_bench.estimation import Estimator
+from ipe_bench.scenario import Scenario
+
+EXPERIMENTS = ("paper", "ranging", "bearings", "triad", "polynomial", "lotka_volterra")
+TRIALS = 200
+EFFICIENT = ("least_squares", "map")
+"""Estimating equations whose root reaches the bound at first order whatever the error scale."""
+AS_SENSIBLE = {"steepest_descent": 0.5, "enkf": 0.0}
+"""Least share of trials that must converge where it is not all: the method is slow, or its answer is a random one."""
+
+
+def scenario(experiment: str) -> Scenario:
+    """The model of an experiment with the experiment's noise, at error scale 0.1; GINS with white noise, since
+    quantisation at that scale is none."""
+    prepare()
+    overrides = [f"+experiment={experiment}", "error_scale=0.1"]
+    if experiment == "paper":
+        overrides.append("noise=gaussian")
+    with initialize_config_dir(str(plugins.own_conf()), version_base="1.3"):
+        return assemble(compose("config", overrides)).scenario
+
+
+def every_estimator(scenario: Scenario) -> dict[str, Estimator]:
+    """All that come with the bench and have what they need."""
+    own = plugins.sources()[0]
+    found = {}
+    for option in (o for group in plugins.ESTIMATOR_GROUPS for o in plugins.options(group)):
+        if option.source == own:
+            config = OmegaConf.to_container(OmegaConf.load(option.path), resolve=True)
+            estimator = construct(config, f"estimators.{option.name}")
+            if not estimator.missing(scenario.problem):
+                found[option.name] = estimator
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_efficient_estimators_reach_the_bound(experiment):
+    """The 95 % interval of the row `all`, widened for as many models as there are, contains the Cramér-Rao bound, or
+    for estimators with a prior the Bayesian one."""
+    one = scenario(experiment)
+    estimators = every_estimator(one)
+    table = run(one, estimators, TRIALS)
+    rows = table[table["parameter"] == "all"].set_index("estimator")
+    wider = norm.isf(0.01 / (2 * len(EXPERIMENTS))) / norm.isf(0.025)
+    failed = {}
+    for label, estimator in estimators.items():
+        row = rows.loc[label]
+        efficient = estimator.equation in EFFICIENT
+        bound = row["bayes_bound"] if np.isfinite(row["bayes_bound"]) else row["crlb"]
+        low = row["rmse"] - wider * (row["rmse"] - row["rmse_low"])
+        high = row["rmse"] + wider * (row["rmse_high"] - row["rmse"])
+        print(
+            f"{experiment:15} {label:20} {row['converged']:6.3f} {row['rmse']:.4g} [{low:.4g} {high:.4g}] {bound:.4g}"
+        )
+        if efficient and not (row["converged"] == 1 and low <= bound <= high):
+            failed[label] = f"converged {row['converged']}, rmse {low:.4g} to {high:.4g}, bound {bound:.4g}"
+    assert not failed
