@@ -12,7 +12,7 @@ ipe-bench estimate: parameters from real readings, and whether the model fits th
 readings=FILE       CSV or Parquet; `ipe-bench list measurement -v` says which rows and columns a model wants.
                     A missing reading keeps its row, with an empty cell.
 noise.deviation=X   the standard deviation of a reading; standard errors and tests rest on it.
-error_scale=X       how far the parameters may lie from the nominal point, for filters and other estimators with a prior.
+error_scale=X       how far the parameters may lie from the nominal point: the prior of filters and map_lm.
 output=DIR          where the files go: outputs/estimate-MODEL unless given, or outputs/estimate-MODEL-2 and so on
                     where another command has written there. Nothing of another command is overwritten.
 

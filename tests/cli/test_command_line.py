@@ -210,3 +210,74 @@ def test_a_plugin_without_its_header_or_with_a_taken_name_is_refused(tmp_path):
     (conf / "lost.yaml").unlink()
     (conf / "newton.yaml").write_text("# @package estimators.newton\n_target_: mine.Newton\n")
     assert "rename one of the two" in ipe_bench("list", folder=tmp_path).stderr
+
+
+def as_parquet(csv_file: Path, path: Path, change=lambda table: table) -> Path:
+    import pandas as pd
+
+    change(pd.read_csv(csv_file)).to_parquet(path)
+    return path
+
+
+def test_estimate_leaves_numbers_residuals_and_figures_from_csv_and_parquet_alike(readings, tmp_path):
+    import json
+
+    import pandas as pd
+
+    as_parquet(readings, tmp_path / "trial.parquet")
+    results = []
+    for file in (readings, tmp_path / "trial.parquet", readings):
+        ran = ipe_bench("estimate", f"readings={file}", "error_scale=10", folder=tmp_path)
+        assert ran.returncode == 0, ran.stderr
+        assert all(len(line) <= 120 for line in ran.stdout.splitlines())
+    # The second file is another command, and the third run is the first command again.
+    folders = sorted(path.name for path in (tmp_path / "outputs").iterdir())
+    assert folders == ["estimate-gins", "estimate-gins-2"]
+    for folder in folders:
+        files = {path.name for path in (tmp_path / "outputs" / folder).iterdir()}
+        assert files >= {f"{name}.{kind}" for name in ("residuals", "ellipses") for kind in ("png", "pdf")}
+        results.append(json.loads((tmp_path / "outputs" / folder / "estimate.json").read_text()))
+        table = pd.read_csv(tmp_path / "outputs" / folder / "residuals.csv")
+        assert len(table) == 2 * 240
+    assert results[0]["estimators"] == results[1]["estimators"]
+    found = results[0]["estimators"]["fixed_point"]
+    assert found["fits"]
+    assert found["outliers"] == []
+    assert len(found["correlation"]) == 11
+    assert not results[0]["estimators"]["linear_lse"]["fits"]
+    assert {"numpy", "scipy"} <= set(results[0]["libraries"])
+
+
+def test_estimate_overwrites_no_other_command(readings, tmp_path, in_process):
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "residuals.csv").write_text("mine")
+    code, error = in_process(["estimate", f"readings={readings}", "output=mine"], tmp_path)
+    assert code == 2
+    assert "output=mine: holds results of another command" in error
+    assert (folder / "residuals.csv").read_text() == "mine"
+
+
+SPOILED_PARQUET = {
+    "unit": (lambda t: t.rename(columns={"reading [m/s]": "reading [km/h]"}), "the unit must be that of reading [m/s]"),
+    "column": (lambda t: t.drop(columns="axis"), "column axis is missing"),
+    "text": (lambda t: t.astype({"reading [m/s]": str}).replace({"axis": {"vx": "up"}}), "has no reading case=1"),
+    "duplicate": (lambda t: t.iloc[[0, 0, *range(1, 240)]], "row 2: case=1, time [min]=3.0, axis=vx stands in row 1"),
+}
+
+
+@pytest.mark.parametrize("case", SPOILED_PARQUET)
+def test_a_spoiled_parquet_file_is_named_by_row_and_column(readings, tmp_path, in_process, case):
+    change, expected = SPOILED_PARQUET[case]
+    path = as_parquet(readings, tmp_path / "spoiled.parquet", change)
+    code, error = in_process(["estimate", f"readings={path}"], tmp_path)
+    assert code == 2
+    assert expected in error
+    assert len(error.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("command", ["estimate", "report", "status", "list", "new", "check"])
+def test_every_command_has_help(tmp_path, monkeypatch, capsys, command):
+    monkeypatch.chdir(tmp_path)
+    assert main([command, "--help"]) == 0
+    assert f"ipe-bench {command}" in capsys.readouterr().out

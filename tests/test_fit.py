@@ -1,0 +1,68 @@
+"""Fits of one file of readings: what they find, and what they say of the model."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from ipe_bench.baselines import EKF, UKF, GaussNewton
+from ipe_bench.fit import fit
+from ipe_bench.ipe import IPE
+from ipe_bench.measurements import GINS, Polynomial
+from ipe_bench.noise import Gaussian
+from ipe_bench.prior import Gaussian as Prior
+from ipe_bench.report.fit import with_error
+from ipe_bench.scenario import Scenario
+from ipe_bench.solvers import Newton, Progressive
+from ipe_bench.statuses import Status
+
+
+def test_missing_readings_are_no_obstacle_to_any_estimator():
+    """Ten readings gone: every estimator still finds the truth, within 5 of the standard errors that it states."""
+    scenario = Scenario(GINS(), Gaussian(0.0066), Prior(), 10.0)
+    trial = scenario.draw(0, 1)
+    z = trial.z[0].copy()
+    z[np.random.default_rng(0).choice(len(z), 10, replace=False)] = np.nan
+    estimators = {
+        "newton": IPE(Newton()),
+        "gauss_newton": GaussNewton(),
+        "progressive": Progressive(),
+        "ekf": EKF(),
+        "ukf": UKF(),
+    }
+    for one in fit(scenario.problem, z, estimators):
+        assert one.status is Status.CONVERGED, one.label
+        assert one.degrees_of_freedom == 230 - 11
+        truth = trial.x[0] * scenario.measurement.sizes
+        assert (np.abs(one.x - truth) < 5 * one.standard_errors).all(), one.label
+        assert (np.isnan(one.residuals) == np.isnan(z)).all()
+        assert not one.outliers.any()
+        assert one.fits
+        assert np.allclose(np.diagonal(one.correlation), 1.0)
+
+
+def test_the_chi_square_test_rejects_a_true_model_as_often_as_it_says_and_a_wrong_deviation_always():
+    scenario = Scenario(Polynomial(), Gaussian(0.01), Prior(), 0.1)
+    optimist = Scenario(Polynomial(), Gaussian(0.005), Prior(), 0.1).problem
+    z = scenario.draw(0, 200).z
+    estimator = {"gauss_newton": GaussNewton()}
+    p = np.array([fit(scenario.problem, row, estimator)[0].p_value for row in z])
+    assert binom.ppf(0.0005, 200, 0.1) <= np.sum(p < 0.1) <= binom.ppf(0.9995, 200, 0.1)
+    assert not any(fit(optimist, row, estimator)[0].fits for row in z[:10])
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "expected"),
+    [
+        (870.0074, 1.62, "870.0 ± 1.6"),
+        (-0.0653277, 2.3e-5, "-0.065328 ± 0.000023"),
+        (1.292e-3, 1.1e-7, "1.29200e-03 ± 1.1e-07"),
+        (12345.6, 678.0, "12350 ± 680"),
+        (1.0, 0.0999, "1.00 ± 0.10"),
+        (3.5, float("nan"), "3.5"),
+        (float("nan"), 1.0, "-"),
+    ],
+)
+def test_a_value_is_shown_to_two_figures_of_its_error(value, error, expected):
+    assert with_error(value, error) == expected
