@@ -9,7 +9,7 @@ from scipy.stats import binom
 from ipe_bench.baselines import EKF, UKF, GaussNewton
 from ipe_bench.fit import fit
 from ipe_bench.ipe import IPE
-from ipe_bench.measurements import GINS, Polynomial
+from ipe_bench.measurements import Gins, Polynomial
 from ipe_bench.noise import Gaussian
 from ipe_bench.prior import Gaussian as Prior
 from ipe_bench.report.fit import with_error
@@ -20,7 +20,7 @@ from ipe_bench.statuses import Status
 
 def test_missing_readings_are_no_obstacle_to_any_estimator():
     """Ten readings gone: every estimator still finds the truth, within 5 of the standard errors that it states."""
-    scenario = Scenario(GINS(), Gaussian(0.0066), Prior(), 10.0)
+    scenario = Scenario(Gins(), Gaussian(0.0066), Prior(), 10.0)
     trial = scenario.draw(0, 1)
     z = trial.z[0].copy()
     z[np.random.default_rng(0).choice(len(z), 10, replace=False)] = np.nan
