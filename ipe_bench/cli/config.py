@@ -105,6 +105,8 @@ def assemble(config: DictConfig) -> Job:
     )
     estimators: dict[str, Estimator] = {}
     for label, options in plain["estimators"].items():
+        if not isinstance(options, Mapping):
+            raise UserError(f"estimators.{label}={options}: set its options, such as estimators.{label}.KEY=VALUE")
         if TARGET not in options:
             keys = ", ".join(f"estimators.{label}.{key}" for key in options)
             raise UserError(

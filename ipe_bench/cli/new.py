@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import keyword
 import re
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from string import Template
 
+from ipe_bench import plugins
 from ipe_bench.components import unknown
 from ipe_bench.errors import UserError
 
@@ -23,6 +25,14 @@ def main(arguments: Sequence[str]) -> int:
         raise UserError(f"{kind}: {unknown(kind, KINDS, 'kind')}")
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise UserError(f"{name}: give a name of small letters, digits and underscores that starts with a letter")
+    if keyword.iskeyword(name):
+        raise UserError(f"{name}: is a word of Python; choose another name")
+    rivals = plugins.ESTIMATOR_GROUPS if kind in plugins.ESTIMATOR_GROUPS else (kind,)
+    for option in plugins.options():
+        if option.group in rivals and option.name == name:
+            raise UserError(
+                f"{name}: {option.group}={name} is there already ({option.source.origin}); choose another name"
+            )
     folder = Path("plugins") / name
     if folder.exists():
         raise UserError(f"{folder}: is there already and is not overwritten; choose another name")

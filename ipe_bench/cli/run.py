@@ -145,7 +145,7 @@ def _explain_os_error(error: OSError) -> Exception:
     where, reason = error.filename or "output", error.strerror or str(error)
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return StorageError(f"{where}: {reason}; what was stored before is whole, and the same command goes on")
-    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST):
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST, errno.ENOENT):
         return UserError(f"output: {where} cannot be written to ({reason}); choose another folder with output=")
     return error
 
@@ -167,7 +167,11 @@ def write_trial(job: Job, path: Path, trial: int) -> None:
         raise UserError(f"write_readings_trial={trial}: give a whole number from 0 up")
     drawn = job.scenario.draw(trial, trial + 1)
     model = job.scenario.measurement
+    if not path.name:
+        raise UserError(f"write_readings={path}: name a file")
     truth = path.with_name(f"{path.stem}.truth.csv")
+    if truth.exists():
+        raise UserError(f"{truth}: is there already and is not overwritten; name another file or remove it")
     write_readings(path, model, drawn.z[0])
     write_truth(truth, model, drawn.x[0])
     print(f"Readings of trial {trial}: {path}\nTrue parameters:     {truth}")

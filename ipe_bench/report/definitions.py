@@ -28,7 +28,8 @@ DEFINITIONS: tuple[tuple[str, str], ...] = (
     (
         "solved",
         f"Converged to the root, within {SAME_ROOT:g} standard deviations, that the same estimating equation reaches"
-        " when it is started at the truth. False root: converged and not solved.",
+        " when it is started at the truth. False root: converged and not solved."
+        " Filters and the linear LSE solve no equation: for them it means that they finished.",
     ),
     (
         "success",

@@ -213,7 +213,9 @@ def ranks(analysis: Analysis) -> Table | None:
         return None
     ordered = sorted(ranking.mean_ranks, key=lambda label: ranking.mean_ranks[label])
     values = [ranking.mean_ranks[label] for label in ordered]
-    apart = ["yes" if v - values[0] >= ranking.critical_difference else "no" for v in values]
+    # Nemenyi's test follows a rejection by Friedman's, and says nothing without one.
+    rejected = ranking.friedman < ALPHA
+    apart = ["yes" if rejected and v - values[0] >= ranking.critical_difference else "no" for v in values]
     columns = [words("estimator", ordered), column("mean rank", values, short), words("apart from the first", apart)]
     caption = (
         f"Over {ranking.scenarios} scenarios, by capped mean error; Friedman's test that all rank alike:"

@@ -67,6 +67,11 @@ class Analysis:
         return tuple(self.collection.stale)
 
     @property
+    def with_equation(self) -> set[str]:
+        """The estimators that seek a root of something; filters and the linear LSE do not, and only finish."""
+        return {g.estimator for g in self.collection.groups if g.footer.get("equation") is not None}
+
+    @property
     def setting_columns(self) -> list[str]:
         """The columns that tell scenarios apart, but for the error scale."""
         first = self.collection.groups[0].columns if self.collection.groups else {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 
 import numpy as np
@@ -15,7 +16,8 @@ from ipe_bench.statistics.analysis import Analysis
 def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
     parameters = {g.columns["measurement"]: len(g.footer["parameters"]) for g in analysis.collection.groups}
     for setting in common.settings(analysis.scores, analysis.setting_columns):
-        root_n = np.sqrt(parameters[setting.rows["measurement"].iloc[0]])
+        n = parameters[setting.rows["measurement"].iloc[0]]
+        root_n = math.sqrt(n)
         there = {label: one for label, one in look.items() if label in set(setting.rows["estimator"])}
         scales = common.spread(setting.scales)
         fig, axes = common.panels(len(scales), extra=0.4 + 0.2 * len(there) / 5)
@@ -34,7 +36,9 @@ def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
                     markeredgewidth=0.7,
                     label=common.text(label),
                 )
-            common.bound_line(ax, 1.0, "bound")
+            # What an efficient estimator's mean error is: the mean of a chi distribution with n degrees.
+            efficient = math.sqrt(2) * math.exp(math.lgamma((n + 1) / 2) - math.lgamma(n / 2)) / root_n
+            common.bound_line(ax, efficient, "efficient")
             ax.set_xscale("log")
             costs = np.maximum(setting.rows["cost_median"].to_numpy(dtype=float), 0.5)
             costs = costs[np.isfinite(costs)]

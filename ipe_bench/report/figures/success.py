@@ -21,6 +21,8 @@ def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
             axes, ("success", "solved"), ("success: inside the gate", "solved: the right root"), strict=True
         ):
             for label, mine in common.by_estimator(setting.rows, there):
+                if column == "solved" and label not in analysis.with_equation:
+                    continue
                 x = mine["error_scale"] * common.dodge(there, label, setting.scales)
                 if column == "success":
                     low, high = mine["success_low"], mine["success_high"]
@@ -37,7 +39,8 @@ def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
         seen = [f"{e} {percent(v)}" for e, v in zip(top["estimator"], top["success"], strict=True)]
         caption = (
             "Left: share of trials whose error lies inside the chi-square gate of the bound's ellipsoid, with"
-            " Clopper-Pearson 95 % intervals. Right: share that ended at the root belonging to the truth. At scale"
+            " Clopper-Pearson 95 % intervals. Right: share that ended at the root belonging to the truth, of those that"
+            " solve an equation. At scale"
             f" {common.plain(max(setting.scales))} succeed: {common.enumerate_few(seen, 20)}. {setting.label}."
         )
         yield Drawing(f"success_against_scale{setting.suffix}", "Success against error scale", caption, fig)
