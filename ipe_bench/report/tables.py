@@ -133,7 +133,7 @@ def costs(analysis: Analysis) -> Table:
         *_head(analysis, rows),
         words("estimator", rows["estimator"]),
         column("iterations", rows["iterations_median"], short),
-        column("95 % of trials", rows["iterations_p95"], short),
+        column("iterations, 95 %", rows["iterations_p95"], short),
         column("simulations", rows["simulations_median"], short),
         column("to 0.05 σ of limit", scores["cost_to_limit_median"], short),
         column("order", scores["order_median"], short),
@@ -213,9 +213,9 @@ def ranks(analysis: Analysis) -> Table | None:
         return None
     ordered = sorted(ranking.mean_ranks, key=lambda label: ranking.mean_ranks[label])
     values = [ranking.mean_ranks[label] for label in ordered]
-    # Nemenyi's test follows a rejection by Friedman's, and says nothing without one.
-    rejected = ranking.friedman < ALPHA
-    apart = ["yes" if rejected and v - values[0] >= ranking.critical_difference else "no" for v in values]
+    # Nemenyi's test is a follow-up: without a rejection by Friedman's it says nothing.
+    rejects = ranking.friedman < ALPHA
+    apart = ["yes" if rejects and v - values[0] >= ranking.critical_difference else "no" for v in values]
     columns = [words("estimator", ordered), column("mean rank", values, short), words("apart from the first", apart)]
     caption = (
         f"Over {ranking.scenarios} scenarios, by capped mean error; Friedman's test that all rank alike:"

@@ -22,6 +22,9 @@ from ipe_bench.statistics.comparisons import (
     leaders,
     rank_over_scenarios,
 )
+from ipe_bench.statistics.comparisons import (
+    common as on_common_trials,
+)
 from ipe_bench.statistics.intervals import bootstrap_rms, quantile, quantiles
 from ipe_bench.statistics.profiles import Profiles, distances_to_limit, iterations_to_limit
 from ipe_bench.statistics.summary import Sample, common_trials, identifier, summary_rows, to_frame
@@ -119,7 +122,7 @@ def analyse(directories: Sequence[Path | str]) -> Analysis:
                 convergence[where] = [d for d, _ in steps]
             mine[group.estimator] = head(group) | {
                 "scenario": number,
-                "capped_error": capped_error(one, n),
+                "capped_error": np.nan,
                 "cost_median": quantile(one.cost, 0.5),
                 "cost_to_limit_median": quantile(np.array([c for _, c in steps]), 0.5),
                 "histories": len(steps),
@@ -128,6 +131,8 @@ def analyse(directories: Sequence[Path | str]) -> Analysis:
             if NIS in sample.scalars:
                 values = sample.scalars[NIS]
                 mine[group.estimator][NIS] = float(np.mean(values[np.isfinite(values)])) if len(values) else np.nan
+        for label, one in on_common_trials(outcomes).items():
+            mine[label]["capped_error"] = capped_error(one, n)
         compared = compare_pairs(outcomes)
         scored = {label: row["capped_error"] for label, row in mine.items()}
         ahead = leaders(scored, compared)

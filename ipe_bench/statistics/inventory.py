@@ -42,7 +42,7 @@ class Inventory:
 
     @property
     def complete(self) -> bool:
-        return not self.damaged and all(cell.complete for cell in self.cells)
+        return bool(self.cells) and not self.damaged and all(cell.complete for cell in self.cells)
 
 
 def take_inventory(directory: Path | str) -> Inventory:

@@ -124,11 +124,12 @@ def scale_axis(ax: Axes, scales: Sequence[float]) -> None:
 
 def decades(ax: Axes, values: Any, least: float = 10.0) -> None:
     """A logarithmic axis around the values that spans at least a decade, so that scatter of a per cent looks small."""
-    ax.set_yscale("log")
     values = np.asarray(values, dtype=float)
     values = values[np.isfinite(values) & (values > 0)]
     if len(values) == 0:
+        # A logarithmic axis without anything to show makes matplotlib warn.
         return
+    ax.set_yscale("log")
     low, high = float(values.min()) / 1.6, float(values.max()) * 1.6
     if high / low < least:
         middle = np.sqrt(low * high)

@@ -34,7 +34,7 @@ def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
         ax.set_ylim(-0.03, 1.03)
         ax.yaxis.set_major_formatter(lambda v, _: f"{100 * v:.0f} %")
         ax.set_xlabel(x)
-        ax.set_ylabel("share of trials solved")
+        ax.set_ylabel("share of trials with success")
         ax.set_title(title)
     left.set_xlim(1, _end(RATIOS, [profiles.performance(e) for e in there]))
     right.set_xlim(1, _end(BUDGETS, [profiles.data(e) for e in there]))
