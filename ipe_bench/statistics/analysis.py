@@ -18,12 +18,10 @@ from ipe_bench.statistics.comparisons import (
     Outcomes,
     Ranking,
     capped_error,
+    common,
     compare_pairs,
     leaders,
     rank_over_scenarios,
-)
-from ipe_bench.statistics.comparisons import (
-    common as on_common_trials,
 )
 from ipe_bench.statistics.intervals import bootstrap_rms, quantile, quantiles
 from ipe_bench.statistics.profiles import Profiles, distances_to_limit, iterations_to_limit
@@ -100,7 +98,7 @@ def analyse(directories: Sequence[Path | str]) -> Analysis:
     convergence: dict[Any, list[Array]] = {}
     contraction: list[dict[str, Any]] = []
     for number, (scenario, groups) in enumerate(collection.scenarios.items()):
-        common = common_trials(collection, groups)
+        solved_by_all = common_trials(collection, groups)
         outcomes: dict[str, Outcomes] = {}
         mine: dict[str, dict[str, Any]] = {}
         n = 1
@@ -110,7 +108,7 @@ def analyse(directories: Sequence[Path | str]) -> Analysis:
             if len(sample) == 0:
                 continue
             n = sample.error.shape[1]
-            rows += summary_rows(sample, common)
+            rows += summary_rows(sample, solved_by_all)
             by_group += _group_rows(sample)
             endings += _ending_rows(sample)
             where = (number, group.estimator)
@@ -131,7 +129,7 @@ def analyse(directories: Sequence[Path | str]) -> Analysis:
             if NIS in sample.scalars:
                 values = sample.scalars[NIS]
                 mine[group.estimator][NIS] = float(np.mean(values[np.isfinite(values)])) if len(values) else np.nan
-        for label, one in on_common_trials(outcomes).items():
+        for label, one in common(outcomes).items():
             mine[label]["capped_error"] = capped_error(one, n)
         compared = compare_pairs(outcomes)
         scored = {label: row["capped_error"] for label, row in mine.items()}

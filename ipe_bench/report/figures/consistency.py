@@ -67,9 +67,9 @@ def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
         )
         always = [e for e in there if inside[setting.rows["estimator"] == e].all()]
         caption = (
-            "First panel: mean normalised estimation error squared over the number of parameters, 1 where the covariance that"
-            " an estimator reports is right, with the chi-square limits of the mean as a band. Second panel: how often the"
-            " truth lies inside the estimator's own 95 % ellipsoid. Inside the limits at every scale:"
+            "First panel: mean normalised estimation error squared over the number of parameters, 1 where the reported"
+            " covariance is right, with the chi-square limits of the mean as a band. Second panel: how often the truth"
+            " lies inside the estimator's own 95 % ellipsoid. Inside the limits at every scale:"
             f" {common.enumerate_few(always, 20) or 'nobody'}. {setting.label}."
         )
         if nis is not None:
