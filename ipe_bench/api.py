@@ -14,14 +14,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ipe_bench.components import describe, fingerprint
-from ipe_bench.errors import UserError
-from ipe_bench.estimation import Estimator
-from ipe_bench.execution import Execution, Serial
-from ipe_bench.machine import cores, library_versions
-from ipe_bench.scenario import Scenario
-from ipe_bench.schedule import RunLog, Watcher, perform, plan, work_through
-from ipe_bench.store import TRUTH, Cell, Store
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.machine import cores, library_versions
+from ipe_bench.estimators.base import Estimator
+from ipe_bench.runs.execution import Execution, Serial
+from ipe_bench.runs.provenance import describe, fingerprint
+from ipe_bench.runs.schedule import RunLog, Watcher, perform, plan, work_through
+from ipe_bench.runs.store import TRUTH, Cell, Store
+from ipe_bench.trials.scenario import Scenario
 
 if TYPE_CHECKING:
     import pandas as pd

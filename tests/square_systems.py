@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.ipe import Counted, FrozenSystem, Tally
-from ipe_bench.linalg import Array
+from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.estimators.ipe import FrozenSystem
 from ipe_bench.measurements import Measurement, Parameter
+from ipe_bench.measurements.counted import Counted, Tally
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,7 @@ class Temperamental(Square):
 
 def system_of(model: Measurement, trials: int) -> FrozenSystem:
     """h(x) = 0 for each trial."""
-    return FrozenSystem(
-        Counted(model, Tally.zeros(trials)), np.eye(model.n)[None], np.zeros((trials, model.m)), np.arange(trials)
-    )
+    unit = np.eye(model.n)[None]
+    R = Covariance(np.ones(model.m))
+    counted = Counted(model, Tally.zeros(trials))
+    return FrozenSystem(counted, unit, np.ones((1, model.n)), R, np.zeros((trials, model.m)), np.arange(trials))

@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from ipe_bench import prior
-from ipe_bench.estimation import Estimates, Estimator
+from ipe_bench import priors as prior
+from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.measurements.base import Measurement, Parameter
-from ipe_bench.montecarlo import GATE
+from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
-from ipe_bench.scenario import Problem, Scenario
-from ipe_bench.store import Cell, Store
+from ipe_bench.runs.store import Cell, Store
+from ipe_bench.trials.scenario import Scenario
+from ipe_bench.trials.scoring import GATE
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ class Synthetic:
 
     @staticmethod
     def scenario(error_scale: float = 1.0, seed: int = 0, sigma: float = 0.2, **model: Any) -> Scenario:
-        return Scenario(Repeated(**model), Gaussian(sigma), prior.Gaussian(), error_scale, seed)
+        return Scenario(Repeated(**model), Gaussian(sigma), prior.GaussianPrior(), error_scale, seed)
 
     @staticmethod
     def bound(scenario: Scenario) -> np.ndarray:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ipe_bench.consistency import assess, clopper_pearson, coverage, mean_limits, nees
+from ipe_bench.statistics.consistency import assess, clopper_pearson, coverage, mean_limits
+from ipe_bench.trials.scoring import nees
 
 
 def draw(trials: int, claimed: float = 1.0, seed: int = 0):

@@ -7,25 +7,24 @@ import pytest
 from scipy.stats import binom
 
 from ipe_bench.baselines import EKF, UKF, GaussNewton
-from ipe_bench.fit import fit
-from ipe_bench.ipe import IPE
+from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements import Gins, Polynomial
 from ipe_bench.noise import Gaussian
-from ipe_bench.prior import Gaussian as Prior
-from ipe_bench.report.fit import with_error
-from ipe_bench.scenario import Scenario
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.real.fits import fit
+from ipe_bench.report.answer import with_error
 from ipe_bench.solvers import Newton, Progressive
-from ipe_bench.statuses import Status
+from ipe_bench.trials.scenario import Scenario
 
 
 def test_missing_readings_are_no_obstacle_to_any_estimator():
     """Ten readings gone: every estimator still finds the truth, within 5 of the standard errors that it states."""
-    scenario = Scenario(Gins(), Gaussian(0.0066), Prior(), 10.0)
+    scenario = Scenario(Gins(), Gaussian(0.0066), GaussianPrior(), 10.0)
     trial = scenario.draw(0, 1)
     z = trial.z[0].copy()
     z[np.random.default_rng(0).choice(len(z), 10, replace=False)] = np.nan
     estimators = {
-        "newton": IPE(Newton()),
+        "newton": Newton(),
         "gauss_newton": GaussNewton(),
         "progressive": Progressive(),
         "ekf": EKF(),
@@ -43,8 +42,8 @@ def test_missing_readings_are_no_obstacle_to_any_estimator():
 
 
 def test_the_chi_square_test_rejects_a_true_model_as_often_as_it_says_and_a_wrong_deviation_always():
-    scenario = Scenario(Polynomial(), Gaussian(0.01), Prior(), 0.1)
-    optimist = Scenario(Polynomial(), Gaussian(0.005), Prior(), 0.1).problem
+    scenario = Scenario(Polynomial(), Gaussian(0.01), GaussianPrior(), 0.1)
+    optimist = Scenario(Polynomial(), Gaussian(0.005), GaussianPrior(), 0.1).problem
     z = scenario.draw(0, 200).z
     estimator = {"gauss_newton": GaussNewton()}
     p = np.array([fit(scenario.problem, row, estimator)[0].p_value for row in z])

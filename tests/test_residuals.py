@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2, kstest
 
-from ipe_bench.linalg import Covariance
-from ipe_bench.residuals import DRAWS, explained, normalised, outlier_limit, whiteness
+from ipe_bench.basics.linalg import Covariance
+from ipe_bench.real.residuals import DRAWS, explained, normalised, outlier_limit, whiteness
 
 M, N = 60, 5
 # Smooth columns take low frequencies out of the residuals, which a test with chi-square limits would call coloured.

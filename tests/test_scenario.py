@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from ipe_bench.errors import UserError
+from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Gins, Polynomial, Ranging
 from ipe_bench.noise import Colored, Gaussian, NoNoise, Quantization, StudentT
-from ipe_bench.prior import Gaussian as Prior
-from ipe_bench.scenario import Scenario
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.trials.scenario import Scenario
 
 
 @pytest.mark.parametrize("noise", [Gaussian(0.1), StudentT(0.1), Colored(0.1, 0.5), Quantization(0.1, dither=True)])
 def test_a_trial_is_the_same_in_every_block(noise):
-    scenario = Scenario(Ranging(), noise, Prior(), 2.0, seed=3)
+    scenario = Scenario(Ranging(), noise, GaussianPrior(), 2.0, seed=3)
     whole = scenario.draw(0, 40)
     for bounds in ((0, 1), (7, 20), (39, 40)):
         part = scenario.draw(*bounds)
@@ -22,31 +22,31 @@ def test_a_trial_is_the_same_in_every_block(noise):
 
 
 def test_gins_trials_are_the_same_in_every_block():
-    scenario = Scenario(Gins(), Quantization(0.02286), Prior(), 33.0)
+    scenario = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), 33.0)
     whole = scenario.draw(0, 30)
     assert (scenario.draw(11, 13).z == whole.z[11:13]).all()
 
 
 def test_seeds_and_trials_are_independent():
-    draws = [Scenario(Polynomial(), Gaussian(1.0), Prior(), 1.0, seed).draw(0, 500) for seed in (1, 2)]
+    draws = [Scenario(Polynomial(), Gaussian(1.0), GaussianPrior(), 1.0, seed).draw(0, 500) for seed in (1, 2)]
     joined = np.column_stack([*(d.x for d in draws), *((d.z - Polynomial().simulate(d.x))[:, :4] for d in draws)])
     assert np.abs(np.corrcoef(joined.T) - np.eye(16)).max() < 5 / np.sqrt(500)
 
 
 def test_truths_are_normal_about_the_nominal_point_with_the_error_scale():
-    scenario = Scenario(Ranging(position=(100.0, 0.0, 0.0)), Gaussian(0.1), Prior(), 5.0)
+    scenario = Scenario(Ranging(position=(100.0, 0.0, 0.0)), Gaussian(0.1), GaussianPrior(), 5.0)
     u = (scenario.draw(0, 2000).x - scenario.problem.x0) / 5.0
     assert np.abs(u.mean(axis=0)).max() < 5 / np.sqrt(2000)
     np.testing.assert_allclose(u.std(axis=0), 1.0, rtol=0.07)
 
 
 def test_one_seed_gives_the_same_draws_at_every_scale_in_units_of_it():
-    small, large = (Scenario(Polynomial(), Gaussian(1.0), Prior(), s).draw(0, 5).x / s for s in (0.5, 64.0))
+    small, large = (Scenario(Polynomial(), Gaussian(1.0), GaussianPrior(), s).draw(0, 5).x / s for s in (0.5, 64.0))
     np.testing.assert_allclose(small, large, rtol=1e-15)
 
 
 def test_the_prior_may_differ_by_parameter():
-    prior = Prior((1.0, 2.0, 0.0, 1.0))
+    prior = GaussianPrior((1.0, 2.0, 0.0, 1.0))
     assert prior.deviation(4, 10.0).tolist() == [10.0, 20.0, 0.0, 10.0]
     x = Scenario(Polynomial(), Gaussian(1.0), prior, 1.0).draw(0, 100).x
     assert (x[:, 2] == 0.0).all()
@@ -54,7 +54,7 @@ def test_the_prior_may_differ_by_parameter():
 
 def test_a_truth_of_its_own_simulates_the_readings():
     own, truth = Polynomial(strength=0.0), Polynomial(strength=0.1)
-    scenario = Scenario(own, NoNoise(1.0), Prior(), 1.0, truth=truth)
+    scenario = Scenario(own, NoNoise(1.0), GaussianPrior(), 1.0, truth=truth)
     trials = scenario.draw(0, 3)
     assert (trials.z == truth.simulate(trials.x)).all()
     assert scenario.problem.measurement is own
@@ -63,4 +63,4 @@ def test_a_truth_of_its_own_simulates_the_readings():
 @pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
 def test_impossible_error_scales_are_named(scale):
     with pytest.raises(UserError, match=r"^error_scale="):
-        Scenario(Polynomial(), Gaussian(1.0), Prior(), scale)
+        Scenario(Polynomial(), Gaussian(1.0), GaussianPrior(), scale)

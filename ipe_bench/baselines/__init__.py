@@ -3,11 +3,13 @@
 from ipe_bench.baselines.ckf import CKF
 from ipe_bench.baselines.ekf import EKF
 from ipe_bench.baselines.enkf import EnKF
-from ipe_bench.baselines.gauss_newton import GaussNewton, LevenbergMarquardt, MapLM
+from ipe_bench.baselines.gauss_newton import GaussNewton
 from ipe_bench.baselines.iterated_ekf import IteratedEKF
-from ipe_bench.baselines.least_squares import LeastSquares
+from ipe_bench.baselines.levenberg_marquardt import LevenbergMarquardt
 from ipe_bench.baselines.linear_lse import LinearLSE
+from ipe_bench.baselines.map_lm import MapLM
 from ipe_bench.baselines.multiscale_lm import MultiscaleLM
+from ipe_bench.baselines.scipy_least_squares import LeastSquares
 from ipe_bench.baselines.ukf import UKF
 
 __all__ = [

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ipe_bench.baselines.sequential import Sequential, Track, refuse_overflow, squared_innovation
-from ipe_bench.linalg import Array
+from ipe_bench.basics.linalg import Array
 
 
 @dataclass(frozen=True)

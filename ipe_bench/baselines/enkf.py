@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric, turned
-from ipe_bench.errors import UserError
-from ipe_bench.linalg import Array
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ import numpy as np
 
 from ipe_bench.baselines.ekf import EKFTrack, turned_by_slopes
 from ipe_bench.baselines.sequential import Sequential, squared_innovation
-from ipe_bench.errors import require_counts, require_positive
-from ipe_bench.linalg import Array
+from ipe_bench.basics.errors import require_counts, require_positive
+from ipe_bench.basics.linalg import Array
 
 
 @dataclass(frozen=True)

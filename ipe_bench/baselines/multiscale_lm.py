@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ipe_bench.errors import require_counts, require_positive
-from ipe_bench.estimation import Estimates, Estimator
-from ipe_bench.least_squares import Damping, Minima, Objective, minimize, report
-from ipe_bench.linalg import Array
-from ipe_bench.scenario import Problem
+from ipe_bench.basics.batches import put, take
+from ipe_bench.basics.errors import require_counts, require_positive
+from ipe_bench.basics.linalg import Array
+from ipe_bench.estimators.base import Estimates, Estimator
+from ipe_bench.estimators.least_squares import Minima, Objective, minimize
+from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
+from ipe_bench.measurements.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -39,21 +41,19 @@ class MultiscaleLM(Estimator):
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         objective = Objective.of(problem, z, prior=False)
-        start = np.broadcast_to(problem.x0, (len(z), problem.measurement.n))
-        size = 1.0 / np.linalg.norm(problem.R.whiten_jacobian(problem.H))
-        best: Minima | None = None
-        for metric in (np.full(len(problem.x0), size), None):
-            found = minimize(
+        size = np.full(len(problem.x0), 1.0 / np.linalg.norm(problem.R.whiten_jacobian(problem.H)))
+        by_size, by_columns = (
+            minimize(
                 objective,
-                start,
-                damping=Damping(self.damping, metric),
+                LevenbergMarquardtMethod(self.damping, metric),
+                np.repeat(problem.x0[None], len(z), axis=0),
                 tolerance=self.tolerance,
                 max_iterations=self.max_iterations,
                 history=history,
             )
-            best = found if best is None else _better(best, found)
-        assert best is not None
-        return report(best, objective.model.tally, z.shape[1])
+            for metric in (size, None)
+        )
+        return _better(by_size, by_columns).estimates(objective.model.tally, z.shape[1])
 
 
 def _better(first: Minima, second: Minima) -> Minima:
@@ -61,18 +61,5 @@ def _better(first: Minima, second: Minima) -> Minima:
     costs = [np.where(np.isfinite(m.chi_square), m.chi_square, np.inf) for m in (first, second)]
     # Without a finite fit anywhere the first keeps its status.
     improves = costs[1] < costs[0] * (1 - 1e-12)
-
-    def choose(a: Array, b: Array) -> Array:
-        return np.where(improves.reshape(-1, *[1] * (a.ndim - 1)), b, a)
-
-    history = None
-    if first.history is not None and second.history is not None:
-        history = [b if yes else a for a, b, yes in zip(first.history, second.history, improves, strict=True)]
-    return Minima(
-        x=choose(first.x, second.x),
-        status=choose(first.status, second.status),
-        iterations=first.iterations + second.iterations,
-        history=history,
-        covariance=choose(first.covariance, second.covariance),
-        chi_square=choose(first.chi_square, second.chi_square),
-    )
+    best = put(first, improves, take(second, improves))
+    return replace(best, iterations=first.iterations + second.iterations)

@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgWarning
 
-from ipe_bench.errors import UserError
-from ipe_bench.estimation import Estimates, Estimator, Need, describe_exception
-from ipe_bench.ipe import Counted, Tally
-from ipe_bench.linalg import Array, Covariance
+from ipe_bench.basics.errors import UserError, describe_exception
+from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.base import Estimates, Estimator, Need
 from ipe_bench.measurements.base import Measurement, Restricted
-from ipe_bench.scenario import Problem
-from ipe_bench.statuses import Status
+from ipe_bench.measurements.counted import Counted, Tally
+from ipe_bench.measurements.problem import Problem
 
 _POINTS_AT_ONCE = 8192
 """Points of one call of the model: bounds the memory that a large ensemble takes."""
@@ -68,7 +68,7 @@ class Sequential(Estimator):
     """What all filters have in common. A new filter is a frozen dataclass that says how a trial's `Track` begins.
 
     Reports filterpy's P, and as `extras["nis"]` the trial's squared innovations over their number: 1 on average where
-    the filter is consistent (`ipe_bench.consistency.mean_limits` has the limits).
+    the filter is consistent (`ipe_bench.statistics.consistency.mean_limits` has the limits).
     """
 
     prior_inflation: float = 1.0

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from ipe_bench import plugins
+from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console
-from ipe_bench.components import construct
-from ipe_bench.conformance import Finding, check_component
-from ipe_bench.errors import UserError
+from ipe_bench.plugins import discovery as plugins
+from ipe_bench.plugins.conformance import Finding, check_component
+from ipe_bench.plugins.construct import construct
 
 _COMPONENT_GROUPS = ("measurement", "noise", "prior", *plugins.ESTIMATOR_GROUPS)
 

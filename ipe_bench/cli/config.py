@@ -15,12 +15,13 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ipe_bench import plugins
-from ipe_bench.components import TARGET, construct, unknown
-from ipe_bench.errors import UserError
-from ipe_bench.estimation import Estimator
-from ipe_bench.execution import Execution
-from ipe_bench.scenario import Scenario
+from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.estimators.base import Estimator
+from ipe_bench.plugins import discovery as plugins
+from ipe_bench.plugins.construct import construct
+from ipe_bench.runs.execution import Execution
+from ipe_bench.runs.provenance import TARGET
+from ipe_bench.trials.scenario import Scenario
 
 CONFIG_ERRORS = (HydraException, OmegaConfBaseException)
 

@@ -12,18 +12,18 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from ipe_bench import plugins
 from ipe_bench.api import check
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.machine import library_versions
+from ipe_bench.basics.statuses import Status
 from ipe_bench.cli import console
 from ipe_bench.cli.config import CONFIG_ERRORS, Job, assemble, explain, prepare, refuse_silent_traps, rewrite
-from ipe_bench.components import describe, fingerprint
-from ipe_bench.errors import UserError
-from ipe_bench.fit import fit
-from ipe_bench.linalg import Array
-from ipe_bench.machine import library_versions
 from ipe_bench.noise import Certified
-from ipe_bench.readings import read_readings
-from ipe_bench.statuses import Status
+from ipe_bench.plugins import discovery as plugins
+from ipe_bench.real.fits import fit
+from ipe_bench.real.readings import read_readings
+from ipe_bench.runs.provenance import describe, fingerprint
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str]) -> int:
     problem = job.scenario.problem
     check([job.scenario], job.estimators, trials=1)
 
-    from ipe_bench.report.fit import claim, render, write_fits
+    from ipe_bench.report.answer import claim, render, write_fits
 
     command = _command(config, job)
     folder = claim(Path(job.output), command, elsewhere=not named)

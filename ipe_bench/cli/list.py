@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from rich.console import Console
 from rich.table import Table
 
-from ipe_bench import plugins
+from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.cli import console
-from ipe_bench.components import construct, unknown
-from ipe_bench.errors import UserError
 from ipe_bench.measurements.base import Measurement
+from ipe_bench.plugins import discovery as plugins
+from ipe_bench.plugins.construct import construct
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -43,7 +43,7 @@ def _describe_measurement(out: Console, option: plugins.Option) -> None:
 
     model = construct(OmegaConf.to_container(OmegaConf.load(option.path)), "measurement")
     assert isinstance(model, Measurement)
-    from ipe_bench.readings import header
+    from ipe_bench.real.readings import header
 
     table = Table(title=f"measurement={option.name}", title_justify="left", box=None, pad_edge=False)
     for heading in ("parameter", "size", "unit"):

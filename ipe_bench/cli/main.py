@@ -58,8 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Batched linear algebra is small per trial: more BLAS threads only get in each other's way.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
-    from ipe_bench.components import unknown
-    from ipe_bench.errors import StorageError, UserError
+    from ipe_bench.basics.errors import StorageError, UserError, unknown
 
     try:
         if command not in COMMANDS:

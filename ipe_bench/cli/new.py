@@ -9,9 +9,8 @@ from importlib.resources import files
 from pathlib import Path
 from string import Template
 
-from ipe_bench import plugins
-from ipe_bench.components import unknown
-from ipe_bench.errors import UserError
+from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.plugins import discovery as plugins
 
 KINDS = ("solver", "baseline", "measurement", "noise")
 
@@ -39,9 +38,6 @@ def main(arguments: Sequence[str]) -> int:
     package = f"ipe_bench_{name}"
     class_name = "".join(part.title() for part in name.split("_"))
     words = {"kind": kind, "name": name, "package": package, "Class": class_name}
-    # A solver is half an estimator: it is checked with the driver that iterates it.
-    words["component"] = f"IPE({class_name}())" if kind == "solver" else f"{class_name}()"
-    words["imports"] = "\nfrom ipe_bench.ipe import IPE" if kind == "solver" else ""
     texts = {
         "pyproject.toml": "pyproject.toml",
         "README.md": "README.md",
@@ -50,7 +46,7 @@ def main(arguments: Sequence[str]) -> int:
         f"{package}/conf/{kind}/{name}.yaml": f"{kind}.yaml",
         f"tests/test_{name}.py": "test.py",
     }
-    templates = files("ipe_bench") / "templates"
+    templates = files("ipe_bench.plugins") / "templates"
     for target, source in texts.items():
         path = folder / target
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -13,7 +13,7 @@ from rich.progress import Progress as Bar
 from rich.progress import Task as BarTask
 from rich.text import Text
 
-from ipe_bench.schedule import Progress, Watcher
+from ipe_bench.runs.schedule import Progress, Watcher
 
 LINE_EVERY_S = 10.0
 

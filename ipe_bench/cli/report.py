@@ -6,8 +6,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console
-from ipe_bench.errors import UserError
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -15,13 +15,13 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from ipe_bench import plugins
 from ipe_bench.api import compute
+from ipe_bench.basics.errors import StorageError, UserError
 from ipe_bench.cli.config import CONFIG_ERRORS, Job, assemble, explain, prepare, refuse_silent_traps, rewrite
 from ipe_bench.cli.progress import shown_progress
 from ipe_bench.cli.report import show
-from ipe_bench.errors import StorageError, UserError
-from ipe_bench.execution import Serial
+from ipe_bench.plugins import discovery as plugins
+from ipe_bench.runs.execution import Serial
 
 _FLAGS_WITH_VALUE = {"--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--config-path", "-cp"}
 _FLAGS_WITH_VALUE |= {"--config-dir", "-cd", "--experimental-rerun"}
@@ -161,7 +161,7 @@ def _title(job: Job) -> str:
 
 def write_trial(job: Job, path: Path, trial: int) -> None:
     """Writes the simulated readings of one trial, and its true parameters beside them."""
-    from ipe_bench.readings import write_readings, write_truth
+    from ipe_bench.real.readings import write_readings, write_truth
 
     if trial < 0:
         raise UserError(f"write_readings_trial={trial}: give a whole number from 0 up")

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 from rich.table import Table
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console
-from ipe_bench.errors import UserError
+from ipe_bench.runs.store import TRUTH
 from ipe_bench.statistics.inventory import Inventory, take_inventory, title
-from ipe_bench.store import TRUTH
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -15,8 +15,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.linalg import Array, Covariance
-from ipe_bench.naming import Named
+from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.naming import Named
 
 _COMPLEX_STEP = 1e-100
 _CENTRAL_STEP = float(np.finfo(float).eps ** (1 / 3))

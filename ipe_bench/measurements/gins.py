@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.linalg import Array
+from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Parameter
 from ipe_bench.measurements.ode.model import OdeMeasurement
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.errors import UserError
-from ipe_bench.linalg import Array
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Parameter
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.ode.kernel import integrate

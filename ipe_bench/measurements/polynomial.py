@@ -11,8 +11,8 @@ import numpy as np
 from numpy.polynomial.chebyshev import chebvander
 from numpy.typing import NDArray
 
-from ipe_bench.errors import UserError
-from ipe_bench.linalg import Array
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Measurement, Parameter
 
 

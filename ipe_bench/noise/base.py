@@ -7,8 +7,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from ipe_bench.linalg import Array, Covariance
-from ipe_bench.naming import Named
+from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.naming import Named
 
 
 class Noise(Named, ABC):

@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from ipe_bench.errors import UserError
-from ipe_bench.linalg import Array, Covariance
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.noise.base import Noise
 
 

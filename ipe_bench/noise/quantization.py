@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.errors import require_positive
-from ipe_bench.linalg import Array, Covariance
+from ipe_bench.basics.errors import require_positive
+from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.noise.base import Noise
 
 _UNIFORM_DEVIATION = 1 / np.sqrt(12)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.errors import UserError
-from ipe_bench.linalg import Array, Covariance
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.noise.base import Noise
 
 

@@ -36,12 +36,12 @@ def write_report(directories: Sequence[Path | str], output: Path | str) -> Repor
     Raises:
         UserError: a directory does not exist.
     """
-    from ipe_bench.report.certified import without_certified, write_certified
+    from ipe_bench.basics.files import write_atomically
+    from ipe_bench.report.certified_tables import without_certified, write_certified
     from ipe_bench.report.figures import draw_all
     from ipe_bench.report.html import render_page
     from ipe_bench.report.tables import all_tables, write_tables
     from ipe_bench.statistics.analysis import analyse
-    from ipe_bench.store import write_atomically
 
     analysis = analyse(directories)
     output = Path(output)

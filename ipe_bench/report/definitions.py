@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from ipe_bench.montecarlo import GATE, HISTORIES, SAME_ROOT
 from ipe_bench.statistics.comparisons import TIE
 from ipe_bench.statistics.intervals import LARGEST_SAMPLE, RESAMPLES
 from ipe_bench.statistics.profiles import CLOSE
+from ipe_bench.trials.scoring import GATE, HISTORIES, SAME_ROOT
 
 DEFINITIONS: tuple[tuple[str, str], ...] = (
     ("trial", "One draw of true parameters and of noise. Trial t is the same for every estimator."),

@@ -11,12 +11,12 @@ from typing import Any
 
 import pandas as pd
 
+from ipe_bench.basics.files import write_atomically
 from ipe_bench.report.words import duration, p_value, percent, plain, precise, short
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.comparisons import ALPHA
 from ipe_bench.statistics.profiles import BUDGETS, RATIOS
 from ipe_bench.statistics.summary import ALL
-from ipe_bench.store import write_atomically
 
 
 @dataclass(frozen=True)

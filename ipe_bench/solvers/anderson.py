@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.errors import UserError
-from ipe_bench.linalg import Array, multiply
-from ipe_bench.solvers.base import Solver, State, System
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.estimators.ipe import IPE, State, System
 
 _DEPENDENT = 1e-12
 """Differences of F that are the same to this share are taken for one."""
@@ -23,7 +23,7 @@ class AndersonState(State):
 
 
 @dataclass(frozen=True)
-class Anderson(Solver):
+class Anderson(IPE[AndersonState]):
     """x <- g(x) - sum of gamma_j times the j-th last difference of g, where gamma minimises |F - dF gamma|.
 
     The fixed-point step g(x) = x - F(x) corrected by what the last `depth` steps say of the slope: no Jacobian, one
@@ -33,6 +33,7 @@ class Anderson(Solver):
     depth: int = 5
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.depth < 1:
             raise UserError(f"depth={self.depth}: give a whole number above 0")
 
@@ -40,8 +41,7 @@ class Anderson(Solver):
         none = np.zeros((*x.shape, min(self.depth, x.shape[1])))
         return AndersonState(x, F, none, none)
 
-    def step(self, system: System, state: State) -> AndersonState:
-        assert isinstance(state, AndersonState)
+    def step(self, system: System, state: AndersonState) -> AndersonState:
         gamma = _least_squares(state.dF, state.F)
         x = state.x - state.F - multiply(state.dx - state.dF, gamma)
         F = system.F(x)

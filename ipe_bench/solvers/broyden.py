@@ -7,9 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from ipe_bench.errors import UserError
-from ipe_bench.linalg import Array, multiply
-from ipe_bench.solvers.base import Solver, State, System
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.estimators.ipe import IPE, State, System
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class BroydenState(State):
 
 
 @dataclass(frozen=True)
-class Broyden(Solver):
+class Broyden(IPE[BroydenState]):
     """x <- x - B F(x), where B is the inverse Jacobian as the steps so far have shown it ("good" Broyden).
 
     The least change of the Jacobian that satisfies the secant equation is of rank one, so the Sherman-Morrison formula
@@ -31,6 +31,7 @@ class Broyden(Solver):
     """B at the start: J(x)^-1, or I, which makes the first step one of fixed-point iteration and needs no Jacobian."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.initial not in ("jacobian", "identity"):
             raise UserError(f"initial={self.initial}: choose jacobian or identity")
 
@@ -42,8 +43,7 @@ class Broyden(Solver):
         J = system.J(x)
         return BroydenState(x, F, np.stack([system.solve(J, columns[:, i]) for i in range(n)], axis=2))
 
-    def step(self, system: System, state: State) -> BroydenState:
-        assert isinstance(state, BroydenState)
+    def step(self, system: System, state: BroydenState) -> BroydenState:
         s = -multiply(state.B, state.F)
         x = state.x + s
         F = system.F(x)

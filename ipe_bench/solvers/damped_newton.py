@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.errors import UserError
-from ipe_bench.linalg import Array
-from ipe_bench.solvers.base import Solver, State, System
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
+from ipe_bench.estimators.ipe import IPE, State, System
 
 
 @dataclass(frozen=True)
-class DampedNewton(Solver):
+class DampedNewton(IPE):
     """x <- x - t J(x)^-1 F(x) with t = 1, 1/2, 1/4, ... until |F| has decreased by enough (Armijo's rule).
 
     Newton's method near a root. A trial whose |F| decreases for no t stays where it is, and has stalled.
@@ -23,6 +23,7 @@ class DampedNewton(Solver):
     halvings: int = 30
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 0 < self.decrease < 1:
             raise UserError(f"decrease={self.decrease}: give a number between 0 and 1")
         if self.halvings < 0:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ipe_bench.solvers.base import Solver, State, System
+from ipe_bench.estimators.ipe import IPE, State, System
 
 
 @dataclass(frozen=True)
-class FixedPoint(Solver):
+class FixedPoint(IPE):
     """x <- x - F(x), which is x0 + H+ (z - h(x0) - N(x)), eq. (17).
 
     Converges linearly where g(x) = x - F(x) contracts, eqs. (15) and (18).

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ipe_bench.solvers.base import Solver, State, System
+from ipe_bench.estimators.ipe import IPE, State, System
 
 
 @dataclass(frozen=True)
-class Newton(Solver):
+class Newton(IPE):
     """x <- x - J(x)^-1 F(x). Converges quadratically near a root with regular J, eq. (23)."""
 
     def step(self, system: System, state: State) -> State:

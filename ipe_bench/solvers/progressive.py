@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.errors import UserError, require_counts, require_positive
-from ipe_bench.estimation import Estimates, Estimator
-from ipe_bench.ipe import Counted, Tally
-from ipe_bench.least_squares import Damping, Minima, Objective, fit_probability, minimize, prior_deviation, report
-from ipe_bench.linalg import Array, Mask, finite
+from ipe_bench.basics.batches import put, take
+from ipe_bench.basics.errors import UserError, require_counts, require_positive
+from ipe_bench.basics.linalg import Array, Mask, finite
+from ipe_bench.estimators.base import Estimates, Estimator
+from ipe_bench.estimators.least_squares import Minima, Objective, minimize
+from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.base import Restricted
-from ipe_bench.scenario import Problem
-from ipe_bench.statuses import Status
+from ipe_bench.measurements.counted import Counted, Tally
+from ipe_bench.measurements.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -72,21 +73,19 @@ class Progressive(Estimator):
         search = _Search(self, problem, z, Tally.zeros(len(z)), history)
         best = search.attempt(0, np.arange(len(z)))
         for k in range(1, self.restarts + 1):
-            suspect = self._suspect(best, search.tally, z)
-            if not suspect.any():
+            suspect = np.flatnonzero(self._suspect(best, search.tally, z))
+            if not len(suspect):
                 break
-            again = search.attempt(k, np.flatnonzero(suspect))
-            better = suspect.copy()
-            better[suspect] = _is_better(again, _rows(best, suspect))
-            _replace(best, better, _rows(again, better[suspect]))
-        return report(best, search.tally, z.shape[1])
+            again = search.attempt(k, suspect)
+            better = _is_better(again, take(best, suspect))
+            best = put(best, suspect[better], take(again, better))
+        return best.estimates(search.tally, z.shape[1])
 
     def _suspect(self, best: Minima, tally: Tally, z: Array) -> Mask:
         """The trials that another attempt may help: (trials,)."""
-        spent = tally.simulations + best.x.shape[1] * tally.jacobians
-        hopeless = ~finite(z) | np.isin(np.arange(len(z)), list(tally.messages))
-        affordable = spent < (np.inf if self.budget is None else self.budget)
-        fits = (best.status == Status.CONVERGED) & (fit_probability(best, z.shape[1]) >= self.fit_level)
+        hopeless = ~finite(z) | tally.failed(np.arange(len(z)))
+        affordable = tally.cost(best.x.shape[1]) < (np.inf if self.budget is None else self.budget)
+        fits = best.converged & (best.fit_probability(z.shape[1]) >= self.fit_level)
         return ~fits & ~hopeless & affordable
 
 
@@ -103,16 +102,16 @@ class _Search:
     def attempt(self, k: int, rows: NDArray[np.intp]) -> Minima:
         """The k-th attempt for the trials `rows`: window after window, then all data."""
         options, problem = self.options, self.problem
-        prior = prior_deviation(problem, options.prior_inflation) if options.use_prior and k == 0 else None
+        prior = problem.prior_used(options.prior_inflation) if options.use_prior and k == 0 else None
         in_windows = problem.measurement.epochs is not None
-        damping = Damping(options.damping, self._metric(k, prior))
+        method = LevenbergMarquardtMethod(options.damping, self._metric(k, prior))
         x = np.repeat(problem.x0[None] if in_windows else self._start(k)[None], len(rows), axis=0)
         passes: list[Minima] = []
         for objective in self._windows(k, rows, prior):
-            passes.append(self._minimize(objective, x, damping, options.window_tolerance, options.window_iterations))
+            passes.append(self._minimize(objective, method, x, options.window_tolerance, options.window_iterations))
             x = passes[-1].x
         whole = Objective(Counted(problem.measurement, self.tally), problem.R, self.z[rows], rows, problem.x0)
-        passes.append(self._minimize(whole, x, damping, options.tolerance, options.max_iterations))
+        passes.append(self._minimize(whole, method, x, options.tolerance, options.max_iterations))
         return _in_sequence(passes)
 
     def _windows(self, k: int, rows: NDArray[np.intp], prior: Array | None) -> Iterator[Objective]:
@@ -129,15 +128,16 @@ class _Search:
             z = self.z[np.ix_(rows, arrived)]
             yield Objective(window, problem.R.restricted(arrived), z, rows, problem.x0, prior)
 
-    def _minimize(self, objective: Objective, x: Array, damping: Damping, tolerance: float, limit: int) -> Minima:
-        budget = np.inf if self.options.budget is None else self.options.budget
+    def _minimize(
+        self, objective: Objective, method: LevenbergMarquardtMethod, x: Array, tolerance: float, limit: int
+    ) -> Minima:
         return minimize(
             objective,
+            method,
             x,
-            damping=damping,
             tolerance=tolerance,
             max_iterations=limit,
-            budget=budget,
+            budget=self.options.budget,
             history=self.history,
         )
 
@@ -170,38 +170,14 @@ def window_stops(epochs: int, growth: float) -> list[int]:
 
 def _in_sequence(passes: list[Minima]) -> Minima:
     """The last pass, with the iterations and iterates of all of them."""
-    last = passes[-1]
-    last.iterations = np.sum([p.iterations for p in passes], axis=0)
-    if last.history is not None:
-        histories = [p.history for p in passes if p.history is not None]
-        last.history = [
-            np.concatenate([parts[0], *(part[1:] for part in parts[1:])]) for parts in zip(*histories, strict=True)
-        ]
-    return last
+    history = None
+    if passes[-1].history is not None:
+        parts = zip(*(p.history for p in passes if p.history is not None), strict=True)
+        history = [np.concatenate([first, *(rest[1:] for rest in later)]) for first, *later in parts]
+    return replace(passes[-1], iterations=np.sum([p.iterations for p in passes], axis=0), history=history)
 
 
 def _is_better(new: Minima, old: Minima) -> Mask:
     """Where a new attempt counts rather than the old one: it converged and fits better, or the old one had no end."""
-    converged = new.status == Status.CONVERGED
     fits_better = ~(new.chi_square >= old.chi_square)
-    return converged & (fits_better | (old.status != Status.CONVERGED))
-
-
-def _rows(minima: Minima, kept: Mask) -> Minima:
-    history = None if minima.history is None else [h for h, keep in zip(minima.history, kept, strict=True) if keep]
-    return Minima(
-        minima.x[kept],
-        minima.status[kept],
-        minima.iterations[kept],
-        history,
-        minima.covariance[kept],
-        minima.chi_square[kept],
-    )
-
-
-def _replace(minima: Minima, where: Mask, by: Minima) -> None:
-    for name in ("x", "status", "iterations", "covariance", "chi_square"):
-        getattr(minima, name)[where] = getattr(by, name)
-    if minima.history is not None and by.history is not None:
-        for row, iterates in zip(np.flatnonzero(where), by.history, strict=True):
-            minima.history[row] = iterates
+    return new.converged & (fits_better | ~old.converged)

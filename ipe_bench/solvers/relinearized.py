@@ -2,23 +2,45 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ipe_bench.errors import UserError, require_counts, require_positive
-from ipe_bench.estimation import Estimates, Estimator
-from ipe_bench.ipe import Counted, FrozenSystem, Tally, find_roots, linear_deviation
-from ipe_bench.linalg import Array, finite, information, inverse
-from ipe_bench.scenario import Problem
-from ipe_bench.solvers.base import Solver
+from ipe_bench.basics.errors import UserError, require_counts, require_positive
+from ipe_bench.basics.linalg import Array, finite, information, inverse
+from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.base import Estimates, Estimator
+from ipe_bench.estimators.driver import Solver, Standing, iterate
+from ipe_bench.estimators.ipe import IPE, FrozenSystem, Start, State, begin, root_standing
+from ipe_bench.measurements.counted import Counted
+from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers.fixed_point import FixedPoint
-from ipe_bench.statuses import Status
+
+_ONLY_A_STEP = ("start", "max_iterations", "tolerance", "budget")
+_NO_ROOT = 1e300
+"""Stands for F where a round has failed."""
+_ROUND_ENDS = (Status.CONVERGED, Status.STALLED, Status.MAX_ITERATIONS)
 
 
 @dataclass(frozen=True)
-class Relinearized(Estimator):
+class Round(State):
+    """Where a round ended: F is that of the linearisation at x itself."""
+
+    H_plus: Array
+    deviation: Array
+    """Standard deviations (trials, n) of the local bound."""
+    inner: NDArray[np.int8]
+    """How the round's inner iteration ended."""
+    steps: NDArray[np.int64]
+    """Inner steps so far."""
+    path: list[Array]
+    """The iterates (steps + 1, n) of each trial, where a history was asked for."""
+
+
+@dataclass(frozen=True)
+class Relinearized(Solver[Round], Estimator):
     """Any solver on F(x) = H_k+ (h(x) - z), with H_k = dh/dx at the estimate x_k that the round before has reached.
 
     Where F(x_k) = 0 at its own linearisation, the gradient J' R^-1 (h - z) of least squares vanishes: the estimate is
@@ -26,8 +48,9 @@ class Relinearized(Estimator):
     With one inner step of fixed-point iteration a round is a Gauss-Newton step; more of them save Jacobians.
     """
 
-    solver: Solver = FixedPoint()  # noqa: RUF009 (frozen)
-    start: Literal["linear_lse", "nominal"] = "linear_lse"
+    solver: IPE[Any] = field(default_factory=FixedPoint)
+    """What a round iterates. Its own start, limits and tolerance have no say here."""
+    start: Start = "linear_lse"
     inner_iterations: int = 5
     """Steps of the solver before H is evaluated again."""
     max_iterations: int = 30
@@ -44,53 +67,66 @@ class Relinearized(Estimator):
             raise UserError(f"start={self.start}: choose linear_lse or nominal")
         require_positive(self, "tolerance", "budget")
         require_counts(self, "inner_iterations", "max_iterations")
+        for option in fields(self.solver):
+            if option.name in _ONLY_A_STEP and getattr(self.solver, option.name) != option.default:
+                raise UserError(f"solver.{option.name}: has no effect inside relinearized; set {option.name} beside it")
+
+    def begin(self, system: FrozenSystem, x: Array) -> Round:
+        none = np.zeros(len(x), np.int64)
+        return self._relinearize(system, x, np.full(len(x), Status.RUNNING, np.int8), none, [row[None] for row in x])
+
+    def step(self, system: FrozenSystem, state: Round) -> Round:
+        """One round: inner steps from the last linearisation, then a new one where they end."""
+        own = system.with_slope(state.H_plus, state.deviation)
+        ended = iterate(
+            own,
+            self.solver,
+            self.solver.init(own, state.x, state.F),
+            tolerance=self.tolerance,
+            max_iterations=self.inner_iterations,
+            budget=self.budget,
+            history=True,
+        )
+        assert ended.history is not None
+        path = [np.concatenate([old, new[1:]]) for old, new in zip(state.path, ended.history, strict=True)]
+        return self._relinearize(system, ended.x, ended.status, state.steps + ended.iterations, path)
+
+    def standing(self, system: FrozenSystem, before: Round | None, state: Round) -> Standing:
+        """F at its own linearisation; an inner root, stall or limit is only the end of a round."""
+        standing = root_standing(state.deviation, None, state)
+        stuck = ~np.isin(state.inner, [Status.RUNNING, *_ROUND_ENDS])
+        return Standing(standing.size, standing.level, standing.moved, stuck, state.inner)
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        frozen = FrozenSystem.at_nominal(problem, z)
-        tally, n, trials = frozen.model.tally, problem.measurement.n, len(z)
-        x = np.repeat(problem.x0[None], trials, axis=0)
-        if self.start == "linear_lse":
-            x = x - frozen.F(x)
-        status = np.full(trials, Status.RUNNING, np.int8)
-        iterations = np.zeros(trials, np.int64)
-        iterates = [row[None] for row in x.copy()]
-        budget = np.inf if self.budget is None else self.budget
-        for _ in range(self.max_iterations):
-            rows = np.flatnonzero(status == Status.RUNNING)
-            if not len(rows):
-                break
-            system = frozen.subset(status == Status.RUNNING).relinearized(x[rows], problem.R)
-            roots = find_roots(
-                system,
-                self.solver,
-                x[rows],
-                linear_deviation(system, problem),
-                tolerance=self.tolerance,
-                max_iterations=self.inner_iterations,
-                budget=budget,
-                history=history,
-            )
-            x[rows] = roots.x
-            iterations[rows] += roots.iterations
-            for row, part in zip(rows, roots.history or [], strict=False):
-                iterates[row] = np.concatenate([iterates[row], part[1:]])
-            # Converged is what holds at the linearisation itself, so before the first inner step; an inner root, an
-            # inner stall or an inner limit is only the end of a round.
-            at_once = (roots.status == Status.CONVERGED) & (roots.iterations == 0)
-            on = np.isin(roots.status, [Status.CONVERGED, Status.STALLED, Status.MAX_ITERATIONS]) & ~at_once
-            status[rows] = np.where(on, Status.RUNNING, roots.status)
-        status[status == Status.RUNNING] = Status.MAX_ITERATIONS
-        # For the report alone, so not counted; the model may raise where a trial has ended.
-        J = np.full((trials, problem.measurement.m, n), np.nan)
-        usable = finite(x)
-        J[usable] = Counted(problem.measurement, Tally.zeros(trials)).jacobian(x[usable], np.flatnonzero(usable))
-        return Estimates(
-            x=x,
-            status=status,
-            covariance=inverse(information(J, problem.R))[0],
-            iterations=iterations,
-            simulations=tally.simulations.copy(),
-            jacobians=tally.jacobians.copy(),
-            messages=dict(tally.messages),
-            history=iterates if history else None,
+        x, system = begin(problem, z, self.start)
+        ended = iterate(
+            system, self, x, tolerance=self.tolerance, max_iterations=self.max_iterations, budget=self.budget
         )
+        return Estimates.of(
+            ended,
+            system.model.tally,
+            iterations=ended.state.steps,
+            history=ended.state.path if history else None,
+            covariance=_bound(problem, ended.x),
+        )
+
+    def _relinearize(
+        self, system: FrozenSystem, x: Array, inner: NDArray[np.int8], steps: NDArray[np.int64], path: list[Array]
+    ) -> Round:
+        """The state at x with a new H; a trial whose round failed keeps its x, and has no F any more."""
+        n, m = x.shape[1], system.z.shape[1]
+        going = np.isin(inner, [Status.RUNNING, *_ROUND_ENDS]) & finite(x)
+        F, H_plus, deviation = np.full(x.shape, _NO_ROOT), np.zeros((len(x), n, m)), np.ones(x.shape)
+        if going.any():
+            part = system.subset(going).relinearized(x[going])
+            F[going], H_plus[going], deviation[going] = part.F(x[going]), part.H_plus, part.deviation
+        return Round(x, F, H_plus, deviation, inner, steps, path)
+
+
+def _bound(problem: Problem, x: Array) -> Array:
+    """(J' R^-1 J)^-1 at x (trials, n, n); for the report alone, so not counted. The model may raise at a bad end."""
+    usable = finite(x)
+    J = np.full((len(x), problem.measurement.m, x.shape[1]), np.nan)
+    model = Counted.uncounted(problem.measurement, len(x))
+    J[usable] = model.jacobian(x[usable], np.flatnonzero(usable))
+    return inverse(information(J, problem.R))[0]

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.linalg import Array, multiply
-from ipe_bench.solvers.base import Solver, State, System
+from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.estimators.ipe import IPE, State, System
 
 _HALVINGS = 40
 
 
 @dataclass(frozen=True)
-class SteepestDescent(Solver):
+class SteepestDescent(IPE):
     """x <- x - alpha d along the gradient of g = |F|^2, alpha by quadratic interpolation of g at 0, alpha/2 and alpha.
 
     The book's first trial step has length one, which presumes variables of order one; here it is as long as F, the step

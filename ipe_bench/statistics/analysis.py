@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ipe_bench.diagnostics import orders_of
-from ipe_bench.linalg import Array
+from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.statuses import Status
 from ipe_bench.statistics.collect import Collection, Group, collect
 from ipe_bench.statistics.comparisons import (
     Outcomes,
@@ -26,7 +26,7 @@ from ipe_bench.statistics.comparisons import (
 from ipe_bench.statistics.intervals import bootstrap_rms, quantile, quantiles
 from ipe_bench.statistics.profiles import Profiles, distances_to_limit, iterations_to_limit
 from ipe_bench.statistics.summary import Sample, common_trials, identifier, summary_rows, to_frame
-from ipe_bench.statuses import Status
+from ipe_bench.statistics.theory import orders_of
 
 PROBABILITIES = np.unique(np.concatenate([np.linspace(0, 1, 101), [0.001, 0.005, 0.025, 0.975, 0.995, 0.999]]))
 """Where the distribution of errors is tabulated."""

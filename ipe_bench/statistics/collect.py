@@ -18,10 +18,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ipe_bench.components import canonical_json
-from ipe_bench.errors import UserError
-from ipe_bench.linalg import Array
-from ipe_bench.store import FOOTER, SCHEMA, TRUTH, DamagedFile, Piece, Store, gaps
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
+from ipe_bench.runs.provenance import canonical_json
+from ipe_bench.runs.store import FOOTER, SCHEMA, TRUTH, DamagedFile, Piece, Store, gaps
 
 TARGET = "_target_"
 NAMED = ("measurement", "noise", "prior")

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest, chi2, friedmanchisquare, studentized_range, wilcoxon
 
-from ipe_bench.linalg import Array
-from ipe_bench.montecarlo import GATE
+from ipe_bench.basics.linalg import Array
+from ipe_bench.trials.scoring import GATE
 
 TIE = 1e-3
 """Errors closer than this, in standard deviations, are equal: round-off is never a difference."""

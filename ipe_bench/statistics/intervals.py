@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ipe_bench.linalg import Array
+from ipe_bench.basics.linalg import Array
 
 LEVEL = 0.95
 RESAMPLES = 1000

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ipe_bench.errors import UserError
-from ipe_bench.store import DamagedFile, Store, gaps
+from ipe_bench.basics.errors import UserError
+from ipe_bench.runs.store import DamagedFile, Store, gaps
 
 
 @dataclass(frozen=True)

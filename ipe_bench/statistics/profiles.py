@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ipe_bench.linalg import Array
+from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.comparisons import Outcomes, common
 
 CLOSE = 0.05

@@ -16,11 +16,11 @@ import numpy as np
 import pandas as pd
 from scipy.stats import chi2, norm
 
-from ipe_bench.consistency import clopper_pearson, mean_limits
-from ipe_bench.linalg import Array
+from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.statuses import Status
 from ipe_bench.statistics.collect import ALWAYS_COLUMNS, Collection, Group, collect
+from ipe_bench.statistics.consistency import clopper_pearson, mean_limits
 from ipe_bench.statistics.intervals import bootstrap_rms, quantile, quantiles
-from ipe_bench.statuses import Status
 
 ALL = "all"
 """The row over all parameters: root mean square of error over bound."""

@@ -7,10 +7,10 @@ from functools import cached_property
 
 import numpy as np
 
-from ipe_bench.linalg import Array
+from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.gins import Gins
-from ipe_bench.scenario import Problem
+from ipe_bench.measurements.problem import Problem
 
 
 @dataclass(frozen=True)

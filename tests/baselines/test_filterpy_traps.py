@@ -9,16 +9,18 @@ from filterpy.kalman import CubatureKalmanFilter, ExtendedKalmanFilter, MerweSca
 from linear_models import Linear, LinearGins, linear_map
 
 from ipe_bench.baselines import CKF, EKF, UKF
-from ipe_bench.consistency import mean_limits, nees
-from ipe_bench.linalg import Covariance
+from ipe_bench.basics.linalg import Covariance
+from ipe_bench.basics.statuses import Status
+from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
-from ipe_bench.prior import Gaussian as Prior
-from ipe_bench.scenario import Problem, Scenario
-from ipe_bench.statuses import Status
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.statistics.consistency import mean_limits
+from ipe_bench.trials.scenario import Scenario
+from ipe_bench.trials.scoring import nees
 
 
 def linear_problem():
-    scenario = Scenario(Linear(), Gaussian(1.0), Prior(), 1.0)
+    scenario = Scenario(Linear(), Gaussian(1.0), GaussianPrior(), 1.0)
     return scenario.problem, scenario.draw(0, 3).z
 
 
@@ -64,7 +66,7 @@ def test_ukf_wants_the_hx_of_each_epoch():
 
 def test_ukf_with_a_small_alpha_loses_digits():
     model = LinearGins()
-    scenario = Scenario(model, Gaussian(0.0066), Prior(), 10.0)
+    scenario = Scenario(model, Gaussian(0.0066), GaussianPrior(), 10.0)
     problem, z = scenario.problem, scenario.draw(0, 5).z
     x, P = linear_map(problem, model.matrix, z)
     near, far = (UKF(alpha=a).estimate(problem, z) for a in (0.1, 1e-3))
@@ -88,7 +90,7 @@ def test_ckf_with_a_flat_reading_turns_x_into_a_matrix():
 def test_p_minus_ksk_cancels_where_the_prior_is_wide(estimator):
     """Prior deviations 1e5 times those of the posterior: filterpy as it stands, on the same sigma points, loses P."""
     model = Linear(sizes=(8, 8), unknowns=4)
-    scenario = Scenario(model, Gaussian(1e-5), Prior(), 1.0)
+    scenario = Scenario(model, Gaussian(1e-5), GaussianPrior(), 1.0)
     problem, z = scenario.problem, scenario.draw(0, 1).z
     x, P = linear_map(problem, model.matrix, z)
     deviation = np.sqrt(np.diag(P))

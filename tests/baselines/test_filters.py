@@ -13,15 +13,17 @@ from scipy.stats import chi2
 from ipe_bench.baselines import CKF, EKF, UKF, EnKF, IteratedEKF
 from ipe_bench.baselines.ekf import EKFTrack
 from ipe_bench.baselines.sequential import Sequential
-from ipe_bench.consistency import mean_limits, nees
-from ipe_bench.errors import UserError
-from ipe_bench.linalg import Covariance, information, inverse, multiply, quadratic_form
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Covariance, information, inverse, multiply, quadratic_form
+from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Restricted
 from ipe_bench.measurements.gins import Gins
+from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Quantization
-from ipe_bench.prior import Gaussian as Prior
-from ipe_bench.scenario import Problem, Scenario
-from ipe_bench.statuses import Status
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.statistics.consistency import mean_limits
+from ipe_bench.trials.scenario import Scenario
+from ipe_bench.trials.scoring import nees
 
 FILTERS: list[Sequential] = [EKF(), IteratedEKF(), UKF(), CKF(), EnKF(members=30)]
 KALMAN = [f for f in FILTERS if not isinstance(f, EnKF)]
@@ -37,7 +39,7 @@ def deviations(P):
 
 
 def gins(scale: float, trials: int, seed: int = 0):
-    scenario = Scenario(Gins(), Quantization(0.075 * FOOT), Prior(), scale, seed)
+    scenario = Scenario(Gins(), Quantization(0.075 * FOOT), GaussianPrior(), scale, seed)
     return scenario.problem, scenario.draw(0, trials)
 
 
@@ -64,7 +66,7 @@ def maximum_a_posteriori(problem: Problem, z, x):
 )
 @pytest.mark.parametrize("model", [Linear(), LinearGins()], ids=label)
 def test_on_a_linear_model_a_filter_is_the_batch_map(model, estimator, apart, scale):
-    scenario = Scenario(model, Gaussian(0.0066), Prior(), scale)
+    scenario = Scenario(model, Gaussian(0.0066), GaussianPrior(), scale)
     problem, trials = scenario.problem, scenario.draw(0, 5)
     x, P = linear_map(problem, model.matrix, trials.z)
     found = estimator.estimate(problem, trials.z)
@@ -75,7 +77,7 @@ def test_on_a_linear_model_a_filter_is_the_batch_map(model, estimator, apart, sc
 
 @pytest.mark.parametrize("estimator", KALMAN, ids=label)
 def test_inflation_widens_the_prior(estimator):
-    scenario = Scenario(Linear(), Gaussian(1.0), Prior(), 0.5)
+    scenario = Scenario(Linear(), Gaussian(1.0), GaussianPrior(), 0.5)
     problem, trials = scenario.problem, scenario.draw(0, 3)
     x, P = linear_map(problem, Linear().matrix, trials.z, inflation=3.0)
     found = replace(estimator, prior_inflation=3.0).estimate(problem, trials.z)
@@ -102,7 +104,7 @@ def test_process_noise_is_added_before_each_epoch(estimator):
 
 
 def test_ensemble_tends_to_the_kalman_filter():
-    scenario = Scenario(Linear(), Gaussian(1.0), Prior(), 1.0)
+    scenario = Scenario(Linear(), Gaussian(1.0), GaussianPrior(), 1.0)
     problem, trials = scenario.problem, scenario.draw(0, 4)
     x, P = linear_map(problem, Linear().matrix, trials.z)
     apart = []
@@ -138,7 +140,7 @@ def test_readings_correlated_between_epochs_are_refused():
 def test_nis_is_chi_square_on_a_linear_model(estimator):
     """The innovations of a Kalman filter are white, so their squares over m have the limits of chi-square."""
     model = Linear()
-    scenario = Scenario(model, Gaussian(0.7), Prior(), 1.0)
+    scenario = Scenario(model, Gaussian(0.7), GaussianPrior(), 1.0)
     found = estimator.estimate(scenario.problem, scenario.draw(0, 200).z)
     low, high = mean_limits(model.m, 200, 0.999)
     if isinstance(estimator, EnKF):  # 30 members make a poor S
@@ -197,7 +199,7 @@ def test_a_thousand_gins_trials_in_time(estimator, seconds):
 @pytest.mark.parametrize("estimator", FILTERS, ids=label)
 def test_a_batch_is_its_trials_one_by_one_bit_for_bit(estimator):
     model = Gins(readings_per_case=4)
-    scenario = Scenario(model, Quantization(0.075 * FOOT), Prior(), 30.0)
+    scenario = Scenario(model, Quantization(0.075 * FOOT), GaussianPrior(), 30.0)
     problem, z = scenario.problem, scenario.draw(0, 7).z
     together = estimator.estimate(problem, z, history=True)
     assert together.history is not None
@@ -212,7 +214,7 @@ def test_a_batch_is_its_trials_one_by_one_bit_for_bit(estimator):
 
 @pytest.mark.parametrize("estimator", FILTERS, ids=label)
 def test_history_holds_the_estimate_after_each_epoch(estimator):
-    scenario = Scenario(Linear(), Gaussian(1.0), Prior(), 1.0)
+    scenario = Scenario(Linear(), Gaussian(1.0), GaussianPrior(), 1.0)
     found = estimator.estimate(scenario.problem, scenario.draw(0, 3).z, history=True)
     assert (found.iterations == 4).all()
     for x, rows in zip(found.x, found.history, strict=True):
@@ -228,7 +230,7 @@ def test_history_holds_the_estimate_after_each_epoch(estimator):
 )
 def test_a_prefix_costs_its_share(estimator, simulations, jacobians):
     """(1 + 2 + 3 + 4) / 4 evaluations per point. On a linear model the iterated EKF looks twice, to see it is done."""
-    scenario = Scenario(Linear(), Gaussian(1.0), Prior(), 1.0)
+    scenario = Scenario(Linear(), Gaussian(1.0), GaussianPrior(), 1.0)
     found = estimator.estimate(scenario.problem, scenario.draw(0, 3).z)
     assert found.simulations == pytest.approx(2.5 * simulations)
     assert found.jacobians == pytest.approx(2.5 * jacobians)
@@ -332,7 +334,7 @@ def test_a_wrong_option_is_named(kind, option):
 
 
 def test_the_ensemble_leaves_the_global_random_state_alone():
-    scenario = Scenario(Linear(), Gaussian(1.0), Prior(), 1.0)
+    scenario = Scenario(Linear(), Gaussian(1.0), GaussianPrior(), 1.0)
     problem, z = scenario.problem, scenario.draw(0, 2).z
     np.random.seed(1)  # noqa: NPY002
     expected = np.random.standard_normal(5)  # noqa: NPY002

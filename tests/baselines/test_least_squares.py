@@ -9,15 +9,17 @@ import pytest
 from scipy.optimize import curve_fit
 
 from ipe_bench.baselines import LeastSquares
-from ipe_bench.consistency import mean_limits, nees
-from ipe_bench.errors import UserError
-from ipe_bench.linalg import Covariance
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Covariance
+from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.gins import Gins
+from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Quantization
-from ipe_bench.prior import Gaussian as Prior
-from ipe_bench.scenario import Problem, Scenario
-from ipe_bench.statuses import Status
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.statistics.consistency import mean_limits
+from ipe_bench.trials.scenario import Scenario
+from ipe_bench.trials.scoring import nees
 
 T = np.linspace(0.0, 3.0, 25)
 
@@ -47,7 +49,7 @@ class Decay(Measurement):
 
 
 def decay(deviation: float = 0.02, trials: int = 6):
-    scenario = Scenario(Decay(), Gaussian(deviation), Prior(), 0.2)
+    scenario = Scenario(Decay(), Gaussian(deviation), GaussianPrior(), 0.2)
     return scenario.problem, scenario.draw(0, trials)
 
 
@@ -70,7 +72,7 @@ def test_agrees_with_minpack_through_curve_fit(method, start):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_gins_reaches_the_minimum_that_gauss_newton_has_from_the_truth(method):
-    scenario = Scenario(Gins(), Quantization(0.075 * 0.3048), Prior(), 33.0)
+    scenario = Scenario(Gins(), Quantization(0.075 * 0.3048), GaussianPrior(), 33.0)
     problem, trials = scenario.problem, scenario.draw(0, 12)
     found = LeastSquares(method=method).estimate(problem, trials.z)
     x = trials.x

@@ -5,12 +5,13 @@ import pytest
 from scipy.optimize import least_squares
 
 from ipe_bench.baselines import MultiscaleLM
-from ipe_bench.errors import UserError
+from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Bearings, Nist
 from ipe_bench.measurements.nist import datasets, score
+from ipe_bench.measurements.problem import recorded_problem
 from ipe_bench.noise import Gaussian
-from ipe_bench.prior import Gaussian as Prior
-from ipe_bench.scenario import Scenario, recorded_problem
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.trials.scenario import Scenario
 
 ESTIMATOR = MultiscaleLM()
 HARD = ("BoxBOD", "MGH10", "MGH17", "Eckerle4", "Bennett5")
@@ -43,7 +44,7 @@ def test_all_27_certified_problems_are_solved_from_both_starts():
 
 
 def test_a_batch_is_its_trials_one_by_one():
-    scenario = Scenario(Bearings(), Gaussian(0.5), Prior(), 1.0)
+    scenario = Scenario(Bearings(), Gaussian(0.5), GaussianPrior(), 1.0)
     problem, z = scenario.problem, scenario.draw(0, 12).z
     batch = ESTIMATOR.estimate(problem, z)
     for i in range(12):
@@ -54,7 +55,7 @@ def test_a_batch_is_its_trials_one_by_one():
 
 
 def test_the_minimum_is_that_of_scipy():
-    scenario = Scenario(Bearings(), Gaussian(0.5), Prior(), 1.0)
+    scenario = Scenario(Bearings(), Gaussian(0.5), GaussianPrior(), 1.0)
     problem, trials = scenario.problem, scenario.draw(0, 5)
     estimates = ESTIMATOR.estimate(problem, trials.z)
     for x, z in zip(estimates.x, trials.z, strict=True):

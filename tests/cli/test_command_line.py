@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from ipe_bench import plugins
 from ipe_bench.cli.main import main
+from ipe_bench.plugins import discovery as plugins
 
 ROOT = Path(__file__).parents[2]
 

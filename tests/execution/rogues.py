@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from ipe_bench.estimation import Estimates, Estimator
+from ipe_bench.estimators.base import Estimates, Estimator
 
 
 @dataclass(frozen=True)

@@ -19,20 +19,19 @@ from small_models import Bent
 from ipe_bench import Scenario, run
 from ipe_bench.api import compute
 from ipe_bench.baselines import LinearLSE
-from ipe_bench.errors import StorageError, UserError  # noqa: F401
-from ipe_bench.execution import Auto, Dask, Event, Failure, Processes, Serial
-from ipe_bench.ipe import IPE
+from ipe_bench.basics.errors import StorageError, UserError  # noqa: F401
 from ipe_bench.noise import Gaussian
-from ipe_bench.prior import Gaussian as Prior
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.runs.execution import Auto, Dask, Event, Failure, Processes, Serial
+from ipe_bench.runs.store import Store
 from ipe_bench.solvers import Newton
 from ipe_bench.statistics.inventory import take_inventory
-from ipe_bench.store import Store
 
-GOOD = {"linear_lse": LinearLSE(), "newton": IPE(Newton())}
+GOOD = {"linear_lse": LinearLSE(), "newton": Newton()}
 
 
 def scenario(**changes) -> Scenario:
-    return Scenario(Bent(0.02), Gaussian(0.1), Prior(), **{"error_scale": 1.0, **changes})
+    return Scenario(Bent(0.02), Gaussian(0.1), GaussianPrior(), **{"error_scale": 1.0, **changes})
 
 
 def stored(directory: Path) -> dict[str, np.ndarray]:
@@ -194,7 +193,7 @@ def test_stopping_a_run_ends_its_workers():
 
 
 def test_workers_end_when_their_parent_is_killed(tmp_path):
-    code = "import rogues; from ipe_bench.execution import Processes\n"
+    code = "import rogues; from ipe_bench.runs.execution import Processes\n"
     code += "for event in Processes(1).run(rogues.doze, [0]): print(event.step, flush=True)"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, env=environment(), text=True) as parent:
         assert parent.stdout is not None
@@ -249,7 +248,7 @@ def test_limits_that_make_no_sense_are_refused(kind, options, key):
 
 
 def test_source_that_changed_since_the_run_began_is_not_mixed_in(tmp_path, monkeypatch):
-    import ipe_bench.schedule as schedule
+    import ipe_bench.runs.schedule as schedule
 
     monkeypatch.setattr(schedule, "fingerprint", lambda parts: {"versions": {}, "source": "other"})
     failures = compute([scenario()], {"linear_lse": LinearLSE()}, 10, tmp_path, execution=Serial())

@@ -10,18 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_models import Bent
 
-import ipe_bench.components
+import ipe_bench.runs.provenance
 from ipe_bench import Scenario
 from ipe_bench.api import compute
 from ipe_bench.baselines import LinearLSE
+from ipe_bench.basics.errors import UserError
 from ipe_bench.cli.status import main as status
-from ipe_bench.errors import UserError
 from ipe_bench.noise import Gaussian
-from ipe_bench.prior import Gaussian as Prior
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.runs.store import Store, gaps
 from ipe_bench.statistics.inventory import take_inventory
-from ipe_bench.store import Store, gaps
 
-SCENARIO = Scenario(Bent(0.02), Gaussian(0.1), Prior(), 1.0)
+SCENARIO = Scenario(Bent(0.02), Gaussian(0.1), GaussianPrior(), 1.0)
 ESTIMATORS = {"linear_lse": LinearLSE()}
 RANGES = st.lists(st.tuples(st.integers(0, 40), st.integers(1, 20)).map(lambda r: (r[0], r[0] + r[1])))
 
@@ -66,10 +66,10 @@ def test_a_block_that_is_gone_is_missing_and_a_cut_one_is_damaged(tmp_path, caps
 
 def test_results_of_other_source_are_stale_and_not_done(tmp_path, monkeypatch):
     compute([SCENARIO], ESTIMATORS, 20, tmp_path)
-    original = ipe_bench.components.fingerprint
+    original = ipe_bench.runs.provenance.fingerprint
     changed = lambda parts: {**original(parts), "source": "a fix"}  # noqa: E731
-    monkeypatch.setattr("ipe_bench.store.fingerprint", changed)
-    monkeypatch.setattr("ipe_bench.schedule.fingerprint", changed)
+    monkeypatch.setattr("ipe_bench.runs.store.fingerprint", changed)
+    monkeypatch.setattr("ipe_bench.runs.schedule.fingerprint", changed)
     compute([dataclasses.replace(SCENARIO)], ESTIMATORS, 10, tmp_path)
     assert [(c.expected, c.done, c.stale) for c in take_inventory(tmp_path).cells] == [(10, 10, 20), (10, 10, 20)]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,12 +12,12 @@ from hypothesis.extra.numpy import arrays
 from small_models import Bent
 
 from ipe_bench.baselines import LinearLSE
-from ipe_bench.errors import UserError
-from ipe_bench.ipe import IPE, FrozenSystem, frozen_covariance, sandwich
-from ipe_bench.linalg import Covariance
-from ipe_bench.scenario import Problem
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Covariance
+from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.ipe import FrozenSystem
+from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers import FixedPoint, Newton
-from ipe_bench.statuses import Status
 
 SIGMA = 0.3
 seeds = st.integers(0, 2**32 - 1)
@@ -63,7 +65,7 @@ def test_a_root_of_F_solves_eq_11():
     problem = problem_of(bend=0.02)
     model, A = problem.measurement, problem.measurement.A
     z = model.simulate(np.array([[1.0, -0.5, 0.8]])) + 0.01
-    x = IPE(Newton(), tolerance=1e-12).estimate(problem, z).x[0]
+    x = Newton(tolerance=1e-12).estimate(problem, z).x[0]
     N = model.simulate(x[None])[0] - A @ x
     np.testing.assert_allclose(x, np.linalg.pinv(A) @ (z[0] - N), atol=1e-11)
 
@@ -72,7 +74,7 @@ def test_fixed_point_iterates_are_those_of_eqs_16_and_17():
     problem = problem_of(bend=0.02)
     model, A = problem.measurement, problem.measurement.A
     z = model.simulate(np.array([[1.0, -0.5, 0.8]]))
-    history = IPE(FixedPoint()).estimate(problem, z, history=True).history[0]
+    history = FixedPoint().estimate(problem, z, history=True).history[0]
     H_plus = np.linalg.pinv(A)
     x = H_plus @ z[0]
     for iterate in history[:4]:
@@ -84,7 +86,7 @@ def test_error_stays_below_the_bound_of_eq_18_on_a_contraction():
     problem = problem_of(bend=0.004)
     model = problem.measurement
     truth = np.array([0.6, -0.4, 0.5])
-    estimates = IPE(FixedPoint(), tolerance=1e-13).estimate(problem, model.simulate(truth[None]), history=True)
+    estimates = FixedPoint(tolerance=1e-13).estimate(problem, model.simulate(truth[None]), history=True)
     history = estimates.history[0]
     H_plus = np.linalg.pinv(model.A)
     # K of eq. (15) over the box that holds the iterates, on a grid of its corners.
@@ -103,21 +105,21 @@ def test_sandwich_is_the_spread_of_the_roots():
     model, truth = problem.measurement, np.array([[1.0, -0.5, 0.8]])
     rng = np.random.default_rng(3)
     z = model.simulate(truth) + 0.01 * rng.standard_normal((40_000, model.m))
-    estimates = IPE(Newton()).estimate(problem, z)
+    estimates = Newton().estimate(problem, z)
     assert (estimates.status == Status.CONVERGED).all()
     system = FrozenSystem.at_nominal(problem, model.simulate(truth))
-    P = sandwich(system, problem, truth)[0]
+    P = system.sandwich(truth)[0]
     np.testing.assert_allclose(np.cov(estimates.x.T), P, atol=4 * np.sqrt(2 / 40_000) * np.abs(P).max())
-    assert np.trace(P) > np.trace(frozen_covariance(system.H_plus, problem)[0]) * 0.1
+    assert np.trace(P) > np.trace(system.covariance()[0]) * 0.1
 
 
 def test_a_batch_equals_its_trials_one_by_one_bit_for_bit():
     problem = problem_of(bend=0.05)
     z = np.random.default_rng(1).normal(size=(37, problem.measurement.m)) * 2
     for solver in (FixedPoint(), Newton()):
-        whole = IPE(solver, max_iterations=15).estimate(problem, z)
+        whole = replace(solver, max_iterations=15).estimate(problem, z)
         for i in range(len(z)):
-            alone = IPE(solver, max_iterations=15).estimate(problem, z[i : i + 1])
+            alone = replace(solver, max_iterations=15).estimate(problem, z[i : i + 1])
             np.testing.assert_array_equal(whole.x[i], alone.x[0])
             np.testing.assert_array_equal(whole.covariance[i], alone.covariance[0])
             assert whole.status[i] == alone.status[0]
@@ -126,7 +128,7 @@ def test_a_batch_equals_its_trials_one_by_one_bit_for_bit():
 
 def test_counts_are_per_trial():
     problem = problem_of(bend=0.0)
-    estimates = IPE(FixedPoint()).estimate(problem, np.ones((2, problem.measurement.m)))
+    estimates = FixedPoint().estimate(problem, np.ones((2, problem.measurement.m)))
     # h(x0) for the start, and one evaluation that finds F to be zero there.
     assert estimates.iterations.tolist() == [0, 0]
     assert estimates.simulations.tolist() == [2.0, 2.0]
@@ -136,16 +138,16 @@ def test_divergence_and_overflow_are_statuses_and_disturb_no_other_trial():
     problem = problem_of(bend=0.5)
     calm = problem.measurement.simulate(np.array([[0.01, 0.02, 0.01]]))
     wild = np.full((1, problem.measurement.m), -1e6)
-    both = IPE(FixedPoint()).estimate(problem, np.concatenate([calm, wild]))
+    both = FixedPoint().estimate(problem, np.concatenate([calm, wild]))
     assert Status(both.status[0]) is Status.CONVERGED
     assert Status(both.status[1]) in (Status.DIVERGED, Status.NONFINITE)
-    np.testing.assert_array_equal(both.x[0], IPE(FixedPoint()).estimate(problem, calm).x[0])
+    np.testing.assert_array_equal(both.x[0], FixedPoint().estimate(problem, calm).x[0])
 
 
 def test_the_budget_of_simulations_ends_a_trial():
     problem = problem_of(bend=0.05)
     z = problem.measurement.simulate(np.array([[1.0, 1.0, -1.0]]))
-    estimates = IPE(FixedPoint(), tolerance=1e-14, budget=4).estimate(problem, z)
+    estimates = FixedPoint(tolerance=1e-14, budget=4).estimate(problem, z)
     assert Status(estimates.status[0]) is Status.BUDGET
     assert estimates.simulations[0] == 4
 
@@ -158,4 +160,4 @@ def test_parameters_that_cannot_be_told_apart_are_refused():
     model = Twins()
     problem = Problem(model, Covariance(np.ones(model.m)), np.ones(3))
     with pytest.raises(UserError, match="full column rank"):
-        IPE(FixedPoint()).estimate(problem, np.ones((1, model.m)))
+        FixedPoint().estimate(problem, np.ones((1, model.m)))

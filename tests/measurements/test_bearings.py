@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from ipe_bench.errors import UserError
-from ipe_bench.ipe import IPE
-from ipe_bench.linalg import Covariance
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Covariance
 from ipe_bench.measurements import Bearings
-from ipe_bench.scenario import Problem
+from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers import Newton
 
 STRAIGHT = ((1800.0, 90.0, 6.0),)
@@ -47,7 +46,7 @@ def test_without_a_manoeuvre_the_problem_is_refused_as_unobservable():
     model = Bearings(legs=STRAIGHT)
     assert np.linalg.matrix_rank(model.linearization(), tol=1e-9) == 3
     with pytest.raises(UserError, match=r"H has not full column rank"):
-        IPE(Newton()).estimate(problem(model), model.simulate(model.nominal[None]))
+        Newton().estimate(problem(model), model.simulate(model.nominal[None]))
 
 
 def test_a_manoeuvre_along_the_line_of_sight_is_not_enough():
@@ -55,14 +54,14 @@ def test_a_manoeuvre_along_the_line_of_sight_is_not_enough():
     model = Bearings(legs=((900.0, 0.0, 3.0), (900.0, 0.0, 9.0)), target=(0.0, 20000.0, 0.0, -2.0))
     assert np.linalg.matrix_rank(model.linearization(), tol=1e-9) < 4
     with pytest.raises(UserError, match=r"H has not full column rank"):
-        IPE(Newton()).estimate(problem(model), model.simulate(model.nominal[None]))
+        Newton().estimate(problem(model), model.simulate(model.nominal[None]))
 
 
 def test_a_turn_makes_it_observable():
     model = Bearings()
     assert np.linalg.matrix_rank(model.linearization(), tol=1e-9) == 4
     x = model.nominal + np.random.default_rng(1).normal(size=(20, 4))
-    estimates = IPE(Newton(), tolerance=1e-9).estimate(problem(model), model.simulate(x))
+    estimates = Newton(tolerance=1e-9).estimate(problem(model), model.simulate(x))
     assert (estimates.status == 0).all()
     np.testing.assert_allclose(estimates.x, x, atol=1e-7)
 

@@ -7,12 +7,12 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from scipy.stats import norm
 
-from ipe_bench import plugins
 from ipe_bench.api import run
 from ipe_bench.cli.config import assemble, prepare
-from ipe_bench.components import construct
-from ipe_bench.estimation import Estimator
-from ipe_bench.scenario import Scenario
+from ipe_bench.estimators.base import Estimator
+from ipe_bench.plugins import discovery as plugins
+from ipe_bench.plugins.construct import construct
+from ipe_bench.trials.scenario import Scenario
 
 EXPERIMENTS = ("paper", "ranging", "bearings", "triad", "polynomial", "lotka_volterra")
 TRIALS = 200

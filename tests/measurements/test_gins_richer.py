@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from ipe_bench.baselines import GaussNewton
-from ipe_bench.errors import UserError
+from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Gins, Polynomial, RicherGins
 from ipe_bench.noise import NoNoise, Quantization
-from ipe_bench.prior import Gaussian as Prior
-from ipe_bench.scenario import Scenario
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.trials.scenario import Scenario
 
 NOISE = Quantization(0.02286)
 
 
 def scenario(scale: float = 33.0, **errors: float) -> Scenario:
-    return Scenario(Gins(), NOISE, Prior(), scale, truth=RicherGins(**errors))
+    return Scenario(Gins(), NOISE, GaussianPrior(), scale, truth=RicherGins(**errors))
 
 
 def test_without_its_errors_it_is_gins():
@@ -50,7 +50,7 @@ def test_a_finer_step_changes_nothing_to_a_micrometre_per_second():
 
 
 def test_the_parameters_of_a_trial_are_those_of_the_plain_scenario():
-    plain = Scenario(Gins(), NOISE, Prior(), 33.0).draw(0, 5)
+    plain = Scenario(Gins(), NOISE, GaussianPrior(), 33.0).draw(0, 5)
     rich = scenario(gyro_random_walk=0.01).draw(0, 5)
     assert (rich.x == plain.x).all()
     assert not (rich.z == plain.z).all()
@@ -59,7 +59,7 @@ def test_the_parameters_of_a_trial_are_those_of_the_plain_scenario():
 def test_nuisances_do_not_scale_with_the_errors():
     """Twice the error scale doubles the parameters' readings, not those of the random walk."""
     noiseless = [
-        Scenario(Gins(), NoNoise(0.0066), Prior(), s, truth=RicherGins(gyro_random_walk=0.01)).draw(0, 20).z
+        Scenario(Gins(), NoNoise(0.0066), GaussianPrior(), s, truth=RicherGins(gyro_random_walk=0.01)).draw(0, 20).z
         for s in (1e-6, 1e-3)
     ]
     assert abs(noiseless[0].std() / noiseless[1].std() - 1) < 0.01
@@ -91,4 +91,4 @@ def test_impossible_errors_and_foreign_truths_are_named():
     with pytest.raises(UserError, match=r"^gyro_random_walk="):
         RicherGins(gyro_random_walk=-1.0)
     with pytest.raises(UserError, match=r"^truth_measurement="):
-        Scenario(Gins(), NOISE, Prior(), 1.0, truth=Polynomial())
+        Scenario(Gins(), NOISE, GaussianPrior(), 1.0, truth=Polynomial())

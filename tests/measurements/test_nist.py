@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ipe_bench.errors import UserError
+from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Nist
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.nist import datasets, digits, score

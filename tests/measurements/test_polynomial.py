@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipe_bench.errors import UserError
-from ipe_bench.ipe import FrozenSystem
-from ipe_bench.linalg import Covariance
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Covariance
+from ipe_bench.estimators.ipe import FrozenSystem
 from ipe_bench.measurements import Polynomial
-from ipe_bench.scenario import Problem
+from ipe_bench.measurements.problem import Problem
 
 
 @given(

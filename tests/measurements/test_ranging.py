@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from ipe_bench.errors import UserError
-from ipe_bench.ipe import IPE
-from ipe_bench.linalg import Covariance
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Covariance
 from ipe_bench.measurements import Ranging
-from ipe_bench.scenario import Problem
+from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers import Newton
 
 
@@ -42,7 +41,7 @@ def test_bancrofts_closed_form_inverts_the_model(trials):
 
 def test_the_iterated_estimate_is_bancrofts_where_readings_are_exact(trials):
     model, _, z = trials
-    estimates = IPE(Newton(), tolerance=1e-9).estimate(Problem(model, Covariance(np.full(model.m, 0.1))), z)
+    estimates = Newton(tolerance=1e-9).estimate(Problem(model, Covariance(np.full(model.m, 0.1))), z)
     assert (estimates.status == 0).all()
     closed = np.stack([bancroft(np.array(model.beacons), ranges) for ranges in z])
     np.testing.assert_allclose(estimates.x * model.sizes, closed, atol=1e-6)

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from ipe_bench.errors import UserError
-from ipe_bench.ipe import IPE
-from ipe_bench.linalg import Covariance
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Covariance
 from ipe_bench.measurements import Triad
-from ipe_bench.scenario import Problem
+from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers import Newton
 
 # A magnetometer with large offsets, turned by hand, in gauss: every fourth sample of the recording that the PX4
@@ -51,7 +50,7 @@ def quadric(outputs, field):
 
 
 def estimate(model, z, deviation):
-    estimates = IPE(Newton(), tolerance=1e-9).estimate(Problem(model, Covariance(np.full(model.m, deviation))), z)
+    estimates = Newton(tolerance=1e-9).estimate(Problem(model, Covariance(np.full(model.m, deviation))), z)
     assert (estimates.status == 0).all()
     p = estimates.x * model.sizes * np.repeat([1.0, 1e-6, 1e-3], 3)
     (xy, xz, yz), (kx, ky, kz) = p[0, 6:], 1.0 + p[0, 3:6]

@@ -10,14 +10,14 @@ from small_models import Bent
 
 from ipe_bench import Scenario, run
 from ipe_bench.baselines import LinearLSE, MapLM
-from ipe_bench.errors import UserError
-from ipe_bench.estimation import Estimates, Estimator
-from ipe_bench.montecarlo import Block
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.noise import Gaussian
-from ipe_bench.prior import Gaussian as Prior
-from ipe_bench.statuses import Status
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.trials.scoring import Block
 
-SCENARIO = Scenario(Bent(0.02), Gaussian(0.1), Prior(), 1.0)
+SCENARIO = Scenario(Bent(0.02), Gaussian(0.1), GaussianPrior(), 1.0)
 
 
 @pytest.mark.parametrize("inflation", [0.3, 1.0, 3.0])
@@ -27,7 +27,7 @@ def test_map_is_held_to_the_root_of_its_own_prior(inflation):
 
 
 def test_a_prior_that_fixes_a_parameter_leaves_finite_bounds():
-    scenario = Scenario(Bent(0.02), Gaussian(0.1), Prior((1.0, 0.0, 1.0)), 1.0)
+    scenario = Scenario(Bent(0.02), Gaussian(0.1), GaussianPrior((1.0, 0.0, 1.0)), 1.0)
     block = Block.draw(scenario, 0, 20)
     _, columns = block.estimate(MapLM())
     assert np.isfinite(block.bayes_information).all()
@@ -56,7 +56,7 @@ def test_the_test_of_the_fit_is_uniform_where_the_model_is_right():
 
 
 @dataclass(frozen=True)
-class Loud(Prior):
+class Loud(GaussianPrior):
     """A prior that cannot be drawn from."""
 
     def draw(self, x0, error_scale, rng):

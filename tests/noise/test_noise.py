@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ipe_bench.errors import UserError
+from ipe_bench.basics.errors import UserError
 from ipe_bench.noise import Colored, Correlated, Gaussian, NoNoise, Outliers, Quantization, StudentT
 
 TRIALS = 4000

@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from ipe_bench import plugins
-from ipe_bench.components import construct
-from ipe_bench.conformance import check_component
-from ipe_bench.estimation import Estimates, Estimator
-from ipe_bench.ipe import IPE
-from ipe_bench.linalg import Covariance
+from ipe_bench.basics.linalg import Covariance
+from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.measurements import Polynomial
 from ipe_bench.noise import Gaussian, Noise
+from ipe_bench.plugins import discovery as plugins
+from ipe_bench.plugins.conformance import check_component
+from ipe_bench.plugins.construct import construct
 from ipe_bench.solvers import Newton
-from ipe_bench.statuses import Status
 
 GROUPS = ("measurement", "noise", "prior", "solver", "baseline")
 OURS = [o for o in plugins.options() if o.group in GROUPS and o.source.name == "ipe-bench"]
@@ -41,7 +40,7 @@ class Faulty(Estimator):
     """Newton's estimate with one fault."""
 
     def estimate(self, problem, z, *, history=False):
-        return self.spoil(IPE(Newton()).estimate(problem, z, history=history), z)
+        return self.spoil(Newton().estimate(problem, z, history=history), z)
 
     def spoil(self, estimates: Estimates, z) -> Estimates:
         return estimates
@@ -133,5 +132,5 @@ def test_a_fault_is_found(faulty, complaint):
 def test_a_fault_in_one_check_leaves_the_others_ok():
     findings = list(check_component("mine", Free()))
     assert sum(bool(f.complaint) for f in findings) == 1
-    assert not complaints(IPE(Newton()))
+    assert not complaints(Newton())
     assert not complaints(Gaussian(1.0))

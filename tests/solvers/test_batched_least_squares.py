@@ -11,17 +11,17 @@ from scipy.stats import chi2
 from small_models import Bent
 
 from ipe_bench.baselines import GaussNewton, LevenbergMarquardt, MapLM
-from ipe_bench.errors import UserError
-from ipe_bench.ipe import IPE
-from ipe_bench.linalg import Array, Covariance, information, inverse, quadratic_form
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array, Covariance, information, inverse, quadratic_form
+from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements import Gins, Polynomial
+from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Quantization
-from ipe_bench.prior import Gaussian as Prior
-from ipe_bench.roots import least_squares_root
-from ipe_bench.scenario import Problem, Scenario
+from ipe_bench.priors import GaussianPrior
 from ipe_bench.solvers import FixedPoint, Newton, Progressive, Relinearized
 from ipe_bench.solvers.progressive import window_stops
-from ipe_bench.statuses import Status
+from ipe_bench.trials.roots import least_squares_root
+from ipe_bench.trials.scenario import Scenario
 
 LEAST_SQUARES = [
     GaussNewton(),
@@ -36,7 +36,7 @@ ALL = [*LEAST_SQUARES, MapLM()]
 
 
 def gins(scale: float, trials: int = 20):
-    scenario = Scenario(Gins(), Quantization(0.02286), Prior(), scale)
+    scenario = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), scale)
     return scenario.problem, scenario.draw(0, trials)
 
 
@@ -50,7 +50,7 @@ def deviations(P: Array) -> Array:
 
 @pytest.mark.parametrize("estimator", LEAST_SQUARES, ids=repr)
 def test_the_minimum_is_that_of_scipy(estimator):
-    scenario = Scenario(Polynomial(strength=0.02), Gaussian(0.1), Prior(), 3.0)
+    scenario = Scenario(Polynomial(strength=0.02), Gaussian(0.1), GaussianPrior(), 3.0)
     problem, trials = scenario.problem, scenario.draw(0, 6)
     estimates = estimator.estimate(problem, trials.z)
     assert (estimates.status == Status.CONVERGED).all()
@@ -107,7 +107,7 @@ def test_relinearized_ipe_is_least_squares_at_scale_200():
     estimates = Relinearized().estimate(problem, trials.z)
     root = least_squares_root(problem, trials.z, trials.x, prior=None)
     deviation = deviations(crlb(problem, trials.x))
-    apart = np.abs(estimates.x - root.x) / deviation
+    apart = np.abs(estimates.x - root) / deviation
     solved = (estimates.status == Status.CONVERGED) & (apart.max(axis=1) < 1e-3)
     assert solved.mean() > 0.95
     assert np.sqrt(np.mean(apart[solved] ** 2)) < 0.01
@@ -115,10 +115,10 @@ def test_relinearized_ipe_is_least_squares_at_scale_200():
 
 def test_frozen_ipe_is_not_least_squares_at_scale_200():
     problem, trials = gins(200.0, 20)
-    frozen = IPE(Newton()).estimate(problem, trials.z)
+    frozen = Newton().estimate(problem, trials.z)
     root = least_squares_root(problem, trials.z, trials.x, prior=None)
     converged = frozen.status == Status.CONVERGED
-    apart = np.abs(frozen.x - root.x) / deviations(crlb(problem, trials.x))
+    apart = np.abs(frozen.x - root) / deviations(crlb(problem, trials.x))
     assert np.median(apart[converged].max(axis=1)) > 0.1
 
 
@@ -148,7 +148,7 @@ def test_progressive_ipe_from_far_away(scale, share):
 
 
 def test_the_test_of_the_fit_is_uniform_where_the_model_holds():
-    scenario = Scenario(Polynomial(), Gaussian(0.1), Prior(), 3.0)
+    scenario = Scenario(Polynomial(), Gaussian(0.1), GaussianPrior(), 3.0)
     p = Progressive().estimate(scenario.problem, scenario.draw(0, 500).z).extras["fit_p"]
     assert abs(p.mean() - 0.5) < 0.07
     assert 0.06 < (p < 0.1).mean() < 0.14

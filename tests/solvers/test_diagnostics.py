@@ -5,8 +5,14 @@ from __future__ import annotations
 import numpy as np
 from small_models import Bent
 
-from ipe_bench.diagnostics import (
-    contraction,
+from ipe_bench.basics.linalg import Covariance
+from ipe_bench.basics.statuses import Status
+from ipe_bench.measurements import Gins, Polynomial
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.noise import Gaussian, Quantization
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.solvers import FixedPoint, Newton
+from ipe_bench.statistics.theory import (
     convergence,
     covariances,
     false_roots,
@@ -14,16 +20,10 @@ from ipe_bench.diagnostics import (
     order_of_convergence,
     quadratic_constant,
 )
-from ipe_bench.ipe import IPE
-from ipe_bench.linalg import Covariance
-from ipe_bench.measurements import Gins, Polynomial
-from ipe_bench.montecarlo import Block
-from ipe_bench.noise import Gaussian, Quantization
-from ipe_bench.prior import Gaussian as Prior
-from ipe_bench.roots import frozen_root
-from ipe_bench.scenario import Problem, Scenario
-from ipe_bench.solvers import FixedPoint, Newton
-from ipe_bench.statuses import Status
+from ipe_bench.trials.contraction import contraction
+from ipe_bench.trials.roots import frozen_root
+from ipe_bench.trials.scenario import Scenario
+from ipe_bench.trials.scoring import Block
 
 
 def test_a_linear_model_contracts_at_once():
@@ -34,7 +34,7 @@ def test_a_linear_model_contracts_at_once():
 
 
 def test_the_three_contractions_stand_in_order():
-    scenario = Scenario(Gins(), Quantization(0.02286), Prior(), 33.0)
+    scenario = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), 33.0)
     trials = scenario.draw(0, 30)
     found = contraction(scenario.problem, trials.x)
     assert (found.spectral_radius <= found.infinity_norm * (1 + 1e-12)).all()
@@ -42,7 +42,7 @@ def test_the_three_contractions_stand_in_order():
     # K says nothing here, and all trials converge.
     assert np.median(found.K) > 1
     assert (found.spectral_radius < 1).all()
-    assert (IPE(FixedPoint()).estimate(scenario.problem, trials.z).status == Status.CONVERGED).all()
+    assert (FixedPoint().estimate(scenario.problem, trials.z).status == Status.CONVERGED).all()
 
 
 def test_eq_18_holds_with_the_k_that_the_print_lost():
@@ -56,10 +56,10 @@ def test_eq_18_holds_with_the_k_that_the_print_lost():
 
 
 def test_eq_18_holds_on_gins_at_scale_1():
-    scenario = Scenario(Gins(), Quantization(0.02286), Prior(), 1.0)
+    scenario = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), 1.0)
     trials = scenario.draw(0, 10)
-    histories = IPE(FixedPoint(), tolerance=1e-9).estimate(scenario.problem, trials.z, history=True).history
-    root = frozen_root(scenario.problem, trials.z, trials.x).x
+    histories = FixedPoint(tolerance=1e-9).estimate(scenario.problem, trials.z, history=True).history
+    root = frozen_root(scenario.problem, trials.z, trials.x)
     for iterates, x in zip(histories, root, strict=True):
         K = 1.05 * contraction(scenario.problem, iterates).K.max()
         assert K < 1
@@ -77,14 +77,14 @@ def test_orders_of_sequences_are_recovered():
 
 
 def test_orders_on_gins_are_linear_and_quadratic():
-    scenario = Scenario(Gins(), Quantization(0.02286), Prior(), 100.0)
+    scenario = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), 100.0)
     trials = scenario.draw(0, 20)
     problem = scenario.problem
-    root = frozen_root(problem, trials.z, trials.x).x
+    root = frozen_root(problem, trials.z, trials.x)
     deviation = np.sqrt(np.diagonal(covariances(problem, trials.x, trials.x, np.ones(20, bool)).linear))
     orders = {}
     for solver in (FixedPoint(), Newton()):
-        histories = IPE(solver).estimate(problem, trials.z, history=True).history
+        histories = solver.estimate(problem, trials.z, history=True).history
         found = [order_of_convergence(h, x, deviation, 1e-5) for h, x in zip(histories, root, strict=True)]
         orders[type(solver)] = np.nanmedian([f.order for f in found])
     assert 0.8 < orders[FixedPoint] < 1.2
@@ -93,10 +93,10 @@ def test_orders_on_gins_are_linear_and_quadratic():
 
 def test_the_constant_of_eq_23_is_that_of_a_quadratic():
     """h(x) = A x + b (A x)^2 with one parameter: F'' = 2 b H+ A^2 and F' = H+ (A + 2 b A^2 x)."""
-    scenario = Scenario(Polynomial(unknowns=1, strength=0.1), Gaussian(0.01), Prior(), 1.0)
+    scenario = Scenario(Polynomial(unknowns=1, strength=0.1), Gaussian(0.01), GaussianPrior(), 1.0)
     problem, trials = scenario.problem, scenario.draw(0, 1)
-    root = frozen_root(problem, trials.z, trials.x).x[0]
-    iterates = IPE(Newton(), start="nominal").estimate(problem, trials.z, history=True).history[0]
+    root = frozen_root(problem, trials.z, trials.x)[0]
+    iterates = Newton(start="nominal").estimate(problem, trials.z, history=True).history[0]
     found = quadratic_constant(problem, iterates, root)
     u, s = root[0], 0.1
     np.testing.assert_allclose(found.M, (s + s**2 * u) / (1 + s * u + s**2 * u**2 / 2), rtol=1e-5)
@@ -104,9 +104,9 @@ def test_the_constant_of_eq_23_is_that_of_a_quadratic():
 
 
 def test_covariances_of_a_mild_model_agree():
-    scenario = Scenario(Polynomial(strength=0.002), Gaussian(0.1), Prior(), 1.0)
+    scenario = Scenario(Polynomial(strength=0.002), Gaussian(0.1), GaussianPrior(), 1.0)
     trials = scenario.draw(0, 3000)
-    estimates = IPE(Newton()).estimate(scenario.problem, trials.z)
+    estimates = Newton().estimate(scenario.problem, trials.z)
     solved = estimates.status == Status.CONVERGED
     found = covariances(scenario.problem, estimates.x, trials.x, solved)
     assert found.trials == 3000
@@ -135,7 +135,7 @@ def test_a_convergence_curve_keeps_what_has_finished():
 
 
 def test_stored_contraction_is_that_of_the_model_at_the_truth():
-    scenario = Scenario(Polynomial(strength=0.02), Gaussian(0.01), Prior(), 1.0)
+    scenario = Scenario(Polynomial(strength=0.02), Gaussian(0.01), GaussianPrior(), 1.0)
     block = Block.draw(scenario, 0, 5)
     columns = block.truth_columns()
     model = scenario.measurement

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from square_systems import BurdenFaires, Cubic, NoRoot, Rosenbrock, Temperamental, system_of
 
-from ipe_bench.diagnostics import order_of_convergence
-from ipe_bench.ipe import IPE, find_roots
+from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.driver import iterate
 from ipe_bench.measurements import Gins, Polynomial
 from ipe_bench.noise import Gaussian, NoNoise, Quantization
-from ipe_bench.prior import Gaussian as Prior
-from ipe_bench.roots import frozen_root
-from ipe_bench.scenario import Scenario
+from ipe_bench.priors import GaussianPrior
 from ipe_bench.solvers import Anderson, Broyden, DampedNewton, FixedPoint, Newton, SteepestDescent
-from ipe_bench.statuses import Status
+from ipe_bench.statistics.theory import order_of_convergence
+from ipe_bench.trials.roots import frozen_root
+from ipe_bench.trials.scenario import Scenario
 
 ALL = [FixedPoint(), Newton(), Broyden(), Broyden("identity"), SteepestDescent(), Anderson(2), DampedNewton()]
 WITH_SLOPE = [Newton(), Broyden(), DampedNewton(), SteepestDescent()]
@@ -24,15 +26,7 @@ def roots_of(model, solver, starts, *, tolerance=1e-9, max_iterations=2000, hist
     starts = np.atleast_2d(np.asarray(starts, dtype=float))
     system = system_of(model, len(starts))
     with np.errstate(all="ignore"):
-        roots = find_roots(
-            system,
-            solver,
-            starts,
-            np.ones(model.n),
-            tolerance=tolerance,
-            max_iterations=max_iterations,
-            history=history,
-        )
+        roots = iterate(system, solver, starts, tolerance=tolerance, max_iterations=max_iterations, history=history)
     return roots, system.model.tally
 
 
@@ -68,32 +62,32 @@ def test_newton_and_broyden_reproduce_the_tables_of_burden_and_faires():
 
 @pytest.mark.parametrize("solver", ALL, ids=repr)
 def test_gins_at_scale_10_converges_to_the_root_near_the_truth(solver):
-    scenario = Scenario(Gins(), Quantization(0.02286), Prior(), 10.0)
+    scenario = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), 10.0)
     trials = scenario.draw(0, 12)
-    estimates = IPE(solver).estimate(scenario.problem, trials.z)
+    estimates = solver.estimate(scenario.problem, trials.z)
     root = frozen_root(scenario.problem, trials.z, trials.x)
     deviation = np.sqrt(np.diagonal(estimates.covariance, axis1=1, axis2=2))
     assert (estimates.status == Status.CONVERGED).all()
-    assert (root.status == Status.CONVERGED).all()
-    assert (np.abs(estimates.x - root.x) / deviation).max() < 1e-4
+    assert np.isfinite(root).all()
+    assert (np.abs(estimates.x - root) / deviation).max() < 1e-4
 
 
 @pytest.mark.parametrize("solver", ALL, ids=repr)
 def test_without_noise_the_truth_of_a_polynomial_is_the_root(solver):
-    scenario = Scenario(Polynomial(), NoNoise(1e-3), Prior(), 5.0)
+    scenario = Scenario(Polynomial(), NoNoise(1e-3), GaussianPrior(), 5.0)
     trials = scenario.draw(0, 10)
-    estimates = IPE(solver, max_iterations=1000).estimate(scenario.problem, trials.z)
+    estimates = replace(solver, max_iterations=1000).estimate(scenario.problem, trials.z)
     assert (estimates.status == Status.CONVERGED).all()
     np.testing.assert_allclose(estimates.x, trials.x, atol=1e-8)
 
 
 @pytest.mark.parametrize("solver", ALL, ids=repr)
 def test_a_batch_equals_its_trials_one_by_one(solver):
-    scenario = Scenario(Polynomial(strength=0.05), Gaussian(0.1), Prior(), 10.0)
+    scenario = Scenario(Polynomial(strength=0.05), Gaussian(0.1), GaussianPrior(), 10.0)
     trials = scenario.draw(0, 12)
     with np.errstate(all="ignore"):
-        batch = IPE(solver).estimate(scenario.problem, trials.z)
-        single = [IPE(solver).estimate(scenario.problem, z[None]) for z in trials.z]
+        batch = solver.estimate(scenario.problem, trials.z)
+        single = [solver.estimate(scenario.problem, z[None]) for z in trials.z]
     np.testing.assert_array_equal(batch.x, np.concatenate([s.x for s in single]))
     np.testing.assert_array_equal(batch.status, np.concatenate([s.status for s in single]))
     np.testing.assert_array_equal(batch.simulations, np.concatenate([s.simulations for s in single]))
@@ -170,16 +164,16 @@ def test_a_trial_that_fails_has_a_status_and_disturbs_no_other(solver):
 
 
 def test_the_budget_ends_a_trial():
-    scenario = Scenario(Polynomial(strength=0.05), Gaussian(0.1), Prior(), 5.0)
+    scenario = Scenario(Polynomial(strength=0.05), Gaussian(0.1), GaussianPrior(), 5.0)
     trials = scenario.draw(0, 5)
-    estimates = IPE(Newton(), tolerance=1e-15, budget=12.0).estimate(scenario.problem, trials.z)
+    estimates = Newton(tolerance=1e-15, budget=12.0).estimate(scenario.problem, trials.z)
     assert set(estimates.status) <= {Status.BUDGET, Status.CONVERGED}
     assert (estimates.simulations + 4 * estimates.jacobians <= 12 + 5).all()
 
 
 def test_a_jacobian_free_solver_evaluates_none():
-    scenario = Scenario(Polynomial(), Gaussian(0.1), Prior(), 5.0)
+    scenario = Scenario(Polynomial(), Gaussian(0.1), GaussianPrior(), 5.0)
     trials = scenario.draw(0, 5)
     for solver in (FixedPoint(), Broyden("identity"), Anderson()):
-        assert (IPE(solver).estimate(scenario.problem, trials.z).jacobians == 0).all()
-    assert (IPE(Broyden()).estimate(scenario.problem, trials.z).jacobians == 1).all()
+        assert (solver.estimate(scenario.problem, trials.z).jacobians == 0).all()
+    assert (Broyden().estimate(scenario.problem, trials.z).jacobians == 1).all()

@@ -5,22 +5,21 @@ import pytest
 
 from ipe_bench.api import check, compute
 from ipe_bench.baselines import LinearLSE, MultiscaleLM
-from ipe_bench.errors import UserError
-from ipe_bench.ipe import IPE
+from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Nist, Polynomial
 from ipe_bench.noise import Certified
-from ipe_bench.prior import Gaussian as Prior
+from ipe_bench.priors import GaussianPrior
 from ipe_bench.report import write_report
-from ipe_bench.scenario import Scenario
 from ipe_bench.solvers import FixedPoint
-from ipe_bench.statistics.certified import certified_averages, certified_table
 from ipe_bench.statistics.collect import collect
+from ipe_bench.statistics.digits import certified_averages, certified_table
+from ipe_bench.trials.scenario import Scenario
 
-ESTIMATORS = {"linear_lse": LinearLSE(), "fixed_point": IPE(FixedPoint()), "multiscale_lm": MultiscaleLM()}
+ESTIMATORS = {"linear_lse": LinearLSE(), "fixed_point": FixedPoint(), "multiscale_lm": MultiscaleLM()}
 
 
 def scenario(dataset, start=1):
-    return Scenario(Nist(dataset, start), Certified(), Prior(), 1.0)
+    return Scenario(Nist(dataset, start), Certified(), GaussianPrior(), 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -63,4 +62,4 @@ def test_more_than_one_trial_is_refused_before_any_work():
 
 def test_a_model_without_real_readings_is_refused():
     with pytest.raises(UserError, match=r"^noise=certified: measurement=polynomial"):
-        Scenario(Polynomial(), Certified(), Prior(), 1.0)
+        Scenario(Polynomial(), Certified(), GaussianPrior(), 1.0)

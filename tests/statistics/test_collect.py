@@ -9,11 +9,11 @@ import pyarrow.parquet as pq
 import pytest
 from synthetic_store import Pretender
 
-from ipe_bench.errors import UserError
-from ipe_bench.execution.base import Failure
+from ipe_bench.basics.errors import UserError
+from ipe_bench.runs.execution.base import Failure
+from ipe_bench.runs.store import FOOTER
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.collect import collect, config_leaves, differing, merge_ranges
-from ipe_bench.store import FOOTER
 
 
 @pytest.fixture

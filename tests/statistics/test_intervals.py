@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from ipe_bench.consistency import clopper_pearson, mean_limits
+from ipe_bench.statistics.consistency import clopper_pearson, mean_limits
 from ipe_bench.statistics.intervals import bootstrap_rms, quantile, quantiles
 
 

@@ -5,8 +5,8 @@ import pandas as pd
 import pytest
 from synthetic_store import Pretender, Synthetic
 
-from ipe_bench.consistency import clopper_pearson
 from ipe_bench.statistics import summarize
+from ipe_bench.statistics.consistency import clopper_pearson
 from ipe_bench.statistics.summary import STATISTICS
 
 

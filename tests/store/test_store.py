@@ -16,15 +16,14 @@ from small_models import Bent
 from ipe_bench import Scenario, run
 from ipe_bench.api import compute
 from ipe_bench.baselines import LinearLSE
-from ipe_bench.ipe import IPE
 from ipe_bench.noise import Gaussian
-from ipe_bench.prior import Gaussian as Prior
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.runs.store import Cell, Store
 from ipe_bench.solvers import FixedPoint, Newton
-from ipe_bench.store import Cell, Store
 
 
 def scenario(**changes) -> Scenario:
-    return Scenario(Bent(0.02), Gaussian(0.1), Prior(), **{"error_scale": 1.0, **changes})
+    return Scenario(Bent(0.02), Gaussian(0.1), GaussianPrior(), **{"error_scale": 1.0, **changes})
 
 
 def rows(store: Store, cell: Cell) -> dict:
@@ -59,7 +58,7 @@ def test_a_second_run_computes_nothing_and_more_trials_only_the_difference(tmp_p
 def test_one_more_estimator_computes_only_itself(tmp_path):
     compute([scenario()], {"linear_lse": LinearLSE()}, 20, tmp_path)
     before = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "trials").iterdir()}
-    compute([scenario()], {"linear_lse": LinearLSE(), "fixed_point": IPE(FixedPoint())}, 20, tmp_path)
+    compute([scenario()], {"linear_lse": LinearLSE(), "fixed_point": FixedPoint()}, 20, tmp_path)
     after = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "trials").iterdir()}
     assert len(after) == len(before) + 1
     assert before.items() <= after.items()
@@ -67,10 +66,10 @@ def test_one_more_estimator_computes_only_itself(tmp_path):
 
 @pytest.mark.parametrize("block_size", [1, 7, 100])
 def test_trials_are_the_same_bits_for_any_block_size(tmp_path, block_size):
-    estimators = {"newton": IPE(Newton())}
+    estimators = {"newton": Newton()}
     compute([scenario()], estimators, 23, tmp_path / "whole", block_size=23)
     compute([scenario()], estimators, 23, tmp_path / "cut", block_size=block_size)
-    cell = Cell(scenario(), "newton", IPE(Newton()))
+    cell = Cell(scenario(), "newton", Newton())
     whole, cut = (rows(Store(tmp_path / name), cell) for name in ("whole", "cut"))
     for name in whole:
         np.testing.assert_array_equal(whole[name], cut[name])
@@ -83,12 +82,12 @@ def test_the_key_follows_every_constant(tmp_path):
             scenario(),
             scenario(error_scale=2.0),
             scenario(seed=1),
-            Scenario(Bent(0.03), Gaussian(0.1), Prior(), 1.0),
+            Scenario(Bent(0.03), Gaussian(0.1), GaussianPrior(), 1.0),
         )
-        for e in (IPE(Newton()), IPE(Newton(), tolerance=1e-7))
+        for e in (Newton(), Newton(tolerance=1e-7))
     }
     assert len(keys) == 8
-    assert Cell(scenario(), "newton", IPE(Newton())).key == Cell(scenario(), "newton", IPE(Newton())).key
+    assert Cell(scenario(), "newton", Newton()).key == Cell(scenario(), "newton", Newton()).key
 
 
 def test_a_changed_source_makes_another_key(tmp_path):
@@ -100,9 +99,7 @@ from ipe_bench.solvers import FixedPoint
 class Mine(FixedPoint):
     pass
 """
-    script = (
-        "from ipe_bench.components import fingerprint\nfrom mine import Mine\nprint(fingerprint([Mine()])['source'])\n"
-    )
+    script = "from ipe_bench.runs.provenance import fingerprint\nfrom mine import Mine\nprint(fingerprint([Mine()])['source'])\n"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
 
     def digest(source: str) -> str:
@@ -140,7 +137,7 @@ def test_the_footer_says_what_the_file_holds(tmp_path):
 
 
 def test_a_raising_estimator_is_a_status_and_the_others_are_complete(tmp_path):
-    from ipe_bench.estimation import Estimator
+    from ipe_bench.estimators.base import Estimator
 
     class Broken(Estimator):
         def estimate(self, problem, z, *, history=False):

@@ -16,8 +16,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ipe_bench.errors import UserError
-from ipe_bench.linalg import Array, Covariance
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.measurements.base import Measurement, Parameter, Recorded
 from ipe_bench.measurements.nist.formulas import FORMULAS
 
@@ -25,7 +25,7 @@ _PREDICTORS: dict[str, tuple[str, ...]] = {"Nelson": ("time", "temperature")}
 
 
 @dataclass(frozen=True)
-class Certified:
+class CertifiedAnswer:
     """What NIST certifies of one data set, to eleven digits."""
 
     parameters: Array
@@ -105,10 +105,10 @@ class Nist(Measurement):
         return np.log(y) if self.dataset == "Nelson" else y
 
     @cached_property
-    def certified(self) -> Certified:
+    def certified(self) -> CertifiedAnswer:
         """The certified answer."""
         table = self._table
-        return Certified(
+        return CertifiedAnswer(
             parameters=np.array(table["certified"], dtype=float),
             deviations=np.array(table["deviations"], dtype=float),
             residual_sum_of_squares=table["residual_sum_of_squares"],

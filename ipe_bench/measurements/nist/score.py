@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.linalg import Array
+from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.nist.model import Nist
 
 CERTIFIED_DIGITS = 11.0

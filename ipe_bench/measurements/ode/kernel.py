@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import DOP853
 
-from ipe_bench.machine import cores
+from ipe_bench.basics.machine import cores
 from ipe_bench.measurements.ode.trace import Expression, Graph, emit, tangent
 
 WIDTH = 16

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.linalg import Array
+from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.ode.kernel import Recording, integrate, record
 

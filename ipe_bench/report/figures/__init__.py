@@ -14,19 +14,19 @@ __all__ = ["Drawing", "draw_all"]
 def draw_all(analysis: Analysis) -> Iterator[Drawing]:
     """Every figure that the data allow, in the order of the report."""
     from ipe_bench.report.figures import (
-        consistency,
         convergence,
         correlation,
         cost,
         distributions,
         error_scale,
-        profiles,
+        nees,
+        profile_curves,
         ranks,
         success,
     )
 
     look = looks(analysis.collection.estimators)
-    rooms = (error_scale, success, distributions, consistency, convergence, cost, profiles, ranks, correlation)
+    rooms = (error_scale, success, distributions, nees, convergence, cost, profile_curves, ranks, correlation)
     with house_style():
         for room in rooms:
             yield from room.draw(analysis, look)

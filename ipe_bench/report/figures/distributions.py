@@ -7,11 +7,11 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from scipy.stats import chi
 
-from ipe_bench.montecarlo import GATE
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, Look
 from ipe_bench.statistics.analysis import PROBABILITIES, Analysis
+from ipe_bench.trials.scoring import GATE
 
 
 def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ipe_bench.store import write_atomically
+from ipe_bench.basics.files import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ipe_bench.errors import UserError
-from ipe_bench.solvers import Solver, State, System
+from ipe_bench.basics.errors import UserError
+from ipe_bench.solvers import IPE, State, System
 
 
 @dataclass(frozen=True)
-class RelaxedFixedPoint(Solver):
+class RelaxedFixedPoint(IPE):
     """x <- x - w F(x) with a relaxation factor w between 0 and 2.
 
     With w below 1 it converges where plain iteration oscillates: an eigenvalue g of the iteration becomes
@@ -19,6 +19,7 @@ class RelaxedFixedPoint(Solver):
     relaxation: float = 0.7
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 0 < self.relaxation < 2:
             raise UserError(f"relaxation={self.relaxation}: give a number between 0 and 2")
 

@@ -10,7 +10,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from ipe_bench_relaxed import RelaxedFixedPoint
 
-from ipe_bench.errors import UserError
+from ipe_bench.basics.errors import UserError
 from ipe_bench.solvers import FixedPoint, State
 
 

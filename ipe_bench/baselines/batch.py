@@ -1,0 +1,62 @@
+"""What the batch least-squares baselines share: their start, their limits, and what they report."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+from ipe_bench.basics.errors import UserError, require_counts, require_positive
+from ipe_bench.basics.linalg import Array
+from ipe_bench.estimators.base import Estimates, Estimator
+from ipe_bench.estimators.driver import Solver
+from ipe_bench.estimators.ipe import Start, begin
+from ipe_bench.estimators.least_squares import Descent, Objective, minimize
+from ipe_bench.measurements.problem import Problem
+
+
+@dataclass(frozen=True)
+class Batch(Estimator):
+    """Least squares on all readings at once; what is minimised, and by which method, is left to the subclass."""
+
+    start: Start = "nominal"
+    """Where the iteration begins: at the linear LSE, eq. (16), or at the nominal point."""
+    max_iterations: int = 100
+    """Steps tried."""
+    tolerance: float = 1e-6
+    """Largest Gauss-Newton step in standard deviations of the local bound: the gradient in whitened units."""
+    budget: float | None = None
+    """Simulations that a trial may cost, a Jacobian counting n; None: no limit."""
+
+    equation: ClassVar = "least_squares"
+
+    def __post_init__(self) -> None:
+        if self.start not in ("linear_lse", "nominal"):
+            raise UserError(f"start={self.start}: choose linear_lse or nominal")
+        require_positive(self, "tolerance", "budget")
+        require_counts(self, "max_iterations")
+
+    def objective(self, problem: Problem, z: Array) -> Objective:
+        """What is minimised for readings z (trials, m)."""
+        return Objective.of(problem, z, prior=False)
+
+    @abstractmethod
+    def method(self, objective: Objective) -> Solver[Descent]:
+        """What minimises it."""
+
+    def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
+        objective = self.objective(problem, z)
+        tally, x = objective.model.tally, problem.x0[None].repeat(len(z), axis=0)
+        if self.start == "linear_lse":
+            x, system = begin(problem, z, self.start)
+            tally.simulations += system.model.tally.simulations
+        minima = minimize(
+            objective,
+            self.method(objective),
+            x,
+            tolerance=self.tolerance,
+            max_iterations=self.max_iterations,
+            budget=self.budget,
+            history=history,
+        )
+        return minima.estimates(tally, z.shape[1])

@@ -1,0 +1,1 @@
+"""What every room uses: arrays and batches, statuses, errors, files, and what this machine offers."""

@@ -1,0 +1,49 @@
+"""The exceptions that are meant for users; everything else that is raised is a bug."""
+
+import difflib
+import math
+from collections.abc import Iterable
+
+
+class UserError(Exception):
+    """A mistake in a config, a command or a file: one line that names the key or row, and the remedy.
+
+    The command line prints it without a traceback and exits with code 2.
+    """
+
+
+class StorageError(Exception):
+    """Results cannot be stored any more: a full disk, a folder that went away. One line.
+
+    What was stored before is whole. The command line prints it without a traceback and exits with code 1.
+    """
+
+
+def require_positive(component: object, *names: str) -> None:
+    """Refuses a field that is no finite number above 0; a field that is None has no limit, or is not used."""
+    for name in names:
+        value = getattr(component, name)
+        if value is not None and not 0 < value < math.inf:
+            raise UserError(f"{name}={value}: give a number above 0")
+
+
+def require_counts(component: object, *names: str, least: int = 1) -> None:
+    """Refuses a field that is no whole number of at least `least`."""
+    for name in names:
+        if getattr(component, name) < least:
+            above = "above 0" if least == 1 else f"from {least} up"
+            raise UserError(f"{name}={getattr(component, name)}: give a whole number {above}")
+
+
+def describe_exception(error: BaseException) -> str:
+    """One line for a table: the type and the first line of the message."""
+    lines = str(error).splitlines()
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+
+
+def unknown(name: str, known: Iterable[str], noun: str) -> str:
+    """'there is no such option; did you mean ...', with everything there is."""
+    known = sorted(known)
+    close = difflib.get_close_matches(name, known, 1)
+    hint = f"; did you mean {close[0]}?" if close else ""
+    return f"there is no such {noun}{hint} (there are: {', '.join(known) or 'none'})"

@@ -1,0 +1,40 @@
+"""Files that appear under their name complete or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ipe_bench.basics.errors import StorageError
+
+
+def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
+    """Calls `write(temporary path)` in the same folder and renames the result: readers see all of it or nothing.
+
+    Raises:
+        StorageError: the disk is full, or the folder cannot be written to any more.
+    """
+    temporary = path.with_name(f".{path.name}.{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(temporary)
+        os.replace(temporary, path)
+    except OSError as error:
+        reason = error.strerror if error.errno is None else os.strerror(error.errno)
+        raise StorageError(
+            f"{path.parent}: cannot be written to any more ({reason or error}); what was stored before is whole, "
+            "and the same command goes on from there"
+        ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a text file in one piece; see `write_atomically`."""
+    write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))

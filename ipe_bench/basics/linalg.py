@@ -1,0 +1,137 @@
+"""Batched linear algebra whose result for one trial does not depend on the other trials in the batch.
+
+Matrix products are stacked, one per trial: a product over a whole batch would change a trial's bits with the size of
+the batch. A singular matrix spoils its own trial only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+Array: TypeAlias = NDArray[Any]
+Mask: TypeAlias = NDArray[Any]
+
+
+def finite(a: Array) -> Mask:
+    """Which trials (trials,) of a (trials, ...) are finite throughout."""
+    return np.asarray(np.isfinite(a).all(axis=tuple(range(1, a.ndim))))
+
+
+def multiply(A: Array, x: Array) -> Array:
+    """A x for each trial: A (..., p, q), x (trials, q) -> (trials, p)."""
+    return np.matmul(A, x[..., None])[..., 0]
+
+
+def solve(A: Array, b: Array) -> tuple[Array, Mask]:
+    """Solves A x = b for each trial: A (trials, n, n), b (trials, n) or (trials, n, k).
+
+    Returns x, NaN where A is singular or not finite, and the mask (trials,) of those trials.
+    """
+    vectors = b.ndim == 2
+    rhs = b[..., None] if vectors else b
+    x, singular = _solve_columns(A, rhs)
+    return (x[..., 0] if vectors else x), singular
+
+
+def inverse(A: Array) -> tuple[Array, Mask]:
+    """The inverse of each A (trials, n, n); NaN and flagged where there is none."""
+    return _solve_columns(A, np.broadcast_to(np.eye(A.shape[-1]), A.shape))
+
+
+def _solve_columns(A: Array, b: Array) -> tuple[Array, Mask]:
+    usable = finite(A) & finite(b)
+    x = np.full(b.shape, np.nan)
+    try:
+        x[usable] = np.linalg.solve(A[usable], b[usable])
+    except np.linalg.LinAlgError:
+        for i in np.flatnonzero(usable):
+            try:
+                x[i] = np.linalg.solve(A[i], b[i])
+            except np.linalg.LinAlgError:
+                continue
+    return x, ~finite(x)
+
+
+def deviations(P: Array) -> Array:
+    """Standard deviations (trials, n) of the covariances P (trials, n, n)."""
+    return np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
+
+
+def quadratic_form(P_inverse: Array, e: Array) -> Array:
+    """e' P^-1 e for each trial: P_inverse (..., n, n), e (trials, n) -> (trials,)."""
+    return np.einsum("...i,...i->...", e, multiply(P_inverse, e))
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """A covariance R of m readings, as what whitens them.
+
+    `factor` is the vector (m,) of standard deviations where readings are independent, else the lower Cholesky factor
+    (m, m) of R.
+    """
+
+    factor: Array
+
+    @property
+    def m(self) -> int:
+        return len(self.factor)
+
+    @property
+    def deviations(self) -> Array:
+        """The standard deviation of each reading (m,)."""
+        return self.factor if self.factor.ndim == 1 else np.sqrt(np.sum(self.factor**2, axis=1))
+
+    def whiten(self, r: Array) -> Array:
+        """R^-1/2 r for residuals r (..., m): independent, of unit variance."""
+        if self.factor.ndim == 1:
+            return r / self.factor
+        return multiply(self._inverse_factor(), r)
+
+    def whiten_jacobian(self, J: Array) -> Array:
+        """R^-1/2 J for J (..., m, n)."""
+        if self.factor.ndim == 1:
+            return J / self.factor[:, None]
+        return np.matmul(self._inverse_factor(), J)
+
+    def restricted(self, rows: NDArray[np.intp]) -> Covariance:
+        """The covariance of some of the readings."""
+        if self.factor.ndim == 1:
+            return Covariance(self.factor[rows])
+        return Covariance(np.linalg.cholesky(self.matrix()[np.ix_(rows, rows)]))
+
+    def matrix(self) -> Array:
+        """R itself (m, m)."""
+        return np.diag(self.factor**2) if self.factor.ndim == 1 else self.factor @ self.factor.T
+
+    def _inverse_factor(self) -> Array:
+        return solve_triangular(self.factor, np.eye(self.m), lower=True)
+
+
+def information(J: Array, R: Covariance) -> Array:
+    """The Fisher information J' R^-1 J for J (..., m, n)."""
+    Jw = R.whiten_jacobian(J)
+    return np.matmul(Jw.swapaxes(-1, -2), Jw)
+
+
+def pseudo_inverse(H: Array, R: Covariance) -> tuple[Array, Mask]:
+    """H+ = (H' R^-1 H)^-1 H' R^-1 for H (trials, m, n), by QR of the whitened H: (trials, n, m).
+
+    Flags the trials whose H has not full column rank to working precision; their H+ is NaN.
+    """
+    Hw = R.whiten_jacobian(H)
+    usable = finite(Hw)
+    Q, U = np.linalg.qr(np.where(usable[:, None, None], Hw, 0.0))
+    diagonal = np.abs(np.diagonal(U, axis1=1, axis2=2))
+    floor = np.finfo(float).eps * max(H.shape[1:]) * np.linalg.norm(U, axis=(1, 2))
+    deficient: Mask = ~usable | (diagonal.min(axis=1) <= floor)
+    U = np.where(deficient[:, None, None], np.nan, U)
+    # H+ = U^-1 Q' R^-1/2
+    whitened = solve(U, Q.swapaxes(1, 2))[0]
+    if R.factor.ndim == 1:
+        return whitened / R.factor, deficient
+    return np.matmul(whitened, R._inverse_factor()), deficient

@@ -1,0 +1,173 @@
+"""What every estimator is: readings of many trials in, estimates of many trials out."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.basics.errors import describe_exception
+from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.statuses import Status
+from ipe_bench.measurements.counted import Tally
+from ipe_bench.measurements.problem import Problem
+
+Need = Literal["epochs", "prior"]
+Equation = Literal["frozen", "least_squares", "map"]
+
+
+def _nothing() -> Array:
+    """Stands for zero in every trial."""
+    return np.zeros(0)
+
+
+def _no_counts() -> NDArray[np.int64]:
+    return np.zeros(0, np.int64)
+
+
+class Answer(Protocol):
+    """Where an iteration of a batch ended."""
+
+    @property
+    def x(self) -> Array: ...
+    @property
+    def status(self) -> NDArray[np.int8]: ...
+    @property
+    def iterations(self) -> NDArray[np.int64]: ...
+    @property
+    def history(self) -> list[Array] | None: ...
+
+
+@dataclass
+class Estimates:
+    """The result of a batch; every field has a leading trials axis."""
+
+    x: Array
+    """(trials, n), in multiples of the parameters' units; whatever was reached where the status is not converged."""
+    status: NDArray[np.int8]
+    covariance: Array | None = None
+    """(trials, n, n): the covariance that the estimator itself reports."""
+    iterations: NDArray[np.int64] = field(default_factory=_no_counts)
+    simulations: Array = field(default_factory=_nothing)
+    """Evaluations of h per trial; a prefix of the epochs counts as its share."""
+    jacobians: Array = field(default_factory=_nothing)
+    """Evaluations of dh/dx per trial, likewise."""
+    messages: dict[int, str] = field(default_factory=dict)
+    """What went wrong, by trial within the batch."""
+    seconds: Array = field(default_factory=_nothing)
+    """Computing time per trial; a batch's time is shared evenly."""
+    history: list[Array] | None = None
+    """For each trial the iterates (iterations + 1, n), where they were asked for."""
+    extras: dict[str, Array] = field(default_factory=dict)
+    """Further numbers per trial (trials,) that this estimator reports, by name: NIS of a filter, say."""
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "simulations", "jacobians", "seconds"):
+            if not len(values := getattr(self, name)):
+                setattr(self, name, np.zeros(len(self.x), values.dtype))
+
+    @classmethod
+    def of(cls, ended: Answer, tally: Tally, **further: Any) -> Estimates:
+        """What an iteration came to, with what it cost; `further` are fields that only the estimator knows."""
+        counts = {"simulations": tally.simulations.copy(), "jacobians": tally.jacobians.copy()}
+        found = {"x": ended.x, "status": ended.status, "iterations": ended.iterations, "history": ended.history}
+        return cls(**{**found, **counts, "messages": dict(tally.messages), **further})
+
+    @classmethod
+    def join(cls, parts: Sequence[Estimates]) -> Estimates:
+        """The batches one after another."""
+        first, starts = parts[0], np.cumsum([0, *(len(p.x) for p in parts)])
+        covariances = [p.covariance for p in parts]
+        if all(c is None for c in covariances):
+            covariance = None
+        else:
+            n = first.x.shape[1]
+            missing = [np.full((len(p.x), n, n), np.nan) for p in parts]
+            covariance = np.concatenate([m if c is None else c for c, m in zip(covariances, missing, strict=True)])
+        names = dict.fromkeys(name for p in parts for name in p.extras)
+        unknown = [np.full(len(p.x), np.nan) for p in parts]
+        histories = [p.history for p in parts]
+        return cls(
+            x=np.concatenate([p.x for p in parts]),
+            status=np.concatenate([p.status for p in parts]),
+            covariance=covariance,
+            iterations=np.concatenate([p.iterations for p in parts]),
+            simulations=np.concatenate([p.simulations for p in parts]),
+            jacobians=np.concatenate([p.jacobians for p in parts]),
+            messages={int(s) + i: m for s, p in zip(starts, parts, strict=False) for i, m in p.messages.items()},
+            seconds=np.concatenate([p.seconds for p in parts]),
+            history=None if any(h is None for h in histories) else [x for h in histories if h for x in h],
+            extras={
+                k: np.concatenate([p.extras.get(k, u) for p, u in zip(parts, unknown, strict=True)]) for k in names
+            },
+        )
+
+    @classmethod
+    def failed(cls, trials: int, n: int, message: str) -> Estimates:
+        """Trials that ended in an exception."""
+        status = np.full(trials, Status.ERROR, dtype=np.int8)
+        return cls(np.full((trials, n), np.nan), status, messages=dict.fromkeys(range(trials), message))
+
+
+class Estimator(ABC):
+    """Turns readings into parameters. A new estimator is a frozen dataclass that writes `estimate`.
+
+    The trials of a batch are independent: a trial's result is the same, bit for bit, in whatever batch it stands, and
+    a trial that fails ends as a status without disturbing the others.
+    """
+
+    needs: ClassVar[frozenset[Need]] = frozenset()
+    """What a scenario must have for this estimator to run: epochs, a prior."""
+    equation: ClassVar[Equation | None] = None
+    """The estimating equation whose root it seeks: that of the frozen H (eq. 11), of least squares, or of the maximum a
+    posteriori; None where an estimate is no root of anything."""
+
+    @abstractmethod
+    def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
+        """Estimates from readings z (trials, m); `history` asks for the iterates as well."""
+
+    def missing(self, problem: Problem) -> list[str]:
+        """What this estimator needs and the problem does not have."""
+        has = {"epochs": problem.measurement.epochs is not None, "prior": problem.prior_deviation is not None}
+        return [need for need in sorted(self.needs) if not has[need]]
+
+
+def estimate_safely(estimator: Estimator, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
+    """`estimator.estimate`, timed, where an exception becomes the status of the trials that cause it.
+
+    A batch that raises is estimated again trial by trial.
+    """
+    began = time.perf_counter()
+    try:
+        with np.errstate(all="ignore"):
+            estimates = estimator.estimate(problem, z, history=history)
+    except MemoryError:
+        raise  # says something of the machine, not of the trial: the block fails and is tried again another day
+    except Exception as error:
+        if len(z) == 1:
+            return Estimates.failed(1, problem.measurement.n, describe_exception(error))
+        return Estimates.join([estimate_safely(estimator, problem, row[None], history=history) for row in z])
+    if not estimates.seconds.any():
+        estimates.seconds = np.full(len(z), (time.perf_counter() - began) / max(1, len(z)))
+    return estimates
+
+
+def one_by_one(trials: Iterable[Any], estimate: Any, n: int) -> Estimates:
+    """Joins `estimate(trial)` over trials, for libraries that take one at a time; exceptions become statuses."""
+    parts = []
+    for trial in trials:
+        began = time.perf_counter()
+        try:
+            part = estimate(trial)
+        except MemoryError:
+            raise
+        except Exception as error:
+            part = Estimates.failed(1, n, describe_exception(error))
+        part.seconds = np.array([time.perf_counter() - began])
+        parts.append(part)
+    return Estimates.join(parts)

@@ -1,0 +1,158 @@
+"""The one loop: iterates any method on a batch of trials until each has an answer, or a failure that has a name.
+
+A method (`Solver`) says where it begins, what a step is, and how far its equation is from holding. Stopping, counting,
+histories and the table of endings are here; what the equation is and what is made of its root is left to others.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.basics.batches import put, take
+from ipe_bench.basics.linalg import Array, Mask
+from ipe_bench.basics.statuses import Status
+from ipe_bench.measurements.counted import Counted
+
+FAR = 1e8
+"""Where the residual is this many times larger than at the start, the iteration has diverged."""
+TINY_STEP = 1e-3
+"""Steps below this share of the tolerance, while the equation does not hold within it, mean a stall."""
+
+
+class HasX(Protocol):
+    """A state: a frozen dataclass whose fields are arrays with the trials in front, x (trials, n) among them."""
+
+    @property
+    def x(self) -> Array: ...
+
+
+S = TypeVar("S", bound=HasX)
+
+
+class Equations(Protocol):
+    """What is solved for the trials `rows` of a batch."""
+
+    @property
+    def model(self) -> Counted: ...
+    @property
+    def rows(self) -> NDArray[np.intp]: ...
+    def subset(self, kept: Mask) -> Any:
+        """The same for some of the trials."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Where each trial stands after a step; every field is (trials,)."""
+
+    size: Array
+    """How far the equation is from holding, in standard deviations: converged where it is within the tolerance."""
+    level: Array
+    """What grows where the iteration diverges; not finite where the model or the algebra has overflowed."""
+    moved: Array
+    """The last step, in standard deviations; infinite before the first."""
+    stuck: Mask | bool = False
+    """Where the method itself knows that it gets no further."""
+    ending: NDArray[Any] | Status = Status.STALLED
+    """What it is called where a trial is stuck, or its steps have become tiny."""
+
+
+class Solver(ABC, Generic[S]):
+    """A method that the driver iterates: where it begins, one step of it, and how far it has come."""
+
+    @abstractmethod
+    def begin(self, system: Any, x: Array) -> S:
+        """The state at the start x (trials, n)."""
+
+    @abstractmethod
+    def step(self, system: Any, state: S) -> S:
+        """The state after one more iteration."""
+
+    @abstractmethod
+    def standing(self, system: Any, before: S | None, state: S) -> Standing:
+        """How far the trials have come; `before` is the state of a step ago, None at the start."""
+
+
+@dataclass(frozen=True)
+class Ended(Generic[S]):
+    """Where the iteration of each trial ended."""
+
+    state: S
+    status: NDArray[np.int8]
+    iterations: NDArray[np.int64]
+    history: list[Array] | None
+    """For each trial the iterates (iterations + 1, n), where they were asked for."""
+
+    @property
+    def x(self) -> Array:
+        return self.state.x
+
+    @property
+    def converged(self) -> Mask:
+        return self.status == Status.CONVERGED
+
+
+def iterate(
+    equations: Equations,
+    solver: Solver[S],
+    start: Array | S,
+    *,
+    tolerance: float,
+    max_iterations: int,
+    budget: float | None = None,
+    history: bool = False,
+) -> Ended[S]:
+    """Iterates from `start`, which is x (trials, n) or a state, until every trial has ended.
+
+    Converged is where `Standing.size` is at most `tolerance`. `budget` bounds the simulations of a trial, a Jacobian
+    counting n; None: no limit. Finished trials leave the batch.
+    """
+    state = ended = solver.begin(equations, start) if isinstance(start, np.ndarray) else start
+    trials, n = state.x.shape
+    tally, active = equations.model.tally, np.arange(trials)
+    status, iterations = np.full(trials, Status.RUNNING, np.int8), np.zeros(trials, np.int64)
+    iterates = [[row] for row in state.x] if history else None
+    standing = solver.standing(equations, None, state)
+    begun = np.maximum(standing.level, 1.0)
+    for iteration in range(max_iterations + 1):
+        if iteration:
+            before, state = state, solver.step(equations, state)
+            standing = solver.standing(equations, before, state)
+            iterations[active] = iteration
+            if iterates is not None:
+                for row, x in zip(active, state.x, strict=True):
+                    iterates[row].append(x)
+        rows = equations.rows
+        spent = tally.cost(n)[rows] >= (np.inf if budget is None else budget)
+        last = Status.MAX_ITERATIONS if iteration == max_iterations else Status.RUNNING
+        now = _endings(standing, tally.failed(rows), tally.singular[rows], begun, spent, tolerance, last)
+        status[active] = now
+        going = now == Status.RUNNING
+        if not going.all():
+            ended = put(ended, active[~going], take(state, ~going))
+            if not going.any():
+                break
+            active, begun = active[going], begun[going]
+            equations, state = equations.subset(going), take(state, going)
+    return Ended(ended, status, iterations, None if iterates is None else [np.array(x) for x in iterates])
+
+
+def _endings(
+    standing: Standing, failed: Mask, singular: Mask, begun: Array, spent: Mask, tolerance: float, last: Status
+) -> NDArray[np.int8]:
+    """The status of each trial: the first line that holds, else `last`."""
+    lines = (
+        (failed, Status.ERROR),
+        (singular, Status.SINGULAR),
+        (~np.isfinite(standing.level), Status.NONFINITE),
+        (standing.size <= tolerance, Status.CONVERGED),
+        (np.broadcast_to(standing.stuck, begun.shape), standing.ending),
+        (standing.level > FAR * begun, Status.DIVERGED),
+        (standing.moved < TINY_STEP * tolerance, standing.ending),
+        (spent, Status.BUDGET),
+    )
+    return np.select([holds for holds, _ in lines], [ending for _, ending in lines], last).astype(np.int8)

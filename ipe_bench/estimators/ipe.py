@@ -1,0 +1,224 @@
+"""Iterative parameter estimation: the nonlinear system of eq. (11), and IPE, from which every solver derives.
+
+A solver is a frozen dataclass with one method, `step`, that reads like its textbook page; the loop, the stopping rules
+and the counting are the driver's.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Any, Generic, Literal, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.basics.errors import UserError, require_counts, require_positive
+from ipe_bench.basics.linalg import (
+    Array,
+    Covariance,
+    Mask,
+    deviations,
+    finite,
+    inverse,
+    multiply,
+    pseudo_inverse,
+    solve,
+)
+from ipe_bench.estimators.base import Estimates, Estimator
+from ipe_bench.estimators.driver import Solver, Standing, iterate
+from ipe_bench.measurements.counted import Counted, Tally
+from ipe_bench.measurements.problem import Problem
+
+Start = Literal["linear_lse", "nominal"]
+
+
+class System(Protocol):
+    """A square system F(x) = 0 for each trial of a batch: all that a solver sees of the problem.
+
+    x and F are (trials, n) in multiples of the parameters' units.
+    """
+
+    def F(self, x: Array) -> Array:
+        """The residual at x; NaN where the model fails."""
+        ...
+
+    def J(self, x: Array) -> Array:
+        """dF/dx (trials, n, n)."""
+        ...
+
+    def solve(self, A: Array, b: Array) -> Array:
+        """A^-1 b for each trial: A (trials, n, n), b (trials, n). Where A is singular the trial ends as such."""
+        ...
+
+    def subset(self, kept: Mask) -> System:
+        """The same system for some of its trials: a line search goes on with the rows that need it."""
+        ...
+
+
+@dataclass(frozen=True)
+class State:
+    """What a solver carries from step to step. Every field is an array with the trials axis in front, so that the
+    driver can drop the trials that have finished; a solver with a memory adds fields in a subclass."""
+
+    x: Array
+    F: Array
+
+
+S = TypeVar("S", bound=State)
+
+
+@dataclass(frozen=True)
+class FrozenSystem:
+    """F(x) = x - x0 - H+ (z - h(x0) - N(x)) = H+ (h(x) - z), eqs. (11) and (19), for the trials `rows` of a batch.
+
+    H+ is frozen: one (1, n, m) for all trials, or one per trial (trials, n, m) where it was re-linearised.
+    """
+
+    model: Counted
+    H_plus: Array
+    deviation: Array
+    """Standard deviations (1, n) or (trials, n) of H+ v, eq. (5): the linear bound."""
+    R: Covariance
+    z: Array
+    rows: NDArray[np.intp]
+
+    @classmethod
+    def at_nominal(cls, problem: Problem, z: Array) -> FrozenSystem:
+        """The paper's system: H about the nominal point, for readings z (trials, m).
+
+        Raises:
+            UserError: H has not full column rank.
+        """
+        H_plus, deficient = pseudo_inverse(problem.H[None], problem.R)
+        if deficient.any():
+            raise UserError(
+                f"measurement={problem.measurement.name}: H has not full column rank at the nominal point, so some "
+                "parameters cannot be told apart; drop or combine parameters, or choose an estimator with a prior"
+            )
+        model = Counted(problem.measurement, Tally.zeros(len(z)))
+        deviation = deviations(frozen_covariance(H_plus, problem.R))
+        return cls(model, H_plus, deviation, problem.R, z, np.arange(len(z)))
+
+    def F(self, x: Array) -> Array:
+        return multiply(self.H_plus, self.model.simulate(x, self.rows) - self.z)
+
+    def J(self, x: Array) -> Array:
+        return np.matmul(self.H_plus, self.model.jacobian(x, self.rows))
+
+    def solve(self, A: Array, b: Array) -> Array:
+        x, singular = solve(A, b)
+        # What is not finite is none of A's doing: the driver finds it in F.
+        self.model.tally.singular[self.rows[singular & finite(A) & finite(b)]] = True
+        return x
+
+    def with_slope(self, H_plus: Array, deviation: Array) -> FrozenSystem:
+        """The same readings with an H+ (trials, n, m) of each trial's own, and its deviations (trials, n)."""
+        return dataclasses.replace(self, H_plus=H_plus, deviation=deviation)
+
+    def subset(self, kept: Mask) -> FrozenSystem:
+        own = {} if len(self.H_plus) == 1 else {"H_plus": self.H_plus[kept], "deviation": self.deviation[kept]}
+        return dataclasses.replace(self, z=self.z[kept], rows=self.rows[kept], **own)
+
+    def relinearized(self, x: Array) -> FrozenSystem:
+        """The same readings with H+ of dh/dx at x (trials, n), for each trial its own; a deficient one is singular."""
+        J = self.model.jacobian(x, self.rows)
+        H_plus, deficient = pseudo_inverse(J, self.R)
+        self.model.tally.singular[self.rows[deficient & finite(J)]] = True
+        return self.with_slope(H_plus, deviations(frozen_covariance(H_plus, self.R)))
+
+    def covariance(self) -> Array:
+        """H+ R H+' (1, n, n) or (trials, n, n), eq. (5): of the linear LSE."""
+        return frozen_covariance(self.H_plus, self.R)
+
+    def sandwich(self, x: Array) -> Array:
+        """(H+ J)^-1 H+ R H+' (H+ J)^-T at x: the first-order covariance (trials, n, n) of the root of eq. (11).
+
+        Not counted as cost: it is part of the report, not of the search.
+        """
+        model = self.model.measurement
+        usable = finite(x)
+        inverse_slope = np.full((len(x), x.shape[1], x.shape[1]), np.nan)
+        if usable.any():
+            report = dataclasses.replace(self, model=Counted.uncounted(model, int(self.rows.max()) + 1))
+            inverse_slope[usable], _ = inverse(report.subset(usable).J(x[usable]))
+        return np.matmul(np.matmul(inverse_slope, self.covariance()), inverse_slope.swapaxes(1, 2))
+
+
+def frozen_covariance(H_plus: Array, R: Covariance) -> Array:
+    """H+ R H+' (trials, n, n) for H+ (trials, n, m), which is eq. (5) where R = sigma^2 I."""
+    scaled = H_plus * R.factor if R.factor.ndim == 1 else np.matmul(H_plus, R.factor)
+    return np.matmul(scaled, scaled.swapaxes(1, 2))
+
+
+def begin(problem: Problem, z: Array, start: Start) -> tuple[Array, FrozenSystem]:
+    """Where an iteration begins, x (trials, n), and the paper's system, which has counted the cost of it.
+
+    F(x0) = H+ (h(x0) - z), so the linear LSE of eq. (2) is one fixed-point step from the nominal point: eq. (16).
+    """
+    system = FrozenSystem.at_nominal(problem, z)
+    x0 = np.repeat(problem.x0[None], len(z), axis=0)
+    return (x0 - system.F(x0) if start == "linear_lse" else x0), system
+
+
+@dataclass(frozen=True, kw_only=True)
+class IPE(Solver[S], Estimator, Generic[S]):
+    """The paper's estimator: a solver iterated on the system of eq. (11), H frozen at the nominal point.
+
+    Reports the sandwich covariance (H+ J)^-1 H+ R H+' (H+ J)^-T at the estimate. A new solver is a frozen dataclass
+    that derives from this class and writes `step`; one with a memory writes `init` too, and names its state:
+    `class Broyden(IPE[BroydenState])`.
+    """
+
+    start: Start = "linear_lse"
+    """Where the iteration begins: at the linear LSE, eq. (16), or at the nominal point."""
+    max_iterations: int = 100
+    tolerance: float = 1e-6
+    """Largest abs(F_i) in standard deviations of the linear bound, eq. (5)."""
+    budget: float | None = None
+    """Simulations that a trial may cost, a Jacobian counting n; None: no limit."""
+
+    equation = "frozen"
+
+    def __post_init__(self) -> None:
+        if self.start not in ("linear_lse", "nominal"):
+            raise UserError(f"start={self.start}: choose linear_lse or nominal")
+        require_positive(self, "tolerance", "budget")
+        require_counts(self, "max_iterations")
+
+    def init(self, system: System, x: Array, F: Array) -> S:
+        """The state at the start x (trials, n), where the residual is F."""
+        return State(x, F)  # type: ignore[return-value]
+
+    @abstractmethod
+    def step(self, system: System, state: S) -> S:
+        """The state after one more iteration."""
+
+    def begin(self, system: Any, x: Array) -> S:
+        return self.init(system, x, system.F(x))
+
+    def standing(self, system: Any, before: S | None, state: S) -> Standing:
+        """abs(F_i), and the step, in standard deviations of the linear bound."""
+        return root_standing(system.deviation, before, state)
+
+    def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
+        x, system = begin(problem, z, self.start)
+        ended = iterate(
+            system,
+            self,
+            x,
+            tolerance=self.tolerance,
+            max_iterations=self.max_iterations,
+            budget=self.budget,
+            history=history,
+        )
+        return Estimates.of(ended, system.model.tally, covariance=system.sandwich(ended.x))
+
+
+def root_standing(deviation: Array, before: State | None, state: State) -> Standing:
+    """How far F is from zero, and how long the last step was, in standard deviations (1, n) or (trials, n)."""
+    residual = np.abs(state.F / deviation).max(axis=1)
+    if before is None:
+        return Standing(residual, residual, np.full(len(residual), np.inf))
+    return Standing(residual, residual, np.abs((state.x - before.x) / deviation).max(axis=1))

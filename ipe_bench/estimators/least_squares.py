@@ -1,0 +1,206 @@
+"""Least squares for a batch of trials: the objective, what a Jacobian says of it, and where a minimisation ended.
+
+The methods have pages of their own, `gauss_newton` and `levenberg_marquardt`; what an estimator starts from, fits and
+reports is left to it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc
+
+from ipe_bench.basics.linalg import Array, Covariance, Mask, finite, inverse, multiply, solve
+from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.base import Estimates
+from ipe_bench.estimators.driver import Solver, Standing, iterate
+from ipe_bench.measurements.counted import Counted, Tally
+from ipe_bench.measurements.problem import Problem
+
+
+@dataclass(frozen=True)
+class Objective:
+    """|R^-1/2 (h(x) - z)|^2, plus |(x - x0) / prior_deviation|^2 where a prior counts, for the trials `rows`."""
+
+    model: Counted
+    R: Covariance
+    z: Array
+    rows: NDArray[np.intp]
+    x0: Array
+    prior_deviation: Array | None = None
+
+    @classmethod
+    def of(cls, problem: Problem, z: Array, *, prior: bool, inflation: float = 1.0) -> Objective:
+        """The objective of all readings z (trials, m); with the prior, its deviations times `inflation`."""
+        model = Counted(problem.measurement, Tally.zeros(len(z)))
+        deviation = problem.prior_used(inflation) if prior else None
+        return cls(model, problem.R, z, np.arange(len(z)), problem.x0, deviation)
+
+    @property
+    def readings(self) -> int:
+        return self.z.shape[1]
+
+    def residual(self, x: Array) -> Array:
+        """Whitened residuals (trials, m), followed by those of the prior (trials, n) where it counts."""
+        r = self.R.whiten(self.model.simulate(x, self.rows) - self.z)
+        if self.prior_deviation is None:
+            return r
+        return np.concatenate([r, (x - self.x0) / self.prior_deviation], axis=1)
+
+    def jacobian(self, x: Array) -> Array:
+        """The derivative of the whitened residuals (trials, m, n) or (trials, m + n, n)."""
+        J = self.R.whiten_jacobian(self.model.jacobian(x, self.rows))
+        if self.prior_deviation is None:
+            return J
+        prior = np.broadcast_to(np.diag(1.0 / self.prior_deviation), (len(x), x.shape[1], x.shape[1]))
+        return np.concatenate([J, prior], axis=1)
+
+    def subset(self, kept: Mask) -> Objective:
+        return dataclasses.replace(self, z=self.z[kept], rows=self.rows[kept])
+
+
+@dataclass(frozen=True)
+class Slope:
+    """J = Q U of each trial: all that a step needs to know of the Jacobian."""
+
+    U: Array
+    gradient: Array
+    """Q' r (trials, n): the part of the residual that a step can remove."""
+    columns: Array
+    """Column norms of J (trials, n)."""
+    newton: Array
+    """The Gauss-Newton step (trials, n); NaN where J has not full rank."""
+    size: Array
+    """Its largest entry (trials,) in standard deviations of the local bound (J'J)^-1; infinite where J has not full
+    rank."""
+
+    @classmethod
+    def of(cls, J: Array, r: Array) -> Slope:
+        missing = max(J.shape[2] - J.shape[1], 0)
+        # Fewer readings than parameters: rows of zeros keep U square, and deficient.
+        J, r = np.pad(J, ((0, 0), (0, missing), (0, 0))), np.pad(r, ((0, 0), (0, missing)))
+        usable = finite(J) & finite(r)
+        Q, U = np.linalg.qr(np.where(usable[:, None, None], J, 0.0))
+        columns = np.sqrt(np.sum(U**2, axis=1))
+        scaled = U / np.where(columns > 0, columns, 1.0)[:, None, :]
+        floor = np.finfo(float).eps * max(J.shape[1:]) * np.sqrt(J.shape[2])
+        deficient = ~usable | (np.abs(np.diagonal(scaled, axis1=1, axis2=2)).min(axis=1) <= floor)
+        gradient = np.where(usable[:, None], multiply(Q.swapaxes(1, 2), r), np.nan)
+        inverse_U, _ = inverse(np.where(deficient[:, None, None], np.nan, U))
+        newton = -multiply(inverse_U, gradient)
+        deviation = np.sqrt(np.sum(inverse_U**2, axis=2))
+        size = np.abs(newton / deviation).max(axis=1)
+        return cls(U, gradient, columns, newton, np.where(np.isfinite(size), size, np.inf))
+
+    def damped(self, weights: Array) -> tuple[Array, Array]:
+        """The step that minimises |r + J s|^2 + |weights s|^2, and the decrease of |r + J s|^2 + that it predicts."""
+        diagonal = weights[:, :, None] * np.eye(self.U.shape[1])
+        Q, U = np.linalg.qr(np.concatenate([self.U, diagonal], axis=1))
+        step, _ = solve(U, -multiply(Q[:, : self.U.shape[1]].swapaxes(1, 2), self.gradient))
+        change = multiply(self.U, step)
+        return step, -np.einsum("ti,ti->t", change, 2.0 * self.gradient + change)
+
+
+@dataclass(frozen=True)
+class Descent:
+    """What the methods of this room carry from step to step; every field has the trials in front."""
+
+    x: Array
+    r: Array
+    """Whitened residuals, those of the prior included."""
+    cost: Array
+    """|r|^2."""
+    slope: Slope
+    moved: Array
+    """The last step, tried or taken, in standard deviations of the readings that it moves."""
+    lam: Array
+    growth: Array
+    scale: Array
+    """What damping measures steps by: the diagonal of D (trials, n)."""
+
+    @classmethod
+    def at(cls, objective: Objective, x: Array, lam: float = 0.0) -> Descent:
+        """The state at the start."""
+        r = objective.residual(x)
+        slope = Slope.of(objective.jacobian(x), r)
+        trials = len(x)
+        scale = np.where(slope.columns > 0, slope.columns, 1.0)
+        far = np.full(trials, np.inf)
+        return cls(x, r, squared(r), slope, far, np.full(trials, lam), np.full(trials, 2.0), scale)
+
+    def reach(self, step: Array) -> Array:
+        """The length (trials,) of a step in standard deviations of the readings that it moves."""
+        return np.abs(step * np.linalg.norm(self.slope.U, axis=1)).max(axis=1)
+
+    @property
+    def rankless(self) -> Mask:
+        """Where J has not full rank (trials,)."""
+        return ~np.isfinite(self.slope.size)
+
+    def standing(self, stuck: Mask) -> Standing:
+        """The Gauss-Newton step still to go says how far the gradient is from zero; the cost says what diverges."""
+        known = np.isfinite(self.cost) & finite(self.slope.gradient)
+        level = np.where(known, np.sqrt(self.cost), np.nan)
+        ending = np.where(self.rankless, Status.SINGULAR, Status.STALLED)
+        return Standing(self.slope.size, level, self.moved, stuck, ending)
+
+
+@dataclass(frozen=True)
+class Minima:
+    """Where the minimisation of each trial ended, with what is known of the objective there."""
+
+    x: Array
+    status: NDArray[np.int8]
+    iterations: NDArray[np.int64]
+    history: list[Array] | None
+    covariance: Array
+    """(J' R^-1 J)^-1 (trials, n, n), with P0^-1 inside where the prior counts; NaN where it does not exist."""
+    chi_square: Array
+    """|R^-1/2 (h(x) - z)|^2 (trials,), of the readings alone."""
+
+    @property
+    def converged(self) -> Mask:
+        return self.status == Status.CONVERGED
+
+    def fit_probability(self, readings: int) -> Array:
+        """The chi-square test of the fit (trials,): how probable residuals at least this large are if the model holds,
+        R is right and the minimum is the global one."""
+        return chdtrc(max(readings - self.x.shape[1], 1), self.chi_square)
+
+    def estimates(self, tally: Tally, readings: int) -> Estimates:
+        """What an estimator hands back."""
+        extras = {"fit_p": self.fit_probability(readings)}
+        return Estimates.of(self, tally, covariance=self.covariance, extras=extras)
+
+
+def minimize(
+    objective: Objective,
+    method: Solver[Descent],
+    x: Array,
+    *,
+    tolerance: float,
+    max_iterations: int,
+    budget: float | None = None,
+    history: bool = False,
+) -> Minima:
+    """Minimises the objective from x (trials, n) by a method of this room.
+
+    Converged is where the Gauss-Newton step, which is the gradient in whitened units, is at most `tolerance` standard
+    deviations of the local bound in every parameter. An iteration is a step tried, taken or not.
+    """
+    limits: dict[str, Any] = {"tolerance": tolerance, "max_iterations": max_iterations, "budget": budget}
+    ended = iterate(objective, method, x, history=history, **limits)
+    # U^-1 U^-T: inverting U'U would lose twice the digits, and with them the sign of a variance.
+    inverse_U, _ = inverse(ended.state.slope.U)
+    covariance = np.matmul(inverse_U, inverse_U.swapaxes(1, 2))
+    chi_square = squared(ended.state.r[:, : objective.readings])
+    return Minima(ended.x, ended.status, ended.iterations, ended.history, covariance, chi_square)
+
+
+def squared(r: Array) -> Array:
+    """|r|^2 of each trial."""
+    return np.einsum("ti,ti->t", r, r)

@@ -1,0 +1,78 @@
+"""Counting what a batch costs: a model whose evaluations are counted, and in which no trial spoils another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.basics.errors import describe_exception
+from ipe_bench.basics.linalg import Array, Mask
+from ipe_bench.measurements.base import Measurement
+
+
+@dataclass
+class Tally:
+    """What a batch has cost and what went wrong in it, by trial; shared by all views of one batch."""
+
+    simulations: Array
+    jacobians: Array
+    singular: Mask
+    messages: dict[int, str] = field(default_factory=dict)
+
+    @classmethod
+    def zeros(cls, trials: int) -> Tally:
+        return cls(np.zeros(trials), np.zeros(trials), np.zeros(trials, dtype=bool))
+
+    def cost(self, n: int) -> Array:
+        """Simulations (trials,), a Jacobian counting n."""
+        return self.simulations + n * self.jacobians
+
+    def failed(self, rows: NDArray[np.intp]) -> Mask:
+        """Which of the trials `rows` an exception has ended."""
+        return np.isin(rows, list(self.messages))
+
+
+@dataclass(frozen=True)
+class Counted:
+    """A model that counts its evaluations per trial, and in which a trial that raises spoils only itself.
+
+    `share` is the cost of one evaluation: below 1 for a model restricted to the first epochs.
+    """
+
+    measurement: Measurement
+    tally: Tally
+    share: float = 1.0
+
+    @classmethod
+    def uncounted(cls, measurement: Measurement, trials: int) -> Counted:
+        """For what is part of a report and not of a search: a tally that nobody reads."""
+        return cls(measurement, Tally.zeros(trials))
+
+    def simulate(self, x: Array, rows: NDArray[np.intp]) -> Array:
+        """h(x) (trials, m) for the trials `rows` of the tally."""
+        self.tally.simulations[rows] += self.share
+        return self._each_if_raising(self.measurement.simulate, x, rows, (self.measurement.m,))
+
+    def jacobian(self, x: Array, rows: NDArray[np.intp]) -> Array:
+        """dh/dx (trials, m, n) for the trials `rows` of the tally."""
+        self.tally.jacobians[rows] += self.share
+        return self._each_if_raising(self.measurement.jacobian, x, rows, (self.measurement.m, self.measurement.n))
+
+    def _each_if_raising(
+        self, function: Callable[[Array], Array], x: Array, rows: NDArray[np.intp], shape: tuple[int, ...]
+    ) -> Array:
+        try:
+            return function(x)
+        except MemoryError:
+            raise
+        except Exception:
+            result = np.full((len(x), *shape), np.nan)
+            for i, row in enumerate(rows):
+                try:
+                    result[i] = function(x[i : i + 1])[0]
+                except Exception as error:
+                    self.tally.messages[int(row)] = describe_exception(error)
+            return result

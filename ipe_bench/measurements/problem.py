@@ -1,0 +1,46 @@
+"""What an estimator is told besides the readings: the model, R, and the prior. The truth is not in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.measurements.base import Measurement
+
+_FIXED = 1e-9
+"""A prior deviation of zero is taken for this share of the largest."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """All that an estimator may know besides the readings."""
+
+    measurement: Measurement
+    R: Covariance
+    prior_deviation: Array | None = None
+    """Standard deviation (n,) of the parameters about the nominal point; None where no prior is known."""
+
+    @property
+    def x0(self) -> Array:
+        return self.measurement.nominal
+
+    @cached_property
+    def H(self) -> Array:
+        """H (m, n) of eq. (1)."""
+        return self.measurement.linearization()
+
+    def prior_used(self, inflation: float = 1.0) -> Array | None:
+        """The prior's standard deviations (n,) times `inflation`; a parameter that the prior fixes is nearly fixed."""
+        deviation = self.prior_deviation
+        if deviation is None:
+            return None
+        return inflation * np.maximum(deviation, _FIXED * deviation.max())
+
+
+def recorded_problem(measurement: Measurement) -> Problem:
+    """What estimators are told of the readings that come with a model: no prior, since nothing was drawn from one."""
+    assert measurement.recorded is not None
+    return Problem(measurement, measurement.recorded.R)

@@ -1,0 +1,1 @@
+"""Real readings: from a file to an answer."""

@@ -1,0 +1,104 @@
+"""What the residuals of one fit say of the model: whether they are as large as R says, whether they are white, and
+which readings are outliers. Numbers in, numbers out: where readings come from is left to others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from ipe_bench.basics.linalg import Array, Covariance
+
+OUTLIER_LEVEL = 0.01
+"""Chance that good readings of a whole file give an outlier somewhere."""
+DRAWS = 1999
+"""Simulated fits behind the test of whiteness: its p is a multiple of 1 / (DRAWS + 1)."""
+_LONGEST_LAG = 10
+_DRAWS_AT_ONCE = 250
+
+
+@dataclass(frozen=True)
+class Whiteness:
+    """The test that successive residuals of one instrument have nothing to do with each other."""
+
+    statistic: float
+    """Ljung and Box's Q; NaN where the residuals are not finite or too few to have neighbours."""
+    lags: int
+    p_value: float
+    """Chance of a Q at least this large if the model and R are right."""
+
+
+def explained(J: Array, R: Covariance) -> Array:
+    """An orthonormal basis (m, rank) of what the parameters explain of whitened readings, for J = dh/dx (m, n).
+
+    Whitened residuals of a least-squares fit are, to first order, what this basis leaves of the whitened noise.
+    """
+    Jw = R.whiten_jacobian(J)
+    size = np.linalg.norm(Jw, axis=0)
+    # Scaled first: the parameters' units must not decide what is singular.
+    U, s, _ = np.linalg.svd(Jw / np.where(size > 0, size, 1.0), full_matrices=False)
+    return U[:, s > np.finfo(float).eps * max(J.shape) * s.max(initial=0.0)]
+
+
+def normalised(w: Array, Q: Array, R: Covariance) -> Array:
+    """Residuals (m,) in their own standard deviations: N(0, 1) each if the model and R are right.
+
+    w = R^-1/2 r (m,) are the whitened residuals, Q (m, rank) is the basis of `explained`. For independent readings this
+    is r_i / (sigma_i sqrt(1 - leverage_i)); in general Baarda's w-test, (R^-1 r)_i over its deviation (A testing
+    procedure for use in geodetic networks, Netherlands Geodetic Commission, 1968). NaN where the parameters absorb a
+    reading's error completely, so that nothing can be said of it.
+    """
+    if R.factor.ndim == 1:
+        numerator, before, taken = w, np.ones(len(w)), np.sum(Q**2, axis=1)
+    else:
+        A = R.whiten(np.eye(len(w)))  # R^-T/2
+        numerator, before, taken = A @ w, np.sum(A**2, axis=1), np.sum((A @ Q) ** 2, axis=1)
+    left = before - taken
+    with np.errstate(all="ignore"):
+        return np.where(left > 1e-9 * before, numerator / np.sqrt(left), np.nan)
+
+
+def outlier_limit(m: int, level: float = OUTLIER_LEVEL) -> float:
+    """Normalised residuals beyond this are outliers: by chance, one among m readings with probability `level` at most
+    (Bonferroni)."""
+    return float(norm.isf(level / (2 * max(m, 1))))
+
+
+def whiteness(w: Array, Q: Array, series: NDArray[np.intp], draws: int = DRAWS) -> Whiteness:
+    """Ljung and Box's test (Biometrika 65, 1978) of whitened residuals w (m,), pooled over instruments.
+
+    series (channels, length) says which residual stands where in each instrument's succession, -1 where a reading is
+    missing. Fitted residuals are not white even when the noise is: the fit has taken out what the basis Q (m, rank)
+    explains. So p is not that of chi-square but is counted among as many simulated fits of white noise (a Monte Carlo
+    test: Davison and Hinkley, Bootstrap Methods and their Application, 1997, section 4.2). The draws are always the
+    same ones.
+    """
+    lags = min(_LONGEST_LAG, max(1, series.shape[1] // 5))
+    there = series >= 0
+    pairs = [int(np.sum(there[:, :-k] & there[:, k:])) for k in range(1, lags + 1)]
+    if not (np.isfinite(w).all() and w.any() and any(pairs)):
+        return Whiteness(np.nan, lags, np.nan)
+    seen = float(_ljung_box(w[None], series, pairs)[0])
+    rng = np.random.Generator(np.random.Philox(0))
+    as_large = 0
+    for start in range(0, draws, _DRAWS_AT_ONCE):
+        noise = rng.standard_normal((min(_DRAWS_AT_ONCE, draws - start), len(w)))
+        # Where one reading is left over, all Q are the same but for round-off.
+        as_large += int(np.sum(_ljung_box(noise - (noise @ Q) @ Q.T, series, pairs) >= seen * (1 - 1e-9)))
+    return Whiteness(seen, lags, (1 + as_large) / (1 + draws))
+
+
+def _ljung_box(w: Array, series: NDArray[np.intp], pairs: list[int]) -> Array:
+    """Q (fits,) of residuals w (fits, m); a pair with a missing reading counts nowhere."""
+    there = series >= 0
+    placed = np.where(there, w[:, series], 0.0)
+    count, total = int(there.sum()), np.sum(placed**2, axis=(1, 2))
+    Q = np.zeros(len(w))
+    for k, number in enumerate(pairs, 1):
+        if number:
+            r = np.sum(placed[:, :, :-k] * placed[:, :, k:], axis=(1, 2)) / total
+            Q += count * (count + 2) * r**2 / number
+    return Q

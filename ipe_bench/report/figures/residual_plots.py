@@ -1,0 +1,178 @@
+"""Figures of estimates from real readings: residuals, and what the readings leave open of pairs of parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
+
+import numpy as np
+from scipy.stats import chi2
+
+from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.statuses import Status
+from ipe_bench.measurements.base import Measurement
+from ipe_bench.real.fits import Fit
+from ipe_bench.report.figures import common
+from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.style import BOUND_COLOR, Look, house_style, looks
+from ipe_bench.report.words import p_value
+
+MOST_ESTIMATORS = 12
+"""Estimators with a panel of residuals; `residuals.csv` has all."""
+MOST_PAIRS = 9
+LEVEL = 0.95
+_BENT = 30.0
+"""Normalised residuals beyond this are drawn on a logarithmic axis: a model that does not fit at all."""
+_NEAR = 10.0
+"""Ellipses whose centres lie within so many deviations of the best fit's are in view."""
+
+
+def draw_fits(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]:
+    """The residual plot and, with two parameters or more, the covariance ellipses."""
+    look = looks([one.label for one in fits])
+    with house_style():
+        yield from _residuals(model, fits, look)
+        yield from _ellipses(model, fits, look)
+
+
+def _residuals(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look]) -> Iterator[Drawing]:
+    from matplotlib.ticker import MaxNLocator
+
+    shown = [one for one in fits if np.isfinite(one.normalised).any()][:MOST_ESTIMATORS]
+    if not shown:
+        return
+    x, heading = _abscissa(model)
+    across = 1 if len(shown) == 1 else 2 if len(shown) in (2, 4) else 3
+    fig, axes = common.panels(len(shown), height=2.6, extra=0.4, most_across=across)
+    for one, ax in zip(shown, axes, strict=True):
+        known, out, limit = np.isfinite(one.normalised), one.outliers, one.outlier_limit
+        style = look[one.label]
+        ax.axhline(0.0, color=BOUND_COLOR, linewidth=0.6, zorder=1)
+        for i, at in enumerate((limit, -limit)):
+            common.bound_line(ax, at, "" if i else "limit for outliers")
+        good = known & ~out
+        ax.plot(x[good], one.normalised[good], linestyle="", marker="o", markersize=3, alpha=0.75, color=style.color)
+        if out.any():
+            ax.plot(x[out], one.normalised[out], linestyle="", marker="x", markersize=5, color=style.color)
+            ax.plot(
+                x[out],
+                one.normalised[out],
+                linestyle="",
+                marker="o",
+                markersize=10 if out.mean() < 0.1 else 5,
+                fillstyle="none",
+                color="#C00000",
+                label="outlier",
+            )
+        largest = float(np.abs(one.normalised[known]).max())
+        if largest > _BENT:
+            ax.set_yscale("symlog", linthresh=10.0, linscale=1.0)
+        else:
+            edge = 1.15 * max(largest, limit)
+            ax.set_ylim(-edge, edge)
+            ax.yaxis.set_major_locator(MaxNLocator(7, integer=True))
+        tests = f"fit p {p_value(one.p_value)}, white p {p_value(one.whiteness.p_value)}"
+        ax.set_title(f"{common.text(one.label)}\n{tests}")
+        ax.set_xlabel(common.text(heading))
+        ax.set_ylabel("residual / its deviation")
+    common.legend_below(fig, axes)
+    parts = [f"{one.label} {int(one.outliers.sum())}" for one in shown]
+    caption = (
+        "Normalised residuals of the readings; each is standard normal where the model and the noise are right."
+        f" Beyond ±{shown[0].outlier_limit:.2f} a reading is an outlier: {common.enumerate_few(parts, 12)}."
+        " p is that of chi-square, white that of the Ljung-Box test."
+    )
+    if len(fits) > len(shown):
+        caption += f" {len(fits) - len(shown)} further estimators: see residuals.csv."
+    yield Drawing("residuals", "Residuals", caption, fig)
+
+
+def _abscissa(model: Measurement) -> tuple[Array, str]:
+    """Where each reading (m,) stands along the axis: its time where it has one, else its epoch, else its row."""
+    if model.epochs is None:
+        return np.arange(1.0, model.m + 1), "reading"
+    epoch = np.zeros(model.m)
+    for number, rows in enumerate(model.epochs, 1):
+        epoch[rows] = number
+    for name, column in model.index.items():
+        if not all(isinstance(v, int | float | np.number) for v in column):
+            continue
+        values = np.array(column, dtype=float)
+        alike = all(np.ptp(values[rows]) == 0 for rows in model.epochs)
+        if alike and np.corrcoef(values, epoch)[0, 1] > 0.99:
+            return values, name
+    return epoch, "epoch"
+
+
+def most_correlated(correlation: Array, most: int = MOST_PAIRS) -> list[tuple[int, int]]:
+    """Pairs of parameters by falling magnitude of correlation (n, n); all of them where they are few."""
+    pairs = list(combinations(range(len(correlation)), 2))
+    pairs.sort(key=lambda pair: -np.nan_to_num(abs(correlation[pair])))
+    return pairs[:most]
+
+
+def ellipse(P: Array, level: float = LEVEL, points: int = 181) -> Array:
+    """The boundary (points, 2) of the region about zero in which an error of covariance P (2, 2) lies with that
+    probability."""
+    # Scaled first: the parameters' units must not decide what is singular.
+    d = np.sqrt(np.diagonal(P))
+    values, vectors = np.linalg.eigh(P / np.outer(d, d))
+    turn = np.linspace(0.0, 2 * np.pi, points)
+    circle = np.sqrt(chi2.ppf(level, 2)) * np.column_stack([np.cos(turn), np.sin(turn)])
+    return (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T * d
+
+
+def _ellipses(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look]) -> Iterator[Drawing]:
+    from matplotlib.ticker import MaxNLocator
+
+    # Where an estimator did not converge, its covariance says nothing of the true values.
+    told = [f for f in fits if f.status is Status.CONVERGED and (f.standard_errors > 0).all()]
+    if not told or model.n < 2:
+        return
+    best = min(told, key=lambda f: f.chi_square)
+    pairs = most_correlated(best.correlation)
+    across = {1: 1, 2: 2, 3: 3, 4: 2}.get(len(pairs), 3)
+    fig, axes = common.panels(len(pairs), height=2.7, extra=0.5, most_across=across)
+    away: dict[str, None] = {}
+    # Equal ellipses lie on top of each other: the later ones are thinner, so that all are seen.
+    widths = np.linspace(4.0, 1.0, len(told)) if len(told) > 1 else [1.6]
+    for (i, j), ax in zip(pairs, axes, strict=True):
+        pick = np.ix_([i, j], [i, j])
+        centre, d = best.x[[i, j]], best.standard_errors[[i, j]]
+        near = []
+        for one, linewidth in zip(told, widths, strict=True):
+            offset = one.x[[i, j]] - centre
+            outline = offset + ellipse(one.covariance[pick])
+            style = look[one.label]
+            ax.plot(
+                *outline.T, color=style.color, linestyle=style.dash, linewidth=linewidth, label=common.text(one.label)
+            )
+            ax.plot(*offset, color=style.color, marker=style.marker, markersize=5, markeredgecolor="white")
+            if (np.abs(offset) <= _NEAR * d).all():
+                near.append(outline)
+            else:
+                away[one.label] = None
+        edges = np.concatenate(near)
+        low, high = edges.min(axis=0), edges.max(axis=0)
+        margin = 0.08 * (high - low)
+        ax.set_xlim(low[0] - margin[0], high[0] + margin[0])
+        ax.set_ylim(low[1] - margin[1], high[1] + margin[1])
+        ax.xaxis.set_major_locator(MaxNLocator(4))
+        ax.yaxis.set_major_locator(MaxNLocator(5))
+        ax.ticklabel_format(style="sci", scilimits=(-3, 4), useMathText=True)
+        for set_label, k in ((ax.set_xlabel, i), (ax.set_ylabel, j)):
+            parameter = model.parameters[k]
+            unit = f" [{parameter.unit}]" if parameter.unit else ""
+            sign = "+" if best.x[k] < 0 else "−"
+            set_label(common.text(f"{parameter.name} {sign} {abs(best.x[k]):.5g}{unit}"))
+        ax.set_title(f"correlation {best.correlation[i, j]:.3f}")
+    common.legend_below(fig, axes)
+    count = model.n * (model.n - 1) // 2
+    which = f"the {len(pairs)} most correlated of {count} pairs" if count > len(pairs) else "each pair of parameters"
+    caption = (
+        f"Regions that hold the true values with {LEVEL:.0%} probability if the model and the noise are right, for"
+        f" {which}, about the estimates of {best.label}."
+    )
+    if away:
+        caption += f" Out of view in some panels: {common.enumerate_few(list(away))}."
+    yield Drawing("ellipses", "Covariance ellipses", caption, fig)

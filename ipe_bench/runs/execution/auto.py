@@ -1,0 +1,29 @@
+"""The default: worker processes where there is something to share out or to guard against, else this process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ipe_bench.runs.execution.base import Event, Work
+from ipe_bench.runs.execution.processes import Processes
+from ipe_bench.runs.execution.serial import Serial
+
+
+@dataclass(frozen=True)
+class Auto(Processes):
+    """Worker processes as in `Processes`, except for a single task that says of itself that it is trusted.
+
+    A worker takes seconds to start, which a job of one block does not win back; compiled models use every core without.
+    """
+
+    def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
+        limited = self.block_timeout_s is not None or self.memory_limit_gb is not None
+        if len(tasks) == 1 and not limited and getattr(tasks[0], "trusted", False):
+            return Serial().run(work, tasks)
+        return super().run(work, tasks)
+
+    def warm_up(self, work: Work, tasks: int) -> None:
+        if tasks > 1:
+            super().warm_up(work, tasks)

@@ -1,0 +1,71 @@
+"""What an execution is: it runs tasks somewhere and tells, in any order, how each of them gets on and ends."""
+
+from __future__ import annotations
+
+import traceback
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from ipe_bench.basics.errors import StorageError, UserError, describe_exception
+from ipe_bench.basics.naming import Named
+
+Work = Callable[[Any], Iterable[Any]]
+"""Does a task in steps: what it yields after each step is handed on, and proves that it is alive."""
+
+FATAL = (UserError, StorageError)
+"""Exceptions that concern the whole run: they end it, where any other is a failure of one task."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a task did not end well."""
+
+    status: Literal["error", "timeout", "died"]
+    """It raised; it exceeded a time limit; or the process that it ran in ended."""
+    message: str
+    detail: str = ""
+    """The traceback, where there is one."""
+
+    @classmethod
+    def of(cls, error: BaseException) -> Failure:
+        return cls("error", describe_exception(error), "".join(traceback.format_exception(error)))
+
+
+@dataclass(frozen=True)
+class Event:
+    """News of one task: a step was done, or it ended."""
+
+    index: int
+    """The task's place in the sequence that was given."""
+    step: Any = None
+    ended: bool = False
+    failure: Failure | None = None
+
+
+class Execution(Named, ABC):
+    """Where tasks run. A new execution is a frozen dataclass that writes `run`."""
+
+    @abstractmethod
+    def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
+        """Yields an event per step, and one with `ended` per task; an exception in `work` fails its task alone.
+
+        Closing the iterator, or an exception of `FATAL`, stops what is under way.
+        """
+
+    def warm_up(self, work: Work, tasks: int) -> None:
+        """Starts what takes time to start before so many tasks can run, without waiting for it. May be left out."""
+
+
+def check_limits(workers: int | None, block_timeout_s: float | None, memory_limit_gb: float | None) -> None:
+    """Refuses limits that make no sense.
+
+    Raises:
+        UserError: naming the option.
+    """
+    if workers is not None and workers < 1:
+        raise UserError(f"workers={workers}: give a whole number above 0, or null")
+    for option, value in (("block_timeout_s", block_timeout_s), ("memory_limit_gb", memory_limit_gb)):
+        if value is not None and not value > 0:
+            raise UserError(f"{option}={value}: give a number above 0, or null for no limit")

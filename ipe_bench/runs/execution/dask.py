@@ -1,0 +1,126 @@
+"""Tasks on a Dask cluster: on this machine, behind a scheduler's address, or in the jobs of a batch system."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import functools
+import json
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.machine import cores
+from ipe_bench.runs.execution.base import FATAL, Event, Execution, Failure, Work, check_limits
+from ipe_bench.runs.execution.processes import supervise
+
+_CONNECT_S = 30
+
+
+@dataclass(frozen=True)
+class Dask(Execution):
+    """Runs tasks on the workers of a Dask cluster, which write to the output directory themselves: all machines need it
+    under the same path, and the same installation of ipe-bench and its plugins.
+
+    Each Dask worker hands its task on to a process of its own, so that what an estimator does to its process never
+    reaches Dask. A task whose Dask worker dies is given to another one by Dask itself.
+    """
+
+    workers: int | None = None
+    """Workers to start; None: one per core here, one job in a batch system."""
+    address: str | None = None
+    """A running scheduler, such as tcp://10.0.0.1:8786, to use in place of starting one."""
+    jobqueue: str | None = None
+    """A cluster class of dask-jobqueue, such as SLURMCluster, to start workers as jobs of a batch system."""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Keyword arguments of the cluster class."""
+    block_timeout_s: float | None = None
+    """Seconds that one estimator may take for one block; None: no limit."""
+    memory_limit_gb: float | None = None
+    """Memory that one estimating process may use, in 1e9 bytes; None: no limit."""
+
+    def __post_init__(self) -> None:
+        check_limits(self.workers, self.block_timeout_s, self.memory_limit_gb)
+        if self.address is not None and (self.jobqueue is not None or self.workers is not None or self.options):
+            raise UserError(f"address={self.address}: goes with no workers, jobqueue or options; leave out either")
+
+    def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
+        if not tasks:
+            return
+        client = self._client()
+        from distributed import as_completed
+
+        limits = (self.block_timeout_s, self.memory_limit_gb)
+        futures = {client.submit(_run_one, work, task, *limits, pure=False): i for i, task in enumerate(tasks)}
+        try:
+            for future in as_completed(list(futures)):
+                index = futures[future]
+                error = future.exception()
+                if isinstance(error, FATAL):
+                    raise error
+                if error is not None:  # Dask gave up on it: its workers died again and again
+                    failure = Failure("died", f"{type(error).__name__}: {' '.join(str(error).split())}")
+                    yield Event(index, ended=True, failure=failure)
+                    continue
+                steps, failure = future.result()
+                for step in steps:
+                    yield Event(index, step)
+                yield Event(index, ended=True, failure=failure)
+        finally:
+            with contextlib.suppress(Exception):
+                client.cancel(list(futures), force=True)
+
+    def _client(self) -> Any:
+        options = json.dumps(dict(self.options), sort_keys=True, default=str)
+        return _connect(self.workers, self.address, self.jobqueue, options)
+
+
+def _run_one(work: Work, task: Any, step_timeout_s: float | None, memory_limit_gb: float | None) -> Any:
+    """On a Dask worker: the steps and the failure of one task, done in a process beside it."""
+    events = list(supervise(work, [task], 1, 1, step_timeout_s, memory_limit_gb))
+    return [event.step for event in events if not event.ended], events[-1].failure
+
+
+@functools.cache
+def _connect(workers: int | None, address: str | None, jobqueue: str | None, options_json: str) -> Any:
+    """A client of the cluster that these options describe; it serves all runs of this process, then is closed."""
+    try:
+        import distributed
+    except ImportError:
+        raise UserError('execution=dask: Dask is not installed; pip install "ipe-bench[dask]"') from None
+    options = json.loads(options_json)
+    if address is not None:
+        try:
+            client = distributed.Client(address, timeout=_CONNECT_S)
+        except (OSError, ValueError) as error:
+            raise UserError(f"execution.address={address}: no scheduler answers there ({error})") from None
+        atexit.register(client.close)
+        return client
+    if jobqueue is not None:
+        cluster = _jobqueue_cluster(jobqueue, options)
+        cluster.scale(workers or 1)
+    else:
+        defaults = {"n_workers": workers or cores(), "threads_per_worker": 1, "dashboard_address": None}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # it may warn of ports in use
+            cluster = distributed.LocalCluster(**{**defaults, **options})  # pyright: ignore[reportArgumentType]
+    client = distributed.Client(cluster)
+    atexit.register(cluster.close)
+    atexit.register(client.close)
+    return client
+
+
+def _jobqueue_cluster(name: str, options: Mapping[str, Any]) -> Any:
+    try:
+        import dask_jobqueue
+    except ImportError:
+        raise UserError('execution=dask: dask-jobqueue is not installed; pip install "ipe-bench[dask]"') from None
+    known = [n for n in dir(dask_jobqueue) if n.endswith("Cluster")]
+    if name not in known:
+        raise UserError(f"execution.jobqueue={name}: there is no such cluster (there are: {', '.join(known)})")
+    try:
+        return getattr(dask_jobqueue, name)(**options)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"execution.options: {name} refuses them: {error}") from None

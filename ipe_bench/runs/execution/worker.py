@@ -1,0 +1,86 @@
+"""The process that a task runs in: `python -m ipe_bench.runs.execution.worker FD [MEMORY_LIMIT_BYTES]`.
+
+It imports next to nothing before it listens, computes with one thread in BLAS, and ends when its parent ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import pickle
+import queue
+import signal
+import sys
+import threading
+from multiprocessing.connection import Connection
+from typing import Any
+
+IDLE_S = 300.0
+"""A worker that nobody has used for so long ends by itself."""
+
+
+def main(handle: int, memory_limit: int | None) -> None:
+    # Ctrl-C is the parent's business: it ends its workers.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if memory_limit is not None:
+        _limit_memory(memory_limit)
+    connection = _connection(handle)
+    messages: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    # Reading in a thread, so that the end of the parent is noticed in the middle of a task.
+    threading.Thread(target=_listen, args=(connection, messages), daemon=True).start()
+    while True:
+        try:
+            path, threads, payload = messages.get(timeout=IDLE_S)
+        except queue.Empty:
+            return
+        sys.path[:] = path
+        os.environ["IPE_BENCH_THREADS"] = str(threads)
+        if isinstance(payload, str):
+            with contextlib.suppress(Exception):
+                importlib.import_module(payload)
+        else:
+            connection.send(_perform(connection, payload))
+
+
+def _listen(connection: Connection, messages: queue.SimpleQueue[Any]) -> None:
+    while True:
+        try:
+            messages.put(connection.recv())
+        except (EOFError, OSError):
+            os._exit(0)
+
+
+def _perform(connection: Connection, payload: bytes) -> tuple[str, Any]:
+    """Does one task; the last message about it."""
+    from ipe_bench.runs.execution.base import FATAL, Failure
+
+    try:
+        work, task = pickle.loads(payload)
+        connection.send(("started", None))
+        for step in work(task):
+            connection.send(("step", step))
+    except FATAL as error:
+        return "fatal", error
+    except BaseException as error:  # sys.exit() in an estimator, too, fails that task only
+        return "ended", Failure.of(error)
+    return "ended", None
+
+
+def _connection(handle: int) -> Connection:
+    if sys.platform == "win32":
+        from multiprocessing.connection import PipeConnection
+
+        return PipeConnection(handle)
+    return Connection(handle)
+
+
+def _limit_memory(limit: int) -> None:
+    import resource
+
+    # Data, not address space: compiled code and thread pools reserve far more addresses than they use.
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else None)

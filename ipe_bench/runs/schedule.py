@@ -1,0 +1,264 @@
+"""What is to be computed, cut into tasks, and how a run gets through them whatever happens to its parts.
+
+A task is the cells of one scenario that are missing in one block. Each cell is stored as soon as it is there, so a task
+that dies has lost no more than the cell it died of: that one is tried again alone, the rest goes on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import itertools
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from ipe_bench.runs.execution.base import FATAL, Execution, Failure
+from ipe_bench.runs.provenance import class_modules, fingerprint
+from ipe_bench.runs.store import Cell, Store
+from ipe_bench.trials.scenario import Scenario
+from ipe_bench.trials.scoring import HISTORIES, Block
+
+log = logging.getLogger(__name__)
+
+TRIES = 2
+"""How often a cell of a block may take its process with it before it counts as failed."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """The unit of work: the cells of one scenario that are missing in one block."""
+
+    directory: Path
+    cells: tuple[Cell, ...]
+    start: int
+    stop: int
+
+    @property
+    def trusted(self) -> bool:
+        """Whether it runs nothing but our own code, which neither ends the process nor hangs."""
+        parts = [part for cell in self.cells for part in (cell.scenario, cell.estimator) if part is not None]
+        return all(name.startswith("ipe_bench.") for name in class_modules(parts))
+
+
+@dataclass(frozen=True)
+class Done:
+    """One cell of a task is finished: stored, or failed."""
+
+    cell: int
+    seconds: float
+    failure: Failure | None = None
+
+
+PREPARED = "prepared"
+"""The step of a task after which its cells begin."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a watcher of a run is told after each cell."""
+
+    done: int
+    """Tasks that have ended."""
+    tasks: int
+    trials: int
+    """Trials times estimators that are done."""
+    total: int
+    """Trials times estimators that were missing when the run began."""
+    failures: tuple[str, ...]
+
+
+Watcher = Callable[[Progress], None]
+
+
+def plan(store: Store, cells: Sequence[Cell], trials: int, block_size: int) -> list[Task]:
+    """Blocks on a fixed grid, each with the cells that lack some of its trials."""
+    lacking: dict[tuple[int, int], list[Cell]] = {}
+    for cell in cells:
+        for start, stop in store.missing(cell, trials):
+            edges = [start, *range((start // block_size + 1) * block_size, stop, block_size), stop]
+            for edge in itertools.pairwise(edges):
+                lacking.setdefault(edge, []).append(cell)
+    return [Task(store.directory, tuple(cells), *edge) for edge, cells in sorted(lacking.items())]
+
+
+def perform(task: Task) -> Iterator[Done | str]:
+    """Computes one task and stores each cell's rows as soon as they are there. Runs wherever the execution has it run.
+
+    An exception in one cell fails that cell alone.
+    """
+    store = Store(task.directory)
+    _check_source(task.cells)
+    with threadpool_limits(limits=1, user_api="blas"):
+        block = Block.draw(task.cells[0].scenario, task.start, task.stop)
+        # What all cells share, and the loading of compiled code, is not to be charged to the first of them.
+        _ = block.crlb_information
+        yield PREPARED
+        for index, cell in enumerate(task.cells):
+            began = time.perf_counter()
+            failure = None
+            try:
+                _compute_cell(store, block, cell)
+            except FATAL:
+                raise
+            except (Exception, SystemExit) as error:
+                failure = Failure.of(error)
+            yield Done(index, time.perf_counter() - began, failure)
+
+
+def _compute_cell(store: Store, block: Block, cell: Cell) -> None:
+    start, stop = block.trials.start, block.trials.stop
+    if cell.estimator is None:
+        store.write(cell, start, stop, block.truth_columns())
+        return
+    estimates, columns = block.estimate(cell.estimator)
+    if start == 0 and estimates.history is not None:
+        store.write_history(cell, _history_columns(cell.scenario, estimates.history[:HISTORIES]))
+    store.write(cell, start, stop, columns)
+
+
+def _check_source(cells: Sequence[Cell]) -> None:
+    """Refuses to compute under a key that stands for other source than is installed here."""
+    for cell in cells:
+        parts = [cell.scenario] if cell.estimator is None else [cell.scenario, cell.estimator]
+        if fingerprint(parts) != cell.made_by:
+            raise RuntimeError(
+                "the numerical source of ipe-bench or of a plugin is not what it was where the run began: "
+                "install the same versions on all machines, or start the run again"
+            )
+
+
+def _history_columns(scenario: Scenario, history: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+    x = np.concatenate(list(history))
+    lengths = [len(rows) for rows in history]
+    return {
+        "trial": np.repeat(np.arange(len(history)), lengths),
+        "iteration": np.concatenate([np.arange(length) for length in lengths]),
+        **{f"x_{p.name}": x[:, i] for i, p in enumerate(scenario.measurement.parameters)},
+    }
+
+
+class RunLog:
+    """The log file of a run. Warnings go to the logger as well, whose listeners are the user's business."""
+
+    def __init__(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.file = path.open("a", encoding="utf-8", buffering=1)
+
+    def __enter__(self) -> RunLog:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        with contextlib.suppress(OSError):
+            self.file.close()
+
+    def info(self, text: str) -> None:
+        # A log that cannot be written must not be what ends a run: the results will say so.
+        with contextlib.suppress(OSError):
+            self.file.write(f"{datetime.datetime.now().isoformat(sep=' ', timespec='seconds')}  {text}\n")
+
+    def warning(self, text: str) -> None:
+        self.info(text)
+        log.warning(text)
+
+
+class Ledger:
+    """What has become of the cells of a run's tasks."""
+
+    def __init__(self, store: Store, tasks: Sequence[Task], watch: Watcher, log: RunLog) -> None:
+        self.log = log
+        self.store = store
+        self.watch = watch
+        self.total = sum(_weight(task, cell) for task in tasks for cell in task.cells)
+        self.left = Counter((id(cell.scenario), task.start, task.stop) for task in tasks for cell in task.cells)
+        self.trials = 0
+        self.failures: list[str] = []
+        self.tell()
+
+    def close(self, task: Task, cell: Cell, failure: Failure | None, seconds: float | None = None) -> None:
+        """Notes that a cell of a task is stored, or has failed for good."""
+        self.left[id(cell.scenario), task.start, task.stop] -= 1
+        self.trials += _weight(task, cell)
+        what = f"{describe_cell(cell)}, trials {task.start} to {task.stop}"
+        if failure is None:
+            self.log.info(f"{what}: stored" + ("" if seconds is None else f" after {seconds:.3g} s"))
+        else:
+            self.failures.append(f"{what}: {failure.message}")
+            self.log.info("\n".join(filter(None, [f"{what}: failed: {failure.message}", failure.detail.rstrip()])))
+            self.store.write_failure(cell, task.start, task.stop, failure)
+        self.tell()
+
+    def tell(self) -> None:
+        done = sum(left == 0 for left in self.left.values())
+        self.watch(Progress(done, len(self.left), self.trials, self.total, tuple(self.failures)))
+
+
+def work_through(
+    tasks: Sequence[Task], execution: Execution, store: Store, watch: Watcher, log: RunLog
+) -> tuple[str, ...]:
+    """Runs tasks until each of their cells is stored or has failed; returns the messages of those that failed.
+
+    Raises:
+        StorageError: nothing can be stored any more.
+    """
+    log.info(f"{len(tasks)} blocks to compute with execution {execution}")
+    ledger = Ledger(store, tasks, watch, log)
+    tries: Counter[tuple[str, int, int]] = Counter()
+    while tasks:
+        closed: list[set[int]] = [set() for _ in tasks]
+        prepared: set[int] = set()
+        again: list[Task] = []
+        for event in execution.run(perform, tasks):
+            task = tasks[event.index]
+            if isinstance(event.step, Done):
+                closed[event.index].add(event.step.cell)
+                ledger.close(task, task.cells[event.step.cell], event.step.failure, event.step.seconds)
+            elif event.step == PREPARED:
+                prepared.add(event.index)
+            if not event.ended or event.failure is None:
+                continue
+            left = []
+            for i, cell in enumerate(task.cells):
+                if i in closed[event.index]:
+                    continue
+                if store.has(cell, task.start, task.stop):  # stored, and the news of it was lost
+                    ledger.close(task, cell, None)
+                else:
+                    left.append(cell)
+            if event.failure.status == "error" or (event.failure.status == "timeout" and event.index not in prepared):
+                # What all of them need failed.
+                for cell in left:
+                    ledger.close(task, cell, event.failure)
+                continue
+            if not left:
+                continue
+            # Cells are computed in order, so the first one that is not there is the one that it happened in.
+            culprit, *rest = left
+            tries[culprit.key, task.start, task.stop] += 1
+            if event.failure.status == "died" and tries[culprit.key, task.start, task.stop] < TRIES:
+                where = f"{describe_cell(culprit)}, trials {task.start} to {task.stop}"
+                log.warning(f"{where}: {event.failure.message}; trying it again")
+                again.append(Task(task.directory, (culprit,), task.start, task.stop))
+            else:
+                ledger.close(task, culprit, event.failure)
+            if rest:
+                again.append(Task(task.directory, tuple(rest), task.start, task.stop))
+        tasks = again
+    log.info(f"done, {len(ledger.failures)} failed")
+    return tuple(ledger.failures)
+
+
+def describe_cell(cell: Cell) -> str:
+    """A cell in a line for people."""
+    scenario = cell.scenario
+    return f"{cell.label} on {scenario.measurement.name}, error_scale={scenario.error_scale:g}, seed={scenario.seed}"
+
+
+def _weight(task: Task, cell: Cell) -> int:
+    return 0 if cell.estimator is None else task.stop - task.start

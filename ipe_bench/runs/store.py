@@ -1,0 +1,294 @@
+"""Results on disk: one Parquet file per scenario, estimator and block, found again by what was computed.
+
+A file's name is a digest of the constructed objects, the versions and the numerical source; how many trials there are
+and how they were cut into blocks is not part of it, so the results of one key are a union of ranges. A file appears
+under its name complete or not at all.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import hashlib
+import json
+import logging
+import socket
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.files import write_atomically
+from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.machine import library_versions
+from ipe_bench.estimators.base import Estimator
+from ipe_bench.runs.execution.base import Failure
+from ipe_bench.runs.provenance import canonical_json, describe, fingerprint
+from ipe_bench.trials.bounds import linear_bound
+from ipe_bench.trials.scenario import Scenario
+
+log = logging.getLogger(__name__)
+
+SCHEMA = 1
+FOOTER = b"ipe_bench"
+TRUTH = "truth"
+"""Stands in place of an estimator's label in the files that hold the truth and its bounds."""
+_ABANDONED_S = 3600.0
+"""A file that somebody began to write so long ago will not be finished."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One scenario under one estimator, or its truth: what a stored file belongs to."""
+
+    scenario: Scenario
+    label: str = TRUTH
+    estimator: Estimator | None = None
+
+    @cached_property
+    def identity(self) -> dict[str, Any]:
+        """What was computed, whatever the version of the program that did."""
+        return {"scenario": describe(self.scenario), "label": self.label, "estimator": describe(self.estimator)}
+
+    @cached_property
+    def key(self) -> str:
+        """Sixteen hexadecimal digits that stand for the identity, the schema, the versions and the source."""
+        return _digest({"schema": SCHEMA, "identity": self.identity, **self.made_by})
+
+    @cached_property
+    def made_by(self) -> dict[str, Any]:
+        return fingerprint([self.scenario] if self.estimator is None else [self.scenario, self.estimator])
+
+    @cached_property
+    def footer(self) -> dict[str, Any]:
+        """All that a reader of the file needs to know; see `Footer`."""
+        scenario, model = self.scenario, self.scenario.measurement
+        return {
+            "schema": SCHEMA,
+            "key": self.key,
+            "identity": self.identity,
+            "identity_key": _digest(self.identity),
+            **self.made_by,
+            "libraries": library_versions(),
+            "names": {
+                "measurement": model.name,
+                "noise": scenario.noise.name,
+                "prior": scenario.prior.name,
+                "error_scale": scenario.error_scale,
+                "seed": scenario.seed,
+                "estimator": self.label,
+            },
+            "bound": "bayes" if self.estimator is not None and "prior" in self.estimator.needs else "crlb",
+            "equation": None if self.estimator is None else self.estimator.equation,
+            "parameters": [describe(p) for p in model.parameters],
+            "linear_bound": linear_bound(scenario.problem).tolist(),
+        }
+
+
+def _digest(value: Any) -> str:
+    return hashlib.sha256(canonical_json(value).encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One stored file: trials start to stop of the cell with that key."""
+
+    path: Path
+    key: str
+    start: int
+    stop: int
+
+    @classmethod
+    def parse(cls, path: Path) -> Piece | None:
+        """The piece that a file name states; None where the name is not one of ours."""
+        parts = path.stem.split("-")
+        if len(parts) != 3 or not (parts[1].isdigit() and parts[2].isdigit()):
+            return None
+        return cls(path, parts[0], int(parts[1]), int(parts[2]))
+
+    def footer(self) -> dict[str, Any]:
+        """The stored footer.
+
+        Raises:
+            DamagedFile: the file is truncated, or not one of ours.
+        """
+        try:
+            metadata = pq.read_metadata(self.path).metadata or {}
+            return json.loads(metadata[FOOTER])
+        except (pa.ArrowException, OSError, KeyError, ValueError) as error:
+            raise DamagedFile(self.path, error) from error
+
+    def check(self) -> None:
+        """Reads all of it.
+
+        Raises:
+            DamagedFile: it is truncated, not one of ours, or does not hold the rows that its name states.
+        """
+        self.footer()
+        rows = self.table().num_rows
+        if rows != self.stop - self.start:
+            raise DamagedFile(self.path, ValueError(f"{rows} rows"))
+
+    def table(self, columns: Sequence[str] | None = None) -> pa.Table:
+        try:
+            return pq.read_table(self.path, columns=columns)
+        except (pa.ArrowException, OSError) as error:
+            raise DamagedFile(self.path, error) from error
+
+
+class DamagedFile(Exception):
+    """A stored file that cannot be read."""
+
+    def __init__(self, path: Path, reason: Exception) -> None:
+        super().__init__(f"{path}: cannot be read as a result of ipe-bench ({type(reason).__name__})")
+        self.path = path
+
+
+class Store:
+    """The results under one output directory."""
+
+    def __init__(self, directory: Path | str) -> None:
+        self.directory = Path(directory)
+        self.trials = self.directory / "trials"
+        self.histories = self.directory / "histories"
+        self.runs = self.directory / "runs"
+        self.failed = self.directory / "failed"
+
+    def prepare(self) -> None:
+        """Makes sure that results can be written, and clears away what writers that were killed left half done.
+
+        Raises:
+            UserError: they cannot.
+        """
+        try:
+            self.trials.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self.trials):
+                pass
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise UserError(
+                f"output={self.directory}: cannot be written to ({reason}); choose another folder"
+            ) from None
+        for folder in (self.trials, self.histories, self.runs, self.failed):
+            for path in folder.glob(".*.tmp"):
+                with contextlib.suppress(OSError):
+                    if time.time() - path.stat().st_mtime > _ABANDONED_S:
+                        path.unlink()
+
+    def pieces(self) -> Iterator[Piece]:
+        """All stored files with a name of ours, in order of name."""
+        for path in sorted(self.trials.glob("*.parquet")):
+            piece = Piece.parse(path)
+            if piece is not None:
+                yield piece
+
+    def missing(self, cell: Cell, trials: int) -> list[tuple[int, int]]:
+        """The ranges of trials 0 to `trials` that no stored file of this cell covers."""
+        return gaps([(p.start, p.stop) for p in self._pieces_of(cell)], 0, trials)
+
+    def _pieces_of(self, cell: Cell) -> Iterator[Piece]:
+        for path in self.trials.glob(f"{cell.key}-*.parquet"):
+            piece = Piece.parse(path)
+            if piece is None:
+                continue
+            try:
+                piece.check()
+            except DamagedFile:
+                # Set aside, never deleted: it is computed again under its own name.
+                aside = path.with_suffix(".damaged")
+                with contextlib.suppress(FileNotFoundError):  # another run may have done so at this moment
+                    path.rename(aside)
+                log.warning("%s: is damaged; set aside as %s and computed again", path, aside.name)
+                continue
+            yield piece
+
+    def write(self, cell: Cell, start: int, stop: int, columns: Mapping[str, Array]) -> Path:
+        """Stores the rows of trials start to stop."""
+        path = self._write(self.trials / f"{cell.key}-{start}-{stop}.parquet", cell, columns)
+        with contextlib.suppress(OSError):
+            (self.failed / f"{cell.key}-{start}-{stop}.json").unlink()
+        return path
+
+    def has(self, cell: Cell, start: int, stop: int) -> bool:
+        """Whether exactly this block of this cell is stored."""
+        return (self.trials / f"{cell.key}-{start}-{stop}.parquet").is_file()
+
+    def write_failure(self, cell: Cell, start: int, stop: int, failure: Failure) -> Path:
+        """States that these trials could not be computed, and why; the next run tries them again."""
+        record = {
+            "key": cell.key,
+            "identity_key": cell.footer["identity_key"],
+            "names": cell.footer["names"],
+            "start": start,
+            "stop": stop,
+            "status": failure.status,
+            "message": failure.message,
+            "detail": failure.detail,
+            "when": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            "host": socket.gethostname(),
+        }
+        path = self.failed / f"{cell.key}-{start}-{stop}.json"
+        return self._write_json(path, record)
+
+    def failures(self) -> list[dict[str, Any]]:
+        """What could not be computed and has not been computed since; see `write_failure`."""
+        records = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(self.failed.glob("*.json"))]
+        ranges: dict[str, list[tuple[int, int]]] = {}
+        for piece in self.pieces():
+            ranges.setdefault(piece.key, []).append((piece.start, piece.stop))
+        return [r for r in records if gaps(ranges.get(r["key"], []), r["start"], r["stop"])]
+
+    def write_history(self, cell: Cell, columns: Mapping[str, Array]) -> Path:
+        """Stores the iterates of the first trials."""
+        return self._write(self.histories / f"{cell.key}.parquet", cell, columns)
+
+    def _write(self, path: Path, cell: Cell, columns: Mapping[str, Array]) -> Path:
+        arrays = [_arrow(values) for values in columns.values()]
+        table = pa.Table.from_arrays(arrays, names=list(columns), metadata={FOOTER: canonical_json(cell.footer)})
+        write_atomically(path, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
+        return path
+
+    def write_run(self, identifier: str, record: Mapping[str, Any]) -> Path:
+        """States, before any work, what a run is going to compute."""
+        path = self.runs / f"{identifier}.json"
+        return self._write_json(path, record)
+
+    def _write_json(self, path: Path, record: Mapping[str, Any]) -> Path:
+        text = json.dumps(record, indent=1, default=str)
+        write_atomically(path, lambda temporary: temporary.write_text(text + "\n", encoding="utf-8"))
+        return path
+
+
+def _arrow(values: Array) -> pa.Array:
+    """A column as Arrow stores it. `pa.array` would import pandas, a second that a worker can do without."""
+    values = np.ascontiguousarray(values)
+    if values.dtype == object:
+        texts = [str(value).encode() for value in values]
+        ends = np.cumsum([0, *(len(text) for text in texts)], dtype=np.int32)
+        return pa.Array.from_buffers(
+            pa.string(), len(values), [None, pa.py_buffer(ends.tobytes()), pa.py_buffer(b"".join(texts))]
+        )
+    if values.dtype == bool:
+        bits = np.packbits(values, bitorder="little")
+        return pa.Array.from_buffers(pa.bool_(), len(values), [None, pa.py_buffer(bits.tobytes())])
+    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, pa.py_buffer(values.tobytes())])
+
+
+def gaps(covered: Iterable[tuple[int, int]], start: int, stop: int) -> list[tuple[int, int]]:
+    """The parts of the range start to stop that no covered range holds."""
+    found, reached = [], start
+    for first, last in sorted(covered):
+        if first >= stop or reached >= stop:
+            break
+        if first > reached:
+            found.append((reached, first))
+        reached = max(reached, last)
+    return [*found, (reached, stop)] if reached < stop else found

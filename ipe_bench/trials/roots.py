@@ -1,0 +1,79 @@
+"""Roots of the estimating equations from given points: started at the truth, they tell a false root from the right one.
+
+Nothing here is an estimator: an estimator does not know where to start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ipe_bench.basics.batches import put
+from ipe_bench.basics.linalg import Array
+from ipe_bench.estimators.driver import Ended, Solver, iterate
+from ipe_bench.estimators.gauss_newton import GaussNewtonMethod
+from ipe_bench.estimators.ipe import IPE, FrozenSystem, State, System
+from ipe_bench.estimators.least_squares import Objective
+from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.solvers.newton import Newton
+
+_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True)
+class _ChordState(State):
+    J: Array
+
+
+@dataclass(frozen=True)
+class _Chord(IPE[_ChordState]):
+    """x <- x - J(x_start)^-1 F(x): Newton's method with the first Jacobian kept."""
+
+    def init(self, system: System, x: Array, F: Array) -> _ChordState:
+        return _ChordState(x, F, system.J(x))
+
+    def step(self, system: System, state: _ChordState) -> _ChordState:
+        x = state.x - system.solve(state.J, state.F)
+        return _ChordState(x, system.F(x), state.J)
+
+
+def frozen_root(problem: Problem, z: Array, x_start: Array) -> Array:
+    """The root (trials, n) of the frozen equation (11) next to x_start (trials, n), for readings z (trials, m); NaN
+    where there is none.
+
+    Chord steps with the Jacobian at x_start, which is enough where x_start is the truth; Newton's method for the trials
+    where it is not.
+    """
+    return _first_root(lambda z: FrozenSystem.at_nominal(problem, z), ((_Chord(), 8), (Newton(), 20)), z, x_start)
+
+
+def least_squares_root(problem: Problem, z: Array, x_start: Array, *, prior: float | None) -> Array:
+    """The minimum (trials, n) of |h(x) - z| in the metric of R next to x_start (trials, n); MAP where `prior` says by
+    how much to widen the prior's deviations. NaN where none is found.
+
+    Gauss-Newton; Levenberg-Marquardt for the trials where that fails.
+    """
+
+    def objective(z: Array) -> Objective:
+        return Objective.of(problem, z, prior=prior is not None, inflation=prior or 1.0)
+
+    return _first_root(objective, ((GaussNewtonMethod(), 20), (LevenbergMarquardtMethod(1e-3), 100)), z, x_start)
+
+
+def _first_root(
+    equations: Callable[[Array], Any], attempts: Sequence[tuple[Solver[Any], int]], z: Array, x_start: Array
+) -> Array:
+    """Where the first method that converges ends: each has that many iterations from x_start."""
+    x, rest = np.full(x_start.shape, np.nan), np.arange(len(z))
+    for method, limit in attempts:
+        if len(rest):
+            ended: Ended[Any] = iterate(
+                equations(z[rest]), method, x_start[rest], tolerance=_TOLERANCE, max_iterations=limit
+            )
+            x = put(x, rest[ended.converged], ended.x[ended.converged])
+            rest = rest[~ended.converged]
+    return x

@@ -1,0 +1,115 @@
+"""A scenario: what is measured, how noisily, and what the truth is drawn from. It draws trials, and never estimates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
+from ipe_bench.measurements.base import Measurement
+from ipe_bench.measurements.problem import Problem, recorded_problem
+from ipe_bench.noise.base import Noise
+from ipe_bench.priors.gaussian import GaussianPrior
+
+_SEEDS = 1 << 23
+"""Seeds there are: seed and trial share one 64-bit number where trials are matched."""
+
+
+@dataclass(frozen=True)
+class Trials:
+    """Consecutive trials of a scenario: truth x (trials, n) and readings z (trials, m)."""
+
+    start: int
+    x: Array
+    z: Array
+
+    @property
+    def stop(self) -> int:
+        return self.start + len(self.x)
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Everything that determines the trials. `truth` simulates the readings where it differs from what estimators
+    assume (a finer step, a richer model); its parameters and readings are those of `measurement`, and whatever else
+    acts on the readings is drawn by its `nuisance_deviation`.
+
+    With a noise that is `real` nothing is drawn: the one trial is the readings that come with the measurement, and its
+    truth is their certified answer.
+    """
+
+    measurement: Measurement
+    noise: Noise
+    prior: GaussianPrior = field(default_factory=GaussianPrior)
+    error_scale: float = 1.0
+    """Times the prior's deviations."""
+    seed: int = 0
+    truth: Measurement | None = None
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.error_scale) and self.error_scale > 0):
+            raise UserError(f"error_scale={self.error_scale}: give a finite number above 0")
+        if not 0 <= self.seed < _SEEDS:
+            raise UserError(f"seed={self.seed}: give a whole number from 0 to {_SEEDS - 1}")
+        if self.noise.real and self.measurement.recorded is None:
+            raise UserError(
+                f"noise=certified: measurement={self.measurement.name} comes with no readings of its own; choose "
+                "another noise, or one of measurement=nist/..."
+            )
+        if self.truth is not None and (self.truth.n, self.truth.m) != (self.measurement.n, self.measurement.m):
+            raise UserError(
+                f"truth_measurement={self.truth.name}: has {self.truth.n} parameters and {self.truth.m} readings, "
+                f"measurement={self.measurement.name} has {self.measurement.n} and {self.measurement.m}; choose a "
+                "truth with the same parameters and readings"
+            )
+
+    @cached_property
+    def problem(self) -> Problem:
+        """What the estimators are told."""
+        if self.noise.real:
+            return recorded_problem(self.measurement)
+        model = self.measurement.suited_to(self.error_scale)
+        return Problem(model, self.noise.covariance(model.m), self.prior.deviation(model.n, self.error_scale))
+
+    @cached_property
+    def simulator(self) -> Measurement:
+        """The model that the readings come from."""
+        return self.problem.measurement if self.truth is None else self.truth.suited_to(self.error_scale)
+
+    def draw(self, start: int, stop: int) -> Trials:
+        """Trials start to stop. Trial t has random streams of its own, so it is the same in whatever block it is drawn.
+
+        One seed gives the same draws, in units of the error scale, at every error scale.
+        """
+        if self.noise.real:
+            return _recorded_trial(self.measurement, start, stop)
+        model = self.simulator
+        streams = [_streams(self.seed, trial) for trial in range(start, stop)]
+        x = np.stack([self.prior.draw(model.nominal, self.error_scale, rng) for rng, _ in streams])
+        deviation = model.nuisance_deviation
+        if len(deviation):
+            # After the parameters, from the same stream: a richer truth keeps the parameters of the trial.
+            h = model.simulate(
+                np.column_stack([x, [deviation * rng.standard_normal(len(deviation)) for rng, _ in streams]])
+            )
+        else:
+            h = model.simulate(x)
+        z = np.stack([self.noise.corrupt(h[i], model.offset, rng) for i, (_, rng) in enumerate(streams)])
+        return Trials(start, x, z)
+
+
+def _recorded_trial(measurement: Measurement, start: int, stop: int) -> Trials:
+    if (start, stop) != (0, 1):
+        raise UserError("noise=certified: has one trial; set trials=1")
+    assert measurement.recorded is not None
+    return Trials(0, measurement.recorded.x[None], measurement.recorded.z[None])
+
+
+def _streams(seed: int, trial: int) -> tuple[np.random.Generator, np.random.Generator]:
+    """Independent random streams for a trial's parameters and for its noise."""
+    sequence = np.random.SeedSequence(seed, spawn_key=(trial,))
+    parameters, noise = (np.random.Generator(np.random.Philox(s)) for s in sequence.spawn(2))
+    return parameters, noise

@@ -1,0 +1,187 @@
+"""Trials through estimators: draws a block of a scenario, lets estimators loose on it, and scores what they return.
+
+A block is a range of trials; its result depends on nothing but the scenario, the estimator and the range. Storing,
+distributing and summarising blocks is left to other rooms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import chdtrc, chdtri
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array, Mask, deviations, information, inverse, pseudo_inverse, quadratic_form, solve
+from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.base import Equation, Estimates, Estimator, estimate_safely
+from ipe_bench.measurements.counted import Counted
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.trials.contraction import contraction_of
+from ipe_bench.trials.roots import frozen_root, least_squares_root
+from ipe_bench.trials.scenario import Scenario, Trials
+
+GATE = 1e-6
+"""A success lies inside the ellipsoid that all but this share of efficient estimates lie in."""
+SAME_ROOT = 1e-3
+"""Two roots closer than this, in standard deviations of the Cramér-Rao bound, are one."""
+HISTORIES = 20
+"""Trials whose iterates are kept: the first ones of a scenario."""
+
+Columns = dict[str, Array]
+
+
+@dataclass(frozen=True)
+class Block:
+    """Trials of a scenario with what the truth says of them: bounds and reference roots, computed when needed."""
+
+    scenario: Scenario
+    trials: Trials
+
+    @classmethod
+    def draw(cls, scenario: Scenario, start: int, stop: int) -> Block:
+        with np.errstate(all="ignore"):
+            return cls(scenario, scenario.draw(start, stop))
+
+    @property
+    def problem(self) -> Problem:
+        return self.scenario.problem
+
+    @cached_property
+    def jacobian(self) -> Array:
+        """dh/dx at the truth (trials, m, n)."""
+        with np.errstate(all="ignore"):
+            return self.problem.measurement.jacobian(self.trials.x)
+
+    @cached_property
+    def crlb_information(self) -> Array:
+        """J' R^-1 J at the truth (trials, n, n): the inverse of the Cramér-Rao bound."""
+        with np.errstate(all="ignore"):
+            return information(self.jacobian, self.problem.R)
+
+    @cached_property
+    def bayes_information(self) -> Array:
+        """J' R^-1 J + P0^-1 at the truth: the inverse of the Bayesian bound."""
+        deviation = self.problem.prior_used()
+        return self.crlb_information + (0.0 if deviation is None else np.diag(deviation**-2.0))
+
+    @cached_property
+    def crlb_deviation(self) -> Array:
+        """Standard deviations (trials, n) of the Cramér-Rao bound at the truth."""
+        return deviations(inverse(self.crlb_information)[0])
+
+    def truth_columns(self) -> Columns:
+        """The truth and its bounds, in multiples of the parameters' units, and the contraction of eq. (15) there."""
+        names = [p.name for p in self.problem.measurement.parameters]
+        bayes = deviations(inverse(self.bayes_information)[0])
+        H_plus, _ = pseudo_inverse(self.problem.H[None], self.problem.R)
+        contracts = contraction_of(np.matmul(H_plus, self.jacobian))
+        return {
+            "trial": np.arange(self.trials.start, self.trials.stop),
+            **_by_parameter("x", names, self.trials.x),
+            **_by_parameter("crlb", names, self.crlb_deviation),
+            **_by_parameter("bayes", names, bayes),
+            "contraction_K": contracts.K,
+            "contraction_norm": contracts.infinity_norm,
+            "contraction_radius": contracts.spectral_radius,
+        }
+
+    @cached_property
+    def _roots(self) -> dict[tuple[Equation, float], Array]:
+        return {}
+
+    def reference_root(self, equation: Equation, inflation: float = 1.0) -> Array:
+        """The root (trials, n) that an estimating equation reaches from the truth; NaN where it reaches none.
+
+        `inflation` widens the prior of the equation `map`.
+        """
+        key = (equation, inflation)
+        if key not in self._roots:
+            with np.errstate(all="ignore"):
+                self._roots[key] = _root_from(self.problem, self.trials, equation, inflation)
+        return self._roots[key]
+
+    def estimate(self, estimator: Estimator) -> tuple[Estimates, Columns]:
+        """What an estimator makes of the block, and its score."""
+        history = self.trials.start < HISTORIES
+        estimates = estimate_safely(estimator, self.problem, self.trials.z, history=history)
+        with np.errstate(all="ignore"):
+            return estimates, self.score(estimator, estimates)
+
+    def _fit_probability(self, x: Array) -> Array:
+        """The chi-square test of the residuals at x (trials, n): the chance of ones at least this large if the model
+        and R are right; NaN where there are none. It needs no truth, so whoever estimates can ask for it too."""
+        model = Counted.uncounted(self.problem.measurement, len(x))
+        r = self.problem.R.whiten(self.trials.z - model.simulate(x, np.arange(len(x))))
+        return chdtrc(model.measurement.m - model.measurement.n, np.sum(r**2, axis=1))
+
+    def score(self, estimator: Estimator, estimates: Estimates) -> Columns:
+        """Each trial's error, cost, status and distances, as columns."""
+        model = self.problem.measurement
+        names = [p.name for p in model.parameters]
+        error = estimates.x - self.trials.x
+        converged = estimates.status == Status.CONVERGED
+        bound = self.bayes_information if "prior" in estimator.needs else self.crlb_information
+        distance = quadratic_form(bound, error)
+        solved = converged & np.isfinite(error).all(axis=1)
+        if estimator.equation is not None:
+            # An estimator that scales its prior solves an equation of its own.
+            inflation = getattr(estimator, "prior_inflation", 1.0) if estimator.equation == "map" else 1.0
+            root = self.reference_root(estimator.equation, inflation)
+            apart = np.abs(estimates.x - root) / self.crlb_deviation
+            solved &= apart.max(axis=1) <= SAME_ROOT
+        trials = len(error)
+        P = estimates.covariance
+        squared = np.full(trials, np.nan) if P is None else nees(error, P)
+        deviation = np.full(error.shape, np.nan) if P is None else deviations(P)
+        return {
+            "trial": np.arange(self.trials.start, self.trials.stop),
+            **_by_parameter("error", names, error),
+            **_by_parameter("deviation", names, deviation),
+            "status": np.array([Status(s).label for s in estimates.status], dtype=object),
+            "message": np.array([estimates.messages.get(i, "") for i in range(trials)], dtype=object),
+            "iterations": estimates.iterations,
+            "simulations": estimates.simulations,
+            "jacobians": estimates.jacobians,
+            "time_s": estimates.seconds,
+            "crlb_distance": quadratic_form(self.crlb_information, error),
+            "nees": squared,
+            "fit_p": self._fit_probability(estimates.x),
+            "solved": solved,
+            "success": np.isfinite(distance) & (distance <= chdtri(model.n, GATE)),
+            **{f"extra_{name}": values for name, values in estimates.extras.items()},
+        }
+
+
+def nees(error: Array, P: Array) -> Array:
+    """The normalised estimation error squared e' P^-1 e of each trial (trials,): chi-square with n degrees where the
+    reported P is right.
+
+    error (trials, n) and P (trials, n, n). Infinite where P is no covariance (not positive definite) or the error is
+    not finite; NaN where no P is reported.
+    """
+    reported = np.isfinite(P).all(axis=(1, 2))
+    with np.errstate(all="ignore"):
+        # Scaled by the deviations first: parameters' units must not decide what is singular.
+        deviation = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+        e, C = error / deviation, P / (deviation[:, :, None] * deviation[:, None, :])
+    usable: Mask = np.asarray(np.isfinite(e).all(axis=1) & np.isfinite(C).all(axis=(1, 2)))
+    C = np.where(usable[:, None, None], C, np.eye(error.shape[1]))
+    x, singular = solve(C, np.where(usable[:, None], e, 0.0))
+    usable = usable & ~singular & (np.linalg.eigvalsh(C)[:, 0] > 0)
+    return np.where(reported, np.where(usable, np.einsum("ti,ti->t", e, x), np.inf), np.nan)
+
+
+def _root_from(problem: Problem, trials: Trials, equation: Equation, inflation: float) -> Array:
+    if equation == "frozen":
+        try:
+            return frozen_root(problem, trials.z, trials.x)
+        except UserError:
+            # H lacks rank, so there is no such equation; the estimators that solve it say so.
+            return np.full(trials.x.shape, np.nan)
+    return least_squares_root(problem, trials.z, trials.x, prior=inflation if equation == "map" else None)
+
+
+def _by_parameter(prefix: str, names: list[str], values: Array) -> Columns:
+    return {f"{prefix}_{name}": np.ascontiguousarray(values[:, i]) for i, name in enumerate(names)}
