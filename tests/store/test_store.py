@@ -99,7 +99,8 @@ from ipe_bench.solvers import FixedPoint
 class Mine(FixedPoint):
     pass
 """
-    script = "from ipe_bench.runs.provenance import fingerprint\nfrom mine import Mine\nprint(fingerprint([Mine()])['source'])\n"
+    script = "from ipe_bench.runs.provenance import fingerprint; from mine import Mine"
+    script += "; print(fingerprint([Mine()])['source'])"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
 
     def digest(source: str) -> str:
