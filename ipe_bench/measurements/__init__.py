@@ -5,6 +5,7 @@ from ipe_bench.measurements.bearings import Bearings
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.gins_richer import RicherGins
 from ipe_bench.measurements.lotka_volterra import LotkaVolterra
+from ipe_bench.measurements.mgh import Mgh
 from ipe_bench.measurements.nist import Nist
 from ipe_bench.measurements.ode.model import OdeMeasurement
 from ipe_bench.measurements.polynomial import Polynomial
@@ -16,6 +17,7 @@ __all__ = [
     "Gins",
     "LotkaVolterra",
     "Measurement",
+    "Mgh",
     "Nist",
     "OdeMeasurement",
     "Parameter",
