@@ -2,6 +2,7 @@
 
 from ipe_bench.measurements.base import Measurement, Parameter, Restricted
 from ipe_bench.measurements.bearings import Bearings
+from ipe_bench.measurements.falling_body import FallingBody
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.gins_richer import RicherGins
 from ipe_bench.measurements.lotka_volterra import LotkaVolterra
@@ -14,6 +15,7 @@ from ipe_bench.measurements.triad import Triad
 
 __all__ = [
     "Bearings",
+    "FallingBody",
     "Gins",
     "LotkaVolterra",
     "Measurement",
