@@ -2,6 +2,7 @@
 
 from ipe_bench.measurements.base import Measurement, Parameter, Restricted
 from ipe_bench.measurements.bearings import Bearings
+from ipe_bench.measurements.bock import Bock
 from ipe_bench.measurements.falling_body import FallingBody
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.gins_richer import RicherGins
@@ -15,6 +16,7 @@ from ipe_bench.measurements.triad import Triad
 
 __all__ = [
     "Bearings",
+    "Bock",
     "FallingBody",
     "Gins",
     "LotkaVolterra",
