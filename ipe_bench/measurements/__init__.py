@@ -12,6 +12,7 @@ from ipe_bench.measurements.nist import Nist
 from ipe_bench.measurements.ode.model import OdeMeasurement
 from ipe_bench.measurements.polynomial import Polynomial
 from ipe_bench.measurements.ranging import Ranging
+from ipe_bench.measurements.sir import Sir
 from ipe_bench.measurements.triad import Triad
 
 __all__ = [
@@ -29,5 +30,6 @@ __all__ = [
     "Ranging",
     "Restricted",
     "RicherGins",
+    "Sir",
     "Triad",
 ]
