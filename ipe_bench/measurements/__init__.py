@@ -6,6 +6,7 @@ from ipe_bench.measurements.bock import Bock
 from ipe_bench.measurements.falling_body import FallingBody
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.gins_richer import RicherGins
+from ipe_bench.measurements.gnss import Gnss
 from ipe_bench.measurements.lotka_volterra import LotkaVolterra
 from ipe_bench.measurements.mgh import Mgh
 from ipe_bench.measurements.nist import Nist
@@ -20,6 +21,7 @@ __all__ = [
     "Bock",
     "FallingBody",
     "Gins",
+    "Gnss",
     "LotkaVolterra",
     "Measurement",
     "Mgh",
