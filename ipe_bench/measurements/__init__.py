@@ -1,5 +1,6 @@
 """Measurement models: what a parameter vector makes the instruments read. Config group `measurement`."""
 
+from ipe_bench.measurements.accelerometer import Accelerometer
 from ipe_bench.measurements.base import Measurement, Parameter, Restricted
 from ipe_bench.measurements.bearings import Bearings
 from ipe_bench.measurements.bock import Bock
@@ -17,6 +18,7 @@ from ipe_bench.measurements.sir import Sir
 from ipe_bench.measurements.triad import Triad
 
 __all__ = [
+    "Accelerometer",
     "Bearings",
     "Bock",
     "FallingBody",

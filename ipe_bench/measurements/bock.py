@@ -30,7 +30,7 @@ class Bock(OdeMeasurement):
     Trials drawn about the nominal point are of use for small mu only.
 
     Source: Bock, Numerical treatment of inverse problems in chemical reaction kinetics, Springer Series in Chemical
-    Physics 18, 1981, and his thesis (Bonner Mathematische Schriften 183, 1987), where the noise is 0.05.
+    Physics 18, 1981, and his thesis (Bonner Mathematische Schriften 183, 1987). A noise of 0.05 is customary.
     """
 
     mu: float = 60.0

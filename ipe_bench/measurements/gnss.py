@@ -67,7 +67,8 @@ class Gnss(Measurement):
     Parameters, all in m: east, north and up of the presumed position, or its x, y and z; a clock for each epoch; an
     offset for each further constellation. Readings in m, grouped into epochs by time. The usual noise is 1 m (code).
 
-    Source: Kaplan and Hegarty, Understanding GPS, 2nd ed., section 2.4; IS-GPS-200, section 20.3.3.4.3.4 (rotation).
+    Sources: Kaplan and Hegarty, Understanding GPS, 2nd ed., section 2.4; Ashby, Relativity in the Global Positioning
+    System, Living Reviews in Relativity 6, 2003 (rotation).
     """
 
     satellites: tuple[tuple[float, float, float], ...] | None = None
