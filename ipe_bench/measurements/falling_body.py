@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ipe_bench.errors import UserError
-from ipe_bench.linalg import Array
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Parameter
 from ipe_bench.measurements.ode.model import OdeMeasurement
 

@@ -11,8 +11,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.errors import UserError
-from ipe_bench.linalg import Array
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Measurement, Parameter
 
 LIGHT = 299792458.0

@@ -6,11 +6,11 @@ from scipy.linalg import polar
 from scipy.optimize import least_squares
 
 from ipe_bench.baselines import GaussNewton
-from ipe_bench.conformance import check_component
-from ipe_bench.errors import UserError
-from ipe_bench.linalg import Covariance
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Covariance
 from ipe_bench.measurements import Accelerometer, Triad
-from ipe_bench.scenario import Problem
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.plugins.conformance import check_component
 
 GRAVITY = 9.8
 BIAS = np.array([33124.0, 33275.0, 32364.0])

@@ -5,10 +5,10 @@ import pytest
 from scipy.integrate import solve_bvp
 
 from ipe_bench.baselines import MultiscaleLM
-from ipe_bench.conformance import check_component
-from ipe_bench.errors import UserError
+from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Bock
-from ipe_bench.scenario import Problem
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.plugins.conformance import check_component
 
 
 def test_the_closed_form_solves_the_equation_as_a_boundary_value_problem():

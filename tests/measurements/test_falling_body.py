@@ -8,9 +8,9 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from scipy.special import expi
 
-from ipe_bench.conformance import check_component
-from ipe_bench.errors import UserError
+from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import FallingBody
+from ipe_bench.plugins.conformance import check_component
 
 FOOT = 0.3048
 PAPER = np.array([0.0, 0.0, 1.0])

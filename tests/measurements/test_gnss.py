@@ -5,12 +5,12 @@ import pytest
 from scipy.optimize import brentq, least_squares
 
 from ipe_bench.baselines import GaussNewton
-from ipe_bench.conformance import check_component
-from ipe_bench.errors import UserError
-from ipe_bench.linalg import Covariance
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Covariance
 from ipe_bench.measurements import Gnss, Ranging
 from ipe_bench.measurements.gnss import east_north_up
-from ipe_bench.scenario import Problem
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.plugins.conformance import check_component
 
 LIGHT, EARTH_RATE = 299792458.0, 7.2921151467e-5
 

@@ -8,12 +8,12 @@ import pytest
 from scipy.optimize import least_squares
 
 from ipe_bench.baselines import MultiscaleLM
-from ipe_bench.conformance import check_component
-from ipe_bench.errors import UserError
+from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Mgh
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.mgh import functions, score
-from ipe_bench.scenario import Problem
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.plugins.conformance import check_component
 
 # m and n, as the paper states them.
 SIZES = {

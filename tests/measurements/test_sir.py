@@ -8,11 +8,11 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, curve_fit
 
 from ipe_bench.baselines import MultiscaleLM
-from ipe_bench.conformance import check_component
-from ipe_bench.errors import UserError
-from ipe_bench.linalg import Covariance
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Covariance
 from ipe_bench.measurements import Sir
-from ipe_bench.scenario import Problem
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.plugins.conformance import check_component
 
 # Boys confined to bed, 22 January to 4 February 1978 (British Medical Journal, 4 March 1978, p. 587).
 IN_BED = np.array([3, 8, 26, 76, 225, 298, 258, 233, 189, 128, 68, 29, 14, 4], dtype=float)

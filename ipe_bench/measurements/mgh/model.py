@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.errors import UserError
-from ipe_bench.linalg import Array, Covariance
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.measurements.base import Measurement, Parameter, Recorded
 from ipe_bench.measurements.mgh.problems import PROBLEMS, Minimum, Problem
 

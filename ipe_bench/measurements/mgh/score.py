@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.linalg import Array
+from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.mgh.model import Mgh
 
 RELATIVE = 1e-6
