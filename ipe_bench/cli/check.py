@@ -16,17 +16,17 @@ from ipe_bench.plugins.construct import construct
 _COMPONENT_GROUPS = ("measurement", "noise", "prior", *plugins.ESTIMATOR_GROUPS)
 
 
-def main(arguments: Sequence[str]) -> int:
+def main(folders: Sequence[str]) -> int:
     """Checks every option of the plugins in the given folders; exit code 1 where a check fails."""
-    if not arguments:
+    if not folders:
         raise UserError("check: name the folder of a plugin, such as plugins/my_plugin")
-    for folder in map(Path, arguments):
+    for folder in map(Path, folders):
         if not folder.is_dir():
             raise UserError(f"{folder}: there is no such folder")
         if not plugins.add_folder(folder):
             raise UserError(f"{folder}: holds no package with a folder conf in it; see `ipe-bench new`")
     failed = 0
-    for folder in map(Path, arguments):
+    for folder in map(Path, folders):
         failed += _check_plugin(folder)
     return 1 if failed else 0
 

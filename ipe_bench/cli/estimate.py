@@ -28,9 +28,6 @@ from ipe_bench.runs.provenance import describe, fingerprint
 
 def main(arguments: Sequence[str]) -> int:
     """Estimates with every chosen estimator, prints tables and writes files; exit code 1 where none converged."""
-    flags = [a for a in arguments if a.startswith("-")]
-    if flags:
-        raise UserError(f"{flags[0]}: estimate takes overrides such as measurement=gins readings=FILE, and no flags")
     refuse_silent_traps(arguments)
     prepare()
     try:

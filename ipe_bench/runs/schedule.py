@@ -42,7 +42,7 @@ class Task:
 
     @property
     def trusted(self) -> bool:
-        """Whether it runs nothing but our own code, which neither ends the process nor hangs."""
+        """Whether it runs only code of this package, which neither ends its process nor runs without end."""
         parts = [part for cell in self.cells for part in (cell.scenario, cell.estimator) if part is not None]
         return all(name.startswith("ipe_bench.") for name in class_modules(parts))
 

@@ -192,6 +192,36 @@ def test_stopping_a_run_ends_its_workers():
     assert gone_within(5, pid)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="ends sessions with POSIX means")
+def test_what_an_estimator_started_ends_with_its_worker():
+    # The first step has a minute in any case, for loading compiled code; those after it have what was asked for.
+    events = list(Processes(1, block_timeout_s=0.3).run(rogues.leave_a_child, [0]))
+    assert events[-1].failure is not None
+    assert events[-1].failure.status == "timeout"
+    assert gone_within(5, events[0].step)
+
+
+def test_a_worker_that_dies_between_two_runs_is_replaced():
+    pids = []
+    for _ in range(2):
+        events = list(Processes(1).run(rogues.surroundings, [0]))
+        assert events[-1].failure is None
+        pids.append(events[0].step[0])
+        os.kill(pids[-1], signal.SIGTERM)
+        gone_within(5, pids[-1])
+    assert pids[0] != pids[1]
+
+
+def test_a_script_needs_no_guard_against_being_imported_by_its_workers(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import rogues\nfrom ipe_bench.runs.execution import Processes\nprint('begins')\n"
+        "print([event.step for event in Processes(2).run(rogues.square, [1]) if not event.ended])\n"
+    )
+    ran = subprocess.run([sys.executable, script], env=environment(), capture_output=True, text=True, check=True)
+    assert ran.stdout.splitlines() == ["begins", "[0, 1, 2]"]
+
+
 def test_workers_end_when_their_parent_is_killed(tmp_path):
     code = "import rogues; from ipe_bench.runs.execution import Processes\n"
     code += "for event in Processes(1).run(rogues.doze, [0]): print(event.step, flush=True)"
@@ -239,6 +269,7 @@ except StorageError as error:
         ({"workers": 0}, "workers=0"),
         ({"block_timeout_s": 0.0}, "block_timeout_s"),
         ({"memory_limit_gb": -1.0}, "memory"),
+        ({"memory_limit_gb": float("inf")}, "memory"),
     ],
 )
 @pytest.mark.parametrize("kind", [Processes, Dask])
