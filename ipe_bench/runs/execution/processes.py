@@ -105,6 +105,7 @@ def supervise(
                 worker = busy[connection]  # pyright: ignore[reportArgumentType]
                 kind, value = worker.receive()
                 if kind == "started":
+                    worker.started = True
                     worker.extend(None if step_timeout_s is None else max(step_timeout_s, _PREPARATION_S))
                 elif kind == "step":
                     worker.extend(step_timeout_s)
@@ -113,6 +114,9 @@ def supervise(
                     del busy[worker.connection]
                     if kind != "died":
                         _give_back(worker)
+                    elif worker.served and not worker.started:  # it was ending while it was handed the task
+                        waiting.appendleft(worker.index)
+                        continue
                     if kind == "fatal":
                         raise value
                     yield Event(worker.index, ended=True, failure=value)
@@ -155,11 +159,16 @@ class _Worker:
         there.close()
         self.index = -1
         self.deadline = math.inf
+        self.served = False
+        """Whether it has ended a task before this one."""
+        self.started = False
+        """Whether it has begun with this one."""
 
     def begin(self, index: int, threads: int, payload: bytes) -> bool:
         """Hands it a task; False where the process is no longer there."""
         self.index = index
         self.deadline = math.inf
+        self.started = False
         try:
             self.connection.send((sys.path, threads, payload))
         except OSError:
@@ -233,6 +242,7 @@ def _take(memory_limit_gb: float | None) -> _Worker:
 
 
 def _give_back(worker: _Worker) -> None:
+    worker.served = True
     with _lock:
         _idle.setdefault((os.getpid(), worker.memory_limit_gb), []).append(worker)
 
