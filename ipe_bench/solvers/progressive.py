@@ -6,13 +6,14 @@ nothing; here is the judge, and when to stop.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.errors import UserError, require_counts, require_positive
 from ipe_bench.basics.linalg import Array, Mask, finite
+from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.least_squares import Minima
 from ipe_bench.measurements.counted import Tally
@@ -95,6 +96,8 @@ class Progressive(Estimator):
             repeated[suspect] += again.converged & before.converged & _same(again.chi_square, before.chi_square)
             better = _is_better(again, before)
             best = put(best, suspect[better], take(again, better))
+        raised = search.tally.failed(np.arange(len(z))) & ~best.converged
+        best = replace(best, status=np.where(raised, Status.ERROR, best.status).astype(np.int8))
         return best.estimates(search.tally, z.shape[1])
 
     def _suspect(self, problem: Problem, best: Minima, tally: Tally, z: Array) -> Mask:
