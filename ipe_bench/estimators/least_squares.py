@@ -111,6 +111,16 @@ class Slope:
         kept = Q[:, : r.shape[1] - missing] if keep_Q else None
         return cls(U, gradient, columns, newton, size, along.max(axis=1), kept)
 
+    def towards(self, r: Array) -> Slope:
+        """The same Jacobian with another residual r (trials, m): a chord. It needs Q."""
+        assert self.Q is not None
+        gradient = multiply(self.Q.swapaxes(1, 2), r)
+        inverse_U, _ = inverse(np.where(np.isfinite(self.size)[:, None, None], self.U, np.nan))
+        newton = -multiply(inverse_U, gradient)
+        size = np.abs(newton / np.sqrt(np.sum(inverse_U**2, axis=2))).max(axis=1)
+        size = np.where(np.isfinite(size), size, np.inf)
+        return dataclasses.replace(self, gradient=gradient, newton=newton, size=size)
+
     def damped(self, weights: Array) -> tuple[Array, Array]:
         """The step that minimises |r + J s|^2 + |weights s|^2, and the decrease of |r + J s|^2 + that it predicts."""
         diagonal = weights[:, :, None] * np.eye(self.U.shape[1])
