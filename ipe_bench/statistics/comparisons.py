@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest, chi2, friedmanchisquare, studentized_range, wilcoxon
+from scipy.stats import binomtest, friedmanchisquare, studentized_range, wilcoxon
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.trials.scoring import GATE
 
 TIE = 1e-3
 """Errors closer than this, in standard deviations, are equal: round-off is never a difference."""
@@ -130,14 +129,6 @@ def holm(p: Sequence[float]) -> Array:
     corrected = np.empty(len(values))
     corrected[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
     return corrected
-
-
-def capped_error(one: Outcomes, n: int) -> float:
-    """Mean error of the trials, each at most the radius of the success gate, so that failing badly is failing once."""
-    if len(one.distance) == 0:
-        return float("nan")
-    radius = float(np.sqrt(chi2.isf(GATE, n)))
-    return float(np.minimum(one.distance, radius).mean())
 
 
 def leaders(scores: Mapping[str, float], pairs: Sequence[Pair]) -> set[str]:

@@ -10,7 +10,7 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, Look
 from ipe_bench.statistics.analysis import Analysis
-from ipe_bench.statistics.profiles import CLOSE
+from ipe_bench.statistics.histories import CLOSE
 
 FLOOR = 1e-10
 """Distances below this are drawn here: round-off."""

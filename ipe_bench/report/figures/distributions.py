@@ -11,7 +11,7 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, Look
 from ipe_bench.statistics.analysis import PROBABILITIES, Analysis
-from ipe_bench.trials.scoring import GATE
+from ipe_bench.trials.thresholds import GATE
 
 
 def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
