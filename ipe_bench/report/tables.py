@@ -174,8 +174,7 @@ def covariances(analysis: Analysis) -> Table | None:
 def iterations(analysis: Analysis) -> Table | None:
     """The paper's bounds on the iterations beside the iterates."""
     scores = analysis.scores
-    told = scores["eq_18_trials"] + scores["eq_23_observed"].notna()
-    rows = scores[(told > 0) & (scores["histories"] > 0)]
+    rows = scores[(scores["eq_18_trials"] > 0) | scores["eq_23_observed"].notna()]
     if rows.empty:
         return None
     columns = [*_head(analysis, rows), words("estimator", rows["estimator"])]
@@ -348,15 +347,15 @@ def latex(table: Table) -> str:
     return f"% {' '.join(table.title.split())}. Needs {needs}.\n{text}"
 
 
-def _show_signs(escaped: str) -> str:
+def _show_signs(escaped: object) -> str:
     """What pandas' escaping leaves: signs beyond ASCII, those that pdflatex may lack by their number."""
     return "".join(
         _SIGNS.get(char, char if char.isascii() and char.isprintable() else f"\\texttt{{U+{ord(char):04X}}}")
-        for char in " ".join(escaped.split())
+        for char in " ".join(str(escaped).split())
     )
 
 
-def _set_numbers(escaped: str) -> str:
+def _set_numbers(escaped: object) -> str:
     """The numbers of a cell set by siunitx, which groups digits by its own rules."""
     text = _NUMBER.sub(lambda m: f"\\num{{{m.group().replace(',', '')}}}", _show_signs(escaped))
     return text.replace(r"} \%", r"}\,\%")

@@ -88,8 +88,8 @@ class FixedPointBound:
 
 
 def fixed_point_bound(iterates: Array, K: float, limit: Array | None = None) -> FixedPointBound:
-    """Eq. (18) for iterates (iterates, n) with a constant K that holds along them; at a single point K is no proven
-    bound. `limit` (n,) is the last iterate where it is not given."""
+    """Eq. (18) for iterates (iterates, n) with a constant K that holds along them; at a single point K is not a
+    proven bound. `limit` (n,) is the last iterate where it is not given."""
     limit = iterates[-1] if limit is None else limit
     step = np.abs(iterates[1] - iterates[0]).max()
     powers = K ** np.arange(len(iterates))

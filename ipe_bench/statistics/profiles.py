@@ -25,7 +25,7 @@ class Profiles:
 
     def add(self, outcomes: Mapping[str, Outcomes]) -> None:
         paired = common(outcomes)
-        costs = {label: np.where(one.success, one.cost, np.inf) for label, one in paired.items()}
+        costs = {label: np.where(o.success, o.cost, np.inf) for label, o in paired.items()}
         if not costs:
             return
         best = np.full(len(next(iter(costs.values()))), np.inf)

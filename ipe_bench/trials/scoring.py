@@ -186,7 +186,7 @@ def nees(error: Array, P: Array) -> Array:
     """The normalised estimation error squared e' P^-1 e of each trial (trials,): chi-square with n degrees where the
     reported P is right.
 
-    error (trials, n) and P (trials, n, n). Infinite where P is no covariance (not positive definite) or the error is
+    error (trials, n) and P (trials, n, n). Infinite where P is not a covariance (not positive definite) or the error is
     not finite; NaN where no P is reported.
     """
     reported = np.isfinite(P).all(axis=(1, 2))

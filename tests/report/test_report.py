@@ -13,11 +13,13 @@ from html.parser import HTMLParser
 import numpy as np
 import pandas as pd
 import pytest
+from markupsafe import escape
 from rich.console import Console
 from synthetic_store import Synthetic
 
 from ipe_bench.noise import Quantization
 from ipe_bench.report import write_report
+from ipe_bench.report.definitions import DEFINITIONS
 from ipe_bench.report.figures.ranks import cliques
 from ipe_bench.report.headline import headline
 from ipe_bench.report.style import looks
@@ -25,6 +27,7 @@ from ipe_bench.report.tables import Table, all_tables, interval, latex, markdown
 from ipe_bench.report.terminal import render
 from ipe_bench.report.words import compact, duration, percent, short
 from ipe_bench.statistics import analyse
+from ipe_bench.statistics.records import SCORES, STATISTICS, frame_columns
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -138,6 +141,24 @@ def test_latex_escapes_every_special_character():
     assert re.sub(r"\\([&%$#{}_]|[a-zA-Z]+)", "", text).count("$") == 0
     assert r"\&" in text
     assert r"\texttt{U+4E2D}" in text
+
+
+def test_a_record_is_all_that_a_statistic_needs(result):
+    """Its column, its definition, and its heading in every table that it names, the terminal's among them."""
+    page = result.report.read_text(encoding="utf-8")
+    tables = {t.name: t for t in all_tables(analyse([result.report.parent]))}
+    out = io.StringIO()
+    Console(file=out, width=300).print(render(result.summary))
+    for record in (*STATISTICS, *SCORES):
+        assert (record.title, record.definition) in DEFINITIONS
+        assert str(escape(record.definition)) in page
+        for where in record.where:
+            headings = [record.titles.get(where, record.title), record.limits_titles.get(where, "")]
+            if where == "terminal":
+                assert all(h in out.getvalue() for h in headings)
+            elif where in tables:
+                assert {*headings, ""} <= {*(c.title for c in tables[where].columns), ""}
+    assert set(frame_columns(STATISTICS)) <= set(result.summary.columns)
 
 
 def test_latex_intervals_read_right():
