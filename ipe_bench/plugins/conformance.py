@@ -16,6 +16,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimator, estimate_safely
 from ipe_bench.measurements.base import Measurement, differentiate
+from ipe_bench.measurements.counted import cost
 from ipe_bench.measurements.polynomial import Polynomial
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
@@ -137,8 +138,8 @@ def accounts_for_itself(estimator: Estimator) -> None:
     estimates = estimator.estimate(problem, z)
     known = {int(status) for status in Status if status is not Status.RUNNING}
     assert set(estimates.status.tolist()) <= known, "a status is none of ipe_bench.Status"
-    cost = estimates.simulations + problem.measurement.n * estimates.jacobians
-    assert (cost > 0).all(), "simulations and jacobians are not counted"
+    spent = cost(estimates.simulations, estimates.jacobians, problem.measurement.n)
+    assert (spent > 0).all(), "simulations and jacobians are not counted"
     P = estimates.covariance
     if P is not None:
         usable = np.isfinite(P).all(axis=(1, 2))

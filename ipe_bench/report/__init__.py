@@ -36,8 +36,8 @@ def write_report(directories: Sequence[Path | str], output: Path | str) -> Repor
     Raises:
         UserError: a directory does not exist.
     """
-    from ipe_bench.basics.files import write_atomically
-    from ipe_bench.report.certified_tables import without_certified, write_certified
+    from ipe_bench.basics.files import write_text
+    from ipe_bench.report.certified_tables import certified_tables, without_certified
     from ipe_bench.report.figures import draw_all
     from ipe_bench.report.html import render_page
     from ipe_bench.report.tables import all_tables, write_tables
@@ -48,11 +48,10 @@ def write_report(directories: Sequence[Path | str], output: Path | str) -> Repor
     folder = output / "figures"
     folder.mkdir(parents=True, exist_ok=True)
     summary_path = output / "summary.csv"
-    write_atomically(summary_path, lambda temporary: analysis.summary.to_csv(temporary, index=False))
-    tables = all_tables(analysis)
+    write_text(summary_path, analysis.summary.to_csv(index=False))
+    certified_shown, certified = certified_tables(analysis.collection)
+    tables = [*certified_shown, *all_tables(analysis)]
     table_paths = write_tables(analysis, tables, output / "tables")
-    certified_paths, certified = write_certified(analysis.collection, output / "tables")
-    table_paths += certified_paths
     figures: list[Path] = []
     shown = []
     pictured = without_certified(analysis)
@@ -62,7 +61,7 @@ def write_report(directories: Sequence[Path | str], output: Path | str) -> Repor
         shown.append((drawing.name, drawing.title, drawing.caption, png.read_bytes()))
     page = render_page(analysis, tables, shown)
     report = output / "report.html"
-    write_atomically(report, lambda temporary: temporary.write_text(page, encoding="utf-8"))
+    write_text(report, page)
     return ReportResult(
         analysis.summary,
         summary_path,
