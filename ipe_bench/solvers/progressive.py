@@ -110,7 +110,8 @@ class Progressive(Estimator):
 
 
 def _same(a: Array, b: Array) -> Mask:
-    return np.abs(a - b) <= _SAME_FIT * np.maximum(a, b)
+    with np.errstate(invalid="ignore"):  # two infinite fits are not one minimum
+        return np.abs(a - b) <= _SAME_FIT * np.maximum(a, b)
 
 
 def _is_better(new: Minima, old: Minima) -> Mask:
