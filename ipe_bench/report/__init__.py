@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import types
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,8 +32,8 @@ class ReportResult:
     """Mean correct digits per estimator and start, on certified readings; empty where there are none."""
 
 
-def write_report(directories: Sequence[Path | str], output: Path | str) -> ReportResult:
-    """Writes summary.csv, tables/, figures/ and report.html under `output` from what is stored in the directories.
+def write_report(directories: Path | str | Sequence[Path | str], output: Path | str | None = None) -> ReportResult:
+    """Writes summary.csv, tables/, figures/ and report.html from what is stored, under `output` or the first directory.
 
     Raises:
         UserError: a directory does not exist.
@@ -43,8 +45,9 @@ def write_report(directories: Sequence[Path | str], output: Path | str) -> Repor
     from ipe_bench.report.tables import all_tables, write_tables
     from ipe_bench.statistics.analysis import analyse
 
+    directories = [directories] if isinstance(directories, Path | str) else list(directories)
     analysis = analyse(directories)
-    output = Path(output)
+    output = Path(directories[0] if output is None else output)
     folder = output / "figures"
     folder.mkdir(parents=True, exist_ok=True)
     summary_path = output / "summary.csv"
@@ -72,3 +75,15 @@ def write_report(directories: Sequence[Path | str], output: Path | str) -> Repor
         analysis.stale,
         certified,
     )
+
+
+class _Callable(types.ModuleType):
+    """`ipe_bench.report` is this room once it is imported, and a public function before: so the room can be called."""
+
+    def __call__(
+        self, directories: Path | str | Sequence[Path | str], output: Path | str | None = None
+    ) -> ReportResult:
+        return write_report(directories, output)
+
+
+sys.modules[__name__].__class__ = _Callable
