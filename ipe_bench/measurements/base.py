@@ -135,11 +135,6 @@ class Measurement(Named, ABC):
         """Real readings that come with this model; None where it has none."""
         return None
 
-    def suited_to(self, error_scale: float) -> Measurement:
-        """This model, accurate enough for parameters of that error scale (an integration step, say)."""
-        del error_scale
-        return self
-
 
 @dataclass(frozen=True)
 class Restricted(Measurement):
@@ -207,9 +202,6 @@ class Restricted(Measurement):
 
     def linearization(self) -> Array:
         return self.whole.linearization()[self._rows]
-
-    def suited_to(self, error_scale: float) -> Measurement:
-        return Restricted(self.whole.suited_to(error_scale), self.kept, self.stop)
 
 
 def differentiate(h: Any, x: Array, *, analytic: bool) -> Array:

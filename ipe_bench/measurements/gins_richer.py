@@ -28,7 +28,7 @@ class RicherGins(Gins):
 
     Random walk of the drifts: each reading interval of each case begins with an independent increment of deviation
     `gyro_random_walk` times the root of the interval, and the drift is constant within it, so the integration goes from
-    reading to reading and stays as exact as that of `Gins`.
+    reading to reading and keeps the tolerance of `Gins`.
     """
 
     gyro_random_walk: float = 0.0
@@ -59,20 +59,30 @@ class RicherGins(Gins):
         angles = np.repeat([self.accelerometer_misalignment * _ARCSEC, self.platform_misalignment * _ARCSEC], [2, 3])
         return np.concatenate([[quadratic, quadratic], angles, walk])
 
-    def simulate_until(self, x: Array, stop: int) -> Array:
+    def _readings(self, x: Array, steps: NDArray[np.int64], stop: int) -> Array:
         if x.shape[1] == self.n:
-            return super().simulate_until(x, stop)
-        return self._velocities(x, stop) - self.offset[self.rows(stop)]
+            return super()._readings(x, steps, stop)
+        return self._walked(x, steps, stop)
 
-    def _velocities(self, x: Array, stop: int) -> Array:
+    def _angle(self, x: Array) -> Array:
+        """With the farthest that the drifts walk; such a trial is tested however slowly it turns."""
+        if x.shape[1] == self.n:
+            return super()._angle(x)
+        walk = np.abs(self._walk(x)).reshape(len(x), -1).max(axis=1)
+        angle = super()._angle(x[:, : self.n]) + np.sqrt(3.0) * walk * 60.0 * self.interval_min
+        return np.maximum(angle, np.nextafter(self.trusted_angle, 1.0))
+
+    def _walk(self, x: Array) -> Array:
+        """How far the drifts have walked: (trials x cases, intervals, axes) in rad/s."""
+        increments = x[:, self._motion.n :].reshape(len(x) * len(self.cases), self.readings_per_case, 3)
+        return np.cumsum(increments, axis=1)
+
+    def _walked(self, x: Array, steps: NDArray[np.int64], stop: int) -> Array:
         """Integrates from reading to reading, with the drifts of each interval: (trials, readings)."""
-        motion, cases = self._motion, len(self.cases)
-        constant = x[:, : motion.n]
-        walk = np.cumsum(x[:, motion.n :].reshape(len(x) * cases, self.readings_per_case, 3), axis=1)
-        p, c = motion._lanes(constant)
+        motion, walk = self._motion, self._walk(x)
+        p, c = motion._lanes(x[:, : motion.n])
         y = motion._start(p, c)
         interval = np.array([60.0 * self.interval_min])
-        substeps = np.ceil(interval / self.step - 1e-9).astype(np.int64)
         first = np.arange(len(p)) * motion.states
         z = np.empty((len(p), stop, 2))
         for k in range(stop):
@@ -80,7 +90,7 @@ class RicherGins(Gins):
             inputs[:, _DRIFTS] += walk[:, k]
             after = np.empty_like(y)
             # The right-hand side does not depend on time, so every interval may begin at 0.
-            integrate(motion._plain, y, inputs, interval, np.maximum(substeps, 1), after, first)
+            integrate(motion._plain, y, inputs, interval, steps[k : k + 1], after, first)
             y, z[:, k] = after, after[:, :2]
         return z.reshape(len(x), -1)
 

@@ -12,7 +12,7 @@ TRIALS = 4000
 
 @pytest.fixture(scope="module")
 def gins():
-    return Gins().suited_to(100.0)
+    return Gins()
 
 
 @pytest.fixture(scope="module")

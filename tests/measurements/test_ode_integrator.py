@@ -8,6 +8,7 @@ from scipy.integrate import DOP853
 
 from ipe_bench.measurements import OdeMeasurement, Parameter, ode
 from ipe_bench.measurements.base import differentiate
+from ipe_bench.measurements.ode.levels import coarser, ladder
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,67 @@ def test_a_trial_that_overflows_leaves_its_neighbours_alone():
     z = Pulse(0.5).simulate(x)
     assert not np.isfinite(z[1]).all()
     assert (z[[0, 2]] == Pulse(0.5).simulate(x[[0, 2]])).all()
+
+
+@dataclass(frozen=True)
+class Chosen(Cases):
+    """The same at a tolerance: the first output within 1e-9, the second within 1e-6."""
+
+    step: float | None = None
+    tolerance = (1e-9, 1e-6)
+
+
+def test_steps_that_follow_the_parameters_hold_the_tolerance_of_each_output():
+    x = np.random.default_rng(4).normal(size=(60, 2)) * [3.0, 1.0]
+    model = Chosen()
+    off = np.abs(model.simulate(x) - Cases(1 / 64).simulate(x)).reshape(60, -1, 2)
+    assert off[..., 0].max() < 1e-9
+    assert off[..., 1].max() < 1e-6
+    assert len(set(model._search(x).places.tolist())) >= 3
+
+
+@dataclass(frozen=True)
+class Transient(OdeMeasurement):
+    """y' = -a (y - cos t), y(0) = 0, read often at first and rarely later."""
+
+    tolerance = 1e-8
+    states, outputs, nominal = 1, ("y",), np.array([2.0])  # type: ignore[assignment]
+    parameters = (Parameter("a"),)
+
+    @property
+    def times(self):
+        return np.array([0.01, 0.02, 0.05, 0.1, 2.0, 10.0])
+
+    def start(self, p, c):
+        return (0.0,)
+
+    def rhs(self, t, y, p, c):
+        return (-p[0] * (y[0] - np.cos(t)),)
+
+    def read(self, t, y, p, c):
+        return y
+
+
+def test_a_stiff_start_read_unevenly_holds_the_tolerance():
+    x = np.array([[0.5], [2.0], [30.0], [200.0]])
+    a, t = x, Transient().times
+    exact = a / (1 + a * a) * (a * np.cos(t) + np.sin(t) - a * np.exp(-a * t))
+    assert np.abs(Transient().simulate(x) - exact).max() < 1e-8
+
+
+def test_without_a_tolerance_or_a_step_the_model_says_what_is_missing():
+    class Silent(Pulse):
+        tolerance = None
+
+    with pytest.raises(ValueError, match="state `tolerance`"):
+        Silent(step=None).simulate(np.ones((1, 2)))
+
+
+def test_the_ladder_of_levels():
+    assert ladder(64).tolist() == [1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64]
+    assert ladder(1.0).tolist() == [1, 2]
+    levels = ladder(768)
+    assert [levels[coarser(i)] for i in range(1, 8)] == [1, 2, 2, 3, 4, 6, 8]
 
 
 def test_a_wrong_number_of_derivatives_is_refused():

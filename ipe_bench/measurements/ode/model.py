@@ -17,17 +17,22 @@ from numpy.typing import NDArray
 from ipe_bench.linalg import Array
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.ode.kernel import Recording, integrate, record
+from ipe_bench.measurements.ode.levels import Found, Indices, Remembered, Search, grouped, ladder
 
 _COMPLEX_STEP = 1e-100
 _BLOCK = 256
 """Trials whose derivatives are integrated together: few enough to stay in the cache."""
 
 
+_ANGLE_AT_START = 0.5
+"""Radians over which the first step that is tried lets the solution turn."""
+
+
 class OdeMeasurement(Measurement):
     """Readings of y' = rhs(t, y, p, c) at given times, for one or more cases that share the parameters.
 
-    A subclass states `states`, `outputs`, `step`, `parameters` and `times`, and writes `start`, `rhs` and `read`; the
-    package's docstring has an example. p are the parameters in SI units (x times `si_sizes`), c the constants of a
+    A subclass states `states`, `outputs`, `tolerance`, `parameters` and `times`, and writes `start`, `rhs` and `read`;
+    the package's docstring has an example. p are the parameters in SI units (x times `si_sizes`), c the constants of a
     case. The three functions use + - * / ** and NumPy's elementary functions on the entries of their arguments, and
     nothing that asks for a value (no if, no comparison). z has C order over (case, time, output); a time is an epoch.
     """
@@ -38,8 +43,16 @@ class OdeMeasurement(Measurement):
     """The names of what is read at each time."""
     time_unit: ClassVar[str] = "s"
     """The unit of `times`, `step` and t."""
-    step: float | None
-    """The longest integration step in seconds; each interval between readings is divided evenly."""
+    tolerance: float | Sequence[float] | None = None
+    """The error that the integration may leave in a reading, in `reading_unit`; or one such error for each output.
+    Each trial's step follows from it and from the trial's parameters."""
+    step: float | None = None
+    """A longest step for all trials, in place of `tolerance`; each interval between readings is divided evenly."""
+    shortest_step: float = 0.0
+    """Steps do not become shorter than about this, however wild the parameters, nor than 1/1024 of the usual interval
+    between readings: what an iterate that diverges may cost."""
+    trusted_angle: float = 0.0
+    """A step that is at most this over `rate` is known to hold the tolerance; 0: every trial is tested."""
 
     @property
     @abstractmethod
@@ -68,6 +81,12 @@ class OdeMeasurement(Measurement):
     def read(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
         """What the instruments show of the state, one entry per output."""
 
+    def rate(self, p: Sequence[Array]) -> Array | None:
+        """How fast each trial's solution may turn, grow or decay (trials,), per unit of time, from the parameters
+        (n, trials); None where nothing is known. It says with which step the search begins, no more."""
+        del p
+        return None
+
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
         cases, times, outputs = np.meshgrid(
@@ -89,25 +108,128 @@ class OdeMeasurement(Measurement):
         return self.simulate_until(x, len(self.times))
 
     def simulate_until(self, x: Array, stop: int) -> Array:
+        if self.step is not None:
+            return self._readings(x, self._fixed_steps(self.step), stop)
+        found = self._search(x)
+        z = np.empty((len(x), len(self.cases) * stop * len(self.outputs)))
+        z[found.computed] = self._prefix(found.z, stop)
+        others = np.delete(np.arange(len(x)), found.computed)
+        for place, rows in grouped(found.places[others], others):
+            z[rows] = self._readings(x[rows], self._steps(place), stop)
+        return z
+
+    def _readings(self, x: Array, steps: NDArray[np.int64], stop: int) -> Array:
+        """Readings (trials, readings) up to the time `stop`, with so many steps to each time."""
         p, c = self._lanes(x)
         per_case = stop * len(self.outputs)
         z = np.empty((len(x), len(self.cases) * per_case))
         first = per_case * np.arange(len(p))
-        self._integrate(self._plain, self._start(p, c), np.concatenate([p, c], axis=1), stop, z, first)
+        self._integrate(self._plain, self._start(p, c), np.concatenate([p, c], axis=1), steps, stop, z, first)
         return z
+
+    def _prefix(self, z: Array, stop: int) -> Array:
+        shape = (len(z), len(self.cases), len(self.times), len(self.outputs))
+        return z.reshape(shape)[:, :, :stop].reshape(len(z), len(self.cases) * stop * len(self.outputs))
+
+    def _search(self, x: Array) -> Found:
+        """The level of each trial, and the readings of those whose level had to be looked for."""
+        places = self._trusted(x)
+        unknown = np.flatnonzero(places < 0)
+        places[unknown] = self._remembered.look_up(x[unknown])
+        unknown = unknown[places[unknown] < 0]
+        if not len(unknown):
+            return Found(places, unknown, np.empty((0, self.m)))
+        found = self._find(x[unknown], self._first_guess(x[unknown]))
+        self._remembered.keep(x[unknown], found.places)
+        places[unknown] = found.places
+        return Found(places, unknown[found.computed], found.z)
+
+    def _find(self, x: Array, start: Indices) -> Found:
+        def readings(rows: Indices, level: int) -> Array:
+            return self._readings(x[rows], level * self._parts, len(self.times))
+
+        return Search(self._ladder, self._tolerances, readings).run(start)
+
+    def _trusted(self, x: Array) -> Indices:
+        """The coarsest level for trials of which it is known to do, -1 for the others."""
+        if self.trusted_angle == 0:
+            return np.full(len(x), -1)
+        return np.where(self._angle(x) <= self.trusted_angle, 0, -1)
+
+    def _angle(self, x: Array) -> Array:
+        """The coarsest step times the rate (trials,); not a number where nothing is known."""
+        rate = self.rate(list((x * self.si_sizes).T))
+        if rate is None:
+            return np.full(len(x), np.nan)
+        longest = np.max(np.diff(self.times, prepend=0.0) / self._parts)
+        return np.broadcast_to(rate * longest, len(x))
+
+    def _first_guess(self, x: Array) -> Indices:
+        """Where on the ladder the search begins: steps of half a radian, or what the nominal parameters need."""
+        angle = self._angle(x)
+        if np.isnan(angle).all() and np.isfinite(x).all():
+            return np.full(len(x), self._nominal_place)
+        wanted = np.nan_to_num(angle / _ANGLE_AT_START, nan=np.inf)
+        return np.clip(np.searchsorted(self._ladder, wanted), 1, len(self._ladder) - 1)
+
+    @cached_property
+    def _nominal_place(self) -> int:
+        return max(1, int(self._find(self.nominal[None], np.array([1])).places[0]))
+
+    @cached_property
+    def _remembered(self) -> Remembered:
+        return Remembered()
+
+    @cached_property
+    def _parts(self) -> NDArray[np.int64]:
+        """Steps to each time at level 1: one, and more where the interval is longer than usual."""
+        intervals = np.diff(self.times, prepend=0.0)
+        return np.maximum(np.ceil(intervals / np.median(intervals) - 1e-9), 1).astype(np.int64)
+
+    @cached_property
+    def _ladder(self) -> NDArray[np.int64]:
+        usual = float(np.median(np.diff(self.times, prepend=0.0)))
+        finest = 1024.0 if self.shortest_step <= 0 else usual / self.shortest_step
+        return ladder(min(finest + 1e-9, 1024.0))
+
+    @cached_property
+    def _tolerances(self) -> Array:
+        """What each reading (m,) may be off by."""
+        if self.tolerance is None:
+            raise ValueError(f"{self.name}: state `tolerance`, the error that a reading may have, or a fixed `step`")
+        per_output = np.broadcast_to(np.asarray(self.tolerance, dtype=float), len(self.outputs))
+        return np.tile(per_output, self.m // len(self.outputs))
+
+    def _steps(self, place: int) -> NDArray[np.int64]:
+        return self._ladder[place] * self._parts
+
+    def _fixed_steps(self, step: float) -> NDArray[np.int64]:
+        intervals = np.diff(self.times, prepend=0.0)
+        return np.maximum(np.ceil(intervals / step - 1e-9), 1).astype(np.int64)
 
     def jacobian(self, x: Array) -> Array:
         return self.jacobian_until(x, len(self.times))
 
     def jacobian_until(self, x: Array, stop: int) -> Array:
-        """dh/dx by the variational equations, integrated by the same compiled formula as the readings."""
+        """dh/dx by the variational equations, integrated by the same formula and steps as the readings of that x."""
         J = np.empty((len(x), len(self.cases) * stop * len(self.outputs), self.n))
-        for begin in range(0, len(x), _BLOCK):
-            block = slice(begin, begin + _BLOCK)
-            self._differentiate(x[block], stop, J[block])
+        for rows, steps in self._grouped_by_steps(x):
+            for begin in range(0, len(rows), _BLOCK):
+                block = rows[begin : begin + _BLOCK]
+                part = np.empty((len(block), *J.shape[1:]))
+                self._differentiate(x[block], steps, stop, part)
+                J[block] = part
         return J
 
-    def _differentiate(self, x: Array, stop: int, J: Array) -> None:
+    def _grouped_by_steps(self, x: Array) -> list[tuple[Indices, NDArray[np.int64]]]:
+        """The trials that share a level, and its steps."""
+        everyone = np.arange(len(x))
+        if self.step is not None:
+            return [(everyone, self._fixed_steps(self.step))]
+        places = self._search(x).places
+        return [(rows, self._steps(place)) for place, rows in grouped(places, everyone)]
+
+    def _differentiate(self, x: Array, steps: NDArray[np.int64], stop: int, J: Array) -> None:
         """Fills J (trials, readings, n): a lane for each trial, direction and case."""
         trials, n = x.shape
         p, c = self._lanes(np.repeat(x, n, axis=0))
@@ -117,7 +239,7 @@ class OdeMeasurement(Measurement):
         inputs = np.concatenate([p, c, direction], axis=1)
         shape = (trials, len(self.cases), stop * len(self.outputs), n)
         first = np.arange(J.size).reshape(shape)[:, :, 0].swapaxes(1, 2).ravel()
-        self._integrate(self._tangent, y0, inputs, stop, J, first, stride=n)
+        self._integrate(self._tangent, y0, inputs, steps, stop, J, first, stride=n)
 
     def _lanes(self, x: Array) -> tuple[Array, Array]:
         """Parameters and constants of every initial value problem: each trial in each case."""
@@ -132,16 +254,14 @@ class OdeMeasurement(Measurement):
         recording: Recording,
         y0: Array,
         inputs: Array,
+        steps: NDArray[np.int64],
         stop: int,
         out: Array,
         first: NDArray[np.int64],
         stride: int = 1,
     ) -> None:
-        if self.step is None:
-            raise ValueError(f"{self.name}: the integration step is not chosen yet; see suited_to")
         times = np.asarray(self.times[:stop], dtype=float)
-        substeps = np.ceil(np.diff(times, prepend=0.0) / self.step - 1e-9).astype(np.int64)
-        integrate(recording, y0, inputs, times, np.maximum(substeps, 1), out, first, stride)
+        integrate(recording, y0, inputs, times, steps[:stop], out, first, stride)
 
     @cached_property
     def _plain(self) -> Recording:
