@@ -112,7 +112,7 @@ def test_trials_that_are_trusted_without_a_test_keep_it_too():
     low, high = np.zeros(len(x)), np.full(len(x), 1e6)
     for _ in range(60):
         middle = (low + high) / 2
-        fits = model._angle(middle[:, None] * x) <= model.trusted_angle
+        fits = model._rates(middle[:, None] * x)[0] * model._longest <= model.trusted_angle
         low, high = np.where(fits, middle, low), np.where(fits, high, middle)
     x = low[:, None] * x
     assert (model.simulate(x) == Gins(step=180.0).simulate(x)).all()
@@ -133,7 +133,7 @@ def test_bits_of_a_trial_depend_on_itself_alone_where_steps_differ(monkeypatch):
     x = np.concatenate([draw(scale, 8, seed=9) for scale in (33.0, 1000.0, 3000.0, 10000.0)])
     model = Gins()
     z, J = model.simulate(x), model.jacobian(x)
-    assert len(set(model._search(x).places.tolist())) >= 5
+    assert len(set(model._search(x, model.offset).places.tolist())) >= 5
     for threads in ("1", "2"):
         monkeypatch.setenv("IPE_BENCH_THREADS", threads)
         assert (Gins().jacobian(x[::-1]) == J[::-1]).all()
@@ -150,7 +150,7 @@ def test_the_jacobian_takes_the_steps_of_the_simulation():
     x, model = draw(3000.0, 6, seed=10), Gins()
     for row in x:
         z = model.simulate(row[None])
-        level = model._ladder[model._search(row[None]).places[0]]
+        level = model._ladder[model._search(row[None], model.offset).places[0]]
         fixed = Gins(step=180.0 / level)
         assert (model.jacobian(row[None]) == fixed.jacobian(row[None])).all()
         np.testing.assert_allclose(z, fixed.simulate(row[None]), atol=1e-8)
@@ -172,7 +172,7 @@ def test_what_diverges_costs_no_more_than_the_shortest_step(scale):
     x = np.concatenate([scale * np.ones((2, 11)), draw(33.0, 2)])
     model = Gins()
     z = model.simulate(x)
-    assert (model._ladder[model._search(x).places] <= 64).all()
+    assert (model._ladder[model._search(x, model.offset).places] <= 64).all()
     assert (z[2:] == model.simulate(x[2:])).all()
     assert model.jacobian(x).shape == (4, 240, 11)
 

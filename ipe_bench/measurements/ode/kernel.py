@@ -1,9 +1,8 @@
-"""Compiles a recorded right-hand side into a batched fixed-step integrator, and runs it on every core.
+"""Compiles recorded equations into batched integrators of readings and of Jacobians, and runs them on every core.
 
-The method is the eighth-order Runge-Kutta formula of Dormand and Prince (the coefficients of DOP853; Hairer, Norsett,
-Wanner, Solving Ordinary Differential Equations I, II.5) at a fixed step. One lane is one initial value problem; `WIDTH`
-lanes advance together, so that the compiler turns each operation into SIMD instructions. A lane's bits depend on
-nothing but its own numbers: neither on its neighbours nor on the number of threads.
+One lane is one initial value problem, a trial in a case; `WIDTH` lanes advance together in vector instructions. A lane's
+bits depend on nothing but its own numbers: neither on its neighbours, nor on the width, nor on the number of threads.
+What is recorded is said by `Equations`; which steps a trial takes is left to `levels`.
 """
 
 from __future__ import annotations
@@ -12,10 +11,11 @@ import functools
 import hashlib
 import importlib.util
 import itertools
+import logging
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,115 +24,343 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import DOP853
 
 from ipe_bench.machine import cores
-from ipe_bench.measurements.ode.trace import Expression, Graph, emit, tangent
+from ipe_bench.measurements.ode.tableau import Tableau
+from ipe_bench.measurements.ode.trace import (
+    Expression,
+    Graph,
+    Program,
+    border,
+    dependent,
+    in_order,
+    separate,
+    substitute,
+    tangent,
+)
 
-WIDTH = 16
-"""Lanes that advance together: two registers of eight doubles."""
+_LOG = logging.getLogger(__name__)
 
-_STAGES = 12
-_A: list[list[float]] = DOP853.A[:_STAGES, :_STAGES].tolist()
-_B: list[float] = DOP853.B[:_STAGES].tolist()
-_C: list[float] = DOP853.C[:_STAGES].tolist()
+WIDTH = 8
+"""Lanes that advance together: one register of AVX-512."""
+NARROW = 4
+"""The same for what is left over, and for small batches."""
+_WORTH_THREADS = 40_000
+"""Steps times lanes times states from which a second thread gains more than it costs, some 150 microseconds."""
+
+_TOGETHER = 2
+"""Tangents that are integrated side by side: one alone would wait for its own results."""
 
 Arithmetic = Callable[..., Sequence[Any]]
+Lanes = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Recording:
-    """The source of one right-hand side and of what is read from its state, ready to be compiled."""
+class Variation:
+    """The equations of small deviations, where fewer numbers than the state has describe them."""
+
+    freedoms: int
+    slope: Arithmetic
+    """(t, y, p, c, d, dp): the time derivative of a deviation d (freedoms,) along the direction dp (n,)."""
+    moved: Arithmetic
+    """(y, d): by how much the state (states,) deviates, linear in d."""
+
+
+@dataclass(frozen=True)
+class Equations:
+    """What is integrated: functions that can be recorded, and the numbers of their arguments and results."""
 
     states: int
-    inputs: int
+    parameters: int
+    constants: int
     outputs: int
-    source: str
+    start: Arithmetic
+    rhs: Arithmetic
+    read: Arithmetic
+    variation: Variation | None = None
+    rate: Callable[..., Any] | None = None
 
 
-def record(rhs: Arithmetic, read: Arithmetic, states: int, inputs: int, outputs: int, *, varying: int = 0) -> Recording:
-    """Records `rhs(t, y, p)` and `read(t, y, p)`, or their derivative along a direction of the first `varying` inputs.
+class _Tape:
+    """The equations as expressions."""
 
-    y has `states` entries, p has `inputs` and what is read has `outputs`. For a derivative the tangents of the state
-    follow y, the direction follows p, and the tangents of the outputs are read in place of the outputs. The variational
-    equations are integrated as part of the system itself, so the derivative is that of the numerical solution, exact to
-    round-off.
+    def __init__(self, equations: Equations) -> None:
+        self.equations = equations
+        graph = self.graph = Graph()
+        self.t = graph.input("t")
+        self.y, self.p = graph.inputs("y", equations.states), graph.inputs("p", equations.parameters)
+        self.c = graph.inputs("c", equations.constants)
+        self.start = self._values(equations.start(self.p, self.c), equations.states, "start")
+        self.slope = self._values(equations.rhs(self.t, self.y, self.p, self.c), equations.states, "rhs")
+        self.shown = self._values(equations.read(self.t, self.y, self.p, self.c), equations.outputs, "read")
+
+    def _values(self, result: Iterable[Any], count: int, name: str) -> list[Expression]:
+        values = [self.graph.apply("add", v, 0.0) for v in result]
+        if len(values) != count:
+            raise ValueError(f"{name} returns {len(values)} values where {count} are declared")
+        return values
+
+    def fixed(self, *outputs: Expression) -> list[Expression]:
+        """What is computed once for each lane: it depends on the parameters and the case alone."""
+        return border(outputs, dependent(outputs, (self.t, *self.y)))
+
+    def along_the_way(self, outputs: Sequence[Expression], fixed: Sequence[Expression]) -> tuple[Program, bool]:
+        """The program that computes the outputs from the state, and whether it needs the time."""
+        timed = self.t in in_order(outputs, fixed)
+        return Program.of(outputs, [*([self.t] if timed else []), *self.y, *fixed]), timed
+
+    def beginning(self, outputs: Sequence[Expression]) -> Program:
+        return Program.of(outputs, [*self.p, *self.c])
+
+
+class _Linear:
+    """Tangents of some outputs: their program, what it needs of the state, and the sources of each direction."""
+
+    def __init__(self, tape: _Tape, tangents: Sequence[Expression], d: Sequence[Expression], dp: Sequence[Expression]):
+        outputs, sources = separate(tangents, d, dp)
+        names = [tape.graph.input(f"source{i}") for i in range(len(sources))]
+        one, zero = tape.graph.constant(1.0), tape.graph.constant(0.0)
+        self.sources = [
+            [substitute(s, {e: one if i == k else zero for i, e in enumerate(dp)}) for s in sources]
+            for k in range(len(dp))
+        ]
+        """The value (n, sources) of each source along each parameter."""
+        needed = border(outputs, dependent(outputs, (*d, *names)))
+        values = [e for row in self.sources for e in row]
+        varying = dependent([*needed, *values], (tape.t, *tape.y))
+        self.fixed = [e for e in needed if e not in varying]
+        self.saved = [e for e in needed if e in varying]
+        self.driving = _distinct(e for e in values if e in varying and e not in self.saved)
+        self.constant = _distinct(e for e in values if e not in varying)
+        self.inputs, self.outputs = [*d, *names, *self.saved], outputs
+
+    def program(self, fixed: Sequence[Expression]) -> Program:
+        return Program.of(self.outputs, [*self.inputs, *fixed])
+
+    def places(self, begin: int, width: int) -> list[list[int]]:
+        """Where each direction finds its sources in what is saved from `begin` on."""
+        order = {e: i for i, e in enumerate([*self.saved, *self.driving, *self.constant])}
+        return [[begin + order[e] * width for e in row] for row in self.sources]
+
+
+def _distinct(expressions: Iterable[Expression]) -> list[Expression]:
+    return list(dict.fromkeys(expressions))
+
+
+def _up(count: int, width: int) -> int:
+    return -(-count // width) * width
+
+
+def simulation_source(equations: Equations, tableau: Tableau, width: int) -> str:
+    """The module whose `integrate` computes readings."""
+    tape = _Tape(equations)
+    fixed = tape.fixed(*tape.slope, *tape.shown)
+    step, step_timed = tape.along_the_way(tape.slope, fixed)
+    read, read_timed = tape.along_the_way(tape.shown, fixed)
+    ns, no = equations.states, equations.outputs
+    out = (ns + len(fixed)) * width
+    weights = out + no * width
+    size = weights + sum(map(len, tableau.weights))
+    places = f"Places(states={ns}, fixed={len(fixed)}, weights={weights}, out={out}, size={size})"
+    stores = [i * width for i in range(ns + len(fixed))]
+    begin = tape.beginning([*tape.start, *fixed])
+    return f'''{_header(tableau)}
+places = {places}
+begin = machine_code.beginner({begin!r}, {stores}, {equations.parameters}, {equations.constants})
+step = machine_code.stepper({width}, formula, {step!r}, places, {step_timed})
+read = machine_code.reader({width}, {read!r}, places, places.out, {read_timed})
+
+
+@njit("{_SIMULATE}", nogil=True, cache=True, error_model="numpy")
+def integrate(x, si, cases, rows, first, last, times, steps, offset, out):
+    raw = np.empty({size + 8})
+    b = raw[(-raw.ctypes.data // 8) % 8:]
+    place = np.empty({width}, np.int64)
+    shift = np.empty({width}, np.int64)
+    per_case = times.shape[0] * {no}
+    for group in range(first, last, {width}):
+        for lane in range({width}):
+            problem = min(group + lane, last - 1)
+            trial = rows[problem // cases.shape[0]]
+            case = problem % cases.shape[0]
+            begin(b, lane, x, trial, si, cases, case)
+            place[lane] = (trial * cases.shape[0] + case) * per_case
+            shift[lane] = case * (offset.shape[0] // cases.shape[0])
+        t = 0.0
+        h = 0.0
+        for k in range(times.shape[0]):
+            before = h
+            h = (times[k] - t) / steps[k]
+            if h != before:
+                for i in range(weights.shape[0]):
+                    b[{weights} + i] = h * weights[i]
+            for s in range(steps[k]):
+                step(b, t + s * h, h)
+            t = times[k]
+            read(b, t, h)
+            for lane in range({width}):
+                for i in range({no}):
+                    out[place[lane] + i] = b[{out} + i * {width} + lane] - offset[shift[lane] + i]
+                place[lane] += {no}
+                shift[lane] += {no}
+'''
+
+
+def jacobian_source(equations: Equations, tableau: Tableau, width: int) -> str:
+    """The module whose `integrate` computes Jacobians: the state once, and beside it one tangent for each parameter.
+
+    The variational equations go through the stages of the state's own steps, so the derivative is that of the
+    numerical solution, exact to round-off; or of the model's own equations of small deviations, to the tolerance.
     """
-    graph = Graph()
-    t = graph.input("t")
-    y = graph.inputs("y", states * 2 if varying else states)
-    p = graph.inputs("p", inputs + varying)
-    direction = dict(zip(y[:states] + p[:varying], y[states:] + p[inputs:], strict=True)) if varying else {}
+    tape = _Tape(equations)
+    n, ns, no = equations.parameters, equations.states, equations.outputs
+    stages, (d, dp, slopes, shown, starts) = tableau.stages, _tangents(tape)
+    nd = len(d)
+    motion, reading = _Linear(tape, slopes, d, dp), _Linear(tape, shown, d, dp)
+    saved = [*motion.saved, *motion.driving]
+    noted = [*reading.saved, *reading.driving]
+    fixed = _distinct([*tape.fixed(*tape.slope, *saved, *noted), *motion.fixed, *reading.fixed])
+    step, step_timed = tape.along_the_way([*tape.slope, *saved], fixed)
+    note, note_timed = tape.along_the_way(noted, fixed)
+    tangents = (ns + len(fixed)) * width
+    stage, stage_size = tangents + n * nd * width, (len(saved) + len(motion.constant)) * width
+    at_reading = stage + stages * stage_size
+    out = at_reading + (len(noted) + len(reading.constant)) * width
+    weights = out + no * width
+    size = weights + sum(map(len, tableau.weights))
+    places = (
+        f"Places(states={ns}, fixed={len(fixed)}, weights={weights}, tangents={nd}, stage={stage}, "
+        f"stage_size={stage_size}, stage_values={len(motion.saved)}, reading={at_reading}, "
+        f"reading_values={len(reading.saved)}, out={out}, size={size})"
+    )
+    started = [*tape.start, *fixed, *(e for row in starts for e in row)]
+    stores = [i * width for i in range(len(started))]
+    for s in range(stages):
+        started += motion.constant
+        stores += [stage + s * stage_size + (len(saved) + i) * width for i in range(len(motion.constant))]
+    started += reading.constant
+    stores += [at_reading + (len(noted) + i) * width for i in range(len(reading.constant))]
+    begin = tape.beginning(started)
+    paired = n - n % _TOGETHER
+    return f'''{_header(tableau)}
+places = {places}
+sources = np.array({motion.places(stage, width)!r}, dtype=np.int64).reshape({n}, -1)
+reading_sources = np.array({reading.places(at_reading, width)!r}, dtype=np.int64).reshape({n}, -1)
+begin = machine_code.beginner({begin!r}, {stores}, {n}, {equations.constants})
+step = machine_code.stepper({width}, formula, {step!r}, places, {step_timed})
+note = machine_code.reader({width}, {note!r}, places, places.reading, {note_timed})
+motion = {motion.program(fixed)!r}
+step_tangents = machine_code.tangent_stepper({width}, formula, motion, places, sources.shape[1], {_TOGETHER})
+step_tangent = machine_code.tangent_stepper({width}, formula, motion, places, sources.shape[1], 1)
+read_tangent = machine_code.tangent_reader({width}, {reading.program(fixed)!r}, places, reading_sources.shape[1])
 
-    def values(function: Arithmetic, count: int, name: str) -> list[Expression]:
-        result = [graph.apply("add", v, 0.0) for v in function(t, y[:states], p[:inputs])]
-        if len(result) != count:
-            raise ValueError(f"{name} returns {len(result)} values where {count} are declared")
-        return result
 
-    slope, shown = values(rhs, states, "rhs"), values(read, outputs, "read")
-    if varying:
-        slope, shown = slope + tangent(slope, direction), tangent(shown, direction)
-    return Recording(len(y), len(p), outputs, _source(len(y), len(p), emit(slope), emit(shown)))
+@njit("{_DIFFERENTIATE}", nogil=True, cache=True, error_model="numpy")
+def integrate(x, si, cases, rows, first, last, times, steps, out):
+    raw = np.empty({size + 8})
+    b = raw[(-raw.ctypes.data // 8) % 8:]
+    place = np.empty({width}, np.int64)
+    per_case = times.shape[0] * {no * n}
+    for group in range(first, last, {width}):
+        for lane in range({width}):
+            problem = min(group + lane, last - 1)
+            trial = rows[problem // cases.shape[0]]
+            case = problem % cases.shape[0]
+            begin(b, lane, x, trial, si, cases, case)
+            place[lane] = (trial * cases.shape[0] + case) * per_case
+        t = 0.0
+        h = 0.0
+        for k in range(times.shape[0]):
+            before = h
+            h = (times[k] - t) / steps[k]
+            if h != before:
+                for i in range(weights.shape[0]):
+                    b[{weights} + i] = h * weights[i]
+            for s in range(steps[k]):
+                step(b, t + s * h, h)
+                for j in range(0, {paired}, {_TOGETHER}):
+                    step_tangents(b, {tangents} + j * {nd * width}, sources, j)
+                for j in range({paired}, {n}):
+                    step_tangent(b, {tangents} + j * {nd * width}, sources, j)
+            t = times[k]
+            note(b, t, h)
+            for j in range({n}):
+                read_tangent(b, {tangents} + j * {nd * width}, reading_sources, j)
+                for lane in range({width}):
+                    for i in range({no}):
+                        out[place[lane] + i * {n} + j] = b[{out} + i * {width} + lane] * si[j]
+            for lane in range({width}):
+                place[lane] += {no * n}
+'''
 
 
-def _source(states: int, inputs: int, rhs: tuple[str, list[str]], read: tuple[str, list[str]]) -> str:
-    y = [f"y{i}" for i in range(states)]
-    p = [f"p{i}" for i in range(inputs)]
-    nonzero = [(s, j) for s in range(_STAGES) for j in range(s) if _A[s][j] != 0.0]
-    used = [s for s in range(_STAGES) if _B[s] != 0.0]
+def rate_source(equations: Equations) -> str:
+    """The module whose `rates` computes how fast each trial turns, and returns the fastest of all."""
+    assert equations.rate is not None
+    p = Graph().inputs("p", equations.parameters)
+    program = Program.of([equations.rate(p)], p)
+    return f"""{_header(None)}
+value = machine_code.scalar({program!r}, {equations.parameters})
 
-    def combine(i: int, terms: list[tuple[str, int]]) -> str:
-        return " + ".join([f"y{i}", *(f"{factor} * k{s}_{i}" for factor, s in terms)])
 
-    stages = []
-    for s in range(_STAGES):
-        at = [combine(i, [(f"a{s}_{j}", j) for z, j in nonzero if z == s]) for i in range(states)]
-        slopes = ", ".join(f"k{s}_{i}" for i in range(states))
-        stages.append(f"        {slopes}, = rhs(t + {_C[s]!r} * h, {', '.join(at + p)})\n")
-    ends = [f"        y[{i * WIDTH} + lane] = {combine(i, [(f'b{s}', s) for s in used])}\n" for i in range(states)]
-    load = "".join(f"        {name} = y[{i * WIDTH} + lane]\n" for i, name in enumerate(y + p))
-    store = "".join(f"        out[place[lane] + {i} * stride] = {term}\n" for i, term in enumerate(read[1]))
-    constants = "".join(f"    a{s}_{j} = h * {_A[s][j]!r}\n" for s, j in nonzero)
-    constants += "".join(f"    b{s} = h * {_B[s]!r}\n" for s in used)
-    fast = "nogil=True, cache=True, error_model='numpy', fastmath={'contract', 'nsz'}"
-    return f'''"""Written by ipe_bench.measurements.ode.kernel; its name is a digest of its text."""
+@njit("float64(float64[:, ::1], float64[::1], float64[::1])", nogil=True, cache=True, error_model="numpy")
+def rates(x, si, out):
+    fastest = 0.0
+    for i in range(x.shape[0]):
+        rate = value(x, i, si)
+        out[i] = rate
+        if not rate <= fastest:
+            fastest = rate if rate == rate else np.inf
+    return fastest
+"""
 
-import math
+
+_ROWS = "float64[:, ::1], float64[::1], float64[:, ::1], int64[::1], int64, int64, float64[::1], int64[::1]"
+_SIMULATE = f"void({_ROWS}, float64[::1], float64[::1])"
+_DIFFERENTIATE = f"void({_ROWS}, float64[::1])"
+
+
+def _tangents(tape: _Tape) -> tuple[Any, Any, list[Expression], list[Expression], list[list[Expression]]]:
+    """Deviations, direction, the tangents of slope and readings in them, and where those of each parameter start."""
+    graph, variation = tape.graph, tape.equations.variation
+    dp = graph.inputs("dp", tape.equations.parameters)
+    begins = tangent(tape.start, dict(zip(tape.p, dp, strict=True)))
+    one, zero = graph.constant(1.0), graph.constant(0.0)
+    starts = [[substitute(e, {b: one if b is a else zero for b in dp}) for e in begins] for a in dp]
+    if variation is None:
+        dy = d = graph.inputs("d", tape.equations.states)
+        slopes = tangent(tape.slope, dict(zip(tape.y + tape.p, (*dy, *dp), strict=True)))
+    else:
+        d = graph.inputs("d", variation.freedoms)
+        if any(e is not zero for row in starts for e in row):
+            raise ValueError("equations of small deviations need a start that does not depend on the parameters")
+        dy = variation.moved(tape.y, d)
+        slopes = [graph.apply("add", v, 0.0) for v in variation.slope(tape.t, tape.y, tape.p, tape.c, d, dp)]
+        starts = [[zero] * variation.freedoms for _ in dp]
+    along = dict(zip(tape.y + tape.p, (*(graph.apply("add", v, 0.0) for v in dy), *dp), strict=True))
+    return d, dp, slopes, tangent(tape.shown, along), starts
+
+
+def _header(tableau: Tableau | None) -> str:
+    weights = "np.array([weight for row in formula.weights for _, weight in row])"
+    formula = f"formula = {tableau!r}\nweights = {weights}\n" if tableau else ""
+    return f'''"""Written by ipe_bench.measurements.ode.kernel for {_compiler_digest()}; its name is a digest of its text."""
 
 import numpy as np
 from numba import njit
 
+from ipe_bench.measurements.ode import machine_code
+from ipe_bench.measurements.ode.machine_code import Places
+from ipe_bench.measurements.ode.tableau import Tableau
+from ipe_bench.measurements.ode.trace import Program
 
-@njit({fast}, forceinline=True)
-def rhs(t, {", ".join(y + p)}):
-{rhs[0]}    return ({", ".join(rhs[1])},)
+{formula}'''
 
 
-@njit({fast})
-def step(t, h, y):
-{constants}    for lane in range({WIDTH}):
-{load}{"".join(stages)}{"".join(ends)}
-
-@njit({fast})
-def read(t, y, place, stride, out):
-    for lane in range({WIDTH}):
-{load}{read[0].replace("    ", "        ")}{store}
-
-@njit({fast})
-def integrate(y, start, times, substeps, first, stride, out):
-    place = np.empty({WIDTH}, np.int64)
-    for group in range(y.shape[0]):
-        t = start
-        place[:] = first[group]
-        for k in range(times.shape[0]):
-            h = (times[k] - t) / substeps[k]
-            for s in range(substeps[k]):
-                step(t + s * h, h, y[group])
-            t = times[k]
-            read(t, y[group], place, stride, out)
-            place += {len(read[1])} * stride
-'''
+@functools.cache
+def _compiler_digest() -> str:
+    """Stands for the code that turns programs into machine code: what it has compiled is not used after it changes."""
+    return hashlib.sha256(Path(__file__).with_name("machine_code.py").read_bytes()).hexdigest()[:16]
 
 
 def _cache_folder() -> Path:
@@ -148,11 +376,12 @@ def _cache_folder() -> Path:
 
 
 @functools.cache
-def _load(source: str) -> ModuleType:
+def load(source: str) -> ModuleType:
     """The module of a generated source, compiled at most once per machine."""
     name = f"ipe_bench_kernel_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     path = _cache_folder() / f"{name}.py"
     if not path.exists():
+        _LOG.info("compiling an integrator, once per machine: it is kept in %s", path.parent)
         with tempfile.NamedTemporaryFile("w", dir=path.parent, suffix=".tmp", delete=False) as file:
             file.write(source)
         os.replace(file.name, path)
@@ -176,41 +405,58 @@ def _pool(workers: int, process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(workers, thread_name_prefix="ode")
 
 
-def integrate(
-    recording: Recording,
-    y0: NDArray[np.float64],
-    p: NDArray[np.float64],
-    times: NDArray[np.float64],
-    substeps: NDArray[np.int64],
-    out: NDArray[np.float64],
-    first: NDArray[np.int64],
-    stride: int = 1,
-) -> None:
-    """Integrates every lane from time 0 and reads it at every time.
+@dataclass(frozen=True)
+class Kernel:
+    """One kind of integration, compiled for full groups of lanes and for what is left over."""
 
-    y0 (lanes, states), p (lanes, inputs); `substeps[k]` equal steps lead to `times[k]`. What is read of lane i goes to
-    `out.flat` at `first[i]`, `first[i] + stride` and so on, in order of time and output: where it is wanted, because
-    moving it later costs as much as a third of the integration.
-    """
-    groups = -(-len(y0) // WIDTH)
-    run = _load(recording.source).integrate
-    y = _in_groups(np.concatenate([y0, p], axis=1), groups)
-    # The lanes that fill up the last group repeat its last lane, to the same place.
-    place = first[np.minimum(np.arange(groups * WIDTH), len(first) - 1)].reshape(groups, WIDTH)
-    flat = out.reshape(-1)
-    workers = min(threads(), groups)
-    if workers == 1:
-        run(y, 0.0, times, substeps, place, stride, flat)
-        return
-    # More pieces than threads, so that a core slowed by other work does not hold up the rest.
-    bounds = np.linspace(0, groups, min(groups, 4 * workers) + 1).astype(int)
-    pieces = [slice(a, b) for a, b in itertools.pairwise(bounds)]
-    pool = _pool(workers, os.getpid())
-    list(pool.map(lambda piece: run(y[piece], 0.0, times, substeps, place[piece], stride, flat), pieces))
+    source: Callable[[Equations, Tableau, int], str]
+    equations: Equations
+    tableau: Tableau
 
+    @functools.cached_property
+    def _wide(self) -> Callable[..., None]:
+        return load(self.source(self.equations, self.tableau, WIDTH)).integrate
 
-def _in_groups(values: NDArray[np.float64], groups: int) -> NDArray[np.float64]:
-    """(lanes, k) as (groups, k * WIDTH); the last group is filled up with copies of the last lane."""
-    missing = groups * WIDTH - len(values)
-    filled = np.concatenate([values, np.repeat(values[-1:], missing, axis=0)]) if missing else values
-    return np.ascontiguousarray(filled.reshape(groups, WIDTH, -1).transpose(0, 2, 1)).reshape(groups, -1)
+    @functools.cached_property
+    def _narrow(self) -> Callable[..., None]:
+        return load(self.source(self.equations, self.tableau, NARROW)).integrate
+
+    def run(
+        self,
+        x: NDArray[np.float64],
+        si: NDArray[np.float64],
+        cases: NDArray[np.float64],
+        rows: NDArray[np.int64],
+        times: NDArray[np.float64],
+        steps: NDArray[np.int64],
+        *more: NDArray[np.float64],
+    ) -> None:
+        """Integrates the trials in these rows of x (trials, n) from time 0, in every case, `steps[k]` equal steps to
+        `times[k]`. The last of `more` takes the results, C-contiguous, in the same rows; before it, for simulations,
+        what is subtracted from the readings."""
+        lanes = len(rows) * len(cases)
+        left = lanes % WIDTH
+        full = lanes - left if 0 < left <= NARROW else lanes
+        arguments = (x, si, cases, rows)
+        if full < lanes:
+            self._narrow(*arguments, full, lanes, times, steps, *more)
+        if not full:
+            return
+        work = full * int(steps[: len(times)].sum()) * self.equations.states * (1 if len(more) > 1 else x.shape[1])
+        workers = min(threads(), full // WIDTH) if work >= _WORTH_THREADS else 1
+        if workers <= 1:
+            self._wide(*arguments, 0, full, times, steps, *more)
+            return
+        # More pieces than threads, so that a core slowed by other work does not hold up the rest.
+        count = min(full // WIDTH, workers * min(4, max(1, work // _WORTH_THREADS)))
+        bounds = [WIDTH * (i * (full // WIDTH) // count) for i in range(count)] + [full]
+        pieces = iter(list(itertools.pairwise(bounds)))
+
+        def work_on() -> None:
+            for first, last in pieces:
+                self._wide(*arguments, first, last, times, steps, *more)
+
+        others = [_pool(workers - 1, os.getpid()).submit(work_on) for _ in range(workers - 1)]
+        work_on()
+        for other in others:
+            other.result()

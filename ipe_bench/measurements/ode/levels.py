@@ -107,14 +107,11 @@ def grouped(places: Indices, rows: Indices) -> Iterator[tuple[int, Indices]]:
 class Remembered:
     """Levels of trials met lately, by the bits of their parameters: a simulation and a Jacobian share one search.
 
-    What is forgotten is found again, the same. It stays behind when a model is copied or sent to another process.
+    What is forgotten is found again, the same.
     """
 
     def __init__(self) -> None:
         self._places: dict[bytes, int] = {}
-
-    def __reduce__(self) -> tuple[type[Remembered], tuple[()]]:
-        return Remembered, ()
 
     def look_up(self, x: Array) -> Indices:
         """The places (trials,); -1 where not known."""

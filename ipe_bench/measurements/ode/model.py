@@ -7,8 +7,9 @@ come from it. Recording and compilation are in `trace` and `kernel`.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
+from types import ModuleType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,14 +17,19 @@ from numpy.typing import NDArray
 
 from ipe_bench.linalg import Array
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.measurements.ode.kernel import Recording, integrate, record
+from ipe_bench.measurements.ode.kernel import (
+    Equations,
+    Kernel,
+    Variation,
+    jacobian_source,
+    load,
+    rate_source,
+    simulation_source,
+)
 from ipe_bench.measurements.ode.levels import Found, Indices, Remembered, Search, grouped, ladder
+from ipe_bench.measurements.ode.tableau import DOP853
 
-_COMPLEX_STEP = 1e-100
-_BLOCK = 256
-"""Trials whose derivatives are integrated together: few enough to stay in the cache."""
-
-
+_STAYS = ("_readings_kernel", "_rate_module", "_jacobian_kernel", "_equations", "_remembered")
 _ANGLE_AT_START = 0.5
 """Radians over which the first step that is tried lets the solution turn."""
 
@@ -81,11 +87,14 @@ class OdeMeasurement(Measurement):
     def read(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
         """What the instruments show of the state, one entry per output."""
 
-    def rate(self, p: Sequence[Array]) -> Array | None:
-        """How fast each trial's solution may turn, grow or decay (trials,), per unit of time, from the parameters
-        (n, trials); None where nothing is known. It says with which step the search begins, no more."""
-        del p
+    @property
+    def variation(self) -> Variation | None:
+        """Equations of small deviations in fewer numbers than the state has, where the model knows them."""
         return None
+
+    rate: Callable[[Sequence[Any]], Any] | None = None
+    """A method rate(p), recorded like `rhs`: how fast the solution may turn, grow or decay, per unit of time. It says
+    with which step the search begins; where there is none, it begins with that of the nominal parameters."""
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
@@ -108,30 +117,55 @@ class OdeMeasurement(Measurement):
         return self.simulate_until(x, len(self.times))
 
     def simulate_until(self, x: Array, stop: int) -> Array:
-        if self.step is not None:
-            return self._readings(x, self._fixed_steps(self.step), stop)
-        found = self._search(x)
-        z = np.empty((len(x), len(self.cases) * stop * len(self.outputs)))
+        return self._shown(x, stop, self._zeros)
+
+    def _shown(self, x: Array, stop: int, offset: Array) -> Array:
+        """Readings less the offset (m,)."""
+        x = _own(x)
+        z = np.empty((len(x), len(self._cases) * stop * len(self.outputs)))
+        common = self._common_steps(x)
+        if common is not None:
+            self._simulate(x, np.arange(len(x)), common, offset, z)
+            return z
+        found = self._search(x, offset)
         z[found.computed] = self._prefix(found.z, stop)
         others = np.delete(np.arange(len(x)), found.computed)
         for place, rows in grouped(found.places[others], others):
-            z[rows] = self._readings(x[rows], self._steps(place), stop)
+            self._simulate(x, rows, self._steps(place), offset, z)
         return z
 
-    def _readings(self, x: Array, steps: NDArray[np.int64], stop: int) -> Array:
-        """Readings (trials, readings) up to the time `stop`, with so many steps to each time."""
-        p, c = self._lanes(x)
-        per_case = stop * len(self.outputs)
-        z = np.empty((len(x), len(self.cases) * per_case))
-        first = per_case * np.arange(len(p))
-        self._integrate(self._plain, self._start(p, c), np.concatenate([p, c], axis=1), steps, stop, z, first)
-        return z
+    def _common_steps(self, x: Array) -> NDArray[np.int64] | None:
+        """The steps to each time that are the same for all trials, fixed or known to do; None where trials differ."""
+        if self.step is not None:
+            return self._fixed_steps
+        return self._parts if self.trusted_angle and self._rates(x)[1] * self._longest <= self.trusted_angle else None
+
+    def _simulate(self, x: Array, rows: Indices, steps: NDArray[np.int64], offset: Array, z: Array) -> None:
+        """Fills these rows of z (trials, readings), as many times as it has room for, with so many steps to each."""
+        times = self._times[: z.shape[1] // (len(self._cases) * len(self.outputs))]
+        self._readings_kernel.run(x, self._si_sizes, self._cases, rows, times, steps, offset, z.reshape(-1))
+
+    @cached_property
+    def _zeros(self) -> Array:
+        return np.zeros(self.m)
+
+    @cached_property
+    def _si_sizes(self) -> Array:
+        return _own(self.si_sizes)
+
+    @cached_property
+    def _cases(self) -> Array:
+        return _own(self.cases)
+
+    @cached_property
+    def _times(self) -> Array:
+        return _own(self.times)
 
     def _prefix(self, z: Array, stop: int) -> Array:
         shape = (len(z), len(self.cases), len(self.times), len(self.outputs))
         return z.reshape(shape)[:, :, :stop].reshape(len(z), len(self.cases) * stop * len(self.outputs))
 
-    def _search(self, x: Array) -> Found:
+    def _search(self, x: Array, offset: Array) -> Found:
         """The level of each trial, and the readings of those whose level had to be looked for."""
         places = self._trusted(x)
         unknown = np.flatnonzero(places < 0)
@@ -139,14 +173,16 @@ class OdeMeasurement(Measurement):
         unknown = unknown[places[unknown] < 0]
         if not len(unknown):
             return Found(places, unknown, np.empty((0, self.m)))
-        found = self._find(x[unknown], self._first_guess(x[unknown]))
+        found = self._find(x[unknown], self._first_guess(x[unknown]), offset)
         self._remembered.keep(x[unknown], found.places)
         places[unknown] = found.places
         return Found(places, unknown[found.computed], found.z)
 
-    def _find(self, x: Array, start: Indices) -> Found:
+    def _find(self, x: Array, start: Indices, offset: Array) -> Found:
         def readings(rows: Indices, level: int) -> Array:
-            return self._readings(x[rows], level * self._parts, len(self.times))
+            z = np.empty((len(rows), self.m))
+            self._simulate(x[rows], np.arange(len(rows)), level * self._parts, offset, z)
+            return z
 
         return Search(self._ladder, self._tolerances, readings).run(start)
 
@@ -154,27 +190,32 @@ class OdeMeasurement(Measurement):
         """The coarsest level for trials of which it is known to do, -1 for the others."""
         if self.trusted_angle == 0:
             return np.full(len(x), -1)
-        return np.where(self._angle(x) <= self.trusted_angle, 0, -1)
+        return np.where(self._rates(x)[0] * self._longest <= self.trusted_angle, 0, -1)
 
-    def _angle(self, x: Array) -> Array:
-        """The coarsest step times the rate (trials,); not a number where nothing is known."""
-        rate = self.rate(list((x * self.si_sizes).T))
-        if rate is None:
-            return np.full(len(x), np.nan)
-        longest = np.max(np.diff(self.times, prepend=0.0) / self._parts)
-        return np.broadcast_to(rate * longest, len(x))
+    def _rates(self, x: Array) -> tuple[Array, float]:
+        """The rate of each trial, and the fastest of all; not a number where nothing is known."""
+        rates = np.full(len(x), np.nan)
+        return rates, self._rate_module.rates(x, self._si_sizes, rates) if self._rate_module else np.inf
+
+    @cached_property
+    def _rate_module(self) -> ModuleType | None:
+        return load(rate_source(self._equations)) if self._equations.rate else None
+
+    @cached_property
+    def _longest(self) -> float:
+        """The longest step of the coarsest level."""
+        return float(np.max(np.diff(self.times, prepend=0.0) / self._parts))
 
     def _first_guess(self, x: Array) -> Indices:
         """Where on the ladder the search begins: steps of half a radian, or what the nominal parameters need."""
-        angle = self._angle(x)
-        if np.isnan(angle).all() and np.isfinite(x).all():
+        if self._rate_module is None and np.isfinite(x).all():
             return np.full(len(x), self._nominal_place)
-        wanted = np.nan_to_num(angle / _ANGLE_AT_START, nan=np.inf)
+        wanted = np.nan_to_num(self._rates(x)[0] * self._longest / _ANGLE_AT_START, nan=np.inf)
         return np.clip(np.searchsorted(self._ladder, wanted), 1, len(self._ladder) - 1)
 
     @cached_property
     def _nominal_place(self) -> int:
-        return max(1, int(self._find(self.nominal[None], np.array([1])).places[0]))
+        return max(1, int(self._find(_own(self.nominal[None]), np.array([1]), self._zeros).places[0]))
 
     @cached_property
     def _remembered(self) -> Remembered:
@@ -203,82 +244,52 @@ class OdeMeasurement(Measurement):
     def _steps(self, place: int) -> NDArray[np.int64]:
         return self._ladder[place] * self._parts
 
-    def _fixed_steps(self, step: float) -> NDArray[np.int64]:
+    @cached_property
+    def _fixed_steps(self) -> NDArray[np.int64]:
+        assert self.step is not None
         intervals = np.diff(self.times, prepend=0.0)
-        return np.maximum(np.ceil(intervals / step - 1e-9), 1).astype(np.int64)
+        return np.maximum(np.ceil(intervals / self.step - 1e-9), 1).astype(np.int64)
 
     def jacobian(self, x: Array) -> Array:
         return self.jacobian_until(x, len(self.times))
 
     def jacobian_until(self, x: Array, stop: int) -> Array:
         """dh/dx by the variational equations, integrated by the same formula and steps as the readings of that x."""
+        x = _own(x)
         J = np.empty((len(x), len(self.cases) * stop * len(self.outputs), self.n))
         for rows, steps in self._grouped_by_steps(x):
-            for begin in range(0, len(rows), _BLOCK):
-                block = rows[begin : begin + _BLOCK]
-                part = np.empty((len(block), *J.shape[1:]))
-                self._differentiate(x[block], steps, stop, part)
-                J[block] = part
+            self._jacobian_kernel.run(x, self._si_sizes, self._cases, rows, self._times[:stop], steps, J.reshape(-1))
         return J
 
     def _grouped_by_steps(self, x: Array) -> list[tuple[Indices, NDArray[np.int64]]]:
         """The trials that share a level, and its steps."""
-        everyone = np.arange(len(x))
-        if self.step is not None:
-            return [(everyone, self._fixed_steps(self.step))]
-        places = self._search(x).places
+        everyone, common = np.arange(len(x)), self._common_steps(x)
+        if common is not None:
+            return [(everyone, common)]
+        places = self._search(x, self._zeros).places
         return [(rows, self._steps(place)) for place, rows in grouped(places, everyone)]
 
-    def _differentiate(self, x: Array, steps: NDArray[np.int64], stop: int, J: Array) -> None:
-        """Fills J (trials, readings, n): a lane for each trial, direction and case."""
-        trials, n = x.shape
-        p, c = self._lanes(np.repeat(x, n, axis=0))
-        direction = np.repeat(np.tile(np.eye(n), (trials, 1)), len(self.cases), axis=0) * self.si_sizes
-        y = self._start(p + 1j * _COMPLEX_STEP * direction, c)
-        y0 = np.concatenate([np.real(y), np.imag(y) / _COMPLEX_STEP], axis=1)
-        inputs = np.concatenate([p, c, direction], axis=1)
-        shape = (trials, len(self.cases), stop * len(self.outputs), n)
-        first = np.arange(J.size).reshape(shape)[:, :, 0].swapaxes(1, 2).ravel()
-        self._integrate(self._tangent, y0, inputs, steps, stop, J, first, stride=n)
-
-    def _lanes(self, x: Array) -> tuple[Array, Array]:
-        """Parameters and constants of every initial value problem: each trial in each case."""
-        p = np.repeat(x * self.si_sizes, len(self.cases), axis=0)
-        return p, np.tile(self.cases, (len(x), 1))
-
-    def _start(self, p: NDArray[Any], c: Array) -> NDArray[Any]:
-        return np.stack(np.broadcast_arrays(*self.start(list(p.T), list(c.T)), p[:, 0])[:-1], axis=1)
-
-    def _integrate(
-        self,
-        recording: Recording,
-        y0: Array,
-        inputs: Array,
-        steps: NDArray[np.int64],
-        stop: int,
-        out: Array,
-        first: NDArray[np.int64],
-        stride: int = 1,
-    ) -> None:
-        times = np.asarray(self.times[:stop], dtype=float)
-        integrate(recording, y0, inputs, times, steps[:stop], out, first, stride)
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is compiled and remembered, which stays with a process."""
+        return {k: v for k, v in self.__dict__.items() if k not in _STAYS}
 
     @cached_property
-    def _plain(self) -> Recording:
-        return self._record(varying=0)
+    def _readings_kernel(self) -> Kernel:
+        return Kernel(simulation_source, self._equations, DOP853)
 
     @cached_property
-    def _tangent(self) -> Recording:
-        return self._record(varying=self.n)
+    def _jacobian_kernel(self) -> Kernel:
+        return Kernel(jacobian_source, self._equations, DOP853)
 
-    def _record(self, *, varying: int) -> Recording:
-        n = self.n
+    @cached_property
+    def _equations(self) -> Equations:
+        constants, outputs = self.cases.shape[1], len(self.outputs)
+        return Equations(
+            self.states, self.n, constants, outputs, self.start, self.rhs, self.read, self.variation, self.rate
+        )
 
-        def rhs(t: Any, y: Sequence[Any], p: Sequence[Any]) -> Sequence[Any]:
-            return self.rhs(t, y, p[:n], p[n:])
 
-        def read(t: Any, y: Sequence[Any], p: Sequence[Any]) -> Sequence[Any]:
-            return self.read(t, y, p[:n], p[n:])
-
-        inputs = n + self.cases.shape[1]
-        return record(rhs, read, self.states, inputs, len(self.outputs), varying=varying)
+def _own(x: Array) -> Array:
+    """The same numbers as the compiled code takes them: contiguous, and not marked as read-only."""
+    x = np.ascontiguousarray(x, dtype=float)
+    return x if x.flags.writeable else x.copy()
