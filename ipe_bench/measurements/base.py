@@ -112,6 +112,20 @@ class Measurement(Named, ABC):
         """dh/dx at each trial: (trials, n) -> (trials, m, n); complex step where analytic, else central differences."""
         return differentiate(self.simulate, x, analytic=self.analytic)
 
+    def coarse_jacobian(self, x: Array) -> Array:
+        """dh/dx near enough for the steps of an iteration, |I - J~+ J| below 0.01, where that is cheaper; else exact.
+        A trial's bits depend on that trial's x alone. Covariances and tests of convergence want `jacobian`."""
+        return self.jacobian(x)
+
+    @property
+    def jacobian_cost(self) -> float:
+        """What a Jacobian costs, in simulations of the same trial."""
+        return float(self.n if self.analytic else 2 * self.n)
+
+    @property
+    def coarse_jacobian_cost(self) -> float:
+        return self.jacobian_cost
+
     def linearization(self) -> Array:
         """The matrix H (m, n) of eq. (1) about the nominal point."""
         return self.jacobian(self.nominal[None])[0]
@@ -129,6 +143,10 @@ class Measurement(Named, ABC):
     def jacobian_until(self, x: Array, stop: int) -> Array:
         """dh/dx in `rows(stop)` alone."""
         return self.jacobian(x)[:, self.rows(stop)]
+
+    def coarse_jacobian_until(self, x: Array, stop: int) -> Array:
+        """`coarse_jacobian` in `rows(stop)` alone."""
+        return self.coarse_jacobian(x)[:, self.rows(stop)]
 
     @property
     def recorded(self) -> Recorded | None:
@@ -199,6 +217,18 @@ class Restricted(Measurement):
     def jacobian(self, x: Array) -> Array:
         J = self.whole.jacobian(x) if self.stop is None else self.whole.jacobian_until(x, self.stop)
         return J[:, self._among_arrived]
+
+    def coarse_jacobian(self, x: Array) -> Array:
+        J = self.whole.coarse_jacobian(x) if self.stop is None else self.whole.coarse_jacobian_until(x, self.stop)
+        return J[:, self._among_arrived]
+
+    @property
+    def jacobian_cost(self) -> float:
+        return self.whole.jacobian_cost
+
+    @property
+    def coarse_jacobian_cost(self) -> float:
+        return self.whole.coarse_jacobian_cost
 
     def linearization(self) -> Array:
         return self.whole.linearization()[self._rows]

@@ -9,6 +9,7 @@ from gins_reference import velocities
 from scipy.integrate import DOP853, solve_ivp
 
 from ipe_bench.measurements import Gins
+from ipe_bench.measurements.base import Restricted
 from ipe_bench.measurements.ode.levels import Search
 
 STEP = 0.075 * 0.3048
@@ -199,6 +200,58 @@ def test_the_jacobian_is_that_of_the_same_formula_in_complex_arithmetic(gins):
             y = y + 180.0 * sum(DOP853.B[s] * slopes[s] for s in range(12))
             exact = y[:2].imag / 1e-100
             assert np.abs(J[k, i] - exact).max() < 1e-9 * np.abs(exact).max()
+
+
+class Plain(Gins):
+    """Without its equations of small deviations: the tangents of the whole state."""
+
+    variation = None
+
+
+@pytest.mark.parametrize("scale", [1.0, 33.0, 300.0, 3000.0])
+def test_eight_deviations_say_what_eleven_tangents_say(scale):
+    """To the error that the integration leaves in either."""
+    x = draw(scale, 10, seed=12)
+    exact, reduced = Plain().jacobian(x), Gins().jacobian(x)
+    assert (np.abs(reduced - exact) / np.abs(exact).max(axis=1, keepdims=True)).max() < 1e-9
+
+
+def test_a_jacobian_costs_what_the_kernel_computes():
+    """Eight deviations in eleven directions, beside eleven states: operations counted, not time."""
+    assert 10.5 < Gins().jacobian_cost < 11.5
+    assert Plain().jacobian_cost > 1.3 * Gins().jacobian_cost
+    assert Gins().coarse_jacobian_cost < 3.0
+    assert Restricted.until(Gins(), 5).jacobian_cost == Gins().jacobian_cost
+    assert Gins(step=60.0).coarse_jacobian_cost == Gins().jacobian_cost
+
+
+@pytest.mark.parametrize("scale", [33.0, 300.0, 1000.0, 3000.0])
+def test_steps_with_a_coarse_jacobian_contract(scale):
+    model, x = Gins(), draw(scale, 40, seed=13)
+    J, coarse = model.jacobian(x), model.coarse_jacobian(x)
+    left = [np.linalg.norm(np.eye(11) - np.linalg.pinv(c) @ j, 2) for c, j in zip(coarse, J, strict=True)]
+    assert max(left) < 0.01
+
+
+def test_bits_of_a_coarse_jacobian_depend_on_the_trial_alone():
+    x = np.concatenate([draw(scale, 5, seed=14) for scale in (33.0, 1000.0, 3000.0)])
+    model = Gins()
+    coarse = model.coarse_jacobian(x)
+    assert not (coarse == model.jacobian(x)).all(axis=(1, 2)).any()
+    assert (np.concatenate([Gins().coarse_jacobian(row[None]) for row in x]) == coarse).all()
+    assert (Gins().coarse_jacobian(x[::-1]) == coarse[::-1]).all()
+    assert (Gins().coarse_jacobian_until(x, 4) == coarse[:, model.rows(4)]).all()
+    assert (Restricted.until(model, 4).coarse_jacobian(x) == coarse[:, model.rows(4)]).all()
+
+
+def test_parameters_are_taken_in_any_layout_and_left_alone():
+    model, x = Gins(), draw(33.0, 5)
+    z, J = model.simulate(x), model.jacobian(x)
+    locked, strided = x.copy(), np.asfortranarray(np.repeat(x, 2, axis=0))[::2]
+    locked.flags.writeable = False
+    for same in (locked, strided):
+        assert (model.simulate(same) == z).all()
+        assert (model.jacobian(same) == J).all()
 
 
 def test_the_linear_bound_is_the_reference(gins):

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scipy.integrate import DOP853
 
-from ipe_bench.measurements import OdeMeasurement, Parameter, ode
+from ipe_bench.measurements import OdeMeasurement, Parameter, Polynomial, ode
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode import tableau
+from ipe_bench.measurements.ode.coarse import contraction
+from ipe_bench.measurements.ode.kernel import load
 from ipe_bench.measurements.ode.levels import coarser, ladder
 
 
@@ -155,6 +157,65 @@ def test_steps_that_follow_the_parameters_hold_the_tolerance_of_each_output():
     assert off[..., 0].max() < 1e-9
     assert off[..., 1].max() < 1e-6
     assert len(set(model._search(x, np.zeros(12)).places.tolist())) >= 3
+
+
+def test_a_trial_that_is_not_a_number_does_not_move_where_the_others_begin():
+    x = np.random.default_rng(6).normal(size=(5, 2))
+    spoilt = np.concatenate([x, [[np.nan, 1.0]]])
+    assert (Chosen().simulate(spoilt)[:5] == Chosen().simulate(x)).all()
+
+
+def test_a_coarse_jacobian_contracts_where_it_was_measured_and_beyond():
+    model = Chosen()
+    x = model.nominal + np.random.default_rng(7).normal(size=(30, 2))
+    J, coarse = model.jacobian(x), model.coarse_jacobian(x)
+    assert max(contraction(c, j) for c, j in zip(coarse, J, strict=True)) < 0.01
+    fixed = Cases(0.5)
+    assert (fixed.coarse_jacobian(x) == fixed.jacobian(x)).all()
+
+
+def test_a_loose_tolerance_leaves_less_room_for_coarse_tangents():
+    """Readings that are themselves only just accurate need tangents at nearly their own step."""
+
+    class Tight(Chosen):
+        nominal = np.ones(2)  # type: ignore[assignment]
+
+    class Loose(Tight):
+        tolerance = (0.03, 0.03)
+
+    assert Loose()._coarseness.level(16) > Tight()._coarseness.level(16) >= 3
+    x = Loose().nominal + 0.3 * np.random.default_rng(8).normal(size=(30, 2))
+    J, coarse = Loose().jacobian(x), Loose().coarse_jacobian(x)
+    assert max(contraction(c, j) for c, j in zip(coarse, J, strict=True)) < 0.01
+
+
+def test_the_contraction_of_a_scaled_jacobian_is_known():
+    """With (1 + d) J in place of J a step overshoots by d / (1 + d)."""
+    J = np.random.default_rng(9).normal(size=(9, 3)) * [1.0, 1e6, 1e-6]
+    assert contraction(1.25 * J, J) == pytest.approx(0.2)
+    assert contraction(J, J) < 1e-14
+    assert contraction(np.nan * J, J) == np.inf
+
+
+def test_other_models_state_what_their_jacobians_cost():
+    assert Polynomial().jacobian_cost == (Polynomial().n if Polynomial().analytic else 2 * Polynomial().n)
+    x = Polynomial().nominal[None]
+    assert (Polynomial().coarse_jacobian(x) == Polynomial().jacobian(x)).all()
+
+    class Differences(Polynomial):
+        analytic = False
+
+    assert Differences().jacobian_cost == 2 * Polynomial().n
+
+
+def test_a_first_compilation_says_so_once(tmp_path, monkeypatch, caplog):
+    monkeypatch.setenv("IPE_BENCH_CACHE", str(tmp_path))
+    with caplog.at_level("INFO"):
+        assert load("answer = 42  # of a first compilation\n").answer == 42
+        assert load.__wrapped__("answer = 42  # of a first compilation\n").answer == 42
+    assert [record.message for record in caplog.records] == [
+        f"compiling an integrator, once per machine: it is kept in {tmp_path}"
+    ]
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Compiles recorded equations into batched integrators of readings and of Jacobians, and runs them on every core.
 
-One lane is one initial value problem, a trial in a case; `WIDTH` lanes advance together in vector instructions. A lane's
-bits depend on nothing but its own numbers: neither on its neighbours, nor on the width, nor on the number of threads.
+One lane is one initial value problem, a trial in a case; `WIDTH` lanes advance together in vector instructions. The
+bits of a lane depend on its own numbers alone: neither on its neighbours, nor on the width, nor on how many threads.
 What is recorded is said by `Equations`; which steps a trial takes is left to `levels`.
 """
 
@@ -147,11 +147,21 @@ def _distinct(expressions: Iterable[Expression]) -> list[Expression]:
     return list(dict.fromkeys(expressions))
 
 
-def _up(count: int, width: int) -> int:
-    return -(-count // width) * width
+@dataclass(frozen=True)
+class Source:
+    """A module to be compiled, and the arithmetic operations of one step of one lane."""
+
+    text: str
+    operations: int
 
 
-def simulation_source(equations: Equations, tableau: Tableau, width: int) -> str:
+def _operations(program: Program, tableau: Tableau, states: int) -> int:
+    """Operations of a step: of the program in every stage, and of the weighted sums between them."""
+    counted = sum(name not in ("constant", "neg") for name, *_ in program.operations)
+    return tableau.stages * counted + states * sum(map(len, tableau.weights))
+
+
+def simulation_source(equations: Equations, tableau: Tableau, width: int) -> Source:
     """The module whose `integrate` computes readings."""
     tape = _Tape(equations)
     fixed = tape.fixed(*tape.slope, *tape.shown)
@@ -164,7 +174,8 @@ def simulation_source(equations: Equations, tableau: Tableau, width: int) -> str
     places = f"Places(states={ns}, fixed={len(fixed)}, weights={weights}, out={out}, size={size})"
     stores = [i * width for i in range(ns + len(fixed))]
     begin = tape.beginning([*tape.start, *fixed])
-    return f'''{_header(tableau)}
+    operations = _operations(step, tableau, ns)
+    text = f'''{_header(tableau)}
 places = {places}
 begin = machine_code.beginner({begin!r}, {stores}, {equations.parameters}, {equations.constants})
 step = machine_code.stepper({width}, formula, {step!r}, places, {step_timed})
@@ -204,9 +215,10 @@ def integrate(x, si, cases, rows, first, last, times, steps, offset, out):
                 place[lane] += {no}
                 shift[lane] += {no}
 '''
+    return Source(text, operations)
 
 
-def jacobian_source(equations: Equations, tableau: Tableau, width: int) -> str:
+def jacobian_source(equations: Equations, tableau: Tableau, width: int) -> Source:
     """The module whose `integrate` computes Jacobians: the state once, and beside it one tangent for each parameter.
 
     The variational equations go through the stages of the state's own steps, so the derivative is that of the
@@ -242,7 +254,8 @@ def jacobian_source(equations: Equations, tableau: Tableau, width: int) -> str:
     stores += [at_reading + (len(noted) + i) * width for i in range(len(reading.constant))]
     begin = tape.beginning(started)
     paired = n - n % _TOGETHER
-    return f'''{_header(tableau)}
+    operations = _operations(step, tableau, ns) + n * _operations(motion.program(fixed), tableau, nd)
+    text = f'''{_header(tableau)}
 places = {places}
 sources = np.array({motion.places(stage, width)!r}, dtype=np.int64).reshape({n}, -1)
 reading_sources = np.array({reading.places(at_reading, width)!r}, dtype=np.int64).reshape({n}, -1)
@@ -292,6 +305,7 @@ def integrate(x, si, cases, rows, first, last, times, steps, out):
             for lane in range({width}):
                 place[lane] += {no * n}
 '''
+    return Source(text, operations)
 
 
 def rate_source(equations: Equations) -> str:
@@ -344,7 +358,10 @@ def _tangents(tape: _Tape) -> tuple[Any, Any, list[Expression], list[Expression]
 def _header(tableau: Tableau | None) -> str:
     weights = "np.array([weight for row in formula.weights for _, weight in row])"
     formula = f"formula = {tableau!r}\nweights = {weights}\n" if tableau else ""
-    return f'''"""Written by ipe_bench.measurements.ode.kernel for {_compiler_digest()}; its name is a digest of its text."""
+    return f'''"""Written by ipe_bench.measurements.ode.kernel; its name is a digest of its text.
+
+For machine_code {_compiler_digest()}.
+"""
 
 import numpy as np
 from numba import njit
@@ -409,17 +426,26 @@ def _pool(workers: int, process: int) -> ThreadPoolExecutor:
 class Kernel:
     """One kind of integration, compiled for full groups of lanes and for what is left over."""
 
-    source: Callable[[Equations, Tableau, int], str]
+    source: Callable[[Equations, Tableau, int], Source]
     equations: Equations
     tableau: Tableau
 
     @functools.cached_property
+    def _source(self) -> Source:
+        return self.source(self.equations, self.tableau, WIDTH)
+
+    @property
+    def operations(self) -> int:
+        """Of one step of one lane: what a step costs, whatever the machine."""
+        return self._source.operations
+
+    @functools.cached_property
     def _wide(self) -> Callable[..., None]:
-        return load(self.source(self.equations, self.tableau, WIDTH)).integrate
+        return load(self._source.text).integrate
 
     @functools.cached_property
     def _narrow(self) -> Callable[..., None]:
-        return load(self.source(self.equations, self.tableau, NARROW)).integrate
+        return load(self.source(self.equations, self.tableau, NARROW).text).integrate
 
     def run(
         self,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.linalg import Array
 from ipe_bench.measurements.base import Measurement
+from ipe_bench.measurements.ode.coarse import CONTRACTION, MOST_RK4, Coarseness, contraction
 from ipe_bench.measurements.ode.kernel import (
     Equations,
     Kernel,
@@ -27,9 +28,9 @@ from ipe_bench.measurements.ode.kernel import (
     simulation_source,
 )
 from ipe_bench.measurements.ode.levels import Found, Indices, Remembered, Search, grouped, ladder
-from ipe_bench.measurements.ode.tableau import DOP853
+from ipe_bench.measurements.ode.tableau import DOP853, RK4
 
-_STAYS = ("_readings_kernel", "_rate_module", "_jacobian_kernel", "_equations", "_remembered")
+_STAYS = ("_readings_kernel", "_rk4_kernel", "_rate_module", "_jacobian_kernel", "_equations", "_remembered")
 _ANGLE_AT_START = 0.5
 """Radians over which the first step that is tried lets the solution turn."""
 
@@ -208,10 +209,11 @@ class OdeMeasurement(Measurement):
 
     def _first_guess(self, x: Array) -> Indices:
         """Where on the ladder the search begins: steps of half a radian, or what the nominal parameters need."""
-        if self._rate_module is None and np.isfinite(x).all():
-            return np.full(len(x), self._nominal_place)
+        top = len(self._ladder) - 1
+        if self._rate_module is None:
+            return np.where(np.isfinite(x).all(axis=1), self._nominal_place, top)
         wanted = np.nan_to_num(self._rates(x)[0] * self._longest / _ANGLE_AT_START, nan=np.inf)
-        return np.clip(np.searchsorted(self._ladder, wanted), 1, len(self._ladder) - 1)
+        return np.clip(np.searchsorted(self._ladder, wanted), 1, top)
 
     @cached_property
     def _nominal_place(self) -> int:
@@ -253,13 +255,84 @@ class OdeMeasurement(Measurement):
     def jacobian(self, x: Array) -> Array:
         return self.jacobian_until(x, len(self.times))
 
+    def coarse_jacobian(self, x: Array) -> Array:
+        return self.coarse_jacobian_until(x, len(self.times))
+
     def jacobian_until(self, x: Array, stop: int) -> Array:
         """dh/dx by the variational equations, integrated by the same formula and steps as the readings of that x."""
         x = _own(x)
-        J = np.empty((len(x), len(self.cases) * stop * len(self.outputs), self.n))
+        J = self._empty_jacobian(x, stop)
         for rows, steps in self._grouped_by_steps(x):
-            self._jacobian_kernel.run(x, self._si_sizes, self._cases, rows, self._times[:stop], steps, J.reshape(-1))
+            self._differentiate(self._jacobian_kernel, x, rows, steps, J)
         return J
+
+    def coarse_jacobian_until(self, x: Array, stop: int) -> Array:
+        """dh/dx with longer steps, or by a cheaper formula, where that was measured to contract; see `coarse`."""
+        if self.step is not None:
+            return self.jacobian_until(x, stop)
+        x = _own(x)
+        J, places, trusted = self._empty_jacobian(x, stop), self._search(x, self._zeros).places, self._trusted(x) == 0
+        for place, rows in grouped(np.where(trusted, -1, places), np.arange(len(x))):
+            kernel, level = self._coarsened(place)
+            self._differentiate(kernel, x, rows, level * self._parts, J)
+        return J
+
+    def _coarsened(self, place: int) -> tuple[Kernel, int]:
+        """The formula and the level for the tangents of trials at this place; -1 for those that are trusted."""
+        level = 1 if place < 0 else int(self._ladder[place])
+        if level > 2 or self._coarseness.rk4 is None:
+            return self._jacobian_kernel, self._coarseness.level(level)
+        # The formula of fourth order loses more by what a trial turns faster than the nominal one: 2^4 and 3^4 in hand.
+        return self._rk4_kernel, self._coarseness.rk4 * (1 if place < 0 else level + 1)
+
+    @cached_property
+    def _coarseness(self) -> Coarseness:
+        """Measured at the nominal parameters."""
+        x, everything = _own(self.nominal[None]), len(self.times)
+        level, J = int(self._ladder[self._search(x, self._zeros).places[0]]), self.jacobian(x)
+        rk4 = next(
+            (k for k in range(1, MOST_RK4 + 1) if level <= 2 and self._contraction(x, k, J) <= CONTRACTION), None
+        )
+        # Half the level; where that is half a step, every second reading.
+        every = slice(None) if level > 1 else slice(1, None, 2)
+        rows = np.arange(self.m).reshape(len(self._cases), everything, -1)[:, every].ravel()
+        times, steps = self._times[every], max(1, level // 2) * self._parts[every]
+        z, coarse = np.empty((1, len(rows))), np.empty((1, len(rows), self.n))
+        given = (x, self._si_sizes, self._cases, np.arange(1), np.ascontiguousarray(times), steps)
+        self._readings_kernel.run(*given, np.zeros(len(rows)), z.reshape(-1))
+        self._jacobian_kernel.run(*given, coarse.reshape(-1))
+        with np.errstate(all="ignore"):
+            off = np.abs(z - self._shown(x, everything, self._zeros)[:, rows]) / self._tolerances[rows]
+            sensitivity = contraction(coarse[0], J[0, rows]) / off.max()
+        return Coarseness(rk4, float(sensitivity) if np.isfinite(sensitivity) else np.inf)
+
+    def _contraction(self, x: Array, rk4: int, J: Array) -> float:
+        coarse = np.empty_like(J)
+        self._differentiate(self._rk4_kernel, x, np.arange(1), rk4 * self._parts, coarse)
+        return contraction(coarse[0], J[0])
+
+    def _empty_jacobian(self, x: Array, stop: int) -> Array:
+        return np.empty((len(x), len(self._cases) * stop * len(self.outputs), self.n))
+
+    def _differentiate(self, kernel: Kernel, x: Array, rows: Indices, steps: NDArray[np.int64], J: Array) -> None:
+        """Fills these rows of J (trials, readings, n), as many times as it has room for."""
+        times = self._times[: J.shape[1] // (len(self._cases) * len(self.outputs))]
+        kernel.run(x, self._si_sizes, self._cases, rows, times, steps, J.reshape(-1))
+
+    @property
+    def jacobian_cost(self) -> float:
+        """Arithmetic operations of a step with all tangents, over those of a simulation's step."""
+        return self._jacobian_kernel.operations / self._readings_kernel.operations
+
+    @property
+    def coarse_jacobian_cost(self) -> float:
+        """At the nominal parameters, or where they are at a level above 2; in simulations at the trial's level."""
+        if self.step is not None:
+            return self.jacobian_cost
+        place = int(self._search(_own(self.nominal[None]), self._zeros).places[0])
+        trusted = self._trusted(_own(self.nominal[None]))[0] == 0
+        kernel, level = self._coarsened(-1 if trusted else place)
+        return kernel.operations * level / (self._readings_kernel.operations * int(self._ladder[place]))
 
     def _grouped_by_steps(self, x: Array) -> list[tuple[Indices, NDArray[np.int64]]]:
         """The trials that share a level, and its steps."""
@@ -280,6 +353,10 @@ class OdeMeasurement(Measurement):
     @cached_property
     def _jacobian_kernel(self) -> Kernel:
         return Kernel(jacobian_source, self._equations, DOP853)
+
+    @cached_property
+    def _rk4_kernel(self) -> Kernel:
+        return Kernel(jacobian_source, self._equations, RK4)
 
     @cached_property
     def _equations(self) -> Equations:

@@ -369,8 +369,8 @@ class Program:
         given = set(inputs)
         needed = [e for e in in_order(outputs, inputs) if e not in given]
         uses: dict[int, int] = {}
-        for e in [*(a for e in needed for a in operands(e)), *outputs]:
-            uses[e.order] = uses.get(e.order, 0) + 1
+        for used in [*(a for e in needed for a in operands(e)), *outputs]:
+            uses[used.order] = uses.get(used.order, 0) + 1
         fused = {e.order: found for e in needed if (found := _fusion(e, uses, given))}
         inside = {product.order for _, product, _ in fused.values()}
         number = {e.order: i for i, e in enumerate(inputs)}
