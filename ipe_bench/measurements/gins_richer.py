@@ -103,7 +103,7 @@ class RicherGins(Gins):
                 y.reshape(-1),
             )
             z[:, k] = y[:, :2]
-        return z.reshape(len(x), -1)
+        return z.reshape(len(x), cases * stop * 2)
 
     def _tilted(self, p: Array, c: Array) -> Array:
         """The platform is turned about x, then y, then z: true up and Earth axis turn the other way in its axes."""

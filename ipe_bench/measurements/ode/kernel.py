@@ -461,6 +461,8 @@ class Kernel:
         `times[k]`. The last of `more` takes the results, C-contiguous, in the same rows; before it, for simulations,
         what is subtracted from the readings."""
         lanes = len(rows) * len(cases)
+        if not lanes:
+            return
         left = lanes % WIDTH
         full = lanes - left if 0 < left <= NARROW else lanes
         arguments = (x, si, cases, rows)

@@ -58,44 +58,53 @@ class Search:
 
     levels: NDArray[np.int64]
     tolerance: Array
-    readings: Callable[[Indices, int], Array]
-    """Readings (rows, m) of the trials in these rows at one level."""
+    simulate: Callable[[Indices, int, Array], None]
+    """Fills these rows of an array (trials, m) with the readings of these trials at one level."""
 
     def run(self, start: Indices) -> Found:
         """From the places (trials,) where to begin; those at the top are accepted as they are."""
         top = len(self.levels) - 1
-        places, final = start.copy(), start.copy()
-        z = np.empty((len(start), len(self.tolerance)))
-        held = np.full(len(start), -1)
-        pending = np.flatnonzero(start < top)
-        computed = pending
+        state = _State(start.copy(), start.copy(), np.full(len(start), -1), len(self.tolerance))
+        pending = computed = np.flatnonzero(start < top)
         while len(pending):
-            still = []
-            for place, rows in grouped(places[pending], pending):
-                still.append(self._compare(place, rows, z, held, places, final))
+            still = [self._compare(place, rows, state) for place, rows in grouped(state.places[pending], pending)]
             pending = np.concatenate(still)
-        return Found(final, computed, z[computed])
+        return Found(state.final, computed, state.fine if len(computed) == len(start) else state.fine[computed])
 
-    def _compare(self, place: int, rows: Indices, z: Array, held: Indices, places: Indices, final: Indices) -> Indices:
+    def _compare(self, place: int, rows: Indices, state: _State) -> Indices:
         """Tries one level for the trials in `rows`; those that are not done, with their next place in `places`."""
         below, top = coarser(place), len(self.levels) - 1
-        missing = held[rows] != below
-        coarse = z[rows]
-        if missing.any():
-            coarse[missing] = self.readings(rows[missing], int(self.levels[below]))
-        fine = self.readings(rows, int(self.levels[place]))
+        known = state.held[rows] == below
+        state.coarse[rows[known]] = state.fine[rows[known]]
+        if not known.all():
+            self.simulate(rows[~known], int(self.levels[below]), state.coarse)
+        self.simulate(rows, int(self.levels[place]), state.fine)
         with np.errstate(all="ignore"):
-            moved = SAFETY * (np.abs(fine - coarse) / self.tolerance).max(axis=1)
+            moved = SAFETY * self._distance(state.fine[rows], state.coarse[rows])
             left = moved / ((self.levels[place] / self.levels[below]) ** ORDER - 1.0)
             # Not a number where an iterate overflows: such a trial climbs to the top, in bounded time.
             moved, left = np.nan_to_num(moved, nan=np.inf), np.nan_to_num(left, nan=np.inf)
             wanted = self.levels[place] * np.minimum(left ** (1.0 / ORDER), _LARGEST_CLIMB)
         enough, good = moved <= 1.0, (left <= 1.0) | (place == top)
-        z[rows] = np.where(enough[:, None], coarse, fine)
-        final[rows] = np.where(enough, below, place)
-        held[rows] = place
-        places[rows] = np.clip(np.searchsorted(self.levels, wanted), place + 1, top)
+        state.fine[rows[enough]] = state.coarse[rows[enough]]
+        state.final[rows] = np.where(enough, below, place)
+        state.held[rows] = place
+        state.places[rows] = np.clip(np.searchsorted(self.levels, wanted), place + 1, top)
         return rows[~(enough | good)]
+
+    def _distance(self, fine: Array, coarse: Array) -> Array:
+        """The largest difference of each trial (trials,) in tolerances. Overwrites its arguments."""
+        np.subtract(fine, coarse, out=fine)
+        np.divide(np.abs(fine, out=fine), self.tolerance, out=fine)
+        return fine.max(axis=1)
+
+
+class _State:
+    """Where a search stands: for each trial the place to try, the one accepted, the one whose readings are `fine`."""
+
+    def __init__(self, places: Indices, final: Indices, held: Indices, m: int) -> None:
+        self.places, self.final, self.held = places, final, held
+        self.fine, self.coarse = np.empty((len(places), m)), np.empty((len(places), m))
 
 
 def grouped(places: Indices, rows: Indices) -> Iterator[tuple[int, Indices]]:

@@ -31,7 +31,7 @@ from ipe_bench.measurements.ode.levels import Found, Indices, Remembered, Search
 from ipe_bench.measurements.ode.tableau import DOP853, RK4
 
 _STAYS = ("_readings_kernel", "_rk4_kernel", "_rate_module", "_jacobian_kernel", "_equations", "_remembered")
-_ANGLE_AT_START = 0.5
+_ANGLE_AT_START = 0.7
 """Radians over which the first step that is tried lets the solution turn."""
 
 
@@ -129,6 +129,8 @@ class OdeMeasurement(Measurement):
             self._simulate(x, np.arange(len(x)), common, offset, z)
             return z
         found = self._search(x, offset)
+        if len(found.computed) == len(x):
+            return self._prefix(found.z, stop)
         z[found.computed] = self._prefix(found.z, stop)
         others = np.delete(np.arange(len(x)), found.computed)
         for place, rows in grouped(found.places[others], others):
@@ -163,6 +165,8 @@ class OdeMeasurement(Measurement):
         return _own(self.times)
 
     def _prefix(self, z: Array, stop: int) -> Array:
+        if stop == len(self.times):
+            return z
         shape = (len(z), len(self.cases), len(self.times), len(self.outputs))
         return z.reshape(shape)[:, :, :stop].reshape(len(z), len(self.cases) * stop * len(self.outputs))
 
@@ -180,12 +184,10 @@ class OdeMeasurement(Measurement):
         return Found(places, unknown[found.computed], found.z)
 
     def _find(self, x: Array, start: Indices, offset: Array) -> Found:
-        def readings(rows: Indices, level: int) -> Array:
-            z = np.empty((len(rows), self.m))
-            self._simulate(x[rows], np.arange(len(rows)), level * self._parts, offset, z)
-            return z
+        def simulate(rows: Indices, level: int, z: Array) -> None:
+            self._simulate(x, rows, level * self._parts, offset, z)
 
-        return Search(self._ladder, self._tolerances, readings).run(start)
+        return Search(self._ladder, self._tolerances, simulate).run(start)
 
     def _trusted(self, x: Array) -> Indices:
         """The coarsest level for trials of which it is known to do, -1 for the others."""
