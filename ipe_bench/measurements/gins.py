@@ -16,8 +16,8 @@ import numpy as np
 
 from ipe_bench.linalg import Array
 from ipe_bench.measurements.base import Parameter
-from ipe_bench.measurements.ode.kernel import Variation
 from ipe_bench.measurements.ode.model import OdeMeasurement
+from ipe_bench.measurements.ode.source import Variation
 from ipe_bench.measurements.ode.trace import tangent
 
 FOOT = 0.3048

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from ipe_bench.errors import UserError
 from ipe_bench.linalg import Array
 from ipe_bench.measurements.gins import Gins
-from ipe_bench.measurements.ode.kernel import Equations, Kernel, simulation_source
+from ipe_bench.measurements.ode.kernel import Kernel
+from ipe_bench.measurements.ode.source import Equations, simulation_source
 from ipe_bench.measurements.ode.tableau import DOP853
 
 _ARCSEC = np.pi / 180 / 3600

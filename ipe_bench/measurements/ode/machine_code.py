@@ -2,7 +2,7 @@
 
 A value is a vector with one number for each of `width` initial value problems, or a single number where width is 0.
 Every operation is exact IEEE arithmetic in a fixed order, so a problem's bits do not depend on the width, on its
-neighbours, or on what a compiler finds faster. What the functions are called on is left to `kernel`.
+neighbours, or on what a compiler finds faster. What the functions are called on is left to `source`.
 """
 
 from __future__ import annotations

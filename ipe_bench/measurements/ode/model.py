@@ -1,7 +1,7 @@
 """Measurement models whose readings are taken from the solution of ordinary differential equations.
 
 The author writes the right-hand side once, in plain arithmetic; the batched compiled integrator and the exact Jacobian
-come from it. Recording and compilation are in `trace` and `kernel`.
+come from it. Recording and compilation are in `trace`, `source` and `kernel`, the choice of steps in `levels`.
 """
 
 from __future__ import annotations
@@ -18,16 +18,9 @@ from numpy.typing import NDArray
 from ipe_bench.linalg import Array
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.ode.coarse import CONTRACTION, MOST_RK4, Coarseness, contraction
-from ipe_bench.measurements.ode.kernel import (
-    Equations,
-    Kernel,
-    Variation,
-    jacobian_source,
-    load,
-    rate_source,
-    simulation_source,
-)
+from ipe_bench.measurements.ode.kernel import Kernel, load
 from ipe_bench.measurements.ode.levels import Found, Indices, Remembered, Search, grouped, ladder
+from ipe_bench.measurements.ode.source import Equations, Variation, jacobian_source, rate_source, simulation_source
 from ipe_bench.measurements.ode.tableau import DOP853, RK4
 
 _STAYS = ("_readings_kernel", "_rk4_kernel", "_rate_module", "_jacobian_kernel", "_equations", "_remembered")
