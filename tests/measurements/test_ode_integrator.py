@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.integrate import DOP853
 
-from ipe_bench.measurements import OdeMeasurement, Parameter, Polynomial, ode
+from ipe_bench import components
+from ipe_bench.measurements import LotkaVolterra, OdeMeasurement, Parameter, Polynomial, ode
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode import tableau
 from ipe_bench.measurements.ode.coarse import contraction
@@ -206,6 +207,14 @@ def test_other_models_state_what_their_jacobians_cost():
         analytic = False
 
     assert Differences().jacobian_cost == 2 * Polynomial().n
+
+
+def test_what_generates_machine_code_is_part_of_the_source_that_results_depend_on(monkeypatch):
+    """It is imported by generated modules alone, and yet a change to it makes stored results those of other code."""
+    before = components.fingerprint([LotkaVolterra()])["source"]
+    read, changed = components._source_of, "ipe_bench.measurements.ode.machine_code"
+    monkeypatch.setattr(components, "_source_of", lambda module: read(module) + b"#" * (module == changed))
+    assert components.fingerprint([LotkaVolterra()])["source"] != before
 
 
 def test_a_first_compilation_says_so_once(tmp_path, monkeypatch, caplog):

@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ipe_bench.measurements.ode.tableau import Tableau
 from ipe_bench.measurements.ode.trace import (
@@ -25,6 +25,10 @@ from ipe_bench.measurements.ode.trace import (
     substitute,
     tangent,
 )
+
+if TYPE_CHECKING:
+    # The modules that are written here import it: where results depend on this source, they depend on that.
+    from ipe_bench.measurements.ode import machine_code  # noqa: F401
 
 _TOGETHER = 2
 """Tangents that are integrated side by side: one alone would wait for its own results."""
