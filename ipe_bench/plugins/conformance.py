@@ -167,10 +167,6 @@ def _points(model: Measurement, trials: int = 4) -> Array:
     return model.nominal + 0.1 * np.random.default_rng(11).standard_normal((trials, model.n))
 
 
-def _suited(model: Measurement) -> Measurement:
-    return model.suited_to(1.0)
-
-
 def names_its_readings(model: Measurement) -> None:
     """Has more readings than parameters, each with its own label, and units."""
     assert model.m > model.n, f"{model.m} readings are too few for {model.n} parameters"
@@ -185,7 +181,6 @@ def names_its_readings(model: Measurement) -> None:
 
 def simulates_batches(model: Measurement) -> None:
     """Simulates a batch as its trials one by one, bit for bit."""
-    model = _suited(model)
     x = _points(model)
     z = model.simulate(x)
     assert z.shape == (len(x), model.m), f"simulate returns {z.shape}, and not {(len(x), model.m)}"
@@ -197,7 +192,6 @@ def simulates_batches(model: Measurement) -> None:
 
 def differentiates(model: Measurement) -> None:
     """Has the Jacobian that differences of its readings show."""
-    model = _suited(model)
     x = _points(model)
     J = model.jacobian(x)
     assert J.shape == (len(x), model.m, model.n), f"jacobian returns {J.shape}"
@@ -215,7 +209,6 @@ def orders_its_epochs(model: Measurement) -> None:
         return
     rows = np.sort(np.concatenate(model.epochs))
     assert np.array_equal(rows, np.arange(model.m)), "the epochs do not hold every reading once"
-    model = _suited(model)
     x, stop = _points(model), max(1, len(model.epochs or ()) // 2)
     prefix, whole = model.simulate_until(x, stop), model.simulate(x)[:, model.rows(stop)]
     assert np.allclose(prefix, whole, rtol=1e-12, atol=1e-12 * np.abs(whole).max()), "a prefix differs from the whole"
