@@ -15,7 +15,6 @@ from ipe_bench.basics.files import write_atomically
 from ipe_bench.report.words import duration, p_value, percent, plain, precise, short
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.comparisons import ALPHA
-from ipe_bench.statistics.profiles import BUDGETS, RATIOS
 from ipe_bench.statistics.summary import ALL
 
 
@@ -380,19 +379,6 @@ def write_tables(analysis: Analysis, tables: Sequence[Table], folder: Path) -> t
         write(f"{table.name}.csv", table.data.to_csv(index=False))
         write(f"{table.name}.md", markdown(table))
         write(f"{table.name}.tex", latex(table))
-    if analysis.profiles.trials:
-        write("profiles.csv", _profiles(analysis).to_csv(index=False))
+    if len(analysis.profiles):
+        write("profiles.csv", analysis.profiles.to_csv(index=False))
     return tuple(paths)
-
-
-def _profiles(analysis: Analysis) -> pd.DataFrame:
-    """The curves of both profiles: estimator, kind, abscissa, share."""
-    profiles = analysis.profiles
-    parts = []
-    for label in profiles.trials:
-        for kind, x, y in (
-            ("performance", RATIOS, profiles.performance(label)),
-            ("data", BUDGETS, profiles.data(label)),
-        ):
-            parts.append(pd.DataFrame({"estimator": label, "profile": kind, "at": x, "share": y}))
-    return pd.concat(parts)

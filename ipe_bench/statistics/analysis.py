@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,8 @@ NIS = "extra_nis"
 
 @dataclass(frozen=True)
 class Analysis:
-    """Tables that figures, tables and the page are drawn from. Each starts with the scenario's columns."""
+    """Tidy tables that figures, tables and the page are drawn from. Each starts with the scenario's columns; those of a
+    scenario under an estimator add `scenario`, its number, and `estimator`."""
 
     collection: Collection
     summary: pd.DataFrame
@@ -47,15 +48,17 @@ class Analysis:
     pairs: pd.DataFrame
     """Every pair of estimators on every scenario; see `comparisons.Pair`."""
     scores: pd.DataFrame
-    """Per scenario (numbered) and estimator: capped mean error, whether it leads significantly, and median costs."""
+    """Per scenario and estimator: capped mean error, whether it leads significantly, and median costs."""
     ranking: Ranking | None
-    profiles: Profiles
-    distributions: Mapping[tuple[int, str], Array]
-    """By number of scenario and estimator, the quantiles of the Mahalanobis error at `PROBABILITIES`."""
-    correlations: Mapping[tuple[int, str], Array]
-    """By number of scenario and estimator, the correlation of the parameters' errors over solved trials."""
-    convergence: Mapping[tuple[int, str], list[Array]]
-    """By number of scenario and estimator, each stored trial's distances of iterates from the last, in deviations."""
+    profiles: pd.DataFrame
+    """Estimator, profile (performance or data), `at` (cost ratio or budget) and share, over all scenarios."""
+    distributions: pd.DataFrame
+    """Quantiles of the Mahalanobis error: probability (of `PROBABILITIES`) and distance."""
+    correlations: pd.DataFrame
+    """Of the parameters' errors over solved trials: row, column (both parameters' names) and value."""
+    convergence: pd.DataFrame
+    """Of each converged trial with a stored history: trial, iteration, and the iterate's distance from the last one
+    in deviations of the bound."""
     contraction: pd.DataFrame
     """Per scenario, how much the fixed-point iteration contracts at the truth; empty where no file says so."""
 
@@ -86,80 +89,107 @@ def analyse(directories: Sequence[Path | str]) -> Analysis:
         UserError: a directory does not exist.
     """
     collection = collect(directories)
-    rows: list[dict[str, Any]] = []
-    by_group: list[dict[str, Any]] = []
-    endings: list[dict[str, Any]] = []
-    pairs: list[dict[str, Any]] = []
-    scores: list[dict[str, Any]] = []
-    ranked: list[dict[str, float]] = []
-    profiles = Profiles()
-    distributions: dict[Any, Array] = {}
-    correlations: dict[Any, Array] = {}
-    convergence: dict[Any, list[Array]] = {}
-    contraction: list[dict[str, Any]] = []
-    for number, (scenario, groups) in enumerate(collection.scenarios.items()):
-        solved_by_all = common_trials(collection, groups)
-        outcomes: dict[str, Outcomes] = {}
-        mine: dict[str, dict[str, Any]] = {}
-        n = 1
-        contraction += _contraction_rows(collection, groups[0])
-        for group in groups:
-            sample = Sample.load(collection, group, optional=["message", NIS])
-            if len(sample) == 0:
-                continue
-            n = sample.error.shape[1]
-            rows += summary_rows(sample, solved_by_all)
-            by_group += _group_rows(sample)
-            endings += _ending_rows(sample)
-            where = (number, group.estimator)
-            outcomes[group.estimator] = one = outcomes_of(sample)
-            distributions[where] = quantiles(one.distance, PROBABILITIES)
-            correlations[where] = _correlation(sample)
-            steps = _convergence(collection, group, sample)
-            if steps:
-                convergence[where] = [d for d, _ in steps]
-            mine[group.estimator] = head(group) | {
-                "scenario": number,
-                "capped_error": np.nan,
-                "cost_median": quantile(one.cost, 0.5),
-                "cost_to_limit_median": quantile(np.array([c for _, c in steps]), 0.5),
-                "histories": len(steps),
-                "order_median": quantile(np.array([o[-1] for d, _ in steps if len(o := orders_of(d))]), 0.5),
-            }
-            if NIS in sample.scalars:
-                values = sample.scalars[NIS]
-                mine[group.estimator][NIS] = float(np.mean(values[np.isfinite(values)])) if len(values) else np.nan
-        for label, one in common(outcomes).items():
-            mine[label]["capped_error"] = capped_error(one, n)
-        compared = compare_pairs(outcomes)
-        scored = {label: row["capped_error"] for label, row in mine.items()}
-        ahead = leaders(scored, compared)
-        pairs += [dict(zip(_scenario_names(groups), scenario, strict=True)) | asdict(p) for p in compared]
-        scores += [row | {"leads": label in ahead} for label, row in mine.items()]
-        ranked.append(scored)
-        profiles.add(outcomes)
+    rows = _Rows()
+    for number, groups in enumerate(collection.scenarios.values()):
+        _add_scenario(rows, collection, number, groups)
     return Analysis(
-        collection,
-        to_frame(rows),
-        pd.DataFrame(by_group),
-        pd.DataFrame(endings),
-        pd.DataFrame(pairs),
-        pd.DataFrame(scores),
-        rank_over_scenarios(ranked),
-        profiles,
-        distributions,
-        correlations,
-        convergence,
-        pd.DataFrame(contraction),
+        collection=collection,
+        summary=to_frame(rows.summary),
+        by_group=pd.DataFrame(rows.by_group),
+        endings=pd.DataFrame(rows.endings),
+        pairs=pd.DataFrame(rows.pairs),
+        scores=pd.DataFrame(rows.scores),
+        ranking=rank_over_scenarios(rows.ranked),
+        profiles=rows.profiles.frame(),
+        distributions=_joined(rows.distributions, ("probability", "distance")),
+        correlations=_joined(rows.correlations, ("row", "column", "value")),
+        convergence=_joined(rows.convergence, ("trial", "iteration", "distance")),
+        contraction=pd.DataFrame(rows.contraction),
     )
+
+
+@dataclass
+class _Rows:
+    """What one scenario after another adds to; see `Analysis`."""
+
+    summary: list[dict[str, Any]] = field(default_factory=list)
+    by_group: list[dict[str, Any]] = field(default_factory=list)
+    endings: list[dict[str, Any]] = field(default_factory=list)
+    pairs: list[dict[str, Any]] = field(default_factory=list)
+    scores: list[dict[str, Any]] = field(default_factory=list)
+    contraction: list[dict[str, Any]] = field(default_factory=list)
+    distributions: list[pd.DataFrame] = field(default_factory=list)
+    correlations: list[pd.DataFrame] = field(default_factory=list)
+    convergence: list[pd.DataFrame] = field(default_factory=list)
+    ranked: list[dict[str, float]] = field(default_factory=list)
+    profiles: Profiles = field(default_factory=Profiles)
+
+
+def _joined(parts: Sequence[pd.DataFrame], columns: Sequence[str]) -> pd.DataFrame:
+    if not parts:
+        return pd.DataFrame(columns=["scenario", "estimator", *columns])
+    return pd.concat(parts, ignore_index=True)
+
+
+def _add_scenario(rows: _Rows, collection: Collection, number: int, groups: Sequence[Group]) -> None:
+    solved_by_all = common_trials(collection, groups)
+    outcomes: dict[str, Outcomes] = {}
+    scores: dict[str, dict[str, Any]] = {}
+    n = 1
+    rows.contraction += _contraction_rows(collection, groups[0])
+    for group in groups:
+        sample = Sample.load(collection, group, optional=["message", NIS])
+        if len(sample) == 0:
+            continue
+        n = sample.error.shape[1]
+        where = numbered(group, number)
+        rows.summary += summary_rows(sample, solved_by_all)
+        rows.by_group += _group_rows(sample)
+        rows.endings += _ending_rows(sample)
+        outcomes[group.estimator] = outcome = outcomes_of(sample)
+        rows.distributions.append(_distribution(where, outcome))
+        rows.correlations.append(_correlation_rows(where, sample))
+        histories = _histories(collection, group, sample)
+        rows.convergence += [
+            pd.DataFrame(where | {"trial": h.trial, "iteration": np.arange(len(h.distances)), "distance": h.distances})
+            for h in histories
+        ]
+        scores[group.estimator] = where | _score(sample, outcome, histories)
+    for label, outcome in common(outcomes).items():
+        scores[label]["capped_error"] = capped_error(outcome, n)
+    compared = compare_pairs(outcomes)
+    capped = {label: row["capped_error"] for label, row in scores.items()}
+    ahead = leaders(capped, compared)
+    scenario = dict(groups[0].columns)
+    rows.pairs += [scenario | asdict(pair) for pair in compared]
+    rows.scores += [row | {"leads": label in ahead} for label, row in scores.items()]
+    rows.ranked.append(capped)
+    rows.profiles.add(outcomes)
+
+
+def _score(sample: Sample, outcome: Outcomes, histories: Sequence[History]) -> dict[str, Any]:
+    """Medians of the costs; the capped error is added when all estimators of the scenario are known."""
+    orders = [observed[-1] for h in histories if len(observed := orders_of(h.distances))]
+    row = {
+        "capped_error": np.nan,
+        "cost_median": quantile(outcome.cost, 0.5),
+        "cost_to_limit_median": quantile(np.array([h.cost_to_limit for h in histories]), 0.5),
+        "histories": len(histories),
+        "order_median": quantile(np.array(orders), 0.5),
+    }
+    if NIS in sample.scalars:
+        values = sample.scalars[NIS]
+        row[NIS] = float(np.mean(values[np.isfinite(values)])) if len(values) else np.nan
+    return row
 
 
 def head(group: Group) -> dict[str, Any]:
     return dict(group.columns) | {"estimator": group.estimator}
 
 
-def _scenario_names(groups: Sequence[Group]) -> list[str]:
-    return list(groups[0].columns)
+def numbered(group: Group, number: int) -> dict[str, Any]:
+    """The columns that a frame of one scenario and estimator starts with."""
+    return dict(group.columns) | {"scenario": number, "estimator": group.estimator}
 
 
 def outcomes_of(sample: Sample) -> Outcomes:
@@ -216,7 +246,7 @@ def _ending_rows(sample: Sample) -> list[dict[str, Any]]:
         message = "" if messages is None or messages[i] is None else str(messages[i])
         ending = (str(sample.scalars["status"][i]), message)
         counts[ending] += 1
-        first.setdefault(ending, f"seed {sample.ids[i, 0]}, trial {sample.ids[i, 1]}")
+        first.setdefault(ending, _trial_label(*sample.ids[i]))
     shown = counts.most_common(MESSAGES)
     rest = sum(counts.values()) - sum(count for _, count in shown)
     result = [
@@ -237,6 +267,17 @@ def _reason(status: str) -> str:
     return reasons.get(status, "")
 
 
+def _distribution(where: dict[str, Any], outcome: Outcomes) -> pd.DataFrame:
+    return pd.DataFrame(where | {"probability": PROBABILITIES, "distance": quantiles(outcome.distance, PROBABILITIES)})
+
+
+def _correlation_rows(where: dict[str, Any], sample: Sample) -> pd.DataFrame:
+    names = [str(p["name"]) for p in sample.parameters]
+    n = len(names)
+    values = _correlation(sample).ravel()
+    return pd.DataFrame(where | {"row": np.repeat(names, n), "column": np.tile(names, n), "value": values})
+
+
 def _correlation(sample: Sample) -> Array:
     """(n, n); NaN where an error does not vary or there are too few trials."""
     used = sample.error[sample.solved]
@@ -251,25 +292,36 @@ def _correlation(sample: Sample) -> Array:
         return covariance / np.outer(deviation, deviation)
 
 
-def _convergence(collection: Collection, group: Group, sample: Sample) -> list[tuple[Array, float]]:
-    """Of each converged trial with a stored history: distances from the last iterate, and the cost of coming close.
+@dataclass(frozen=True)
+class History:
+    """How a converged trial came to its limit."""
 
-    The cost of iterate k is taken as its share (k + 1) / (iterates) of the trial's whole cost.
-    """
+    trial: str
+    distances: Array
+    """(iterates,) from the last iterate, in deviations of the bound."""
+    cost_to_limit: float
+    """The cost of coming close; that of iterate k is its share (k + 1) / (iterates) of the trial's whole cost."""
+
+
+def _histories(collection: Collection, group: Group, sample: Sample) -> list[History]:
     names = [p["name"] for p in sample.parameters]
     columns = [f"x_{name}" for name in names]
-    result: list[tuple[Array, float]] = []
+    result: list[History] = []
     for cell, _ in group.cells:
-        rows = collection.load_history(cell, [*columns, "iteration"])
-        if rows is None:
+        stored = collection.load_history(cell, [*columns, "iteration"])
+        if stored is None:
             continue
-        x = np.stack([rows[c] for c in columns], axis=1)
-        for trial in np.unique(rows["trial"]):
+        x = np.stack([stored[c] for c in columns], axis=1)
+        for trial in np.unique(stored["trial"]):
             at = np.flatnonzero((sample.ids[:, 0] == cell.seed) & (sample.ids[:, 1] == trial))
-            history = x[rows["trial"] == trial]
+            history = x[stored["trial"] == trial]
             if len(at) == 0 or not sample.converged[at[0]] or len(history) < 2:
                 continue
             distances = distances_to_limit(history, sample.crlb[at[0]])
-            cost = float(sample.cost[at[0]])
-            result.append((distances, cost * (iterations_to_limit(distances) + 1) / len(history)))
+            cost = float(sample.cost[at[0]]) * (iterations_to_limit(distances) + 1) / len(history)
+            result.append(History(_trial_label(cell.seed, trial), distances, cost))
     return result
+
+
+def _trial_label(seed: int, trial: int) -> str:
+    return f"seed {seed}, trial {trial}"

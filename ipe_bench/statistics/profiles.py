@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+import pandas as pd
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.comparisons import Outcomes, common
@@ -55,6 +56,16 @@ class Profiles:
     def data(self, label: str) -> Array:
         """Share of trials solved within `BUDGETS` simulations (Moré and Wild, SIAM J. Optim. 20, 2009)."""
         return self.within_budget[label] / max(1, self.trials[label])
+
+    def frame(self) -> pd.DataFrame:
+        """Both profiles of every estimator: estimator, profile, `at` (ratio or budget) and share."""
+        parts = [
+            pd.DataFrame({"estimator": label, "profile": profile, "at": at, "share": share(label)})
+            for label in self.trials
+            for profile, at, share in (("performance", RATIOS, self.performance), ("data", BUDGETS, self.data))
+        ]
+        columns = ["estimator", "profile", "at", "share"]
+        return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
 
 
 def distances_to_limit(history: Array, deviation: Array) -> Array:
