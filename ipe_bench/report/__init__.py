@@ -46,7 +46,6 @@ def write_report(directories: Sequence[Path | str], output: Path | str) -> Repor
     analysis = analyse(directories)
     output = Path(output)
     folder = output / "figures"
-    folder.mkdir(parents=True, exist_ok=True)
     summary_path = output / "summary.csv"
     write_atomically(summary_path, lambda temporary: analysis.summary.to_csv(temporary, index=False))
     tables = all_tables(analysis)
@@ -56,10 +55,9 @@ def write_report(directories: Sequence[Path | str], output: Path | str) -> Repor
     figures: list[Path] = []
     shown = []
     pictured = without_certified(analysis)
-    for drawing in draw_all(pictured) if pictured.collection.groups else ():
-        png, pdf = drawing.save(folder)
-        figures += [png, pdf]
-        shown.append((drawing.name, drawing.title, drawing.caption, png.read_bytes()))
+    for drawn in draw_all(pictured, folder):
+        figures += drawn.files
+        shown.append((drawn.name, drawn.title, drawn.caption, drawn.files[0].read_bytes()))
     page = render_page(analysis, tables, shown)
     report = output / "report.html"
     write_atomically(report, lambda temporary: temporary.write_text(page, encoding="utf-8"))

@@ -43,7 +43,7 @@ def _residuals(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look]
         return
     x, heading = _abscissa(model)
     across = 1 if len(shown) == 1 else 2 if len(shown) in (2, 4) else 3
-    fig, axes = common.panels(len(shown), height=2.6, extra=0.4, most_across=across)
+    fig, axes = common.panels(len(shown), height=2.6, most_across=across)
     for one, ax in zip(shown, axes, strict=True):
         known, out, limit = np.isfinite(one.normalised), one.outliers, one.outlier_limit
         style = look[one.label]
@@ -132,7 +132,7 @@ def _ellipses(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look])
     best = min(told, key=lambda f: f.chi_square)
     pairs = most_correlated(best.correlation)
     across = {1: 1, 2: 2, 3: 3, 4: 2}.get(len(pairs), 3)
-    fig, axes = common.panels(len(pairs), height=2.7, extra=0.5, most_across=across)
+    fig, axes = common.panels(len(pairs), height=2.7, most_across=across)
     away: dict[str, None] = {}
     # Equal ellipses lie on top of each other: the later ones are thinner, so that all are seen.
     widths = np.linspace(4.0, 1.0, len(told)) if len(told) > 1 else [1.6]
