@@ -22,6 +22,8 @@ LONG = 60
 def draw(view: View) -> Iterator[Drawing]:
     from matplotlib.ticker import MaxNLocator
 
+    if view["convergence"].empty:
+        return
     medians = median_distances(view["convergence"])
     # A filter's epochs are no iterations; what solves no equation has no limit that it could approach.
     iterating = [label for label, equation in view.equations.items() if equation is not None]
