@@ -15,7 +15,9 @@ from ipe_bench.basics.linalg import Array, Covariance
 OUTLIER_LEVEL = 0.01
 """Chance that good readings of a whole file give an outlier somewhere."""
 DRAWS = 1999
-"""Simulated fits behind the test of whiteness: its p is a multiple of 1 / (DRAWS + 1)."""
+"""Simulated fits behind the test of whiteness."""
+LEAST_P = 1 / (DRAWS + 1)
+"""Its p is a multiple of this; the least says only that no simulated fit was as extreme."""
 _LONGEST_LAG = 10
 _DRAWS_AT_ONCE = 250
 

@@ -16,6 +16,7 @@ from ipe_bench.basics.files import write_atomically
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.real.fits import Fit
+from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.words import p_value
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
@@ -240,7 +241,7 @@ def _verdicts(fits: Sequence[Fit], width: int) -> Any:
     table.add_column("fits", no_wrap=True)
     for one in fits:
         numbers = [f"{one.residual_deviation:.4g}", f"{one.chi_square:.4g}", str(one.degrees_of_freedom)]
-        numbers += [p_value(one.p_value), p_value(one.whiteness.p_value), str(int(one.outliers.sum()))]
+        numbers += [p_value(one.p_value), p_value(one.whiteness.p_value, LEAST_P), str(int(one.outliers.sum()))]
         status = one.status.label.replace("_", " ")
         table.add_row(escape(one.label), status, *numbers[width < _NARROW :], "yes" if one.fits else "NO")
     return table
