@@ -19,6 +19,7 @@ from scipy.linalg import LinAlgWarning
 
 from ipe_bench.basics.errors import UserError, describe_exception
 from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.options import NonNegative, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
 from ipe_bench.measurements.base import Measurement, Restricted
@@ -71,21 +72,15 @@ class Sequential(Estimator):
     the filter is consistent (`ipe_bench.statistics.consistency.mean_limits` has the limits).
     """
 
-    prior_inflation: float = 1.0
+    prior_inflation: Positive = 1.0
     """The filter's prior deviations over the scenario's: in life a prior is never exact."""
-    process_noise: float = 0.0
+    process_noise: NonNegative = 0.0
     """Standard deviation of the parameters' random walk from one epoch to the next, in prior deviations (before
     inflation). The parameters are constants, so anything above 0 makes the filter forget."""
 
     needs: ClassVar[frozenset[Need]] = frozenset({"epochs", "prior"})
     slopes: ClassVar[bool] = False
     """True where `Track.update` wants dh/dx; then there is one point per trial."""
-
-    def __post_init__(self) -> None:
-        if not 0 < self.prior_inflation < np.inf:
-            raise UserError(f"prior_inflation={self.prior_inflation}: give a number above 0")
-        if not 0 <= self.process_noise < np.inf:
-            raise UserError(f"process_noise={self.process_noise}: give 0 or a number above")
 
     @abstractmethod
     def track(self, P0: Array, Q: Array, z: Array) -> Track:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.estimators.base import Estimator
+from ipe_bench.measurements.nist import datasets
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
 from ipe_bench.runs.execution import Execution
@@ -83,8 +85,35 @@ def prepare() -> None:
 
 
 def rewrite(overrides: Sequence[str]) -> list[str]:
-    """Overrides in Hydra's own words: truth_measurement= chooses from the group measurement."""
-    return [re.sub(r"^(\+?)truth_measurement=", r"\1measurement@truth_measurement=", o) for o in overrides]
+    """Overrides in Hydra's own words: truth_measurement= chooses from the group measurement, and measurement=nist/NAME
+    is measurement=nist with that data set."""
+    overrides = [re.sub(r"^(\+?)truth_measurement=", r"\1measurement@truth_measurement=", o) for o in overrides]
+    return [part for override in overrides for part in _nist(override)]
+
+
+def _nist(override: str) -> list[str]:
+    """measurement=nist/misra1a, also in a sweep or as a pattern, as the option and its data set.
+
+    Raises:
+        UserError: there is no such data set, or other models stand in one sweep with them.
+    """
+    key, _, value = override.partition("=")
+    if key.lstrip("+") not in ("measurement", "measurement@truth_measurement") or "nist/" not in value:
+        return [override]
+    known = {name.lower(): name for name in datasets()}
+    pattern = re.fullmatch(r"glob\(nist/(.*)\)", value)
+    if pattern:
+        names = fnmatch.filter(known, pattern.group(1))
+    else:
+        options = [option.strip() for option in value.split(",")]
+        if not all(option.startswith("nist/") for option in options):
+            raise UserError(f"{override}: a sweep over measurement=nist has no other models in it; run them one by one")
+        names = [option.removeprefix("nist/").lower() for option in options]
+    if wrong := [name for name in names if name not in known]:
+        raise UserError(f"measurement=nist/{wrong[0]}: {unknown(wrong[0], known, 'data set')}")
+    if not names:
+        raise UserError(f"{override}: fits no data set; write measurement=nist measurement.dataset=Misra1a")
+    return [f"{key}=nist", f"{key.rpartition('@')[2].lstrip('+')}.dataset={','.join(known[name] for name in names)}"]
 
 
 def assemble(config: DictConfig) -> Job:

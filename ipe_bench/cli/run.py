@@ -20,6 +20,7 @@ from ipe_bench.basics.errors import StorageError, UserError
 from ipe_bench.cli.config import CONFIG_ERRORS, Job, assemble, explain, prepare, refuse_silent_traps, rewrite
 from ipe_bench.cli.progress import shown_progress
 from ipe_bench.cli.report import show
+from ipe_bench.measurements import Nist
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.runs.execution import Serial
 
@@ -154,6 +155,8 @@ def _title(job: Job) -> str:
     """What a job is about, for its progress bar: the option that was chosen, and what is drawn."""
     scenario = job.scenario
     chosen = HydraConfig.get().runtime.choices.get("measurement", scenario.measurement.name)
+    if isinstance(scenario.measurement, Nist):
+        chosen = f"{chosen} {scenario.measurement.dataset}"
     if scenario.noise.real:
         return str(chosen)
     return f"{chosen}, error scale {scenario.error_scale:g}, seed {scenario.seed}"

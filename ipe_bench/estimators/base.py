@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import describe_exception
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Component
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.counted import Tally
 from ipe_bench.measurements.problem import Problem
@@ -114,7 +115,7 @@ class Estimates:
         return cls(np.full((trials, n), np.nan), status, messages=dict.fromkeys(range(trials), message))
 
 
-class Estimator(ABC):
+class Estimator(Component, ABC):
     """Turns readings into parameters. A new estimator is a frozen dataclass that writes `estimate`.
 
     The trials of a batch are independent: a trial's result is the same, bit for bit, in whatever batch it stands, and

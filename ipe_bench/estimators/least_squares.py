@@ -132,7 +132,7 @@ class Slope:
 
 @dataclass(frozen=True)
 class Descent:
-    """What the methods of this room carry from step to step; every field has the trials in front."""
+    """What these methods carry from step to step; every field has the trials in front."""
 
     x: Array
     r: Array
@@ -235,7 +235,7 @@ def minimize(
     budget: float | None = None,
     history: bool = False,
 ) -> Minima:
-    """Minimises the objective from x (trials, n) by a method of this room.
+    """Minimises the objective from x (trials, n) by Gauss-Newton or Levenberg-Marquardt.
 
     Converged is where the Gauss-Newton step, which is the gradient in whitened units, is at most `tolerance` standard
     deviations of the local bound in every parameter. An iteration is a step tried, taken or not.

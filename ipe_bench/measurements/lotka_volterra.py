@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ipe_bench.basics.options import Count, Positive
 from ipe_bench.measurements.base import Parameter
 from ipe_bench.measurements.ode.model import OdeMeasurement
 
@@ -17,8 +18,8 @@ class LotkaVolterra(OdeMeasurement):
     The values are those of the Hudson's Bay pelts (Carpenter, Predator-Prey Population Dynamics, Stan, 2018).
     """
 
-    years: int = 20
-    step: float | None = None
+    years: Count = 20
+    step: Positive | None = None
     tolerance = 1e-6
     states, outputs, time_unit, reading_unit = 2, ("prey", "predators"), "year", "thousand"
     parameters = tuple(Parameter(name, size=0.02 * value) for name, value in _VALUES.items())  # type: ignore[assignment]

@@ -6,19 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.basics.errors import require_positive
 from ipe_bench.basics.linalg import Array, Covariance
-from ipe_bench.noise.base import Noise
+from ipe_bench.basics.options import Positive
+from ipe_bench.noise.base import GINS_DEVIATION, Noise
 
 
 @dataclass(frozen=True)
 class Gaussian(Noise):
     """z = h + v with independent v of the given standard deviation, in the unit of the readings."""
 
-    deviation: float
-
-    def __post_init__(self) -> None:
-        require_positive(self, "deviation")
+    deviation: Positive = GINS_DEVIATION
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         return h + self.deviation * rng.standard_normal(h.shape)
@@ -31,11 +28,8 @@ class Gaussian(Noise):
 class NoNoise(Noise):
     """z = h exactly, while estimators assume readings of the nominal standard deviation."""
 
-    deviation: float
+    deviation: Positive = GINS_DEVIATION
     name = "none"
-
-    def __post_init__(self) -> None:
-        require_positive(self, "deviation")
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         return h

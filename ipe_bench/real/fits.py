@@ -138,9 +138,9 @@ def _fit_one(
     w = problem.R.whiten(r)
     if np.isfinite(w).all() and np.isfinite(J).all():
         Q = explained(J, problem.R)
-        own, white = normalised(w, Q, problem.R), whiteness(w, Q, order)
+        scaled, white = normalised(w, Q, problem.R), whiteness(w, Q, order)
     else:
-        own, white = np.full(len(z), np.nan), Whiteness(np.nan, 0, np.nan)
+        scaled, white = np.full(len(z), np.nan), Whiteness(np.nan, 0, np.nan)
     P = np.full((n, n), np.nan) if estimates.covariance is None else estimates.covariance[0]
     return Fit(
         label,
@@ -149,7 +149,7 @@ def _fit_one(
         estimates.x[0] * model.sizes,
         P * np.outer(model.sizes, model.sizes),
         _at(rows, r, m),
-        _at(rows, own, m),
+        _at(rows, scaled, m),
         float(np.sum(w**2)),
         len(z) - n,
         white,

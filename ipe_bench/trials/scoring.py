@@ -1,7 +1,7 @@
 """Trials through estimators: draws a block of a scenario, lets estimators loose on it, and scores what they return.
 
 A block is a range of trials; its result depends on nothing but the scenario, the estimator and the range. Storing,
-distributing and summarising blocks is left to other rooms.
+distributing and summarising blocks is left to others.
 """
 
 from __future__ import annotations
