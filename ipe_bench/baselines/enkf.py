@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import numpy as np
 from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric, turned
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.streams import own_bits
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,7 @@ class EnKF(Sequential):
             raise UserError(f"seed={self.seed}: give a whole number from 0 up")
 
     def track(self, P0: Array, Q: Array, z: Array) -> EnKFTrack:
-        digest = hashlib.sha256(np.ascontiguousarray(z, dtype=float).tobytes()).digest()
-        stream = np.random.Philox(np.random.SeedSequence([self.seed, *np.frombuffer(digest, dtype=np.uint32).tolist()]))
-        return EnKFTrack(P0, Q, self.members, stream)
+        return EnKFTrack(P0, Q, self.members, own_bits(self.seed, z))
 
 
 class EnKFTrack(Track):
