@@ -12,7 +12,7 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from ipe_bench.api import check
+from ipe_bench.api import validate
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import library_versions
@@ -28,9 +28,6 @@ from ipe_bench.runs.provenance import describe, fingerprint
 
 def main(arguments: Sequence[str]) -> int:
     """Estimates with every chosen estimator, prints tables and writes files; exit code 1 where none converged."""
-    flags = [a for a in arguments if a.startswith("-")]
-    if flags:
-        raise UserError(f"{flags[0]}: estimate takes overrides such as measurement=gins readings=FILE, and no flags")
     refuse_silent_traps(arguments)
     prepare()
     try:
@@ -46,7 +43,7 @@ def main(arguments: Sequence[str]) -> int:
         job = replace(job, output=config.output)
     job, z = _readings(config, job)
     problem = job.scenario.problem
-    check([job.scenario], job.estimators, trials=1)
+    validate([job.scenario], job.estimators, trials=1)
 
     from ipe_bench.report.answer import claim, render, write_fits
 

@@ -14,16 +14,14 @@ from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
 
 
-def main(arguments: Sequence[str]) -> int:
-    """One line per option; with -v the parameters and the readings file of each measurement."""
-    verbose = any(a in ("-v", "--verbose") for a in arguments)
-    names = [a for a in arguments if not a.startswith("-")]
+def main(groups: Sequence[str], verbose: bool) -> int:
+    """One line per option; where verbose, the parameters and the readings file of each measurement."""
     known = plugins.groups()
-    for name in names:
+    for name in groups:
         if name not in known:
             raise UserError(f"{name}: {unknown(name, known, 'group')}")
     out = console()
-    for group in names or known:
+    for group in groups or known:
         table = Table(title=group, title_justify="left", title_style="bold", box=None, pad_edge=False, expand=False)
         for heading in ("option", "what it is", "from"):
             table.add_column(heading, overflow="fold", no_wrap=heading == "option")

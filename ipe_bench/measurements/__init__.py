@@ -1,21 +1,32 @@
 """Measurement models: what a parameter vector makes the instruments read. Config group `measurement`."""
 
+from ipe_bench.measurements.accelerometer import Accelerometer
 from ipe_bench.measurements.base import Measurement, Parameter, Restricted
 from ipe_bench.measurements.bearings import Bearings
+from ipe_bench.measurements.bock import Bock
+from ipe_bench.measurements.falling_body import FallingBody
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.gins_richer import RicherGins
+from ipe_bench.measurements.gnss import Gnss
 from ipe_bench.measurements.lotka_volterra import LotkaVolterra
+from ipe_bench.measurements.mgh import Mgh
 from ipe_bench.measurements.nist import Nist
 from ipe_bench.measurements.ode.model import OdeMeasurement
 from ipe_bench.measurements.polynomial import Polynomial
 from ipe_bench.measurements.ranging import Ranging
+from ipe_bench.measurements.sir import Sir
 from ipe_bench.measurements.triad import Triad
 
 __all__ = [
+    "Accelerometer",
     "Bearings",
+    "Bock",
+    "FallingBody",
     "Gins",
+    "Gnss",
     "LotkaVolterra",
     "Measurement",
+    "Mgh",
     "Nist",
     "OdeMeasurement",
     "Parameter",
@@ -23,5 +34,6 @@ __all__ = [
     "Ranging",
     "Restricted",
     "RicherGins",
+    "Sir",
     "Triad",
 ]

@@ -18,7 +18,8 @@ class LotkaVolterra(OdeMeasurement):
     """
 
     years: int = 20
-    step: float | None = 0.125
+    step: float | None = None
+    tolerance = 1e-6
     states, outputs, time_unit, reading_unit = 2, ("prey", "predators"), "year", "thousand"
     parameters = tuple(Parameter(name, size=0.02 * value) for name, value in _VALUES.items())  # type: ignore[assignment]
     nominal = np.full(6, 50.0)  # type: ignore[assignment]

@@ -1,7 +1,11 @@
-"""Calibration of three accelerometers or magnetometers by the magnitude of what they measure."""
+"""Calibration of three accelerometers or magnetometers by the magnitude of what they measure.
+
+`Magnitudes` is what such models share, `Triad` the symmetric form in errors; the form in raw counts is `accelerometer`.
+"""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,14 +28,44 @@ def attitudes() -> Array:
     return np.array([np.array(v) / np.linalg.norm(v) for v in corners])
 
 
+class Magnitudes(Measurement):
+    """The magnitude of a vector that a triad was exposed to in each of its attitudes, from the outputs of the triad.
+
+    A subclass gives the outputs and how they are corrected. Each attitude is an epoch. Outputs are taken to be exact,
+    with their noise counted in the readings.
+    """
+
+    analytic = True
+
+    @property
+    @abstractmethod
+    def measured(self) -> Array:
+        """The outputs r_k of the triad (attitudes, 3)."""
+
+    @abstractmethod
+    def corrected(self, x: Array) -> Sequence[Array]:
+        """The three components, each (trials, attitudes), of what acted on the triad."""
+
+    @property
+    def index(self) -> Mapping[str, Sequence[Any]]:
+        return {"attitude": list(range(1, len(self.measured) + 1))}
+
+    @cached_property
+    def epochs(self) -> tuple[NDArray[np.intp], ...]:
+        return tuple(np.arange(self.m)[:, None])
+
+    def simulate(self, x: Array) -> Array:
+        a = self.corrected(x)
+        return np.sqrt(a[0] ** 2 + a[1] ** 2 + a[2] ** 2)
+
+
 @dataclass(frozen=True)
-class Triad(Measurement):
+class Triad(Magnitudes):
     """The magnitude |(I + E)(r_k - b)| of the vector that a triad with outputs r_k was exposed to in attitude k.
 
     b is the bias; E is symmetric, with scale-factor errors on its diagonal and misalignments beside it. A rotation of
     the whole triad does not change a magnitude, so it is not among the parameters. The reading of attitude k is the
-    magnitude that a reference states: a scalar magnetometer, or the local gravity. Outputs r_k are taken to be exact,
-    with their noise counted in the readings. Each attitude is an epoch.
+    magnitude that a reference states: a scalar magnetometer, or the local gravity.
 
     Parameters: three biases in `unit`, three scale-factor errors in ppm, three misalignments in mrad. A bias of b bends
     the magnitude by b^2 / (2 field): 2e-6 of the field at error scale 1, to be compared with a noise of 1e-5.
@@ -55,8 +89,6 @@ class Triad(Measurement):
     """The presumed bias in `unit`, then errors of scale (plain numbers) and alignment (rad): the nominal point."""
     scale: tuple[float, float, float] = (0.0, 0.0, 0.0)
     misalignment: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    analytic = True
 
     def __post_init__(self) -> None:
         if self.outputs is not None and (np.shape(self.outputs)[1:] != (3,) or len(self.outputs) < 10):
@@ -84,22 +116,14 @@ class Triad(Measurement):
         return np.concatenate([self.bias, self.scale, self.misalignment]) / self._plain_sizes
 
     @cached_property
-    def _outputs(self) -> Array:
+    def measured(self) -> Array:
         return self.field * attitudes() if self.outputs is None else np.asarray(self.outputs, dtype=float)
 
-    @property
-    def index(self) -> Mapping[str, Sequence[Any]]:
-        return {"attitude": list(range(1, len(self._outputs) + 1))}
-
-    @cached_property
-    def epochs(self) -> tuple[NDArray[np.intp], ...]:
-        return tuple(np.arange(self.m)[:, None])
-
-    def simulate(self, x: Array) -> Array:
+    def corrected(self, x: Array) -> Sequence[Array]:
         p = (x * self._plain_sizes)[:, :, None]
-        d = [self._outputs[:, i] - p[:, i] for i in range(3)]
-        corrected = [(1.0 + p[:, 3 + i]) * d[i] for i in range(3)]
+        d = [self.measured[:, i] - p[:, i] for i in range(3)]
+        a = [(1.0 + p[:, 3 + i]) * d[i] for i in range(3)]
         for k, (i, j) in enumerate(_PAIRS):
-            corrected[i] = corrected[i] + p[:, 6 + k] * d[j]
-            corrected[j] = corrected[j] + p[:, 6 + k] * d[i]
-        return np.sqrt(corrected[0] ** 2 + corrected[1] ** 2 + corrected[2] ** 2)
+            a[i] = a[i] + p[:, 6 + k] * d[j]
+            a[j] = a[j] + p[:, 6 + k] * d[i]
+        return a

@@ -13,11 +13,10 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimator, estimate_safely
 from ipe_bench.measurements.base import Measurement, Restricted
+from ipe_bench.measurements.counted import cost
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.real.residuals import Whiteness, explained, normalised, outlier_limit, whiteness
-
-FIT_LEVEL = 1e-3
-"""A model fits where chi-square is no less probable than this."""
+from ipe_bench.trials.thresholds import FIT_LEVEL
 
 
 @dataclass(frozen=True)
@@ -155,7 +154,7 @@ def _fit_one(
         len(z) - n,
         white,
         int(estimates.iterations[0]),
-        float(estimates.simulations[0] + n * estimates.jacobians[0]),
+        float(cost(estimates.simulations, estimates.jacobians, n)[0]),
     )
 
 

@@ -15,9 +15,10 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import write_atomically
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.real.fits import FIT_LEVEL, Fit
+from ipe_bench.real.fits import Fit
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.words import p_value
+from ipe_bench.trials.thresholds import FIT_LEVEL
 
 if TYPE_CHECKING:
     from rich.console import Group

@@ -14,24 +14,16 @@ import pandas as pd
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.statistics.collect import Collection, Group, collect
-from ipe_bench.statistics.comparisons import (
-    Outcomes,
-    Ranking,
-    capped_error,
-    common,
-    compare_pairs,
-    leaders,
-    rank_over_scenarios,
-)
+from ipe_bench.statistics.comparisons import Outcomes, Ranking, compare_pairs, leaders, rank_over_scenarios
+from ipe_bench.statistics.histories import History, trial_label
 from ipe_bench.statistics.intervals import bootstrap_rms, quantile, quantiles
-from ipe_bench.statistics.profiles import Profiles, distances_to_limit, iterations_to_limit
-from ipe_bench.statistics.summary import Sample, common_trials, identifier, summary_rows, to_frame
-from ipe_bench.statistics.theory import orders_of
+from ipe_bench.statistics.profiles import Profiles
+from ipe_bench.statistics.records import SCORES, rows_of
+from ipe_bench.statistics.sample import Sample, Shared
+from ipe_bench.statistics.summary import summary_rows, to_frame
 
 PROBABILITIES = np.unique(np.concatenate([np.linspace(0, 1, 101), [0.001, 0.005, 0.025, 0.975, 0.995, 0.999]]))
 """Where the distribution of errors is tabulated."""
-NIS = "extra_nis"
-"""Where filters report their normalised innovations squared."""
 
 
 @dataclass(frozen=True)
@@ -132,55 +124,30 @@ def _joined(parts: Sequence[pd.DataFrame], columns: Sequence[str]) -> pd.DataFra
 
 
 def _add_scenario(rows: _Rows, collection: Collection, number: int, groups: Sequence[Group]) -> None:
-    solved_by_all = common_trials(collection, groups)
+    shared = Shared.among(collection, groups)
     outcomes: dict[str, Outcomes] = {}
-    scores: dict[str, dict[str, Any]] = {}
-    n = 1
+    scores: list[dict[str, Any]] = []
     rows.contraction += _contraction_rows(collection, groups[0])
     for group in groups:
-        sample = Sample.load(collection, group, optional=["message", NIS])
+        sample = Sample.load(collection, group, shared)
         if len(sample) == 0:
             continue
-        n = sample.error.shape[1]
         where = numbered(group, number)
-        rows.summary += summary_rows(sample, solved_by_all)
+        rows.summary += summary_rows(sample)
         rows.by_group += _group_rows(sample)
         rows.endings += _ending_rows(sample)
+        scores.append(where | rows_of(SCORES, sample)[-1])
         outcomes[group.estimator] = outcome = outcomes_of(sample)
         rows.distributions.append(_distribution(where, outcome))
         rows.correlations.append(_correlation_rows(where, sample))
-        histories = _histories(collection, group, sample)
-        rows.convergence += [
-            pd.DataFrame(where | {"trial": h.trial, "iteration": np.arange(len(h.distances)), "distance": h.distances})
-            for h in histories
-        ]
-        scores[group.estimator] = where | _score(sample, outcome, histories)
-    for label, outcome in common(outcomes).items():
-        scores[label]["capped_error"] = capped_error(outcome, n)
+        rows.convergence += [_convergence_rows(where, history) for history in sample.histories]
     compared = compare_pairs(outcomes)
-    capped = {label: row["capped_error"] for label, row in scores.items()}
+    capped = {row["estimator"]: row["capped_error"] for row in scores}
     ahead = leaders(capped, compared)
-    scenario = dict(groups[0].columns)
-    rows.pairs += [scenario | asdict(pair) for pair in compared]
-    rows.scores += [row | {"leads": label in ahead} for label, row in scores.items()]
+    rows.pairs += [dict(groups[0].columns) | asdict(pair) for pair in compared]
+    rows.scores += [row | {"leads": row["estimator"] in ahead} for row in scores]
     rows.ranked.append(capped)
     rows.profiles.add(outcomes)
-
-
-def _score(sample: Sample, outcome: Outcomes, histories: Sequence[History]) -> dict[str, Any]:
-    """Medians of the costs; the capped error is added when all estimators of the scenario are known."""
-    orders = [observed[-1] for h in histories if len(observed := orders_of(h.distances))]
-    row = {
-        "capped_error": np.nan,
-        "cost_median": quantile(outcome.cost, 0.5),
-        "cost_to_limit_median": quantile(np.array([h.cost_to_limit for h in histories]), 0.5),
-        "histories": len(histories),
-        "order_median": quantile(np.array(orders), 0.5),
-    }
-    if NIS in sample.scalars:
-        values = sample.scalars[NIS]
-        row[NIS] = float(np.mean(values[np.isfinite(values)])) if len(values) else np.nan
-    return row
 
 
 def head(group: Group) -> dict[str, Any]:
@@ -194,15 +161,9 @@ def numbered(group: Group, number: int) -> dict[str, Any]:
 
 def outcomes_of(sample: Sample) -> Outcomes:
     """What comparisons and profiles need of a sample, by ascending seed and trial."""
-    ids = identifier(sample.ids)
-    distance = np.sqrt(sample.scalars["crlb_distance"])
-    distance[~np.isfinite(distance)] = np.inf
-    cost = sample.cost
-    success = sample.scalars["success"]
-    if np.all(ids[1:] > ids[:-1]):
-        return Outcomes(ids, distance, success, cost)
-    order = np.argsort(ids, kind="stable")
-    return Outcomes(ids[order], distance[order], success[order], cost[order])
+    order = np.argsort(sample.number, kind="stable")
+    values = (sample.number, sample.distance, sample.scalars["success"], sample.cost)
+    return Outcomes(*(v[order] for v in values))
 
 
 def _group_rows(sample: Sample) -> list[dict[str, Any]]:
@@ -246,7 +207,7 @@ def _ending_rows(sample: Sample) -> list[dict[str, Any]]:
         message = "" if messages is None or messages[i] is None else str(messages[i])
         ending = (str(sample.scalars["status"][i]), message)
         counts[ending] += 1
-        first.setdefault(ending, _trial_label(*sample.ids[i]))
+        first.setdefault(ending, trial_label(*sample.ids[i]))
     shown = counts.most_common(MESSAGES)
     rest = sum(counts.values()) - sum(count for _, count in shown)
     result = [
@@ -292,36 +253,6 @@ def _correlation(sample: Sample) -> Array:
         return covariance / np.outer(deviation, deviation)
 
 
-@dataclass(frozen=True)
-class History:
-    """How a converged trial came to its limit."""
-
-    trial: str
-    distances: Array
-    """(iterates,) from the last iterate, in deviations of the bound."""
-    cost_to_limit: float
-    """The cost of coming close; that of iterate k is its share (k + 1) / (iterates) of the trial's whole cost."""
-
-
-def _histories(collection: Collection, group: Group, sample: Sample) -> list[History]:
-    names = [p["name"] for p in sample.parameters]
-    columns = [f"x_{name}" for name in names]
-    result: list[History] = []
-    for cell, _ in group.cells:
-        stored = collection.load_history(cell, [*columns, "iteration"])
-        if stored is None:
-            continue
-        x = np.stack([stored[c] for c in columns], axis=1)
-        for trial in np.unique(stored["trial"]):
-            at = np.flatnonzero((sample.ids[:, 0] == cell.seed) & (sample.ids[:, 1] == trial))
-            history = x[stored["trial"] == trial]
-            if len(at) == 0 or not sample.converged[at[0]] or len(history) < 2:
-                continue
-            distances = distances_to_limit(history, sample.crlb[at[0]])
-            cost = float(sample.cost[at[0]]) * (iterations_to_limit(distances) + 1) / len(history)
-            result.append(History(_trial_label(cell.seed, trial), distances, cost))
-    return result
-
-
-def _trial_label(seed: int, trial: int) -> str:
-    return f"seed {seed}, trial {trial}"
+def _convergence_rows(where: dict[str, Any], history: History) -> pd.DataFrame:
+    iteration = np.arange(len(history.distances))
+    return pd.DataFrame(where | {"trial": history.trial, "iteration": iteration, "distance": history.distances})

@@ -1,7 +1,4 @@
-"""What accuracy costs: performance and data profiles, and the cost of coming close to an estimator's own limit.
-
-The cost of a trial is its number of simulations, a Jacobian counting n; a trial without success costs infinitely much.
-"""
+"""What success costs: performance and data profiles. A trial without success costs infinitely much."""
 
 from __future__ import annotations
 
@@ -14,8 +11,6 @@ import pandas as pd
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.comparisons import Outcomes, common
 
-CLOSE = 0.05
-"""An iterate within this many standard deviations of the last one is as good as the last one."""
 RATIOS = np.unique(np.round(np.geomspace(1, 1000, 181), 6))
 BUDGETS = np.unique(np.round(np.geomspace(1, 100_000, 301)))
 
@@ -30,7 +25,7 @@ class Profiles:
 
     def add(self, outcomes: Mapping[str, Outcomes]) -> None:
         paired = common(outcomes)
-        costs = {label: np.where(one.success, one.cost, np.inf) for label, one in paired.items()}
+        costs = {label: np.where(o.success, o.cost, np.inf) for label, o in paired.items()}
         if not costs:
             return
         best = np.full(len(next(iter(costs.values()))), np.inf)
@@ -66,15 +61,3 @@ class Profiles:
         ]
         columns = ["estimator", "profile", "at", "share"]
         return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
-
-
-def distances_to_limit(history: Array, deviation: Array) -> Array:
-    """Largest component of each iterate's (iterates, n) distance from the last one, in standard deviations (n,)."""
-    with np.errstate(invalid="ignore"):
-        return np.abs((history - history[-1]) / deviation).max(axis=1)
-
-
-def iterations_to_limit(distances: Array) -> int:
-    """The first iterate from which on all are within `CLOSE` of the last."""
-    far = np.flatnonzero(~(distances <= CLOSE))
-    return int(far[-1]) + 1 if len(far) else 0

@@ -17,7 +17,8 @@ from ipe_bench.statistics.comparisons import (
     signed_rank,
     tied_ranks,
 )
-from ipe_bench.statistics.profiles import BUDGETS, RATIOS, Profiles, distances_to_limit, iterations_to_limit
+from ipe_bench.statistics.histories import distances_to_limit, iterations_to_limit
+from ipe_bench.statistics.profiles import BUDGETS, RATIOS, Profiles
 
 
 def outcomes(distance, success=None, cost=None, ids=None):

@@ -1,0 +1,94 @@
+"""A body that falls into the atmosphere, tracked by radar ranges: the classic comparison of nonlinear filters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
+from ipe_bench.measurements.base import Parameter
+from ipe_bench.measurements.ode.model import OdeMeasurement
+
+_FOOT = 0.3048
+
+
+@dataclass(frozen=True)
+class FallingBody(OdeMeasurement):
+    """Altitude h, velocity v (downwards) and ballistic coefficient b of a re-entering body from slant ranges.
+
+        h' = -v,   v' = -b exp(-gamma h) v^2,   reading: sqrt(M^2 + (h - H)^2)
+
+    with a radar at altitude H, at the horizontal distance M from the vertical along which the body falls. Gravity is
+    neglected, as it is in both papers. Parameters: h and v at the start, in m and m/s, and ln(b / presumed b): the
+    logarithm, because a negative b accelerates the body without limit. Readings: ranges in m, each an epoch.
+
+    Sources: Athans, Wishner, Bertolini, Suboptimal state estimation for continuous-time nonlinear systems from discrete
+    noisy measurements, IEEE Transactions on Automatic Control 13(5), 1968; Julier, Uhlmann, Durrant-Whyte, A new method
+    for the nonlinear transformation of means and covariances in filters and estimators, ibid. 45(3), 2000. Their values
+    are the defaults: presumed 300,000 ft, 20,000 ft/s and 3e-5 / ft with deviations of 1000 ft and 2000 ft/s; the
+    radar at 100,000 ft both ways; gamma 5e-5 / ft; a range every second with a noise of 100 ft (30.48 m). Their true b,
+    1e-3 / ft, is exactly one unit of error from the presumed one; their deviation of b, 1e-2 / ft, would make half of
+    all bodies impossible.
+    """
+
+    altitude: float = 3e5 * _FOOT
+    """Presumed altitude at the start in m,"""
+    velocity: float = 2e4 * _FOOT
+    """velocity in m/s,"""
+    ballistic: float = 3e-5 / _FOOT
+    """and ballistic coefficient in 1/m."""
+    radar_distance: float = 1e5 * _FOOT
+    """M in m."""
+    radar_altitude: float = 1e5 * _FOOT
+    """H in m."""
+    density_decay: float = 5e-5 / _FOOT
+    """gamma in 1/m: the density of the air falls with altitude like exp(-gamma h)."""
+    interval: float = 1.0
+    """Time between ranges in s."""
+    readings: int = 60
+    altitude_size: float = 1e3 * _FOOT
+    """What one unit of error is: of the altitude in m,"""
+    velocity_size: float = 2e3 * _FOOT
+    """of the velocity in m/s,"""
+    ballistic_size: float = float(np.log(1e-3 / 3e-5))
+    """and of the logarithm of the ballistic coefficient."""
+    step: float | None = 0.5
+
+    states, outputs, reading_unit = 2, ("range",), "m"
+
+    def __post_init__(self) -> None:
+        if self.ballistic <= 0:
+            raise UserError(f"ballistic={self.ballistic}: give a presumed coefficient above 0")
+        if self.readings < 4:
+            raise UserError(f"readings={self.readings}: give at least 4 for 3 parameters")
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (
+            Parameter("altitude", "m", self.altitude_size),
+            Parameter("velocity", "m/s", self.velocity_size),
+            Parameter("ln_ballistic", size=self.ballistic_size),
+        )
+
+    @cached_property
+    def nominal(self) -> Array:
+        return np.array([self.altitude, self.velocity, 0.0]) / self.sizes
+
+    @cached_property
+    def times(self) -> Array:
+        return self.interval * np.arange(1.0, self.readings + 1)
+
+    def start(self, p, c):
+        return p[0], p[1]
+
+    def rhs(self, t, y, p, c):
+        altitude, velocity = y
+        drag = self.ballistic * np.exp(p[2] - self.density_decay * altitude)
+        return -velocity, -drag * velocity * velocity
+
+    def read(self, t, y, p, c):
+        above = y[0] - self.radar_altitude
+        return (np.sqrt(self.radar_distance**2 + above * above),)

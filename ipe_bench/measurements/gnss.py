@@ -1,0 +1,222 @@
+"""Satellite navigation: position and clocks of a receiver at rest from pseudo-ranges of one or more constellations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
+from ipe_bench.measurements.base import Measurement, Parameter
+
+LIGHT = 299792458.0
+"""Speed of light in m/s."""
+EARTH_RATE = 7.2921151467e-5
+"""Rate of the Earth's rotation in rad/s, as WGS 84 and GPS define it."""
+_SEMI_MAJOR, _FLATTENING = 6378137.0, 1.0 / 298.257223563
+_LEAST_RADIUS = 6e6
+"""Closer to the Earth's centre, in m, nothing is taken for a place on it."""
+
+_SKY = (
+    ("gps", 26_560e3, 20.0, 65.0), ("gps", 26_560e3, 75.0, 30.0), ("gps", 26_560e3, 140.0, 50.0),
+    ("gps", 26_560e3, 205.0, 18.0), ("gps", 26_560e3, 260.0, 40.0), ("gps", 26_560e3, 320.0, 25.0),
+    ("galileo", 29_600e3, 45.0, 45.0), ("galileo", 29_600e3, 110.0, 15.0), ("galileo", 29_600e3, 185.0, 70.0),
+    ("galileo", 29_600e3, 290.0, 35.0),
+)  # fmt: skip
+"""Constellation, radius of the orbit in m, azimuth and elevation in degrees of the satellites that are the default."""
+
+
+def east_north_up(position: Array) -> Array:
+    """The rows (3, 3) east, north and up at a place given in ECEF, up along the normal of the WGS 84 ellipsoid.
+
+    The latitude is found by Bowring's formula, to better than 1e-9 rad at the surface (Survey Review 23, 1976).
+    """
+    x, y, z = position
+    minor, p = _SEMI_MAJOR * (1.0 - _FLATTENING), math.hypot(x, y)
+    e2 = _FLATTENING * (2.0 - _FLATTENING)
+    reduced = math.atan2(z * _SEMI_MAJOR, p * minor)
+    latitude = math.atan2(
+        z + e2 / (1.0 - e2) * minor * math.sin(reduced) ** 3, p - e2 * _SEMI_MAJOR * math.cos(reduced) ** 3
+    )
+    longitude = math.atan2(y, x)
+    sin_lat, cos_lat, sin_lon, cos_lon = (f(a) for a in (latitude, longitude) for f in (math.sin, math.cos))
+    return np.array(
+        [
+            [-sin_lon, cos_lon, 0.0],
+            [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
+            [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class Gnss(Measurement):
+    """Pseudo-ranges r + c_e + o_s from a receiver at rest to satellites whose places at transmission are known.
+
+    r is the distance that the signal travels: the satellite's place, in the Earth-fixed axes (ECEF, WGS 84) of the time
+    of transmission, is turned by the Earth's rotation during the travel (the Sagnac correction, up to 40 m). c_e is the
+    receiver's clock error in epoch e against the first constellation, o_s the constant offset of every further
+    constellation s, both as lengths. Satellite clocks, troposphere and ionosphere are to be taken off the readings.
+
+    Parameters, all in m: east, north and up of the presumed position, or its x, y and z; a clock for each epoch; an
+    offset for each further constellation. Readings in m, grouped into epochs by time. The usual noise is 1 m (code).
+
+    Sources: Kaplan and Hegarty, Understanding GPS, 2nd ed., section 2.4; Ashby, Relativity in the Global Positioning
+    System, Living Reviews in Relativity 6, 2003 (rotation).
+    """
+
+    satellites: tuple[tuple[float, float, float], ...] | None = None
+    """x, y, z in m (ECEF) for each reading; None: six GPS and four Galileo satellites over the presumed position, each
+    read once in each of `rounds` epochs."""
+    constellations: tuple[str, ...] | None = None
+    """The constellation of each reading; None: all of one."""
+    times: tuple[int, ...] | None = None
+    """The number of the epoch of each reading; None: all of one."""
+    position: tuple[float, float, float] = (-3120042.0, 4084614.0, 3764026.0)
+    """The presumed position in m (ECEF): the nominal point, with clocks of 0."""
+    frame: Literal["enu", "ecef"] = "enu"
+    """In which axes the position is estimated: east, north, up, or x, y, z."""
+    rounds: int = 1
+    position_size: float = 1000.0
+    """What one unit of error is, in m: of each coordinate,"""
+    clock_size: float = 1000.0
+    """of each clock,"""
+    offset_size: float = 10.0
+    """and of the offset of each further constellation."""
+    earth_rate: float = EARTH_RATE
+    """In rad/s; 0 for beacons and readings whose rotation is taken off already."""
+
+    reading_unit = "m"
+    analytic = True
+
+    def __post_init__(self) -> None:
+        given = {"constellations": self.constellations, "times": self.times}
+        if self.satellites is None:
+            for name, column in given.items():
+                if column is not None:
+                    raise UserError(f"{name}: give satellites as well, three coordinates for each reading")
+        else:
+            if np.shape(self.satellites) != (len(self.satellites), 3):
+                raise UserError("satellites: give three coordinates for each reading")
+            for name, column in given.items():
+                if column is not None and len(column) != len(self.satellites):
+                    raise UserError(f"{name}: {len(column)} entries for {len(self.satellites)} satellites")
+        if self.frame == "enu" and math.hypot(*self.position) < _LEAST_RADIUS:
+            raise UserError("position: there is no up near the centre of the Earth; set frame=ecef")
+        if self.rounds < 1:
+            raise UserError(f"rounds={self.rounds}: give at least 1")
+        if self.m <= self.n:
+            raise UserError(f"satellites: {self.m} readings are too few for {self.n} parameters")
+
+    @cached_property
+    def _columns(self) -> tuple[Array, tuple[str, ...], tuple[int, ...]]:
+        """Satellite (m, 3), constellation and epoch of each reading."""
+        if self.satellites is not None:
+            m = len(self.satellites)
+            systems, times = self.constellations or ("gps",) * m, self.times or (1,) * m
+            return np.asarray(self.satellites, dtype=float), systems, times
+        sky = np.array([self._overhead(*place[1:]) for place in _SKY])
+        systems = tuple(place[0] for place in _SKY) * self.rounds
+        times = tuple(k for k in range(1, self.rounds + 1) for _ in _SKY)
+        return np.tile(sky, (self.rounds, 1)), systems, times
+
+    def _overhead(self, radius: float, azimuth: float, elevation: float) -> Array:
+        """The place (3,) on a sphere about the Earth's centre that is seen in that direction."""
+        a, e = math.radians(azimuth), math.radians(elevation)
+        here = np.asarray(self.position)
+        # From the centre of the Earth, any axes do.
+        axes = east_north_up(here) if np.linalg.norm(here) > _LEAST_RADIUS else np.eye(3)
+        towards = axes.T @ np.array([math.sin(a) * math.cos(e), math.cos(a) * math.cos(e), math.sin(e)])
+        along = float(here @ towards)
+        return here + (math.sqrt(along**2 + radius**2 - float(here @ here)) - along) * towards
+
+    @cached_property
+    def _systems(self) -> tuple[str, ...]:
+        """Each constellation once, in order of appearance."""
+        return tuple(dict.fromkeys(self._columns[1]))
+
+    @cached_property
+    def _times(self) -> tuple[int, ...]:
+        return tuple(sorted(set(self._columns[2])))
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        axes = ("east", "north", "up") if self.frame == "enu" else ("x", "y", "z")
+        clocks = [f"clock_{k}" for k in self._times] if len(self._times) > 1 else ["clock"]
+        return (
+            *(Parameter(name, "m", self.position_size, "position") for name in axes),
+            *(Parameter(name, "m", self.clock_size, "clock") for name in clocks),
+            *(Parameter(f"offset_{name}", "m", self.offset_size, "offset") for name in self._systems[1:]),
+        )
+
+    @cached_property
+    def nominal(self) -> Array:
+        values = np.zeros(self.n)
+        if self.frame == "ecef":
+            values[:3] = self.position
+        return values / self.sizes
+
+    @cached_property
+    def m(self) -> int:
+        return len(self._columns[0])
+
+    @cached_property
+    def index(self) -> Mapping[str, Sequence[Any]]:
+        _, systems, times = self._columns
+        seen: dict[tuple[int, str], int] = {}
+        numbers = []
+        for key in zip(times, systems, strict=True):
+            seen[key] = seen.get(key, 0) + 1
+            numbers.append(seen[key])
+        return {"epoch": list(times), "constellation": list(systems), "satellite": numbers}
+
+    @cached_property
+    def epochs(self) -> tuple[NDArray[np.intp], ...]:
+        times = np.array(self._columns[2])
+        return tuple(np.flatnonzero(times == k) for k in self._times)
+
+    @cached_property
+    def _biases(self) -> Array:
+        """Which of the clocks and offsets each reading carries: (n - 3, m) of zeros and ones."""
+        _, systems, times = self._columns
+        return np.array(
+            [
+                *([t == k for t in times] for k in self._times),
+                *([s == name for s in systems] for name in self._systems[1:]),
+            ],
+            dtype=float,
+        )
+
+    def simulate(self, x: Array) -> Array:
+        values = (x * self.sizes)[:, :, None]
+        place = self._place(values)
+        z = self._travelled(place)
+        for k, carried in enumerate(self._biases):
+            z = z + values[:, 3 + k] * carried
+        return z
+
+    def _place(self, values: Array) -> list[Any]:
+        """The receiver's x, y, z in ECEF, each (trials, 1)."""
+        if self.frame == "ecef":
+            return [values[:, i] for i in range(3)]
+        axes = east_north_up(np.asarray(self.position))
+        return [self.position[i] + sum(values[:, k] * axes[k, i] for k in range(3)) for i in range(3)]
+
+    def _travelled(self, place: list[Any]) -> Array:
+        """The distance (trials, m) that light travels: the Earth turns meanwhile, by an angle that depends on it.
+
+        Each of the three passes takes the error down by the speed of the satellite's turning over that of light, 1e-5.
+        """
+        x, y, z = self._columns[0].T
+        distance: Any = 0.0
+        for _ in range(3):
+            angle = self.earth_rate / LIGHT * distance
+            turned = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x, z
+            distance = np.sqrt(sum((s - p) ** 2 for s, p in zip(turned, place, strict=True)))
+        return distance

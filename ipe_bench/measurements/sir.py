@@ -1,0 +1,93 @@
+"""An epidemic: susceptible, infected, removed, the smallest model of one (see `ode`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
+from ipe_bench.measurements.base import Parameter
+from ipe_bench.measurements.ode.model import OdeMeasurement
+
+State = Literal["susceptible", "infected", "removed"]
+_STATES = ("susceptible", "infected", "removed")
+
+
+@dataclass(frozen=True)
+class Sir(OdeMeasurement):
+    """Rates of infection and recovery, and the first infected, from how many are infected each day.
+
+        S' = -beta S I / N,   I' = beta S I / N - gamma I,   R = N - S - I;   S(0) = N - I(0), R(0) = 0
+
+    Parameters: the logarithms of beta, gamma and the odds I(0) / S(0), each over its presumed value, because rates and
+    people are positive: whatever is drawn is an epidemic. An estimate of 0.1 stands for 10 % more than presumed; for
+    few infected the odds are their share. Readings: people in each of the states in `observed`, at the end of each day;
+    a day is an epoch.
+
+    Source: Kermack and McKendrick, Proceedings of the Royal Society A 115, 1927. The defaults are the influenza in an
+    English boarding school of 763 boys (British Medical Journal, 4 March 1978) as Murray fits it, Mathematical
+    Biology I, 3rd ed., section 10.2: beta / N = 2.18e-3 per day, gamma N / beta = 202, one boy at the start. A fit
+    leaves residuals of about 20 boys there.
+    """
+
+    population: float = 763.0
+    """N."""
+    infection: float = 1.66
+    """Presumed beta per day,"""
+    recovery: float = 0.44
+    """gamma per day,"""
+    infected: float = 1.0
+    """and I(0)."""
+    days: int = 14
+    observed: tuple[State, ...] = ("infected",)
+    """What is counted each day."""
+    rate_size: float = 0.1
+    """What one unit of error is: of the logarithm of each rate,"""
+    infected_size: float = 0.3
+    """and of the logarithm of the odds I(0) / S(0)."""
+    step: float | None = 0.125
+
+    states, time_unit, reading_unit = 2, "day", "people"
+
+    def __post_init__(self) -> None:
+        for name in ("population", "infection", "recovery", "infected"):
+            if not getattr(self, name) > 0:
+                raise UserError(f"{name}={getattr(self, name)}: give a number above 0")
+        if self.infected >= self.population:
+            raise UserError(f"infected={self.infected}: give fewer than the population of {self.population:g}")
+        if not self.observed or len(set(self.observed)) < len(self.observed) or set(self.observed) - set(_STATES):
+            raise UserError(f"observed={list(self.observed)}: choose some of {', '.join(_STATES)}, each once")
+        if self.days * len(self.observed) < 4:
+            raise UserError(f"days={self.days}: give at least 4 readings for 3 parameters")
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return self.observed
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        rates = (Parameter(f"ln_{name}", size=self.rate_size, group="rates") for name in ("beta", "gamma"))
+        return (*rates, Parameter("ln_odds", size=self.infected_size))
+
+    @cached_property
+    def times(self) -> Array:
+        return np.arange(1.0, self.days + 1)
+
+    def start(self, p, c):
+        odds = self.infected / (self.population - self.infected) * np.exp(p[2])
+        susceptible = self.population / (1.0 + odds)
+        return susceptible, odds * susceptible
+
+    def rhs(self, t, y, p, c):
+        susceptible, infected = y
+        beta, gamma = self.infection * np.exp(p[0]), self.recovery * np.exp(p[1])
+        infections = beta / self.population * susceptible * infected
+        return -infections, infections - gamma * infected
+
+    def read(self, t, y, p, c):
+        counted = {"susceptible": y[0], "infected": y[1], "removed": self.population - y[0] - y[1]}
+        return [counted[name] for name in self.observed]

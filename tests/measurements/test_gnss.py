@@ -1,0 +1,167 @@
+"""Pseudo-ranges against the flight of light in inertial axes, the ellipsoid's formulas, and SciPy's solution."""
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq, least_squares
+
+from ipe_bench.baselines import GaussNewton
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Covariance
+from ipe_bench.measurements import Gnss, Ranging
+from ipe_bench.measurements.gnss import east_north_up
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.plugins.conformance import check_component
+
+LIGHT, EARTH_RATE = 299792458.0, 7.2921151467e-5
+
+
+def flight(satellite, receiver):
+    """The distance to a receiver that the Earth carries along while light flies, in axes that do not turn."""
+
+    def late(tau):
+        a = EARTH_RATE * tau
+        x, y, z = receiver
+        carried = np.array([np.cos(a) * x - np.sin(a) * y, np.sin(a) * x + np.cos(a) * y, z])
+        return np.linalg.norm(carried - satellite) - LIGHT * tau
+
+    return LIGHT * brentq(late, 0.0, 1.0, xtol=1e-17, rtol=1e-15)
+
+
+def on_ellipsoid(latitude, longitude, height):
+    a, f = 6378137.0, 1 / 298.257223563
+    e2 = f * (2 - f)
+    N = a / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
+    r = (N + height) * np.cos(latitude)
+    return np.array(
+        [
+            r * np.cos(longitude),
+            r * np.sin(longitude),
+            (N * (1 - e2) + height) * np.sin(latitude),
+        ]
+    )
+
+
+def sky(model):
+    """Satellites (m, 3) of the default sky, found from the readings' directions: the model's own table."""
+    return model._columns[0]
+
+
+def given(model, **others):
+    """The same readings with everything in fields."""
+    index = model.index
+    return Gnss(
+        satellites=tuple(map(tuple, sky(model).tolist())),
+        constellations=tuple(index["constellation"]),
+        times=tuple(index["epoch"]),
+        **others,
+    )
+
+
+def test_distances_are_those_of_light_in_axes_that_do_not_turn():
+    model = Gnss(frame="ecef")
+    x = model.nominal + np.random.default_rng(0).normal(size=(3, model.n))
+    for row, z in zip(x, model.simulate(x), strict=True):
+        p = row * model.sizes
+        clock = p[3] + np.where(np.array(model.index["constellation"]) == "galileo", p[4], 0.0)
+        np.testing.assert_allclose(z - clock, [flight(s, p[:3]) for s in sky(model)], atol=1e-6)
+
+
+def test_the_rotation_is_worth_the_sagnac_term():
+    turning, still = Gnss(), Gnss(earth_rate=0.0)
+    x, y, _ = sky(turning).T
+    px, py, _ = turning.position
+    difference = (turning.simulate(turning.nominal[None]) - still.simulate(still.nominal[None]))[0]
+    np.testing.assert_allclose(difference, EARTH_RATE / LIGHT * (x * py - y * px), atol=1e-3)
+    assert 10.0 < np.abs(difference).max() < 45.0
+
+
+def test_local_axes_are_the_tangents_of_the_ellipsoid():
+    latitude, longitude, height, h = 0.6344, 2.2230, 120.0, 1e-6
+    place = on_ellipsoid(latitude, longitude, height)
+    east = on_ellipsoid(latitude, longitude + h, height) - on_ellipsoid(latitude, longitude - h, height)
+    north = on_ellipsoid(latitude + h, longitude, height) - on_ellipsoid(latitude - h, longitude, height)
+    up = on_ellipsoid(latitude, longitude, height + 1.0) - place
+    expected = np.array([v / np.linalg.norm(v) for v in (east, north, up)])
+    np.testing.assert_allclose(east_north_up(place), expected, atol=1e-8)
+
+
+def test_satellites_stand_where_the_default_says():
+    model = Gnss()
+    towards = (sky(model) - model.position) @ east_north_up(np.array(model.position)).T
+    elevation = np.rad2deg(np.arcsin(towards[:, 2] / np.linalg.norm(towards, axis=1)))
+    azimuth = np.rad2deg(np.arctan2(towards[:, 0], towards[:, 1])) % 360
+    np.testing.assert_allclose((azimuth[0], elevation[0]), (20.0, 65.0), atol=1e-9)
+    radii = np.linalg.norm(sky(model), axis=1)
+    np.testing.assert_allclose(radii, np.where(np.array(model.index["constellation"]) == "gps", 26560e3, 29600e3))
+
+
+def test_east_north_up_and_ecef_are_one_model():
+    local = Gnss(rounds=2)
+    fixed = given(local, frame="ecef")
+    x = local.nominal + np.random.default_rng(1).normal(size=(3, local.n))
+    values = x * local.sizes
+    values[:, :3] = np.array(local.position) + values[:, :3] @ east_north_up(np.array(local.position))
+    np.testing.assert_allclose(fixed.simulate(values / fixed.sizes), local.simulate(x), atol=1e-6)
+
+
+def test_without_rotation_and_with_one_clock_it_is_ranging():
+    beacons = Ranging(rounds=2)
+    model = Gnss(
+        satellites=beacons.beacons * 2,
+        frame="ecef",
+        position=(0.0, 0.0, 0.0),
+        earth_rate=0.0,
+        position_size=10.0,
+        clock_size=10.0,
+    )
+    x = np.random.default_rng(2).normal(size=(5, 4))
+    np.testing.assert_allclose(model.simulate(x), beacons.simulate(x), rtol=1e-14)
+
+
+def test_an_epoch_of_two_constellations_from_the_centre_of_the_earth_is_scipys_solution():
+    model = Gnss()
+    truth = np.array([*on_ellipsoid(0.6344, 2.2230, 120.0), 3e5, -25.0])
+    galileo = np.array(model.index["constellation"]) == "galileo"
+
+    def ranges(p):
+        return np.array([flight(s, p[:3]) for s in sky(model)]) + p[3] + np.where(galileo, p[4], 0.0)
+
+    z = ranges(truth) + np.random.default_rng(3).normal(size=model.m)
+    scale = np.array([1e6, 1e6, 1e6, 1e6, 10.0])
+    theirs = least_squares(lambda p: z - ranges(p), np.array([1e6, 1e6, 1e6, 0, 0]), x_scale=scale, xtol=1e-15).x
+    centre = given(model, frame="ecef", position=(0.0, 0.0, 0.0), position_size=1e6, clock_size=1e5)
+    estimates = GaussNewton(start="nominal").estimate(Problem(centre, Covariance(np.ones(model.m))), z[None])
+    assert estimates.status[0] == 0
+    np.testing.assert_allclose((estimates.x * centre.sizes)[0], theirs, atol=1e-3)
+    assert np.linalg.norm(theirs[:3] - truth[:3]) < 10.0
+
+
+def test_clocks_belong_to_epochs_and_offsets_to_constellations():
+    model = Gnss(rounds=2)
+    assert [p.name for p in model.parameters[3:]] == ["clock_1", "clock_2", "offset_galileo"]
+    moved = model.simulate(model.nominal + np.vstack([np.zeros(6), np.diag(1 / model.sizes)[3:]]))
+    difference = np.round(moved[1:] - moved[0], 6)
+    epoch, galileo = np.array(model.index["epoch"]), np.array(model.index["constellation"]) == "galileo"
+    np.testing.assert_array_equal(difference, np.array([epoch == 1, epoch == 2, galileo], dtype=float))
+    assert [len(rows) for rows in model.epochs] == [10, 10]
+
+
+@pytest.mark.parametrize("options", [{}, {"rounds": 3}, {"frame": "ecef"}])
+def test_it_keeps_the_promises_of_models(options):
+    assert not [f.complaint for f in check_component("gnss", Gnss(**options)) if f.complaint]
+
+
+@pytest.mark.parametrize(
+    ("message", "options"),
+    [
+        ("satellites: 3 readings", {"satellites": ((2e7, 0.0, 0.0),) * 3}),
+        ("satellites: give three", {"satellites": ((2e7, 0.0),) * 9}),
+        ("times: 2 entries", {"satellites": ((2e7, 0.0, 0.0),) * 9, "times": (1, 2)}),
+        ("constellations: give", {"constellations": ("gps",)}),
+        ("position:", {"position": (0.0, 0.0, 0.0)}),
+        ("rounds=0", {"rounds": 0}),
+    ],
+)
+def test_mistakes_are_named(message, options):
+    with pytest.raises(UserError, match=f"^{message}"):
+        Gnss(**options)

@@ -1,0 +1,94 @@
+"""The rooms of the package stand in one line, and nothing is imported against it."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import ipe_bench
+
+HOUSE = Path(ipe_bench.__file__).parent
+LINE = (
+    ("basics",),
+    ("measurements",),
+    ("noise", "priors"),
+    ("estimators",),
+    ("solvers", "baselines"),
+    ("trials",),
+    ("runs",),
+    ("statistics",),
+    ("real", "plugins"),
+    ("report",),
+    ("api",),
+    ("cli",),
+)
+PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}
+HEAVY_BELOW = {"matplotlib": "report", "seaborn": "report", "hydra": "cli", "omegaconf": "cli", "rich": "report"}
+
+
+def modules():
+    for path in sorted(HOUSE.rglob("*.py")):
+        parts = path.relative_to(HOUSE).with_suffix("").parts
+        if parts[0] in PLACE:
+            yield pytest.param(path, parts[0], id="/".join(parts))
+
+
+def imported(path: Path, *, checked_types: bool) -> set[str]:
+    """The modules that a file imports, late imports included; those for type checkers alone where asked for."""
+    names: set[str] = set()
+
+    def visit(node: ast.AST) -> None:
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test) and not checked_types:
+            return
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.update({node.module, *(f"{node.module}.{alias.name}" for alias in node.names)})
+        for child in ast.iter_child_nodes(node):
+            visit(child)
+
+    visit(ast.parse(path.read_text(encoding="utf-8")))
+    return names
+
+
+@pytest.mark.parametrize(("path", "room"), list(modules()))
+def test_nothing_is_imported_against_the_line(path, room):
+    for name in imported(path, checked_types=True):
+        parts = name.split(".")
+        if parts[0] == "ipe_bench" and len(parts) > 1 and parts[1] in PLACE:
+            assert PLACE[parts[1]] <= PLACE[room], f"{room} imports {name}, which stands later in the line"
+            rooms = LINE[PLACE[room]]
+            assert parts[1] == room or parts[1] not in rooms, f"{room} imports {name}, its neighbour in the line"
+
+
+@pytest.mark.parametrize(("path", "room"), list(modules()))
+def test_rooms_know_only_the_libraries_that_are_theirs(path, room):
+    for name in imported(path, checked_types=False):
+        home = HEAVY_BELOW.get(name.split(".")[0])
+        assert home is None or PLACE[room] >= PLACE[home], f"{room} knows {name}, which belongs to {home} and above"
+
+
+def test_modules_import_each_other_in_no_circle():
+    paths = {".".join(("ipe_bench", *p.relative_to(HOUSE).with_suffix("").parts)): p for p in HOUSE.rglob("*.py")}
+    paths = {name.removesuffix(".__init__"): path for name, path in paths.items() if name != "ipe_bench.__init__"}
+    edges = {name: {n for n in imported(path, checked_types=False) if n in paths} for name, path in paths.items()}
+    done: set[str] = set()
+
+    def walk(name: str, trail: tuple[str, ...]) -> None:
+        assert name not in trail, " -> ".join((*trail[trail.index(name) :], name))
+        if name not in done:
+            for other in sorted(edges[name]):
+                # A package imports its own modules, which may name it in turn only through another room.
+                if other != name and not name.startswith(f"{other}."):
+                    walk(other, (*trail, name))
+            done.add(name)
+
+    for name in sorted(paths):
+        walk(name, ())
+
+
+def test_the_top_of_the_package_can_be_taken_in_at_a_glance():
+    entries = [p.name for p in HOUSE.iterdir() if p.name not in ("__pycache__", "conf")]
+    assert len(entries) <= 18, sorted(entries)
