@@ -11,7 +11,7 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
 from ipe_bench.report.words import plain
-from ipe_bench.statistics.profiles import CLOSE
+from ipe_bench.statistics.histories import CLOSE
 
 FLOOR = 1e-10
 """Distances below this are drawn here: round-off."""
