@@ -12,7 +12,7 @@ from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
 from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH
 from ipe_bench.report.words import plain
-from ipe_bench.trials.scoring import GATE
+from ipe_bench.trials.thresholds import GATE
 
 
 def draw(view: View) -> Iterator[Drawing]:
