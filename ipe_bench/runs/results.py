@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import os
+from collections import Counter
 from collections.abc import Collection as Keys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -24,7 +25,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.pieces import Failed, Foreign, Outdated, Piece, Run, Unusable, read_history
 from ipe_bench.runs.provenance import canonical_json
-from ipe_bench.runs.store import TRUTH, Store, describe_names, gaps
+from ipe_bench.runs.store import TRUTH, Store, describe_names, gaps, title
 from ipe_bench.runs.verified import Verified, signature
 
 _KEPT_BYTES = 1 << 28
@@ -90,6 +91,13 @@ class CellState:
     """Trials that another version of the source computed; they do not count as done."""
     messages: tuple[str, ...]
     """Why trials failed."""
+    tag: str = ""
+    """The beginning of its key, where other cells have the same names."""
+
+    @property
+    def title(self) -> str:
+        """Its scenario in a line for people."""
+        return title(self.names) + (f" (#{self.tag})" if self.tag else "")
 
     @property
     def complete(self) -> bool:
@@ -98,7 +106,7 @@ class CellState:
     @property
     def problems(self) -> Iterator[str]:
         """A line for what is wrong with it, if anything."""
-        who = describe_names(self.names)
+        who = describe_names(self.names) + (f" (#{self.tag})" if self.tag else "")
         for line in self.messages if self.failed else ():
             yield f"failed: {who}: {self.failed} of {self.expected} expected trials: {line}"
         if self.missing:
@@ -288,6 +296,13 @@ class Results:
     @cached_property
     def cells(self) -> tuple[CellState, ...]:
         """How far every cell is: those that runs asked for in their order, then others that are there."""
+        names = [*(n for _, _, n in self._asked_for.values())]
+        names += [c.names for i, (c, _) in self._rivals.items() if i not in self._asked_for and c is not None]
+        alike = Counter(map(describe_names, names))
+
+        def tag(key: str, names: Mapping[str, Any]) -> str:
+            return key[:6] if alike[describe_names(names)] > 1 else ""
+
         failures: dict[str, list[Failed]] = {}
         for failure in self.failures:
             failures.setdefault(failure.key, []).append(failure)
@@ -298,10 +313,12 @@ class Results:
             done, missing = trials - _count(lacking), _count(untried)
             stale = sum(cell.trials for cell in self._rivals.get(identity, (None, []))[1])
             messages = tuple(dict.fromkeys(f.reason for f in lost))
-            states.append(CellState(names, trials, done, trials - done - missing, missing, stale, messages))
+            counts = trials, done, trials - done - missing, missing, stale
+            states.append(CellState(names, *counts, messages, tag(key, names)))
         for identity, (cell, old) in self._rivals.items():
             if identity not in self._asked_for and cell is not None:
-                states.append(CellState(cell.names, 0, cell.trials, 0, 0, sum(c.trials for c in old), ()))
+                counts = 0, cell.trials, 0, 0, sum(c.trials for c in old)
+                states.append(CellState(cell.names, *counts, (), tag(cell.key, cell.names)))
         return tuple(states)
 
     def set_aside(self) -> list[str]:
