@@ -16,7 +16,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.statistics.collect import Collection, Group, collect
 from ipe_bench.statistics.comparisons import Outcomes, Ranking, compare_pairs, leaders, rank_over_scenarios
 from ipe_bench.statistics.histories import History, trial_label
-from ipe_bench.statistics.intervals import bootstrap_rms, quantile, quantiles
+from ipe_bench.statistics.intervals import quantile, quantiles, rms_interval
 from ipe_bench.statistics.profiles import Profiles
 from ipe_bench.statistics.records import SCORES, rows_of
 from ipe_bench.statistics.sample import Sample, Shared
@@ -175,7 +175,7 @@ def _group_rows(sample: Sample) -> list[dict[str, Any]]:
     solved = sample.solved
     squares = np.where(solved[:, None], sample.normalised, 0.0) ** 2
     means = np.stack([squares[:, which].mean(axis=1) for which in members.values()], axis=1)
-    lows, highs = bootstrap_rms(means, solved)
+    lows, highs = rms_interval(means, solved)
     for i, name in enumerate(members):
         rmse = float(np.sqrt(means[solved, i].mean())) if solved.any() else np.nan
         rows.append(head(sample.group) | {"group": name, "rmse": rmse, "low": lows[i], "high": highs[i]})

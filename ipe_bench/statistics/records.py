@@ -16,7 +16,7 @@ from scipy.stats import chi2, norm
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.consistency import clopper_pearson, mean_limits, verdict
 from ipe_bench.statistics.histories import CLOSE, FixedPointBound, fixed_point_bound, observed_constant, orders_of
-from ipe_bench.statistics.intervals import LARGEST_SAMPLE, RESAMPLES, bootstrap_rms, quantile, quantiles
+from ipe_bench.statistics.intervals import LARGEST_SAMPLE, RESAMPLES, quantile, quantiles, rms_interval
 from ipe_bench.statistics.sample import FIT, NIS, Sample, root_mean
 from ipe_bench.trials.thresholds import FIT_LEVEL, GATE, SAME_ROOT
 
@@ -167,12 +167,12 @@ def _rmse(s: Sample) -> Array:
 
 def _rmse_limits(s: Sample) -> Limits:
     squares = np.mean(np.where(s.solved[:, None], s.normalised, 0.0) ** 2, axis=1, keepdims=True)
-    low, high = bootstrap_rms(squares, s.solved)
+    low, high = rms_interval(squares, s.solved)
     return float(low[0]), float(high[0])
 
 
 def _rmse_limits_each(s: Sample) -> Limits:
-    low, high = bootstrap_rms(np.where(s.solved[:, None], s.error, 0.0) ** 2, s.solved)
+    low, high = rms_interval(np.where(s.solved[:, None], s.error, 0.0) ** 2, s.solved)
     return low * s.sizes, high * s.sizes
 
 
