@@ -32,7 +32,7 @@ from ipe_bench.trials.contraction import contraction_of, curvature
 from ipe_bench.trials.fit_test import Spread, fit_probability, frozen_spread, least_squares_spread, prior_spread
 from ipe_bench.trials.roots import frozen_root, least_squares_root
 from ipe_bench.trials.scenario import Scenario, Trials
-from ipe_bench.trials.thresholds import GATE, SAME_ROOT
+from ipe_bench.trials.thresholds import EXPECTED, GATE, SAME_ROOT
 
 HISTORIES = 20
 """Trials whose iterates are kept: the first ones of a scenario."""
@@ -94,12 +94,26 @@ class Block:
             **_by_parameter("x", names, self.trials.x),
             **_by_parameter("crlb", names, self.crlb_deviation),
             **_by_parameter("bayes", names, bayes),
+            **_by_parameter("van_trees", names, self._van_trees()),
             **_by_parameter("linear_error", names, multiply(H_plus, self.trials.z - self.readings_at(self.trials.x))),
             "contraction_K": contracts.K,
             "contraction_norm": contracts.infinity_norm,
             "contraction_radius": contracts.spectral_radius,
             "curvature_M": self._curvature(H_plus),
         }
+
+    def _van_trees(self) -> Array:
+        """Deviations (trials, n) of Van Trees's bound (E[J' R^-1 J] + P0^-1)^-1 (Detection, Estimation, and Modulation
+        Theory I, 1968, sec. 2.4), the mean taken over the first `EXPECTED` truths of the scenario: in its first trial,
+        and NaN in the others."""
+        bound = np.full(self.trials.x.shape, np.nan)
+        deviation = self.problem.prior_used()
+        if self.trials.start == 0 and len(bound) and deviation is not None and not self.scenario.noise.real:
+            x = self.scenario.truths(0, EXPECTED)
+            with np.errstate(all="ignore"):
+                expected = information(self.problem.measurement.jacobian(x), self.problem.R).mean(axis=0)
+                bound[0] = deviations(inverse((expected + np.diag(deviation**-2.0))[None])[0])[0]
+        return bound
 
     def readings_at(self, x: Array) -> Array:
         """h(x) (trials, m) for x (trials, n); NaN where the model fails."""
