@@ -254,7 +254,9 @@ def ranks(analysis: Analysis) -> Table | None:
         f" alike: p = {p_value(ranking.friedman)}. Nemenyi's critical difference at 5 %:"
         f" {ranking.critical_difference:.2f}."
     )
-    data = pd.DataFrame({"estimator": ordered, "mean_rank": values, "apart_from_first": apart})
+    data = pd.DataFrame({"estimator": ordered, "mean_rank": values, "apart_from_first": apart}).assign(
+        replicates=ranking.replicates, friedman_p=ranking.friedman, critical_difference=ranking.critical_difference
+    )
     return Table("ranks", "Ranks over seeds", caption, columns, data)
 
 
