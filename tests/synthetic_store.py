@@ -64,6 +64,22 @@ class Pretender(Estimator):
         raise NotImplementedError
 
 
+@dataclass(frozen=True)
+class Seeker(Pretender):
+    """The same for an estimator that seeks a root."""
+
+    equation = "frozen"
+
+
+@dataclass(frozen=True)
+class Filter(Pretender):
+    """The same for one that takes epoch after epoch."""
+
+    @cached_property
+    def needs(self) -> frozenset[str]:  # type: ignore[override]
+        return frozenset({"prior", "epochs"})
+
+
 class Synthetic:
     """Writes stores: `scenario(...)`, `add(...)` rows under an estimator, `record()` what a run expects."""
 

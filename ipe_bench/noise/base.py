@@ -30,3 +30,10 @@ class Noise(Component, Named, ABC):
     @abstractmethod
     def covariance(self, m: int) -> Covariance:
         """R of m readings, as the estimators assume it."""
+
+    def whitened(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array | None:
+        """Draws of the errors of whitened readings, R^-1/2 v, if R is right: independent, of mean 0 and variance 1.
+
+        None, unless a noise says otherwise: they are normal. The test of fit takes its law from here.
+        """
+        return None

@@ -27,9 +27,22 @@ class Outliers(Noise):
     assumed: Literal["nominal", "total"] = "nominal"
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
-        gross = rng.random(h.shape) < self.share
-        return h + self.deviation * np.where(gross, self.factor, 1.0) * rng.standard_normal(h.shape)
+        return h + self.deviation * self._mixture(h.shape, rng)
+
+    def _mixture(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+        """Errors over the deviation of a good reading."""
+        gross = rng.random(shape) < self.share
+        return np.where(gross, self.factor, 1.0) * rng.standard_normal(shape)
+
+    def whitened(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array | None:
+        """The mixture where estimators are told of it; otherwise R is that of good readings, which are normal."""
+        return None if self.assumed == "nominal" else self._mixture(shape, rng) / self._excess
+
+    @property
+    def _excess(self) -> float:
+        """The deviation of the mixture over that of a good reading."""
+        return float(np.sqrt(1 - self.share + self.share * self.factor**2))
 
     def covariance(self, m: int) -> Covariance:
-        excess = 1.0 if self.assumed == "nominal" else np.sqrt(1 - self.share + self.share * self.factor**2)
+        excess = 1.0 if self.assumed == "nominal" else self._excess
         return Covariance(np.full(m, self.deviation * excess))

@@ -31,5 +31,9 @@ class Quantization(Noise):
         shift = self.step * (rng.random(h.shape) - 0.5) if self.dither else 0.0
         return self.step * np.round((offset + h + shift) / self.step) - offset - shift
 
+    def whitened(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+        """Uniform."""
+        return (rng.random(shape) - 0.5) / _UNIFORM_DEVIATION
+
     def covariance(self, m: int) -> Covariance:
         return Covariance(np.full(m, self.deviation or self.step * _UNIFORM_DEVIATION))

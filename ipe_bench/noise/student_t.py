@@ -26,9 +26,13 @@ class StudentT(Noise):
     """Above 2, for a finite variance; the smaller, the heavier the tails."""
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
+        return h + self.deviation * self.whitened(h.shape, rng)
+
+    def whitened(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+        """Student's t, scaled to variance 1."""
         # The variance of Student's t is nu / (nu - 2).
-        scale = self.deviation * np.sqrt((self.degrees_of_freedom - 2) / self.degrees_of_freedom)
-        return h + scale * rng.standard_t(self.degrees_of_freedom, h.shape)
+        scale = np.sqrt((self.degrees_of_freedom - 2) / self.degrees_of_freedom)
+        return scale * rng.standard_t(self.degrees_of_freedom, shape)
 
     def covariance(self, m: int) -> Covariance:
         return Covariance(np.full(m, self.deviation))

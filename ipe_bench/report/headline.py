@@ -29,25 +29,38 @@ def headline(analysis: Analysis) -> str:
         reach = f"error scales {plain(scales[0])} to {plain(scales[-1])}"
     scenarios = f" in {len(own)} scenarios" if len(own) > len(scales) else ""
     sentence = f"At {reach}{scenarios}, {best} succeeds in {percent(success)} of {trials:,} trials"
-    over = own["rmse_over_linear_bound"].to_numpy()
-    if np.isfinite(over).any():
-        worst = own.iloc[int(np.nanargmax(over))]
-        sentence += (
-            f", and where it does worst (scale {plain(worst['error_scale'])}) the root mean square error of the trials"
-            f" it solves is {short(worst['rmse_over_linear_bound'])} times the linear bound"
-            f" (95 % interval {short(worst['rmse_low'])} to {short(worst['rmse_high'])})"
-        )
+    worst = _least_efficient(own)
+    if worst is not None:
+        sentence += f", and where it does worst (scale {plain(worst['error_scale'])}) {_efficiency(worst)}"
     sentences = [sentence + "."]
     linear = rows[rows["estimator"] == REFERENCE]
     if best != REFERENCE and len(linear):
         at = linear.iloc[int(np.argmax(linear["error_scale"].to_numpy()))]
-        if np.isfinite(at["rmse_over_linear_bound"]):
-            sentences.append(
-                f"The linear estimate is off by {short(at['rmse_over_linear_bound'])} times that bound at scale"
-                f" {plain(at['error_scale'])}, and succeeds there in {percent(at['success'])} of trials."
-            )
+        sentences.append(
+            f"At scale {plain(at['error_scale'])} the linear estimate has an efficiency of"
+            f" {short(at['efficiency_all'])}, and succeeds in {percent(at['success'])} of trials."
+        )
     # A number and its sign stay on one line.
     return " ".join(sentences).replace(" %", "\u00a0%")
+
+
+def _least_efficient(rows: pd.DataFrame) -> pd.Series | None:
+    """The scenario with the smallest efficiency over all trials, or where that tells nothing over solved ones."""
+    for name in ("efficiency_all", "efficiency"):
+        values = rows[name].to_numpy(dtype=float)
+        if np.isfinite(values).any():
+            return rows.iloc[int(np.nanargmin(values))]
+    return None
+
+
+def _efficiency(row: pd.Series) -> str:
+    """Efficiency against the bound that applies at that scale, and of which trials."""
+    text = f"its efficiency, the bound that applies over its error, is {short(row['efficiency_all'])}"
+    if row["solved_trials"] < row["trials"] and row["equation"] != "-":
+        text += f" over all trials, and {short(row['efficiency'])} over the {row['solved_trials']} that it solves"
+    if np.isfinite(row["efficiency_low"]):
+        text += f" (95 % interval {short(row['efficiency_low'])} to {short(row['efficiency_high'])})"
+    return text
 
 
 def best_estimator(analysis: Analysis) -> str:
@@ -58,14 +71,14 @@ def best_estimator(analysis: Analysis) -> str:
 def best_of(scores: pd.DataFrame, summary: pd.DataFrame) -> str:
     """The estimator with the smallest mean capped error over the scenarios that most estimators have.
 
-    Of those within `NEAR` of it the one that solves most, and of those the cheapest. Both frames are of the same
+    Of those within `NEAR` of it the one that succeeds most, and of those the cheapest. Both frames are of the same
     scenarios and estimators, in the same order.
     """
-    solved = summary.loc[summary["parameter"] == ALL, "solved"].to_numpy()
-    scores = scores.assign(solved=solved)
+    success = summary.loc[summary["parameter"] == ALL, "success"].to_numpy()
+    scores = scores.assign(success=success)
     counts = scores.groupby("estimator", sort=False).size()
     scores = scores[scores["estimator"].isin(counts.index[counts == counts.max()])]
-    means = scores.groupby("estimator", sort=False)[["capped_error", "solved", "cost_median"]].mean()
+    means = scores.groupby("estimator", sort=False)[["capped_error", "success", "cost_median"]].mean()
     means = means[means["capped_error"] <= means["capped_error"].min() * (1 + NEAR)]
-    means = means[means["solved"] >= means["solved"].max() - 1e-9]
+    means = means[means["success"] >= means["success"].max() - 1e-9]
     return str(means.index[int(np.argmin(means["cost_median"].to_numpy()))])

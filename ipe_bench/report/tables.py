@@ -12,10 +12,10 @@ from typing import Any
 import pandas as pd
 
 from ipe_bench.basics.files import write_text
-from ipe_bench.report.words import p_value, percent, plain, short, shower
+from ipe_bench.report.words import limits, p_value, percent, plain, short, shower, shown
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.comparisons import ALPHA
-from ipe_bench.statistics.records import SCORES, STATISTICS, Statistic, Where
+from ipe_bench.statistics.records import SCORES, STATISTICS, Kind, Statistic, Where
 from ipe_bench.statistics.summary import ALL
 
 
@@ -72,8 +72,10 @@ def interval(title: str, low: Iterable[float], high: Iterable[float], show: Call
     return Column(title, [Cell(f"{show(a)} to {show(b)}" if math.isfinite(a) else "-", _key(a)) for a, b in pairs])
 
 
-def _key(value: Any) -> Any:
-    """A number to sort by: what is not a number goes last."""
+def _key(value: Any, kind: Kind = "number") -> Any:
+    """A number to sort by: what is not a number goes last. Words are sorted as they stand."""
+    if kind == "word":
+        return None
     number = float(value)
     return "1e999" if math.isnan(number) or number == math.inf else repr(number)
 
@@ -102,33 +104,31 @@ def overview(analysis: Analysis) -> Table:
     best = list(scores["leads"])
     columns = [*_head(analysis, rows), words("estimator", rows["estimator"], best)]
     columns += statistics("overview", STATISTICS, rows)
-    columns += statistics("overview", SCORES, scores, best)
+    columns += statistics("overview", SCORES, scores)
     caption = (
-        "Shares are of all trials. rmse / bound: root mean square over parameters of error over linear bound, on the"
-        " trials that the estimator solved; common: on those that every estimator solved. misfit: trials whose"
-        " residuals fail the chi-square test at 0.1 %. Bold: the smallest capped mean error and those that do not"
-        " differ significantly from it (Wilcoxon, Holm, 5 %), where any other does."
+        "Shares are of all trials. Efficiency is the bound that applies over the root mean square error: over the"
+        " trials that the estimator solved, whose number stands in brackets where it is not all, and over all trials."
+        " Filters and the linear estimate solve nothing, so for them there are all trials only. rmse, common: on the"
+        " trials that every estimator solved. misfit: trials whose residuals fail the test of fit at 0.1 %. Bold: the"
+        " estimators than which none is significantly closer to the truth (Wilcoxon, Holm, 5 %), where any is beaten."
     )
     return Table("overview", "Overview", caption, columns, rows)
 
 
-def statistics(
-    where: Where, records: Sequence[Statistic], rows: pd.DataFrame, best: Sequence[bool] | None = None
-) -> list[Column]:
+def statistics(where: Where, records: Sequence[Statistic], rows: pd.DataFrame) -> list[Column]:
     """The columns of the statistics that are shown in that table."""
     columns: list[Column] = []
+    told = [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]
     for record in records:
         if where not in record.where:
             continue
-        show = shower(record.kind, where)
         title = record.titles.get(where, record.title)
-        if record.kind == "word":
-            columns.append(words(title, rows[record.name], best))
-        else:
-            columns.append(column(title, rows[record.name], show, best))
+        cells = [Cell(shown(record, where, row), _key(row[record.name], record.kind)) for row in told]
+        columns.append(Column(title, cells, numeric=record.kind != "word"))
         if where in record.limits_titles:
-            low, high = (rows[name] for name in record.columns[1:])
-            columns.append(interval(record.limits_titles[where], low, high, show))
+            ends = [limits(record, where, row) for row in told]
+            lows, highs = zip(*ends, strict=True) if ends else ((), ())
+            columns.append(interval(record.limits_titles[where], lows, highs, shower(record.kind, where)))
     return columns
 
 
@@ -214,11 +214,6 @@ def comparisons(analysis: Analysis) -> Table | None:
     if rows.empty:
         return None
 
-    def verdict(row: Any) -> str:
-        if row.p_error >= ALPHA:
-            return "no difference"
-        return f"{row.first if row.wins > row.losses else row.second} is closer"
-
     columns = [
         *_head(analysis, rows),
         words("first", rows["first"]),
@@ -232,18 +227,19 @@ def comparisons(analysis: Analysis) -> Table | None:
         column("first alone", rows["only_first"], lambda v: f"{v:d}"),
         column("second alone", rows["only_second"], lambda v: f"{v:d}"),
         column("p of success", rows["p_success"], p_value),
-        words("finding", [verdict(row) for row in rows.itertuples()]),
+        words("finding", [f"{label} is closer" if label else "no difference" for label in rows["closer"]]),
     ]
     caption = (
         "On the trials that both have. A win is a Mahalanobis error of the first smaller by more than 0.001 standard"
         " deviations; p of error: Wilcoxon's signed-rank test without the ties. First, second alone: trials in which"
-        " only that one succeeds; p of success: McNemar's exact test. Both Holm-corrected over the pairs of a scenario."
+        " only that one succeeds; p of success: McNemar's exact test. Both Holm-corrected over all pairs of all"
+        " scenarios. Success is the gate of the Cramér-Rao bound here, prior or not."
     )
     return Table("comparisons", "Paired comparisons", caption, columns, rows)
 
 
 def ranks(analysis: Analysis) -> Table | None:
-    """Mean ranks over scenarios."""
+    """Mean ranks over independent replicates."""
     ranking = analysis.ranking
     if ranking is None:
         return None
@@ -254,11 +250,14 @@ def ranks(analysis: Analysis) -> Table | None:
     apart = ["yes" if rejects and v - values[0] >= ranking.critical_difference else "no" for v in values]
     columns = [words("estimator", ordered), column("mean rank", values, short), words("apart from the first", apart)]
     caption = (
-        f"Over {ranking.scenarios} scenarios, by capped mean error; Friedman's test that all rank alike:"
-        f" p = {p_value(ranking.friedman)}; Nemenyi's critical difference at 5 %: {ranking.critical_difference:.2f}."
+        f"Over {ranking.replicates} seeds, by capped mean error over all scenarios. Friedman's test that all rank"
+        f" alike: p = {p_value(ranking.friedman)}. Nemenyi's critical difference at 5 %:"
+        f" {ranking.critical_difference:.2f}."
     )
-    data = pd.DataFrame({"estimator": ordered, "mean_rank": values, "apart_from_first": apart})
-    return Table("ranks", "Ranks over scenarios", caption, columns, data)
+    data = pd.DataFrame({"estimator": ordered, "mean_rank": values, "apart_from_first": apart}).assign(
+        replicates=ranking.replicates, friedman_p=ranking.friedman, critical_difference=ranking.critical_difference
+    )
+    return Table("ranks", "Ranks over seeds", caption, columns, data)
 
 
 def parameters(analysis: Analysis) -> Table:

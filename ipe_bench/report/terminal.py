@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from ipe_bench.report.words import compact, plain, shower
+from ipe_bench.report.words import compact, limits, plain, shown
 from ipe_bench.statistics.records import STATISTICS, Statistic
 from ipe_bench.statistics.summary import ALL, COLUMNS
 
@@ -57,19 +57,19 @@ def render(summary: pd.DataFrame, certified: pd.DataFrame | None = None) -> Grou
         table.add_column("scale", justify="right", no_wrap=True)
         table.add_column("estimator", overflow="fold", min_width=12)
         # The number of trials stands in the title where it is the same for all.
-        shown = [record for record in _SHOWN if not (alike and record.name == "trials")]
-        for heading in _headings(shown):
+        records = [record for record in _SHOWN if not (alike and record.name == "trials")]
+        for heading in _headings(records):
             table.add_column(heading, justify="right", no_wrap=True)
         for scale, block in part.groupby("error_scale", sort=False):
             for i, (_, row) in enumerate(block.iterrows()):
-                table.add_row(f"{scale:g}" if i == 0 else "", escape(str(row["estimator"])), *_cells(shown, row))
+                table.add_row(f"{scale:g}" if i == 0 else "", escape(str(row["estimator"])), *_cells(records, row))
             table.add_section()
         parts.append(table)
     note = (
-        "rmse/bound: root mean square error of the solved trials over the linear bound, all parameters, with its 95 %"
-        " bootstrap interval. solved, success: of all trials. NEES: 1 where the reported covariance is right."
-        " misfit: trials whose residuals fail the chi-square test at 0.1 %. sims, time: medians per trial, a"
-        " Jacobian counting as one simulation per parameter."
+        "efficiency: the bound that applies over the root mean square error, 1 at best, with its 95 % bootstrap"
+        " interval: of the solved trials (their number in brackets where it is not all), and of all. Filters and the"
+        " linear estimate solve no equation. NEES: 1 where the reported covariance is right. misfit: trials whose"
+        " residuals fail the test of fit at 0.1 %. sims, time: medians per trial, a Jacobian counting what it costs."
     )
     return Group(*digits, *parts, Text(note, style="dim"))
 
@@ -113,7 +113,7 @@ def _headings(records: Sequence[Statistic]) -> Iterator[str]:
 
 def _cells(records: Sequence[Statistic], row: Any) -> Iterator[str]:
     for record in records:
-        yield shower(record.kind, "terminal")(row[record.name])
+        yield shown(record, "terminal", row)
         if "terminal" in record.limits_titles:
-            low, high = (row[name] for name in record.columns[1:])
+            low, high = limits(record, "terminal", row)
             yield f"{compact(low)}-{compact(high)}" if math.isfinite(low) else "-"

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from ipe_bench.statistics.records import Kind, Where
+from ipe_bench.statistics.records import Kind, Statistic, Where
 
 
 def plain(value: Any) -> str:
@@ -92,3 +92,25 @@ def shower(kind: Kind, where: Where) -> Callable[[Any], str]:
         "seconds": (lambda v: duration(v, 2)) if where == "terminal" else duration,
         "word": str,
     }[kind]
+
+
+def applies(record: Statistic, where: Where, row: Mapping[str, Any]) -> bool:
+    """Whether a row can have the statistic: what solves no equation has nothing to say of solved trials. In the table
+    of parameters its finished trials stand in for them."""
+    return record.given != "solved" or where == "parameters" or row["equation"] != "-"
+
+
+def shown(record: Statistic, where: Where, row: Mapping[str, Any]) -> str:
+    """A value as it stands in a table: with the number of trials that it is conditional on, where that is not all."""
+    if not applies(record, where, row):
+        return "-"
+    text = shower(record.kind, where)(row[record.name])
+    if record.given and text != "-" and row[record.count] < row["trials"]:
+        text += f" ({int(row[record.count])})"
+    return text
+
+
+def limits(record: Statistic, where: Where, row: Mapping[str, Any]) -> tuple[float, float]:
+    """The ends of a statistic's interval; NaN where it has none."""
+    low, high = (float(row[name]) for name in record.columns[1:])
+    return (low, high) if math.isfinite(low) and applies(record, where, row) else (math.nan, math.nan)

@@ -14,11 +14,19 @@ import pandas as pd
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.statistics.collect import Collection, Group, collect
-from ipe_bench.statistics.comparisons import Outcomes, Ranking, compare_pairs, leaders, rank_over_scenarios
+from ipe_bench.statistics.comparisons import (
+    Outcomes,
+    Pair,
+    Ranking,
+    compare_pairs,
+    corrected,
+    leaders,
+    rank_over_replicates,
+)
 from ipe_bench.statistics.histories import History, trial_label
-from ipe_bench.statistics.intervals import bootstrap_rms, quantile, quantiles
+from ipe_bench.statistics.intervals import quantile, quantiles, rms_interval
 from ipe_bench.statistics.profiles import Profiles
-from ipe_bench.statistics.records import SCORES, rows_of
+from ipe_bench.statistics.records import SCORES, capped_error, gate_radius, rows_of
 from ipe_bench.statistics.sample import Sample, Shared
 from ipe_bench.statistics.summary import summary_rows, to_frame
 
@@ -50,7 +58,7 @@ class Analysis:
     """Of the parameters' errors over solved trials: row, column (both parameters' names) and value."""
     convergence: pd.DataFrame
     """Of each converged trial with a stored history: trial, iteration, and the iterate's distance from the last one
-    in deviations of the bound."""
+    in deviations of the bound; without the last, whose distance is zero by definition, and without filters."""
     contraction: pd.DataFrame
     """Per scenario, how much the fixed-point iteration contracts at the truth; empty where no file says so."""
 
@@ -81,17 +89,17 @@ def analyse(directories: Sequence[Path | str]) -> Analysis:
         UserError: a directory does not exist.
     """
     collection = collect(directories)
-    rows = _Rows()
+    rows, everywhere = _Rows(), _everywhere(collection)
     for number, groups in enumerate(collection.scenarios.values()):
-        _add_scenario(rows, collection, number, groups)
+        _add_scenario(rows, collection, number, groups, everywhere)
     return Analysis(
         collection=collection,
         summary=to_frame(rows.summary),
         by_group=pd.DataFrame(rows.by_group),
         endings=pd.DataFrame(rows.endings),
-        pairs=pd.DataFrame(rows.pairs),
-        scores=pd.DataFrame(rows.scores),
-        ranking=rank_over_scenarios(rows.ranked),
+        pairs=_pair_frame(rows.pairs),
+        scores=_with_leaders(pd.DataFrame(rows.scores), rows.pairs),
+        ranking=_ranking(rows.replicates, everywhere),
         profiles=rows.profiles.frame(),
         distributions=_joined(rows.distributions, ("probability", "distance")),
         correlations=_joined(rows.correlations, ("row", "column", "value")),
@@ -107,13 +115,14 @@ class _Rows:
     summary: list[dict[str, Any]] = field(default_factory=list)
     by_group: list[dict[str, Any]] = field(default_factory=list)
     endings: list[dict[str, Any]] = field(default_factory=list)
-    pairs: list[dict[str, Any]] = field(default_factory=list)
+    pairs: list[tuple[dict[str, Any], Pair]] = field(default_factory=list)
     scores: list[dict[str, Any]] = field(default_factory=list)
     contraction: list[dict[str, Any]] = field(default_factory=list)
     distributions: list[pd.DataFrame] = field(default_factory=list)
     correlations: list[pd.DataFrame] = field(default_factory=list)
     convergence: list[pd.DataFrame] = field(default_factory=list)
-    ranked: list[dict[str, float]] = field(default_factory=list)
+    replicates: list[tuple[int, int, str, float]] = field(default_factory=list)
+    """Scenario, seed, estimator and capped error."""
     profiles: Profiles = field(default_factory=Profiles)
 
 
@@ -123,7 +132,9 @@ def _joined(parts: Sequence[pd.DataFrame], columns: Sequence[str]) -> pd.DataFra
     return pd.concat(parts, ignore_index=True)
 
 
-def _add_scenario(rows: _Rows, collection: Collection, number: int, groups: Sequence[Group]) -> None:
+def _add_scenario(
+    rows: _Rows, collection: Collection, number: int, groups: Sequence[Group], everywhere: set[str]
+) -> None:
     shared = Shared.among(collection, groups)
     outcomes: dict[str, Outcomes] = {}
     scores: list[dict[str, Any]] = []
@@ -138,16 +149,53 @@ def _add_scenario(rows: _Rows, collection: Collection, number: int, groups: Sequ
         rows.endings += _ending_rows(sample)
         scores.append(where | rows_of(SCORES, sample)[-1])
         outcomes[group.estimator] = outcome = outcomes_of(sample)
+        rows.replicates += [
+            (number, int(seed), group.estimator, capped_error(sample, sample.ids[:, 0] == seed))
+            for seed in np.unique(sample.ids[:, 0])
+        ]
         rows.distributions.append(_distribution(where, outcome))
         rows.correlations.append(_correlation_rows(where, sample))
         rows.convergence += [_convergence_rows(where, history) for history in sample.histories]
-    compared = compare_pairs(outcomes)
-    capped = {row["estimator"]: row["capped_error"] for row in scores}
-    ahead = leaders(capped, compared)
-    rows.pairs += [dict(groups[0].columns) | asdict(pair) for pair in compared]
-    rows.scores += [row | {"leads": row["estimator"] in ahead} for row in scores]
-    rows.ranked.append(capped)
-    rows.profiles.add(outcomes)
+    rows.pairs += [(dict(groups[0].columns) | {"scenario": number}, pair) for pair in compare_pairs(outcomes)]
+    rows.scores += scores
+    rows.profiles.add({label: outcome for label, outcome in outcomes.items() if label in everywhere})
+
+
+def _everywhere(collection: Collection) -> set[str]:
+    """The estimators that every scenario has: profiles compare on the same scenarios only."""
+    labels = [{group.estimator for group in groups} for groups in collection.scenarios.values()]
+    return set.intersection(*labels) if labels else set()
+
+
+def _pair_frame(pairs: Sequence[tuple[dict[str, Any], Pair]]) -> pd.DataFrame:
+    """Corrected over all scenarios: a sweep asks all its questions at once."""
+    final = corrected([pair for _, pair in pairs])
+    rows = [where | asdict(p) | {"closer": p.closer} for (where, _), p in zip(pairs, final, strict=True)]
+    return pd.DataFrame(rows)
+
+
+def _with_leaders(scores: pd.DataFrame, pairs: Sequence[tuple[dict[str, Any], Pair]]) -> pd.DataFrame:
+    by_scenario: dict[int, list[Pair]] = {}
+    for (where, _), pair in zip(pairs, corrected([pair for _, pair in pairs]), strict=True):
+        by_scenario.setdefault(where["scenario"], []).append(pair)
+    leads = pd.Series(False, index=scores.index)
+    for number, rows in scores.groupby("scenario") if len(scores) else ():
+        ahead = leaders(rows["estimator"], by_scenario.get(int(str(number)), []))
+        leads[rows.index] = rows["estimator"].isin(ahead)
+    return scores.assign(leads=leads)
+
+
+def _ranking(replicates: Sequence[tuple[int, int, str, float]], everywhere: set[str]) -> Ranking | None:
+    """Ranks of the estimators that every scenario has, over seeds: by the mean capped error over the scenarios that all
+    seeds have."""
+    table = pd.DataFrame(replicates, columns=["scenario", "seed", "estimator", "error"])
+    table = table[table["estimator"].isin(everywhere) & table["error"].notna()]
+    seeds = table["seed"].nunique()
+    whole = table.groupby("scenario")["error"].transform("size") == seeds * len(everywhere)
+    means = table[whole].groupby(["seed", "estimator"], sort=False)["error"].mean()
+    return rank_over_replicates(
+        [{str(e): float(v) for e, v in part.droplevel("seed").items()} for _, part in means.groupby("seed")]
+    )
 
 
 def head(group: Group) -> dict[str, Any]:
@@ -162,7 +210,8 @@ def numbered(group: Group, number: int) -> dict[str, Any]:
 def outcomes_of(sample: Sample) -> Outcomes:
     """What comparisons and profiles need of a sample, by ascending seed and trial."""
     order = np.argsort(sample.number, kind="stable")
-    values = (sample.number, sample.distance, sample.scalars["success"], sample.cost)
+    success = sample.distance <= gate_radius(sample.n)
+    values = (sample.number, sample.distance, success, sample.cost)
     return Outcomes(*(v[order] for v in values))
 
 
@@ -175,7 +224,7 @@ def _group_rows(sample: Sample) -> list[dict[str, Any]]:
     solved = sample.solved
     squares = np.where(solved[:, None], sample.normalised, 0.0) ** 2
     means = np.stack([squares[:, which].mean(axis=1) for which in members.values()], axis=1)
-    lows, highs = bootstrap_rms(means, solved)
+    lows, highs = rms_interval(means, solved)
     for i, name in enumerate(members):
         rmse = float(np.sqrt(means[solved, i].mean())) if solved.any() else np.nan
         rows.append(head(sample.group) | {"group": name, "rmse": rmse, "low": lows[i], "high": highs[i]})
@@ -254,5 +303,7 @@ def _correlation(sample: Sample) -> Array:
 
 
 def _convergence_rows(where: dict[str, Any], history: History) -> pd.DataFrame:
-    iteration = np.arange(len(history.distances))
-    return pd.DataFrame(where | {"trial": history.trial, "iteration": iteration, "distance": history.distances})
+    # The last iterate stands for the limit: that it is at no distance from itself says nothing of convergence.
+    distances = history.distances[:-1]
+    iteration = np.arange(len(distances))
+    return pd.DataFrame(where | {"trial": history.trial, "iteration": iteration, "distance": distances})

@@ -1,4 +1,4 @@
-"""Comparisons of estimators on the same trials: differences of error, of success, and ranks over scenarios.
+"""Comparisons of estimators on the same trials: differences of error, of success, and ranks over replicates.
 
 The error of a trial is its Mahalanobis distance sqrt(e' J' R^-1 J e) from the truth, in standard deviations of the
 Cramér-Rao bound: about sqrt(n) for an efficient estimator. An estimate that is not finite is infinitely wrong.
@@ -7,12 +7,12 @@ Cramér-Rao bound: about sqrt(n) for an efficient estimator. An estimate that is
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest, friedmanchisquare, studentized_range, wilcoxon
+from scipy.stats import binomtest, friedmanchisquare, rankdata, studentized_range, wilcoxon
 
 from ipe_bench.basics.linalg import Array
 
@@ -30,8 +30,9 @@ class Outcomes:
     distance: Array
     """(trials,) Mahalanobis errors, infinite where the estimate is not finite."""
     success: Array
+    """(trials,) whether the error lies inside the gate of the Cramér-Rao bound: one gate for all, prior or not."""
     cost: Array
-    """(trials,) simulations, a Jacobian counting n."""
+    """(trials,) in simulations."""
 
     def at(self, ids: Array) -> Outcomes:
         """The trials with these numbers, all of which are there."""
@@ -63,34 +64,56 @@ class Pair:
     median_difference: float
     """Median of first's error less second's, in standard deviations of the bound."""
     p_error: float
-    """Wilcoxon's signed-rank test of the differences that are not ties, Holm-corrected over the pairs."""
+    """Wilcoxon's signed-rank test of the differences that are not ties."""
+    favours: str
+    """Whose side the sum of the signed ranks is on; empty where it is on neither's."""
     only_first: int
     """Trials in which the first alone succeeds."""
     only_second: int
     p_success: float
-    """McNemar's exact test of those two numbers, Holm-corrected over the pairs."""
+    """McNemar's exact test of those two numbers."""
+
+    @property
+    def closer(self) -> str:
+        """The estimator that is significantly closer to the truth; empty where neither is."""
+        return self.favours if self.p_error < ALPHA else ""
 
 
 def compare_pairs(outcomes: Mapping[str, Outcomes]) -> list[Pair]:
-    """Every pair of estimators of one scenario; corrections are over these pairs."""
+    """Every pair of estimators of one scenario, each p by itself; see `corrected`."""
     paired = common(outcomes)
-    raw = [(a, b, *_compare(paired[a], paired[b])) for a, b in itertools.combinations(paired, 2)]
-    p_error = holm([r[6] for r in raw])
-    p_success = holm([r[9] for r in raw])
+    return [_compare(a, b, paired[a], paired[b]) for a, b in itertools.combinations(paired, 2)]
+
+
+def corrected(pairs: Sequence[Pair]) -> list[Pair]:
+    """The pairs with each kind of p Holm-corrected over all of them."""
+    p_error = holm([p.p_error for p in pairs])
+    p_success = holm([p.p_success for p in pairs])
     return [
-        Pair(a, b, len(paired[a].ids), wins, ties, losses, median, float(pe), only_a, only_b, float(ps))
-        for (a, b, wins, ties, losses, median, _, only_a, only_b, _), pe, ps in zip(
-            raw, p_error, p_success, strict=True
-        )
+        replace(pair, p_error=float(error), p_success=float(success))
+        for pair, error, success in zip(pairs, p_error, p_success, strict=True)
     ]
 
 
-def _compare(a: Outcomes, b: Outcomes) -> tuple[int, int, int, float, float, int, int, float]:
+def _compare(first: str, second: str, a: Outcomes, b: Outcomes) -> Pair:
     d = differences(a.distance, b.distance)
     wins, losses = int((d < 0).sum()), int((d > 0).sum())
     only_a, only_b = int((a.success & ~b.success).sum()), int((b.success & ~a.success).sum())
-    median = float(np.median(d)) if len(d) else float("nan")
-    return wins, len(d) - wins - losses, losses, median, signed_rank(d), only_a, only_b, mcnemar(only_a, only_b)
+    side = signed_ranks(d).sum()
+    return Pair(
+        first,
+        second,
+        trials=len(d),
+        wins=wins,
+        ties=len(d) - wins - losses,
+        losses=losses,
+        median_difference=float(np.median(d)) if len(d) else float("nan"),
+        p_error=signed_rank(d),
+        favours=first if side < 0 else second if side > 0 else "",
+        only_first=only_a,
+        only_second=only_b,
+        p_success=mcnemar(only_a, only_b),
+    )
 
 
 def differences(first: Array, second: Array) -> Array:
@@ -104,14 +127,18 @@ def differences(first: Array, second: Array) -> Array:
 
 def signed_rank(d: Array) -> float:
     """Two-sided p of Wilcoxon's signed-rank test (Biometrics Bulletin 1, 1945), zeros left out; 1 where all are."""
-    d = d[d != 0]
-    if len(d) == 0:
+    ranks = signed_ranks(d)
+    if len(ranks) == 0:
         return 1.0
-    # An infinite difference ranks above all finite ones; how far above does not matter to ranks.
-    finite = np.abs(d[np.isfinite(d)])
-    d = np.where(np.isfinite(d), d, np.sign(d) * (2 * finite.max(initial=1.0)))
-    result: Any = wilcoxon(d)
+    # The test sees ranks alone, so it may be given those.
+    result: Any = wilcoxon(ranks)
     return float(result.pvalue)
+
+
+def signed_ranks(d: Array) -> Array:
+    """The ranks of the magnitudes of what is not zero, with its signs; an infinite one ranks above the others."""
+    d = d[d != 0]
+    return np.sign(d) * rankdata(np.abs(d))
 
 
 def mcnemar(only_first: int, only_second: int) -> float:
@@ -131,43 +158,39 @@ def holm(p: Sequence[float]) -> Array:
     return corrected
 
 
-def leaders(scores: Mapping[str, float], pairs: Sequence[Pair]) -> set[str]:
-    """The best estimator of a scenario and those whose error does not differ significantly from its; empty where that
-    is everyone, because then there is no best."""
-    finite = {k: v for k, v in scores.items() if np.isfinite(v)}
-    if len(finite) < 2:
-        return set()
-    best = min(finite, key=lambda k: finite[k])
-    worse = set()
-    for pair in pairs:
-        if best in (pair.first, pair.second) and pair.p_error < ALPHA:
-            other = pair.second if pair.first == best else pair.first
-            if finite.get(other, np.inf) > finite[best]:
-                worse.add(other)
-    return set(scores) - worse if worse else set()
+def leaders(labels: Iterable[str], pairs: Sequence[Pair]) -> set[str]:
+    """The estimators of a scenario than which none is significantly closer; empty where that is everyone, because then
+    nobody leads. It goes by the same verdicts as the pairs, so the two cannot disagree."""
+    beaten = {({pair.first, pair.second} - {pair.closer}).pop() for pair in pairs if pair.closer}
+    return set(labels) - beaten if beaten else set()
 
 
 @dataclass(frozen=True)
 class Ranking:
-    """Mean ranks over scenarios, 1 being the best, with the difference that is needed to tell two apart."""
+    """Mean ranks over independent replicates, 1 being the best, with the difference that tells two apart."""
 
     mean_ranks: Mapping[str, float]
-    scenarios: int
+    replicates: int
     friedman: float
     """P of Friedman's test (J. Amer. Statist. Assoc. 32, 1937) that all estimators rank alike."""
     critical_difference: float
     """Nemenyi's, q_0.05 sqrt(k (k + 1) / (6 N)) (Demsar, J. Mach. Learn. Res. 7, 2006, sec. 3.2.2)."""
 
 
-def rank_over_scenarios(scores: Sequence[Mapping[str, float]]) -> Ranking | None:
-    """Ranks of the estimators that every scenario has, by capped mean error; None with fewer than two of either.
+REPLICATES = 5
+"""Fewer seeds than this are not ranked: the distribution of Friedman's statistic is not known well enough."""
 
-    A scenario is one observation, however many trials it has: trials of one scenario share model, noise and prior, and
-    would feign evidence.
+
+def rank_over_replicates(scores: Sequence[Mapping[str, float]]) -> Ranking | None:
+    """Ranks of the estimators that every replicate has, by their scores in it, the smaller the better.
+
+    A replicate is one observation, and must be independent of the others: all trials of one seed, whatever the error
+    scale, model and noise, since one seed gives the same draws everywhere. None with fewer than two estimators, or
+    fewer than `REPLICATES` replicates.
     """
     everywhere = [label for label in (scores[0] if scores else ()) if all(label in s for s in scores)]
     k, count = len(everywhere), len(scores)
-    if k < 2 or count < 2:
+    if k < 2 or count < REPLICATES:
         return None
     ranks = np.array([tied_ranks(np.array([s[label] for label in everywhere])) for s in scores])
     if np.ptp(ranks, axis=1).max() == 0:

@@ -7,36 +7,54 @@ from functools import lru_cache
 import numpy as np
 
 from ipe_bench.basics.linalg import Array
+from ipe_bench.trials.thresholds import FEW
 
 LEVEL = 0.95
-RESAMPLES = 1000
+RESAMPLES = 2000
 LARGEST_SAMPLE = 2000
 """Above this many trials, groups of consecutive trials are resampled in their place."""
 
 
-def bootstrap_rms(squares: Array, used: Array, level: float = LEVEL) -> tuple[Array, Array]:
-    """Percentile bootstrap interval of the root mean square over the trials used, per column.
+def rms_interval(squares: Array, used: Array, level: float = LEVEL) -> tuple[Array, Array]:
+    """Bootstrap-t interval of the root mean square over the trials used, per column; NaN for fewer than `FEW` of them.
 
-    squares is (trials, k), used (trials,) boolean. Trials are drawn with replacement (Efron and Tibshirani, An
-    Introduction to the Bootstrap, 1993, ch. 13), used or not, so the number of used ones varies as it would; the draws
-    are the same for every estimator. Of more than `LARGEST_SAMPLE` trials, groups of consecutive ones are drawn, which
-    is as good since trials are independent.
+    squares is (trials, k), used (trials,) boolean. The logarithm of the mean square is studentised (Efron and
+    Tibshirani, An Introduction to the Bootstrap, 1993, ch. 12), which makes its variance nearly constant: the plain
+    percentile interval of 20 normal errors holds the truth in 88 % of cases instead of 95 %. Its standard error s is
+    taken s times larger, since where few large errors carry the mean, s itself comes out too small: found by
+    simulation, coverage is then 94 % or more from 20 trials on for errors from uniform to Student's t with 5 degrees.
+    Trials are drawn with replacement, used or not; the draws are the same for every estimator. Of more than
+    `LARGEST_SAMPLE` trials, groups of consecutive ones are drawn, which is as good since trials are independent.
     """
     trials, k = squares.shape
-    if not used.any():
+    if used.sum() < FEW:
         return np.full(k, np.nan), np.full(k, np.nan)
-    weighted = np.where(used[:, None], squares, 0.0)
-    count = used.astype(float)
+    sums = np.where(used[:, None], squares, 0.0)
+    counts = used.astype(float)[:, None]
     if trials > LARGEST_SAMPLE:
         edges = np.linspace(0, trials, LARGEST_SAMPLE, endpoint=False).astype(int)
-        weighted, count = np.add.reduceat(weighted, edges), np.add.reduceat(count, edges)
-    draws = _draws(len(count))
-    n = draws @ count
+        sums, counts = np.add.reduceat(sums, edges), np.add.reduceat(counts, edges)
     with np.errstate(all="ignore"):
-        rms = np.sqrt((draws @ weighted)[n > 0] / n[n > 0, None])
-    tail = (1 - level) / 2
-    low, high = np.quantile(rms, [tail, 1 - tail], axis=0)
-    return low, high
+        # A sum of squares beside its own size: errors may be anything from 1e-200 to 1e200.
+        size = sums.max(axis=0)
+        scaled = np.where(size > 0, sums / size, 0.0)
+        centre, error = _log_ratio(np.ones((1, len(counts))), scaled, counts)
+        drawn, drawn_error = _log_ratio(_draws(len(counts)), scaled, counts)
+        t = np.where(drawn_error > 0, (drawn - centre) / drawn_error, 0.0)
+        tail = (1 - level) / 2
+        low, high = np.quantile(t, [tail, 1 - tail], axis=0)
+        widened = error[0] * (1 + error[0])
+        ends = [np.sqrt(size) * np.exp((centre[0] - t * widened) / 2) for t in (high, low)]
+    return np.where(size > 0, ends[0], 0.0), np.where(size > 0, ends[1], 0.0)
+
+
+def _log_ratio(draws: Array, sums: Array, counts: Array) -> tuple[Array, Array]:
+    """Logarithm of sums over counts in each resample (resamples, k), and its standard error."""
+    number = draws.sum(axis=1, keepdims=True)
+    total, count = draws @ sums, draws @ counts
+    ratio = total / count
+    scatter = draws @ sums**2 - 2 * ratio * (draws @ (sums * counts)) + ratio**2 * (draws @ counts**2)
+    return np.log(ratio), np.sqrt(np.maximum(scatter, 0.0) * number / (number - 1)) / total
 
 
 @lru_cache(maxsize=4)

@@ -16,9 +16,9 @@ from scipy.stats import chi2, norm
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.consistency import clopper_pearson, mean_limits, verdict
 from ipe_bench.statistics.histories import CLOSE, FixedPointBound, fixed_point_bound, observed_constant, orders_of
-from ipe_bench.statistics.intervals import LARGEST_SAMPLE, RESAMPLES, bootstrap_rms, quantile, quantiles
+from ipe_bench.statistics.intervals import LARGEST_SAMPLE, RESAMPLES, quantile, quantiles
 from ipe_bench.statistics.sample import FIT, NIS, Sample, root_mean
-from ipe_bench.trials.thresholds import FIT_LEVEL, GATE, SAME_ROOT
+from ipe_bench.trials.thresholds import EXPECTED, FEW, FIT_LEVEL, GATE, SAME_ROOT
 
 Kind = Literal["count", "share", "number", "physical", "seconds", "word"]
 """How a value is written; `report.words` knows each."""
@@ -46,6 +46,8 @@ class Statistic:
     each: Callable[[Sample], Array] | None = None
     limits: Callable[[Sample], Limits] | None = None
     each_limits: Callable[[Sample], Limits] | None = None
+    given: Literal["", "solved", "common"] = ""
+    """The trials that it is conditional on: their number is the column `count`."""
     kind: Kind = "number"
     where: tuple[Where, ...] = ()
     """The tables that show it."""
@@ -57,6 +59,10 @@ class Statistic:
     @property
     def columns(self) -> tuple[str, ...]:
         return (self.name,) if self.limits is None else (self.name, f"{self.name}_low", f"{self.name}_high")
+
+    @property
+    def count(self) -> str:
+        return f"{self.given}_trials"
 
     @property
     def definition(self) -> str:
@@ -103,7 +109,8 @@ def _success_limits(s: Sample) -> Limits:
 
 def _misfit(s: Sample) -> float:
     # Residuals that are not finite do not fit.
-    return _share(~(s.scalars[FIT] >= FIT_LEVEL)) if FIT in s.scalars else np.nan
+    known = FIT in s.scalars and np.isfinite(s.scalars[FIT]).any()
+    return _share(~(s.scalars[FIT] >= FIT_LEVEL)) if known else np.nan
 
 
 def _bias(s: Sample) -> Array:
@@ -124,6 +131,10 @@ def _crlb(s: Sample) -> Array:
 
 def _bayes(s: Sample) -> Array:
     return root_mean(s.bayes, s.solved)
+
+
+def _van_trees(s: Sample) -> Array:
+    return root_mean(s.van_trees, ~np.isnan(s.van_trees[:, 0]))
 
 
 def _applying_bound(s: Sample) -> Array:
@@ -166,19 +177,37 @@ def _rmse(s: Sample) -> Array:
 
 
 def _rmse_limits(s: Sample) -> Limits:
-    squares = np.mean(np.where(s.solved[:, None], s.normalised, 0.0) ** 2, axis=1, keepdims=True)
-    low, high = bootstrap_rms(squares, s.solved)
-    return float(low[0]), float(high[0])
+    low, high = s.rmse_limits
+    return float(low[-1]), float(high[-1])
 
 
 def _rmse_limits_each(s: Sample) -> Limits:
-    low, high = bootstrap_rms(np.where(s.solved[:, None], s.error, 0.0) ** 2, s.solved)
-    return low * s.sizes, high * s.sizes
+    low, high = s.rmse_limits
+    return low[:-1] * s.sizes, high[:-1] * s.sizes
 
 
 def _efficiency(s: Sample) -> float:
     bound, rmse = _over_linear_bound(_applying_bound)(s), _over_linear_bound(_rmse)(s)
     return float(_ratio(bound, rmse))
+
+
+def _efficiency_limits(s: Sample) -> Limits:
+    bound, (low, high) = _over_linear_bound(_applying_bound)(s), _rmse_limits(s)
+    return float(_ratio(bound, high)), float(_ratio(bound, low))
+
+
+def _efficiency_limits_each(s: Sample) -> Limits:
+    bound, (low, high) = _applying_bound(s) * s.sizes, _rmse_limits_each(s)
+    return _ratio(bound, high), _ratio(bound, low)
+
+
+def _rmse_all(s: Sample) -> Array:
+    with np.errstate(over="ignore"):
+        return np.sqrt(np.mean(np.where(np.isfinite(s.error), s.error, np.inf) ** 2, axis=0))
+
+
+def _bound_all(s: Sample) -> Array:
+    return np.sqrt(np.mean(s.bound**2, axis=0))
 
 
 def _efficiency_each(s: Sample) -> Array:
@@ -236,10 +265,10 @@ def _false_root_distance(s: Sample) -> float:
     return quantile(s.scalars["root_distance"][wrong], 0.5) if known else np.nan
 
 
-def _capped_error(s: Sample) -> float:
-    if not s.present.any():
-        return np.nan
-    return float(np.minimum(s.distance[s.present], gate_radius(s.n)).mean())
+def capped_error(s: Sample, among: Array | None = None) -> float:
+    """Mean Mahalanobis error of the trials that all have (and of `among` alone), each at most the gate's radius."""
+    used = s.present if among is None else s.present & among
+    return float(np.minimum(s.distance[used], gate_radius(s.n)).mean()) if used.any() else np.nan
 
 
 def gate_radius(n: int) -> float:
@@ -314,6 +343,31 @@ STATISTICS: tuple[Statistic, ...] = (
         limits_titles={"overview": "95 % of success"},
     ),
     Statistic(
+        "solved_trials",
+        "solved trials",
+        "all trials",
+        "Number that is solved: what bias, std, rmse, bounds, efficiency and NEES are over.",
+        lambda s: int(s.solved.sum()),
+        kind="count",
+    ),
+    Statistic(
+        "common_trials",
+        "common trials",
+        "all trials",
+        "Number that every estimator of the scenario solved.",
+        lambda s: int((s.solved & s.solved_by_all).sum()),
+        kind="count",
+    ),
+    Statistic(
+        "equation",
+        "equation",
+        "no trials: the same for all",
+        "What the estimator seeks a root of: eq. (11) with the frozen H, the least-squares or the maximum a posteriori"
+        " condition; none for filters and the linear LSE.",
+        lambda s: s.group.footer.get("equation") or "-",
+        kind="word",
+    ),
+    Statistic(
         "false_root",
         "false root",
         "all trials",
@@ -338,6 +392,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "Mean error.",
         _over_linear_bound(_bias),
         _in_units(_bias),
+        given="solved",
         kind="physical",
         where=("parameters",),
     ),
@@ -348,6 +403,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "Standard deviation of the error (n - 1).",
         _over_linear_bound(_std),
         _in_units(_std),
+        given="solved",
         kind="physical",
         where=("parameters",),
     ),
@@ -355,17 +411,18 @@ STATISTICS: tuple[Statistic, ...] = (
         "rmse",
         "rmse",
         "solved trials",
-        "Root mean square error. Interval: 95 % percentile bootstrap over trials,"
-        f" {RESAMPLES} resamples, the same for every estimator; above {LARGEST_SAMPLE} trials, groups of consecutive"
-        " trials are resampled (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, ch. 13).",
+        "Root mean square error. Interval: 95 %, by the studentised bootstrap of its logarithm over trials (Efron and"
+        f" Tibshirani, An Introduction to the Bootstrap, 1993, ch. 12), {RESAMPLES} resamples, the same for every"
+        f" estimator; above {LARGEST_SAMPLE} trials, groups of consecutive trials are resampled. None for fewer than"
+        f" {FEW} trials.",
         _over_linear_bound(_rmse),
         _in_units(_rmse),
         limits=_rmse_limits,
         each_limits=_rmse_limits_each,
+        given="solved",
         kind="physical",
-        where=("overview", "parameters", "terminal", "covariances"),
-        titles={"overview": "rmse / bound", "terminal": "rmse/bound"},
-        limits_titles={"overview": "95 % of rmse", "parameters": "95 % of rmse", "terminal": "95 %"},
+        where=("parameters", "covariances"),
+        limits_titles={"parameters": "95 % of rmse"},
     ),
     Statistic(
         "rmse_common",
@@ -374,6 +431,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "Root mean square error.",
         _over_linear_bound(_rmse_common),
         _in_units(_rmse_common),
+        given="common",
         where=("overview",),
     ),
     Statistic(
@@ -393,6 +451,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "Cramér-Rao bound (J' R⁻¹ J)⁻¹ at the truth: root mean square of its standard deviation.",
         _over_linear_bound(_crlb),
         _in_units(_crlb),
+        given="solved",
         kind="physical",
         where=("parameters", "covariances"),
     ),
@@ -401,10 +460,24 @@ STATISTICS: tuple[Statistic, ...] = (
         "Bayesian bound",
         "solved trials",
         "(J' R⁻¹ J + P₀⁻¹)⁻¹ at the truth, which estimators that use a prior are compared with: root mean square of its"
-        " standard deviation (Van Trees, Detection, Estimation, and Modulation Theory I, 1968, sec. 2.4).",
+        " standard deviation. It is a local bound, for each truth its own, and not Van Trees's.",
         _over_linear_bound(_bayes),
         _in_units(_bayes),
+        given="solved",
         kind="physical",
+        where=("parameters",),
+    ),
+    Statistic(
+        "van_trees",
+        "Van Trees's bound",
+        "truths drawn from the prior",
+        "(E[J' R⁻¹ J] + P₀⁻¹)⁻¹, which no estimator can beat on average over the prior, biased or not (Van Trees,"
+        " Detection, Estimation, and Modulation Theory I, 1968, sec. 2.4): standard deviation. The mean E is over"
+        f" {EXPECTED} truths of each seed.",
+        _over_linear_bound(_van_trees),
+        _in_units(_van_trees),
+        kind="physical",
+        where=("parameters",),
     ),
     Statistic(
         "reported",
@@ -414,6 +487,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " sandwich (H⁺J)⁻¹ H⁺RH⁺' (H⁺J)⁻ᵀ at the estimate for the frozen root.",
         _over_linear_bound(_reported),
         _in_units(_reported),
+        given="solved",
         kind="physical",
         where=("covariances",),
     ),
@@ -426,6 +500,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " eq. (14) leaves out are of the same order. The sandwich has them, to first order.",
         _over_linear_bound(_eq_14),
         _in_units(_eq_14),
+        given="solved",
         kind="physical",
         where=("covariances",),
     ),
@@ -436,17 +511,44 @@ STATISTICS: tuple[Statistic, ...] = (
         "Root mean square error over the linear bound.",
         _over_linear_bound(_rmse),
         lambda s: _ratio(s.rmse * s.sizes, s.linear_bound * s.sizes),
+        given="solved",
         where=("parameters",),
     ),
     Statistic(
         "efficiency",
         "efficiency",
         "solved trials",
-        "Bound over rmse, as standard deviations: 1 for an efficient estimator. The bound is the Bayesian one for"
-        " estimators that use a prior.",
+        "Bound over rmse, as standard deviations: 1 for an efficient estimator. The bound is the one at the truth,"
+        " Cramér and Rao's or, for estimators that use a prior, the Bayesian one. Interval: from that of rmse.",
         _efficiency,
         _efficiency_each,
+        limits=_efficiency_limits,
+        each_limits=_efficiency_limits_each,
+        given="solved",
+        where=("overview", "parameters", "terminal"),
+        limits_titles={"overview": "95 % of efficiency", "terminal": "95 %"},
+    ),
+    Statistic(
+        "rmse_all",
+        "rmse, all",
+        "all trials",
+        "Root mean square error, whatever became of the trial; infinite where one has no finite estimate.",
+        _over_linear_bound(_rmse_all),
+        _in_units(_rmse_all),
+        kind="physical",
         where=("overview", "parameters"),
+        titles={"overview": "rmse / linear bound, all"},
+    ),
+    Statistic(
+        "efficiency_all",
+        "efficiency, all",
+        "all trials",
+        "The same bound over the root mean square error of all trials: it lets nobody off a trial, so it compares"
+        " estimators that solve an equation with those that do not.",
+        lambda s: float(_ratio(_over_linear_bound(_bound_all)(s), _over_linear_bound(_rmse_all)(s))),
+        lambda s: _ratio(_bound_all(s), _rmse_all(s)),
+        where=("overview", "parameters", "terminal"),
+        titles={"terminal": "all"},
     ),
     Statistic(
         "median_abs_error",
@@ -478,6 +580,7 @@ STATISTICS: tuple[Statistic, ...] = (
         _nees_each,
         limits=_nees_limits,
         each_limits=_nees_limits_each,
+        given="solved",
         where=("overview", "parameters", "terminal"),
         titles={"parameters": "NEES", "terminal": "NEES"},
         limits_titles={"overview": "NEES limits"},
@@ -508,8 +611,10 @@ STATISTICS: tuple[Statistic, ...] = (
         "misfit",
         "misfit",
         "all trials",
-        "Share whose residuals fail the chi-square test: |R^-1/2 (z - h(x))|² is larger than it would be in"
-        " 0.1 % of trials if model and noise were right. It needs no truth, so it is known for real readings too.",
+        "Share whose residuals fail the test of fit: |R^-1/2 (z - h(x))|² is larger than it would be in 0.1 % of trials"
+        " if model and noise were right. Its law is chi-square with m - n degrees for least squares and normal noise."
+        " For other noise it is simulated; for other estimators it is scaled to the effective degrees of what they"
+        " leave, m less the trace of their influence. It needs no truth, so it is known for real readings too.",
         _misfit,
         kind="share",
         where=_EVERYWHERE,
@@ -518,8 +623,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "iterations_median",
         "iterations",
         "all trials",
-        "Median.",
-        lambda s: quantile(s.scalars["iterations"], 0.5),
+        "Median; none for filters, whose epochs are not iterations.",
+        lambda s: quantile(s.scalars["iterations"], 0.5) if s.iterates else np.nan,
         where=("costs",),
     ),
     Statistic(
@@ -527,14 +632,14 @@ STATISTICS: tuple[Statistic, ...] = (
         "iterations, 95 %",
         "all trials",
         "95 % quantile.",
-        lambda s: quantile(s.scalars["iterations"], 0.95),
+        lambda s: quantile(s.scalars["iterations"], 0.95) if s.iterates else np.nan,
         where=("costs",),
     ),
     Statistic(
         "simulations_median",
         "simulations",
         "all trials",
-        "Median cost of a trial, a Jacobian counting as many simulations as there are parameters.",
+        "Median cost of a trial. A Jacobian counts as many simulations as the model says that it costs.",
         lambda s: quantile(s.cost, 0.5),
         where=("costs", "terminal"),
         titles={"terminal": "sims"},
@@ -559,7 +664,7 @@ SCORES: tuple[Statistic, ...] = (
         "Mean Mahalanobis error sqrt(e' J' R⁻¹ J e), the error in standard deviations of the Cramér-Rao bound, about √n"
         " when efficient; each trial's counts at most the radius of the gate of success, so that failing badly is"
         " failing once.",
-        _capped_error,
+        capped_error,
         where=("overview",),
     ),
     Statistic("cost_median", "cost", "all trials", "Median cost of a trial.", lambda s: quantile(s.cost, 0.5)),

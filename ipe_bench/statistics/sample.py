@@ -14,6 +14,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.counted import cost
 from ipe_bench.statistics.collect import Collection, Group
 from ipe_bench.statistics.histories import History, distances_to_limit, trial_label
+from ipe_bench.statistics.intervals import rms_interval
 
 FIT = "fit_p"
 NIS = "extra_nis"
@@ -81,6 +82,8 @@ class Sample:
     """(trials, n), deviations of the bounds at the truth; NaN where the truth is missing."""
     linear_error: Array
     """(trials, n), H+ v: what the linear estimate would be off by if h were linear."""
+    van_trees: Array
+    """(trials, n), deviations of Van Trees's bound, in the first trial of each seed and NaN in the others."""
     truth: Mapping[str, Array]
     """Per trial, by the names in `TRUTH`; NaN where it is not stored."""
     scalars: Mapping[str, Array]
@@ -92,7 +95,7 @@ class Sample:
         names = [p["name"] for p in group.footer["parameters"]]
         vectors = [f"{kind}_{name}" for kind in ("error", "deviation") for name in names]
         bounds = [f"{kind}_{name}" for kind in ("crlb", "bayes") for name in names]
-        linear = [f"linear_error_{name}" for name in names]
+        linear = [f"{kind}_{name}" for kind in ("linear_error", "van_trees") for name in names]
         parts: list[dict[str, Array]] = []
         for cell, truth in group.cells:
             rows = collection.load(cell, [*vectors, *SCALARS], OPTIONAL)
@@ -119,6 +122,7 @@ class Sample:
             crlb=matrix("crlb"),
             bayes=matrix("bayes"),
             linear_error=matrix("linear_error"),
+            van_trees=matrix("van_trees"),
             truth=truth,
             scalars=joined,
             shared=shared,
@@ -152,7 +156,18 @@ class Sample:
     @cached_property
     def cost(self) -> Array:
         """(trials,)"""
-        return cost(self.scalars["simulations"], self.scalars["jacobians"], self.n)
+        jacobian_cost = self.group.footer.get("jacobian_cost", self.n)
+        return cost(self.scalars["simulations"], self.scalars["jacobians"], jacobian_cost)
+
+    @property
+    def iterates(self) -> bool:
+        """Whether the estimator approaches a limit step by step; the epochs of a filter are not such steps."""
+        return not self.group.footer.get("sequential", False)
+
+    @property
+    def solves(self) -> bool:
+        """Whether the estimator seeks a root of something; filters and the linear LSE do not, and only finish."""
+        return self.group.footer.get("equation") is not None
 
     @cached_property
     def number(self) -> Array:
@@ -194,7 +209,9 @@ class Sample:
 
     @cached_property
     def histories(self) -> list[History]:
-        """Those of the converged trials whose iterates are stored."""
+        """Those of the converged trials whose iterates are stored; none of a filter, which has epochs instead."""
+        if not self.iterates:
+            return []
         names = [p["name"] for p in self.parameters]
         columns = [f"x_{name}" for name in names]
         result: list[History] = []
@@ -218,6 +235,13 @@ class Sample:
     def rmse(self) -> Array:
         """(n,), over solved trials."""
         return root_mean(self.error, self.solved)
+
+    @cached_property
+    def rmse_limits(self) -> tuple[Array, Array]:
+        """Ends (n + 1,) of the intervals of rmse, per parameter; the last of all, over the linear bound."""
+        together = np.mean(np.where(self.solved[:, None], self.normalised, 0.0) ** 2, axis=1)
+        each = np.where(self.solved[:, None], self.error, 0.0) ** 2
+        return rms_interval(np.column_stack([each, together]), self.solved)
 
 
 def root_mean(values: Array, used: Array) -> Array:

@@ -79,6 +79,12 @@ class Scenario:
         """The model that the readings come from."""
         return self.measurement if self.truth is None else self.truth
 
+    def truths(self, start: int, stop: int) -> Array:
+        """The true parameters (trials, n) of trials start to stop, as `draw` draws them."""
+        nominal = self.simulator.nominal
+        draws = (_streams(self.seed, trial)[0] for trial in range(start, stop))
+        return np.stack([self.prior.draw(nominal, self.error_scale, rng) for rng in draws])
+
     def draw(self, start: int, stop: int) -> Trials:
         """Trials start to stop. Trial t has random streams of its own, so it is the same in whatever block it is drawn.
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtri
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import (
@@ -29,9 +29,10 @@ from ipe_bench.estimators.base import Equation, Estimates, Estimator, estimate_s
 from ipe_bench.measurements.counted import Counted
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.trials.contraction import contraction_of, curvature
+from ipe_bench.trials.fit_test import Spread, fit_probability, frozen_spread, least_squares_spread, prior_spread
 from ipe_bench.trials.roots import frozen_root, least_squares_root
 from ipe_bench.trials.scenario import Scenario, Trials
-from ipe_bench.trials.thresholds import GATE, SAME_ROOT
+from ipe_bench.trials.thresholds import EXPECTED, GATE, SAME_ROOT
 
 HISTORIES = 20
 """Trials whose iterates are kept: the first ones of a scenario."""
@@ -93,12 +94,26 @@ class Block:
             **_by_parameter("x", names, self.trials.x),
             **_by_parameter("crlb", names, self.crlb_deviation),
             **_by_parameter("bayes", names, bayes),
+            **_by_parameter("van_trees", names, self._van_trees()),
             **_by_parameter("linear_error", names, multiply(H_plus, self.trials.z - self.readings_at(self.trials.x))),
             "contraction_K": contracts.K,
             "contraction_norm": contracts.infinity_norm,
             "contraction_radius": contracts.spectral_radius,
             "curvature_M": self._curvature(H_plus),
         }
+
+    def _van_trees(self) -> Array:
+        """Deviations (trials, n) of Van Trees's bound (E[J' R^-1 J] + P0^-1)^-1 (Detection, Estimation, and Modulation
+        Theory I, 1968, sec. 2.4), the mean taken over the first `EXPECTED` truths of the scenario: in its first trial,
+        and NaN in the others."""
+        bound = np.full(self.trials.x.shape, np.nan)
+        deviation = self.problem.prior_used()
+        if self.trials.start == 0 and len(bound) and deviation is not None and not self.scenario.noise.real:
+            x = self.scenario.truths(0, EXPECTED)
+            with np.errstate(all="ignore"):
+                expected = information(self.problem.measurement.jacobian(x), self.problem.R).mean(axis=0)
+                bound[0] = deviations(inverse((expected + np.diag(deviation**-2.0))[None])[0])[0]
+        return bound
 
     def readings_at(self, x: Array) -> Array:
         """h(x) (trials, m) for x (trials, n); NaN where the model fails."""
@@ -135,12 +150,34 @@ class Block:
         with np.errstate(all="ignore"):
             return estimates, self.score(estimator, estimates)
 
-    def _fit_probability(self, x: Array) -> Array:
-        """The chi-square test of the residuals at x (trials, n): the chance of ones at least this large if the model
-        and R are right; NaN where there are none. It needs no truth, so whoever estimates can ask for it too."""
-        model = self.problem.measurement
-        r = self.problem.R.whiten(self.trials.z - self.readings_at(x))
-        return chdtrc(model.m - model.n, np.sum(r**2, axis=1))
+    def _fit_probability(self, estimator: Estimator, x: Array) -> Array:
+        """The test of fit at x (trials, n); see `fit_test`."""
+        problem = self.problem
+        r = problem.R.whiten(self.trials.z - self.readings_at(x))
+        with np.errstate(all="ignore"):
+            squares = np.sum(r**2, axis=1)
+        return fit_probability(squares, self._spread(estimator), self.scenario.noise, problem.H, problem.R)
+
+    def _spread(self, estimator: Estimator) -> Spread:
+        """How the residuals that an estimator leaves scatter, with the slopes at the truth."""
+        key = (estimator.equation, "prior" in estimator.needs, _inflation(estimator))
+        if key not in self._spreads:
+            self._spreads[key] = self._spread_of(*key)
+        return self._spreads[key]
+
+    def _spread_of(self, equation: Equation | None, uses_prior: bool, inflation: float) -> Spread:
+        problem, model = self.problem, self.problem.measurement
+        deviation = problem.prior_used()
+        with np.errstate(all="ignore"):
+            if uses_prior and deviation is not None:
+                return prior_spread(self.jacobian, problem.R, deviation, inflation)
+            if equation == "frozen" and np.isfinite(problem.H).all():
+                return frozen_spread(self.jacobian, problem.H, problem.R)
+        return least_squares_spread(model.m, model.n, len(self.trials.x))
+
+    @cached_property
+    def _spreads(self) -> dict[tuple[Equation | None, bool, float], Spread]:
+        return {}
 
     def score(self, estimator: Estimator, estimates: Estimates) -> Columns:
         """Each trial's error, cost, status and distances, as columns."""
@@ -156,9 +193,7 @@ class Block:
         solved = converged
         apart = np.full(len(error), np.nan)
         if estimator.equation is not None:
-            # An estimator that scales its prior solves an equation of its own.
-            inflation = getattr(estimator, "prior_inflation", 1.0) if estimator.equation == "map" else 1.0
-            root = self.reference_root(estimator.equation, inflation)
+            root = self.reference_root(estimator.equation, _inflation(estimator))
             apart = (np.abs(estimates.x - root) / self.crlb_deviation).max(axis=1)
             solved = solved & (apart <= SAME_ROOT)
         trials = len(error)
@@ -177,12 +212,17 @@ class Block:
             "time_s": estimates.seconds,
             "crlb_distance": quadratic_form(self.crlb_information, error),
             "nees": squared,
-            "fit_p": self._fit_probability(estimates.x),
+            "fit_p": self._fit_probability(estimator, estimates.x),
             "root_distance": apart,
             "solved": solved,
             "success": np.isfinite(distance) & (distance <= chdtri(model.n, GATE)),
             **{f"extra_{name}": values for name, values in estimates.extras.items()},
         }
+
+
+def _inflation(estimator: Estimator) -> float:
+    """By how much an estimator widens the prior: one that does solves an equation of its own."""
+    return float(getattr(estimator, "prior_inflation", 1.0)) if "prior" in estimator.needs else 1.0
 
 
 def nees(error: Array, P: Array) -> Array:

@@ -7,15 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from small_models import Bent
+from synthetic_store import Repeated
 
 from ipe_bench import Scenario, run
-from ipe_bench.baselines import LinearLSE, MapLM
+from ipe_bench.baselines import GaussNewton, LinearLSE, MapLM
 from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import information, inverse
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.trials.scoring import Block
+from ipe_bench.trials.thresholds import EXPECTED
 
 SCENARIO = Scenario(Bent(0.02), Gaussian(0.1), GaussianPrior(), 1.0)
 
@@ -72,3 +75,60 @@ def test_what_fails_is_warned_of_and_not_dropped_silently():
 def test_no_estimator_may_be_called_truth():
     with pytest.raises(UserError, match="truth"):
         run(SCENARIO, {"truth": LinearLSE()}, 4)
+
+
+@dataclass(frozen=True)
+class Beside(Estimator):
+    """The least-squares root, moved along one parameter by some deviations of the bound."""
+
+    by: float = 0.0
+    equation = "least_squares"
+
+    def estimate(self, problem, z, *, history=False):
+        found = GaussNewton(tolerance=1e-10).estimate(problem, z)
+        J = problem.measurement.jacobian(found.x)
+        found.x[:, 0] += self.by * np.sqrt(inverse(information(J, problem.R))[0][:, 0, 0])
+        return found
+
+
+@pytest.mark.parametrize(("by", "solved"), [(0.0, True), (0.5e-3, True), (2e-3, False), (1.0, False)])
+def test_another_root_is_one_that_lies_a_thousandth_of_a_deviation_away(by, solved):
+    _, columns = Block.draw(SCENARIO, 0, 40).estimate(Beside(by))
+    assert (columns["solved"] == solved).all()
+    np.testing.assert_allclose(columns["root_distance"], by, rtol=0.05, atol=1e-5)
+
+
+def test_the_bayesian_bound_has_the_prior_in_it_and_so_has_its_gate():
+    """Linear, one reading of each parameter: the variance is 1 / (1 / sigma^2 + 1 / d^2), sigma = d = 1."""
+    scenario = Scenario(Repeated(names=("a", "b"), repeats=1), Gaussian(1.0), GaussianPrior(), 1.0)
+    block = Block.draw(scenario, 0, 4)
+    columns = block.truth_columns()
+    np.testing.assert_allclose([columns["crlb_a"], columns["bayes_a"]], [[1.0] * 4, [np.sqrt(0.5)] * 4], rtol=1e-9)
+
+    @dataclass(frozen=True)
+    class Off(Estimator):
+        needs = frozenset({"prior"})
+
+        def estimate(self, problem, z, *, history=False):
+            x = block.trials.x + np.array([[3.0, 0.0], [3.5, 0.0], [3.9, 0.0], [5.5, 0.0]])
+            return Estimates(x, np.zeros(4, np.int8))
+
+    # The gate is at sqrt(chi2_2(1 - 1e-6)) = 5.26 deviations: 3.72 of the Bayesian bound, 5.26 of the other.
+    assert block.estimate(Off())[1]["success"].tolist() == [True, True, False, False]
+
+
+def test_van_trees_bound_is_that_of_the_mean_information():
+    """In closed form where h is linear, the same at every truth; and below the mean of the local bounds where it is
+    not, as Jensen's inequality has it."""
+    linear = Scenario(Repeated(names=("a", "b"), repeats=1), Gaussian(1.0), GaussianPrior(), 1.0)
+    columns = Block.draw(linear, 0, 4).truth_columns()
+    assert columns["van_trees_a"][0] == pytest.approx(np.sqrt(0.5))
+    assert np.isnan(columns["van_trees_a"][1:]).all()
+    assert np.isnan(Block.draw(linear, 4, 8).truth_columns()["van_trees_a"]).all()
+    bent = Scenario(Bent(0.3), Gaussian(0.1), GaussianPrior(), 1.0)
+    whole, part = (Block.draw(bent, 0, stop).truth_columns() for stop in (EXPECTED, 3))
+    for name in ("a", "b", "c"):
+        local = np.mean(whole[f"bayes_{name}"] ** 2)
+        assert whole[f"van_trees_{name}"][0] ** 2 <= local
+        # Whatever the block, it is the same bound.
+        assert whole[f"van_trees_{name}"][0] == part[f"van_trees_{name}"][0]

@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 from markupsafe import escape
 from rich.console import Console
-from synthetic_store import Synthetic
+from synthetic_store import Seeker, Synthetic
 
 from ipe_bench.noise import Quantization
 from ipe_bench.report import write_report
@@ -32,22 +32,25 @@ from ipe_bench.statistics.records import SCORES, STATISTICS, frame_columns
 HOSTILE = "<script>alert(1)</script>"
 
 
-def fill(store: Synthetic, labels=("linear_lse", "one", "two"), scales=(1.0, 10.0, 100.0), trials=80, **model) -> None:
+def fill(
+    store: Synthetic, labels=("linear_lse", "one", "two"), scales=(1.0, 10.0, 100.0), trials=80, seeds=1, **model
+) -> None:
     """A linear estimate that is worse the larger the scale, and others that reach the bound."""
     rng = np.random.default_rng(0)
     for scale in scales:
-        scenario = store.scenario(error_scale=scale, **model)
-        base = 0.1 * rng.normal(size=(trials, scenario.measurement.n))
-        for i, label in enumerate(labels):
-            factor = scale if label == "linear_lse" else 1.0 + 0.05 * i
-            store.add(scenario, label, factor * base, simulations=1.0 + 3 * i, iterations=i)
+        for seed in range(seeds):
+            scenario = store.scenario(error_scale=scale, seed=seed, **model)
+            base = 0.1 * rng.normal(size=(trials, scenario.measurement.n))
+            for i, label in enumerate(labels):
+                factor = scale if label == "linear_lse" else 1.0 + 0.05 * i
+                store.add(scenario, label, factor * base, simulations=1.0 + 3 * i, iterations=i)
     store.record(trials)
 
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     store = Synthetic(tmp_path_factory.mktemp("report") / "store")
-    fill(store)
+    fill(store, seeds=5)
     return write_report([store.directory], store.directory)
 
 
@@ -79,8 +82,43 @@ def test_the_headline_is_computed_from_the_data(synthetic):
     total = rows.summary[rows.summary["parameter"] == "all"].set_index(["estimator", "error_scale"])
     sentence = headline(rows).replace("\u00a0", " ")
     assert "At error scales 1 to 100, one succeeds in" in sentence
-    value = total.loc[("linear_lse", 100.0), "rmse_over_linear_bound"]
-    assert f"off by {short(value)} times" in sentence
+    worst = total.loc["one"].sort_values("efficiency_all").iloc[0]
+    assert f"its efficiency, the bound that applies over its error, is {short(worst['efficiency_all'])}" in sentence
+    linear = total.loc[("linear_lse", 100.0), "efficiency_all"]
+    assert f"At scale 100 the linear estimate has an efficiency of {short(linear)}" in sentence
+
+
+def test_survivors_are_shown_as_survivors(synthetic):
+    """One trial of 200 is solved, and by luck well: its errors have no interval, their number beside them, and all
+    trials' errors in the next column; who solves nothing has those alone."""
+    rng = np.random.default_rng(3)
+    e = 0.1 * rng.normal(size=(200, 3))
+    solved = np.arange(200) == 7
+    scenario = synthetic.scenario(error_scale=1000.0)
+    synthetic.add(scenario, "lucky", np.where(solved[:, None], e, 1e6), solved=solved, estimator=Seeker())
+    synthetic.add(scenario, "steady", 3 * e, estimator=Seeker(option=1))
+    synthetic.add(scenario, "filter", 3 * e)
+    analysis = analyse([synthetic.directory])
+    total = analysis.summary[analysis.summary["parameter"] == "all"].set_index("estimator")
+    lucky, steady, finisher = (total.loc[label] for label in ("lucky", "steady", "filter"))
+    assert lucky["solved_trials"] == 1
+    assert np.isnan([lucky["rmse_low"], lucky["rmse_high"], lucky["efficiency_low"]]).all()
+    assert lucky["efficiency_all"] < 1e-6
+    assert lucky["rmse_all"] > 1e6
+    assert steady["efficiency_all"] == finisher["efficiency_all"] == steady["efficiency"]
+    assert (total["common_trials"] == 1).all()
+    overview = next(t for t in all_tables(analysis) if t.name == "overview")
+    shown = {c.title: [cell.text for cell in c.cells] for c in overview.columns}
+    at = shown["estimator"].index
+    assert shown["efficiency"][at("lucky")].endswith(" (1)")
+    assert shown["rmse, common"][at("steady")].endswith(" (1)")
+    assert "(" not in shown["efficiency"][at("steady")]
+    assert shown["efficiency"][at("filter")] == "-"
+    assert shown["efficiency, all"][at("filter")] == shown["efficiency, all"][at("steady")] != "-"
+    out = io.StringIO()
+    Console(file=out, width=100).print(render(analysis.summary))
+    row = next(line for line in out.getvalue().splitlines() if "lucky" in line)
+    assert "(1)" in row
 
 
 def test_nothing_stored_gives_a_page_that_says_so(tmp_path):

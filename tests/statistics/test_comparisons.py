@@ -3,17 +3,22 @@
 import numpy as np
 import pytest
 from scipy import stats
+from synthetic_store import Pretender
 
+from ipe_bench.report.tables import all_tables
 from ipe_bench.statistics import analyse
+from ipe_bench.statistics.analysis import _ranking
 from ipe_bench.statistics.comparisons import (
+    REPLICATES,
     TIE,
     Outcomes,
     compare_pairs,
+    corrected,
     differences,
     holm,
     leaders,
     mcnemar,
-    rank_over_scenarios,
+    rank_over_replicates,
     signed_rank,
     tied_ranks,
 )
@@ -72,7 +77,7 @@ def test_equal_estimators_are_told_apart_in_at_most_one_of_twenty_repeats():
     false = 0
     for _ in range(200):
         d = rng.normal(5, 1, size=(3, 60))
-        pairs = compare_pairs({str(i): outcomes(row) for i, row in enumerate(d)})
+        pairs = corrected(compare_pairs({str(i): outcomes(row) for i, row in enumerate(d)}))
         false += any(p.p_error < 0.05 for p in pairs)
     # Family-wise error 5 %, four standard deviations above it.
     assert false / 200 <= 0.05 + 4 * np.sqrt(0.05 * 0.95 / 200)
@@ -89,9 +94,41 @@ def test_the_best_is_marked_only_where_somebody_is_worse():
     rng = np.random.default_rng(2)
     d = np.abs(rng.normal(3, 1, 300))
     same = {"one": outcomes(d), "two": outcomes(d)}
-    assert leaders({"one": 3.0, "two": 3.0}, compare_pairs(same)) == set()
+    assert leaders(same, compare_pairs(same)) == set()
     three = same | {"three": outcomes(d + 0.5)}
-    assert leaders({"one": 3.0, "two": 3.0, "three": 3.5}, compare_pairs(three)) == {"one", "two"}
+    assert leaders(three, compare_pairs(three)) == {"one", "two"}
+
+
+def test_who_leads_is_who_is_closer_and_not_who_fails_less():
+    """A is 2 % worse everywhere and never fails; B is better in 380 of 400 trials, and fails in 20."""
+    rng = np.random.default_rng(5)
+    d = rng.normal(3, 0.3, 400)
+    failed = np.arange(400) < 20
+    pairs = compare_pairs({"A": outcomes(1.02 * d), "B": outcomes(np.where(failed, 1e6, d))})
+    assert pairs[0].closer == "B"
+    assert (pairs[0].wins, pairs[0].losses) == (20, 380)
+    assert leaders(["A", "B"], pairs) == {"B"}
+
+
+def test_many_small_losses_do_not_outweigh_in_number_what_they_lose_in_rank():
+    """A wins 60 of 100 trials by little and loses 40 by much: by ranks B is closer, whoever wins more often."""
+    d = np.concatenate([np.full(60, -0.01), np.full(40, 1.0)]) * (1 + np.arange(100) / 1e4)
+    pair = compare_pairs({"A": outcomes(5 + d), "B": outcomes(np.full(100, 5.0))})[0]
+    assert pair.wins > pair.losses
+    assert pair.favours == "B"
+
+
+def test_correction_is_over_all_questions_that_are_asked():
+    rng = np.random.default_rng(6)
+    pairs = [
+        pair
+        for _ in range(20)
+        for pair in compare_pairs({str(i): outcomes(row) for i, row in enumerate(rng.normal(5, 1, size=(2, 40)))})
+    ]
+    assert min(p.p_error for p in pairs) < 0.05
+    final = corrected(pairs)
+    smallest = min(p.p_error for p in pairs)
+    assert min(p.p_error for p in final) == pytest.approx(min(20 * smallest, 1.0))
 
 
 def test_ranks_share_their_mean_where_scores_tie():
@@ -102,7 +139,7 @@ def test_critical_difference_is_demsars():
     # Demsar 2006, sec. 3.2.2: four classifiers, 14 data sets, q = 2.569, CD = 1.25.
     rng = np.random.default_rng(3)
     scores = [dict(zip("abcd", rng.normal([0, 100, 200, 300], 100), strict=True)) for _ in range(14)]
-    ranking = rank_over_scenarios(scores)
+    ranking = rank_over_replicates(scores)
     assert ranking is not None
     assert ranking.critical_difference == pytest.approx(1.25, abs=0.005)
     table = np.array([[s[k] for k in "abcd"] for s in scores])
@@ -110,10 +147,10 @@ def test_critical_difference_is_demsars():
     assert sum(ranking.mean_ranks.values()) == pytest.approx(10)
 
 
-def test_ranking_needs_two_scenarios_and_two_estimators():
-    assert rank_over_scenarios([{"a": 1.0, "b": 2.0}]) is None
-    assert rank_over_scenarios([{"a": 1.0}, {"a": 2.0}]) is None
-    alike = rank_over_scenarios([{"a": 1.0, "b": 1.0, "c": 1.0}] * 3)
+def test_ranking_needs_replicates_and_two_estimators():
+    assert rank_over_replicates([{"a": 1.0, "b": 2.0}] * (REPLICATES - 1)) is None
+    assert rank_over_replicates([{"a": float(i)} for i in range(REPLICATES)]) is None
+    alike = rank_over_replicates([{"a": 1.0, "b": 1.0, "c": 1.0}] * REPLICATES)
     assert alike is not None
     assert alike.friedman == 1.0
 
@@ -155,28 +192,102 @@ def test_iterations_to_the_limit_of_a_halving_sequence():
     assert iterations_to_limit(np.array([0.01, 1.0, 0.0])) == 2
 
 
-def test_known_differences_are_found_in_a_store(synthetic):
+@pytest.mark.parametrize("seeds", [1, REPLICATES])
+def test_known_differences_are_found_in_a_store(synthetic, seeds):
     rng = np.random.default_rng(4)
     for scale in (1.0, 2.0, 3.0, 4.0):
-        scenario = synthetic.scenario(error_scale=scale)
-        base = 0.1 * rng.normal(size=(300, 3))
-        synthetic.add(scenario, "good", base, simulations=3.0)
-        synthetic.add(scenario, "same", base * (1 + 1e-9), simulations=9.0)
-        synthetic.add(scenario, "bad", 1.3 * base, simulations=1.0, jacobians=1.0)
+        for seed in range(seeds):
+            scenario = synthetic.scenario(error_scale=scale, seed=seed)
+            base = 0.1 * rng.normal(size=(300, 3))
+            synthetic.add(scenario, "good", base, simulations=3.0)
+            synthetic.add(scenario, "same", base * (1 + 1e-9), simulations=9.0)
+            synthetic.add(scenario, "bad", 1.3 * base, simulations=1.0, jacobians=1.0)
     analysis = analyse([synthetic.directory])
     pairs = analysis.pairs.set_index(["first", "second"])
-    assert (pairs.loc[("good", "same"), "ties"] == 300).all()
+    assert (pairs.loc[("good", "same"), "ties"] == 300 * seeds).all()
     others = pairs[~pairs.index.isin([("good", "same")])]
     assert (others["p_error"] < 1e-6).all()
     leads = analysis.scores.set_index("estimator")["leads"]
     assert leads["good"].all()
     assert leads["same"].all()
     assert not leads["bad"].any()
-    assert analysis.ranking is not None
-    assert analysis.ranking.mean_ranks == {"good": 1.5, "same": 1.5, "bad": 3.0}
+    # One seed is one observation, at however many error scales.
+    if seeds == 1:
+        assert analysis.ranking is None
+    else:
+        assert analysis.ranking is not None
+        assert analysis.ranking.mean_ranks == {"good": 1.5, "same": 1.5, "bad": 3.0}
+        assert analysis.ranking.replicates == seeds
     # A Jacobian counts as three simulations here.
     assert set(analysis.scores[analysis.scores["estimator"] == "bad"]["cost_median"]) == {4.0}
     # Efficient errors are uncorrelated here, up to 1 / sqrt(300).
     for _, rows in analysis.correlations.groupby(["scenario", "estimator"]):
         matrix = rows["value"].to_numpy().reshape(3, 3)
         np.testing.assert_allclose(matrix, np.eye(3), atol=0.25)
+
+
+def test_the_error_that_is_compared_is_a_distance_and_not_its_square(synthetic):
+    """Every error 3 bounds in each of 3 parameters: the distance is 3 sqrt(3), which the gate does not cap."""
+    synthetic.add(synthetic.scenario(), "one", np.full((30, 3), 0.3))
+    synthetic.add(synthetic.scenario(), "two", np.full((30, 3), 0.1))
+    analysis = analyse([synthetic.directory])
+    scores = analysis.scores.set_index("estimator")
+    assert scores.loc["one", "capped_error"] == pytest.approx(3 * np.sqrt(3))
+    assert scores.loc["two", "capped_error"] == pytest.approx(np.sqrt(3))
+    assert analysis.pairs.loc[0, "median_difference"] == pytest.approx(2 * np.sqrt(3))
+    middle = analysis.distributions.query("estimator == 'one' and probability == 0.5")["distance"]
+    assert middle.item() == pytest.approx(3 * np.sqrt(3))
+
+
+def test_tables_of_one_report_agree_on_who_is_closer(synthetic):
+    rng = np.random.default_rng(8)
+    d = 0.1 * rng.normal(size=(400, 3))
+    failed = (np.arange(400) < 20)[:, None]
+    synthetic.add(synthetic.scenario(), "A", 1.02 * d)
+    synthetic.add(synthetic.scenario(), "B", np.where(failed, 1e6, d))
+    analysis = analyse([synthetic.directory])
+    assert analysis.pairs.loc[0, "closer"] == "B"
+    assert set(analysis.scores.loc[analysis.scores["leads"], "estimator"]) == {"B"}
+    tables = {t.name: t for t in all_tables(analysis)}
+    finding = tables["comparisons"].columns[-1].cells[0].text
+    bold = [cell.text for column in tables["overview"].columns for cell in column.cells if cell.best]
+    assert (finding, bold) == ("B is closer", ["B"])
+
+
+def test_profiles_compare_on_the_same_scenarios_and_by_the_same_gate(synthetic):
+    """An estimator that was spared the hard scenario has no part in the profile; users of a prior have no easier or
+    harder gate than the others."""
+    easy, hard = (synthetic.scenario(error_scale=s) for s in (1.0, 2.0))
+    e = 0.1 * np.random.default_rng(9).normal(size=(50, 3))
+    bayes = Pretender(knows_prior=True)
+    synthetic.add(easy, "both", e)
+    synthetic.add(hard, "both", np.full((50, 3), 9.0))
+    synthetic.add(easy, "map", e, estimator=bayes, success=False)
+    synthetic.add(hard, "map", e, estimator=bayes, success=False)
+    synthetic.add(easy, "spared", e)
+    analysis = analyse([synthetic.directory])
+    last = analysis.profiles[analysis.profiles["profile"] == "data"].groupby("estimator")["share"].last()
+    assert last.to_dict() == {"both": 0.5, "map": 1.0}
+    pairs = analysis.pairs.set_index(["first", "second", "error_scale"])
+    assert pairs.loc[("both", "map", 1.0), "only_first"] == 0
+    assert pairs.loc[("both", "map", 2.0), "only_second"] == 50
+
+
+@pytest.mark.slow
+def test_seeds_that_tell_equal_estimators_apart_are_one_in_twenty():
+    """Three equal estimators, six seeds, five error scales with the same draws in each: Friedman's test by scales
+    rejected always."""
+    rng = np.random.default_rng(10)
+    rejected = 0
+    for _ in range(400):
+        scores = rng.normal(size=(12, 3))
+        replicates = [
+            (scale, seed, label, float(scores[seed, i]) + 0.001 * scale)
+            for scale in range(5)
+            for seed in range(12)
+            for i, label in enumerate("abc")
+        ]
+        ranking = _ranking(replicates, {"a", "b", "c"})
+        assert ranking is not None
+        rejected += ranking.friedman < 0.05
+    assert rejected / 400 <= 0.05 + 4 * np.sqrt(0.05 * 0.95 / 400)

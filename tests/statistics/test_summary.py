@@ -1,11 +1,15 @@
 """On trials made up with known bias, variance and success, the summary says what theory says."""
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
-from synthetic_store import Pretender, Synthetic
+from synthetic_store import Filter, Pretender, Repeated, Synthetic
 
-from ipe_bench.statistics import summarize
+from ipe_bench.statistics import analyse, summarize
 from ipe_bench.statistics.consistency import clopper_pearson
 from ipe_bench.statistics.summary import COLUMNS
 
@@ -123,15 +127,7 @@ def test_estimators_with_a_prior_are_held_against_the_bayesian_bound(synthetic):
     synthetic.add(synthetic.scenario(), "plain", e)
     synthetic.add(synthetic.scenario(), "bayes", e, estimator=Pretender(knows_prior=True))
     # Half the deviation where the prior adds information: rewritten in the truth's file.
-    for path in (synthetic.directory / "trials").glob("*.parquet"):
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        table = pq.read_table(path)
-        for name in [n for n in table.column_names if n.startswith("bayes_")]:
-            at = table.column_names.index(name)
-            table = table.set_column(at, name, pa.array(np.full(table.num_rows, 0.05)))
-        pq.write_table(table, path)
+    rewrite_truth(synthetic, "bayes", 0.05)
     frame = summarize([synthetic.directory])
     assert row(frame, "plain")["efficiency"] == pytest.approx(1.0)
     assert row(frame, "bayes")["efficiency"] == pytest.approx(0.5)
@@ -183,3 +179,87 @@ def test_nothing_stored_is_an_empty_table_with_its_columns(tmp_path):
     frame = summarize([tmp_path])
     assert frame.empty
     assert "rmse_over_linear_bound" in frame.columns
+
+
+def rewrite_truth(synthetic, kind: str, value: float) -> None:
+    """Puts another number in place of a bound in the truth's files."""
+    for path in (synthetic.directory / "trials").glob("*.parquet"):
+        table = pq.read_table(path)
+        for name in [n for n in table.column_names if n.startswith(f"{kind}_")]:
+            at = table.column_names.index(name)
+            table = table.set_column(at, name, pa.array(np.full(table.num_rows, value)))
+        pq.write_table(table, path)
+
+
+def test_efficiency_is_against_the_bound_that_applies_and_not_the_linear_one(synthetic):
+    """Bound at the truth 0.08, linear bound 0.1, errors of exactly 0.1: in every row, with its interval."""
+    synthetic.add(synthetic.scenario(), "one", errors(300, bias=(0, 0, 0)))
+    rewrite_truth(synthetic, "crlb", 0.08)
+    frame = summarize([synthetic.directory])
+    np.testing.assert_allclose(frame["efficiency"], 0.8, rtol=1e-9)
+    np.testing.assert_allclose(frame["efficiency_all"], 0.8, rtol=1e-9)
+    np.testing.assert_allclose(frame["rmse_over_linear_bound"], 1.0, rtol=1e-9)
+    assert (frame["efficiency_low"] < 0.8).all()
+    assert (frame["efficiency_high"] > 0.8).all()
+    bound = np.where(frame["parameter"] == "all", 0.8, frame["crlb"])
+    np.testing.assert_allclose(frame["efficiency_low"], bound / frame["rmse_high"], rtol=1e-9)
+
+
+@pytest.mark.parametrize(("solved", "known"), [(19, False), (20, True)])
+def test_few_solved_trials_have_no_interval(synthetic, solved, known):
+    synthetic.add(synthetic.scenario(), "one", errors(100), solved=np.arange(100) < solved)
+    frame = summarize([synthetic.directory])
+    assert (frame["solved_trials"] == solved).all()
+    assert (frame[["rmse_low", "rmse_high"]].notna() == known).all(axis=None)
+    assert frame["rmse"].notna().all()
+
+
+def test_errors_of_all_trials_let_nobody_off(synthetic):
+    e = errors(100)
+    e[0] = 1e3
+    synthetic.add(synthetic.scenario(), "far", e, solved=np.arange(100) > 0)
+    e = e.copy()
+    e[0] = np.nan
+    synthetic.add(synthetic.scenario(), "gone", e, solved=np.arange(100) > 0)
+    frame = summarize([synthetic.directory])
+    far, gone = row(frame, "far"), row(frame, "gone")
+    assert far["rmse"] == gone["rmse"]
+    assert far["rmse_all"] == pytest.approx(1e4 / np.sqrt(100), rel=1e-3)
+    assert gone["rmse_all"] == np.inf
+    assert gone["efficiency_all"] == 0.0
+
+
+def test_a_jacobian_counts_what_the_model_says_it_costs(synthetic):
+    @dataclass(frozen=True)
+    class Dear(Repeated):
+        jacobian_cost = 25.0
+
+    e = errors(30)
+    synthetic.add(synthetic.scenario(), "cheap", e, simulations=2.0, jacobians=1.0)
+    dear = replace(synthetic.scenario(), measurement=Dear())
+    synthetic.add(dear, "dear", e, simulations=2.0, jacobians=1.0)
+    frame = summarize([synthetic.directory])
+    assert row(frame, "cheap")["simulations_median"] == 5.0
+    assert row(frame, "dear")["simulations_median"] == 27.0
+
+
+def test_epochs_of_a_filter_are_not_iterations(synthetic):
+    scenario = synthetic.scenario()
+    synthetic.add(scenario, "ekf", errors(40), iterations=30, estimator=Filter())
+    synthetic.add(scenario, "newton", errors(40), iterations=3)
+    for cell in list(synthetic.cells.values()):
+        path = 0.1 * 0.5 ** np.arange(6.0)
+        columns = {"trial": np.zeros(6, dtype=int), "iteration": np.arange(6)} | {f"x_{n}": path for n in "abc"}
+        if cell.label != "truth":
+            synthetic.store.write_history(cell, columns)
+    analysis = analyse([synthetic.directory])
+    assert np.isnan(row(analysis.summary, "ekf")["iterations_median"])
+    assert row(analysis.summary, "newton")["iterations_median"] == 3
+    scores = analysis.scores.set_index("estimator")
+    assert np.isnan(scores.loc["ekf", "order_median"])
+    assert scores.loc["ekf", "histories"] == 0
+    assert scores.loc["newton", "histories"] == 1
+    assert set(analysis.convergence["estimator"]) == {"newton"}
+    # The last iterate is the limit, and at no distance from itself by definition.
+    assert analysis.convergence["iteration"].tolist() == [0, 1, 2, 3, 4]
+    assert (analysis.convergence["distance"] > 0).all()

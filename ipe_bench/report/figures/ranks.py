@@ -1,4 +1,4 @@
-"""The critical-difference diagram: mean ranks over scenarios, and who cannot be told apart."""
+"""The critical-difference diagram: mean ranks over seeds, and who cannot be told apart."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ def draw(view: View) -> Iterator[Drawing]:
     ax.set_xlim(0.8, k + 0.55)
     ax.set_xticks(range(1, k + 1))
     ax.grid(axis="y", visible=False)
-    ax.set_xlabel(f"mean rank over {ranking.scenarios} scenarios (1 is best); critical difference {difference:.2f}")
+    ax.set_xlabel(f"mean rank over {ranking.replicates} seeds (1 is best); critical difference {difference:.2f}")
     ax.set_ylabel("")
     alike = "; ".join(" = ".join(ordered[a : b + 1]) for a, b in bars)
     caption = common.sentence(
-        f"Mean ranks over {ranking.scenarios} scenarios by capped mean error (ties share ranks). Bars join estimators"
+        f"Mean ranks over {ranking.replicates} seeds by capped mean error (ties share ranks). Bars join estimators"
         f" whose ranks differ by less than Nemenyi's critical difference of {difference:.2f}: they cannot be told apart"
         f" at 5 %. Friedman's test that all rank alike: p = {p_value(ranking.friedman)}.",
         f"Not told apart: {alike}." if alike else "",
     )
-    yield Drawing("critical_difference", "Ranks over scenarios", caption, fig)
+    yield Drawing("critical_difference", "Ranks over seeds", caption, fig)
 
 
 def cliques(ranks: list[float], difference: float) -> list[tuple[int, int]]:

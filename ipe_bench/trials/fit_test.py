@@ -1,0 +1,118 @@
+"""The test of fit: how probable residuals as large as these are if the model and R are right.
+
+The sum of squares of whitened residuals is chi-square with m - n degrees only for least squares and normal noise. Here
+its law follows from the noise, which states that of its whitened readings, and from what the estimator makes of them:
+
+- least squares leaves (I - P) w of whitened noise w, P the projection on the range of R^-1/2 J;
+- the root of eq. (11) leaves (I - B) w with the oblique projection B = J (H+ J)^-1 H+;
+- an estimate with a prior leaves residuals of covariance (I - J S J')(J P0 J' + I)(I - J S J'), S the covariance that
+  it reports, over truths from the prior (whitened J).
+
+It needs no truth, so whoever estimates can ask for it too.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from scipy.special import chdtrc
+
+from ipe_bench.basics.linalg import Array, Covariance, finite
+from ipe_bench.noise.base import Noise
+
+DRAWS = 20_000
+"""Simulated fits behind the law where whitened noise is not normal: the smallest p is 1 / (DRAWS + 1)."""
+_AT_ONCE = 2_000
+
+
+@dataclass(frozen=True)
+class Spread:
+    """The eigenvalues of the covariance of whitened residuals, trial by trial: those that are 1, and `others`."""
+
+    ones: int
+    others: Array
+    """(trials, k); empty for least squares."""
+
+    @property
+    def mean(self) -> Array:
+        """The expected sum of squares (trials,): the effective degrees of freedom."""
+        return self.ones + self.others.sum(axis=1)
+
+    @property
+    def squares(self) -> Array:
+        """Half of the variance (trials,) of the sum of squares where the noise is normal."""
+        return self.ones + (self.others**2).sum(axis=1)
+
+
+def least_squares_spread(m: int, n: int, trials: int) -> Spread:
+    return Spread(m - n, np.empty((trials, 0)))
+
+
+def frozen_spread(J: Array, H: Array, R: Covariance) -> Spread:
+    """For the root of eq. (11), with dh/dx = J (trials, m, n) and H (m, n).
+
+    I - B is 1 outside the ranges of H and J, and 1 / cos of the principal angles between them on n directions.
+    """
+    m, n = H.shape
+    slopes, frozen = (_basis(slope, R) for slope in (J, H[None]))
+    cosines = np.linalg.svd(np.matmul(frozen.swapaxes(1, 2), slopes), compute_uv=False)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        others = 1 / np.minimum(cosines, 1.0) ** 2
+    # With fewer than n readings to spare the largest angles are those that are left.
+    kept = min(n, m - n)
+    return Spread(max(m - 2 * n, 0), others[:, n - kept :])
+
+
+def prior_spread(J: Array, R: Covariance, deviation: Array, inflation: float = 1.0) -> Spread:
+    """For an estimate with a prior of `deviation` (n,), widened by `inflation` for the estimator."""
+    m, n = J.shape[1:]
+    slopes = R.whiten_jacobian(J) * deviation
+    usable = finite(slopes)
+    values = np.linalg.svd(np.where(usable[:, None, None], slopes, 0.0), compute_uv=False) ** 2
+    values = np.where(usable[:, None], values, np.nan)
+    return Spread(max(m - n, 0), ((1 + values) / (1 + inflation**2 * values) ** 2)[:, : min(m, n)])
+
+
+def _basis(J: Array, R: Covariance) -> Array:
+    """An orthonormal basis (trials, m, n) of the range of R^-1/2 J; NaN where J is not finite."""
+    white = R.whiten_jacobian(J)
+    usable = finite(white)
+    Q = np.linalg.qr(np.where(usable[:, None, None], white, 0.0))[0]
+    return np.where(usable[:, None, None], Q, np.nan)
+
+
+def fit_probability(squares: Array, spread: Spread, noise: Noise, H: Array, R: Covariance) -> Array:
+    """The chance (trials,) of a sum of squares of whitened residuals at least as large as `squares` (trials,).
+
+    NaN where there are no residuals, or none to spare. Where spread is not that of least squares, the sum is scaled to
+    the mean and variance of a sum that is (Satterthwaite, Biometrics Bulletin 2, 1946).
+    """
+    m, n = H.shape
+    if m <= n:
+        return np.full(len(squares), np.nan)
+    with np.errstate(all="ignore"):
+        reference = _reference(noise, m, _basis(H[None], R)[0].tobytes())
+        if reference is None:
+            ratio = spread.mean / spread.squares
+            return chdtrc(spread.mean * ratio, squares * ratio)
+        degrees = m - n
+        alike = degrees + (squares - spread.mean) * np.sqrt(degrees / spread.squares)
+    larger = len(reference) - np.searchsorted(reference, alike)
+    return np.where(np.isfinite(alike), (larger + 1) / (len(reference) + 1), np.where(alike == np.inf, 0.0, np.nan))
+
+
+@functools.lru_cache(maxsize=16)
+def _reference(noise: Noise, m: int, basis: bytes) -> Array | None:
+    """Ascending sums of squares of least-squares residuals of simulated whitened noise; None where it is normal."""
+    Q = np.frombuffer(basis).reshape(m, -1)
+    rng = np.random.Generator(np.random.Philox(0))
+    sums = []
+    for _ in range(0, DRAWS, _AT_ONCE):
+        w = noise.whitened((_AT_ONCE, m), rng)
+        if w is None:
+            return None
+        sums.append(np.sum(w**2, axis=1) - np.sum((w @ Q) ** 2, axis=1))
+    return cast(Array, np.sort(np.concatenate(sums)))

@@ -1,0 +1,122 @@
+"""The p of the test of fit is uniform where model and noise are right, whatever the noise and the estimator."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, kstest
+
+from ipe_bench.baselines import EKF, GaussNewton, MapLM
+from ipe_bench.basics.linalg import Covariance
+from ipe_bench.measurements import Gins, Polynomial
+from ipe_bench.noise import Colored, Correlated, Gaussian, NoNoise, Outliers, Quantization, StudentT
+from ipe_bench.solvers import Newton
+from ipe_bench.trials.fit_test import DRAWS, fit_probability, frozen_spread, least_squares_spread, prior_spread
+from ipe_bench.trials.scenario import Scenario
+from ipe_bench.trials.scoring import Block
+
+NOISES = [
+    Gaussian(0.1),
+    StudentT(0.1, 5.0),
+    StudentT(0.1, 3.0),
+    Outliers(0.1, assumed="total"),
+    Colored(0.1, assumed="full"),
+    Correlated(0.1),
+    Quantization(0.3, dither=True),
+]
+
+
+def p_values(model, noise, error_scale, estimator, trials=2000):
+    _, columns = Block.draw(Scenario(model, noise, error_scale=error_scale), 0, trials).estimate(estimator)
+    return columns["fit_p"]
+
+
+@pytest.mark.parametrize("noise", NOISES, ids=lambda noise: f"{type(noise).__name__}")
+def test_p_is_uniform_for_every_noise_that_states_its_law(noise):
+    """With chi-square in its place the test fails for Student's t, outliers and quantisation."""
+    assert kstest(p_values(Polynomial(strength=0.01), noise, 1.0, GaussNewton()), "uniform").pvalue > 0.01
+
+
+@pytest.mark.parametrize("estimator", [MapLM(), MapLM(prior_inflation=3.0), EKF()], ids=repr)
+def test_p_is_uniform_for_estimators_with_a_prior(estimator):
+    """The prior is as good as the readings here: m - n degrees are 3 too few of 40."""
+    p = p_values(Polynomial(strength=0.001), Gaussian(1.0), 0.2, estimator)
+    assert kstest(p, "uniform").pvalue > 0.01
+    assert kstest(chi2.sf(chi2.isf(p, 40 - 4), 40), "uniform").pvalue < 1e-3
+
+
+def test_p_is_uniform_for_the_frozen_root_where_its_projection_is_oblique():
+    p = p_values(Polynomial(strength=0.15), Gaussian(0.02), 2.0, Newton())
+    known = np.isfinite(p)
+    assert known.mean() > 0.9
+    _, columns = Block.draw(Scenario(Polynomial(strength=0.15), Gaussian(0.02), error_scale=2.0), 0, 2000).estimate(
+        Newton()
+    )
+    assert kstest(p[columns["solved"]], "uniform").pvalue > 0.01
+
+
+@pytest.mark.slow
+def test_the_table_of_uniformity():
+    """Kolmogorov and Smirnov's p of 2000 trials, and shares below 5 % and 0.1 %."""
+    cases = [(Polynomial(strength=0.01), noise, scale) for noise in NOISES for scale in (0.1, 1.0)]
+    cases += [(Gins(), Quantization(0.02286), 33.0), (Gins(), Gaussian(0.0066), 0.1), (Gins(), Gaussian(0.0066), 100.0)]
+    worst = 1.0
+    print("\nuniformity of the p of the test of fit")
+    for model, noise, scale in cases:
+        for estimator in (GaussNewton(), Newton(), MapLM()):
+            p = p_values(model, noise, scale, estimator)
+            ks = kstest(p, "uniform").pvalue
+            worst = min(worst, ks)
+            names = f"{type(model).__name__:>10} {type(noise).__name__:>12} {scale:>5g} {type(estimator).__name__:>11}"
+            print(f"{names} {ks:8.3f} {(p < 0.05).mean():8.4f} {(p < 0.001).mean():8.4f}")
+    # The smallest of some fifty, many of them of the same draws.
+    assert worst > 0.002
+
+
+def test_least_squares_and_normal_noise_is_chi_square():
+    H = np.random.default_rng(0).normal(size=(12, 3))
+    squares = np.array([0.0, 3.0, 9.0, 40.0, np.inf, np.nan])
+    p = fit_probability(squares, least_squares_spread(12, 3, 6), Gaussian(1.0), H, Covariance(np.ones(12)))
+    np.testing.assert_allclose(p[:5], chi2.sf(squares[:5], 9), rtol=1e-12)
+    assert np.isnan(p[5])
+
+
+def test_a_simulated_law_has_a_floor_and_ends_at_nothing():
+    H = np.random.default_rng(0).normal(size=(12, 3))
+    squares = np.array([0.0, 1e9, np.inf, np.nan])
+    spread = least_squares_spread(12, 3, 4)
+    p = fit_probability(squares, spread, Quantization(1.0), H, Covariance(np.ones(12)))
+    assert p[0] == 1.0
+    assert p[1] == 1 / (DRAWS + 1)
+    assert p[2] == 0.0
+    assert np.isnan(p[3])
+
+
+def test_nothing_to_spare_is_nothing_to_test():
+    H = np.eye(3)
+    p = fit_probability(np.zeros(2), least_squares_spread(3, 3, 2), Gaussian(1.0), H, Covariance(np.ones(3)))
+    assert np.isnan(p).all()
+
+
+def test_no_noise_fits_perfectly():
+    assert (p_values(Polynomial(), NoNoise(0.1), 1.0, GaussNewton(), 20) > 0.999).all()
+
+
+def test_spreads_are_the_eigenvalues_of_the_residuals_covariance():
+    rng = np.random.default_rng(1)
+    m, n = 15, 4
+    H, J = rng.normal(size=(m, n)), rng.normal(size=(3, m, n))
+    R = Covariance(np.linalg.cholesky(np.cov(rng.normal(size=(m, 60)))))
+    d = rng.uniform(0.1, 2.0, n)
+    frozen, prior = frozen_spread(J, H, R), prior_spread(J, R, d, 1.7)
+    Hw = R.whiten_jacobian(H)
+    for i, slope in enumerate(J):
+        Jw = R.whiten_jacobian(slope)
+        plus = np.linalg.pinv(Hw)
+        B = Jw @ np.linalg.solve(plus @ Jw, plus)
+        A = (np.eye(m) - B).T @ (np.eye(m) - B)
+        np.testing.assert_allclose([frozen.mean[i], frozen.squares[i]], [np.trace(A), np.trace(A @ A)], rtol=1e-8)
+        S = np.linalg.inv(Jw.T @ Jw + np.diag((1.7 * d) ** -2))
+        left = np.eye(m) - Jw @ S @ Jw.T
+        C = left @ (Jw @ np.diag(d**2) @ Jw.T + np.eye(m)) @ left.T
+        np.testing.assert_allclose([prior.mean[i], prior.squares[i]], [np.trace(C), np.trace(C @ C)], rtol=1e-8)
