@@ -11,7 +11,7 @@ import subprocess
 import tempfile
 import uuid
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,7 @@ from ipe_bench.runs.provenance import describe, fingerprint
 from ipe_bench.runs.results import Results, require_results
 from ipe_bench.runs.schedule import RunLog, Watcher, perform, plan, work_through
 from ipe_bench.runs.store import TRUTH, Cell, Store
+from ipe_bench.trials.bounds import linear_bound
 from ipe_bench.trials.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -42,6 +43,10 @@ if TYPE_CHECKING:
 
 BLOCK_SIZE = 250
 Directories = Path | str | Sequence[Path | str]
+MOST_BLOCKS = 1_000_000
+_FEW = 4
+LARGEST = 1e100
+"""Beyond it, or below its inverse, squares and products of squares are no numbers any more."""
 
 
 def run(
@@ -312,6 +317,8 @@ def validate(
         mistakes.append(f"trials={trials}: give a whole number above 0")
     if block_size < 1:
         mistakes.append(f"block_size={block_size}: give a whole number above 0")
+    elif trials > MOST_BLOCKS * block_size:
+        mistakes.append(f"trials={trials}: are more than {MOST_BLOCKS} blocks of block_size={block_size}")
     if not scenarios:
         mistakes.append("there is no scenario; give at least one")
     if TRUTH in estimators:
@@ -321,6 +328,7 @@ def validate(
     for scenario in scenarios:
         if scenario.noise.real and trials != 1:
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
+        mistakes += _beyond_numbers(scenario)
         mistakes += _needs(scenario.problem, estimators)
     if mistakes:
         raise UserError("; ".join(dict.fromkeys(mistakes)))
@@ -333,6 +341,26 @@ def _needs(problem: Problem, estimators: Mapping[str, Estimator]) -> list[str]:
         for label, estimator in estimators.items()
         for need in estimator.missing(problem)
     ]
+
+
+def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
+    """Scales at which every statistic would be infinite or 0, as no number holds their squares."""
+    if scenario.error_scale > LARGEST:
+        yield f"error_scale={scenario.error_scale:g}: its square overflows; give a number up to {LARGEST:g}"
+        return
+    model = scenario.measurement
+    with np.errstate(all="ignore"):
+        bound = linear_bound(scenario.problem)
+        few = scenario.draw(0, 1 if scenario.noise.real else _FEW)
+    if not scenario.noise.real and not np.isfinite(few.z).all(axis=1).any():
+        yield f"measurement={model.name}: none of the first {_FEW} trials has finite readings; choose smaller scales"
+    for parameter, deviation in zip(model.parameters, bound, strict=True):
+        if not 1 / LARGEST <= deviation <= LARGEST and deviation != 0:
+            yield (
+                f"noise={scenario.noise.name}: {parameter.name} has a linear bound of {deviation:g} of its size, "
+                "whose square is beyond numbers; choose another scale of the noise"
+            )
+            return
 
 
 def _cells(scenario: Scenario, estimators: Mapping[str, Estimator]) -> list[Cell]:

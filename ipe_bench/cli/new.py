@@ -11,6 +11,7 @@ from string import Template
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.plugins import discovery as plugins
 
+LONGEST = 60
 KINDS = ("solver", "baseline", "measurement", "noise")
 
 
@@ -20,6 +21,8 @@ def main(kind: str, name: str) -> int:
         raise UserError(f"{kind}: {unknown(kind, KINDS, 'kind')}")
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise UserError(f"{name}: give a name of small letters, digits and underscores that starts with a letter")
+    if len(name) > LONGEST:
+        raise UserError(f"{name[:20]}...: give a name of at most {LONGEST} letters")
     if keyword.iskeyword(name):
         raise UserError(f"{name}: is a word of Python; choose another name")
     rivals = plugins.ESTIMATOR_GROUPS if kind in plugins.ESTIMATOR_GROUPS else (kind,)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import sys
 from collections.abc import Sequence
@@ -11,23 +10,24 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import MissingConfigException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from ipe_bench.api import compute
 from ipe_bench.basics.errors import StorageError, UserError
-from ipe_bench.cli.config import CONFIG_ERRORS, Job, assemble, explain, prepare, refuse_silent_traps, rewrite
+from ipe_bench.cli import interrupts
+from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, assemble, explain, prepare, rewrite
+from ipe_bench.cli.overrides import known_options, read
+from ipe_bench.cli.parser import INFO_TOPICS, parsers
 from ipe_bench.cli.progress import shown_progress
 from ipe_bench.cli.report import show
 from ipe_bench.measurements import Nist
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.runs.execution import Serial
 
-_FLAGS_WITH_VALUE = {"--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--config-path", "-cp"}
-_FLAGS_WITH_VALUE |= {"--config-dir", "-cd", "--experimental-rerun"}
 _OWN_LAUNCHER = ".BasicLauncher"
-_INFO_TOPICS = {"all", "config", "defaults", "defaults-tree", "plugins", "searchpath"}
 
 
 class Outcome:
@@ -42,6 +42,7 @@ class Outcome:
         self.outputs: dict[Path, None] = {}
         self.failures: list[str] = []
         self.mistakes: dict[str, None] = {}
+        self.bug: Exception | None = None
         self.storage: StorageError | None = None
         """Nothing can be stored any more: the remaining jobs are not begun."""
 
@@ -70,19 +71,35 @@ def main(arguments: Sequence[str]) -> int:
     """Runs Hydra on the arguments; then aggregates and shows the folders that were filled."""
     global _outcome
     _outcome = Outcome()
-    flags, overrides = hoist(arguments)
-    refuse_silent_traps(overrides)
+    if any(word in ("-h", "--help") for word in arguments):
+        flags, words = ["--help"], []
+    else:
+        flags, words = _flags_and_words(arguments)
     prepare()
-    _complete_without_subcommand()
+    if "--shell-completion" in flags:
+        _check_completion(words)
+    elif words:
+        folders = [Path(flags[i + 1]) for i, flag in enumerate(flags) if flag == "--config-dir"]
+        words = rewrite(words)
+        read(words, KEYS, folders)
+        if not {"--multirun", "--run", "--cfg", "--info"}.intersection(flags) and sweeps_by_itself(words, folders):
+            flags.append("--multirun")
     # Hydra would print config errors itself, badly, and exit with 1.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    sys.argv = ["ipe-bench", *flags, *rewrite(overrides)]
+    sys.argv = ["ipe-bench", *flags, *words]
     try:
         hydra.main(version_base="1.3", config_path=str(plugins.own_conf()), config_name="config")(task)()
-    except CONFIG_ERRORS as error:
-        raise explain(error) from error
+    except (UserError, StorageError):
+        raise
     except OSError as error:  # Hydra writes its own files before our task is called
-        raise _explain_os_error(error) from error
+        if isinstance(error, MissingConfigException):
+            raise explain(error) from error
+        raise
+    except Exception as error:
+        # What Hydra makes of overrides raises nearly anything; what our own task raises is a bug.
+        if _outcome.bug is not None or plugins.blame(error):
+            raise
+        raise explain(error) from error
     if _outcome.storage is not None:
         raise _outcome.storage
     if not _outcome.started:
@@ -100,15 +117,54 @@ def main(arguments: Sequence[str]) -> int:
     return code
 
 
+def _flags_and_words(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Flags and overrides apart: Hydra's parser wants all flags before or after all overrides."""
+    waiting = list(arguments)
+    for i, word in enumerate(waiting):
+        # Hydra takes the topic as optional: what follows may be an override as well.
+        if word in ("-i", "--info") and (i + 1 == len(waiting) or waiting[i + 1] not in INFO_TOPICS):
+            waiting[i] = "--info=all"
+    values = vars(parsers()[1]["run"].parse(waiting))
+    words = values.pop("overrides")
+    flags: list[str] = []
+    for name, value in values.items():
+        if value:
+            flags += [f"--{name.replace('_', '-')}", *([] if value is True else [value])]
+    commands = [f for f in flags if f in ("--run", "--multirun", "--cfg", "--info", "--shell-completion", "--dry-run")]
+    if len(commands) > 1:
+        raise UserError(f"run: {' '.join(commands)}: do not go together; choose one")
+    if "--resolve" in flags and "--cfg" not in flags:
+        raise UserError("run: --resolve: goes with --cfg, such as --cfg job --resolve")
+    for name in ("config_dir", "config_path"):
+        if values[name] is not None and not Path(values[name]).is_dir():
+            raise UserError(f"run: --{name.replace('_', '-')}={values[name]}: there is no such folder")
+    if values["experimental_rerun"] is not None and not Path(values["experimental_rerun"]).is_file():
+        raise UserError(f"run: --experimental-rerun={values['experimental_rerun']}: there is no such file")
+    return flags, words
+
+
+def sweeps_by_itself(words: Sequence[str], folders: Sequence[Path]) -> bool:
+    """Whether the experiment that is asked for sweeps: then nobody has to say -m as well."""
+    for word in words:
+        group, _, name = word.lstrip("+").partition("=")
+        path = known_options("experiment", folders).get(name) if group == "experiment" else None
+        if path is not None:
+            config = OmegaConf.load(path)
+            return bool(OmegaConf.select(config, "hydra.sweeper.params")) and not OmegaConf.select(config, "hydra.mode")
+    return False
+
+
 def task(config: DictConfig) -> None:
     """One job: a scenario under its estimators. A mistake in one job of a sweep does not stop the others."""
     if _outcome.storage is not None:
         return
     try:
         job = assemble(config)
+        _refuse_keys_without_use(config)
         if config.write_readings is not None:
             write_trial(job, Path(config.write_readings), config.write_readings_trial)
             return
+        interrupts.begin_work()
         with shown_progress(_title(job)) as watch:
             failures = compute(
                 [job.scenario],
@@ -119,36 +175,34 @@ def task(config: DictConfig) -> None:
                 block_size=job.block_size,
                 watch=watch,
             )
-    except CONFIG_ERRORS as error:
+    except (UserError, StorageError, *CONFIG_ERRORS) as error:
         if _launched_elsewhere():
-            raise explain(error) from None
-        _outcome.mistakes[str(explain(error))] = None
-    except UserError as error:
-        if _launched_elsewhere():
-            raise
-        _outcome.mistakes[str(error)] = None
-    except StorageError as error:
-        if _launched_elsewhere():
-            raise
-        _outcome.storage = error
+            raise explain(error) if isinstance(error, CONFIG_ERRORS) else error from None
+        if isinstance(error, StorageError):
+            _outcome.storage = error
+        else:
+            _outcome.mistakes[str(explain(error) if isinstance(error, CONFIG_ERRORS) else error)] = None
+    except Exception as error:
+        _outcome.bug = error
+        raise
     else:
         _outcome.failures += failures
         _outcome.outputs[Path(job.output)] = None
+
+
+def _refuse_keys_without_use(config: DictConfig) -> None:
+    if config.readings is not None:
+        raise UserError(
+            f"readings={config.readings}: run simulates its readings; `ipe-bench estimate` estimates from a file"
+        )
+    if config.write_readings is None and config.write_readings_trial:
+        raise UserError(f"write_readings_trial={config.write_readings_trial}: goes with write_readings=FILE")
 
 
 def _launched_elsewhere() -> bool:
     """Whether a launcher plugin of Hydra (joblib, submitit) runs the jobs: then the cores are its to share out."""
     launcher = HydraConfig.get().launcher
     return HydraConfig.get().mode == RunMode.MULTIRUN and not launcher["_target_"].endswith(_OWN_LAUNCHER)
-
-
-def _explain_os_error(error: OSError) -> Exception:
-    where, reason = error.filename or "output", error.strerror or str(error)
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return StorageError(f"{where}: {reason}; what was stored before is whole, and the same command goes on")
-    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST, errno.ENOENT):
-        return UserError(f"output: {where} cannot be written to ({reason}); choose another folder with output=")
-    return error
 
 
 def _title(job: Job) -> str:
@@ -180,23 +234,15 @@ def write_trial(job: Job, path: Path, trial: int) -> None:
     print(f"Readings of trial {trial}: {path}\nTrue parameters:     {truth}")
 
 
-def hoist(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Flags and overrides apart: Hydra's parser wants all flags before or after all overrides."""
-    flags: list[str] = []
-    overrides: list[str] = []
-    waiting = list(arguments)
-    while waiting:
-        argument = waiting.pop(0)
-        if not argument.startswith("-"):
-            overrides.append(argument)
-            continue
-        flags.append(argument)
-        takes_next = argument in _FLAGS_WITH_VALUE
-        takes_next |= argument in ("--info", "-i") and bool(waiting) and waiting[0] in _INFO_TOPICS
-        takes_next |= argument in ("-sc", "--shell-completion") and bool(waiting)
-        if takes_next and waiting:
-            flags.append(waiting.pop(0))
-    return flags, overrides
+def _check_completion(words: Sequence[str]) -> None:
+    """What `-sc` may be followed by, which Hydra looks up without checking."""
+    shells = ("bash", "fish", "zsh")
+    if not any(list(words) == [f"{what}={shell}"] for what in ("install", "uninstall", "query") for shell in shells):
+        shown = " ".join(words) or "nothing"
+        raise UserError(f"-sc {shown}: write -sc install=SHELL or -sc uninstall=SHELL, SHELL being {', '.join(shells)}")
+    if words[0].startswith("query") and "COMP_LINE" not in os.environ:
+        raise UserError(f"-sc {words[0]}: is what a shell asks while completing, with COMP_LINE set")
+    _complete_without_subcommand()
 
 
 def _complete_without_subcommand() -> None:
