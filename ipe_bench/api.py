@@ -261,14 +261,12 @@ def check(component: Any) -> list[Finding]:
     Raises:
         UserError: there is no plugin in the folder.
     """
-    from ipe_bench.plugins.conformance import check_component
-    from ipe_bench.plugins.discovery import components_in
+    from ipe_bench.plugins.conformance import check_component, check_option
+    from ipe_bench.plugins.discovery import options_in
 
     if isinstance(component, Path | str):
-        parts = components_in(Path(component))
-    else:
-        parts = [(getattr(component, "name", type(component).__name__), component)]
-    return [finding for name, part in parts for finding in check_component(name, part)]
+        return [finding for option in options_in(Path(component)) for finding in check_option(option)]
+    return list(check_component(getattr(component, "name", type(component).__name__), component))
 
 
 def _paths(directories: Directories) -> list[Path]:

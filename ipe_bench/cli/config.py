@@ -213,6 +213,8 @@ def explain(error: BaseException) -> UserError:
     """An error of Hydra, OmegaConf or YAML while composing, as one line with the remedy."""
     import yaml
 
+    if isinstance(error, UserError):
+        return error
     if isinstance(error, yaml.YAMLError):
         return UserError(plugins.explain_yaml(error))
     if isinstance(error, UnicodeDecodeError):
@@ -278,5 +280,5 @@ _EXPLAINED: tuple[tuple[str, Callable[..., str]], ...] = (
         r"Primary config[^']*'([^']+)'|Cannot find primary config '([^']+)'",
         lambda *n: f"there is no config {n[0] or n[1]}",
     ),
-    (r"Missing mandatory value: (\S+)", lambda key: f"{key}: is not given; give it a value"),
+    (r"Missing mandatory value: \S+[\s\S]*full_key: (\S+)", lambda key: f"{key}: is not given; give it a value"),
 )
