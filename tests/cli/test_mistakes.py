@@ -1,4 +1,4 @@
-"""Hundreds of wrong command lines and broken plugins: each is answered in one line, and none is taken without a word."""
+"""Hundreds of wrong command lines and broken plugins: each answered in one line, and none taken without a word."""
 
 from __future__ import annotations
 
@@ -61,27 +61,37 @@ CHOICES = (
     "a/b",
     "*",
 )
+# fmt: off
 FLAGS = {
-    "run": ("--trials=5", "-x", "--verbose", "-make", "--cfg", "--cfg nope", "-i nope", "--resolve", "-m --cfg job")
-    + (
-        "--config-dir=/nope",
-        "-cd /nope",
-        "-cp /nope",
-        "-cn nope",
-        "--experimental-rerun nope",
-        "-sc",
-        "-sc install=nope",
-    )
-    + ("-sc install=bash uninstall=bash", "-sc query=bash", "--dry", "-r -m", "--multirun=5", "-c job -p"),
-    "estimate": ("-m", "--cfg job", "-x", "--dry-run", "trials=5", "seed=1", "block_size=5", "execution=serial")
-    + ("truth_measurement=gins", "write_readings=x.csv", "readings=absent.csv", f"readings={LONG}", "readings=/", ""),
-    "report": ("", "-x", "nowhere", ".", LONG, "--output=x", "loop"),
-    "status": ("", "-x", "nowhere", ".", LONG, "loop", "-v"),
-    "list": ("-x", "solvers", "solver nothing", "--verbos", "-v=3", "solver/newton/x", "../conf"),
-    "new": ("", "solver", "solver a b", "nothing x", "solver Abc", "solver 1a", "solver ../x", f"solver {LONG}")
-    + ("solver class", "solver newton", "noise gaussian", "solver -x", "solver ü", "solver a/b", "solver a-b"),
-    "check": ("", "nowhere", ".", "-x", "loop", LONG),
+    "run": (
+        "--trials=5", "-x", "--verbose", "-make", "--cfg", "--cfg nope", "-i nope", "--resolve", "-m --cfg job",
+        "--config-dir=/nope", "-cd /nope", "-cp /nope", "-cn nope", "--experimental-rerun nope", "-sc",
+        "-sc install=nope", "-sc install=bash uninstall=bash", "-sc query=bash", "--dry", "-r -m", "--multirun=5",
+        "-c job -p",
+    ),
+    "estimate": (
+        "-m", "--cfg job", "-x", "--dry-run", "trials=5", "seed=1", "block_size=5", "execution=serial",
+        "truth_measurement=gins", "write_readings=x.csv", "readings=absent.csv", f"readings={LONG}", "readings=/",
+        "",
+    ),
+    "report": (
+        "", "-x", "nowhere", ".", LONG, "--output=x", "loop",
+    ),
+    "status": (
+        "", "-x", "nowhere", ".", LONG, "loop", "-v",
+    ),
+    "list": (
+        "-x", "solvers", "solver nothing", "--verbos", "-v=3", "solver/newton/x", "../conf",
+    ),
+    "new": (
+        "", "solver", "solver a b", "nothing x", "solver Abc", "solver 1a", "solver ../x", f"solver {LONG}",
+        "solver class", "solver newton", "noise gaussian", "solver -x", "solver ü", "solver a/b", "solver a-b",
+    ),
+    "check": (
+        "", "nowhere", ".", "-x", "loop", LONG,
+    ),
 }
+# fmt: on
 SYNTAX = (
     "trials",
     "+",
@@ -203,6 +213,7 @@ def answer(monkeypatch, capsys, tmp_path):
         monkeypatch.setenv(variable, "1" if variable != "PYTHONPATH" else "")
     monkeypatch.delenv("COMP_LINE", raising=False)
     monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(plugins, "_added", {})
     monkeypatch.chdir(tmp_path)
     (tmp_path / "loop").symlink_to("loop")
 
@@ -211,7 +222,9 @@ def answer(monkeypatch, capsys, tmp_path):
         plugins.sources.cache_clear()
         capsys.readouterr()
         code = main(list(words))
-        return code, [line for line in capsys.readouterr().err.splitlines() if line.strip()]
+        written = capsys.readouterr()
+        print(written.out)  # shown where a test fails
+        return code, [line for line in written.err.splitlines() if line.strip()]
 
     return run
 
