@@ -294,7 +294,7 @@ def compute(
     store = Store(Path(output).absolute())
     store.prepare()
     execution = execution or Serial()
-    cells = [_cells(scenario, estimators) for scenario in scenarios]
+    cells = [cells_of(scenario, estimators) for scenario in scenarios]
     results = Results.read([store.directory], keys={cell.key for part in cells for cell in part})
     aside = results.set_aside()
     tasks = [task for part in cells for task in plan(store.directory, part, results, trials, block_size)]
@@ -361,14 +361,15 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
             return
 
 
-def _cells(scenario: Scenario, estimators: Mapping[str, Estimator]) -> list[Cell]:
+def cells_of(scenario: Scenario, estimators: Mapping[str, Estimator]) -> list[Cell]:
+    """What a run stores of one scenario: its truth, and each estimator."""
     return [Cell(scenario), *(Cell(scenario, label, estimator) for label, estimator in estimators.items())]
 
 
 def _write_record(store: Store, scenarios: Sequence[Scenario], estimators: Mapping[str, Estimator], trials: int) -> str:
     """States what is going to be computed, so that what is missing later is known to be missing; returns its name."""
     now = datetime.datetime.now(datetime.UTC)
-    cells = [cell for scenario in scenarios for cell in _cells(scenario, estimators)]
+    cells = [cell for scenario in scenarios for cell in cells_of(scenario, estimators)]
     record: dict[str, Any] = {
         "started": now.isoformat(timespec="microseconds"),
         "trials": trials,

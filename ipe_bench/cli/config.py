@@ -37,7 +37,7 @@ CONFIG_ERRORS = (HydraException, OmegaConfBaseException)
 class Schema:
     """The keys of a run besides the groups, with their types."""
 
-    default_name: str = "run"
+    default_name: str = "gins"
     """What the command was, in short: names the output folder where nothing else does."""
     name: str = "${default_name}"
     """Names the output folder."""

@@ -6,7 +6,9 @@ the word and the remedy. What an experiment file asks for is checked where the c
 
 from __future__ import annotations
 
+import hashlib
 import math
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -131,10 +133,10 @@ def _check(word: _Word) -> None:
 
 
 def _check_deletion(word: _Word) -> None:
-    if word.group in plugins.ESTIMATOR_GROUPS and word.package is None:
-        return
+    if word.group in plugins.ESTIMATOR_GROUPS:
+        raise word.error(f"cannot be left out; {word.group}=[] chooses none")
     if not word.group.startswith("estimators."):
-        raise word.error("only solver, baseline and estimators.LABEL can be left out; give the key another value")
+        raise word.error("only estimators.LABEL can be left out; give the key another value")
 
 
 def _check_key(word: _Word) -> None:
@@ -222,3 +224,37 @@ def _check_labels(words: Sequence[str], overrides: Sequence[Override]) -> None:
             if label in taken and (package or taken[label] != word):
                 raise UserError(f"{word}: {label} is the label of {taken[label]} already; choose another label")
             taken[label] = word
+
+
+_NO_PART_OF_A_NAME = ("name", "output", "trials", "block_size", "seed", "execution", "experiment", "hydra", "readings")
+_NO_PART_OF_A_NAME += ("write_readings", "write_readings_trial", "default_name")
+_LONGEST_NAME = 80
+
+
+def default_name(overrides: Sequence[Override]) -> str:
+    """What a command asks for, in a name for its folder: ranging-gaussian-deviation=0.1.
+
+    The same for the same settings in any order. What changes no setting, or adds trials to it, is no part of it.
+    """
+    parts: dict[str, str] = {"measurement": "gins"}
+    experiment = ""
+    for override in overrides:
+        key, value = (override.input_line or "").partition("=")[::2]
+        key = key.lstrip("+~").replace("measurement@truth_measurement", "truth").partition("@estimators.")
+        key = key[2] or key[0]
+        text = re.sub(r"[\[\]'\" ]", "", value.replace("],[", ";").replace(",", "+") if "[" in value else value)
+        if override.key_or_group == "experiment":
+            experiment = text
+        elif override.key_or_group.partition(".")[0].partition("/")[0] not in _NO_PART_OF_A_NAME:
+            parts[key] = f"no_{key}" if override.type is OverrideType.DEL or text == "" else text
+    if experiment and parts["measurement"] == "gins":
+        parts["measurement"] = experiment
+    order = ["measurement", "measurement.dataset", "truth", "noise", *plugins.ESTIMATOR_GROUPS]
+    keys = sorted(parts, key=lambda k: (order.index(k) if k in order else len(order), k))
+    bare = ("measurement", "measurement.dataset", "noise", *plugins.ESTIMATOR_GROUPS)
+    full = "-".join(parts[k] if k in bare else f"{k.removeprefix('estimators.')}={parts[k]}" for k in keys)
+    full = full.replace("/", "-")
+    short = re.sub(r"[^\w.,=+-]", "_", full, flags=re.ASCII)
+    if short == full and len(full) <= _LONGEST_NAME:
+        return full
+    return f"{short[: _LONGEST_NAME - 10]}-{hashlib.sha256(full.encode()).hexdigest()[:8]}"

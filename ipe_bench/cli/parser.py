@@ -42,7 +42,7 @@ _REPORT = """
 Nothing is computed again.
 
   ipe-bench report DIR                            into DIR itself
-  ipe-bench report DIR1 DIR2 output=DIR           several folders together, into DIR
+  ipe-bench report DIR1 DIR2 output=DIR           several folders together, into another
 """
 
 
@@ -115,6 +115,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         "status", "what is done, missing, failed and stale in folders of results", "0 complete; 1 not complete"
     )
     status.add_argument("arguments", metavar="DIR", nargs="*", help="folders of results, such as outputs/paper")
+    status.add_argument("-v", "--verbose", action="store_true", help="with what is complete, too")
     options = add("list", "what there is to choose from, and where it comes from")
     options.add_argument("groups", metavar="GROUP", nargs="*", help="solver, baseline, measurement, ... or all")
     options.add_argument(
@@ -123,7 +124,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         help="with each measurement's parameters and the columns of its readings file",
     )
     new = add("new", "a working plugin to start from, in plugins/NAME")
-    new.add_argument("kind", metavar="KIND", help="solver, baseline, measurement or noise")
+    new.add_argument("kind", metavar="KIND", help="solver, baseline, measurement, noise or experiment")
     new.add_argument("name", metavar="NAME", help="small letters, digits and underscores")
     check = add(
         "check",

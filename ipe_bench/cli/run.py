@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,17 +18,20 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from ipe_bench.api import compute
-from ipe_bench.basics.errors import StorageError, UserError
+from ipe_bench.api import cells_of, compute
+from ipe_bench.basics.errors import StorageError, UserError, shortened
 from ipe_bench.cli import interrupts
 from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, assemble, explain, prepare, rewrite
-from ipe_bench.cli.overrides import known_options, read
+from ipe_bench.cli.dry_run import DryRun
+from ipe_bench.cli.overrides import default_name, known_options, read
 from ipe_bench.cli.parser import INFO_TOPICS, parsers
 from ipe_bench.cli.progress import shown_progress
-from ipe_bench.cli.report import show
+from ipe_bench.cli.report import main as report
+from ipe_bench.cli.report import show_command
 from ipe_bench.measurements import Nist
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.runs.execution import Serial
+from ipe_bench.runs.store import describe_names
 
 _OWN_LAUNCHER = ".BasicLauncher"
 
@@ -39,8 +45,11 @@ class Outcome:
         self.elsewhere = False
         """Jobs run in other processes, from which nothing but an exception or a file comes back."""
         self.jobs = 0
-        self.outputs: dict[Path, None] = {}
+        self.outputs: dict[Path, dict[str, str]] = {}
+        """The folders that were filled, and by key a line for each cell that was asked for."""
         self.failures: list[str] = []
+        self.dry: DryRun | None = None
+        """What would be done, where nothing is to be."""
         self.mistakes: dict[str, None] = {}
         self.bug: Exception | None = None
         self.storage: StorageError | None = None
@@ -61,7 +70,7 @@ class Watch(Callback):
         _outcome.elsewhere = not config.hydra.launcher["_target_"].endswith(_OWN_LAUNCHER)
         output = OmegaConf.select(config, "output")
         if output is not None:
-            _outcome.outputs[Path(output)] = None
+            _outcome.outputs[Path(output)] = {}
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         _outcome.jobs += 1
@@ -81,9 +90,22 @@ def main(arguments: Sequence[str]) -> int:
     elif words:
         folders = [Path(flags[i + 1]) for i, flag in enumerate(flags) if flag == "--config-dir"]
         words = rewrite(words)
-        read(words, KEYS, folders)
+        name = default_name(read(words, KEYS, folders))
         if not {"--multirun", "--run", "--cfg", "--info"}.intersection(flags) and sweeps_by_itself(words, folders):
             flags.append("--multirun")
+        words = [*words, f"default_name='{name}'"]
+    with contextlib.ExitStack() as stack:
+        if "--dry-run" in flags:
+            _outcome.dry = DryRun()
+            flags.remove("--dry-run")
+            # Hydra would begin a folder of results for its own log.
+            log = stack.enter_context(tempfile.TemporaryDirectory(prefix="ipe-bench-"))
+            words += [f"hydra.run.dir='{log}'", f"hydra.sweep.dir='{log}'"]
+        _run_hydra(flags, words)
+    return _conclude()
+
+
+def _run_hydra(flags: Sequence[str], words: Sequence[str]) -> None:
     # Hydra would print config errors itself, badly, and exit with 1.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     sys.argv = ["ipe-bench", *flags, *words]
@@ -94,24 +116,35 @@ def main(arguments: Sequence[str]) -> int:
     except OSError as error:  # Hydra writes its own files before our task is called
         if isinstance(error, MissingConfigException):
             raise explain(error) from error
-        raise
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        where, reason = shortened(str(error.filename or "output")), error.strerror or str(error)
+        raise UserError(
+            f"output: {where} cannot be written to ({reason}); choose another folder with output="
+        ) from error
     except Exception as error:
         # What Hydra makes of overrides raises nearly anything; what our own task raises is a bug.
         if _outcome.bug is not None or plugins.blame(error):
             raise
         raise explain(error) from error
+
+
+def _conclude() -> int:
+    """Shows what the jobs came to; the exit code."""
     if _outcome.storage is not None:
         raise _outcome.storage
     if not _outcome.started:
         return 0
     if _outcome.multirun and not _outcome.elsewhere and not _outcome.jobs and not _outcome.mistakes:
         raise UserError("the sweep has no jobs: check the patterns in its lists")
-    for failure in _outcome.failures:
-        print(f"ipe-bench: failed: {failure}", file=sys.stderr)
     code = 1 if _outcome.failures else 0
-    for output in _outcome.outputs:
+    if _outcome.dry is not None and not _outcome.mistakes:
+        print(_outcome.dry.summary())
+        return code
+    for output, cells in _outcome.outputs.items():
         if (output / "trials").is_dir():
-            code = max(code, show([output], output))
+            # Of jobs in other processes nothing is known but the folder.
+            code = max(code, show_command(output, cells) if cells else report([str(output)]))
     if _outcome.mistakes:
         raise UserError("; ".join(_outcome.mistakes))
     return code
@@ -130,7 +163,7 @@ def _flags_and_words(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     for name, value in values.items():
         if value:
             flags += [f"--{name.replace('_', '-')}", *([] if value is True else [value])]
-    commands = [f for f in flags if f in ("--run", "--multirun", "--cfg", "--info", "--shell-completion", "--dry-run")]
+    commands = [f for f in flags if f in ("--run", "--multirun", "--cfg", "--info", "--shell-completion")]
     if len(commands) > 1:
         raise UserError(f"run: {' '.join(commands)}: do not go together; choose one")
     if "--resolve" in flags and "--cfg" not in flags:
@@ -164,6 +197,9 @@ def task(config: DictConfig) -> None:
         if config.write_readings is not None:
             write_trial(job, Path(config.write_readings), config.write_readings_trial)
             return
+        if _outcome.dry is not None:
+            print(_outcome.dry.add(job, _title(job)))
+            return
         interrupts.begin_work()
         with shown_progress(_title(job)) as watch:
             failures = compute(
@@ -187,7 +223,8 @@ def task(config: DictConfig) -> None:
         raise
     else:
         _outcome.failures += failures
-        _outcome.outputs[Path(job.output)] = None
+        own = _outcome.outputs.setdefault(Path(job.output), {})
+        own.update((cell.key, describe_names(cell.names)) for cell in cells_of(job.scenario, job.estimators))
 
 
 def _refuse_keys_without_use(config: DictConfig) -> None:
@@ -205,15 +242,24 @@ def _launched_elsewhere() -> bool:
     return HydraConfig.get().mode == RunMode.MULTIRUN and not launcher["_target_"].endswith(_OWN_LAUNCHER)
 
 
+_IN_EVERY_TITLE = {"measurement", "measurement.dataset", "truth_measurement", "noise", "error_scale", "seed"}
+_NOT_IN_TITLES = {"trials", "block_size", "output", "name", "default_name", "experiment", "solver", "baseline"}
+
+
 def _title(job: Job) -> str:
-    """What a job is about, for its progress bar: the option that was chosen, and what is drawn."""
-    scenario = job.scenario
-    chosen = HydraConfig.get().runtime.choices.get("measurement", scenario.measurement.name)
-    if isinstance(scenario.measurement, Nist):
-        chosen = f"{chosen} {scenario.measurement.dataset}"
-    if scenario.noise.real:
-        return str(chosen)
-    return f"{chosen}, error scale {scenario.error_scale:g}, seed {scenario.seed}"
+    """What a job is about, for its progress bar: everything that may tell it from other jobs of a sweep."""
+    scenario, chosen = job.scenario, HydraConfig.get().runtime.choices
+    model = scenario.measurement
+    parts = [str(chosen.get("measurement", model.name)) + (f" {model.dataset}" if isinstance(model, Nist) else "")]
+    if scenario.truth is not None:
+        parts.append(f"truth {chosen.get('measurement@truth_measurement', scenario.truth.name)}")
+    if not scenario.noise.real:
+        parts += [scenario.noise.name, f"error scale {scenario.error_scale:g}", f"seed {scenario.seed}"]
+    for word in HydraConfig.get().overrides.task:
+        key = word.lstrip("+~").partition("=")[0].partition("@")[-1] or word.lstrip("+~").partition("=")[0]
+        if key not in _IN_EVERY_TITLE | _NOT_IN_TITLES and not key.startswith("execution"):
+            parts.append(word.lstrip("+"))
+    return ", ".join(parts)
 
 
 def write_trial(job: Job, path: Path, trial: int) -> None:

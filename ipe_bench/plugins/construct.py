@@ -84,6 +84,8 @@ def _instantiate(cls: type, options: dict[str, Any], where: str) -> Any:
     except KeyboardInterrupt:
         raise
     except BaseException as error:
+        if isinstance(error, ValueError) and _is_ours(cls.__module__):
+            raise UserError(f"{where}: {' '.join(str(error).split())}") from error
         if _is_ours(cls.__module__):
             raise
         raise UserError(f"{where}: {cls.__name__} cannot be made: {_place(error)}") from None
