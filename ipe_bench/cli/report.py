@@ -71,7 +71,7 @@ def _show(summary: pd.DataFrame, certified: pd.DataFrame, output: Path, result: 
     from ipe_bench.report.terminal import render
 
     out = console()
-    out.print(render(summary, certified))
+    out.print(render(summary, certified, out.width))
     figures = f"\nFigures  {output / 'figures'}" if result.figures else ""
     out.print(f"\nSummary  {result.summary_path}\nTables   {output / 'tables'}{figures}", markup=False, soft_wrap=True)
     out.print(f"Report   {result.report}", markup=False, soft_wrap=True)
