@@ -11,7 +11,7 @@ import subprocess
 import tempfile
 import uuid
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +31,7 @@ from ipe_bench.runs.provenance import describe, fingerprint
 from ipe_bench.runs.results import Results, require_results
 from ipe_bench.runs.schedule import RunLog, Watcher, perform, plan, work_through
 from ipe_bench.runs.store import TRUTH, Cell, Store
+from ipe_bench.trials.bounds import linear_bound
 from ipe_bench.trials.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -42,6 +43,10 @@ if TYPE_CHECKING:
 
 BLOCK_SIZE = 250
 Directories = Path | str | Sequence[Path | str]
+MOST_BLOCKS = 1_000_000
+_FEW = 4
+LARGEST = 1e100
+"""Beyond it, or below its inverse, squares and products of squares are no numbers any more."""
 
 
 def run(
@@ -256,14 +261,12 @@ def check(component: Any) -> list[Finding]:
     Raises:
         UserError: there is no plugin in the folder.
     """
-    from ipe_bench.plugins.conformance import check_component
-    from ipe_bench.plugins.discovery import components_in
+    from ipe_bench.plugins.conformance import check_component, check_option
+    from ipe_bench.plugins.discovery import options_in
 
     if isinstance(component, Path | str):
-        parts = components_in(Path(component))
-    else:
-        parts = [(getattr(component, "name", type(component).__name__), component)]
-    return [finding for name, part in parts for finding in check_component(name, part)]
+        return [finding for option in options_in(Path(component)) for finding in check_option(option)]
+    return list(check_component(getattr(component, "name", type(component).__name__), component))
 
 
 def _paths(directories: Directories) -> list[Path]:
@@ -291,7 +294,7 @@ def compute(
     store = Store(Path(output).absolute())
     store.prepare()
     execution = execution or Serial()
-    cells = [_cells(scenario, estimators) for scenario in scenarios]
+    cells = [cells_of(scenario, estimators) for scenario in scenarios]
     results = Results.read([store.directory], keys={cell.key for part in cells for cell in part})
     aside = results.set_aside()
     tasks = [task for part in cells for task in plan(store.directory, part, results, trials, block_size)]
@@ -316,6 +319,8 @@ def validate(
         mistakes.append(f"trials={trials}: give a whole number above 0")
     if block_size < 1:
         mistakes.append(f"block_size={block_size}: give a whole number above 0")
+    elif trials > MOST_BLOCKS * block_size:
+        mistakes.append(f"trials={trials}: are more than {MOST_BLOCKS} blocks of block_size={block_size}")
     if not scenarios:
         mistakes.append("there is no scenario; give at least one")
     if TRUTH in estimators:
@@ -325,6 +330,7 @@ def validate(
     for scenario in scenarios:
         if scenario.noise.real and trials != 1:
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
+        mistakes += _beyond_numbers(scenario)
         mistakes += _needs(scenario.problem, estimators)
     if mistakes:
         raise UserError("; ".join(dict.fromkeys(mistakes)))
@@ -339,14 +345,35 @@ def _needs(problem: Problem, estimators: Mapping[str, Estimator]) -> list[str]:
     ]
 
 
-def _cells(scenario: Scenario, estimators: Mapping[str, Estimator]) -> list[Cell]:
+def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
+    """Scales at which every statistic would be infinite or 0, as no number holds their squares."""
+    if scenario.error_scale > LARGEST:
+        yield f"error_scale={scenario.error_scale:g}: its square overflows; give a number up to {LARGEST:g}"
+        return
+    model = scenario.measurement
+    with np.errstate(all="ignore"):
+        bound = linear_bound(scenario.problem)
+        few = scenario.draw(0, 1 if scenario.noise.real else _FEW)
+    if not scenario.noise.real and not np.isfinite(few.z).all(axis=1).any():
+        yield f"measurement={model.name}: none of the first {_FEW} trials has finite readings; choose smaller scales"
+    for parameter, deviation in zip(model.parameters, bound, strict=True):
+        if not 1 / LARGEST <= deviation <= LARGEST and deviation != 0:
+            yield (
+                f"noise={scenario.noise.name}: {parameter.name} has a linear bound of {deviation:g} of its size, "
+                "whose square is beyond numbers; choose another scale of the noise"
+            )
+            return
+
+
+def cells_of(scenario: Scenario, estimators: Mapping[str, Estimator]) -> list[Cell]:
+    """What a run stores of one scenario: its truth, and each estimator."""
     return [Cell(scenario), *(Cell(scenario, label, estimator) for label, estimator in estimators.items())]
 
 
 def _write_record(store: Store, scenarios: Sequence[Scenario], estimators: Mapping[str, Estimator], trials: int) -> str:
     """States what is going to be computed, so that what is missing later is known to be missing; returns its name."""
     now = datetime.datetime.now(datetime.UTC)
-    cells = [cell for scenario in scenarios for cell in _cells(scenario, estimators)]
+    cells = [cell for scenario in scenarios for cell in cells_of(scenario, estimators)]
     record: dict[str, Any] = {
         "started": now.isoformat(timespec="microseconds"),
         "trials": trials,

@@ -24,6 +24,11 @@ def describe_exception(error: BaseException) -> str:
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
+def shortened(text: str, length: int = 120) -> str:
+    """The text, or its beginning and its end where it is longer than a line."""
+    return text if len(text) <= length else f"{text[: length - 24]}...{text[-20:]}"
+
+
 def unknown(name: str, known: Iterable[str], noun: str) -> str:
     """'there is no such option; did you mean ...', with everything there is."""
     known = sorted(known)

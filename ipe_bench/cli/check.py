@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from ipe_bench.api import check
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console
+from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.conformance import Finding
-from ipe_bench.plugins.discovery import components_in
 
 
 def main(folders: Sequence[str]) -> int:
@@ -17,7 +18,9 @@ def main(folders: Sequence[str]) -> int:
     if not folders:
         raise UserError("check: name the folder of a plugin, such as plugins/my_plugin")
     for folder in folders:
-        components_in(Path(folder))  # a mistake in the second is said before the first is checked
+        plugins.options_in(Path(folder))  # a mistake in the second is said before the first is checked
+    for problem in plugins.take_problems():
+        print(f"ipe-bench: {problem}", file=sys.stderr)
     return 1 if sum(_check_plugin(folder) for folder in folders) else 0
 
 

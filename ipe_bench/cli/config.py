@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import fnmatch
 import re
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
+import cloudpickle
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
@@ -16,13 +19,15 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.errors import UserError, describe_exception, unknown
 from ipe_bench.estimators.base import Estimator
+from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.nist import datasets
+from ipe_bench.noise.base import Noise
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
 from ipe_bench.runs.execution import Execution
-from ipe_bench.runs.provenance import TARGET
+from ipe_bench.runs.provenance import TARGET, canonical_json, describe
 from ipe_bench.trials.scenario import Scenario
 
 CONFIG_ERRORS = (HydraException, OmegaConfBaseException)
@@ -32,7 +37,9 @@ CONFIG_ERRORS = (HydraException, OmegaConfBaseException)
 class Schema:
     """The keys of a run besides the groups, with their types."""
 
-    name: str = "run"
+    default_name: str = "gins"
+    """What the command was, in short: names the output folder where nothing else does."""
+    name: str = "${default_name}"
     """Names the output folder."""
     output: str = MISSING
     error_scale: float = 1.0
@@ -53,6 +60,9 @@ class Schema:
     prior: Any = MISSING
     execution: Any = MISSING
     estimators: dict[str, Any] = field(default_factory=dict)
+
+
+KEYS = tuple(Schema.__dataclass_fields__)
 
 
 @dataclass(frozen=True)
@@ -76,8 +86,9 @@ class PluginSearchPath(SearchPathPlugin):
 
 
 def prepare() -> None:
-    """Makes the schema and the plugins known to Hydra, and checks that every option can be chosen."""
-    plugins.options()
+    """Makes the schema and the plugins known to Hydra."""
+    for problem in plugins.take_problems():
+        print(f"ipe-bench: {problem}", file=sys.stderr)
     ConfigStore.instance().store("schema", node=Schema, provider="ipe-bench")
     registry = Plugins.instance()
     if PluginSearchPath not in registry.discover(SearchPathPlugin):
@@ -121,68 +132,153 @@ def assemble(config: DictConfig) -> Job:
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(plain, dict)
     for key in plain:
-        if key not in Schema.__dataclass_fields__:
-            raise UserError(f"{key}: {unknown(str(key), Schema.__dataclass_fields__, 'key')}")
-    parts = {key: construct(plain[key], key) for key in ("measurement", "noise", "prior", "execution")}
+        if key not in KEYS:
+            raise UserError(f"{key}: {unknown(str(key), KEYS, 'key')}")
+    for key in KEYS:
+        if key not in plain:
+            raise UserError(f"{key}: is left out; give it a value")
+    for key in ("name", "output"):
+        if not Path(plain[key]).name:
+            raise UserError(f"{key}={plain[key]}: name a folder")
     truth = plain["truth_measurement"]
     scenario = Scenario(
-        parts["measurement"],
-        parts["noise"],
-        parts["prior"],
+        _part(plain, "measurement", Measurement),
+        _part(plain, "noise", Noise),
+        _part(plain, "prior", Prior),
         plain["error_scale"],
         plain["seed"],
-        None if truth is None else construct(truth, "truth_measurement"),
+        None if truth is None else _part(plain, "truth_measurement", Measurement),
     )
+    execution = _part(plain, "execution", Execution)
     estimators: dict[str, Estimator] = {}
-    for label, options in plain["estimators"].items():
+    for label, options in (plain["estimators"] or {}).items():
         if not isinstance(options, Mapping):
             raise UserError(f"estimators.{label}={options}: set its options, such as estimators.{label}.KEY=VALUE")
         if TARGET not in options:
-            keys = ", ".join(f"estimators.{label}.{key}" for key in options)
+            keys = ", ".join(f"estimators.{label}.{key}" for key in options) or f"estimators.{label}"
             raise UserError(
                 f"{keys}: is set, but {label} is not chosen; add it to solver= or baseline=, or leave it out"
             )
-        estimators[str(label)] = construct(options, f"estimators.{label}")
-    return Job(scenario, estimators, parts["execution"], plain["trials"], plain["block_size"], plain["output"])
+        _refuse_false_name(str(label), options[TARGET])
+        estimators[str(label)] = _checked(construct(options, f"estimators.{label}"), f"estimators.{label}", Estimator)
+    return Job(scenario, estimators, execution, plain["trials"], plain["block_size"], plain["output"])
 
 
-def refuse_silent_traps(overrides: Sequence[str]) -> None:
-    """Refuses what Hydra would take without a word and not do: see each message."""
-    for override in overrides:
-        key, _, value = override.partition("=")
-        group = key.lstrip("+")
-        if group == "experiment" and "," in value:
-            raise UserError(f"{override}: a sweep over experiments would ignore their own sweeps; run them one by one")
-        if group in plugins.ESTIMATOR_GROUPS and value.startswith("["):
-            names = [name.strip() for name in value.strip("[]").split(",")]
-            for name in names:
-                if names.count(name) > 1:
-                    remedy = f"+{group}@estimators.{name}_2={name} runs it again under a label of its own"
-                    raise UserError(f"{override}: {name} stands there twice and would run once; {remedy}")
+@runtime_checkable
+class Prior(Protocol):
+    """What a scenario asks of a prior."""
+
+    def deviation(self, n: int, error_scale: float) -> Any: ...
+
+    def draw(self, nominal: Any, error_scale: float, rng: Any) -> Any: ...
 
 
-def explain(error: Exception) -> UserError:
-    """A config error of Hydra or OmegaConf as one line with the remedy."""
+Part = TypeVar("Part")
+
+
+def _part(plain: Mapping[Any, Any], key: str, kind: type) -> Any:
+    config = plain[key]
+    if not isinstance(config, Mapping) or TARGET not in config:
+        raise UserError(f"{key}={config}: is not a part that can be used; choose one, see `ipe-bench list`")
+    return _checked(construct(config, key), key, kind)
+
+
+def _checked(part: Any, key: str, kind: type[Part]) -> Part:
+    """The part, where it is of the kind that belongs there and can be stored and sent to other processes."""
+    if not isinstance(part, kind):
+        name = type(part).__name__
+        raise UserError(f"{key}: {name} is not a {kind.__name__.lower()}; choose one, see `ipe-bench list`")
+    try:
+        canonical_json(describe(part))
+        cloudpickle.dumps(part)
+    except Exception as error:  # whatever a field's own methods raise
+        raise UserError(
+            f"{key}: a field of {type(part).__name__} can be neither stored nor sent to a worker "
+            f"({describe_exception(error)}); use numbers, texts, lists and components"
+        ) from None
+    return part
+
+
+def _refuse_false_name(label: str, target: Any) -> None:
+    """Refuses to table one estimator under the name of another."""
+    for group in plugins.ESTIMATOR_GROUPS:
+        for option in plugins.options(group):
+            if option.label == label and option.target != str(target):
+                raise UserError(
+                    f"estimators.{label}: is {target}, under the name of {group}={label}; choose another label"
+                )
+
+
+def explain(error: BaseException) -> UserError:
+    """An error of Hydra, OmegaConf or YAML while composing, as one line with the remedy."""
+    import yaml
+
+    if isinstance(error, UserError):
+        return error
+    if isinstance(error, yaml.YAMLError):
+        return UserError(plugins.explain_yaml(error))
+    if isinstance(error, UnicodeDecodeError):
+        return UserError(f"a config file is not UTF-8 ({error.reason}); `ipe-bench list` names it")
     text = "\n".join(str(e) for e in (error, error.__cause__) if e is not None)
-    missing = re.search(r"Could not (?:find|load) '([^']+)'", text)
-    if missing:
-        group, _, name = missing.group(1).partition("/")
-        known = [option.name for option in plugins.options(group)]
-        return UserError(f"{group}={name}: {unknown(name, known, 'option')}")
-    no_group = re.search(r"Could not override '([^']+)'", text)
-    if no_group:
-        name = no_group.group(1)
-        if name == "experiment":
-            return UserError("experiment: is added, not overridden; write +experiment=NAME")
-        known = {*Schema.__dataclass_fields__, *plugins.groups()}
-        key = name.split(".")[0]
-        if key in known:
-            return UserError(f"{name}: there is no such key; see `ipe-bench run --cfg job` for those there are")
-        return UserError(f"{name}: {unknown(key, known, 'key')}")
+    for pattern, explained in _EXPLAINED:
+        found = re.search(pattern, text)
+        if found:
+            return UserError(explained(*found.groups()))
     full_key = re.search(r"full_key: (\S+)", text)
-    value = re.search(r"Value '([^']*)' of type '[^']*' could not be converted to (\w+)", text)
-    if value and full_key:
-        kind = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false"}
-        return UserError(f"{full_key.group(1)}={value.group(1)}: give {kind.get(value.group(2), value.group(2))}")
     lines = dict.fromkeys(line.strip() for line in text.splitlines() if line.strip())
-    return UserError(" ".join(line for line in lines if not line.startswith("object_type=")))
+    kept = [line for line in lines if not line.startswith(("object_type=", "full_key:", "reference_type=", "See "))]
+    return UserError(f"{full_key.group(1) + ': ' if full_key else ''}{' '.join(kept) or describe_exception(error)}")
+
+
+def _no_such_option(name: str) -> str:
+    group, _, option = name.rpartition("/") if name.startswith("hydra/") else name.partition("/")
+    known = [o.name for o in plugins.options(group)]
+    if group in ("hydra/launcher", "hydra/sweeper"):
+        kind = group.partition("/")[2]
+        return f"{group}={option}: this {kind} is not installed; pip install hydra-{option}-{kind}, or choose basic"
+    return f"{group}={option}: {unknown(option, known, 'option')}"
+
+
+def _no_such_key(name: str) -> str:
+    key = name.split(".")[0]
+    if key == "experiment":
+        return "experiment: is added, not overridden; write +experiment=NAME"
+    known = {*KEYS, *plugins.groups()}
+    if key in known or key == "hydra":
+        return f"{name}: there is no such key; see `ipe-bench run --cfg job` for those there are"
+    return f"{name}: {unknown(key, known, 'key')}"
+
+
+def _invalid(word: str, value: str, choices: str) -> str:
+    return f"{word}: {value} cannot be chosen (there are: {choices})"
+
+
+def _wrong_type(value: str, kind: str, key: str) -> str:
+    kinds = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false"}
+    return f"{key}={value}: give {kinds.get(kind, kind)}"
+
+
+_EXPLAINED: tuple[tuple[str, Callable[..., str]], ...] = (
+    (r"Could not (?:find|load) '([^']+)'", _no_such_option),
+    (r"Could not override '([^']+)'", _no_such_key),
+    (
+        r"Could not append to config\. An item is already at '([^']+)'",
+        lambda k: f"{k}: is there already; leave out the +",
+    ),
+    (r"Ambiguous value for argument '([^']+)'", lambda word: f"{word}: is a sweep; add -m, or put a list in brackets"),
+    (r"Error merging override (\S+)\s+Invalid value '([^']+)', expected one of \[([^]]+)\]", _invalid),
+    (r"Value '(.*)' of type '[^']*' could not be converted to (\w+)[\s\S]*?full_key: (\S+)", _wrong_type),
+    (
+        r"Error merging override (\S+)[\s\S]*field '(\w+)' is not Optional",
+        lambda word, key: f"{word}: {key} cannot be null; give it a value",
+    ),
+    (
+        r"Interpolation key '([^']+)' not found\s+full_key: (\S+)",
+        lambda k, key: f"{key}: ${{{k}}} is no key of the config",
+    ),
+    (
+        r"Primary config[^']*'([^']+)'|Cannot find primary config '([^']+)'",
+        lambda *n: f"there is no config {n[0] or n[1]}",
+    ),
+    (r"Missing mandatory value: \S+[\s\S]*full_key: (\S+)", lambda key: f"{key}: is not given; give it a value"),
+)

@@ -18,7 +18,8 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import library_versions
 from ipe_bench.basics.statuses import Status
 from ipe_bench.cli import console
-from ipe_bench.cli.config import CONFIG_ERRORS, Job, assemble, explain, prepare, refuse_silent_traps, rewrite
+from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, assemble, explain, prepare, rewrite
+from ipe_bench.cli.overrides import read
 from ipe_bench.measurements import Nist
 from ipe_bench.noise import Certified
 from ipe_bench.plugins import discovery as plugins
@@ -29,11 +30,16 @@ from ipe_bench.runs.provenance import describe, fingerprint
 
 def main(arguments: Sequence[str]) -> int:
     """Estimates with every chosen estimator, prints tables and writes files; exit code 1 where none converged."""
-    refuse_silent_traps(arguments)
     prepare()
+    words = rewrite(arguments)
+    _refuse_keys_without_use(words)
+    read(words, KEYS)
     try:
         with initialize_config_dir(str(plugins.own_conf()), version_base="1.3"):
-            config = compose("config", rewrite(arguments))
+            config = compose("config", words)
+    except Exception as error:  # what Hydra makes of overrides raises nearly anything
+        raise explain(error) from error
+    try:
         job = assemble(config)
     except CONFIG_ERRORS as error:
         raise explain(error) from error
@@ -58,6 +64,16 @@ def main(arguments: Sequence[str]) -> int:
     out.print(render(name, job.scenario.measurement, fits, out.width))
     out.print(f"\nIn {folder}: {', '.join(path.name for path in files)}", markup=False, soft_wrap=True)
     return 0 if any(f.status is Status.CONVERGED for f in fits) else 1
+
+
+_WITHOUT_USE = ("trials", "seed", "block_size", "execution", "truth_measurement", "write_readings")
+
+
+def _refuse_keys_without_use(words: Sequence[str]) -> None:
+    for word in words:
+        key = word.lstrip("+~").partition("=")[0].replace("measurement@truth", "truth")
+        if key.startswith(_WITHOUT_USE):
+            raise UserError(f"{key}: is for `ipe-bench run`, and nothing in an estimate from readings; leave it out")
 
 
 def _measurement_name(arguments: Sequence[str], job: Job) -> str:

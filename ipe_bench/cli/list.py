@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.cli import console
@@ -16,6 +18,8 @@ from ipe_bench.plugins.construct import construct
 
 def main(groups: Sequence[str], verbose: bool) -> int:
     """One line per option; where verbose, the parameters and the readings file of each measurement."""
+    for problem in plugins.take_problems():
+        print(f"ipe-bench: {problem}", file=sys.stderr)
     known = plugins.groups()
     for name in groups:
         if name not in known:
@@ -27,12 +31,15 @@ def main(groups: Sequence[str], verbose: bool) -> int:
             table.add_column(heading, overflow="fold", no_wrap=heading == "option")
         chosen = plugins.options(group)
         for option in chosen:
-            table.add_row(option.name, option.summary, option.source.origin)
+            table.add_row(Text(option.name), Text(option.summary), Text(option.source.origin))
         out.print(table)
         out.print()
         if verbose and group == "measurement":
-            for option in chosen:
+            for option in [o for o in chosen if o.fault is None]:
                 _describe_measurement(out, option)
+    for option in plugins.options():
+        if option.fault is not None and option.group in (groups or known):
+            print(f"ipe-bench: {option.group}={option.name}: {option.fault}", file=sys.stderr)
     return 0
 
 

@@ -2,42 +2,79 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 
-from ipe_bench import __version__
-from ipe_bench.basics.errors import StorageError, UserError, unknown
-from ipe_bench.cli.parser import parsers
+from ipe_bench.cli import interrupts
 
 COMMANDS = ("run", "estimate", "report", "status", "list", "check", "new")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code."""
+    interrupts.install()
     words = list(sys.argv[1:] if argv is None else argv)
     # Batched linear algebra is small per trial: more BLAS threads only get in each other's way.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     try:
-        return _dispatch(words)
-    except UserError as error:
-        print(f"ipe-bench: {error}", file=sys.stderr)
-        return 2
-    except StorageError as error:
-        print(f"ipe-bench: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("ipe-bench: stopped; what was computed is kept, and the same command goes on from there", file=sys.stderr)
-        return 130
+        with warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            # Where numbers overflow, the statuses of trials say so.
+            warnings.filterwarnings("ignore", category=RuntimeWarning)
+            return _dispatch(words)
     except BrokenPipeError:
         # Whoever read the output has closed it: not worth a traceback.
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
         return 0
+    except (Exception, KeyboardInterrupt) as error:
+        code, line = _explain(error)
+        print(f"ipe-bench: {line}", file=sys.stderr)
+        return code
+
+
+def _explain(error: BaseException) -> tuple[int, str]:
+    """The exit code and the line for what ended the command; raises again what is a bug."""
+    from ipe_bench.basics.errors import StorageError, UserError
+    from ipe_bench.plugins.discovery import blame
+
+    if isinstance(error, KeyboardInterrupt) or interrupts.came():
+        return interrupts.EXIT_CODE, interrupts.STOPPED
+    if isinstance(error, UserError | StorageError):
+        return 2 if isinstance(error, UserError) else 1, " ".join(str(error).split())
+    if isinstance(error, OSError):
+        return _explain_os_error(error)
+    line = blame(error)
+    if line is None:
+        raise error
+    return 2, line
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *where: object, **options: object) -> None:
+    print(f"ipe-bench: warning: {' '.join(str(message).split())}", file=sys.stderr)
+
+
+def _explain_os_error(error: OSError) -> tuple[int, str]:
+    """The exit code and the line for a file or folder that cannot be read or written."""
+    from ipe_bench.basics.errors import shortened
+
+    reason = error.strerror or str(error)
+    where = shortened(str(error.filename)) if error.filename is not None else "a file"
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return 1, f"{where}: {reason}; what was stored before is whole, and the same command goes on from there"
+    return 2, f"{where}: cannot be used ({reason}); choose another file or folder, for results with output="
 
 
 def _dispatch(words: list[str]) -> int:
+    # Late, so that Ctrl-C is listened to while they load.
+    from ipe_bench import __version__
+    from ipe_bench.basics.errors import UserError, unknown
+    from ipe_bench.cli.parser import parsers
+
     command, *rest = words or ["--help"]
     if command in ("-h", "--help", "help"):
         parsers()[0].print_help()

@@ -11,7 +11,8 @@ from string import Template
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.plugins import discovery as plugins
 
-KINDS = ("solver", "baseline", "measurement", "noise")
+LONGEST = 60
+KINDS = ("solver", "baseline", "measurement", "noise", "experiment")
 
 
 def main(kind: str, name: str) -> int:
@@ -20,6 +21,8 @@ def main(kind: str, name: str) -> int:
         raise UserError(f"{kind}: {unknown(kind, KINDS, 'kind')}")
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise UserError(f"{name}: give a name of small letters, digits and underscores that starts with a letter")
+    if len(name) > LONGEST:
+        raise UserError(f"{name[:20]}...: give a name of at most {LONGEST} letters")
     if keyword.iskeyword(name):
         raise UserError(f"{name}: is a word of Python; choose another name")
     rivals = plugins.ESTIMATOR_GROUPS if kind in plugins.ESTIMATOR_GROUPS else (kind,)
@@ -42,12 +45,22 @@ def main(kind: str, name: str) -> int:
         f"{package}/conf/{kind}/{name}.yaml": f"{kind}.yaml",
         f"tests/test_{name}.py": "test.py",
     }
+    if kind == "experiment":  # it has no class
+        texts = {
+            "pyproject.toml": "pyproject.toml",
+            "README.md": "experiment_readme.md",
+            f"{package}/__init__.py": "experiment_init.py",
+            f"{package}/conf/experiment/{name}.yaml": "experiment.yaml",
+            f"tests/test_{name}.py": "experiment_test.py",
+        }
     templates = files("ipe_bench.plugins") / "templates"
     for target, source in texts.items():
         path = folder / target
         path.parent.mkdir(parents=True, exist_ok=True)
         text = (templates / f"{source}.template").read_text(encoding="utf-8")
         path.write_text(Template(text).substitute(words), encoding="utf-8")
-    choose = f"{kind}=[{name}]" if kind in ("solver", "baseline") else f"{kind}={name}"
-    print(f'{folder} is ready. Try:\n  ipe-bench check {folder}\n  ipe-bench run "{choose}" trials=100')
+    choices = {"solver": f'"solver=[{name}]"', "baseline": f'"baseline=[{name}]"', "experiment": f"+experiment={name}"}
+    choose = choices.get(kind, f"{kind}={name}")
+    first = f"ipe-bench run {choose} --dry-run" if kind == "experiment" else f"ipe-bench check {folder}"
+    print(f"{folder} is ready. Try:\n  {first}\n  ipe-bench run {choose} trials=100")
     return 0

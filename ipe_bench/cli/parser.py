@@ -42,8 +42,11 @@ _REPORT = """
 Nothing is computed again.
 
   ipe-bench report DIR                            into DIR itself
-  ipe-bench report DIR1 DIR2 output=DIR           several folders together, into DIR
+  ipe-bench report DIR1 DIR2 output=DIR           several folders together, into another
 """
+
+
+INFO_TOPICS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
 
 class Parser(argparse.ArgumentParser):
@@ -68,6 +71,10 @@ class Parser(argparse.ArgumentParser):
         """
         values, surplus = self.parse_known_intermixed_args(words)
         for word in surplus:
+            if word.startswith("-") and "=" in word and not word.startswith("--config"):
+                raise UserError(
+                    f"{self.command}: {word}: there is no such flag; keys have no dashes: {word.lstrip('-')}"
+                )
             if word.startswith("-"):
                 flags = [flag for action in self._actions for flag in action.option_strings]
                 raise UserError(f"{self.command}: {word}: {unknown(word, flags, 'flag')}")
@@ -89,7 +96,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         )
         return found[name]
 
-    add("run", "simulate, estimate, store and report")
+    _add_run(add("run", "simulate, estimate, store and report"))
     estimate = add(
         "estimate",
         "parameters from real readings, and whether the model fits them",
@@ -108,6 +115,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         "status", "what is done, missing, failed and stale in folders of results", "0 complete; 1 not complete"
     )
     status.add_argument("arguments", metavar="DIR", nargs="*", help="folders of results, such as outputs/paper")
+    status.add_argument("-v", "--verbose", action="store_true", help="with what is complete, too")
     options = add("list", "what there is to choose from, and where it comes from")
     options.add_argument("groups", metavar="GROUP", nargs="*", help="solver, baseline, measurement, ... or all")
     options.add_argument(
@@ -116,7 +124,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         help="with each measurement's parameters and the columns of its readings file",
     )
     new = add("new", "a working plugin to start from, in plugins/NAME")
-    new.add_argument("kind", metavar="KIND", help="solver, baseline, measurement or noise")
+    new.add_argument("kind", metavar="KIND", help="solver, baseline, measurement, noise or experiment")
     new.add_argument("name", metavar="NAME", help="small letters, digits and underscores")
     check = add(
         "check",
@@ -125,3 +133,24 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     )
     check.add_argument("folders", metavar="DIR", nargs="*", help="folders of plugins, such as plugins/my_plugin")
     return program, found
+
+
+def _add_run(run: Parser) -> None:
+    """The flags of Hydra, and ours beside them. Hydra writes the help, with all options there are."""
+    run.add_argument("overrides", metavar="KEY=VALUE", nargs="*")
+    run.add_argument("--dry-run", action="store_true", help="say what is stored, what is missing and how long it takes")
+    for names in (
+        ("--hydra-help",),
+        ("--resolve",),
+        ("-r", "--run"),
+        ("-m", "--multirun"),
+        ("-sc", "--shell-completion"),
+    ):
+        run.add_argument(*names, action="store_true")
+    run.add_argument("-c", "--cfg", choices=("job", "hydra", "all"))
+    run.add_argument("-i", "--info", choices=INFO_TOPICS)
+    run.add_argument("-p", "--package")
+    run.add_argument("-cp", "--config-path")
+    run.add_argument("-cn", "--config-name")
+    run.add_argument("-cd", "--config-dir")
+    run.add_argument("--experimental-rerun")

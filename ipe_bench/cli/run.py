@@ -2,33 +2,38 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import MissingConfigException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from ipe_bench.api import compute
-from ipe_bench.basics.errors import StorageError, UserError
-from ipe_bench.cli.config import CONFIG_ERRORS, Job, assemble, explain, prepare, refuse_silent_traps, rewrite
+from ipe_bench.api import cells_of, compute
+from ipe_bench.basics.errors import StorageError, UserError, shortened
+from ipe_bench.cli import interrupts
+from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, assemble, explain, prepare, rewrite
+from ipe_bench.cli.dry_run import DryRun
+from ipe_bench.cli.overrides import default_name, known_options, read
+from ipe_bench.cli.parser import INFO_TOPICS, parsers
 from ipe_bench.cli.progress import shown_progress
-from ipe_bench.cli.report import show
+from ipe_bench.cli.report import main as report
+from ipe_bench.cli.report import show_command
 from ipe_bench.measurements import Nist
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.runs.execution import Serial
-from ipe_bench.runs.store import digest
+from ipe_bench.runs.store import describe_names, digest
 
-_FLAGS_WITH_VALUE = {"--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--config-path", "-cp"}
-_FLAGS_WITH_VALUE |= {"--config-dir", "-cd", "--experimental-rerun"}
 _OWN_LAUNCHER = ".BasicLauncher"
-_INFO_TOPICS = {"all", "config", "defaults", "defaults-tree", "plugins", "searchpath"}
 
 
 class Outcome:
@@ -40,9 +45,13 @@ class Outcome:
         self.elsewhere = False
         """Jobs run in other processes, from which nothing but an exception or a file comes back."""
         self.jobs = 0
-        self.outputs: dict[Path, None] = {}
+        self.outputs: dict[Path, dict[str, str]] = {}
+        """The folders that were filled, and by key a line for each cell that was asked for."""
         self.failures: list[str] = []
+        self.dry: DryRun | None = None
+        """What would be done, where nothing is to be."""
         self.mistakes: dict[str, None] = {}
+        self.bug: Exception | None = None
         self.storage: StorageError | None = None
         """Nothing can be stored any more: the remaining jobs are not begun."""
 
@@ -61,7 +70,7 @@ class Watch(Callback):
         _outcome.elsewhere = not config.hydra.launcher["_target_"].endswith(_OWN_LAUNCHER)
         output = OmegaConf.select(config, "output")
         if output is not None:
-            _outcome.outputs[Path(output)] = None
+            _outcome.outputs[Path(output)] = {}
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         _outcome.jobs += 1
@@ -71,34 +80,111 @@ def main(arguments: Sequence[str]) -> int:
     """Runs Hydra on the arguments; then aggregates and shows the folders that were filled."""
     global _outcome
     _outcome = Outcome()
-    flags, overrides = hoist(arguments)
-    refuse_silent_traps(overrides)
+    if any(word in ("-h", "--help") for word in arguments):
+        flags, words = ["--help"], []
+    else:
+        flags, words = _flags_and_words(arguments)
     prepare()
-    _complete_without_subcommand()
+    if "--shell-completion" in flags:
+        _check_completion(words)
+    elif words:
+        folders = [Path(flags[i + 1]) for i, flag in enumerate(flags) if flag == "--config-dir"]
+        words = rewrite(words)
+        name = default_name(read(words, KEYS, folders))
+        if not {"--multirun", "--run", "--cfg", "--info"}.intersection(flags) and sweeps_by_itself(words, folders):
+            flags.append("--multirun")
+        words = [*words, f"default_name='{name}'"]
+    with contextlib.ExitStack() as stack:
+        if "--dry-run" in flags:
+            _outcome.dry = DryRun()
+            flags.remove("--dry-run")
+            # Hydra would begin a folder of results for its own log.
+            log = stack.enter_context(tempfile.TemporaryDirectory(prefix="ipe-bench-"))
+            words += [f"hydra.run.dir='{log}'", f"hydra.sweep.dir='{log}'"]
+        _run_hydra(flags, words)
+    return _conclude()
+
+
+def _run_hydra(flags: Sequence[str], words: Sequence[str]) -> None:
     # Hydra would print config errors itself, badly, and exit with 1.
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    sys.argv = ["ipe-bench", *flags, *rewrite(overrides)]
+    sys.argv = ["ipe-bench", *flags, *words]
     try:
         hydra.main(version_base="1.3", config_path=str(plugins.own_conf()), config_name="config")(task)()
-    except CONFIG_ERRORS as error:
-        raise explain(error) from error
+    except (UserError, StorageError):
+        raise
     except OSError as error:  # Hydra writes its own files before our task is called
-        raise _explain_os_error(error) from error
+        if isinstance(error, MissingConfigException):
+            raise explain(error) from error
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        where, reason = shortened(str(error.filename or "output")), error.strerror or str(error)
+        raise UserError(
+            f"output: {where} cannot be written to ({reason}); choose another folder with output="
+        ) from error
+    except Exception as error:
+        # What Hydra makes of overrides raises nearly anything; what our own task raises is a bug.
+        if _outcome.bug is not None or plugins.blame(error):
+            raise
+        raise explain(error) from error
+
+
+def _conclude() -> int:
+    """Shows what the jobs came to; the exit code."""
     if _outcome.storage is not None:
         raise _outcome.storage
     if not _outcome.started:
         return 0
     if _outcome.multirun and not _outcome.elsewhere and not _outcome.jobs and not _outcome.mistakes:
         raise UserError("the sweep has no jobs: check the patterns in its lists")
-    for failure in _outcome.failures:
-        print(f"ipe-bench: failed: {failure}", file=sys.stderr)
     code = 1 if _outcome.failures else 0
-    for output in _outcome.outputs:
+    if _outcome.dry is not None and not _outcome.mistakes:
+        print(_outcome.dry.summary())
+        return code
+    for output, cells in _outcome.outputs.items():
         if (output / "trials").is_dir():
-            code = max(code, show([output], output))
+            # Of jobs in other processes nothing is known but the folder.
+            code = max(code, show_command(output, cells) if cells else report([str(output)]))
     if _outcome.mistakes:
         raise UserError("; ".join(_outcome.mistakes))
     return code
+
+
+def _flags_and_words(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Flags and overrides apart: Hydra's parser wants all flags before or after all overrides."""
+    waiting = list(arguments)
+    for i, word in enumerate(waiting):
+        # Hydra takes the topic as optional: what follows may be an override as well.
+        if word in ("-i", "--info") and (i + 1 == len(waiting) or waiting[i + 1] not in INFO_TOPICS):
+            waiting[i] = "--info=all"
+    values = vars(parsers()[1]["run"].parse(waiting))
+    words = values.pop("overrides")
+    flags: list[str] = []
+    for name, value in values.items():
+        if value:
+            flags += [f"--{name.replace('_', '-')}", *([] if value is True else [value])]
+    commands = [f for f in flags if f in ("--run", "--multirun", "--cfg", "--info", "--shell-completion")]
+    if len(commands) > 1:
+        raise UserError(f"run: {' '.join(commands)}: do not go together; choose one")
+    if "--resolve" in flags and "--cfg" not in flags:
+        raise UserError("run: --resolve: goes with --cfg, such as --cfg job --resolve")
+    for name in ("config_dir", "config_path"):
+        if values[name] is not None and not Path(values[name]).is_dir():
+            raise UserError(f"run: --{name.replace('_', '-')}={values[name]}: there is no such folder")
+    if values["experimental_rerun"] is not None and not Path(values["experimental_rerun"]).is_file():
+        raise UserError(f"run: --experimental-rerun={values['experimental_rerun']}: there is no such file")
+    return flags, words
+
+
+def sweeps_by_itself(words: Sequence[str], folders: Sequence[Path]) -> bool:
+    """Whether the experiment that is asked for sweeps: then nobody has to say -m as well."""
+    for word in words:
+        group, _, name = word.lstrip("+").partition("=")
+        path = known_options("experiment", folders).get(name) if group == "experiment" else None
+        if path is not None:
+            config = OmegaConf.load(path)
+            return bool(OmegaConf.select(config, "hydra.sweeper.params")) and not OmegaConf.select(config, "hydra.mode")
+    return False
 
 
 def task(config: DictConfig) -> None:
@@ -107,9 +193,14 @@ def task(config: DictConfig) -> None:
         return
     try:
         job = assemble(config)
+        _refuse_keys_without_use(config)
         if config.write_readings is not None:
             write_trial(job, Path(config.write_readings), config.write_readings_trial)
             return
+        if _outcome.dry is not None:
+            print(_outcome.dry.add(job, _title(job)))
+            return
+        interrupts.begin_work()
         with shown_progress(_title(job)) as watch:
             failures = compute(
                 [job.scenario],
@@ -120,21 +211,29 @@ def task(config: DictConfig) -> None:
                 block_size=job.block_size,
                 watch=watch,
             )
-    except CONFIG_ERRORS as error:
+    except (UserError, StorageError, *CONFIG_ERRORS) as error:
         if _launched_elsewhere():
-            raise explain(error) from None
-        _outcome.mistakes[str(explain(error))] = None
-    except UserError as error:
-        if _launched_elsewhere():
-            raise
-        _outcome.mistakes[str(error)] = None
-    except StorageError as error:
-        if _launched_elsewhere():
-            raise
-        _outcome.storage = error
+            raise explain(error) if isinstance(error, CONFIG_ERRORS) else error from None
+        if isinstance(error, StorageError):
+            _outcome.storage = error
+        else:
+            _outcome.mistakes[str(explain(error) if isinstance(error, CONFIG_ERRORS) else error)] = None
+    except Exception as error:
+        _outcome.bug = error
+        raise
     else:
         _outcome.failures += failures
-        _outcome.outputs[Path(job.output)] = None
+        own = _outcome.outputs.setdefault(Path(job.output), {})
+        own.update((cell.key, describe_names(cell.names)) for cell in cells_of(job.scenario, job.estimators))
+
+
+def _refuse_keys_without_use(config: DictConfig) -> None:
+    if config.readings is not None:
+        raise UserError(
+            f"readings={config.readings}: run simulates its readings; `ipe-bench estimate` estimates from a file"
+        )
+    if config.write_readings is None and config.write_readings_trial:
+        raise UserError(f"write_readings_trial={config.write_readings_trial}: goes with write_readings=FILE")
 
 
 def _launched_elsewhere() -> bool:
@@ -143,29 +242,24 @@ def _launched_elsewhere() -> bool:
     return HydraConfig.get().mode == RunMode.MULTIRUN and not launcher["_target_"].endswith(_OWN_LAUNCHER)
 
 
-def _explain_os_error(error: OSError) -> Exception:
-    where, reason = error.filename or "output", error.strerror or str(error)
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return StorageError(f"{where}: {reason}; what was stored before is whole, and the same command goes on")
-    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.EEXIST, errno.ENOENT):
-        return UserError(f"output: {where} cannot be written to ({reason}); choose another folder with output=")
-    return error
+_IN_EVERY_TITLE = {"measurement", "measurement.dataset", "truth_measurement", "noise", "error_scale", "seed"}
+_NOT_IN_TITLES = {"trials", "block_size", "output", "name", "default_name", "experiment", "solver", "baseline"}
 
 
 def _title(job: Job) -> str:
-    """What a job is about, for its progress bar: the option that was chosen, what is drawn, and what a sweep sets."""
-    scenario = job.scenario
-    hydra_config = HydraConfig.get()
-    chosen = hydra_config.runtime.choices.get("measurement", scenario.measurement.name)
-    if isinstance(scenario.measurement, Nist):
-        chosen = f"{chosen} {scenario.measurement.dataset}"
-    parts = [str(chosen)]
+    """What a job is about, for its progress bar: everything that may tell it from other jobs of a sweep."""
+    scenario, chosen = job.scenario, HydraConfig.get().runtime.choices
+    model = scenario.measurement
+    parts = [str(chosen.get("measurement", model.name)) + (f" {model.dataset}" if isinstance(model, Nist) else "")]
+    if scenario.truth is not None:
+        parts.append(f"truth {chosen.get('measurement@truth_measurement', scenario.truth.name)}")
     if not scenario.noise.real:
-        parts += [f"error scale {scenario.error_scale:g}", f"seed {scenario.seed}"]
-    if hydra_config.mode == RunMode.MULTIRUN:
-        said = ("measurement=", "error_scale=", "seed=", "trials=", "output=", "name=", "block_size=", "execution")
-        settings = [o for o in hydra_config.overrides.task if not o.lstrip("+").startswith(said)]
-        parts += [o if len(o) <= 40 else f"{o[:30]}… #{digest(o)[:6]}" for o in settings]
+        parts += [scenario.noise.name, f"error scale {scenario.error_scale:g}", f"seed {scenario.seed}"]
+    for word in HydraConfig.get().overrides.task:
+        key = word.lstrip("+~").partition("=")[0].partition("@")[-1] or word.lstrip("+~").partition("=")[0]
+        if key not in _IN_EVERY_TITLE | _NOT_IN_TITLES and not key.startswith("execution"):
+            word = word.lstrip("+")
+            parts.append(word if len(word) <= 40 else f"{word[:30]}… #{digest(word)[:6]}")
     return ", ".join(parts)
 
 
@@ -187,23 +281,15 @@ def write_trial(job: Job, path: Path, trial: int) -> None:
     print(f"Readings of trial {trial}: {path}\nTrue parameters:     {truth}")
 
 
-def hoist(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Flags and overrides apart: Hydra's parser wants all flags before or after all overrides."""
-    flags: list[str] = []
-    overrides: list[str] = []
-    waiting = list(arguments)
-    while waiting:
-        argument = waiting.pop(0)
-        if not argument.startswith("-"):
-            overrides.append(argument)
-            continue
-        flags.append(argument)
-        takes_next = argument in _FLAGS_WITH_VALUE
-        takes_next |= argument in ("--info", "-i") and bool(waiting) and waiting[0] in _INFO_TOPICS
-        takes_next |= argument in ("-sc", "--shell-completion") and bool(waiting)
-        if takes_next and waiting:
-            flags.append(waiting.pop(0))
-    return flags, overrides
+def _check_completion(words: Sequence[str]) -> None:
+    """What `-sc` may be followed by, which Hydra looks up without checking."""
+    shells = ("bash", "fish", "zsh")
+    if not any(list(words) == [f"{what}={shell}"] for what in ("install", "uninstall", "query") for shell in shells):
+        shown = " ".join(words) or "nothing"
+        raise UserError(f"-sc {shown}: write -sc install=SHELL or -sc uninstall=SHELL, SHELL being {', '.join(shells)}")
+    if words[0].startswith("query") and "COMP_LINE" not in os.environ:
+        raise UserError(f"-sc {words[0]}: is what a shell asks while completing, with COMP_LINE set")
+    _complete_without_subcommand()
 
 
 def _complete_without_subcommand() -> None:

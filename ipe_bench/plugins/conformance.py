@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimator, estimate_safely
@@ -21,6 +22,8 @@ from ipe_bench.measurements.polynomial import Polynomial
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.gaussian import Gaussian
+from ipe_bench.plugins.construct import construct
+from ipe_bench.plugins.discovery import Option, blame
 from ipe_bench.priors.gaussian import GaussianPrior
 from ipe_bench.runs.provenance import describe
 from ipe_bench.trials.scenario import Scenario
@@ -55,6 +58,24 @@ def check_component(name: str, component: Any) -> Iterator[Finding]:
             yield Finding(name, title, f"it raises {type(error).__name__}: {error}")
         else:
             yield Finding(name, title)
+
+
+def check_option(option: Option) -> Iterator[Finding]:
+    """Runs the checks on the component that an option of a plugin describes; one that cannot be made is a finding."""
+    name = f"{option.group}={option.name}"
+    if option.fault is not None:
+        yield Finding(name, "Has a config that can be read", option.fault)
+        return
+    try:
+        component = construct(option.config, option.package or option.group)
+        yield from check_component(name, component)
+    except UserError as error:
+        yield Finding(name, "Can be made from its config", str(error))
+    except Exception as error:
+        complaint = blame(error)
+        if complaint is None:
+            raise
+        yield Finding(name, "Can be used", complaint)
 
 
 def describes_itself(component: Any) -> None:

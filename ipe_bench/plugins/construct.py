@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import traceback
 from collections.abc import Mapping
 from typing import Any
 
@@ -51,9 +52,13 @@ def _find_class(target: Any, where: str) -> type:
     try:
         cls = getattr(importlib.import_module(module_name), class_name)
     except (ImportError, AttributeError) as error:
-        raise UserError(f"{where}: {error}") from None
-    except (Exception, SystemExit) as error:
-        raise UserError(f"{where}: its module cannot be imported ({describe_exception(error)})") from error
+        raise UserError(f"{where}: {_first_line(error)}") from None
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # a plugin may do anything while it is imported, sys.exit() too
+        if _is_ours(module_name):
+            raise
+        raise UserError(f"{where}: cannot be imported: {_place(error)}") from None
     if not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
         raise UserError(f"{where}: is not a component (a component is a frozen dataclass)")
     if missing := sorted(getattr(cls, "__abstractmethods__", ())):
@@ -76,5 +81,27 @@ def _instantiate(cls: type, options: dict[str, Any], where: str) -> Any:
         return cls(**options)
     except UserError as error:
         raise UserError(f"{where}.{error}") from None
-    except ValueError as error:
-        raise UserError(f"{where}: {' '.join(str(error).split())}") from error
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        if isinstance(error, ValueError) and _is_ours(cls.__module__):
+            raise UserError(f"{where}: {' '.join(str(error).split())}") from error
+        if _is_ours(cls.__module__):
+            raise
+        raise UserError(f"{where}: {cls.__name__} cannot be made: {_place(error)}") from None
+
+
+def _is_ours(module: str) -> bool:
+    return module.split(".")[0] == "ipe_bench"
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def _place(error: BaseException) -> str:
+    """What was raised, and the file and line where."""
+    if isinstance(error, SyntaxError):
+        return f"{error.filename}, line {error.lineno}: {type(error).__name__}: {error.msg}"
+    frames = traceback.extract_tb(error.__traceback__)
+    return f"{frames[-1].filename}, line {frames[-1].lineno}: {describe_exception(error)}"

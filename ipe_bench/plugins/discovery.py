@@ -6,12 +6,15 @@ package in the entry-point group `ipe_bench.plugins`; a plugin in a folder needs
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import importlib.metadata
 import importlib.util
+import math
 import os
 import re
 import sys
+import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,12 +22,15 @@ from typing import Any
 
 import yaml
 
-from ipe_bench.basics.errors import UserError
-from ipe_bench.plugins.construct import construct, register_package
+from ipe_bench.basics.errors import UserError, describe_exception
+from ipe_bench.plugins.construct import register_package
 
 ENTRY_POINTS = "ipe_bench.plugins"
 ESTIMATOR_GROUPS = ("solver", "baseline")
 COMPONENT_GROUPS = ("measurement", "noise", "prior", *ESTIMATOR_GROUPS)
+_LARGEST = 100_000
+"""No option has more values than this."""
+_TARGET_LINE = re.compile(r"^_target_:\s*['\"]?([\w.]+)", re.MULTILINE)
 _PACKAGE_HEADER = re.compile(r"^#\s*@package\s+(\S+)", re.MULTILINE)
 
 
@@ -55,11 +61,21 @@ class Option:
     name: str
     path: Path
     source: Source
+    rival: Path | None = None
+    """The file of another option that would run in its place, or it in place of that."""
+
+    @functools.cached_property
+    def text(self) -> str:
+        """What stands in the file; what is not UTF-8 is replaced, and told by `fault`."""
+        try:
+            return self.path.read_bytes().decode("utf-8", errors="replace")
+        except OSError:
+            return ""
 
     @property
     def summary(self) -> str:
         """The first line of comment in the file that is not a header."""
-        for line in self.path.read_text(encoding="utf-8").splitlines():
+        for line in self.text.splitlines():
             if line.startswith("#") and not _PACKAGE_HEADER.match(line):
                 return line.lstrip("# ").strip()
         return ""
@@ -72,8 +88,83 @@ class Option:
     @property
     def package(self) -> str | None:
         """Where in the config the option lands, where its header says so."""
-        found = _PACKAGE_HEADER.search(self.path.read_text(encoding="utf-8"))
+        found = _PACKAGE_HEADER.search(self.text)
         return found.group(1) if found else None
+
+    @property
+    def target(self) -> str | None:
+        """The class that it names."""
+        found = _TARGET_LINE.search(self.text)
+        return found.group(1) if found else None
+
+    @functools.cached_property
+    def fault(self) -> str | None:
+        """Why it cannot be used, in a line with the remedy; None where it can, as far as the file tells."""
+        if self.rival is not None:
+            return f"{self.rival} and {self.path} offer it both; rename one of the two files"
+        try:
+            text = self.path.read_bytes().decode("utf-8")
+        except UnicodeDecodeError as error:
+            return f"{self.path}: is not UTF-8 ({error.reason} at byte {error.start}); save it as UTF-8"
+        except OSError as error:
+            return f"{self.path}: cannot be read ({error.strerror})"
+        if self.group in ESTIMATOR_GROUPS and self.package != f"estimators.{self.label}":
+            return f"{self.path}: its first line must be '# @package estimators.{self.label}', or it never runs"
+        return _yaml_fault(self.path, text)
+
+    @property
+    def label(self) -> str:
+        """What an estimator is called in tables."""
+        return Path(self.name).name
+
+
+def _yaml_fault(path: Path, text: str) -> str | None:
+    try:
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.YAMLError as error:
+        return explain_yaml(error, path)
+    except RecursionError:
+        return f"{path}: is nested too deeply"
+    if not isinstance(node, yaml.MappingNode):
+        return f"{path}: holds no keys; write KEY: VALUE lines"
+    try:
+        if _expanded(node, {}) > _LARGEST:
+            return f"{path}: its aliases (*NAME) stand for more than {_LARGEST} values; write out what is meant"
+    except yaml.YAMLError as error:
+        return explain_yaml(error, path)
+    return None
+
+
+def _expanded(node: Any, sizes: dict[int, float]) -> float:
+    """How many values a YAML node stands for, once its aliases are replaced by what they refer to.
+
+    Raises:
+        YAMLError: two values under one key, of which one would be lost, or a tag.
+    """
+    if id(node) in sizes:
+        return sizes[id(node)]
+    sizes[id(node)] = math.inf  # one that holds itself never ends
+    if not node.tag.startswith("tag:yaml.org,2002:") or "python" in node.tag:
+        raise yaml.MarkedYAMLError(problem=f"the tag {node.tag} is not known", problem_mark=node.start_mark)
+    parts: list[Any] = [] if isinstance(node, yaml.ScalarNode) else node.value
+    if isinstance(node, yaml.MappingNode):
+        keys = [key.value for key, _ in parts]
+        for key, _ in parts:
+            if isinstance(key.value, str) and keys.count(key.value) > 1:
+                raise yaml.MarkedYAMLError(problem=f"the key {key.value} is there twice", problem_mark=key.start_mark)
+        parts = [part for pair in parts for part in pair]
+    sizes[id(node)] = 1 + sum(_expanded(part, sizes) for part in parts)
+    return sizes[id(node)]
+
+
+def explain_yaml(error: Any, path: Path | None = None) -> str:
+    """A YAML error in one line: the file, the line and what is wrong."""
+    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+    where = str(path or getattr(mark, "name", "config"))
+    if mark is not None:
+        where += f", line {mark.line + 1}"
+    what = getattr(error, "problem", None) or getattr(error, "reason", None) or describe_exception(error)
+    return f"{where}: is not YAML that can be read ({what})"
 
 
 def own_conf() -> Path:
@@ -89,19 +180,51 @@ _added: dict[Path, None] = {}
 """Folders of plugins besides those in `plugins/`."""
 
 
+_problems: dict[str, None] = {}
+
+
+def take_problems() -> list[str]:
+    """What cannot be used of the plugins that were found, each in a line and once; the rest goes on without it."""
+    sources()
+    taken = list(_problems)
+    _problems.clear()
+    return taken
+
+
 @functools.cache
 def sources() -> tuple[Source, ...]:
     """Ours first, then the installed plugins, then the folders `plugins/*/`; their packages become importable."""
-    plugins = Path("plugins")
-    folders = sorted(plugins.resolve().iterdir()) if plugins.is_dir() else []
     found = [Source("ipe-bench", own_conf(), "built in"), *_installed()]
-    for folder in dict.fromkeys([*folders, *_added]):
-        found += _in_folder(folder)
+    for folder in dict.fromkeys([*_folders(), *_added]):
+        try:
+            found += _in_folder(folder)
+        except (OSError, RuntimeError) as error:  # RuntimeError: a loop of links
+            _problems[f"plugin {folder}: cannot be read ({describe_exception(error)}); it is left out"] = None
     unique: dict[str, Source] = {}
     for source in found:
         # A plugin that is installed from its folder is found twice.
-        unique.setdefault(source.name, source)
+        known = unique.setdefault(source.name, source)
+        if known is not source and not _same_file(known.conf, source.conf):
+            _problems[
+                f"plugin {source.conf.parent}: {known.conf.parent} is called {source.name} too; it is left out"
+            ] = None
     return tuple(unique.values())
+
+
+def _same_file(a: Path, b: Path) -> bool:
+    try:
+        return a.samefile(b)
+    except OSError:
+        return False
+
+
+def _folders() -> list[Path]:
+    plugins = Path("plugins")
+    try:
+        return sorted(plugins.resolve().iterdir()) if plugins.is_dir() else []
+    except (OSError, RuntimeError) as error:
+        _problems[f"plugins: cannot be read ({describe_exception(error)}); they are left out"] = None
+        return []
 
 
 def add_folder(folder: Path) -> bool:
@@ -113,9 +236,15 @@ def add_folder(folder: Path) -> bool:
 
 def _installed() -> Iterator[Source]:
     for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
-        spec = importlib.util.find_spec(entry.value)
+        try:
+            spec = importlib.util.find_spec(entry.value)
+        except Exception as error:  # its parent package is imported, which may raise anything
+            spec, reason = None, describe_exception(error)
+        else:
+            reason = f"there is no package {entry.value}"
         if spec is None or not spec.submodule_search_locations:
-            raise UserError(f"plugin {entry.name}: there is no package {entry.value}; install the plugin again")
+            _problems[f"plugin {entry.name}: {reason}; it is left out, install it again"] = None
+            continue
         register_package(entry.value.split(".")[0])
         version = f" {entry.dist.version}" if entry.dist else ""
         conf = Path(spec.submodule_search_locations[0]) / "conf"
@@ -142,54 +271,63 @@ def _make_importable(folder: Path) -> None:
 
 
 def options(group: str | None = None) -> list[Option]:
-    """All options of a group, or of all groups.
-
-    Raises:
-        UserError: two sources offer one option, of which the second would silently never run; or an estimator's file
-            lacks the header that puts it among the estimators.
-    """
+    """All options of a group, or of all groups; those that cannot be used have a `fault`."""
     found: dict[tuple[str, str], Option] = {}
-    labels: dict[str, Option] = {}
     for source in sources():
         for path in sorted(source.conf.rglob("*.yaml")):
             relative = path.relative_to(source.conf).with_suffix("")
             if len(relative.parts) < 2:
                 continue
             option = Option(relative.parts[0], "/".join(relative.parts[1:]), path, source)
-            known = found.setdefault((option.group, option.name), option)
-            if known is not option:
-                raise UserError(
-                    f"{option.group}={option.name}: both {known.source.origin} and {source.origin} offer it; "
-                    "rename one of the two files"
-                )
-            if option.group in ESTIMATOR_GROUPS:
-                label = Path(option.name).name
-                if option.package != f"estimators.{label}":
-                    raise UserError(f"{path}: its first line must be '# @package estimators.{label}', or it never runs")
-                if labels.setdefault(label, option) is not option:
-                    raise UserError(
-                        f"{path}: {labels[label].path} is called {label} too, and only one of them would run"
-                    )
+            # Solvers and baselines share their labels: of two with one label, only one would run.
+            kind = "estimator" if option.group in ESTIMATOR_GROUPS else option.group
+            place = (kind, option.label if kind == "estimator" else option.name)
+            known = found.get(place)
+            if known is None:
+                found[place] = option
+            elif known.rival is None:
+                found[place] = dataclasses.replace(known, rival=path)
     return [o for o in found.values() if group is None or o.group == group]
 
 
-def components_in(folder: Path) -> list[tuple[str, Any]]:
-    """Every component that the options of a plugin's folder describe, constructed, with GROUP=NAME for a name.
+def options_in(folder: Path) -> list[Option]:
+    """The components among the options of a plugin's folder, with those that they clash with.
 
     Raises:
-        UserError: there is no plugin in the folder.
+        UserError: there is no plugin in the folder, or no component.
     """
     if not folder.is_dir():
         raise UserError(f"{folder}: there is no such folder")
     if not add_folder(folder):
         raise UserError(f"{folder}: holds no package with a folder conf in it; see `ipe-bench new`")
-    return [
-        (f"{o.group}={o.name}", construct(o.config, o.package or o.group))
-        for o in options()
-        if o.path.is_relative_to(folder.resolve()) and o.group in COMPONENT_GROUPS
+    home = folder.resolve()
+    found = [
+        option
+        for option in options()
+        if option.group in COMPONENT_GROUPS
+        and any(path is not None and path.is_relative_to(home) for path in (option.path, option.rival))
     ]
+    if not found:
+        raise UserError(f"{folder}: holds nothing to check; its conf has no option of {', '.join(COMPONENT_GROUPS)}")
+    return found
+
+
+def fault(group: str, name: str) -> str | None:
+    """Why that option cannot be used, in a line; None where it can."""
+    return next((option.fault for option in options(group) if option.name == name), None)
 
 
 def groups() -> list[str]:
     """The config groups that hold options."""
     return sorted({option.group for option in options()})
+
+
+def blame(error: BaseException) -> str | None:
+    """The plugin whose code raised this, with file, line and message; None where no plugin's code was running."""
+    homes = {str(source.conf.parent) + os.sep: source.origin for source in sources()[1:]}
+    found = None
+    for frame in traceback.extract_tb(error.__traceback__):
+        for home, origin in homes.items():
+            if frame.filename.startswith(home):
+                found = f"plugin {origin}: {frame.filename}, line {frame.lineno}: {describe_exception(error)}"
+    return found

@@ -1,4 +1,4 @@
-"""The summary as a table in the terminal, readable in 100 columns."""
+"""The summary as a table in the terminal: where it is narrow, columns go from the right, never the names."""
 
 from __future__ import annotations
 
@@ -14,20 +14,23 @@ from ipe_bench.statistics.summary import ALL, COLUMNS
 
 if TYPE_CHECKING:
     from rich.console import Group
+    from rich.table import Table
 
+WIDE = 120
+_SHORTEST_NAME = 12
+"""Narrower than this, a name is not folded."""
+_PADDING = 2
 _SHOWN = tuple(record for record in STATISTICS if "terminal" in record.where)
 _NOT_SETTINGS = {*COLUMNS, "parameter", "unit", "estimator", "error_scale"}
 
 
-def render(summary: pd.DataFrame, certified: pd.DataFrame | None = None) -> Group:
+def render(summary: pd.DataFrame, certified: pd.DataFrame | None = None, width: int = WIDE) -> Group:
     """One table per setting (measurement, noise, and every option that differs), a section per error scale.
 
-    Runs on certified readings, whose mean digits are in `certified`, share one table instead.
+    Columns that do not fit the width are left out, and named below. Runs on certified readings, whose mean digits are
+    in `certified`, share one table instead.
     """
-    from rich import box
     from rich.console import Group
-    from rich.markup import escape
-    from rich.table import Table
     from rich.text import Text
 
     digits = [] if certified is None or certified.empty else _digits(certified)
@@ -36,35 +39,17 @@ def render(summary: pd.DataFrame, certified: pd.DataFrame | None = None) -> Grou
         return Group(*digits or [Text("nothing is stored yet")])
     columns = [c for c in rows.columns if c not in _NOT_SETTINGS and not c.startswith("estimator.")]
     parts: list[Any] = []
+    absent: dict[str, None] = {}
     for values, part in rows.groupby(columns, dropna=False, sort=False):
         named = dict(zip(columns, values if isinstance(values, tuple) else (values,), strict=True))
         title = ", ".join(
             str(v) if k in ("measurement", "noise") else f"{k}={plain(v)}" for k, v in named.items() if _says(v)
         )
-        counts = part["trials"].unique()
-        alike = len(counts) == 1
-        if alike:
-            title += f": {counts[0]} trials per row"
-        table = Table(
-            title=escape(title),
-            title_justify="left",
-            title_style="bold",
-            box=box.SIMPLE_HEAD,
-            padding=(0, 1),
-            pad_edge=False,
-            collapse_padding=True,
-        )
-        table.add_column("scale", justify="right", no_wrap=True)
-        table.add_column("estimator", overflow="fold", min_width=12)
-        # The number of trials stands in the title where it is the same for all.
-        records = [record for record in _SHOWN if not (alike and record.name == "trials")]
-        for heading in _headings(records):
-            table.add_column(heading, justify="right", no_wrap=True)
-        for scale, block in part.groupby("error_scale", sort=False):
-            for i, (_, row) in enumerate(block.iterrows()):
-                table.add_row(f"{scale:g}" if i == 0 else "", escape(str(row["estimator"])), *_cells(records, row))
-            table.add_section()
+        table, left_out = _setting(title, part, width)
         parts.append(table)
+        absent |= dict.fromkeys(left_out)
+    if absent:
+        parts.append(Text(f"Too narrow for: {', '.join(absent)}; summary.csv has them.", style="dim"))
     note = (
         "efficiency: the bound that applies over the root mean square error, 1 at best, with its 95 % bootstrap"
         " interval: of the solved trials (their number in brackets where it is not all), and of all. Filters and the"
@@ -72,6 +57,59 @@ def render(summary: pd.DataFrame, certified: pd.DataFrame | None = None) -> Grou
         " residuals fail the test of fit at 0.1 %. sims, time: medians per trial, a Jacobian counting what it costs."
     )
     return Group(*digits, *parts, Text(note, style="dim"))
+
+
+def _setting(title: str, part: pd.DataFrame, width: int) -> tuple[Table, list[str]]:
+    """The table of one setting, and the headings of what does not fit."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    # The number of trials stands in the title where it is the same for all.
+    counts = part["trials"].unique()
+    alike = len(counts) == 1
+    shown = [record for record in _SHOWN if not (alike and record.name == "trials")]
+    headings = ["scale", "estimator", *_headings(shown)]
+    sections = [
+        [
+            [f"{scale:g}" if i == 0 else "", str(row["estimator"]), *_cells(shown, row)]
+            for i, (_, row) in enumerate(block.iterrows())
+        ]
+        for scale, block in part.groupby("error_scale", sort=False)
+    ]
+    fitting = _fitting(headings, [row for section in sections for row in section], width)
+    table = Table(
+        title=Text(f"{title}: {counts[0]} trials per row" if alike else title),
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1),
+        pad_edge=False,
+        collapse_padding=True,
+    )
+    for heading in headings[:fitting]:
+        if heading == "estimator":
+            table.add_column(heading, overflow="fold", min_width=_SHORTEST_NAME)
+        else:
+            table.add_column(heading, justify="right", no_wrap=True)
+    for section in sections:
+        for row in section:
+            table.add_row(*map(Text, row[:fitting]))
+        table.add_section()
+    return table, headings[fitting:]
+
+
+def _fitting(headings: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> int:
+    """How many columns fit, counted from the left: the scale and the names always, long names folded at the least."""
+    from rich.cells import cell_len
+
+    needed = 2  # at both edges
+    for i, heading in enumerate(headings):
+        longest = max(cell_len(text) for text in (heading, *(row[i] for row in rows)))
+        needed += (_SHORTEST_NAME if heading == "estimator" else longest) + _PADDING
+        if needed > width and i > 1:
+            return i
+    return len(headings)
 
 
 def _says(value: Any) -> bool:

@@ -10,6 +10,7 @@ import contextlib
 import datetime
 import itertools
 import logging
+import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -108,7 +109,9 @@ def perform(task: Task) -> Iterator[Done | str]:
                 _compute_cell(store, block, cell)
             except FATAL:
                 raise
-            except (Exception, SystemExit) as error:
+            except BaseException as error:  # an estimator may raise anything, sys.exit() and KeyboardInterrupt too
+                if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+                    raise  # a user's Ctrl-C; where it is ignored, in worker processes, there can be none
                 failure = Failure.of(error)
             yield Done(index, time.perf_counter() - began, failure)
 

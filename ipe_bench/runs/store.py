@@ -71,9 +71,10 @@ class Cell:
     @property
     def names(self) -> dict[str, Any]:
         """What people call it by."""
-        scenario = self.scenario
+        scenario, truth = self.scenario, self.scenario.truth
         return {
             "measurement": scenario.measurement.name,
+            **({} if truth is None else {"truth_measurement": truth.name}),
             "noise": scenario.noise.name,
             "prior": scenario.prior.name,
             "error_scale": scenario.error_scale,
@@ -255,9 +256,15 @@ def gaps(covered: Iterable[tuple[int, int]], start: int, stop: int) -> list[tupl
 
 def title(names: Mapping[str, Any]) -> str:
     """The scenario of a cell in a line for people."""
-    scale = names.get("error_scale")
-    parts = [names.get("measurement"), names.get("noise"), None if scale is None else f"error scale {scale:g}"]
-    return ", ".join(str(part) for part in (*parts, f"seed {names.get('seed')}") if part is not None)
+    scale, truth = names.get("error_scale"), names.get("truth_measurement")
+    parts = [
+        names.get("measurement"),
+        None if truth is None else f"truth {truth}",
+        names.get("noise"),
+        None if scale is None else f"error scale {scale:g}",
+        f"seed {names.get('seed')}",
+    ]
+    return ", ".join(str(part) for part in parts if part is not None)
 
 
 def describe_names(names: Mapping[str, Any]) -> str:

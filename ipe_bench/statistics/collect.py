@@ -5,6 +5,7 @@ What is there, and what is wrong with it, `runs.results` says; what the numbers 
 
 from __future__ import annotations
 
+from collections.abc import Collection as Keys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -69,13 +70,13 @@ class Collection(Results):
         return list(dict.fromkeys(g.estimator for g in self.groups))
 
 
-def collect(directories: Sequence[Path | str]) -> Collection:
-    """Finds what is stored under the directories.
+def collect(directories: Sequence[Path | str], keys: Keys[str] | None = None) -> Collection:
+    """Finds what is stored under the directories, or of the cells with these keys alone.
 
     Raises:
         UserError: a directory does not exist.
     """
-    collection = Collection.read(directories)
+    collection = Collection.read(directories, keys)
     collection.groups = _groups(collection.current, collection.runs)
     return collection
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from ipe_bench.statistics.collect import ALWAYS_COLUMNS, collect
+from ipe_bench.statistics.collect import ALWAYS_COLUMNS, Collection, collect
 from ipe_bench.statistics.records import STATISTICS, frame_columns, rows_of
 from ipe_bench.statistics.sample import Sample, Shared
 
@@ -20,7 +20,11 @@ COLUMNS = frame_columns(STATISTICS)
 
 def summarize(directories: Sequence[Path | str]) -> pd.DataFrame:
     """The tidy summary of everything stored under the directories; empty where there is nothing."""
-    collection = collect(directories)
+    return summary_of(collect(directories))
+
+
+def summary_of(collection: Collection) -> pd.DataFrame:
+    """The tidy summary of a collection; empty where it is."""
     rows: list[dict[str, Any]] = []
     for groups in collection.scenarios.values():
         shared = Shared.among(collection, groups)

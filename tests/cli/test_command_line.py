@@ -55,7 +55,7 @@ def readings(tmp_path_factory) -> Path:
 def test_a_sweep_leaves_tables_figures_and_a_report(tmp_path):
     result = ipe_bench("run", "-m", "error_scale=1,10", "trials=20", folder=tmp_path)
     assert result.returncode == 0, result.stderr
-    assert (tmp_path / "outputs/run/summary.csv").is_file()
+    assert (tmp_path / "outputs/gins-error_scale=1,10/summary.csv").is_file()
     assert "fixed_point" in result.stdout
     again = ipe_bench("run", "-m", "error_scale=1,10", "trials=20", folder=tmp_path)
     assert again.stderr.count("nothing left to compute") == 2

@@ -41,7 +41,7 @@ class Failure:
     """Why a task did not end well."""
 
     status: Literal["error", "timeout", "died"]
-    """It raised; it exceeded a time limit; or the process that it ran in ended."""
+    """It raised; it exceeded a time limit; or it never began, or the process that it ran in ended."""
     message: str
     detail: str = ""
     """The traceback, where there is one."""

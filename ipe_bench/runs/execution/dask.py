@@ -2,22 +2,35 @@
 
 from __future__ import annotations
 
+import asyncio
 import atexit
+import concurrent.futures
 import contextlib
 import functools
 import json
+import logging
+import pickle
+import platform
+import threading
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from ipe_bench.basics.errors import UserError
+import cloudpickle
+
+from ipe_bench.basics.errors import StorageError, UserError, describe_exception
 from ipe_bench.basics.machine import cores
 from ipe_bench.basics.options import Count
 from ipe_bench.runs.execution.base import FATAL, Event, Execution, Failure, Limit, Task, Work
 from ipe_bench.runs.execution.processes import supervise
 
+log = logging.getLogger(__name__)
+
+_CANCELLED = (asyncio.CancelledError, concurrent.futures.CancelledError)
 _CONNECT_S = 30
+_PATIENCE_S = 15.0
+"""So long nothing is said while a cluster has no workers."""
 
 
 @dataclass(frozen=True)
@@ -54,13 +67,20 @@ class Dask(Execution):
         from distributed import as_completed
 
         limits = (self.block_timeout_s, self.memory_limit_gb)
-        futures = {client.submit(_run_one, work, task, *limits, pure=False): i for i, task in enumerate(tasks)}
+        # As bytes: what a Dask worker cannot unpickle, such as a plugin that it lacks, is then ours to name.
+        payloads = [cloudpickle.dumps((work, task)) for task in tasks]
+        futures = {client.submit(_run_one, payload, *limits, pure=False): i for i, payload in enumerate(payloads)}
+        heard = threading.Event()
+        threading.Thread(target=_say_when_nobody_works, args=(client, heard), daemon=True).start()
         try:
             for future in as_completed(list(futures)):
+                heard.set()
                 index = futures[future]
-                error = future.exception()
+                error = None if future.cancelled() else future.exception()
                 if isinstance(error, FATAL):
                     raise error
+                if future.cancelled() or isinstance(error, _CANCELLED):
+                    raise _lost(client)
                 if error is not None:  # Dask gave up on it: its workers died again and again
                     failure = Failure("died", f"{type(error).__name__}: {' '.join(str(error).split())}")
                     yield Event(index, ended=True, failure=failure)
@@ -69,8 +89,11 @@ class Dask(Execution):
                 for step in steps:
                     yield Event(index, step)
                 yield Event(index, ended=True, failure=failure)
+        except (*_CANCELLED, OSError) as error:  # what as_completed raises where the scheduler is gone
+            raise _lost(client) from error
         finally:
-            with contextlib.suppress(Exception):
+            heard.set()
+            with contextlib.suppress(Exception, *_CANCELLED):
                 client.cancel(list(futures), force=True)
 
     def _client(self) -> Any:
@@ -78,8 +101,28 @@ class Dask(Execution):
         return _connect(self.workers, self.address, self.jobqueue, options)
 
 
-def _run_one(work: Work, task: Any, step_timeout_s: float | None, memory_limit_gb: float | None) -> Any:
+def _lost(client: Any) -> StorageError:
+    return StorageError(
+        f"execution=dask: the scheduler at {client.scheduler.address} is gone; what was computed is kept, and the same "
+        "command goes on from there"
+    )
+
+
+def _say_when_nobody_works(client: Any, heard: threading.Event) -> None:
+    """A scheduler without workers waits for ever, in case that one comes: says so, again and again."""
+    while not heard.wait(_PATIENCE_S):
+        with contextlib.suppress(Exception):
+            if not client.nthreads():
+                address = client.scheduler.address
+                log.warning(f"execution=dask: the scheduler at {address} has no workers yet; waiting for one")
+
+
+def _run_one(payload: bytes, step_timeout_s: float | None, memory_limit_gb: float | None) -> Any:
     """On a Dask worker: the steps and the failure of one task, done in a process beside it."""
+    try:
+        work, task = pickle.loads(payload)
+    except Exception as error:
+        return [], Failure("died", f"{describe_exception(error)}, on {platform.node()}: install the same there")
     events = list(supervise(work, [task], 1, 1, step_timeout_s, memory_limit_gb))
     return [event.step for event in events if not event.ended], events[-1].failure
 

@@ -14,6 +14,7 @@ import queue
 import signal
 import sys
 import threading
+import warnings
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -24,6 +25,8 @@ IDLE_S = 300.0
 def main(handle: int, memory_limit_gb: float | None) -> None:
     # Ctrl-C is the parent's business: it ends its workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Where numbers overflow, the statuses of trials say so.
+    warnings.filterwarnings("ignore", category=RuntimeWarning)
     if memory_limit_gb is not None:
         enforce(memory_limit_gb)
     connection = _connection(handle)

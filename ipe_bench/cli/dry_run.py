@@ -1,0 +1,85 @@
+"""`ipe-bench run --dry-run`: what is stored of a job, what is missing, and about how long that takes."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ipe_bench.api import cells_of, validate
+from ipe_bench.basics.machine import cores
+from ipe_bench.cli.config import Job
+from ipe_bench.runs.results import Results
+from ipe_bench.runs.schedule import plan
+from ipe_bench.runs.store import Cell
+from ipe_bench.trials.scoring import Block
+
+_TRIED = 4
+"""Trials that an estimator is timed on where the folder holds none of it."""
+
+
+@dataclass
+class DryRun:
+    """What the jobs of a command would do."""
+
+    stored: int = 0
+    missing: int = 0
+    seconds: float = 0.0
+    """Of one core."""
+    workers: int = 1
+    _tried: dict[tuple[str, str, float], float] = field(default_factory=dict)
+    """Seconds per trial, by what they depend on most."""
+
+    def add(self, job: Job, title: str) -> str:
+        """Notes what a job lacks; a line for people."""
+        validate([job.scenario], job.estimators, job.trials, job.block_size)
+        cells = cells_of(job.scenario, job.estimators)
+        output = Path(job.output)
+        results = Results.read([output] if output.is_dir() else [], keys={cell.key for cell in cells})
+        lacking = {cell.key: 0 for cell in cells}
+        for task in plan(output, cells, results, job.trials, job.block_size):
+            for cell in task.cells:
+                lacking[cell.key] += task.stop - task.start
+        estimates = [cell for cell in cells if cell.estimator is not None]
+        missing = sum(lacking[cell.key] for cell in estimates)
+        stored = job.trials * len(estimates) - missing
+        seconds = sum(lacking[c.key] * self._per_trial(c, results) for c in estimates if lacking[c.key])
+        self.stored, self.missing, self.seconds = self.stored + stored, self.missing + missing, self.seconds + seconds
+        self.workers = getattr(job.execution, "workers", None) or cores()
+        return f"{title}: {stored} of {job.trials * len(estimates)} estimates are stored" + (
+            f", {missing} are missing (on one core {duration(seconds)})" if missing else ""
+        )
+
+    def _per_trial(self, cell: Cell, results: Results) -> float:
+        """Seconds: those of the trials that are stored, else of some that are tried here."""
+        known = results.stored.get(cell.key)
+        if known is not None:
+            return float(np.nanmean(results.load(known, ("time_s",))["time_s"]))
+        scenario = cell.scenario
+        place = (cell.label, scenario.measurement.name, scenario.error_scale)
+        if place not in self._tried and cell.estimator is not None:
+            block = Block.draw(scenario, 0, 1 if scenario.noise.real else _TRIED)
+            block.estimate(cell.estimator)  # compiled code is loaded
+            began = time.perf_counter()
+            block.estimate(cell.estimator)
+            self._tried[place] = (time.perf_counter() - began) / len(block.trials.x)
+        return self._tried[place]
+
+    def summary(self) -> str:
+        """What it comes to, in a line."""
+        if not self.missing:
+            return f"all {self.stored} estimates are stored; nothing would be computed"
+        return (
+            f"{self.stored} estimates are stored, {self.missing} would be computed, in about "
+            f"{duration(self.seconds / self.workers)} on {self.workers} cores; nothing was computed now"
+        )
+
+
+def duration(seconds: float) -> str:
+    """About how long, for people."""
+    for size, unit in ((86_400.0, "days"), (3600.0, "h"), (60.0, "min")):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.2g} {unit}"
+    return "a moment" if seconds < 0.1 else f"{seconds:.2g} s"

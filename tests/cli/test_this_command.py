@@ -1,0 +1,191 @@
+"""What a command answers is about what it asked for: its scenarios, a folder of its own, what it would do."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from rich.console import Console
+
+from ipe_bench.cli.config import KEYS, prepare, rewrite
+from ipe_bench.cli.main import main
+from ipe_bench.cli.overrides import default_name, read
+from ipe_bench.plugins import discovery as plugins
+from ipe_bench.report.terminal import render
+
+SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "execution=serial", "baseline=[]")
+
+
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    """Runs a command in this process: its exit code and what it wrote on stdout and stderr."""
+    for variable in ("HYDRA_FULL_ERROR", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "PYTHONPATH"):
+        monkeypatch.setenv(variable, "1" if variable != "PYTHONPATH" else "")
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(plugins, "_added", {})
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["ipe-bench"])
+        plugins.sources.cache_clear()
+        capsys.readouterr()
+        code = main(list(words))
+        written = capsys.readouterr()
+        return code, written.out, written.err
+
+    return run
+
+
+def rows_of(text: str, name: str) -> int:
+    """How many rows of tables are about the estimator of that name."""
+    return sum(name in line.split() for line in text.splitlines())
+
+
+def test_run_shows_what_it_asked_for_and_counts_the_rest(command):
+    for solver in ("newton", "fixed_point"):
+        code, out, _ = command("run", *SMALL, f"solver=[{solver}]", "trials=8", "output=both")
+        assert code == 0
+        assert rows_of(out, solver) == 1
+    assert rows_of(out, "newton") == 0
+    assert "1 result of other commands; `ipe-bench report both` shows all" in out
+    # Another setting of one label gives the label no other name, and it is not shown with this one.
+    _, out, _ = command(
+        "run", *SMALL, "solver=[newton]", "estimators.newton.max_iterations=50", "trials=8", "output=both"
+    )
+    assert rows_of(out, "newton") == 1
+    assert "max_iterations" not in out
+    _, out, _ = command("report", "both")
+    assert rows_of(out, "fixed_point") == 1
+    assert "max_iterations" in out
+
+
+NAMES = {
+    "": "gins",
+    "trials=50 seed=3 execution=serial block_size=10": "gins",
+    "error_scale=300": "gins-error_scale=300",
+    "error_scale=1,10,100": "gins-error_scale=1,10,100",
+    "measurement=ranging noise=gaussian noise.deviation=0.1": "ranging-gaussian-noise.deviation=0.1",
+    "noise.deviation=0.1 noise=gaussian measurement=ranging": "ranging-gaussian-noise.deviation=0.1",
+    "solver=[newton,fixed_point] baseline=[ekf]": "gins-newton+fixed_point-ekf",
+    "solver=[] baseline=[ekf]": "gins-no_solver-ekf",
+    "measurement=nist/misra1a noise=certified": "nist-Misra1a-certified",
+    "truth_measurement=gins_tilted": "gins-truth=gins_tilted",
+    "estimators.fixed_point.tolerance=1e-9": "gins-fixed_point.tolerance=1e-9",
+    "+solver@estimators.n2=newton": "gins-n2=newton",
+    "+experiment=paper": "paper",
+    "+experiment=paper error_scale=3": "paper-error_scale=3",
+}
+
+
+@pytest.mark.parametrize("words", NAMES)
+def test_a_folder_is_named_after_what_was_asked(words):
+    prepare()
+    assert default_name(read(rewrite(words.split()), KEYS)) == NAMES[words]
+
+
+def test_a_long_name_is_cut_and_stays_one_of_a_kind():
+    prepare()
+    names = [default_name(read([f"prior.deviations=[{'1,' * 60}{last}]"], KEYS)) for last in (1, 2)]
+    assert names[0] != names[1]
+    assert all(len(name) <= 80 for name in names)
+
+
+def test_unnamed_commands_have_folders_of_their_own_and_the_same_one_goes_on(command):
+    for solver in ("newton", "fixed_point", "newton"):
+        assert command("run", *SMALL, f"solver=[{solver}]", "trials=8")[0] == 0
+    folders = sorted(path.name for path in Path("outputs").iterdir())
+    common = "polynomial-gaussian-{}-no_baseline-noise.deviation=0.01"
+    assert folders == [common.format(solver) for solver in ("fixed_point", "newton")]
+    assert all(len(list((Path("outputs") / f / "trials").iterdir())) == 2 for f in folders)
+
+
+def test_a_dry_run_says_what_is_missing_and_computes_nothing(command):
+    words = ("run", *SMALL, "solver=[newton]", "-m", "error_scale=1,3", "output=dry")
+    code, out, _ = command(*words, "trials=8", "--dry-run")
+    assert code == 0
+    assert "0 estimates are stored, 16 would be computed" in out
+    assert not Path("dry").exists()
+    assert command(*words, "trials=8")[0] == 0
+    stored = sorted(Path("dry").rglob("*"))
+    _, out, _ = command(*words, "trials=8", "--dry-run")
+    assert "all 16 estimates are stored" in out
+    _, out, _ = command(*words, "trials=20", "--dry-run")
+    assert "16 estimates are stored, 24 would be computed" in out
+    assert sorted(Path("dry").rglob("*")) == stored
+
+
+def test_a_dry_run_finds_the_mistakes_of_a_run(command):
+    code, _, error = command("run", *SMALL, "solver=[]", "--dry-run")
+    assert code == 2
+    assert "there is no estimator" in error
+
+
+def test_status_says_complete_in_a_line(command):
+    assert command("run", *SMALL, "solver=[newton]", "trials=8", "output=whole")[0] == 0
+    code, out, _ = command("status", "whole")
+    assert (code, out) == (0, "whole: complete: 1 scenarios under an estimator, 8 trials\n")
+    assert rows_of(command("status", "whole", "-v")[1], "newton") == 1
+    next(Path("whole/trials").glob("*-0-8.parquet")).unlink()
+    code, out, _ = command("status", "whole")
+    assert code == 1
+    assert "missing" in out
+
+
+def test_a_report_on_two_folders_needs_a_third(command):
+    for scale in (1, 3):
+        assert command("run", *SMALL, "solver=[newton]", "trials=8", f"error_scale={scale}", f"output=s{scale}")[0] == 0
+    before = Path("s1/summary.csv").read_bytes()
+    code, _, error = command("report", "s1", "s3")
+    assert code == 2
+    assert "need output=DIR" in error
+    assert Path("s1/summary.csv").read_bytes() == before
+    assert command("report", "s1", "s3", "output=both")[0] == 0
+    assert set(pd.read_csv("both/summary.csv")["error_scale"]) == {1.0, 3.0}
+
+
+EXPERIMENT = """\
+# @package _global_
+# Mine.
+defaults:
+  - override /measurement: polynomial
+  - override /noise: gaussian
+  - override /solver: [newton]
+  - override /baseline: []
+noise: {deviation: 0.01}
+trials: 4
+hydra:
+  sweeper: {params: {error_scale: "1,3,10"}}
+"""
+
+
+def test_an_experiment_of_ones_own_sweeps_as_ours_do(command):
+    folder = Path("conf/experiment")
+    folder.mkdir(parents=True)
+    (folder / "mine.yaml").write_text(EXPERIMENT)
+    code, out, _ = command("run", "--config-dir", "conf", "+experiment=mine", "execution=serial")
+    assert code == 0
+    assert rows_of(out, "newton") == 3
+    assert [path.name for path in Path("outputs").iterdir()] == ["mine"]
+
+
+def test_a_new_experiment_runs(command):
+    assert command("new", "experiment", "mine")[0] == 0
+    code, out, _ = command("run", "+experiment=mine", "trials=2", "--dry-run")
+    assert code == 0
+    assert "0 estimates are stored, 24 would be computed" in out
+    assert "mine" in command("list", "experiment")[1]
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 100, 120])
+def test_a_narrow_terminal_keeps_the_names(command, width):
+    assert command("run", *SMALL, "solver=[newton,fixed_point]", "trials=8", "output=wide")[0] == 0
+    console = Console(width=width)
+    with console.capture() as shown:
+        console.print(render(pd.read_csv("wide/summary.csv"), width=width))
+    lines = shown.get().splitlines()
+    assert max(map(len, lines)) <= width
+    for name in ("newton", "fixed_point"):
+        row = next(line for line in lines if name in line.split())
+        assert "…" not in row
