@@ -9,6 +9,7 @@ from ipe_bench.baselines.levenberg_marquardt import LevenbergMarquardt
 from ipe_bench.baselines.linear_lse import LinearLSE
 from ipe_bench.baselines.map_lm import MapLM
 from ipe_bench.baselines.multiscale_lm import MultiscaleLM
+from ipe_bench.baselines.multistart import Multistart
 from ipe_bench.baselines.scipy_least_squares import LeastSquares
 from ipe_bench.baselines.ukf import UKF
 
@@ -24,4 +25,5 @@ __all__ = [
     "LinearLSE",
     "MapLM",
     "MultiscaleLM",
+    "Multistart",
 ]

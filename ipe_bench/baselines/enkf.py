@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from annotated_types import Gt
 from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric, turned
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Whole
+from ipe_bench.basics.streams import own_bits
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,7 @@ class EnKF(Sequential):
     """A trial's random stream depends on this and on its readings: on nothing else in the batch."""
 
     def track(self, P0: Array, Q: Array, z: Array) -> EnKFTrack:
-        digest = hashlib.sha256(np.ascontiguousarray(z, dtype=float).tobytes()).digest()
-        stream = np.random.Philox(np.random.SeedSequence([self.seed, *np.frombuffer(digest, dtype=np.uint32).tolist()]))
-        return EnKFTrack(P0, Q, self.members, stream)
+        return EnKFTrack(P0, Q, self.members, own_bits(self.seed, z))
 
 
 class EnKFTrack(Track):
