@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
+from annotated_types import Gt, Le
 
 from ipe_bench.baselines.ensemble import read_members
 from ipe_bench.baselines.recursive_update import geometric_weights
-from ipe_bench.basics.errors import UserError, require_counts, require_positive
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Mask, finite, solve
+from ipe_bench.basics.options import Count, Positive, Whole
 from ipe_bench.basics.statuses import Status
 from ipe_bench.basics.streams import normals, own_generators
 from ipe_bench.estimators.base import Equation, Estimates, Estimator, Need
@@ -33,29 +35,21 @@ class EsMda(Estimator):
     whose covariance is reported instead.
     """
 
-    members: int = 100
-    steps: int = 16
-    first: float = 1e-12
+    members: Annotated[int, Gt(1)] = 100
+    steps: Count = 16
+    first: Annotated[float, Gt(0), Le(1)] = 1e-12
     """1 / alpha_1: about the square of the noise over what the prior lets the readings be."""
-    polish: int = 5
+    polish: Whole = 5
     """Gauss-Newton steps at most; 0: none."""
-    tolerance: float = 1e-6
+    tolerance: Positive = 1e-6
     """Of the polish: largest Gauss-Newton step in deviations of the posterior."""
-    prior_inflation: float = 1.0
+    prior_inflation: Positive = 1.0
     """Times the prior's standard deviations."""
-    seed: int = 0
+    seed: Whole = 0
     """A trial's random stream depends on this and on its readings: on nothing else in the batch."""
 
     name = "es_mda"
     needs: ClassVar[frozenset[Need]] = frozenset({"prior"})
-
-    def __post_init__(self) -> None:
-        require_positive(self, "first", "tolerance", "prior_inflation")
-        require_counts(self, "members", least=2)
-        require_counts(self, "steps")
-        require_counts(self, "polish", "seed", least=0)
-        if self.first > 1:
-            raise UserError(f"first={self.first}: give a number up to 1")
 
     @property
     def equation(self) -> Equation | None:  # type: ignore[override]

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from ipe_bench.baselines.ensemble import read_members
 from ipe_bench.baselines.epochs import Epoch, arrivals
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.errors import UserError, require_positive
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Mask, finite, inverse, multiply
+from ipe_bench.basics.options import Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
 from ipe_bench.estimators.least_squares import squared
@@ -107,13 +108,10 @@ class InformationFilter(Estimator):
     filter is consistent.
     """
 
-    prior_inflation: float = 1.0
+    prior_inflation: Positive = 1.0
     """The filter's prior deviations over the scenario's: in life a prior is never exact."""
 
     needs: ClassVar[frozenset[Need]] = frozenset({"epochs", "prior"})
-
-    def __post_init__(self) -> None:
-        require_positive(self, "prior_inflation")
 
     @abstractmethod
     def update(self, readings: EpochReadings) -> tuple[Belief, Array]:

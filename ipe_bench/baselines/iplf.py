@@ -8,8 +8,8 @@ import numpy as np
 
 from ipe_bench.baselines.information import Belief, EpochReadings, InformationFilter
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.errors import require_counts, require_positive
 from ipe_bench.basics.linalg import Array, Mask, finite, multiply
+from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.driver import Solver, Standing, iterate
 from ipe_bench.estimators.least_squares import squared
@@ -30,17 +30,12 @@ class IPLF(InformationFilter):
     Gauss-Newton steps halved until the misfit decreases; the outer loop brings the covariance and Omega up to date.
     """
 
-    max_iterations: int = 30
+    max_iterations: Count = 30
     """Regressions per epoch; an epoch that has not settled by then goes on from where it is."""
-    inner_iterations: int = 3
+    inner_iterations: Count = 3
     """Regressions between two covariances."""
-    tolerance: float = 1e-2
+    tolerance: Positive = 1e-2
     """Largest change, in deviations of the updated P and in share of them, at which an epoch is done."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_positive(self, "tolerance")
-        require_counts(self, "max_iterations", "inner_iterations")
 
     def update(self, readings: EpochReadings) -> tuple[Belief, Array]:
         prior = readings.belief

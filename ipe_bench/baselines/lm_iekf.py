@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.baselines.information import Belief, EpochReadings, InformationFilter
-from ipe_bench.basics.errors import require_counts, require_positive
 from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.driver import Ended, iterate
 from ipe_bench.estimators.least_squares import Descent, squared
@@ -25,19 +25,14 @@ class LMIEKF(InformationFilter):
     Steps are damped in the metric of the prior that the earlier epochs left.
     """
 
-    max_iterations: int = 20
+    max_iterations: Count = 20
     """Steps tried per epoch; one that has not settled by then goes on from where it is."""
-    tolerance: float = 1e-3
+    tolerance: Positive = 1e-3
     """Largest Gauss-Newton step, in deviations of the updated P, at which an epoch is done."""
-    damping: float = 1e-2
+    damping: Positive = 1e-2
     """lambda at the start of every epoch."""
 
     name = "lm_iekf"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_positive(self, "tolerance", "damping")
-        require_counts(self, "max_iterations")
 
     def update(self, readings: EpochReadings) -> tuple[Belief, Array]:
         problem = Standardized(readings, readings.belief.root())

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Lt
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.errors import UserError, require_counts, require_positive
 from ipe_bench.basics.linalg import Array, Mask, deviations, finite
+from ipe_bench.basics.options import Count, Positive, Whole
 from ipe_bench.basics.streams import normals, own_generators
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.least_squares import Minima, Objective, minimize
@@ -35,30 +37,23 @@ class Multistart(Estimator):
     size of the nominal point, or by 1 where that is zero.
     """
 
-    starts: int = 8
-    confirmations: int = 2
+    starts: Count = 8
+    confirmations: Whole = 2
     """Starts after the first fit, within `starts`."""
-    damping: float = 1e-3
+    damping: Positive = 1e-3
     """lambda at each start."""
-    max_iterations: int = 100
+    max_iterations: Count = 100
     """Steps tried from each start."""
-    tolerance: float = 1e-6
+    tolerance: Positive = 1e-6
     """Largest Gauss-Newton step in standard deviations of the local bound."""
-    fit_level: float = 1e-6
+    fit_level: Annotated[float, Ge(0), Lt(1)] = 1e-6
     """Residuals less probable than this are taken for those of a wrong minimum."""
-    seed: int = 0
+    seed: Whole = 0
     """A trial's random stream depends on this and on its readings: on nothing else in the batch."""
-    budget: float | None = None
+    budget: Positive | None = None
     """Simulations that a trial may cost, a Jacobian counting n; None: no limit."""
 
     equation = "least_squares"
-
-    def __post_init__(self) -> None:
-        require_positive(self, "damping", "tolerance", "budget")
-        require_counts(self, "starts", "max_iterations")
-        require_counts(self, "confirmations", "seed", least=0)
-        if not 0 <= self.fit_level < 1:
-            raise UserError(f"fit_level={self.fit_level}: give a probability from 0 to below 1")
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         objective = Objective.of(problem, z, prior=False)

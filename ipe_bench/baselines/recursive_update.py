@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ipe_bench.baselines.information import Belief, EpochReadings, InformationFilter
-from ipe_bench.basics.errors import require_counts, require_positive
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Count, Positive
 
 
 @dataclass(frozen=True)
@@ -21,15 +21,10 @@ class RecursiveUpdate(InformationFilter):
     largest eigenvalue of w_1 H P H' (H whitened) is about `first`. On a linear model all this is the Kalman filter.
     """
 
-    steps: int = 8
+    steps: Count = 8
     """Linearisations per epoch."""
-    first: float = 100.0
+    first: Positive = 100.0
     """The information of the first step over that of the prior, in the direction that the readings see best."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_counts(self, "steps")
-        require_positive(self, "first")
 
     def update(self, readings: EpochReadings) -> tuple[Belief, Array]:
         belief = readings.belief

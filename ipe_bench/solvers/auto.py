@@ -10,6 +10,7 @@ from annotated_types import Ge, Lt
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Positive
 from ipe_bench.basics.statuses import Status
