@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance, Mask, finite, inverse, multiply, solve
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.base import Estimates, Estimator
+from ipe_bench.estimators.base import Estimates, Estimator, Need
 from ipe_bench.estimators.driver import Solver, Standing, iterate
 from ipe_bench.estimators.least_squares import Minima, squared
 from ipe_bench.measurements.base import Measurement, Restricted
@@ -58,14 +58,13 @@ class MultipleShooting(Estimator):
     """Simulations that a trial may cost, a Jacobian counting n; None: no limit."""
 
     equation = "least_squares"
+    needs: ClassVar[frozenset[Need]] = frozenset({"differential equations"})
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
+        for need in self.missing(problem):
+            raise UserError(f"measurement={problem.measurement.name}: has no {need}, which multiple shooting needs")
         model, kept = _whole(problem.measurement)
-        if not isinstance(model, OdeMeasurement):
-            raise UserError(
-                f"measurement={problem.measurement.name}: is no model by differential equations, which multiple "
-                "shooting needs; choose another baseline"
-            )
+        assert isinstance(model, OdeMeasurement)
         pieces = Pieces(problem, model, kept, self.segments, self.step)
         with np.errstate(all="ignore"):
             shooting = Shooting(pieces, z, Tally.zeros(len(z)), np.arange(len(z)))

@@ -131,7 +131,7 @@ def test_gins_at_scale_300():
 
 
 def test_other_models_are_refused():
-    with pytest.raises(UserError, match="no model by differential equations"):
+    with pytest.raises(UserError, match="has no differential equations"):
         MultipleShooting().estimate(Problem(Linear(), Covariance(np.ones(11))), np.zeros((1, 11)))
     with pytest.raises(UserError, match=r"^segments=0"):
         MultipleShooting(segments=0)
