@@ -11,6 +11,7 @@ from ipe_bench.baselines.levenberg_marquardt import LevenbergMarquardt
 from ipe_bench.baselines.linear_lse import LinearLSE
 from ipe_bench.baselines.lm_iekf import LMIEKF
 from ipe_bench.baselines.map_lm import MapLM
+from ipe_bench.baselines.multiple_shooting import MultipleShooting
 from ipe_bench.baselines.multiscale_lm import MultiscaleLM
 from ipe_bench.baselines.multistart import Multistart
 from ipe_bench.baselines.recursive_update import RecursiveUpdate
@@ -31,6 +32,7 @@ __all__ = [
     "LevenbergMarquardt",
     "LinearLSE",
     "MapLM",
+    "MultipleShooting",
     "MultiscaleLM",
     "Multistart",
     "RecursiveUpdate",

@@ -10,7 +10,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import Solver
-from ipe_bench.estimators.ipe import Start, begin
+from ipe_bench.estimators.ipe import Start, starting_points
 from ipe_bench.estimators.least_squares import Descent, Objective, minimize
 from ipe_bench.measurements.problem import Problem
 
@@ -20,7 +20,8 @@ class Batch(Estimator):
     """Least squares on all readings at once; what is minimised, and by which method, is left to the subclass."""
 
     start: Start = "nominal"
-    """Where the iteration begins: at the linear LSE, eq. (16), or at the nominal point."""
+    """Where the iteration begins: at the linear LSE, eq. (16), at the nominal point, or at that of the two where the
+    readings fit better (`best`)."""
     max_iterations: Count = 100
     """Steps tried."""
     tolerance: Positive = 1e-6
@@ -40,10 +41,8 @@ class Batch(Estimator):
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         objective = self.objective(problem, z)
-        tally, x = objective.model.tally, problem.x0[None].repeat(len(z), axis=0)
-        if self.start == "linear_lse":
-            x, system = begin(problem, z, self.start)
-            tally.simulations += system.model.tally.simulations
+        tally = objective.model.tally
+        x = starting_points(problem, z, self.start, tally)
         minima = minimize(
             objective,
             self.method(objective),

@@ -18,6 +18,9 @@ class LevenbergMarquardt(Batch):
 
     damping: Positive = 1e-3
     """lambda at the start."""
+    geodesic: bool = False
+    """Bends each step along the curvature of the readings, for one more simulation (Transtrum and Sethna, 2012,
+    arXiv 1201.5885)."""
 
     def method(self, objective: Objective) -> Solver[Descent]:
-        return LevenbergMarquardtMethod(self.damping)
+        return LevenbergMarquardtMethod(self.damping, geodesic=self.geodesic)

@@ -14,7 +14,8 @@ from ipe_bench.basics.linalg import Array, Covariance, pseudo_inverse
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Equation, Estimates, Estimator, one_by_one
-from ipe_bench.estimators.ipe import Start, begin
+from ipe_bench.estimators.ipe import Start, starting_points
+from ipe_bench.measurements.counted import Tally
 from ipe_bench.measurements.problem import Problem
 
 _OUT_OF_EVALUATIONS = 0
@@ -34,7 +35,8 @@ class LeastSquares(Estimator):
 
     method: Literal["trf", "lm", "dogbox"] = "trf"
     """Trust region, MINPACK's Levenberg-Marquardt, or dogleg."""
-    start: Start = "linear_lse"
+    start: Start = "best"
+    """The linear LSE, eq. (16), the nominal point, or that of the two where the readings fit better (`best`)."""
     loss: Literal["linear", "soft_l1", "huber", "cauchy", "arctan"] = "linear"
     """Anything but linear bounds what one bad reading can do; `lm` knows linear only."""
     f_scale: Positive = 1.0
@@ -60,15 +62,12 @@ class LeastSquares(Estimator):
         return "least_squares" if self.loss == "linear" else None
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        x = np.repeat(problem.x0[None], len(z), axis=0)
-        spent = np.zeros(len(z))
-        if self.start == "linear_lse":
-            x, system = begin(problem, z, self.start)
-            spent = system.model.tally.simulations
+        tally = Tally.zeros(len(z))
+        x = starting_points(problem, z, self.start, tally)
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
             return one_by_one(
-                zip(z, x, spent, strict=True),
+                zip(z, x, tally.simulations, strict=True),
                 lambda trial: self._search(_Residuals(problem, *trial), history=history),
                 problem.measurement.n,
             )

@@ -18,7 +18,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.counted import Tally
 from ipe_bench.measurements.problem import Problem
 
-Need = Literal["epochs", "prior"]
+Need = Literal["differential equations", "epochs", "prior"]
 Equation = Literal["frozen", "least_squares", "map"]
 
 
@@ -134,7 +134,7 @@ class Estimator(Component, ABC):
     """
 
     needs: ClassVar[frozenset[Need]] = frozenset()
-    """What a scenario must have for this estimator to run: epochs, a prior."""
+    """What a scenario must have for this estimator to run: epochs, a prior, a model by differential equations."""
     equation: ClassVar[Equation | None] = None
     """The estimating equation whose root it seeks: that of the frozen H (eq. 11), of least squares, or of the maximum a
     posteriori; None where an estimate is no root of anything."""
@@ -145,7 +145,11 @@ class Estimator(Component, ABC):
 
     def missing(self, problem: Problem) -> list[str]:
         """What this estimator needs and the problem does not have."""
-        has = {"epochs": problem.measurement.epochs is not None, "prior": problem.prior_deviation is not None}
+        has = {
+            "differential equations": problem.measurement.by_differential_equations,
+            "epochs": problem.measurement.epochs is not None,
+            "prior": problem.prior_deviation is not None,
+        }
         return [need for need in sorted(self.needs) if not has[need]]
 
 

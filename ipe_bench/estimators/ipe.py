@@ -32,7 +32,9 @@ from ipe_bench.estimators.driver import Solver, Standing, iterate
 from ipe_bench.measurements.counted import Counted, Tally
 from ipe_bench.measurements.problem import Problem
 
-Start = Literal["linear_lse", "nominal"]
+Start = Literal["linear_lse", "nominal", "best"]
+"""Where an iteration begins: at the linear LSE, eq. (16), at the nominal point, or at that of the two where the
+readings fit better."""
 
 
 class System(Protocol):
@@ -95,8 +97,9 @@ class FrozenSystem:
         H_plus, deficient = pseudo_inverse(problem.H[None], problem.R)
         if deficient.any():
             raise UserError(
-                f"measurement={problem.measurement.name}: H has not full column rank at the nominal point, so some "
-                "parameters cannot be told apart; drop or combine parameters, or choose an estimator with a prior"
+                f"measurement={problem.measurement.name}: H has not full column rank at the nominal point: some "
+                "parameters cannot be told apart there, so there is no linear estimate to start from; give another "
+                "nominal point, start=nominal or best for least squares, or an estimator with a prior"
             )
         model = Counted(problem.measurement, Tally.zeros(len(z)))
         deviation = deviations(frozen_covariance(H_plus, problem.R))
@@ -160,7 +163,40 @@ def begin(problem: Problem, z: Array, start: Start) -> tuple[Array, FrozenSystem
     """
     system = FrozenSystem.at_nominal(problem, z)
     x0 = np.repeat(problem.x0[None], len(z), axis=0)
+    if start == "best":
+        return _better_fitting(system, x0), system
     return (x0 - system.F(x0) if start == "linear_lse" else x0), system
+
+
+def starting_points(problem: Problem, z: Array, start: Start, tally: Tally) -> Array:
+    """Where least squares begins (trials, n); what that costs goes to the tally.
+
+    Where H has not full column rank at the nominal point there is no linear LSE to choose, and `best` is the nominal
+    point: that the parameters cannot be told apart there says nothing of other points.
+
+    Raises:
+        UserError: linear_lse is asked for, and there is none.
+    """
+    if start == "nominal" or (start == "best" and pseudo_inverse(problem.H[None], problem.R)[1].any()):
+        return np.repeat(problem.x0[None], len(z), axis=0)
+    x, system = begin(problem, z, start)
+    tally.simulations += system.model.tally.simulations
+    tally.messages.update(system.model.tally.messages)
+    return x
+
+
+def _better_fitting(system: FrozenSystem, x0: Array) -> Array:
+    """x0 or the linear LSE (trials, n), whichever has the smaller |R^-1/2 (h - z)|; x0 where the other has none."""
+    r0 = system.model.simulate(x0, system.rows) - system.z
+    lse = x0 - multiply(system.H_plus, r0)
+    r = system.model.simulate(lse, system.rows) - system.z
+    better = squared_norm(system.R.whiten(r)) < squared_norm(system.R.whiten(r0))
+    return np.where(better[:, None], lse, x0)
+
+
+def squared_norm(r: Array) -> Array:
+    """|r|^2 of each trial (trials,)."""
+    return np.einsum("ti,ti->t", r, r)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,7 +209,8 @@ class IPE(Solver[S], Estimator, Generic[S]):
     """
 
     start: Start = "linear_lse"
-    """Where the iteration begins: at the linear LSE, eq. (16), or at the nominal point."""
+    """Where the iteration begins: at the linear LSE, eq. (16), at the nominal point, or at that of the two where the
+    readings fit better (`best`)."""
     max_iterations: Count = 100
     tolerance: Positive = 1e-6
     """Largest abs(F_i) in standard deviations of the linear bound, eq. (5)."""

@@ -97,6 +97,11 @@ class Measurement(Component, Named, ABC):
         return np.zeros(self.m)
 
     @property
+    def by_differential_equations(self) -> bool:
+        """Whether the readings are taken from a trajectory that can be entered anywhere: `OdeMeasurement`."""
+        return False
+
+    @property
     def n(self) -> int:
         return len(self.parameters)
 
@@ -184,6 +189,10 @@ class Restricted(Measurement):
     @property
     def nominal(self) -> Array:
         return self.whole.nominal
+
+    @property
+    def by_differential_equations(self) -> bool:
+        return self.whole.by_differential_equations
 
     @property
     def offset(self) -> Array:

@@ -91,6 +91,10 @@ class OdeMeasurement(Measurement):
     with which step the search begins; where there is none, it begins with that of the nominal parameters."""
 
     @property
+    def by_differential_equations(self) -> bool:
+        return True
+
+    @property
     def index(self) -> Mapping[str, Sequence[Any]]:
         cases, times, outputs = np.meshgrid(
             np.arange(1, len(self.cases) + 1), self.times, np.arange(len(self.outputs)), indexing="ij"

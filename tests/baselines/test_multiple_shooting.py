@@ -1,0 +1,137 @@
+"""Multiple shooting against single shooting, against the closed form of Bock's problem, and against its own pieces."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from linear_models import Linear
+
+from ipe_bench.baselines import LevenbergMarquardt, MultipleShooting
+from ipe_bench.baselines.multiple_shooting import Linear as Linearized
+from ipe_bench.baselines.multiple_shooting import Pieces
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Covariance
+from ipe_bench.basics.statuses import Status
+from ipe_bench.measurements import Bock, Gins, LotkaVolterra, Sir
+from ipe_bench.measurements.base import Restricted
+from ipe_bench.measurements.problem import Problem, recorded_problem
+from ipe_bench.noise import Gaussian, Quantization
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.trials.scenario import Scenario
+
+MODELS = {"gins": (Gins(), 100.0, 0.0066), "lotka_volterra": (LotkaVolterra(), 1.0, 0.5), "sir": (Sir(), 1.0, 5.0)}
+
+
+def scenario(name: str) -> Scenario:
+    model, scale, deviation = MODELS[name]
+    return Scenario(model, Gaussian(deviation), GaussianPrior(), scale, seed=2)
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("segments", [1, 4, 7])
+def test_pieces_that_meet_are_the_trajectory(name, segments):
+    """Followed from nodes on the trajectory the readings are those of the model, and its slopes theirs."""
+    drawn = scenario(name).draw(0, 3)
+    problem = scenario(name).problem
+    model = problem.measurement
+    pieces = Pieces(problem, model, np.arange(model.m), segments, 0.05)
+    first, _ = pieces.first_states(drawn.x)
+    y = np.repeat(first[:, None], len(pieces.cuts) - 1, axis=1)
+    for g in range(1, len(pieces.cuts) - 1):
+        y[:, g] = pieces.follow(drawn.x, y)[0][:, g - 1]
+    ends, h = pieces.follow(drawn.x, y)
+    np.testing.assert_array_equal(ends[:, :-1], y[:, 1:])
+    expected = model.simulate(drawn.x)
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(h.reshape(3, -1) - model.offset, expected, atol=1e-8 * scale)
+    # And as a matrix: chaining the pieces' slopes gives the Jacobian of single shooting.
+    M, Jh = pieces.slopes(drawn.x, y)
+    _, S = pieces.first_states(drawn.x)
+    n, along = drawn.x.shape[1], S
+    J = np.empty((*h.shape, n))
+    for g in range(len(pieces.cuts) - 1):
+        times = slice(pieces.cuts[g], pieces.cuts[g + 1])
+        J[:, :, times] = Jh[:, :, times, :, :n] + np.einsum("tckos,tcsn->tckon", Jh[:, :, times][..., n:], along)
+        along = M[:, g, ..., :n] + np.matmul(M[:, g, ..., n:], along)
+    exact = model.jacobian(drawn.x)
+    np.testing.assert_allclose(J.reshape(exact.shape), exact, atol=1e-6 * np.abs(exact).max())
+
+
+def test_a_linear_step_is_that_of_constrained_least_squares():
+    """The Lagrange equations, solved as one system."""
+    rng = np.random.default_rng(0)
+    C, J = rng.standard_normal((4, 5, 8)), rng.standard_normal((4, 9, 8))
+    d, r = rng.standard_normal((4, 5)), rng.standard_normal((4, 9))
+    linear = Linearized.of(C, J)
+    found = linear.step(d, r)
+    for k in range(4):
+        A = np.block([[J[k].T @ J[k], C[k].T], [C[k], np.zeros((5, 5))]])
+        u = np.linalg.solve(A, np.concatenate([-J[k].T @ r[k], -d[k]]))[:8]
+        np.testing.assert_allclose(found[k], u, atol=1e-9)
+        np.testing.assert_allclose(linear.covariance[k], np.linalg.inv(A)[:3, :3], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_its_minimum_is_that_of_single_shooting(name):
+    drawn, problem = scenario(name).draw(0, 4), scenario(name).problem
+    found = MultipleShooting(step=0.05).estimate(problem, drawn.z, history=True)
+    single = LevenbergMarquardt().estimate(problem, drawn.z)
+    deviation = np.sqrt(np.diagonal(single.covariance, axis1=1, axis2=2))
+    assert (found.status == Status.CONVERGED).all()
+    assert np.abs((found.x - single.x) / deviation).max() < 1e-3
+    np.testing.assert_allclose(np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)), deviation, rtol=1e-3)
+    np.testing.assert_allclose(found.extras["fit_p"], single.extras["fit_p"], rtol=1e-3)
+    for i in range(4):
+        alone = MultipleShooting(step=0.05).estimate(problem, drawn.z[i : i + 1])
+        np.testing.assert_array_equal(alone.x[0], found.x[i])
+        np.testing.assert_array_equal(alone.covariance[0], found.covariance[i])
+        np.testing.assert_array_equal(found.history[i][-1], found.x[i])
+
+
+@pytest.mark.parametrize("initial", [False, True])
+def test_bocks_problem_is_solved_where_single_shooting_is_lost(initial):
+    """Solutions grow by exp(60) = 1e26; p = pi in closed form."""
+    model = Bock(mu=60.0, initial=initial)
+    problem, z = recorded_problem(model), model.recorded.z[None]
+    with np.errstate(all="ignore"):
+        single = LevenbergMarquardt().estimate(problem, z)
+    assert not abs(single.x[0, 0] * model.size - np.pi) < 1e-6 or single.status[0] != Status.CONVERGED
+    found = MultipleShooting().estimate(problem, z)
+    assert found.status[0] == Status.CONVERGED
+    assert found.iterations[0] < 15
+    np.testing.assert_allclose(found.x[0] * model.size, [np.pi, 0.0, np.pi][: model.n], atol=1e-6)
+
+
+def test_missing_readings_are_as_if_they_had_never_been_taken():
+    whole = scenario("lotka_volterra")
+    problem, drawn = whole.problem, whole.draw(0, 2)
+    kept = tuple(i for i in range(problem.measurement.m) if i not in (2, 11, 12))
+    part = Problem(Restricted(problem.measurement, kept), problem.R.restricted(np.array(kept)))
+    found = MultipleShooting(step=0.05).estimate(part, drawn.z[:, list(kept)])
+    single = LevenbergMarquardt().estimate(part, drawn.z[:, list(kept)])
+    np.testing.assert_allclose(found.x, single.x, atol=1e-4)
+
+
+def test_a_bad_trial_disturbs_no_other():
+    whole = scenario("lotka_volterra")
+    z = whole.draw(0, 4).z
+    spoiled = z.copy()
+    spoiled[1, 3] = np.nan
+    found, alone = (MultipleShooting().estimate(whole.problem, a) for a in (spoiled, z))
+    assert found.status[1] == Status.NONFINITE
+    np.testing.assert_array_equal(found.x[[0, 2, 3]], alone.x[[0, 2, 3]])
+
+
+def test_gins_at_scale_300():
+    drawn = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), 300.0, 91)
+    trials = drawn.draw(0, 4)
+    found = MultipleShooting().estimate(drawn.problem, trials.z)
+    assert (found.status == Status.CONVERGED).all()
+    assert np.abs((found.x - trials.x) / np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))).max() < 6
+
+
+def test_other_models_are_refused():
+    with pytest.raises(UserError, match="has no differential equations"):
+        MultipleShooting().estimate(Problem(Linear(), Covariance(np.ones(11))), np.zeros((1, 11)))
+    with pytest.raises(UserError, match=r"^segments=0"):
+        MultipleShooting(segments=0)
