@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from ipe_bench.basics.options import component_classes
+
 TARGET = "_target_"
 WITHOUT_NUMBERS = frozenset(f"ipe_bench.basics.{name}" for name in ("errors", "files", "machine", "naming", "statuses"))
 """Modules that no number of a result comes from: they word messages, write files, name things."""
@@ -52,7 +54,7 @@ def fingerprint(components: Iterable[Any]) -> dict[str, Any]:
     """
     modules = set(_import_closure("ipe_bench.trials.scoring"))
     for component in components:
-        for cls in _classes(component):
+        for cls in component_classes(component):
             modules |= _import_closure(cls.__module__)
     packages = sorted({m.split(".")[0] for m in modules})
     digest = hashlib.sha256("".join(f"{m} {_digest_of(m)}\n" for m in sorted(modules)).encode())
@@ -61,17 +63,7 @@ def fingerprint(components: Iterable[Any]) -> dict[str, Any]:
 
 def class_modules(component: Any) -> set[str]:
     """The modules of the classes of a component and of the components inside it."""
-    return {cls.__module__ for cls in _classes(component)}
-
-
-def _classes(component: Any) -> list[type]:
-    """The class of a component and of the components inside it."""
-    if isinstance(component, tuple | list):
-        return [cls for item in component for cls in _classes(item)]
-    if not dataclasses.is_dataclass(component) or isinstance(component, type):
-        return []
-    inner = [cls for f in dataclasses.fields(component) for cls in _classes(getattr(component, f.name))]
-    return [type(component), *inner]
+    return {cls.__module__ for cls in component_classes(component)}
 
 
 @functools.cache
