@@ -22,6 +22,13 @@ def finite(a: Array) -> Mask:
     return np.asarray(np.isfinite(a).all(axis=tuple(range(1, a.ndim))))
 
 
+def read_only(a: Array) -> Array:
+    """The same numbers, which nobody can write to by this name."""
+    view = np.asarray(a).view()
+    view.flags.writeable = False
+    return view
+
+
 def multiply(A: Array, x: Array) -> Array:
     """A x for each trial: A (..., p, q), x (trials, q) -> (trials, p)."""
     return np.matmul(A, x[..., None])[..., 0]
@@ -76,6 +83,9 @@ class Covariance:
     """
 
     factor: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "factor", read_only(self.factor))
 
     @property
     def m(self) -> int:

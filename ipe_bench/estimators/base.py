@@ -11,10 +11,12 @@ from typing import Any, ClassVar, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics.containment import contained
 from ipe_bench.basics.errors import describe_exception
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, read_only
 from ipe_bench.basics.options import Component
 from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.private import Private, is_ours
 from ipe_bench.measurements.counted import Tally
 from ipe_bench.measurements.problem import Problem
 
@@ -156,18 +158,29 @@ class Estimator(Component, ABC):
 def estimate_safely(estimator: Estimator, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
     """`estimator.estimate`, timed, where an exception becomes the status of the trials that cause it.
 
-    A batch that raises is estimated again trial by trial.
+    A batch that raises is estimated again trial by trial. What an estimator does to global state is undone, and one
+    that is not of this package works on copies: if it changes them all the same, all its trials end as errors.
     """
+    if is_ours(estimator):
+        return _estimate(estimator, problem, read_only(z), history)
+    private = Private(problem, z)
+    estimates = _estimate(estimator, private.problem, private.z, history)
+    if complaint := private.complaint():
+        return Estimates.failed(len(z), problem.measurement.n, complaint)
+    return estimates
+
+
+def _estimate(estimator: Estimator, problem: Problem, z: Array, history: bool) -> Estimates:
     began = time.perf_counter()
     try:
-        with np.errstate(all="ignore"):
+        with contained():
             estimates = estimator.estimate(problem, z, history=history)
     except MemoryError:
         raise  # says something of the machine, not of the trial: the block fails and is tried again another day
     except Exception as error:
         if len(z) == 1:
             return Estimates.failed(1, problem.measurement.n, describe_exception(error))
-        return Estimates.join([estimate_safely(estimator, problem, row[None], history=history) for row in z])
+        return Estimates.join([_estimate(estimator, problem, row[None], history) for row in z])
     if not estimates.seconds.any():
         estimates.seconds = np.full(len(z), (time.perf_counter() - began) / max(1, len(z)))
     return estimates

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.linalg import Array, Covariance, read_only
 from ipe_bench.measurements.base import Measurement
 
 _FIXED = 1e-9
@@ -16,21 +16,25 @@ _FIXED = 1e-9
 
 @dataclass(frozen=True)
 class Problem:
-    """All that an estimator may know besides the readings."""
+    """All that an estimator may know besides the readings; its arrays are read-only."""
 
     measurement: Measurement
     R: Covariance
     prior_deviation: Array | None = None
     """Standard deviation (n,) of the parameters about the nominal point; None where no prior is known."""
 
+    def __post_init__(self) -> None:
+        if self.prior_deviation is not None:
+            object.__setattr__(self, "prior_deviation", read_only(self.prior_deviation))
+
     @property
     def x0(self) -> Array:
-        return self.measurement.nominal
+        return read_only(self.measurement.nominal)
 
     @cached_property
     def H(self) -> Array:
         """H (m, n) of eq. (1)."""
-        return self.measurement.linearization()
+        return read_only(self.measurement.linearization())
 
     def prior_used(self, inflation: float = 1.0) -> Array | None:
         """The prior's standard deviations (n,) times `inflation`; a parameter that the prior fixes is nearly fixed."""

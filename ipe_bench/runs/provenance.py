@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from ipe_bench.basics.options import component_classes
+
 TARGET = "_target_"
 WITHOUT_NUMBERS = tuple(
     f"ipe_bench.{name}"
@@ -64,7 +66,7 @@ def fingerprint(components: Iterable[Any]) -> dict[str, Any]:
     """
     modules = set(_import_closure("ipe_bench.trials.scoring"))
     for component in components:
-        for cls in _classes(component):
+        for cls in component_classes(component):
             modules |= _import_closure(cls.__module__)
     packages = sorted({m.split(".")[0] for m in modules})
     digest = hashlib.sha256("".join(f"{m} {_digest_of(m)}\n" for m in sorted(modules)).encode())
@@ -73,17 +75,7 @@ def fingerprint(components: Iterable[Any]) -> dict[str, Any]:
 
 def class_modules(component: Any) -> set[str]:
     """The modules of the classes of a component and of the components inside it."""
-    return {cls.__module__ for cls in _classes(component)}
-
-
-def _classes(component: Any) -> list[type]:
-    """The class of a component with its bases, and those of the components inside it."""
-    if isinstance(component, tuple | list):
-        return [cls for item in component for cls in _classes(item)]
-    if not dataclasses.is_dataclass(component) or isinstance(component, type):
-        return []
-    inner = [cls for f in dataclasses.fields(component) for cls in _classes(getattr(component, f.name))]
-    return [*(cls for cls in type(component).__mro__ if cls.__module__ not in ("builtins", "abc", "typing")), *inner]
+    return {cls.__module__ for cls in component_classes(component)}
 
 
 @functools.cache

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import functools
 import itertools
 import logging
 import signal
@@ -16,10 +17,12 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
+from ipe_bench.basics.containment import contained
 from ipe_bench.runs.execution.base import FATAL, Execution, Failure
 from ipe_bench.runs.provenance import class_modules, fingerprint
 from ipe_bench.runs.results import Results
@@ -97,23 +100,34 @@ def perform(task: Task) -> Iterator[Done | str]:
     """
     store = Store(task.directory)
     _check_source(task.cells)
-    with threadpool_limits(limits=1, user_api="blas"):
+    with _alone(), contained():
         block = Block.draw(task.cells[0].scenario, task.start, task.stop)
         # What all cells share, and the loading of compiled code, is not to be charged to the first of them.
         _ = block.crlb_information
-        yield PREPARED
-        for index, cell in enumerate(task.cells):
-            began = time.perf_counter()
-            failure = None
-            try:
+    yield PREPARED
+    for index, cell in enumerate(task.cells):
+        began = time.perf_counter()
+        failure = None
+        try:
+            with _alone(), contained():
                 _compute_cell(store, block, cell)
-            except FATAL:
-                raise
-            except BaseException as error:  # an estimator may raise anything, sys.exit() and KeyboardInterrupt too
-                if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-                    raise  # a user's Ctrl-C; where it is ignored, in worker processes, there can be none
-                failure = Failure.of(error)
-            yield Done(index, time.perf_counter() - began, failure)
+        except FATAL:
+            raise
+        except BaseException as error:  # an estimator may raise anything, sys.exit() and KeyboardInterrupt too
+            if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+                raise  # a user's Ctrl-C; where it is ignored, in worker processes, there can be none
+            failure = Failure.of(error)
+        yield Done(index, time.perf_counter() - began, failure)
+
+
+def _alone() -> Any:
+    """One thread in BLAS, whatever the part before has asked for."""
+    return _blas().limit(limits=1, user_api="blas")
+
+
+@functools.cache
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController()
 
 
 def _compute_cell(store: Store, block: Block, cell: Cell) -> None:

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, read_only
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem, recorded_problem
 from ipe_bench.noise.base import Noise
@@ -94,7 +94,7 @@ class Scenario:
             return _recorded_trial(self.measurement, start, stop)
         model = self.simulator
         streams = [_streams(self.seed, trial) for trial in range(start, stop)]
-        x = np.stack([self.prior.draw(model.nominal, self.error_scale, rng) for rng, _ in streams])
+        x = np.stack([self.prior.draw(read_only(model.nominal), self.error_scale, rng) for rng, _ in streams])
         deviation = model.nuisance_deviation
         if len(deviation):
             # After the parameters, from the same stream: a richer truth keeps the parameters of the trial.
@@ -102,7 +102,7 @@ class Scenario:
                 np.column_stack([x, [deviation * rng.standard_normal(len(deviation)) for rng, _ in streams]])
             )
         else:
-            h = model.simulate(x)
+            h = model.simulate(read_only(x))
         z = np.stack([self.noise.corrupt(h[i], model.offset, rng) for i, (_, rng) in enumerate(streams)])
         return Trials(start, x, z)
 

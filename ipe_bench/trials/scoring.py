@@ -22,6 +22,7 @@ from ipe_bench.basics.linalg import (
     multiply,
     pseudo_inverse,
     quadratic_form,
+    read_only,
     solve,
 )
 from ipe_bench.basics.statuses import Status
@@ -63,7 +64,7 @@ class Block:
     def jacobian(self) -> Array:
         """dh/dx at the truth (trials, m, n)."""
         with np.errstate(all="ignore"):
-            return self.problem.measurement.jacobian(self.trials.x)
+            return self.problem.measurement.jacobian(read_only(self.trials.x))
 
     @cached_property
     def crlb_information(self) -> Array:
@@ -117,7 +118,7 @@ class Block:
 
     def readings_at(self, x: Array) -> Array:
         """h(x) (trials, m) for x (trials, n); NaN where the model fails."""
-        return Counted.uncounted(self.problem.measurement, len(x)).simulate(x, np.arange(len(x)))
+        return Counted.uncounted(self.problem.measurement, len(x)).simulate(read_only(x), np.arange(len(x)))
 
     def _curvature(self, H_plus: Array) -> Array:
         """M of eq. (23) at the truth, for the first trials and NaN for the others."""

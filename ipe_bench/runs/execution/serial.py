@@ -23,6 +23,6 @@ class Serial(Execution):
                     yield Event(index, step)
             except FATAL:
                 raise
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 failure = Failure.of(error)
             yield Event(index, ended=True, failure=failure)
