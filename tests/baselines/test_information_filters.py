@@ -11,13 +11,16 @@ from scipy.optimize import least_squares
 from small_models import Bent
 
 from ipe_bench.baselines import EKF, IPLF, LMIEKF, IteratedEKF, RecursiveUpdate
-from ipe_bench.baselines.information import InformationFilter
+from ipe_bench.baselines.epochs import arrivals
+from ipe_bench.baselines.information import Belief, EpochReadings, InformationFilter
+from ipe_bench.baselines.iplf import Affine
 from ipe_bench.baselines.recursive_update import geometric_weights
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Covariance, multiply
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements import Gins
 from ipe_bench.measurements.base import Restricted
+from ipe_bench.measurements.counted import Tally
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.plugins.conformance import check_component
@@ -220,6 +223,29 @@ def test_damping_changes_nothing_where_gauss_newton_converges():
     np.testing.assert_allclose(ours.extras["nis"], theirs.extras["nis"], rtol=1e-3)
 
 
+def test_regression_over_the_cubature_points_is_the_textbooks():
+    """A = Psi' P^-1 and Omega = Phi - A P A' with the moments of the readings, all by sums over the points."""
+    problem, trials = bent(0.5, 0.2, 4)
+    epoch = next(arrivals(problem))
+    rng = np.random.default_rng(5)
+    U, x = rng.standard_normal((4, 3, 3)) + 2 * np.eye(3), rng.standard_normal((4, 3))
+    z = epoch.whitened(trials.z)
+    readings = EpochReadings(epoch, problem, np.ones(3), Tally.zeros(4), z, np.arange(4), Belief(x, U))
+    found = Affine.over(readings, x, U)
+    for k in range(4):
+        S = np.linalg.inv(U[k])
+        points = x[k] + np.sqrt(3) * np.concatenate([S.T, -S.T])
+        h = problem.measurement.simulate(points)[:, epoch.rows] / 0.2
+        P, centre = S @ S.T, h.mean(axis=0)
+        A = ((h - centre).T @ (points - x[k]) / 6) @ np.linalg.inv(P)
+        Omega = np.cov(h, rowvar=False, ddof=0) - A @ P @ A.T
+        assert np.linalg.eigvalsh(Omega).max() > 0.1
+        np.testing.assert_allclose(found.r[k], centre - z[k], rtol=1e-9)
+        np.testing.assert_allclose(found.A[k], A, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(found.Omega[k], Omega, rtol=1e-8, atol=1e-8 * np.abs(h).max() ** 2)
+    assert readings.tally.simulations == pytest.approx(6 / 4)  # six points of the first of four epochs
+
+
 def textbook_iplf(model, z, variance, iterations):
     """García-Fernández et al.'s algorithm in covariance form, undamped, at the 2n points of the cubature rule."""
     n = 3
@@ -278,8 +304,6 @@ def test_mistakes_are_named(estimator, options):
 
 def test_the_square_root_does_not_matter_to_the_belief():
     """P = U^-1 U^-T and its update, by the inverse of the sum of informations."""
-    from ipe_bench.baselines.information import Belief
-
     rng = np.random.default_rng(3)
     U, J = rng.standard_normal((5, 3, 3)), rng.standard_normal((5, 2, 3))
     mean, at, r = rng.standard_normal((5, 3)), rng.standard_normal((5, 3)), rng.standard_normal((5, 2))

@@ -101,6 +101,23 @@ def test_it_stops_at_the_first_fit_if_nothing_is_to_be_confirmed():
     assert (more.simulations > found.simulations).all()
 
 
+def test_after_the_first_fit_as_many_starts_follow_as_are_to_confirm_it(monkeypatch):
+    problem, trials = draw(Wave(), 0.1, 1.0, 20)
+    descended, descend = np.zeros(20, dtype=int), Multistart._descend
+
+    def counting(self, objective, *rest):
+        descended[objective.rows] += 1
+        return descend(self, objective, *rest)
+
+    monkeypatch.setattr(Multistart, "_descend", counting)
+    Multistart(starts=60, confirmations=0).estimate(problem, trials.z)
+    until_fit = descended.copy()
+    descended[:] = 0
+    Multistart(starts=60, confirmations=3).estimate(problem, trials.z)
+    assert until_fit.max() > 4
+    np.testing.assert_array_equal(descended, np.minimum(until_fit + 3, 60))
+
+
 def test_a_trial_draws_its_own_starts():
     """Whatever else stands in the batch, and in whatever order."""
     problem, trials = draw(Wave(), 0.1, 1.0, 12)
