@@ -58,7 +58,7 @@ def _find_class(target: Any, where: str) -> type:
     except BaseException as error:  # a plugin may do anything while it is imported, sys.exit() too
         if _is_ours(module_name):
             raise
-        raise UserError(f"{where}: cannot be imported: {_place(error)}") from None
+        raise UserError(f"{where}: its module cannot be imported: {_place(error)}") from None
     if not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
         raise UserError(f"{where}: is not a component (a component is a frozen dataclass)")
     if missing := sorted(getattr(cls, "__abstractmethods__", ())):
@@ -84,7 +84,7 @@ def _instantiate(cls: type, options: dict[str, Any], where: str) -> Any:
     except KeyboardInterrupt:
         raise
     except BaseException as error:
-        if isinstance(error, ValueError) and _is_ours(cls.__module__):
+        if isinstance(error, ValueError):  # how classes that know nothing of ours refuse an option
             raise UserError(f"{where}: {' '.join(str(error).split())}") from error
         if _is_ours(cls.__module__):
             raise

@@ -134,6 +134,9 @@ def _connect(workers: int | None, address: str | None, jobqueue: str | None, opt
         import distributed
     except ImportError:
         raise UserError('execution=dask: Dask is not installed; pip install "ipe-bench[dask]"') from None
+    # What Dask logs of a cluster that goes away is a traceback; a line of ours says it.
+    for name in ("client", "core", "comm", "batched"):
+        logging.getLogger(f"distributed.{name}").setLevel(logging.CRITICAL)
     options = json.loads(options_json)
     if address is not None:
         try:
