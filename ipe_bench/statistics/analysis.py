@@ -58,7 +58,8 @@ class Analysis:
     """Of the parameters' errors over solved trials: row, column (both parameters' names) and value."""
     convergence: pd.DataFrame
     """Of each converged trial with a stored history: trial, iteration, and the iterate's distance from the last one
-    in deviations of the bound; without the last, whose distance is zero by definition, and without filters."""
+    in deviations of the bound; none of filters, whose epochs are not iterations. The last
+    distance is zero by definition, which says nothing of convergence."""
     contraction: pd.DataFrame
     """Per scenario, how much the fixed-point iteration contracts at the truth; empty where no file says so."""
 
@@ -303,7 +304,5 @@ def _correlation(sample: Sample) -> Array:
 
 
 def _convergence_rows(where: dict[str, Any], history: History) -> pd.DataFrame:
-    # The last iterate stands for the limit: that it is at no distance from itself says nothing of convergence.
-    distances = history.distances[:-1]
-    iteration = np.arange(len(distances))
-    return pd.DataFrame(where | {"trial": history.trial, "iteration": iteration, "distance": distances})
+    iteration = np.arange(len(history.distances))
+    return pd.DataFrame(where | {"trial": history.trial, "iteration": iteration, "distance": history.distances})

@@ -171,9 +171,9 @@ class Block:
         deviation = problem.prior_used()
         with np.errstate(all="ignore"):
             if uses_prior and deviation is not None:
-                return prior_spread(self.jacobian, problem.R, deviation, inflation)
+                return prior_spread(self.crlb_information, model.m, deviation, inflation)
             if equation == "frozen" and np.isfinite(problem.H).all():
-                return frozen_spread(self.jacobian, problem.H, problem.R)
+                return frozen_spread(self.jacobian, problem.H, problem.R, self.crlb_information)
         return least_squares_spread(model.m, model.n, len(self.trials.x))
 
     @cached_property

@@ -7,11 +7,18 @@ import pytest
 from scipy.stats import chi2, kstest
 
 from ipe_bench.baselines import EKF, GaussNewton, MapLM
-from ipe_bench.basics.linalg import Covariance
+from ipe_bench.basics.linalg import Covariance, information
 from ipe_bench.measurements import Gins, Polynomial
 from ipe_bench.noise import Colored, Correlated, Gaussian, NoNoise, Outliers, Quantization, StudentT
 from ipe_bench.solvers import Newton
-from ipe_bench.trials.fit_test import DRAWS, fit_probability, frozen_spread, least_squares_spread, prior_spread
+from ipe_bench.trials.fit_test import (
+    DRAWS,
+    _by_bases,
+    fit_probability,
+    frozen_spread,
+    least_squares_spread,
+    prior_spread,
+)
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import Block
 
@@ -108,7 +115,8 @@ def test_spreads_are_the_eigenvalues_of_the_residuals_covariance():
     H, J = rng.normal(size=(m, n)), rng.normal(size=(3, m, n))
     R = Covariance(np.linalg.cholesky(np.cov(rng.normal(size=(m, 60)))))
     d = rng.uniform(0.1, 2.0, n)
-    frozen, prior = frozen_spread(J, H, R), prior_spread(J, R, d, 1.7)
+    frozen, prior = frozen_spread(J, H, R), prior_spread(information(J, R), m, d, 1.7)
+    np.testing.assert_allclose(_by_bases(J, H, R), frozen.others, rtol=1e-8)
     Hw = R.whiten_jacobian(H)
     for i, slope in enumerate(J):
         Jw = R.whiten_jacobian(slope)

@@ -291,3 +291,21 @@ def test_seeds_that_tell_equal_estimators_apart_are_one_in_twenty():
         assert ranking is not None
         rejected += ranking.friedman < 0.05
     assert rejected / 400 <= 0.05 + 4 * np.sqrt(0.05 * 0.95 / 400)
+
+
+def test_p_in_a_report_is_corrected_over_the_whole_sweep(synthetic):
+    """Ten scenarios of two equal estimators, one with a difference that is significant by itself and not among ten."""
+    rng = np.random.default_rng(11)
+    raw = []
+    for i in range(10):
+        e, f = (0.1 * rng.normal(size=(60, 3)) for _ in range(2))
+        scenario = synthetic.scenario(error_scale=1.0 + i)
+        synthetic.add(scenario, "one", e)
+        synthetic.add(scenario, "two", f)
+        d = differences(*(np.sqrt(((x / 0.1) ** 2).sum(axis=1)) for x in (e, f)))
+        raw.append(signed_rank(d))
+    assert 0.005 < min(raw) < 0.05
+    analysis = analyse([synthetic.directory])
+    np.testing.assert_allclose(analysis.pairs["p_error"], holm(raw), rtol=1e-9)
+    assert not analysis.scores["leads"].any()
+    assert (analysis.pairs["closer"] == "").all()

@@ -10,6 +10,7 @@ import pandas as pd
 
 from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, Look
 from ipe_bench.report.words import plain
+from ipe_bench.trials.thresholds import FEW
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,8 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_PANELS = 6
-FEW = 20
-"""A point that fewer trials carry is hollow and has no interval."""
 COINCIDE = 0.015
 """Points nearer than this part of the axis lie upon each other."""
 UPON = "Where points coincide, each marker lies smaller upon the one before it."
