@@ -379,7 +379,7 @@ def _write_record(store: Store, scenarios: Sequence[Scenario], estimators: Mappi
         "trials": trials,
         "scenarios": [describe(s) for s in scenarios],
         "estimators": {label: describe(e) for label, e in estimators.items()},
-        "cells": [{"key": c.key, "identity_key": c.footer["identity_key"], "names": c.names} for c in cells],
+        "cells": [{"key": c.key, "identity_key": c.identity_key, "names": c.names} for c in cells],
         "libraries": library_versions(),
         "machine": {"host": platform.node(), "system": platform.platform(), "cores": cores()},
         "git_commit": _git_commit(Path.cwd()),

@@ -65,6 +65,11 @@ class Cell:
         return key_of(self.identity, self.made_by["source"])
 
     @cached_property
+    def identity_key(self) -> str:
+        """Sixteen hexadecimal digits that stand for the identity alone."""
+        return digest(self.identity)
+
+    @cached_property
     def made_by(self) -> dict[str, Any]:
         return fingerprint([self.scenario] if self.estimator is None else [self.scenario, self.estimator])
 
@@ -95,7 +100,7 @@ class Cell:
             "schema": SCHEMA,
             "key": self.key,
             "identity": self.identity,
-            "identity_key": digest(self.identity),
+            "identity_key": self.identity_key,
             **self.made_by,
             "libraries": library_versions(),
             "names": self.names,
@@ -178,7 +183,7 @@ class Store:
         """States that these trials could not be computed, and why; the next run tries them again."""
         record = {
             "key": cell.key,
-            "identity_key": cell.footer["identity_key"],
+            "identity_key": cell.identity_key,
             "names": cell.names,
             "start": start,
             "stop": stop,
