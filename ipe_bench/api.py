@@ -299,7 +299,8 @@ def compute(
     aside = results.set_aside()
     tasks = [task for part in cells for task in plan(store.directory, part, results, trials, block_size)]
     execution.warm_up(perform, len(tasks))
-    identifier = _write_record(store, scenarios, estimators, trials)
+    record = _record(scenarios, estimators, trials)
+    identifier = (None if tasks or aside else store.same_run(record)) or _write_record(store, record)
     with RunLog(store.directory / "log" / f"{identifier}.log") as log:
         for line in aside:
             log.warning(line)
@@ -370,12 +371,17 @@ def cells_of(scenario: Scenario, estimators: Mapping[str, Estimator]) -> list[Ce
     return [Cell(scenario), *(Cell(scenario, label, estimator) for label, estimator in estimators.items())]
 
 
-def _write_record(store: Store, scenarios: Sequence[Scenario], estimators: Mapping[str, Estimator], trials: int) -> str:
+def _write_record(store: Store, record: Mapping[str, Any]) -> str:
     """States what is going to be computed, so that what is missing later is known to be missing; returns its name."""
     now = datetime.datetime.now(datetime.UTC)
+    identifier = f"{now:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}"
+    store.write_run(identifier, {"started": now.isoformat(timespec="microseconds"), **record})
+    return identifier
+
+
+def _record(scenarios: Sequence[Scenario], estimators: Mapping[str, Estimator], trials: int) -> dict[str, Any]:
     cells = [cell for scenario in scenarios for cell in cells_of(scenario, estimators)]
-    record: dict[str, Any] = {
-        "started": now.isoformat(timespec="microseconds"),
+    return {
         "trials": trials,
         "scenarios": [describe(s) for s in scenarios],
         "estimators": {label: describe(e) for label, e in estimators.items()},
@@ -385,9 +391,6 @@ def _write_record(store: Store, scenarios: Sequence[Scenario], estimators: Mappi
         "git_commit": _git_commit(Path.cwd()),
         **fingerprint([*scenarios, *estimators.values()]),
     }
-    identifier = f"{now:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}"
-    store.write_run(identifier, record)
-    return identifier
 
 
 @functools.cache

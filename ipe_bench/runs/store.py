@@ -216,6 +216,22 @@ class Store:
         path = self.runs / f"{identifier}.json"
         return self._write_json(path, {"run": identifier, **record})
 
+    def same_run(self, record: Mapping[str, Any]) -> str | None:
+        """The name of a stored record that says the same, and after which nothing else was asked of its cells; None
+        where there is none. A run that has nothing to compute needs no further record then."""
+        record = json.loads(json.dumps(record, default=str))
+        keys = {cell["identity_key"]: cell["key"] for cell in record["cells"]}
+        for path in sorted(self.runs.glob("*.json"), reverse=True):
+            try:
+                known = json.loads(path.read_text(encoding="utf-8"))
+                if all(known.get(name) == value for name, value in record.items()):
+                    return path.stem
+                if any(keys.get(cell["identity_key"], cell["key"]) != cell["key"] for cell in known["cells"]):
+                    return None
+            except (OSError, ValueError, KeyError, TypeError, AttributeError):
+                continue
+        return None
+
     def _write_json(self, path: Path, record: Mapping[str, Any]) -> Path:
         text = json.dumps({"schema": SCHEMA, **record, "seal": BLANK_SEAL}, indent=1, default=str)
         content = seal(text.encode())

@@ -6,10 +6,11 @@ Nothing here is an estimator: an estimator does not know where to start.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put
 from ipe_bench.basics.linalg import Array
@@ -18,6 +19,7 @@ from ipe_bench.estimators.gauss_newton import GaussNewtonMethod
 from ipe_bench.estimators.ipe import IPE, FrozenSystem, State, System
 from ipe_bench.estimators.least_squares import Objective
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
+from ipe_bench.measurements.counted import Counted
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers.newton import Newton
 
@@ -41,19 +43,33 @@ class _Chord(IPE[_ChordState]):
         return _ChordState(x, system.F(x), state.J)
 
 
-def frozen_root(problem: Problem, z: Array, x_start: Array) -> Array:
+@dataclass(frozen=True)
+class _Informed(Counted):
+    """A model whose dh/dx (trials, m, n) at the starts x (trials, n) is known, so that it is not computed there."""
+
+    x: Array = ()  # type: ignore[assignment]
+    J: Array = ()  # type: ignore[assignment]
+
+    def jacobian(self, x: Array, rows: NDArray[np.intp]) -> Array:
+        return self.J[rows] if np.array_equal(x, self.x[rows]) else super().jacobian(x, rows)
+
+
+def frozen_root(problem: Problem, z: Array, x_start: Array, J: Array | None = None) -> Array:
     """The root (trials, n) of the frozen equation (11) next to x_start (trials, n), for readings z (trials, m); NaN
-    where there is none.
+    where there is none. J (trials, m, n) is dh/dx at x_start, where it is known.
 
     Chord steps with the Jacobian at x_start, which is enough where x_start is the truth; Newton's method for the trials
     where it is not.
     """
-    return _first_root(lambda z: FrozenSystem.at_nominal(problem, z), ((_Chord(), 8), (Newton(), 20)), z, x_start)
+    return _first_root(lambda z: FrozenSystem.at_nominal(problem, z), ((_Chord(), 8), (Newton(), 20)), z, x_start, J)
 
 
-def least_squares_root(problem: Problem, z: Array, x_start: Array, *, prior: float | None) -> Array:
+def least_squares_root(
+    problem: Problem, z: Array, x_start: Array, J: Array | None = None, *, prior: float | None
+) -> Array:
     """The minimum (trials, n) of |h(x) - z| in the metric of R next to x_start (trials, n); MAP where `prior` says by
-    how much to widen the prior's deviations. NaN where none is found.
+    how much to widen the prior's deviations. NaN where none is found. J (trials, m, n) is dh/dx at x_start, where it
+    is known.
 
     Gauss-Newton; Levenberg-Marquardt for the trials where that fails.
     """
@@ -61,19 +77,25 @@ def least_squares_root(problem: Problem, z: Array, x_start: Array, *, prior: flo
     def objective(z: Array) -> Objective:
         return Objective.of(problem, z, prior=prior is not None, inflation=prior or 1.0)
 
-    return _first_root(objective, ((GaussNewtonMethod(), 20), (LevenbergMarquardtMethod(1e-3), 100)), z, x_start)
+    return _first_root(objective, ((GaussNewtonMethod(), 20), (LevenbergMarquardtMethod(1e-3), 100)), z, x_start, J)
 
 
 def _first_root(
-    equations: Callable[[Array], Any], attempts: Sequence[tuple[Solver[Any], int]], z: Array, x_start: Array
+    equations: Callable[[Array], Any],
+    attempts: Sequence[tuple[Solver[Any], int]],
+    z: Array,
+    x_start: Array,
+    J: Array | None,
 ) -> Array:
     """Where the first method that converges ends: each has that many iterations from x_start."""
     x, missing = np.full(x_start.shape, np.nan), np.arange(len(z))
     for method, limit in attempts:
         if len(missing):
-            ended: Ended[Any] = iterate(
-                equations(z[missing]), method, x_start[missing], tolerance=_TOLERANCE, max_iterations=limit
-            )
+            system = equations(z[missing])
+            if J is not None:
+                known = _Informed(system.model.measurement, system.model.tally, 1.0, x_start[missing], J[missing])
+                system = replace(system, model=known)
+            ended: Ended[Any] = iterate(system, method, x_start[missing], tolerance=_TOLERANCE, max_iterations=limit)
             x = put(x, missing[ended.converged], ended.x[ended.converged])
             missing = missing[~ended.converged]
     return x

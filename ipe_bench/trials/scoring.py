@@ -140,7 +140,7 @@ class Block:
         key = (equation, inflation)
         if key not in self._roots:
             with np.errstate(all="ignore"):
-                self._roots[key] = _root_from(self.problem, self.trials, equation, inflation)
+                self._roots[key] = _root_from(self.problem, self.trials, self.jacobian, equation, inflation)
         return self._roots[key]
 
     def estimate(self, estimator: Estimator) -> tuple[Estimates, Columns]:
@@ -244,14 +244,15 @@ def nees(error: Array, P: Array) -> Array:
     return np.where(reported, np.where(usable, np.einsum("ti,ti->t", e, x), np.inf), np.nan)
 
 
-def _root_from(problem: Problem, trials: Trials, equation: Equation, inflation: float) -> Array:
+def _root_from(problem: Problem, trials: Trials, J: Array, equation: Equation, inflation: float) -> Array:
+    """The root next to the truth, where dh/dx is J (trials, m, n)."""
     if equation == "frozen":
         try:
-            return frozen_root(problem, trials.z, trials.x)
+            return frozen_root(problem, trials.z, trials.x, J)
         except UserError:
             # H lacks rank, so there is no such equation; the estimators that solve it say so.
             return np.full(trials.x.shape, np.nan)
-    return least_squares_root(problem, trials.z, trials.x, prior=inflation if equation == "map" else None)
+    return least_squares_root(problem, trials.z, trials.x, J, prior=inflation if equation == "map" else None)
 
 
 def _by_parameter(prefix: str, names: list[str], values: Array) -> Columns:
