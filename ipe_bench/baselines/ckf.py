@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from ipe_bench.baselines.batched import Rows, Stack, correct, rows_of_root
 from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric, turned
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, Mask
 
 
 @dataclass(frozen=True)
@@ -17,6 +18,9 @@ class CKF(Sequential):
 
     def track(self, P0: Array, Q: Array, z: Array) -> CKFTrack:
         return CKFTrack(P0, Q)
+
+    def stack(self, P0: Array, Q: Array, z: Array) -> CKFStack:
+        return CKFStack(P0, Q, len(z))
 
 
 class CKFTrack(Track):
@@ -66,3 +70,21 @@ class CKFTrack(Track):
         self.reference = self.reference + f.x[:, 0]
         f.x = np.zeros_like(f.x)
         return True
+
+
+class CKFStack(Stack):
+    """The same filter for all trials at once."""
+
+    def __init__(self, P0: Array, Q: Array, trials: int) -> None:
+        super().__init__(P0, Q, trials)
+        self.away = np.zeros((trials, 2 * len(P0), len(P0)))
+
+    def points(self, at: Rows) -> Array:
+        U = rows_of_root(self.P[at]) * np.sqrt(self.P.shape[1])
+        self.away[at] = np.concatenate([U, -U], axis=1)
+        return self.x[at][:, None] + self.away[at]
+
+    def update(self, at: Rows, z: Array, h: Array, H: Array | None) -> Mask:
+        weights = np.full(h.shape[1], 1 / h.shape[1])
+        correct(self, at, self.away[at], z, h, weights, weights)
+        return np.ones(len(at), dtype=bool)

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ipe_bench.baselines.batched import Rows, Stack, gain_of, principal_axes, squared_innovations
 from ipe_bench.baselines.sequential import Sequential, Track, refuse_overflow, squared_innovation
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, Mask, multiply
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,9 @@ class EKF(Sequential):
 
     def track(self, P0: Array, Q: Array, z: Array) -> EKFTrack:
         return EKFTrack(P0, Q)
+
+    def stack(self, P0: Array, Q: Array, z: Array) -> EKFStack:
+        return EKFStack(P0, Q, len(z))
 
 
 class EKFTrack(Track):
@@ -61,3 +65,28 @@ def turned_by_slopes(z: Array, h: Array, H: Array, P: Array) -> tuple[Array, Arr
     refuse_overflow(S)
     axes = np.linalg.eigh(S)[1][:, ::-1].T
     return axes @ z, axes @ h, axes @ H
+
+
+class EKFStack(Stack):
+    """The same filter for all trials at once."""
+
+    def points(self, at: Rows) -> Array:
+        return self.x[at][:, None]
+
+    def update(self, at: Rows, z: Array, h: Array, H: Array | None) -> Mask:
+        assert H is not None
+        y = self.linear_update(at, self.x[at], self.P[at], z - h[:, 0], H)
+        self.nis[at] += y
+        return np.ones(len(at), dtype=bool)
+
+    def linear_update(self, at: Rows, x: Array, P: Array, y: Array, H: Array) -> Array:
+        """From the priors x and P and the innovations y (trials, m); returns y' S^-1 y (trials,)."""
+        axes = principal_axes(np.matmul(np.matmul(H, P), H.swapaxes(1, 2)))
+        y, H = multiply(axes.swapaxes(1, 2), y), np.matmul(axes.swapaxes(1, 2), H)
+        PHT = np.matmul(P, H.swapaxes(1, 2))
+        S = np.matmul(H, PHT) + np.eye(y.shape[1])
+        K = gain_of(PHT, S)
+        I_KH = np.eye(P.shape[1]) - np.matmul(K, H)
+        self.x[at] = x + multiply(K, y)
+        self.P[at] = np.matmul(np.matmul(I_KH, P), I_KH.swapaxes(1, 2)) + np.matmul(K, K.swapaxes(1, 2))
+        return squared_innovations(y, S)

@@ -11,8 +11,10 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Gt
 
+from ipe_bench.baselines.batched import Rows, Stack, gain_of, squared_innovations
+from ipe_bench.baselines.batched import symmetric as symmetric_each
 from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric, turned
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, Mask, multiply
 from ipe_bench.basics.options import Whole
 from ipe_bench.basics.streams import own_bits
 
@@ -31,6 +33,9 @@ class EnKF(Sequential):
 
     def track(self, P0: Array, Q: Array, z: Array) -> EnKFTrack:
         return EnKFTrack(P0, Q, self.members, own_bits(self.seed, z))
+
+    def stack(self, P0: Array, Q: Array, z: Array) -> EnKFStack:
+        return EnKFStack(P0, Q, self.members, [own_bits(self.seed, row) for row in z])
 
 
 class EnKFTrack(Track):
@@ -70,6 +75,54 @@ class EnKFTrack(Track):
         f.P = symmetric(f.P)
         self.nis += squared_innovation(z, f.SI)  # the turned h has mean 0
         return True
+
+
+class EnKFStack(Stack):
+    """The same filter for all trials at once, with the same draws."""
+
+    def __init__(self, P0: Array, Q: Array, members: int, streams: list[np.random.Philox]) -> None:
+        super().__init__(P0, Q, len(streams))
+        self.members, self.draws = members, [np.random.RandomState(stream) for stream in streams]
+        self.root_Q = _root(Q)
+        self.ensemble = self._drawn(np.arange(len(streams)), _root(P0))
+
+    def _drawn(self, at: Rows, root: Array) -> Array:
+        """Gaussian draws (trials, members, size) of covariance root' root, from each trial's own stream."""
+        white = [self.draws[trial].standard_normal((self.members, len(root))) for trial in at]
+        return np.matmul(np.stack(white), root) if white else np.empty((0, self.members, len(root)))
+
+    def predict(self, at: Rows) -> None:
+        self.ensemble[at] += self._drawn(at, self.root_Q)
+        self.x[at] = self.ensemble[at].mean(axis=1)
+        away = self.ensemble[at] - self.x[at][:, None]
+        self.P[at] = np.matmul(away.swapaxes(1, 2), away) / (self.members - 1)
+
+    def points(self, at: Rows) -> Array:
+        return self.ensemble[at]
+
+    def update(self, at: Rows, z: Array, h: Array, H: Array | None) -> Mask:
+        centre = h.mean(axis=1, keepdims=True)
+        spread = h - centre
+        # The perturbations are drawn along these axes, so they are those of `turned` to the sign.
+        axes = np.linalg.svd(spread, full_matrices=h.shape[1] < h.shape[2])[2].swapaxes(1, 2)
+        spread, z = np.matmul(spread, axes), multiply(axes.swapaxes(1, 2), z - centre[:, 0])
+        off = spread - spread.mean(axis=1, keepdims=True)
+        I = np.eye(z.shape[1])  # noqa: E741  the field's letter for the unit matrix
+        S = np.matmul(off.swapaxes(1, 2), off) / (self.members - 1) + I
+        away = self.ensemble[at] - self.x[at][:, None]
+        K = gain_of(np.matmul(away.swapaxes(1, 2), off) / (self.members - 1), S)
+        innovations = z[:, None] + self._drawn(at, _root(I)) - spread
+        self.ensemble[at] += np.matmul(innovations, K.swapaxes(1, 2))
+        self.x[at] = self.ensemble[at].mean(axis=1)
+        self.P[at] = symmetric_each(self.P[at] - np.matmul(np.matmul(K, S), K.swapaxes(1, 2)))
+        self.nis[at] += squared_innovations(z, S)
+        return np.ones(len(at), dtype=bool)
+
+
+def _root(P: Array) -> Array:
+    """The root of P by which NumPy's `multivariate_normal` turns white draws into draws of covariance P."""
+    _, s, v = np.linalg.svd(P)
+    return np.sqrt(s)[:, None] * v
 
 
 _GLOBAL_STATE = Lock()

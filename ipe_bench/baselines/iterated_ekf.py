@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.baselines.ekf import EKFTrack, turned_by_slopes
+from ipe_bench.baselines.batched import Rows
+from ipe_bench.baselines.ekf import EKFStack, EKFTrack, turned_by_slopes
 from ipe_bench.baselines.sequential import Sequential, squared_innovation
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, Mask, deviations, multiply
 from ipe_bench.basics.options import Count, Positive
 
 
@@ -26,6 +27,9 @@ class IteratedEKF(Sequential):
 
     def track(self, P0: Array, Q: Array, z: Array) -> IteratedEKFTrack:
         return IteratedEKFTrack(P0, Q, self.max_iterations, self.tolerance)
+
+    def stack(self, P0: Array, Q: Array, z: Array) -> IteratedEKFStack:
+        return IteratedEKFStack(P0, Q, len(z), self.max_iterations, self.tolerance)
 
 
 class IteratedEKFTrack(EKFTrack):
@@ -53,3 +57,29 @@ class IteratedEKFTrack(EKFTrack):
             self.nis += squared_innovation(f.y, f.SI)
         change = np.abs(f.x - at) / np.sqrt(np.diag(f.P))
         return self.iteration >= self.max_iterations or bool(change.max() <= self.tolerance)
+
+
+class IteratedEKFStack(EKFStack):
+    """The same filter for all trials at once."""
+
+    def __init__(self, P0: Array, Q: Array, trials: int, max_iterations: int, tolerance: float) -> None:
+        super().__init__(P0, Q, trials)
+        self.max_iterations, self.tolerance = max_iterations, tolerance
+        self.x_prior, self.P_prior = self.x.copy(), self.P.copy()
+        self.iteration = 0
+
+    def predict(self, at: Rows) -> None:
+        super().predict(at)
+        self.x_prior, self.P_prior, self.iteration = self.x.copy(), self.P.copy(), 0
+
+    def update(self, at: Rows, z: Array, h: Array, H: Array | None) -> Mask:
+        assert H is not None
+        x, before = self.x_prior[at], self.x[at]
+        y = z - h[:, 0] - multiply(H, x - before)
+        squared = self.linear_update(at, x, self.P_prior[at], y, H)
+        self.iteration += 1
+        if self.iteration == 1:
+            # The innovation of the prediction; later ones have seen z.
+            self.nis[at] += squared
+        change = (np.abs(self.x[at] - before) / deviations(self.P[at])).max(axis=1)
+        return (change <= self.tolerance) | (self.iteration >= self.max_iterations)

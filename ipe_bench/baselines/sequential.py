@@ -11,11 +11,12 @@ import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from scipy.linalg import LinAlgWarning
 
+from ipe_bench.baselines.batched import Stack, run
 from ipe_bench.baselines.epochs import Epoch, arrivals
 from ipe_bench.basics.errors import UserError, describe_exception
 from ipe_bench.basics.linalg import Array
@@ -74,10 +75,17 @@ class Sequential(Estimator):
     process_noise: NonNegative = 0.0
     """Standard deviation of the parameters' random walk from one epoch to the next, in prior deviations (before
     inflation). The parameters are constants, so anything above 0 makes the filter forget."""
+    engine: Literal["filterpy", "batched"] = "filterpy"
+    """Who computes the filter's equations: filterpy, trial by trial, or this package, for all trials at once."""
 
     needs: ClassVar[frozenset[Need]] = frozenset({"epochs", "prior"})
     slopes: ClassVar[bool] = False
     """True where `Track.update` wants dh/dx; then there is one point per trial."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.engine == "batched" and type(self).stack is Sequential.stack:
+            raise UserError("engine=batched: this filter has none; choose engine=filterpy")
 
     @abstractmethod
     def track(self, P0: Array, Q: Array, z: Array) -> Track:
@@ -85,9 +93,19 @@ class Sequential(Estimator):
         (n, n) per epoch. z (m,) are all readings of the trial: for a random stream that is the trial's own, and for
         nothing else."""
 
+    def stack(self, P0: Array, Q: Array, z: Array) -> Stack:
+        """The filters of all trials, as `track`, for readings z (trials, m). A filter that has none is filterpy's."""
+        raise NotImplementedError
+
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         for need in self.missing(problem):
             raise UserError(f"measurement={problem.measurement.name}: has no {need}, which a filter needs")
+        if self.engine == "batched":
+            I = np.eye(problem.measurement.n)  # noqa: E741  the field's letter for the unit matrix
+            stack = self.stack(self.prior_inflation**2 * I, self.process_noise**2 * I, z)
+            epochs = list(arrivals(problem))
+            with np.errstate(all="ignore"):
+                return run(stack, problem, z, epochs, slopes=self.slopes, history=history)
         with np.errstate(all="ignore"), warnings.catch_warnings():
             # SciPy warns of an ill-conditioned S, which R's smallness beside a wide prior explains.
             warnings.simplefilter("ignore", LinAlgWarning)

@@ -8,8 +8,9 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Gt, Le
 
+from ipe_bench.baselines.batched import Rows, Stack, correct, rows_of_root
 from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric, turned
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.basics.options import Finite, NonNegative
 
 
@@ -30,6 +31,9 @@ class UKF(Sequential):
         from filterpy.kalman import MerweScaledSigmaPoints
 
         return UKFTrack(P0, Q, MerweScaledSigmaPoints(len(P0), self.alpha, self.beta, self.kappa))
+
+    def stack(self, P0: Array, Q: Array, z: Array) -> UKFStack:
+        return UKFStack(P0, Q, len(z), self.alpha, self.beta, self.kappa)
 
 
 class UKFTrack(Track):
@@ -68,3 +72,26 @@ class UKFTrack(Track):
         f.P = symmetric(f.P)
         self.nis += squared_innovation(f.y, f.SI)
         return True
+
+
+class UKFStack(Stack):
+    """The same filter for all trials at once, with van der Merwe's points and weights."""
+
+    def __init__(self, P0: Array, Q: Array, trials: int, alpha: float, beta: float, kappa: float) -> None:
+        super().__init__(P0, Q, trials)
+        n = len(P0)
+        self.reach = alpha**2 * (n + kappa)
+        self.mean = np.full(2 * n + 1, 0.5 / self.reach)
+        self.mean[0] = (self.reach - n) / self.reach
+        self.weights = self.mean.copy()
+        self.weights[0] += 1 - alpha**2 + beta
+        self.away = np.zeros((trials, 2 * n + 1, n))
+
+    def points(self, at: Rows) -> Array:
+        U = rows_of_root(self.reach * self.P[at])
+        self.away[at, 1:] = np.concatenate([U, -U], axis=1)
+        return self.x[at][:, None] + self.away[at]
+
+    def update(self, at: Rows, z: Array, h: Array, H: Array | None) -> Mask:
+        correct(self, at, self.away[at], z, h, self.weights, self.mean)
+        return np.ones(len(at), dtype=bool)

@@ -43,12 +43,12 @@ class _Chord(IPE[_ChordState]):
         return _ChordState(x, system.F(x), state.J)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Informed(Counted):
     """A model whose dh/dx (trials, m, n) at the starts x (trials, n) is known, so that it is not computed there."""
 
-    x: Array = ()  # type: ignore[assignment]
-    J: Array = ()  # type: ignore[assignment]
+    x: Array
+    J: Array
 
     def jacobian(self, x: Array, rows: NDArray[np.intp]) -> Array:
         return self.J[rows] if np.array_equal(x, self.x[rows]) else super().jacobian(x, rows)
@@ -93,7 +93,7 @@ def _first_root(
         if len(missing):
             system = equations(z[missing])
             if J is not None:
-                known = _Informed(system.model.measurement, system.model.tally, 1.0, x_start[missing], J[missing])
+                known = _Informed(system.model.measurement, system.model.tally, x=x_start[missing], J=J[missing])
                 system = replace(system, model=known)
             ended: Ended[Any] = iterate(system, method, x_start[missing], tolerance=_TOLERANCE, max_iterations=limit)
             x = put(x, missing[ended.converged], ended.x[ended.converged])
