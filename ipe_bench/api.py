@@ -289,7 +289,10 @@ def compute(
         UserError: what was asked for cannot be computed, or the folder cannot be written to; nothing is computed then.
         StorageError: nothing can be stored any more.
     """
-    validate(scenarios, estimators, trials, block_size)
+    # What is stored of a scenario shows that its numbers can be computed with, without drawing any.
+    stored = [any(Path(output).glob(f"trials/{Cell(scenario).key}-*.parquet")) for scenario in scenarios]
+    untried = [scenario for scenario, known in zip(scenarios, stored, strict=True) if not known]
+    validate(scenarios, estimators, trials, block_size, untried=untried)
     # Absolute: workers may have another working folder.
     store = Store(Path(output).absolute())
     store.prepare()
@@ -312,9 +315,17 @@ def compute(
 
 
 def validate(
-    scenarios: Sequence[Scenario], estimators: Mapping[str, Estimator], trials: int, block_size: int = BLOCK_SIZE
+    scenarios: Sequence[Scenario],
+    estimators: Mapping[str, Estimator],
+    trials: int,
+    block_size: int = BLOCK_SIZE,
+    *,
+    untried: Sequence[Scenario] | None = None,
 ) -> None:
-    """Raises one UserError with everything that stands in the way of this run."""
+    """Raises one UserError with everything that stands in the way of this run.
+
+    Trials are drawn of the scenarios `untried` (all where it is None), to see whether numbers hold what is asked for.
+    """
     mistakes = []
     if trials < 1:
         mistakes.append(f"trials={trials}: give a whole number above 0")
@@ -331,7 +342,8 @@ def validate(
     for scenario in scenarios:
         if scenario.noise.real and trials != 1:
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
-        mistakes += _beyond_numbers(scenario)
+        if untried is None or scenario in untried:
+            mistakes += _beyond_numbers(scenario)
         mistakes += _needs(scenario.problem, estimators)
     if mistakes:
         raise UserError("; ".join(dict.fromkeys(mistakes)))

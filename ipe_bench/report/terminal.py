@@ -29,14 +29,14 @@ def render(
 ) -> Group:
     """One table per setting (measurement, noise, and every option that differs), a section per error scale.
 
-    `summary` is the frame or its rows. Columns that do not fit the width are left out, and named below. Runs on certified readings, whose mean digits are
-    in `certified`, share one table instead.
+    `summary` is the frame or its rows. Columns that do not fit the width are left out, and named below. Runs on
+    certified readings, whose mean digits are in `certified`, share one table instead.
     """
     from rich.console import Group
     from rich.text import Text
 
     digits = [] if certified is None or certified.empty else _digits(certified)
-    listed = summary if isinstance(summary, Sequence) else summary.to_dict("records")
+    listed: Sequence[Any] = summary if isinstance(summary, Sequence) else summary.to_dict("records")
     rows = [row for row in listed if row["parameter"] == ALL and row["noise"] != "certified"]
     if not rows:
         return Group(*digits or [Text("nothing is stored yet")])

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from ipe_bench.cli.main import main
-from ipe_bench.runs.results import _numpy
+from ipe_bench.runs.columns import as_array
 
 HEAVY = ("numba", "pandas", "scipy.stats", "scipy.integrate", "matplotlib", "seaborn", "jinja2")
 COMMAND = """
@@ -104,7 +104,7 @@ def test_columns_are_read_as_arrow_reads_them(tmp_path: Path, cut: slice) -> Non
     joined = pa.concat_tables([read, read])
     for name in columns:
         for part in (read, joined):
-            expected, found = part[name].to_numpy(), _numpy(part[name])
+            expected, found = part[name].to_numpy(), as_array(part[name])
             assert len(expected) == len(found)
             if len(expected):
                 assert found.dtype == expected.dtype
