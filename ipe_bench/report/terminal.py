@@ -37,11 +37,11 @@ def render(
 
     digits = [] if certified is None or certified.empty else _digits(certified)
     listed: Sequence[Any] = summary if isinstance(summary, Sequence) else summary.to_dict("records")
-    rows = [row for row in listed if row["parameter"] == ALL and row["noise"] != "certified"]
+    rows: list[Any] = [row for row in listed if row["parameter"] == ALL and row["noise"] != "certified"]
     if not rows:
         return Group(*digits or [Text("nothing is stored yet")])
     columns = dict.fromkeys(c for row in rows for c in row if c not in _NOT_SETTINGS and not c.startswith("estimator."))
-    settings: dict[str, list[Mapping[str, Any]]] = {}
+    settings: dict[str, list[Any]] = {}
     for row in rows:
         named = {k: row.get(k) for k in columns}
         title = ", ".join(
