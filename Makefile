@@ -19,8 +19,9 @@ lint: .venv/ready
 	$(BIN)/ruff format --check
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+# What everything costs beside its rivals, as a table in outputs/bench.
 bench: .venv/ready
-	$(BIN)/pytest tests/benchmarks --benchmark-only --benchmark-columns=min,median,ops
+	IPE_BENCH_THREADS=1 OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/table.py outputs/bench
 
 .venv/ready: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \

@@ -289,7 +289,10 @@ def compute(
         UserError: what was asked for cannot be computed, or the folder cannot be written to; nothing is computed then.
         StorageError: nothing can be stored any more.
     """
-    validate(scenarios, estimators, trials, block_size)
+    # What is stored of a scenario shows that its numbers can be computed with, without drawing any.
+    stored = [any(Path(output).glob(f"trials/{Cell(scenario).key}-*.parquet")) for scenario in scenarios]
+    untried = [scenario for scenario, known in zip(scenarios, stored, strict=True) if not known]
+    validate(scenarios, estimators, trials, block_size, untried=untried)
     # Absolute: workers may have another working folder.
     store = Store(Path(output).absolute())
     store.prepare()
@@ -299,7 +302,8 @@ def compute(
     aside = results.set_aside()
     tasks = [task for part in cells for task in plan(store.directory, part, results, trials, block_size)]
     execution.warm_up(perform, len(tasks))
-    identifier = _write_record(store, scenarios, estimators, trials)
+    record = _record(scenarios, estimators, trials)
+    identifier = (None if tasks or aside else store.same_run(record)) or _write_record(store, record)
     with RunLog(store.directory / "log" / f"{identifier}.log") as log:
         for line in aside:
             log.warning(line)
@@ -311,9 +315,17 @@ def compute(
 
 
 def validate(
-    scenarios: Sequence[Scenario], estimators: Mapping[str, Estimator], trials: int, block_size: int = BLOCK_SIZE
+    scenarios: Sequence[Scenario],
+    estimators: Mapping[str, Estimator],
+    trials: int,
+    block_size: int = BLOCK_SIZE,
+    *,
+    untried: Sequence[Scenario] | None = None,
 ) -> None:
-    """Raises one UserError with everything that stands in the way of this run."""
+    """Raises one UserError with everything that stands in the way of this run.
+
+    Trials are drawn of the scenarios `untried` (all where it is None), to see whether numbers hold what is asked for.
+    """
     mistakes = []
     if trials < 1:
         mistakes.append(f"trials={trials}: give a whole number above 0")
@@ -330,7 +342,8 @@ def validate(
     for scenario in scenarios:
         if scenario.noise.real and trials != 1:
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
-        mistakes += _beyond_numbers(scenario)
+        if untried is None or scenario in untried:
+            mistakes += _beyond_numbers(scenario)
         mistakes += _needs(scenario.problem, estimators)
     if mistakes:
         raise UserError("; ".join(dict.fromkeys(mistakes)))
@@ -370,24 +383,26 @@ def cells_of(scenario: Scenario, estimators: Mapping[str, Estimator]) -> list[Ce
     return [Cell(scenario), *(Cell(scenario, label, estimator) for label, estimator in estimators.items())]
 
 
-def _write_record(store: Store, scenarios: Sequence[Scenario], estimators: Mapping[str, Estimator], trials: int) -> str:
+def _write_record(store: Store, record: Mapping[str, Any]) -> str:
     """States what is going to be computed, so that what is missing later is known to be missing; returns its name."""
     now = datetime.datetime.now(datetime.UTC)
+    identifier = f"{now:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}"
+    store.write_run(identifier, {"started": now.isoformat(timespec="microseconds"), **record})
+    return identifier
+
+
+def _record(scenarios: Sequence[Scenario], estimators: Mapping[str, Estimator], trials: int) -> dict[str, Any]:
     cells = [cell for scenario in scenarios for cell in cells_of(scenario, estimators)]
-    record: dict[str, Any] = {
-        "started": now.isoformat(timespec="microseconds"),
+    return {
         "trials": trials,
         "scenarios": [describe(s) for s in scenarios],
         "estimators": {label: describe(e) for label, e in estimators.items()},
-        "cells": [{"key": c.key, "identity_key": c.footer["identity_key"], "names": c.names} for c in cells],
+        "cells": [{"key": c.key, "identity_key": c.identity_key, "names": c.names} for c in cells],
         "libraries": library_versions(),
         "machine": {"host": platform.node(), "system": platform.platform(), "cores": cores()},
         "git_commit": _git_commit(Path.cwd()),
         **fingerprint([*scenarios, *estimators.values()]),
     }
-    identifier = f"{now:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}"
-    store.write_run(identifier, record)
-    return identifier
 
 
 @functools.cache

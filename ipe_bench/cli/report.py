@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console
@@ -13,9 +13,8 @@ from ipe_bench.runs.results import require_results
 from ipe_bench.runs.store import TRUTH
 
 if TYPE_CHECKING:
-    import pandas as pd
-
-    from ipe_bench.report import ReportResult
+    from ipe_bench.statistics.analysis import Begun
+    from ipe_bench.statistics.collect import Collection
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -29,12 +28,18 @@ def main(arguments: Sequence[str]) -> int:
     if len(directories) > 1 and not outputs:
         raise UserError("report: several directories need output=DIR, as the report on all is not that of the first")
     require_results(directories)
+    from ipe_bench.report.stamp import made_from
+    from ipe_bench.statistics.analysis import begin
+
     output = Path(outputs[0]) if outputs else directories[0]
-    result = _write(directories, output)
-    for problem in (*result.problems, *result.stale):
+    made = made_from(directories, output)
+    begun = begin(directories)
+    _print_table(begun.summary, begun.collection)
+    collection = _write(begun, output, made)
+    for problem in (*collection.problems, *collection.stale):
         print(f"ipe-bench: {problem}", file=sys.stderr)
-    _show(result.summary, result.certified, output, result)
-    return 1 if result.problems else 0
+    _print_places(output)
+    return 1 if collection.problems else 0
 
 
 def show_command(output: Path, cells: Mapping[str, str]) -> int:
@@ -42,39 +47,62 @@ def show_command(output: Path, cells: Mapping[str, str]) -> int:
 
     `cells` has a line for people by key.
     """
-    from ipe_bench.report.certified_tables import certified_tables
+    from ipe_bench.report.stamp import made_from
+    from ipe_bench.statistics.analysis import begin
     from ipe_bench.statistics.collect import collect
-    from ipe_bench.statistics.summary import summary_of
+    from ipe_bench.statistics.summary import rows_of_all
 
-    result = _write([output], output)
-    own = collect([output], cells.keys())
-    others = sum(cell.key not in cells and cell.label != TRUTH for cell in collect([output]).current)
-    elsewhere = [p for p in result.problems if not any(line in p for line in cells.values())]
-    for problem in [p for p in result.problems if p not in elsewhere]:
+    made = made_from([output], output)
+    begun = begin([output])
+    others = sum(cell.key not in cells and cell.label != TRUTH for cell in begun.collection.current)
+    if others:
+        own = collect([output], cells.keys())
+        _print_table(rows_of_all(own), own)
+    else:
+        _print_table(begun.summary, begun.collection)
+    problems = _write(begun, output, made).problems
+    elsewhere = [p for p in problems if not any(line in p for line in cells.values())]
+    for problem in [p for p in problems if p not in elsewhere]:
         print(f"ipe-bench: {problem}", file=sys.stderr)
     if elsewhere:
         told = f"{_counted(len(elsewhere), 'problem')} of other commands; `ipe-bench status {output}` lists them"
         print(f"ipe-bench: {output}: {told}", file=sys.stderr)
-    _show(summary_of(own), certified_tables(own)[1], output, result)
+    _print_places(output)
     if others:
         print(f"Here too  {_counted(others, 'result')} of other commands; `ipe-bench report {output}` shows all")
-    return 1 if result.problems else 0
+    return 1 if problems else 0
 
 
-def _write(directories: Sequence[Path], output: Path) -> ReportResult:
-    from ipe_bench.report import write_report
+def _write(begun: Begun, output: Path, made: str) -> Collection:
+    """Writes the report unless it is there already; returns what it is on, with all problems."""
+    from ipe_bench.report.stamp import is_current, leave
 
-    return write_report(directories, output)
+    collection = begun.collection
+    if not is_current(output, made, [*collection.problems, *collection.stale]):
+        from ipe_bench.report import write_analysis
+
+        result = write_analysis(begun, output)
+        leave(output, made, [*collection.problems, *collection.stale], result.files)
+    return collection
 
 
-def _show(summary: pd.DataFrame, certified: pd.DataFrame, output: Path, result: ReportResult) -> None:
+def _print_table(rows: Sequence[Mapping[str, Any]], collection: Collection) -> None:
     from ipe_bench.report.terminal import render
 
+    certified = None
+    if any(row["noise"] == "certified" for row in rows):
+        from ipe_bench.report.certified_tables import certified_tables
+
+        certified = certified_tables(collection)[1]
     out = console()
-    out.print(render(summary, certified, out.width))
-    figures = f"\nFigures  {output / 'figures'}" if result.figures else ""
-    out.print(f"\nSummary  {result.summary_path}\nTables   {output / 'tables'}{figures}", markup=False, soft_wrap=True)
-    out.print(f"Report   {result.report}", markup=False, soft_wrap=True)
+    out.print(render(rows, certified, out.width))
+    sys.stdout.flush()
+
+
+def _print_places(output: Path) -> None:
+    figures = f"\nFigures  {output / 'figures'}" if any(output.glob("figures/*.png")) else ""
+    places = f"\nSummary  {output / 'summary.csv'}\nTables   {output / 'tables'}{figures}"
+    console().print(f"{places}\nReport   {output / 'report.html'}", markup=False, soft_wrap=True)
 
 
 def _counted(number: int, noun: str) -> str:

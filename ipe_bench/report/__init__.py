@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import pandas as pd
 
+    from ipe_bench.statistics.analysis import Begun
+
 __all__ = ["ReportResult", "write_report"]
 
 
@@ -31,6 +33,11 @@ class ReportResult:
     certified: pd.DataFrame
     """Mean correct digits per estimator and start, on certified readings; empty where there are none."""
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Everything that was written."""
+        return (self.summary_path, *self.tables, *self.figures, self.report)
+
 
 def write_report(directories: Path | str | Sequence[Path | str], output: Path | str | None = None) -> ReportResult:
     """Writes summary.csv, tables/, figures/ and report.html from what is stored, under `output` or the first directory.
@@ -38,16 +45,21 @@ def write_report(directories: Path | str | Sequence[Path | str], output: Path | 
     Raises:
         UserError: a directory does not exist.
     """
+    from ipe_bench.statistics.analysis import begin
+
+    directories = [directories] if isinstance(directories, Path | str) else list(directories)
+    return write_analysis(begin(directories), Path(directories[0] if output is None else output))
+
+
+def write_analysis(begun: Begun, output: Path) -> ReportResult:
+    """Finishes an analysis and writes the report on it under `output`."""
     from ipe_bench.basics.files import write_text
     from ipe_bench.report.certified_tables import certified_tables, without_certified
     from ipe_bench.report.figures import draw_all
     from ipe_bench.report.html import render_page
     from ipe_bench.report.tables import all_tables, write_tables
-    from ipe_bench.statistics.analysis import analyse
 
-    directories = [directories] if isinstance(directories, Path | str) else list(directories)
-    analysis = analyse(directories)
-    output = Path(directories[0] if output is None else output)
+    analysis = begun.finish()
     folder = output / "figures"
     summary_path = output / "summary.csv"
     write_text(summary_path, analysis.summary.to_csv(index=False))
@@ -55,12 +67,12 @@ def write_report(directories: Path | str | Sequence[Path | str], output: Path | 
     tables = [*certified_shown, *all_tables(analysis)]
     table_paths = write_tables(analysis, tables, output / "tables")
     figures: list[Path] = []
-    shown = []
+    drawn = []
     pictured = without_certified(analysis)
-    for drawn in draw_all(pictured, folder):
-        figures += drawn.files
-        shown.append((drawn.name, drawn.title, drawn.caption, drawn.files[0].read_bytes()))
-    page = render_page(analysis, tables, shown)
+    for figure in draw_all(pictured, folder):
+        figures += figure.files
+        drawn.append((figure.name, figure.title, figure.caption, figure.files[0].read_bytes()))
+    page = render_page(analysis, tables, drawn)
     report = output / "report.html"
     write_text(report, page)
     return ReportResult(

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
 from typing import TYPE_CHECKING, Any
-
-import pandas as pd
 
 from ipe_bench.report.words import compact, limits, plain, shown
 from ipe_bench.statistics.records import STATISTICS, Statistic
 from ipe_bench.statistics.summary import ALL, COLUMNS
 
 if TYPE_CHECKING:
+    import pandas as pd
     from rich.console import Group
     from rich.table import Table
 
@@ -24,27 +24,33 @@ _SHOWN = tuple(record for record in STATISTICS if "terminal" in record.where)
 _NOT_SETTINGS = {*COLUMNS, "parameter", "unit", "estimator", "error_scale"}
 
 
-def render(summary: pd.DataFrame, certified: pd.DataFrame | None = None, width: int = WIDE) -> Group:
+def render(
+    summary: pd.DataFrame | Sequence[Mapping[str, Any]], certified: pd.DataFrame | None = None, width: int = WIDE
+) -> Group:
     """One table per setting (measurement, noise, and every option that differs), a section per error scale.
 
-    Columns that do not fit the width are left out, and named below. Runs on certified readings, whose mean digits are
-    in `certified`, share one table instead.
+    `summary` is the frame or its rows. Columns that do not fit the width are left out, and named below. Runs on
+    certified readings, whose mean digits are in `certified`, share one table instead.
     """
     from rich.console import Group
     from rich.text import Text
 
     digits = [] if certified is None or certified.empty else _digits(certified)
-    rows = summary[(summary["parameter"] == ALL) & (summary["noise"] != "certified")] if len(summary) else summary
-    if rows.empty:
+    listed: Sequence[Any] = summary if isinstance(summary, Sequence) else summary.to_dict("records")
+    rows: list[Any] = [row for row in listed if row["parameter"] == ALL and row["noise"] != "certified"]
+    if not rows:
         return Group(*digits or [Text("nothing is stored yet")])
-    columns = [c for c in rows.columns if c not in _NOT_SETTINGS and not c.startswith("estimator.")]
-    parts: list[Any] = []
-    absent: dict[str, None] = {}
-    for values, part in rows.groupby(columns, dropna=False, sort=False):
-        named = dict(zip(columns, values if isinstance(values, tuple) else (values,), strict=True))
+    columns = dict.fromkeys(c for row in rows for c in row if c not in _NOT_SETTINGS and not c.startswith("estimator."))
+    settings: dict[str, list[Any]] = {}
+    for row in rows:
+        named = {k: row.get(k) for k in columns}
         title = ", ".join(
             str(v) if k in ("measurement", "noise") else f"{k}={plain(v)}" for k, v in named.items() if _says(v)
         )
+        settings.setdefault(title, []).append(row)
+    parts: list[Any] = []
+    absent: dict[str, None] = {}
+    for title, part in settings.items():
         table, left_out = _setting(title, part, width)
         parts.append(table)
         absent |= dict.fromkeys(left_out)
@@ -59,23 +65,20 @@ def render(summary: pd.DataFrame, certified: pd.DataFrame | None = None, width: 
     return Group(*digits, *parts, Text(note, style="dim"))
 
 
-def _setting(title: str, part: pd.DataFrame, width: int) -> tuple[Table, list[str]]:
+def _setting(title: str, part: Sequence[Mapping[str, Any]], width: int) -> tuple[Table, list[str]]:
     """The table of one setting, and the headings of what does not fit."""
     from rich import box
     from rich.table import Table
     from rich.text import Text
 
     # The number of trials stands in the title where it is the same for all.
-    counts = part["trials"].unique()
+    counts = list({row["trials"] for row in part})
     alike = len(counts) == 1
     shown = [record for record in _SHOWN if not (alike and record.name == "trials")]
     headings = ["scale", "estimator", *_headings(shown)]
     sections = [
-        [
-            [f"{scale:g}" if i == 0 else "", str(row["estimator"]), *_cells(shown, row)]
-            for i, (_, row) in enumerate(block.iterrows())
-        ]
-        for scale, block in part.groupby("error_scale", sort=False)
+        [[f"{scale:g}" if i == 0 else "", str(row["estimator"]), *_cells(shown, row)] for i, row in enumerate(block)]
+        for scale, block in groupby(part, key=lambda row: row["error_scale"])
     ]
     fitting = _fitting(headings, [row for section in sections for row in section], width)
     table = Table(

@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 
 from ipe_bench.basics.files import is_sealed
 from ipe_bench.basics.linalg import Array
+from ipe_bench.runs.columns import as_array
 from ipe_bench.runs.rows import Rule, faults, history_rules, trial_rules
 from ipe_bench.runs.store import FOOTER, SCHEMA, TRUTH, digest, key_of
 
@@ -114,7 +115,7 @@ def _check_names(names: Mapping[str, Any]) -> None:
 
 
 def _check_rows(table: pa.Table, rules: Mapping[str, Rule], start: int | None = None) -> None:
-    rows: dict[str, Array] = {name: table[name].to_numpy() for name in table.column_names}
+    rows: dict[str, Array] = {name: as_array(table[name]) for name in table.column_names}
     for fault in faults(rows, rules, start):
         raise Unusable(f"damaged: {fault}")
 

@@ -23,6 +23,7 @@ import pyarrow as pa
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.runs.columns import as_array
 from ipe_bench.runs.pieces import Failed, Foreign, Outdated, Piece, Run, Unusable, read_history
 from ipe_bench.runs.provenance import canonical_json
 from ipe_bench.runs.store import TRUTH, Store, describe_names, gaps, title
@@ -365,11 +366,11 @@ class Results:
         if not tables:
             return {name: np.empty(0) for name in names or ["trial"]}
         table = pa.concat_tables(tables, promote_options="default")
-        trial, order = np.unique(table["trial"].to_numpy(), return_index=True)
+        trial, order = np.unique(as_array(table["trial"]), return_index=True)
         whole = len(order) == table.num_rows and np.array_equal(order, np.arange(len(order)))
         result = {}
         for name in table.column_names if names is None else [n for n in names if n in table.column_names]:
-            values = table[name].to_numpy()
+            values = as_array(table[name])
             result[name] = values if whole else values[order]
         return result | {"trial": trial}
 
@@ -398,7 +399,7 @@ class Results:
                 continue
             with self.naming(path):
                 table = self._kept[path] if path in self._kept else read_history(path)[1]
-                return {name: table[name].to_numpy() for name in ("trial", *columns)}
+                return {name: as_array(table[name]) for name in ("trial", *columns)}
         return None
 
 

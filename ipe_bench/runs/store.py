@@ -65,6 +65,11 @@ class Cell:
         return key_of(self.identity, self.made_by["source"])
 
     @cached_property
+    def identity_key(self) -> str:
+        """Sixteen hexadecimal digits that stand for the identity alone."""
+        return digest(self.identity)
+
+    @cached_property
     def made_by(self) -> dict[str, Any]:
         return fingerprint([self.scenario] if self.estimator is None else [self.scenario, self.estimator])
 
@@ -95,7 +100,7 @@ class Cell:
             "schema": SCHEMA,
             "key": self.key,
             "identity": self.identity,
-            "identity_key": digest(self.identity),
+            "identity_key": self.identity_key,
             **self.made_by,
             "libraries": library_versions(),
             "names": self.names,
@@ -178,7 +183,7 @@ class Store:
         """States that these trials could not be computed, and why; the next run tries them again."""
         record = {
             "key": cell.key,
-            "identity_key": cell.footer["identity_key"],
+            "identity_key": cell.identity_key,
             "names": cell.names,
             "start": start,
             "stop": stop,
@@ -210,6 +215,22 @@ class Store:
         """States, before any work, what a run is going to compute."""
         path = self.runs / f"{identifier}.json"
         return self._write_json(path, {"run": identifier, **record})
+
+    def same_run(self, record: Mapping[str, Any]) -> str | None:
+        """The name of a stored record that says the same, and after which nothing else was asked of its cells; None
+        where there is none. A run that has nothing to compute needs no further record then."""
+        record = json.loads(json.dumps(record, default=str))
+        keys = {cell["identity_key"]: cell["key"] for cell in record["cells"]}
+        for path in sorted(self.runs.glob("*.json"), reverse=True):
+            try:
+                known = json.loads(path.read_text(encoding="utf-8"))
+                if all(known.get(name) == value for name, value in record.items()):
+                    return path.stem
+                if any(keys.get(cell["identity_key"], cell["key"]) != cell["key"] for cell in known["cells"]):
+                    return None
+            except (OSError, ValueError, KeyError, TypeError, AttributeError):
+                continue
+        return None
 
     def _write_json(self, path: Path, record: Mapping[str, Any]) -> Path:
         text = json.dumps({"schema": SCHEMA, **record, "seal": BLANK_SEAL}, indent=1, default=str)

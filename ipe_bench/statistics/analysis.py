@@ -6,10 +6,9 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
@@ -29,6 +28,9 @@ from ipe_bench.statistics.profiles import Profiles
 from ipe_bench.statistics.records import SCORES, capped_error, gate_radius, rows_of
 from ipe_bench.statistics.sample import Sample, Shared
 from ipe_bench.statistics.summary import summary_rows, to_frame
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 PROBABILITIES = np.unique(np.concatenate([np.linspace(0, 1, 101), [0.001, 0.005, 0.025, 0.975, 0.995, 0.999]]))
 """Where the distribution of errors is tabulated."""
@@ -89,10 +91,45 @@ def analyse(directories: Sequence[Path | str]) -> Analysis:
     Raises:
         UserError: a directory does not exist.
     """
-    collection = collect(directories)
-    rows, everywhere = _Rows(), _everywhere(collection)
-    for number, groups in enumerate(collection.scenarios.values()):
-        _add_scenario(rows, collection, number, groups, everywhere)
+    return begin(directories).finish()
+
+
+def begin(directories: Sequence[Path | str]) -> Begun:
+    """Reads what is stored under the directories and computes the summary, which stands long before all the rest.
+
+    Raises:
+        UserError: a directory does not exist.
+    """
+    collection, rows = collect(directories), _Rows()
+    scenarios = enumerate(collection.scenarios.values())
+    return Begun(collection, rows, [_add_scenario(rows, collection, number, groups) for number, groups in scenarios])
+
+
+@dataclass(frozen=True)
+class Begun:
+    """An analysis of which the summary stands; comparisons, and libraries that take long to load, are still to come."""
+
+    collection: Collection
+    _rows: _Rows
+    _scenarios: list[_Compared]
+
+    @property
+    def summary(self) -> Sequence[dict[str, Any]]:
+        """The rows of `Analysis.summary`."""
+        return self._rows.summary
+
+    def finish(self) -> Analysis:
+        everywhere = _everywhere(self.collection)
+        for where, outcomes in self._scenarios:
+            self._rows.pairs += [(where, pair) for pair in compare_pairs(outcomes)]
+            self._rows.profiles.add({label: outcome for label, outcome in outcomes.items() if label in everywhere})
+        self._scenarios.clear()
+        return _analysis(self.collection, self._rows, everywhere)
+
+
+def _analysis(collection: Collection, rows: _Rows, everywhere: set[str]) -> Analysis:
+    import pandas as pd
+
     return Analysis(
         collection=collection,
         summary=to_frame(rows.summary),
@@ -119,23 +156,28 @@ class _Rows:
     pairs: list[tuple[dict[str, Any], Pair]] = field(default_factory=list)
     scores: list[dict[str, Any]] = field(default_factory=list)
     contraction: list[dict[str, Any]] = field(default_factory=list)
-    distributions: list[pd.DataFrame] = field(default_factory=list)
-    correlations: list[pd.DataFrame] = field(default_factory=list)
-    convergence: list[pd.DataFrame] = field(default_factory=list)
+    distributions: list[dict[str, Any]] = field(default_factory=list)
+    correlations: list[dict[str, Any]] = field(default_factory=list)
+    convergence: list[dict[str, Any]] = field(default_factory=list)
     replicates: list[tuple[int, int, str, float]] = field(default_factory=list)
     """Scenario, seed, estimator and capped error."""
     profiles: Profiles = field(default_factory=Profiles)
 
 
-def _joined(parts: Sequence[pd.DataFrame], columns: Sequence[str]) -> pd.DataFrame:
+def _joined(parts: Sequence[dict[str, Any]], columns: Sequence[str]) -> pd.DataFrame:
+    """Frames one after another, each given by its columns."""
+    import pandas as pd
+
     if not parts:
         return pd.DataFrame(columns=["scenario", "estimator", *columns])
-    return pd.concat(parts, ignore_index=True)
+    return pd.concat([pd.DataFrame(part) for part in parts], ignore_index=True)
 
 
-def _add_scenario(
-    rows: _Rows, collection: Collection, number: int, groups: Sequence[Group], everywhere: set[str]
-) -> None:
+_Compared = tuple[dict[str, Any], dict[str, Outcomes]]
+
+
+def _add_scenario(rows: _Rows, collection: Collection, number: int, groups: Sequence[Group]) -> _Compared:
+    """Adds what each estimator of a scenario came to; returns its columns, and what is to be compared."""
     shared = Shared.among(collection, groups)
     outcomes: dict[str, Outcomes] = {}
     scores: list[dict[str, Any]] = []
@@ -157,9 +199,8 @@ def _add_scenario(
         rows.distributions.append(_distribution(where, outcome))
         rows.correlations.append(_correlation_rows(where, sample))
         rows.convergence += [_convergence_rows(where, history) for history in sample.histories]
-    rows.pairs += [(dict(groups[0].columns) | {"scenario": number}, pair) for pair in compare_pairs(outcomes)]
     rows.scores += scores
-    rows.profiles.add({label: outcome for label, outcome in outcomes.items() if label in everywhere})
+    return dict(groups[0].columns) | {"scenario": number}, outcomes
 
 
 def _everywhere(collection: Collection) -> set[str]:
@@ -170,12 +211,16 @@ def _everywhere(collection: Collection) -> set[str]:
 
 def _pair_frame(pairs: Sequence[tuple[dict[str, Any], Pair]]) -> pd.DataFrame:
     """Corrected over all scenarios: a sweep asks all its questions at once."""
+    import pandas as pd
+
     final = corrected([pair for _, pair in pairs])
     rows = [where | asdict(p) | {"closer": p.closer} for (where, _), p in zip(pairs, final, strict=True)]
     return pd.DataFrame(rows)
 
 
 def _with_leaders(scores: pd.DataFrame, pairs: Sequence[tuple[dict[str, Any], Pair]]) -> pd.DataFrame:
+    import pandas as pd
+
     by_scenario: dict[int, list[Pair]] = {}
     for (where, _), pair in zip(pairs, corrected([pair for _, pair in pairs]), strict=True):
         by_scenario.setdefault(where["scenario"], []).append(pair)
@@ -189,6 +234,8 @@ def _with_leaders(scores: pd.DataFrame, pairs: Sequence[tuple[dict[str, Any], Pa
 def _ranking(replicates: Sequence[tuple[int, int, str, float]], everywhere: set[str]) -> Ranking | None:
     """Ranks of the estimators that every scenario has, over seeds: by the mean capped error over the scenarios that all
     seeds have."""
+    import pandas as pd
+
     table = pd.DataFrame(replicates, columns=["scenario", "seed", "estimator", "error"])
     table = table[table["estimator"].isin(everywhere) & table["error"].notna()]
     seeds = table["seed"].nunique()
@@ -278,15 +325,15 @@ def _reason(status: str) -> str:
     return reasons.get(status, "")
 
 
-def _distribution(where: dict[str, Any], outcome: Outcomes) -> pd.DataFrame:
-    return pd.DataFrame(where | {"probability": PROBABILITIES, "distance": quantiles(outcome.distance, PROBABILITIES)})
+def _distribution(where: dict[str, Any], outcome: Outcomes) -> dict[str, Any]:
+    return where | {"probability": PROBABILITIES, "distance": quantiles(outcome.distance, PROBABILITIES)}
 
 
-def _correlation_rows(where: dict[str, Any], sample: Sample) -> pd.DataFrame:
+def _correlation_rows(where: dict[str, Any], sample: Sample) -> dict[str, Any]:
     names = [str(p["name"]) for p in sample.parameters]
     n = len(names)
     values = _correlation(sample).ravel()
-    return pd.DataFrame(where | {"row": np.repeat(names, n), "column": np.tile(names, n), "value": values})
+    return where | {"row": np.repeat(names, n), "column": np.tile(names, n), "value": values}
 
 
 def _correlation(sample: Sample) -> Array:
@@ -303,6 +350,6 @@ def _correlation(sample: Sample) -> Array:
         return covariance / np.outer(deviation, deviation)
 
 
-def _convergence_rows(where: dict[str, Any], history: History) -> pd.DataFrame:
+def _convergence_rows(where: dict[str, Any], history: History) -> dict[str, Any]:
     iteration = np.arange(len(history.distances))
-    return pd.DataFrame(where | {"trial": history.trial, "iteration": iteration, "distance": history.distances})
+    return where | {"trial": history.trial, "iteration": iteration, "distance": history.distances}

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest, friedmanchisquare, rankdata, studentized_range, wilcoxon
 
 from ipe_bench.basics.linalg import Array
 
@@ -130,6 +129,8 @@ def signed_rank(d: Array) -> float:
     ranks = signed_ranks(d)
     if len(ranks) == 0:
         return 1.0
+    from scipy.stats import wilcoxon  # late, as below: it takes longer to load than a small run to compute
+
     # The test sees ranks alone, so it may be given those.
     result: Any = wilcoxon(ranks)
     return float(result.pvalue)
@@ -137,6 +138,8 @@ def signed_rank(d: Array) -> float:
 
 def signed_ranks(d: Array) -> Array:
     """The ranks of the magnitudes of what is not zero, with its signs; an infinite one ranks above the others."""
+    from scipy.stats import rankdata
+
     d = d[d != 0]
     return np.sign(d) * rankdata(np.abs(d))
 
@@ -145,6 +148,8 @@ def mcnemar(only_first: int, only_second: int) -> float:
     """Two-sided p of McNemar's exact test (Psychometrika 12, 1947): discordant trials are fair coin tosses."""
     if only_first + only_second == 0:
         return 1.0
+    from scipy.stats import binomtest
+
     return float(binomtest(only_first, only_first + only_second, 0.5).pvalue)
 
 
@@ -192,6 +197,8 @@ def rank_over_replicates(scores: Sequence[Mapping[str, float]]) -> Ranking | Non
     k, count = len(everywhere), len(scores)
     if k < 2 or count < REPLICATES:
         return None
+    from scipy.stats import friedmanchisquare, studentized_range
+
     ranks = np.array([tied_ranks(np.array([s[label] for label in everywhere])) for s in scores])
     if np.ptp(ranks, axis=1).max() == 0:
         friedman = 1.0

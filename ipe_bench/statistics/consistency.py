@@ -9,8 +9,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from scipy.special import chdtri
-from scipy.stats import binomtest
+from scipy.special import betaincinv, chdtri
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.trials.thresholds import GATE
@@ -41,8 +40,10 @@ def clopper_pearson(count: int, trials: int, level: float = 0.95) -> tuple[float
     """
     if trials < 1:
         return np.nan, np.nan
-    interval = binomtest(count, trials).proportion_ci(level, "exact")
-    return float(interval.low), float(interval.high)
+    tail = (1 - level) / 2
+    low = 0.0 if count == 0 else float(betaincinv(count, trials - count + 1, tail))
+    high = 1.0 if count == trials else float(betaincinv(count + 1, trials - count, 1 - tail))
+    return low, high
 
 
 def verdict(nees: Array, n: int, level: float = 0.95) -> Verdict:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.comparisons import Outcomes, common
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 RATIOS = np.unique(np.round(np.geomspace(1, 1000, 181), 6))
 BUDGETS = np.unique(np.round(np.geomspace(1, 100_000, 301)))
@@ -54,6 +57,8 @@ class Profiles:
 
     def frame(self) -> pd.DataFrame:
         """Both profiles of every estimator: estimator, profile, `at` (ratio or budget) and share."""
+        import pandas as pd
+
         parts = [
             pd.DataFrame({"estimator": label, "profile": profile, "at": at, "share": share(label)})
             for label in self.trials

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-import pandas as pd
+from typing import TYPE_CHECKING, Any
 
 from ipe_bench.statistics.collect import ALWAYS_COLUMNS, Collection, collect
 from ipe_bench.statistics.records import STATISTICS, frame_columns, rows_of
 from ipe_bench.statistics.sample import Sample, Shared
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 ALL = "all"
 """The row over all parameters."""
@@ -25,12 +26,17 @@ def summarize(directories: Sequence[Path | str]) -> pd.DataFrame:
 
 def summary_of(collection: Collection) -> pd.DataFrame:
     """The tidy summary of a collection; empty where it is."""
+    return to_frame(rows_of_all(collection))
+
+
+def rows_of_all(collection: Collection) -> list[dict[str, Any]]:
+    """The rows of the summary of a collection."""
     rows: list[dict[str, Any]] = []
     for groups in collection.scenarios.values():
         shared = Shared.among(collection, groups)
         for group in groups:
             rows += summary_rows(Sample.load(collection, group, shared))
-    return to_frame(rows)
+    return rows
 
 
 def summary_rows(sample: Sample) -> list[dict[str, Any]]:
@@ -46,6 +52,8 @@ def summary_rows(sample: Sample) -> list[dict[str, Any]]:
 
 def to_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Rows as a table, columns in the order that readers know."""
+    import pandas as pd
+
     frame = pd.DataFrame(list(rows))
     if frame.empty:
         return pd.DataFrame(columns=[*ALWAYS_COLUMNS, "parameter", "unit", *COLUMNS])

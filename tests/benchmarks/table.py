@@ -1,0 +1,282 @@
+"""What everything costs, in one table: `make bench` writes it as Markdown and as JSON to outputs/bench.
+
+All figures of a row are taken in one process, in turns, as CPU time, and the least of several rounds is kept: so their
+ratios hold on a busy machine, too. The Makefile sets one thread for each library. Whole commands are timed as
+processes, beside the import of the libraries that they use.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import c_kernel
+import numpy as np
+from scipy.integrate import solve_ivp
+
+import ipe_bench as ib
+from ipe_bench.baselines.epochs import Epoch
+from ipe_bench.basics.machine import library_versions
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.trials.scoring import Block
+
+STEP_S = 180.0
+BATCH = 250
+LIBRARIES = "import pandas, matplotlib.pyplot, scipy.stats, numba"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One comparison: what it costs here, beside what it costs there."""
+
+    part: str
+    what: str
+    value: float
+    unit: str
+    beside: str
+    other: float
+
+    @property
+    def ratio(self) -> float:
+        return self.value / self.other
+
+
+def least(*calls: Callable[[], Any], rounds: int = 5, at_least: float = 0.1) -> list[float]:
+    """The least CPU seconds of one call of each, taken in turns."""
+    best = [np.inf] * len(calls)
+    repeats = []
+    for call in calls:
+        call()
+        began = time.process_time()
+        call()
+        repeats.append(max(1, round(at_least / max(time.process_time() - began, 1e-6))))
+    for _ in range(rounds):
+        for i, (call, count) in enumerate(zip(calls, repeats, strict=True)):
+            began = time.process_time()
+            for _ in range(count):
+                call()
+            best[i] = min(best[i], (time.process_time() - began) / count)
+    return best
+
+
+def scenario(scale: float) -> ib.Scenario:
+    return ib.Scenario(ib.measurements.Gins(), ib.noise.Quantization(step=0.02286), error_scale=scale)
+
+
+def simulation() -> Iterator[Row]:
+    model, x = ib.measurements.Gins(step=STEP_S), 33.0 * np.random.default_rng(0).normal(size=(BATCH, 11))
+    adaptive = ib.measurements.Gins()
+    if c_kernel.compiler():
+        integrate = c_kernel.simulator(model, 1)
+        if not np.abs(integrate(x) - model.simulate(x)).max() < 1e-9:
+            raise AssertionError("the kernel in C integrates something else")
+        (best,) = least(lambda: integrate(x))
+        best /= BATCH
+        for batch in (250, 64, 8, 1):
+            part = x[:batch]
+            ours, theirs = least(lambda part=part: model.simulate(part), lambda: integrate(x))
+            best = min(best, theirs / BATCH)
+            name = f"one simulation, batch {batch}"
+            yield Row("simulation", name, 1e6 * ours / batch, "µs", "C, 8 lanes, batch 250", 1e6 * best)
+    ours, fixed = least(lambda: adaptive.simulate(x), lambda: model.simulate(x))
+    name = f"one simulation, batch {BATCH}, step by tolerance"
+    yield Row("simulation", name, 1e6 * ours / BATCH, "µs", f"steps of {STEP_S:g} s", 1e6 * fixed / BATCH)
+    few = x[:2]
+    ours, theirs = least(lambda: model.simulate(x), lambda: [by_scipy(model, row) for row in few], rounds=2)
+    for beside, seconds in (("SciPy DOP853, rtol 1e-9", theirs / len(few)),):
+        yield Row("simulation", f"one simulation, batch {BATCH}", 1e6 * ours / BATCH, "µs", beside, 1e6 * seconds)
+
+
+def by_scipy(model: Any, x: np.ndarray) -> np.ndarray:
+    p = (x * model.si_sizes).tolist()
+    ends = []
+    for case in model.cases.tolist():
+        y0 = [float(v) for v in model.start(p, case)]
+        found = solve_ivp(
+            lambda t, y, case=case: model.rhs(t, y.tolist(), p, case),
+            (0.0, model.times[-1]),
+            y0,
+            method="DOP853",
+            rtol=1e-9,
+            atol=1e-12,
+            t_eval=model.times,
+        )
+        ends.append(found.y)
+    return np.array(ends)
+
+
+def jacobians() -> Iterator[Row]:
+    for scale in (33.0, 1000.0, 3000.0):
+        model, x = ib.measurements.Gins(), scale * np.random.default_rng(0).normal(size=(BATCH, 11))
+        calls = (model.simulate, model.jacobian, model.coarse_jacobian)
+        simulate, exact, coarse = least(*(partial(call, x) for call in calls), rounds=3)
+        for name, seconds in (("exact Jacobian", exact), ("Jacobian inside iterations", coarse)):
+            what = f"{name}, scale {scale:g}"
+            yield Row("Jacobian", what, 1e6 * seconds / BATCH, "µs", "own simulation", 1e6 * simulate / BATCH)
+
+
+def estimation() -> Iterator[Row]:
+    s = scenario(33.0)
+    block = Block.draw(s, 0, BATCH)
+    problem, z, x = s.problem, block.trials.z, block.trials.x
+    S, B = ib.solvers, ib.baselines
+    estimators = [B.LinearLSE(), S.FixedPoint(), S.Anderson(), S.Broyden(), S.Newton(), S.Progressive()]
+    estimators += [B.GaussNewton(), B.LevenbergMarquardt()]
+    for estimator in estimators:
+        name = type(estimator).__name__
+        seconds, once = least(
+            lambda e=estimator: e.estimate(problem, z), lambda: problem.measurement.simulate(x), rounds=3
+        )
+        yield Row("estimation", name, 1e6 * seconds / BATCH, "µs", "one simulation", 1e6 * once / BATCH)
+    few = z[:10]
+    seconds, theirs = least(
+        lambda: B.LevenbergMarquardt().estimate(problem, z), lambda: B.LeastSquares().estimate(problem, few), rounds=2
+    )
+    yield Row(
+        "estimation", "LevenbergMarquardt", 1e6 * seconds / BATCH, "µs", "SciPy least_squares", 1e6 * theirs / len(few)
+    )
+
+    def scored() -> None:
+        fresh = Block.draw(s, 0, BATCH)
+        fresh.truth_columns()
+        for estimator in (S.FixedPoint(), B.LinearLSE()):
+            fresh.estimate(estimator)
+
+    seconds, once = least(scored, lambda: problem.measurement.simulate(x), rounds=3)
+    what = "fixed_point and linear_lse with truth and score"
+    yield Row("estimation", what, 1e6 * seconds / BATCH, "µs", "one simulation", 1e6 * once / BATCH)
+
+
+def filters() -> Iterator[Row]:
+    B = ib.baselines
+    s = scenario(33.0)
+    for cls, trials in ((B.EKF, 100), (B.IteratedEKF, 100), (B.UKF, 100), (B.CKF, 100), (B.EnKF, 20)):
+        z = s.draw(0, trials).z
+        batched, floor = _with_floor(cls(engine="batched"), s.problem, z)
+        few = z[:10]
+        (plain,) = least(lambda cls=cls, few=few: cls().estimate(s.problem, few), rounds=1)
+        name, unit = cls.__name__, "µs"
+        yield Row("filters", name, 1e6 * batched / trials, unit, "its model evaluations", 1e6 * floor / trials)
+        yield Row("filters", name, 1e6 * batched / trials, unit, "filterpy, trial by trial", 1e6 * plain / len(few))
+
+
+def _with_floor(filter: Any, problem: Problem, z: np.ndarray) -> tuple[float, float]:
+    """CPU seconds of a filter, and of the evaluations of the model among them."""
+    inside = 0.0
+    read = Epoch.read
+
+    def timed(self: Epoch, *args: Any, **more: Any) -> Any:
+        nonlocal inside
+        began = time.process_time()
+        try:
+            return read(self, *args, **more)
+        finally:
+            inside += time.process_time() - began
+
+    best = (np.inf, np.inf)
+    Epoch.read = timed  # type: ignore[method-assign]
+    try:
+        for _ in range(3):
+            inside, began = 0.0, time.process_time()
+            filter.estimate(problem, z)
+            best = min(best, (time.process_time() - began, inside))
+    finally:
+        Epoch.read = read  # type: ignore[method-assign]
+    return best
+
+
+def loop() -> Iterator[Row]:
+    """Whole commands as a user sees them, with bytecode kept."""
+    environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONDONTWRITEBYTECODE", "IPE_BENCH_THREADS")}
+    with tempfile.TemporaryDirectory(prefix="ipe-bench-") as folder:
+        runs: dict[str, list[tuple[float, float, float]]] = {}
+        for attempt in range(3):
+            run = [sys.executable, "-m", "ipe_bench", "run", "trials=2", f"output={folder}/{attempt}"]
+            for name, command in (
+                ("libraries", [sys.executable, "-c", LIBRARIES]),
+                ("run trials=2, all figures", run),
+                ("the same with nothing to do", run),
+            ):
+                runs.setdefault(name, []).append(_timed(command, environment))
+    wall, cpu, _ = (min(column) for column in zip(*runs.pop("libraries"), strict=True))
+    for name, measured in runs.items():
+        whole, busy, table = (min(column) for column in zip(*measured, strict=True))
+        yield Row("loop", f"{name}: table on the screen", table, "s wall", LIBRARIES, wall)
+        yield Row("loop", f"{name}: whole", whole, "s wall", LIBRARIES, wall)
+        yield Row("loop", f"{name}: whole", busy, "s CPU", LIBRARIES, cpu)
+
+
+def _timed(command: list[str], environment: dict[str, str]) -> tuple[float, float, float]:
+    """Wall and CPU seconds of a process, and the seconds until it had printed its table."""
+    import resource
+
+    before, began, table = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter(), 0.0
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if "linear_lse" in line:
+                table = time.perf_counter() - began
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, command)
+    wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return wall, cpu, table or wall
+
+
+PARTS = {f.__name__: f for f in (simulation, jacobians, estimation, filters, loop)}
+
+
+def machine() -> dict[str, Any]:
+    names = [line.split(":", 1)[1].strip() for line in _lines("/proc/cpuinfo") if line.startswith("model name")]
+    load = os.getloadavg() if hasattr(os, "getloadavg") else (float("nan"),)
+    return {
+        "processor": names[0] if names else platform.processor(),
+        "cores": os.cpu_count(),
+        "system": platform.platform(),
+        "load": round(load[0], 1),
+        "when": time.strftime("%Y-%m-%d %H:%M"),
+        **library_versions(),
+    }
+
+
+def _lines(path: str) -> list[str]:
+    try:
+        return Path(path).read_text().splitlines()
+    except OSError:
+        return []
+
+
+def markdown(facts: dict[str, Any], rows: list[Row]) -> str:
+    head = ", ".join(f"{k} {v}" for k, v in facts.items())
+    lines = [head, "", "| part | what | here | beside | there | ratio |", "|---|---|--:|---|--:|--:|"]
+    lines += [
+        f"| {r.part} | {r.what} | {r.value:.3g} {r.unit} | {r.beside} | {r.other:.3g} | {r.ratio:.3g} |" for r in rows
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def main(folder: Path, parts: list[str]) -> None:
+    facts, rows = machine(), []
+    for part in parts or list(PARTS):
+        for row in PARTS[part]():
+            rows.append(row)
+            print(f"{row.part:11s} {row.what:52s} {row.value:9.3g} {row.unit:7s} x{row.ratio:<8.3g} {row.beside}")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "bench.md").write_text(markdown(facts, rows), encoding="utf-8")
+    content = {"machine": facts, "rows": [asdict(row) | {"ratio": row.ratio} for row in rows]}
+    (folder / "bench.json").write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    print(f"\n{folder / 'bench.md'}\n{folder / 'bench.json'}")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2:])
