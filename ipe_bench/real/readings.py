@@ -1,13 +1,18 @@
 """Files of readings: one row per reading, with columns that say which reading it is, and the reading with its unit.
 
 The header for GINS is `case,time [min],axis,reading [m/s]`. Rows may stand in any order; an empty reading is missing.
+Cells are separated by commas; or by semicolons, and then a comma is a decimal point, as European spreadsheets write it.
+Nothing is guessed: what is not plainly a number, or not part of the table, is refused with its row.
 """
 
 from __future__ import annotations
 
 import csv
+import io
 import math
+import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +22,30 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import write_atomically
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Measurement
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_WITH_COMMA = re.compile(r"[+-]?\d*,\d*([eE][+-]?\d+)?", re.ASCII)
+
+
+@dataclass(frozen=True)
+class _Table:
+    """A file as text: its header, and its rows with their numbers in the file."""
+
+    path: Path
+    heading: list[str]
+    rows: list[tuple[int, list[str]]]
+    decimal: str = "."
+
+    def error(self, text: str) -> UserError:
+        return UserError(f"readings={self.path}: {text}")
+
+    def number(self, text: str) -> float | None:
+        """What a cell says in digits that everybody reads alike; None where it says something else."""
+        plain = text.strip()
+        if self.decimal == ",":
+            # A point would be one between thousands, or one of another country: nobody can tell.
+            plain = plain.replace(".", "?").replace(",", ".")
+        return float(plain) if _NUMBER.fullmatch(plain) else None
 
 
 def header(model: Measurement) -> list[str]:
@@ -60,96 +89,110 @@ def read_readings(path: Path, model: Measurement) -> Array:
     """
     if not path.is_file():
         raise UserError(f"readings={path}: there is no such file")
-    heading, rows = _table(path)
+    table = _read_parquet(path) if path.suffix == ".parquet" else _read_text(path)
     wanted = header(model)
-    _check_header(path, heading, wanted)
-    places = {_label(label): i for i, label in enumerate(zip(*model.index.values(), strict=True))}
+    _check_header(table, wanted)
+    labels = list(zip(*model.index.values(), strict=True))
+    places = {tuple(_label(v) for v in label): i for i, label in enumerate(labels)}
+    column = table.heading.index(wanted[-1])
     z = np.full(model.m, np.nan)
-    seen: dict[int, int] = {}
-    for number, row in rows:
-        cells = dict(zip(heading, row, strict=False))
-        label = tuple(cells.get(name, "") for name in model.index)
-        said = ", ".join(f"{name}={value}" for name, value in zip(model.index, label, strict=True))
-        place = places.get(_label(label))
+    rows: dict[int, int] = {}
+    for number, row in table.rows:
+        if len(row) != len(table.heading):
+            raise table.error(_miscounted(table, number, row))
+        cells = dict(zip(table.heading, row, strict=True))
+        said = ", ".join(f"{name}={cells[name].strip()}" for name in model.index)
+        place = places.get(tuple(_label_of(table, cells[name]) for name in model.index))
         if place is None:
-            raise UserError(
-                f"readings={path}: row {number}: {model.name} has no reading {said}; correct or remove the row"
-            )
-        if place in seen:
-            raise UserError(
-                f"readings={path}: row {number}: {said} stands in row {seen[place]} already; keep one of them"
-            )
-        seen[place] = number
-        z[place] = _reading(cells.get(wanted[-1], ""), f"readings={path}: row {number}, column {wanted[-1]}")
-    if len(seen) < model.m:
-        absent = next(label for i, label in enumerate(zip(*model.index.values(), strict=True)) if i not in seen)
+            raise table.error(f"row {number}: {model.name} has no reading {said}; correct or remove the row")
+        if place in rows:
+            raise table.error(f"row {number}: {said} stands in row {rows[place]} already; keep one of them")
+        rows[place] = number
+        z[place] = _reading(table, row[column], f"row {number}, column {wanted[-1]}")
+    if len(rows) < model.m:
+        absent = next(label for i, label in enumerate(labels) if i not in rows)
         said = ", ".join(f"{name}={value}" for name, value in zip(model.index, absent, strict=True))
-        raise UserError(
-            f"readings={path}: has {len(seen)} of {model.m} rows; the first absent one is {said} "
+        raise table.error(
+            f"has {len(rows)} of {model.m} rows; the first absent one is {said} "
             "(a missing reading keeps its row, with an empty cell)"
         )
     if np.isnan(z).sum() > model.m - model.n - 1:
-        raise UserError(f"readings={path}: {int((~np.isnan(z)).sum())} readings are too few for {model.n} parameters")
+        raise table.error(f"{int((~np.isnan(z)).sum())} readings are too few for {model.n} parameters")
     return z
 
 
-def _table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Header and numbered rows as text, from CSV or Parquet."""
-    if path.suffix == ".parquet":
-        import pyarrow as pa
-        import pyarrow.parquet as pq
+def _read_parquet(path: Path) -> _Table:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
-        try:
-            table = pq.read_table(path)
-        except (pa.ArrowException, OSError) as error:
-            raise UserError(f"readings={path}: is not a readable Parquet file") from error
-        columns = [["" if v is None else str(v) for v in column.to_pylist()] for column in table.columns]
-        return table.column_names, list(enumerate(map(list, zip(*columns, strict=True)), 1))
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            lines = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(c.strip() for c in row)]
+        table = pq.read_table(path)
+    except (pa.ArrowException, OSError) as error:
+        raise UserError(f"readings={path}: is not a readable Parquet file") from error
+    columns = [["" if v is None else str(v) for v in column.to_pylist()] for column in table.columns]
+    return _Table(path, table.column_names, list(enumerate(map(list, zip(*columns, strict=True)), 1)))
+
+
+def _read_text(path: Path) -> _Table:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        first = next((line for line in text.splitlines() if line.strip()), "")
+        separator = ";" if ";" in first else ","
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
+        lines = [(reader.line_num, row) for row in reader if any(c.strip() for c in row)]
     except (UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"readings={path}: is not a readable CSV file ({error})") from error
+        raise UserError(f"readings={path}: is not a readable CSV file ({error}); save it as CSV in UTF-8") from error
     if not lines:
         raise UserError(f"readings={path}: is empty")
-    return [name.strip() for name in lines[0][1]], lines[1:]
+    rows = lines[1:]
+    comma = separator == ";" and any(_WITH_COMMA.fullmatch(cell.strip()) for _, row in rows for cell in row)
+    return _Table(path, [name.strip() for name in lines[0][1]], rows, "," if comma else ".")
 
 
-def _check_header(path: Path, heading: Sequence[str], wanted: Sequence[str]) -> None:
+def _check_header(table: _Table, wanted: Sequence[str]) -> None:
+    heading = table.heading
     for name in wanted:
         if name in heading:
             continue
         quantity = name.split(" [")[0]
         other = next((h for h in heading if h.split(" [")[0] == quantity), None)
         if other is not None:
-            raise UserError(f"readings={path}: column {other}: the unit must be that of {name}; convert the values")
-        raise UserError(f"readings={path}: column {name} is missing; the header must be {','.join(wanted)}")
-    repeated = [name for name in wanted if list(heading).count(name) > 1]
-    if repeated:
-        raise UserError(f"readings={path}: column {repeated[0]} stands there twice; keep one")
+            raise table.error(f"column {other}: the unit must be that of {name}; convert the values")
+        raise table.error(f"column {name} is missing; the header must be {','.join(wanted)}")
+    for name in heading:
+        if heading.count(name) > 1:
+            raise table.error(f"column {name} stands there twice; keep one")
+        if name not in wanted:
+            what = f"column {name}" if name else f"column {heading.index(name) + 1}, which has no name,"
+            raise table.error(f"{what} is not understood; remove it (the header must be {','.join(wanted)})")
 
 
-def _label(values: Sequence[Any]) -> tuple[Any, ...]:
-    """Labels compared as numbers where they are numbers: 3 and 3.0 are one."""
-    return tuple(_number(value) for value in values)
+def _miscounted(table: _Table, number: int, row: Sequence[str]) -> str:
+    """What is wrong with a row that has more or fewer cells than the header."""
+    text = f"row {number}: has {len(row)} cells and the header {len(table.heading)}"
+    if len(row) > len(table.heading) and table.decimal == ".":
+        return f"{text}; with decimal commas, separate the cells by semicolons"
+    return f"{text}; a missing reading is an empty cell"
 
 
-def _number(value: Any) -> Any:
-    try:
-        return round(float(value), 9)
-    except ValueError:
-        return str(value).strip()
+def _label(value: Any) -> Any:
+    """Labels are compared as numbers where they are numbers: 3 and 3.0 are one."""
+    text = str(value).strip()
+    return round(float(text), 9) if _NUMBER.fullmatch(text) else text
 
 
-def _reading(text: str, where: str) -> float:
+def _label_of(table: _Table, text: str) -> Any:
+    value = table.number(text)
+    return text.strip() if value is None else round(value, 9)
+
+
+def _reading(table: _Table, text: str, where: str) -> float:
     if not text.strip():
         return math.nan
-    try:
-        value = float(text)
-    except ValueError:
-        raise UserError(
-            f"{where}: '{text}' is not a number; correct it, or leave the cell empty if it is missing"
-        ) from None
-    if not math.isfinite(value):
-        raise UserError(f"{where}: {text} is not a reading; leave the cell empty if it is missing")
-    return value
+    value = table.number(text)
+    if value is not None and math.isfinite(value):
+        return value
+    if text.strip().lstrip("+-").lower() in ("nan", "inf", "infinity") or value is not None:
+        raise table.error(f"{where}: {text.strip()} is not a reading; leave the cell empty if it is missing")
+    said = f"'{' '.join(text.split())}' is not a number" + (", with decimal commas" if table.decimal == "," else "")
+    raise table.error(f"{where}: {said}; correct it, or leave the cell empty if it is missing")

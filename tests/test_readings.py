@@ -1,0 +1,161 @@
+"""A file of readings is read as it was meant, or refused with the row and the column: never something in between."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from small_models import Bent
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.measurements import Bearings, Gins, Ranging
+from ipe_bench.real.readings import header, read_readings, write_readings
+
+MODELS = [Ranging(), Bearings(), Gins(), Bent(count=5)]
+
+
+def written(folder: Path, model, z) -> Path:
+    path = folder / "readings.csv"
+    path.unlink(missing_ok=True)
+    write_readings(path, model, z)
+    return path
+
+
+def european(path: Path) -> Path:
+    """The same file as a spreadsheet of Germany or France saves it."""
+    text = path.read_text().replace(",", ";").replace(".", ",")
+    path.write_text("﻿" + text.replace("\n", "\r\n"), encoding="utf-8", newline="")
+    return path
+
+
+def refusal(path: Path, model) -> str:
+    with pytest.raises(UserError) as told:
+        read_readings(path, model)
+    assert "\n" not in str(told.value)
+    return str(told.value).removeprefix(f"readings={path}: ")
+
+
+def with_reading(folder: Path, text: str, separator: str = ",") -> Path:
+    """A file of `Bent` whose third reading is that text."""
+    rows = [f"{i}{separator}{text if i == 3 else '0.25'}" for i in range(1, 6)]
+    path = folder / "readings.csv"
+    path.write_text("\n".join([f"number{separator}reading [m]", *rows]) + "\n", encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("model", MODELS, ids=lambda m: m.name)
+def test_what_is_written_is_read_bit_for_bit_with_points_and_with_commas(tmp_path, model):
+    z = model.simulate(model.nominal[None])[0] * np.pi
+    z[1] = np.nan
+    path = written(tmp_path, model, z)
+    np.testing.assert_array_equal(read_readings(path, model), z)
+    np.testing.assert_array_equal(read_readings(european(path), model), z)
+
+
+@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(value=st.floats(allow_nan=False, allow_infinity=False))
+def test_every_number_survives_both_ways_of_writing_it(tmp_path, value):
+    path = with_reading(tmp_path, repr(value))
+    assert read_readings(path, Bent(count=5))[2] == value
+    assert read_readings(european(path), Bent(count=5))[2] == value
+
+
+@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(text=st.text(st.characters(codec="utf-8", exclude_characters='"\n\r'), min_size=1, max_size=8))
+def test_no_text_is_read_as_a_number_that_it_does_not_say(tmp_path, text):
+    """What is accepted consists of the signs that numbers are written with, and is what Python reads."""
+    path = with_reading(tmp_path, text)
+    try:
+        value = read_readings(path, Bent(count=5))[2]
+    except UserError as error:
+        assert "\n" not in str(error)
+        return
+    assert (np.isnan(value) and not text.strip()) or (
+        set(text.strip()) <= set("0123456789.+-eE") and value == float(text)
+    )
+
+
+def test_decimal_commas_between_commas_are_refused_with_the_row(tmp_path):
+    """1,1,1017,1189 was read as 1017, and the receiver stood 150 standard errors off, converged."""
+    model = Ranging()
+    path = written(tmp_path, model, model.simulate(model.nominal[None])[0])
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([lines[0], *(line.replace(".", ",") for line in lines[1:])]))
+    assert (
+        refusal(path, model)
+        == "row 2: has 4 cells and the header 3; with decimal commas, separate the cells by semicolons"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "separator", "complaint"),
+    [
+        ("1_0", ",", "row 4, column reading [m]: '1_0' is not a number; correct it"),
+        ("１２", ",", "row 4, column reading [m]: '１２' is not a number"),
+        ("٣", ",", "'٣' is not a number"),
+        ('"1,5"', ",", "row 4, column reading [m]: '1,5' is not a number"),
+        ("1,5", ",", "row 4: has 3 cells and the header 2; with decimal commas, separate the cells by semicolons"),
+        ("0x1F", ",", "'0x1F' is not a number"),
+        ("1e", ",", "'1e' is not a number"),
+        ("1 000", ",", "'1 000' is not a number"),
+        ("1.2.3", ",", "'1.2.3' is not a number"),
+        ("−1", ",", "'−1' is not a number"),
+        ("inf", ",", "row 4, column reading [m]: inf is not a reading; leave the cell empty"),
+        ("-Infinity", ",", "-Infinity is not a reading"),
+        ("nan", ",", "nan is not a reading"),
+        ("1e999", ",", "1e999 is not a reading"),
+        ("1.234,5", ";", "row 4, column reading [m]: '1.234,5' is not a number"),
+    ],
+)
+def test_what_is_not_plainly_a_number_is_refused(tmp_path, text, separator, complaint):
+    assert complaint in refusal(with_reading(tmp_path, text, separator), Bent(count=5))
+
+
+def test_points_and_commas_in_one_file_are_refused(tmp_path):
+    """Either could stand between thousands."""
+    complaint = "row 2, column reading [m]: '0.25' is not a number, with decimal commas"
+    assert complaint in refusal(with_reading(tmp_path, "1,234", ";"), Bent(count=5))
+
+
+def test_semicolons_with_points_are_read_too(tmp_path):
+    assert read_readings(with_reading(tmp_path, "1.234", ";"), Bent(count=5))[2] == 1.234
+
+
+ROWS = ["1,0.25", "2,0.25", "3,0.25", "4,0.25", "5,0.25"]
+
+
+@pytest.mark.parametrize(
+    ("heading", "rows", "complaint"),
+    [
+        ("number,reading [m]", ["1", *ROWS[1:]], "row 2: has 1 cells and the header 2; a missing reading is an empty"),
+        ("number,reading [m]", ["1,,", *ROWS[1:]], "row 2: has 3 cells and the header 2"),
+        ("number,reading [m],sigma", [r + ",0.1" for r in ROWS], "column sigma is not understood; remove it"),
+        ("number,reading [m],sigma [m]", [r + ",0.1" for r in ROWS], "column sigma [m] is not understood; remove it"),
+        ("number,reading [m],", [r + "," for r in ROWS], "column 3, which has no name, is not understood; remove it"),
+        ("number,note,reading [m],note", ROWS, "column note stands there twice; keep one"),
+        ("number,reading [m]", ["1\xa0000,0.25", *ROWS[1:]], "row 2: bent has no reading number=1"),
+        ("number,reading [m]", ["1_0,0.25", *ROWS[1:]], "row 2: bent has no reading number=1_0"),
+        ("number,reading [m]", ["１,0.25", *ROWS[1:]], "row 2: bent has no reading number=１"),
+        ("number,reading [m]", [*ROWS, '6,"0.2'], "is not a readable CSV file"),
+    ],
+)
+def test_a_table_of_another_shape_is_refused(tmp_path, heading, rows, complaint):
+    path = tmp_path / "readings.csv"
+    path.write_text("\n".join([heading, *rows]) + "\n", encoding="utf-8")
+    assert complaint in refusal(path, Bent(count=5))
+
+
+def test_a_file_in_another_encoding_is_refused(tmp_path):
+    path = tmp_path / "readings.csv"
+    path.write_bytes("number,reading [µm]\n1,0.25\n".encode("latin-1"))
+    assert "is not a readable CSV file" in refusal(path, Bent(count=5))
+
+
+def test_labels_are_compared_as_what_they_say(tmp_path):
+    path = tmp_path / "readings.csv"
+    path.write_text("reading [m],number\n" + "\n".join(f"{i}.5,{i}.0" for i in (5, 3, 1, 2, 4)))
+    np.testing.assert_array_equal(read_readings(path, Bent(count=5)), [1.5, 2.5, 3.5, 4.5, 5.5])
+    assert header(Bent(count=5)) == ["number", "reading [m]"]
