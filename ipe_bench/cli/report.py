@@ -49,7 +49,9 @@ def show_command(output: Path, cells: Mapping[str, str]) -> int:
     result = _write([output], output)
     own = collect([output], cells.keys())
     others = sum(cell.key not in cells and cell.label != TRUTH for cell in collect([output]).current)
-    elsewhere = [p for p in result.problems if not any(line in p for line in cells.values())]
+    # What is wrong with a file or a folder may concern anybody; what other commands lack does not.
+    of_cells = [p for p in result.problems if p.startswith(("missing: ", "failed: "))]
+    elsewhere = [p for p in of_cells if not any(line in p for line in cells.values())]
     for problem in [p for p in result.problems if p not in elsewhere]:
         print(f"ipe-bench: {problem}", file=sys.stderr)
     if elsewhere:
