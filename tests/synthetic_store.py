@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 from scipy.stats import chi2
 
 from ipe_bench import priors as prior
@@ -17,7 +19,7 @@ from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
-from ipe_bench.runs.store import Cell, Store
+from ipe_bench.runs.store import FOOTER, Cell, Store, encode
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.thresholds import GATE
 
@@ -161,3 +163,12 @@ class Synthetic:
 
 def rows_true(trials: int) -> np.ndarray:
     return np.ones(trials, dtype=bool)
+
+
+def forge(path: Path, change: Callable[[dict[str, Any], dict[str, Any]], Any]) -> None:
+    """Writes the rows and the footer of a stored file anew after `change(rows, footer)`, with a digest that fits."""
+    table = pq.read_table(path)
+    rows = {name: table[name].to_numpy() for name in table.column_names}
+    footer = json.loads(table.schema.metadata[FOOTER])
+    change(rows, footer)
+    path.write_bytes(encode(rows, footer))

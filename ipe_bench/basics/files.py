@@ -36,6 +36,18 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
             temporary.unlink(missing_ok=True)
 
 
+def make_folder(path: Path) -> None:
+    """Makes sure that there is such a folder.
+
+    Raises:
+        StorageError: there is none and none can be made, as where a file has its name.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be made a folder ({error.strerror or error}); move what is there") from None
+
+
 def write_text(path: Path, text: str) -> None:
     """Writes a text file in one piece; see `write_atomically`."""
     write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))

@@ -61,7 +61,9 @@ def show_command(output: Path, cells: Mapping[str, str]) -> int:
     else:
         _print_table(begun.summary, begun.collection)
     problems = _write(begun, output, made).problems
-    elsewhere = [p for p in problems if not any(line in p for line in cells.values())]
+    # What is wrong with a file or a folder may concern anybody; what other commands lack does not.
+    of_cells = [p for p in problems if p.startswith(("missing: ", "failed: "))]
+    elsewhere = [p for p in of_cells if not any(line in p for line in cells.values())]
     for problem in [p for p in problems if p not in elsewhere]:
         print(f"ipe-bench: {problem}", file=sys.stderr)
     if elsewhere:

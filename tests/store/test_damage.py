@@ -18,12 +18,14 @@ import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 from small_models import Bent
+from synthetic_store import forge
 
 from ipe_bench import Scenario
 from ipe_bench.api import compute
 from ipe_bench.baselines import LinearLSE
 from ipe_bench.basics.errors import StorageError
 from ipe_bench.basics.files import BLANK_SEAL, is_sealed, seal
+from ipe_bench.cli.main import main
 from ipe_bench.cli.report import main as report
 from ipe_bench.cli.status import main as status
 from ipe_bench.estimators.base import Estimates, Estimator
@@ -31,7 +33,7 @@ from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.runs import verified
 from ipe_bench.runs.results import Results
-from ipe_bench.runs.store import FOOTER, Store, encode, key_of
+from ipe_bench.runs.store import FOOTER, Store, key_of
 from ipe_bench.solvers import Newton
 from ipe_bench.statistics import summarize
 
@@ -266,6 +268,28 @@ def test_the_commands_say_it_in_a_line_and_exit_with_1(folder, capsys, kind, har
     assert str(path) in capsys.readouterr().out.replace("\n", "")
 
 
+@pytest.mark.parametrize("name", ["trials", "histories", "runs", "failed", "figures", "tables", ".verified.json"])
+@pytest.mark.parametrize("command", ["status", "report", "run"])
+def test_a_file_where_a_folder_should_be_and_the_other_way_round_is_a_line(folder, capfd, name, command):
+    path = folder / name
+    if name.startswith("."):
+        path.unlink()
+        path.mkdir()
+    else:
+        shutil.rmtree(path, ignore_errors=True)
+        path.write_text("a file")
+    words = {"run": ["run", "measurement=polynomial", "trials=5", f"output={folder}", "execution=serial"]}
+    with within(120):
+        code = main(words.get(command, [command, str(folder)]))
+    out, err = capfd.readouterr()
+    assert "Traceback" not in out + err
+    if name.startswith(".") or (command == "status" and name in ("figures", "tables")):
+        assert str(path) not in out + err
+    else:
+        assert code in (1, 2)
+        assert str(path) in (out + err).replace("\n", "") or f"output={folder}" in err
+
+
 def test_report_and_status_say_the_same(folder, capsys):
     truncate(files(folder, "trials")[0], random.Random(0))
     truncate(files(folder, "runs")[0], random.Random(0))
@@ -280,15 +304,6 @@ def test_report_and_status_say_the_same(folder, capsys):
 
 
 # Files with a digest of their own that nevertheless do not hold what they should -------------------------------------
-
-
-def forge(path: Path, change: Callable[[dict, dict], None]) -> None:
-    """Writes rows and footer anew after a change, with a digest that fits, as a faulty program would."""
-    table = pq.read_table(path)
-    rows = {name: table[name].to_numpy() for name in table.column_names}
-    footer = json.loads(table.schema.metadata[FOOTER])
-    change(rows, footer)
-    path.write_bytes(encode(rows, footer))
 
 
 def set_to(name: str, value, at=slice(None)) -> Callable[[dict, dict], None]:

@@ -21,7 +21,7 @@ from importlib import import_module, metadata, resources
 from pathlib import Path
 from typing import Any, Literal
 
-from ipe_bench.basics.files import write_text
+from ipe_bench.basics.files import make_folder, write_text
 from ipe_bench.report.figures.drawing import FORMATS, Figure
 from ipe_bench.report.figures.views import View, views
 from ipe_bench.report.style import house_style
@@ -90,7 +90,7 @@ def draw_all(
     missing = [d for d in wanted if not _is_there(old.get(d), folder, formats)]
     entries = {d: _intact(old[d], folder) for d in tasks if d in old}
     if missing:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         known = {d: {kind for entry in entries.get(d, ()) for kind in entry.digests} for d in missing}
         # What was drawn in another format before is drawn in that one too, so that all formats show the same.
         lists = {d: [kind for kind in FORMATS if kind in formats or kind in known[d]] for d in missing}
