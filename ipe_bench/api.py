@@ -229,14 +229,14 @@ def estimate(
         remedy = "; give error_scale" if error_scale is None and prior is None else ""
         raise UserError("; ".join(lacking) + remedy)
     if noise is not None:
-        return fit(problem, z, estimators)
+        return fit(problem, z, estimators, noise)
     # The first round weighs all readings alike, which is all that finding the deviation takes.
     found = [f.residual_deviation for f in fit(problem, z, estimators)]
     deviation = np.nanmin(found) if np.isfinite(found).any() else np.nan
     if not deviation > 0:
         raise UserError("noise: is not given and cannot be estimated from the residuals; state it, as in Gaussian(0.1)")
     problem = _real_problem(model, Gaussian(float(deviation)), prior, error_scale)
-    return [dataclasses.replace(f, chi_square=np.nan) for f in fit(problem, z, estimators)]
+    return [dataclasses.replace(f, chi_square=np.nan, p_value=np.nan) for f in fit(problem, z, estimators)]
 
 
 def _real_problem(model: Measurement, noise: Noise, prior: GaussianPrior | None, error_scale: float | None) -> Problem:

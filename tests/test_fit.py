@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, chi2, kstest
 
 from ipe_bench.baselines import EKF, UKF, GaussNewton
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements import Gins, Polynomial
-from ipe_bench.noise import Gaussian
+from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.real.fits import fit
 from ipe_bench.report.answer import with_error
@@ -49,6 +49,18 @@ def test_the_chi_square_test_rejects_a_true_model_as_often_as_it_says_and_a_wron
     p = np.array([fit(scenario.problem, row, estimator)[0].p_value for row in z])
     assert binom.ppf(0.0005, 200, 0.1) <= np.sum(p < 0.1) <= binom.ppf(0.9995, 200, 0.1)
     assert not any(fit(optimist, row, estimator)[0].fits for row in z[:10])
+
+
+def test_rounded_readings_are_held_to_the_law_of_rounding():
+    """Uniform errors have a chi-square of .4 of the variance: 20 % too large a sum is then improbable."""
+    noise = Quantization(0.3, dither=True)
+    scenario = Scenario(Polynomial(), noise, GaussianPrior(), 0.1)
+    z = scenario.draw(0, 500).z
+    estimator = {"gauss_newton": GaussNewton()}
+    found = [fit(scenario.problem, row, estimator, noise)[0] for row in z]
+    p = np.array([f.p_value for f in found])
+    assert kstest(p, "uniform").pvalue > 0.01
+    assert kstest([chi2.sf(f.chi_square, f.degrees_of_freedom) for f in found], "uniform").pvalue < 0.01
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ def main(arguments: Sequence[str]) -> int:
 
     command = _command(config, job)
     folder = claim(Path(job.output), command, elsewhere=not named)
-    fits = fit(problem, z, job.estimators)
+    fits = fit(problem, z, job.estimators, job.scenario.noise)
     files = write_fits(
         folder, job.scenario.measurement, z, fits, command, {"measurement": name, **_provenance(config, job)}
     )

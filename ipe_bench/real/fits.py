@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
@@ -15,8 +14,14 @@ from ipe_bench.estimators.base import Estimator, estimate_safely
 from ipe_bench.measurements.base import Measurement, Restricted
 from ipe_bench.measurements.counted import cost
 from ipe_bench.measurements.problem import Problem
+from ipe_bench.noise.base import Noise
+from ipe_bench.noise.gaussian import Gaussian
 from ipe_bench.real.residuals import Whiteness, explained, normalised, outlier_limit, whiteness
+from ipe_bench.trials.fit_test import fit_probability, spread_of
 from ipe_bench.trials.thresholds import FIT_LEVEL
+
+_NORMAL = Gaussian(1.0)
+"""Its whitened errors are those of any normal noise."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,9 @@ class Fit:
     """Readings that are there, less parameters."""
     whiteness: Whiteness
     iterations: int
+    p_value: float
+    """Chance of a chi-square at least this large if the model and R are right: tiny means that they are not. Its law is
+    that of the noise and of what the estimator leaves; see `ipe_bench.trials.fit_test`."""
     simulations: float
     """Evaluations of the model, a Jacobian counting n."""
 
@@ -66,11 +74,6 @@ class Fit:
         return float(np.sqrt(np.nansum(self.residuals**2) / self.degrees_of_freedom)) if known else np.nan
 
     @property
-    def p_value(self) -> float:
-        """Chance of a chi-square at least this large if the model and R are right: tiny means that they are not."""
-        return float(chi2.sf(self.chi_square, self.degrees_of_freedom))
-
-    @property
     def fits(self) -> bool:
         return self.p_value >= FIT_LEVEL
 
@@ -85,13 +88,15 @@ class Fit:
             return np.abs(self.normalised) > self.outlier_limit
 
 
-def fit(problem: Problem, z: Array, estimators: Mapping[str, Estimator]) -> list[Fit]:
-    """Lets every estimator loose on the readings z (m,), of which those that are NaN are missing."""
+def fit(problem: Problem, z: Array, estimators: Mapping[str, Estimator], noise: Noise = _NORMAL) -> list[Fit]:
+    """Lets every estimator loose on the readings z (m,), of which those that are NaN are missing; `noise` states the
+    law of their whitened errors."""
     present = np.flatnonzero(~np.isnan(z))
     given = problem if len(present) == len(z) else _restricted(problem, present)
     order = _succession(problem.measurement, present)
     return [
-        _fit_one(label, estimator, given, z[present], present, len(z), order) for label, estimator in estimators.items()
+        _fit_one(label, estimator, given, z[present], present, len(z), order, noise)
+        for label, estimator in estimators.items()
     ]
 
 
@@ -122,6 +127,7 @@ def _fit_one(
     rows: NDArray[np.intp],
     m: int,
     order: NDArray[np.intp],
+    noise: Noise,
 ) -> Fit:
     model, n = problem.measurement, problem.measurement.n
     estimates = estimate_safely(estimator, problem, z[None])
@@ -141,6 +147,9 @@ def _fit_one(
         scaled, white = normalised(w, Q, problem.R), whiteness(w, Q, order)
     else:
         scaled, white = np.full(len(z), np.nan), Whiteness(np.nan, 0, np.nan)
+    chi_square = float(np.sum(w**2))
+    spread = spread_of(estimator, problem, J[None])
+    p = fit_probability(np.array([chi_square]), spread, noise, problem.H, problem.R)[0]
     P = np.full((n, n), np.nan) if estimates.covariance is None else estimates.covariance[0]
     return Fit(
         label,
@@ -150,10 +159,11 @@ def _fit_one(
         P * np.outer(model.sizes, model.sizes),
         _at(rows, r, m),
         _at(rows, scaled, m),
-        float(np.sum(w**2)),
+        chi_square,
         len(z) - n,
         white,
         int(estimates.iterations[0]),
+        float(p),
         float(cost(estimates.simulations, estimates.jacobians, n)[0]),
     )
 

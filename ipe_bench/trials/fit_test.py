@@ -21,6 +21,8 @@ import numpy as np
 from scipy.special import chdtrc
 
 from ipe_bench.basics.linalg import Array, Covariance, finite, information, inverse
+from ipe_bench.estimators.base import Estimator
+from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
 
 DRAWS = 10_000
@@ -46,6 +48,25 @@ class Spread:
     def squares(self) -> Array:
         """Half of the variance (trials,) of the sum of squares where the noise is normal."""
         return self.ones + (self.others**2).sum(axis=1)
+
+
+def spread_of(estimator: Estimator, problem: Problem, J: Array, inner: Array | None = None) -> Spread:
+    """How the residuals scatter that an estimator leaves, with dh/dx = J (trials, m, n) near its estimates; `inner` is
+    J' R^-1 J where it is known."""
+    m, n = J.shape[1:]
+    deviation = problem.prior_used()
+    with np.errstate(all="ignore"):
+        if "prior" in estimator.needs and deviation is not None:
+            inner = information(J, problem.R) if inner is None else inner
+            return prior_spread(inner, m, deviation, inflation_of(estimator))
+        if estimator.equation == "frozen" and np.isfinite(problem.H).all():
+            return frozen_spread(J, problem.H, problem.R, inner)
+    return least_squares_spread(m, n, len(J))
+
+
+def inflation_of(estimator: Estimator) -> float:
+    """By how much an estimator widens the prior: one that does solves an equation of its own."""
+    return float(getattr(estimator, "prior_inflation", 1.0)) if "prior" in estimator.needs else 1.0
 
 
 def least_squares_spread(m: int, n: int, trials: int) -> Spread:

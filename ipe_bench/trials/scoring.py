@@ -30,7 +30,7 @@ from ipe_bench.estimators.base import Equation, Estimates, Estimator, estimate_s
 from ipe_bench.measurements.counted import Counted
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.trials.contraction import contraction_of, curvature
-from ipe_bench.trials.fit_test import Spread, fit_probability, frozen_spread, least_squares_spread, prior_spread
+from ipe_bench.trials.fit_test import Spread, fit_probability, inflation_of, spread_of
 from ipe_bench.trials.roots import frozen_root, least_squares_root
 from ipe_bench.trials.scenario import Scenario, Trials
 from ipe_bench.trials.thresholds import EXPECTED, GATE, SAME_ROOT
@@ -161,20 +161,10 @@ class Block:
 
     def _spread(self, estimator: Estimator) -> Spread:
         """How the residuals that an estimator leaves scatter, with the slopes at the truth."""
-        key = (estimator.equation, "prior" in estimator.needs, _inflation(estimator))
+        key = (estimator.equation, "prior" in estimator.needs, inflation_of(estimator))
         if key not in self._spreads:
-            self._spreads[key] = self._spread_of(*key)
+            self._spreads[key] = spread_of(estimator, self.problem, self.jacobian, self.crlb_information)
         return self._spreads[key]
-
-    def _spread_of(self, equation: Equation | None, uses_prior: bool, inflation: float) -> Spread:
-        problem, model = self.problem, self.problem.measurement
-        deviation = problem.prior_used()
-        with np.errstate(all="ignore"):
-            if uses_prior and deviation is not None:
-                return prior_spread(self.crlb_information, model.m, deviation, inflation)
-            if equation == "frozen" and np.isfinite(problem.H).all():
-                return frozen_spread(self.jacobian, problem.H, problem.R, self.crlb_information)
-        return least_squares_spread(model.m, model.n, len(self.trials.x))
 
     @cached_property
     def _spreads(self) -> dict[tuple[Equation | None, bool, float], Spread]:
@@ -194,7 +184,7 @@ class Block:
         solved = converged
         apart = np.full(len(error), np.nan)
         if estimator.equation is not None:
-            root = self.reference_root(estimator.equation, _inflation(estimator))
+            root = self.reference_root(estimator.equation, inflation_of(estimator))
             apart = (np.abs(estimates.x - root) / self.crlb_deviation).max(axis=1)
             solved = solved & (apart <= SAME_ROOT)
         trials = len(error)
@@ -219,11 +209,6 @@ class Block:
             "success": np.isfinite(distance) & (distance <= chdtri(model.n, GATE)),
             **{f"extra_{name}": values for name, values in estimates.extras.items()},
         }
-
-
-def _inflation(estimator: Estimator) -> float:
-    """By how much an estimator widens the prior: one that does solves an equation of its own."""
-    return float(getattr(estimator, "prior_inflation", 1.0)) if "prior" in estimator.needs else 1.0
 
 
 def nees(error: Array, P: Array) -> Array:
