@@ -164,7 +164,6 @@ PLACES += (
     "solver=[] baseline=[]",
     "execution=serial execution.workers=2",
     "noise=certified",
-    "baseline=[ekf] measurement=polynomial",
 )
 DELETED = (
     "trials",
