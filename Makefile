@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test slow lint bench clean
+.PHONY: run test slow campaigns lint bench clean
 
 run: .venv/ready
 	$(BIN)/ipe-bench run +experiment=paper
@@ -13,6 +13,10 @@ test: .venv/ready
 # What takes minutes: Monte Carlo, end-to-end and browser checks.
 slow: .venv/ready
 	$(BIN)/pytest -m "slow or browser"
+
+# What takes the better part of an hour: hundreds of damaged files, wrong command lines, tables of error rates.
+campaigns: .venv/ready
+	$(BIN)/pytest -n auto -m campaign
 
 lint: .venv/ready
 	$(BIN)/ruff check

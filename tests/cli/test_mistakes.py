@@ -241,7 +241,7 @@ QUICK = 7
 
 
 @pytest.mark.parametrize(
-    "line", [pytest.param(line, marks=() if i % QUICK == 0 else pytest.mark.slow) for i, line in enumerate(LINES)]
+    "line", [pytest.param(line, marks=() if i % QUICK == 0 else pytest.mark.campaign) for i, line in enumerate(LINES)]
 )
 def test_a_wrong_command_line_is_answered_in_one_line(answer, tmp_path, line):
     code, error = answer(*LINES[line])

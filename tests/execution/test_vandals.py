@@ -46,8 +46,8 @@ QUIET = ("covariance", "seed", "folder", "floating_point", "handler")
 FAULTS = [*MESSAGES, *QUIET, "thread"]
 EXECUTIONS = [
     Serial(),
-    pytest.param(Processes(2), marks=pytest.mark.slow),
-    pytest.param(Dask(2), marks=pytest.mark.slow),
+    pytest.param(Processes(2), marks=pytest.mark.campaign),
+    pytest.param(Dask(2), marks=pytest.mark.campaign),
 ]
 
 

@@ -64,7 +64,7 @@ def test_p_is_uniform_for_the_frozen_root_where_its_projection_is_oblique():
     assert kstest(chi2.sf(squares[solved], 8 - 3), "uniform").pvalue < 1e-6
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_the_table_of_uniformity():
     """Kolmogorov and Smirnov's p of 2000 trials, and shares below 5 % and 0.1 %."""
     cases = [(Polynomial(strength=0.01), noise, scale) for noise in NOISES for scale in (0.1, 1.0)]

@@ -273,7 +273,7 @@ def test_profiles_compare_on_the_same_scenarios_and_by_the_same_gate(synthetic):
     assert pairs.loc[("both", "map", 2.0), "only_second"] == 50
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_seeds_that_tell_equal_estimators_apart_are_one_in_twenty():
     """Three equal estimators, six seeds, five error scales with the same draws in each: Friedman's test by scales
     rejected always."""

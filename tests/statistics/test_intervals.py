@@ -76,7 +76,7 @@ def test_an_interval_of_many_trials_is_at_the_level_of_95_per_cent():
     assert coverage(LAWS["normal"], 400, 4000) == pytest.approx(0.957, abs=4 * np.sqrt(0.95 * 0.05 / 4000))
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_the_table_of_coverage():
     """At least 94 %, within what 4000 repeats can tell, from 20 to 2000 trials."""
     trials = (20, 48, 200, 1000, 2000)

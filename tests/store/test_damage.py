@@ -243,14 +243,14 @@ def test_whatever_is_done_to_a_file_is_named_and_healed(folder, expected, kind, 
     harm_and_heal(folder, expected, kind, harm, 0)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize("seed", range(60))
 @pytest.mark.parametrize("kind", KINDS)
 def test_300_flipped_bits(folder, expected, kind, seed):
     harm_and_heal(folder, expected, kind, flip, 1000 + seed)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("harm", HARMS, ids=lambda harm: harm.__name__)
