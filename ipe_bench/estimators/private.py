@@ -44,16 +44,16 @@ class Private:
         """What has been changed in spite of that; empty where nothing has."""
         problem, shared = self.problem, self._shared
         if not _same(self.z, self._z):
-            return "it changed its readings"
+            return "it writes into its readings"
         if not _same(problem.R.factor, shared.R.factor):
-            return "it changed R"
+            return "it writes into R"
         if not _same(problem.prior_deviation, shared.prior_deviation):
-            return "it changed the prior"
+            return "it writes into the prior"
         model = problem.measurement
         if _digest(model) != self._before or not _same(model.nominal, shared.measurement.nominal):
-            return "it changed the model"
+            return "it changes the model"
         if "H" in vars(problem) and not _same(problem.H, shared.H):
-            return "it changed H"
+            return "it writes into H"
         return ""
 
 

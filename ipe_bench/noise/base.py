@@ -23,6 +23,11 @@ class Noise(Component, Named, ABC):
     real: ClassVar[bool] = False
     """True where readings are not simulated at all, but are those that come with the model."""
 
+    @property
+    def true_covariance(self) -> bool:
+        """Whether R is that of the errors; False where estimators are told another one on purpose."""
+        return True
+
     @abstractmethod
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         """The readings z (m,) of one trial, given the error-free h (m,) and what the instruments show besides it."""

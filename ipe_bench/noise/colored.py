@@ -40,6 +40,10 @@ class Colored(Noise):
             raise UserError(f"channels={self.channels}, length={self.length}: {m} readings do not divide into these")
         return m // (length * self.channels), length, self.channels
 
+    @property
+    def true_covariance(self) -> bool:
+        return self.assumed == "full" or self.correlation == 0
+
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         e = rng.standard_normal(self._series(len(h)))
         v = np.empty_like(e)
@@ -76,6 +80,10 @@ class Correlated(Noise):
     matrix: tuple[tuple[float, ...], ...] | None = None
     """R (m, m); where it is given, the three options above play no part."""
     assumed: Literal["white", "full"] = "full"
+
+    @property
+    def true_covariance(self) -> bool:
+        return self.assumed == "full"
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         return h + _factor(self, len(h)) @ rng.standard_normal(len(h))

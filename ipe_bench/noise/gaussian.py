@@ -31,6 +31,10 @@ class NoNoise(Noise):
     deviation: Positive = GINS_DEVIATION
     name = "none"
 
+    @property
+    def true_covariance(self) -> bool:
+        return False
+
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         return h
 

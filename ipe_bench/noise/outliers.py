@@ -26,6 +26,10 @@ class Outliers(Noise):
     factor: Positive = 10.0
     assumed: Literal["nominal", "total"] = "nominal"
 
+    @property
+    def true_covariance(self) -> bool:
+        return self.assumed == "total"
+
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         return h + self.deviation * self._mixture(h.shape, rng)
 

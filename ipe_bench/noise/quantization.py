@@ -27,6 +27,10 @@ class Quantization(Noise):
     deviation: Positive | None = None
     dither: bool = False
 
+    @property
+    def true_covariance(self) -> bool:
+        return self.deviation is None
+
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         shift = self.step * (rng.random(h.shape) - 0.5) if self.dither else 0.0
         return self.step * np.round((offset + h + shift) / self.step) - offset - shift

@@ -30,13 +30,13 @@ from ipe_bench.solvers import Newton
 OTHERS = {"linear_lse": LinearLSE(), "newton": Newton(), "enkf": EnKF(members=20), "bystander": Bystander()}
 MESSAGES = {
     "readings": "ValueError: output array is read-only",
-    "readings_by_force": "it changed its readings",
+    "readings_by_force": "it writes into its readings",
     "linearization": "ValueError: assignment destination is read-only",
     "R": "ValueError: output array is read-only",
-    "R_by_force": "it changed R",
-    "model": "it changed the model",
+    "R_by_force": "it writes into R",
+    "model": "it changes the model",
     "nominal": "ValueError: output array is read-only",
-    "nominal_by_force": "it changed the model",
+    "nominal_by_force": "it changes the model",
     "interrupt": "Escaped: KeyboardInterrupt: of its own",
     "panic": "Escaped: Panic: of its own",
     "generator_exit": "Escaped: GeneratorExit",

@@ -13,11 +13,11 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.measurements import Nist, Polynomial
 from ipe_bench.measurements.nist import datasets
-from ipe_bench.noise import Gaussian, Noise
+from ipe_bench.noise import Colored, Gaussian, Noise
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.plugins.construct import construct
-from ipe_bench.solvers import Newton
+from ipe_bench.solvers import IPE, Newton, State
 
 GROUPS = ("measurement", "noise", "prior", "solver", "baseline")
 OURS = [o for o in plugins.options() if o.group in GROUPS and o.source.name == "ipe-bench"]
@@ -60,6 +60,15 @@ class Leaning(Faulty):
 
 
 @dataclass(frozen=True)
+class Rounding(Faulty):
+    """As a matrix product over the whole batch."""
+
+    def spoil(self, estimates, z):
+        estimates.x = estimates.x * (1 + 1e-15 * len(z))
+        return estimates
+
+
+@dataclass(frozen=True)
 class Boasting(Faulty):
     def spoil(self, estimates, z):
         estimates.status[:] = Status.CONVERGED
@@ -88,6 +97,69 @@ class Scribbling(Faulty):
         return estimates
 
 
+@dataclass(frozen=True)
+class Linearizing(Newton):
+    def estimate(self, problem, z, *, history=False):
+        problem.H[0] = 0.0
+        return super().estimate(problem, z, history=history)
+
+
+@dataclass(frozen=True)
+class Tinkering(Newton):
+    def estimate(self, problem, z, *, history=False):
+        object.__setattr__(problem.measurement, "strength", 0.004)
+        return super().estimate(problem, z, history=history)
+
+
+@dataclass(frozen=True)
+class Timid(Faulty):
+    def spoil(self, estimates, z):
+        estimates.covariance = 100 * estimates.covariance
+        return estimates
+
+
+@dataclass(frozen=True)
+class Bold(Faulty):
+    def spoil(self, estimates, z):
+        estimates.covariance = estimates.covariance / 4
+        return estimates
+
+
+@dataclass(frozen=True)
+class Diagonal(Faulty):
+    def spoil(self, estimates, z):
+        estimates.covariance = np.diagonal(estimates.covariance, axis1=1, axis2=2).copy()
+        return estimates
+
+
+@dataclass(frozen=True)
+class Dicing(Faulty):
+    def spoil(self, estimates, z):
+        estimates.x = estimates.x + 1e-6 * np.random.default_rng().standard_normal(estimates.x.shape)
+        estimates.history = None
+        return estimates
+
+
+@dataclass(frozen=True)
+class Averaging(Faulty):
+    def spoil(self, estimates, z):
+        estimates.x = estimates.x + 1e-3 * np.nanmean(z)
+        estimates.history = None
+        return estimates
+
+
+@dataclass(frozen=True)
+class Bare(IPE):
+    def step(self, system, state):
+        return state.x - state.F
+
+
+@dataclass(frozen=True)
+class Misshapen(IPE):
+    def step(self, system, state):
+        return State(state.x - state.F, state.F[:, :1])
+
+
 @dataclass
 class Thawed(Faulty):
     pass
@@ -107,6 +179,52 @@ class Slanted(Polynomial):
 
 
 @dataclass(frozen=True)
+class Tilted(Polynomial):
+    """Wrong in one entry."""
+
+    def jacobian(self, x):
+        J = super().jacobian(x)
+        J[:, 6, 2] += 0.5
+        return J
+
+
+@dataclass(frozen=True)
+class Broken(Polynomial):
+    """As analytic as np.abs is."""
+
+    def simulate(self, x):
+        return super().simulate(x) + np.abs(x[:, :1])
+
+
+@dataclass(frozen=True)
+class Shifting(Polynomial):
+    def simulate(self, x):
+        x += 1.0
+        return super().simulate(x)
+
+
+@dataclass(frozen=True)
+class Confused(Gaussian):
+    """Takes the variance for the deviation."""
+
+    def covariance(self, m):
+        return Covariance(np.full(m, self.deviation**2))
+
+
+@dataclass(frozen=True)
+class Biased(Gaussian):
+    def corrupt(self, h, offset, rng):
+        return super().corrupt(h, offset, rng) + 0.1 * self.deviation
+
+
+@dataclass(frozen=True)
+class Whitened(Colored):
+    """Says that it states the whole truth, and does not."""
+
+    true_covariance = True
+
+
+@dataclass(frozen=True)
 class Forgetful(Noise):
     def corrupt(self, h, offset, rng):
         return h + np.random.default_rng().standard_normal(h.shape)
@@ -119,10 +237,26 @@ class Forgetful(Noise):
     ("faulty", "complaint"),
     [
         (Leaning(), "trial 0 differs"),
+        (Rounding(), "trial 0 differs, by rounding alone: use stacked matmul"),
+        (Averaging(), "trial 0 differs, by more than rounding"),
+        (Dicing(), "draws random numbers"),
+        (Linearizing(), "writes into H, R, the prior or the nominal point"),
+        (Tinkering(), "it changes the model"),
+        (Timid(), "variances are 1"),
+        (Bold(), "times too small"),
+        (Diagonal(), "covariance has shape (60, 4), and not (trials, n, n), which is (60, 4, 4) here"),
+        (Bare(), "step returns an array, and not a State: return State(x, system.F(x))"),
+        (Misshapen(), "step returns a State whose F has shape (8, 1), and not (8, 4)"),
+        (Tilted(), "most for parameter c2 in reading time=-0.6"),
+        (Broken(), "write np.where(u.real < 0, -u, u) for np.abs(u)"),
+        (Shifting(), "simulate writes into x"),
+        (Confused(0.01), "have the standard deviation 0.01"),
+        (Biased(0.01), "mean is 0.1"),
+        (Whitened(0.01, 0.5), "have the correlation 0.5"),
         (Boasting(), "NaN readings counts as converged"),
         (Wrong(), "standard deviations of the bound"),
         (Free(), "not counted"),
-        (Scribbling(), "the readings have changed"),
+        (Scribbling(), "it writes into its readings"),
         (Thawed(), "frozen=True"),
         (Mislabelled(), "two readings have one label"),
         (Slanted(), "off by"),
@@ -133,6 +267,18 @@ class Forgetful(Noise):
 )
 def test_a_fault_is_found(faulty, complaint):
     assert complaint in complaints(faulty)
+
+
+@pytest.mark.parametrize("faulty", [Dicing(), Linearizing(), Tinkering(), Scribbling(), Timid(), Tilted()], ids=repr)
+def test_a_fault_is_said_once(faulty):
+    assert sum(bool(f.complaint) for f in check_component("mine", faulty)) == 1
+
+
+def test_mixing_trials_is_not_taken_for_randomness():
+    said = complaints(Averaging())
+    assert "depend on the others of the batch" in said
+    assert "random" not in said
+    assert "writes" not in said
 
 
 def test_a_fault_in_one_check_leaves_the_others_ok():
