@@ -219,7 +219,8 @@ def test_errors_of_all_trials_let_nobody_off(synthetic):
     synthetic.add(synthetic.scenario(), "far", e, solved=np.arange(100) > 0)
     e = e.copy()
     e[0] = np.nan
-    synthetic.add(synthetic.scenario(), "gone", e, solved=np.arange(100) > 0)
+    status = np.where(np.arange(100) > 0, "converged", "nonfinite")
+    synthetic.add(synthetic.scenario(), "gone", e, solved=np.arange(100) > 0, status=status)
     frame = summarize([synthetic.directory])
     far, gone = row(frame, "far"), row(frame, "gone")
     assert far["rmse"] == gone["rmse"]
