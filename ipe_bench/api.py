@@ -366,7 +366,12 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
     model = scenario.measurement
     with np.errstate(all="ignore"):
         bound = linear_bound(scenario.problem)
-        few = scenario.draw(0, 1 if scenario.noise.real else _FEW)
+        try:
+            few = scenario.draw(0, 1 if scenario.noise.real else _FEW)
+        except UserError:
+            raise
+        except Exception:  # what cannot be drawn is a failure of its blocks, and told of there
+            return
     if not scenario.noise.real and not np.isfinite(few.z).all(axis=1).any():
         yield f"measurement={model.name}: none of the first {_FEW} trials has finite readings; choose smaller scales"
     for parameter, deviation in zip(model.parameters, bound, strict=True):

@@ -129,6 +129,8 @@ def _read_parquet(path: Path) -> _Table:
         table = pq.read_table(path)
     except (pa.ArrowException, OSError) as error:
         raise UserError(f"readings={path}: is not a readable Parquet file") from error
+    names = [name for name in table.column_names if not name.startswith("__index_level_")]  # pandas' own row numbers
+    table = table.select(names)
     columns = [["" if v is None else str(v) for v in column.to_pylist()] for column in table.columns]
     return _Table(path, table.column_names, list(enumerate(map(list, zip(*columns, strict=True)), 1)))
 

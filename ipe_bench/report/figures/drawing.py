@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,7 +46,10 @@ class Drawing:
         # Layout once and one drawing per file: `savefig` would draw everything five times.
         engine = self.figure.get_layout_engine()
         if engine is not None:
-            engine.execute(self.figure)
+            with warnings.catch_warnings():
+                # Labels of great length leave a panel no room: it is drawn as it is.
+                warnings.filterwarnings("ignore", "constrained_layout not applied")
+                engine.execute(self.figure)
             self.figure.set_layout_engine("none")
         paths = tuple(folder / f"{self.name}.{kind}" for kind in formats)
         for path, kind in zip(paths, formats, strict=True):
