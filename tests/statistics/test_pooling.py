@@ -160,6 +160,6 @@ def test_a_sweep_over_lists_names_what_differs_in_tables_status_and_files(tmp_pa
     assert len(titles) == len(set(titles)) == 2
     table = ib.load("out")
     assert table.groupby("measurement.beacons")["trial"].count().tolist() == [20, 20]
-    assert main(["status", "out"]) == 0
+    assert main(["status", "-v", "out"]) == 0
     rows = [line for line in capsys.readouterr().out.splitlines() if "20 of 20" in line]
     assert len(rows) == len(set(rows)) == 4
