@@ -88,9 +88,14 @@ def compute(
 
 
 def check(
-    scenarios: Sequence[Scenario], estimators: Mapping[str, Estimator], trials: int, block_size: int = BLOCK_SIZE
+    scenarios: Sequence[Scenario],
+    estimators: Mapping[str, Estimator],
+    trials: int,
+    block_size: int = BLOCK_SIZE,
+    *,
+    estimating: bool = False,
 ) -> None:
-    """Raises one UserError with everything that stands in the way of this run."""
+    """Raises one UserError with everything that stands in the way of this run, or of estimating from real readings."""
     mistakes = []
     if trials < 1:
         mistakes.append(f"trials={trials}: give a whole number above 0")
@@ -103,6 +108,8 @@ def check(
     if not estimators:
         mistakes.append("there is no estimator; choose with solver= and baseline=")
     for scenario in scenarios:
+        if scenario.noise.estimated and not estimating:
+            mistakes.append("noise=unknown: has no level to simulate with; choose another noise, or use `estimate`")
         if scenario.noise.real and trials != 1:
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
         for label, estimator in estimators.items():

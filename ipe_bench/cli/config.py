@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.estimators.base import Estimator
+from ipe_bench.noise import ModelNoise, Unknown
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
 from ipe_bench.runs.execution import Execution
@@ -39,8 +43,8 @@ class Schema:
     trials: int = 1000
     block_size: int = 250
     """Trials per unit of work and of storage; changes no number."""
-    readings: str | None = None
-    """A file of real readings, for `estimate`."""
+    readings: Any = None
+    """A file of real readings, for `estimate`, or a list of files that are estimated together."""
     write_readings: str | None = None
     """Write the simulated readings of one trial to this file instead of running."""
     write_readings_trial: int = 0
@@ -82,13 +86,61 @@ def prepare() -> None:
         registry.register(PluginSearchPath)
 
 
+_FORMULA = re.compile(
+    r"^(\+*(?:truth_)?measurement\.(?:expression|(?:initial|rates|outputs)\.\w+))=(?!['\"])(.*)$", re.DOTALL
+)
+_FILE = re.compile(r"^\+*(?:truth_)?measurement\.file=")
+_OPEN = re.compile(r"^(?:parameters|(?:truth_)?measurement\.(?:start|columns|initial|rates|outputs))\.")
+"""Keys to which users add entries of their own names."""
+
+
 def rewrite(overrides: Sequence[str]) -> list[str]:
-    """Overrides in Hydra's own words: truth_measurement= chooses from the group measurement."""
-    return [re.sub(r"^(\+?)truth_measurement=", r"\1measurement@truth_measurement=", o) for o in overrides]
+    """Overrides in Hydra's own words: truth_measurement= chooses from the group measurement, formulas stand in quotes
+    that the shell has taken off, and entries are added where users name them."""
+    return [words for o in overrides for words in (_from_file(o) if _FILE.match(o) else [_in_hydras_words(o)])]
 
 
-def assemble(config: DictConfig) -> Job:
-    """The scenario, the estimators and the execution that a composed config describes; UserError by key."""
+def _from_file(override: str) -> list[str]:
+    """A model's options from a YAML file, as if each had been typed there."""
+    key, _, name = override.partition("=")
+    try:
+        content = yaml.safe_load(Path(name).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{override}: cannot be read ({error.__class__.__name__}); name a YAML file") from None
+    except yaml.YAMLError as error:
+        raise UserError(f"{override}: is not YAML ({' '.join(str(error).split())})") from None
+    if not isinstance(content, dict):
+        raise UserError(f"{override}: holds no keys; write a YAML file of options such as rates, start, outputs")
+    if TARGET in content:
+        raise UserError(f"{override}: has a {TARGET}; the model is chosen by measurement=, so leave it out")
+    group = key.removesuffix(".file").lstrip("+")
+    return [f"++{group}.{k}={_literal(v, override)}" for k, v in content.items()]
+
+
+def _literal(value: Any, where: str) -> str:
+    """A value in the grammar of overrides."""
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{k}:{_literal(v, where)}" for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ",".join(_literal(v, where) for v in value) + "]"
+    if isinstance(value, str):
+        return "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"
+    if value is None or isinstance(value, bool | int | float):
+        return json.dumps(value) if value is None or isinstance(value, bool) else repr(value)
+    raise UserError(f"{where}: {value!r} is neither text nor number")
+
+
+def _in_hydras_words(override: str) -> str:
+    override = re.sub(r"^(\+?)truth_measurement=", r"\1measurement@truth_measurement=", override)
+    override = _FORMULA.sub(lambda found: f"{found[1]}='{found[2]}'", override)
+    return f"++{override}" if _OPEN.match(override) else override
+
+
+def assemble(config: DictConfig, *, estimating: bool = False) -> Job:
+    """The scenario, the estimators and the execution that a composed config describes; UserError by key.
+
+    `estimating`: for real readings, of which the level of the noise need not be known.
+    """
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(plain, dict)
     for key in plain:
@@ -96,9 +148,12 @@ def assemble(config: DictConfig) -> Job:
             raise UserError(f"{key}: {unknown(str(key), Schema.__dataclass_fields__, 'key')}")
     parts = {key: construct(plain[key], key) for key in ("measurement", "noise", "prior", "execution")}
     truth = plain["truth_measurement"]
+    noise = parts["noise"]
+    if estimating and isinstance(noise, ModelNoise):
+        noise = noise.of(parts["measurement"]) or Unknown()
     scenario = Scenario(
         parts["measurement"],
-        parts["noise"],
+        noise,
         parts["prior"],
         plain["error_scale"],
         plain["seed"],
@@ -155,5 +210,7 @@ def explain(error: Exception) -> UserError:
     if value and full_key:
         kind = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false"}
         return UserError(f"{full_key.group(1)}={value.group(1)}: give {kind.get(value.group(2), value.group(2))}")
+    if isinstance(error, MissingMandatoryValue) and full_key:
+        return UserError(f"{full_key.group(1)}: is not given; give it a value")
     lines = dict.fromkeys(line.strip() for line in text.splitlines() if line.strip())
     return UserError(" ".join(line for line in lines if not line.startswith("object_type=")))

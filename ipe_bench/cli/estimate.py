@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
@@ -16,13 +17,12 @@ from ipe_bench.api import check
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import library_versions
-from ipe_bench.basics.statuses import Status
 from ipe_bench.cli import console
 from ipe_bench.cli.config import CONFIG_ERRORS, Job, assemble, explain, prepare, refuse_silent_traps, rewrite
-from ipe_bench.noise import Certified
+from ipe_bench.noise import Certified, Gaussian, ModelNoise, Noise, Unknown
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.real.fits import fit
-from ipe_bench.real.readings import read_readings
+from ipe_bench.real.sources import SIGMA, Readings, open_readings
 from ipe_bench.runs.provenance import describe, fingerprint
 
 
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str]) -> int:
     try:
         with initialize_config_dir(str(plugins.own_conf()), version_base="1.3"):
             config = compose("config", rewrite(arguments))
-        job = assemble(config)
+        job = assemble(config, estimating=True)
     except CONFIG_ERRORS as error:
         raise explain(error) from error
     named = any(a.lstrip("+").startswith(("name=", "output=")) for a in arguments)
@@ -46,20 +46,20 @@ def main(arguments: Sequence[str]) -> int:
         job = replace(job, output=config.output)
     job, z = _readings(config, job)
     problem = job.scenario.problem
-    check([job.scenario], job.estimators, trials=1)
+    check([job.scenario], job.estimators, trials=1, estimating=True)
 
     from ipe_bench.report.answer import claim, render, write_fits
 
     command = _command(config, job)
     folder = claim(Path(job.output), command, elsewhere=not named)
-    fits = fit(problem, z, job.estimators)
+    fits = fit(problem, z, job.estimators, level_unknown=job.scenario.noise.estimated)
     files = write_fits(
         folder, job.scenario.measurement, z, fits, command, {"measurement": name, **_provenance(config, job)}
     )
     out = console()
     out.print(render(name, job.scenario.measurement, fits, out.width))
     out.print(f"\nIn {folder}: {', '.join(path.name for path in files)}", markup=False, soft_wrap=True)
-    return 0 if any(f.status is Status.CONVERGED for f in fits) else 1
+    return 0 if any(f.passes for f in fits) else 1
 
 
 def _measurement_name(arguments: Sequence[str], job: Job) -> str:
@@ -71,11 +71,29 @@ def _measurement_name(arguments: Sequence[str], job: Job) -> str:
 def _readings(config: DictConfig, job: Job) -> tuple[Job, Array]:
     """The readings (m,) of the file, or those that come with the model; with the latter, their own noise."""
     if config.readings is not None:
-        return job, read_readings(Path(config.readings), job.scenario.measurement)
+        found = open_readings(Path(config.readings), job.scenario.measurement)
+        noise = _noise(config, job, found)
+        return replace(job, scenario=replace(job.scenario, measurement=found.model, noise=noise)), found.z
     recorded = job.scenario.measurement.recorded
     if recorded is None:
         raise UserError("readings: is not given; write readings=FILE (see `ipe-bench list measurement -v`)")
     return replace(job, scenario=replace(job.scenario, noise=Certified())), recorded.z
+
+
+def _noise(config: DictConfig, job: Job, found: Readings) -> Noise:
+    """What is known of the errors: the deviations of the file, unless the level is said to be unknown."""
+    noise = job.scenario.noise
+    if found.deviations is None:
+        return noise
+    deviations = tuple(np.where(np.isfinite(found.deviations), found.deviations, 1.0).tolist())
+    if isinstance(noise, Unknown) and not config.noise["_target_"].endswith(ModelNoise.__name__):
+        return Unknown(deviations)
+    if not config.noise["_target_"].endswith(ModelNoise.__name__) or config.noise.get("deviation") is not None:
+        raise UserError(
+            f"readings={config.readings}: has a column {SIGMA}, and noise is given too; leave one of them out, or set "
+            "noise=unknown to take the column for relative weights"
+        )
+    return Gaussian(deviations)
 
 
 def _command(config: DictConfig, job: Job) -> dict[str, Any]:

@@ -34,6 +34,29 @@ class Parameter:
 
 
 @dataclass(frozen=True)
+class Input:
+    """Something known of each reading besides what it is: a column of the file, such as a satellite's place."""
+
+    heading: str
+    """As in the file, with the unit: `x [m]`."""
+    kind: type = float
+    """float, int or str."""
+    label: bool = False
+    """Whether it is part of what tells readings apart, and stands in every file."""
+    default: Any = None
+    """What is meant where a file lacks the column; None: it must have it, or none of the inputs."""
+
+
+@dataclass(frozen=True)
+class UsualNoise:
+    """The noise that is a model's own: rounding to a step where there is one, else white and Gaussian."""
+
+    deviation: float | None = None
+    """Standard deviation of a reading, in `reading_unit`."""
+    step: float | None = None
+
+
+@dataclass(frozen=True)
 class Recorded:
     """Real readings that come with a model, and what is known of their answer."""
 
@@ -55,6 +78,12 @@ class Measurement(Named, ABC):
     analytic: ClassVar[bool] = False
     """True where `simulate` accepts complex x and is analytic in it: the Jacobian is then a complex step."""
     reading_unit: str = ""
+    reading_name: str = "reading"
+    """What the column of the readings is called in a file; `reading` is understood too."""
+    usual_noise: UsualNoise | None = None
+    """The noise of the readings unless told otherwise; None: the model does not know any."""
+    own_parameters: Sequence[str] = ()
+    """Names of parameters of which every file of readings has its own, where several are estimated together."""
 
     @property
     @abstractmethod
@@ -94,6 +123,31 @@ class Measurement(Named, ABC):
     def offset(self) -> Array:
         """What the instruments show (m,) where h(x) is zero; read-outs are quantised with it added."""
         return np.zeros(self.m)
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        """What the model takes from the columns of a readings file, where the file has them."""
+        return ()
+
+    @property
+    def input_columns(self) -> Mapping[str, Sequence[Any]]:
+        """The values of those columns, m each, by heading, of this model as it stands."""
+        return {}
+
+    @property
+    def input_columns_known(self) -> bool:
+        """Whether there are readings without a file, whose inputs stand in the config or are the model's own."""
+        return True
+
+    def absent_input(self, heading: str, columns: Sequence[str]) -> str:
+        """What to do where a file lacks that column, having others of the inputs."""
+        del heading, columns
+        return f"give all of {', '.join(i.heading for i in self.inputs)}, or none"
+
+    def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
+        """This model with the inputs of a file: `columns` by heading, one entry for each of its readings, in the
+        order of the file, which is that of z from then on."""
+        raise NotImplementedError(f"{self.name} takes nothing from a file but readings")
 
     @property
     def n(self) -> int:

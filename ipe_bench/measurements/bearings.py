@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,7 @@ class Bearings(Measurement):
     """and of each velocity in m/s."""
 
     reading_unit = "deg"
+    usual_noise = UsualNoise(0.5)
     analytic = True
 
     def __post_init__(self) -> None:

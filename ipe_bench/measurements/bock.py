@@ -9,7 +9,7 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
-from ipe_bench.measurements.base import Parameter, Recorded
+from ipe_bench.measurements.base import Parameter, Recorded, UsualNoise
 from ipe_bench.measurements.ode.model import OdeMeasurement
 
 
@@ -47,6 +47,10 @@ class Bock(OdeMeasurement):
     step: float | None = 0.0025
 
     states, outputs = 2, ("x1", "x2")
+
+    @property
+    def usual_noise(self) -> UsualNoise:  # type: ignore[override]
+        return UsualNoise(self.deviation)
 
     def __post_init__(self) -> None:
         if self.mu <= 0:

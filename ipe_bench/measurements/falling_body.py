@@ -9,7 +9,7 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.base import Parameter
+from ipe_bench.measurements.base import Parameter, UsualNoise
 from ipe_bench.measurements.ode.model import OdeMeasurement
 
 _FOOT = 0.3048
@@ -56,8 +56,11 @@ class FallingBody(OdeMeasurement):
     ballistic_size: float = float(np.log(1e-3 / 3e-5))
     """and of the logarithm of the ballistic coefficient."""
     step: float | None = 0.5
+    sampled: tuple[float, ...] | None = None
+    """Times of the ranges in s, in place of equal intervals."""
 
     states, outputs, reading_unit = 2, ("range",), "m"
+    usual_noise = UsualNoise(100 * _FOOT)
 
     def __post_init__(self) -> None:
         if self.ballistic <= 0:
@@ -79,7 +82,7 @@ class FallingBody(OdeMeasurement):
 
     @cached_property
     def times(self) -> Array:
-        return self.interval * np.arange(1.0, self.readings + 1)
+        return self.interval * np.arange(1.0, self.readings + 1) if self.sampled is None else np.array(self.sampled)
 
     def start(self, p, c):
         return p[0], p[1]

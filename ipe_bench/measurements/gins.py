@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.base import Parameter
+from ipe_bench.measurements.base import Parameter, UsualNoise
 from ipe_bench.measurements.ode.model import OdeMeasurement
 
 FOOT = 0.3048
@@ -51,6 +51,7 @@ class Gins(OdeMeasurement):
     step: float | None = None
 
     reading_unit = "m/s"
+    usual_noise = UsualNoise(step=0.02286)
     states = 11
     outputs = ("vx", "vy")
 

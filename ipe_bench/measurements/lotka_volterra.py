@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.measurements.base import Parameter
+from ipe_bench.measurements.base import Parameter, UsualNoise
 from ipe_bench.measurements.ode.model import OdeMeasurement
 
 _VALUES = {"birth": 0.55, "hunting": 0.028, "death": 0.8, "growth": 0.024, "prey": 34.0, "predators": 5.9}
@@ -19,13 +19,16 @@ class LotkaVolterra(OdeMeasurement):
 
     years: int = 20
     step: float | None = 0.125
+    sampled: tuple[float, ...] | None = None
+    """Times of the readings in years, in place of one a year."""
     states, outputs, time_unit, reading_unit = 2, ("prey", "predators"), "year", "thousand"
+    usual_noise = UsualNoise(0.5)
     parameters = tuple(Parameter(name, size=0.02 * value) for name, value in _VALUES.items())  # type: ignore[assignment]
     nominal = np.full(6, 50.0)  # type: ignore[assignment]
 
     @property
     def times(self):
-        return np.arange(1.0, self.years + 1)
+        return np.arange(1.0, self.years + 1) if self.sampled is None else np.array(self.sampled)
 
     def start(self, p, c):
         return p[4], p[5]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,7 @@ class Polynomial(Measurement):
     """s, by how much the readings bend per unit of x."""
 
     analytic = True
+    usual_noise = UsualNoise(0.01)
 
     def __post_init__(self) -> None:
         if self.unknowns < 1 or self.count <= self.unknowns:

@@ -16,6 +16,8 @@ class Noise(Named, ABC):
 
     real: ClassVar[bool] = False
     """True where readings are not simulated at all, but are those that come with the model."""
+    estimated: ClassVar[bool] = False
+    """True where the level of the errors is estimated from the residuals, R being known up to a factor."""
 
     @abstractmethod
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:

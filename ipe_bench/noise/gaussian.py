@@ -6,25 +6,36 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.basics.errors import require_positive
+from ipe_bench.basics.errors import UserError, require_positive
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.noise.base import Noise
 
 
 @dataclass(frozen=True)
 class Gaussian(Noise):
-    """z = h + v with independent v of the given standard deviation, in the unit of the readings."""
+    """z = h + v with independent v of the given standard deviation, in the unit of the readings; or of one for each
+    reading."""
 
-    deviation: float
+    deviation: float | tuple[float, ...]
 
     def __post_init__(self) -> None:
-        require_positive(self, "deviation")
+        if not isinstance(self.deviation, tuple):
+            require_positive(self, "deviation")
+            return
+        for i, value in enumerate(self.deviation):
+            if not 0 < value < np.inf:
+                raise UserError(f"deviation[{i}]={value}: give a number above 0")
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
-        return h + self.deviation * rng.standard_normal(h.shape)
+        return h + self._deviations(len(h)) * rng.standard_normal(h.shape)
 
     def covariance(self, m: int) -> Covariance:
-        return Covariance(np.full(m, self.deviation))
+        return Covariance(np.array(np.broadcast_to(self._deviations(m), m)))
+
+    def _deviations(self, m: int) -> Array | float:
+        if isinstance(self.deviation, tuple) and len(self.deviation) != m:
+            raise UserError(f"noise.deviation: has {len(self.deviation)} numbers; give one for each of {m} readings")
+        return np.asarray(self.deviation) if isinstance(self.deviation, tuple) else self.deviation
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
+from scipy.stats import f as fisher
+from scipy.stats import t as student
 
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimator, estimate_safely
 from ipe_bench.measurements.base import Measurement, Restricted
@@ -18,6 +21,13 @@ from ipe_bench.real.residuals import Whiteness, explained, normalised, outlier_l
 
 FIT_LEVEL = 1e-3
 """A model fits where chi-square is no less probable than this."""
+_MOST_LEVELS = 6
+"""Fits in search of the level of the noise,"""
+_SAME_LEVEL = 1e-3
+"""which is found where it changes by less than this share."""
+_SMALLEST_LEVEL = 1e-8
+"""As a share of the readings, the level that estimators are told at least."""
+_FARTHEST = 40.0
 
 
 @dataclass(frozen=True)
@@ -43,6 +53,9 @@ class Fit:
     iterations: int
     simulations: float
     """Evaluations of the model, a Jacobian counting n."""
+    level: float | None = None
+    """The factor by which the readings are noisier than R says, where it is estimated from the residuals; R and all
+    that rests on it, the covariance included, have been multiplied by it already. None: R is known."""
 
     @property
     def standard_errors(self) -> Array:
@@ -63,17 +76,42 @@ class Fit:
     def residual_deviation(self) -> float:
         """Root of the residual sum of squares over the degrees of freedom, in the unit of the readings."""
         # A sum that skips NaN would be zero, and a perfect fit, where no residual is known.
-        known = np.isfinite(self.residuals).any()
+        known = np.isfinite(self.residuals).any() and self.degrees_of_freedom > 0
         return float(np.sqrt(np.nansum(self.residuals**2) / self.degrees_of_freedom)) if known else np.nan
 
     @property
-    def p_value(self) -> float:
-        """Chance of a chi-square at least this large if the model and R are right: tiny means that they are not."""
-        return float(chi2.sf(self.chi_square, self.degrees_of_freedom))
+    def testable(self) -> bool:
+        """Whether the size of the residuals says anything of the model: not where it made R, nor without any left."""
+        return self.level is None and self.degrees_of_freedom > 0
 
     @property
-    def fits(self) -> bool:
-        return self.p_value >= FIT_LEVEL
+    def p_value(self) -> float:
+        """Chance of a chi-square at least this large if the model and R are right: tiny means that they are not. NaN
+        where that cannot be tested."""
+        return float(chi2.sf(self.chi_square, self.degrees_of_freedom)) if self.testable else np.nan
+
+    @property
+    def fits(self) -> bool | None:
+        """Whether the residuals are as small as R says; None where that cannot be tested."""
+        return self.p_value >= FIT_LEVEL if self.testable else None
+
+    @property
+    def passes(self) -> bool:
+        """Whether this is an answer: the estimator converged, and nothing says that the model does not fit."""
+        return self.status is Status.CONVERGED and self.fits is not False
+
+    def half_width(self, confidence: float = 0.95) -> float:
+        """Half the width of a confidence interval in standard errors: of the normal distribution, or of Student's t
+        where the level of the noise is estimated."""
+        tail = (1.0 - confidence) / 2.0
+        return float(norm.isf(tail) if self.level is None else student.isf(tail, self.degrees_of_freedom))
+
+    def region(self, parameters: int, confidence: float = 0.95) -> float:
+        """The squared distance, in standard errors, to the edge of a joint region of so many parameters: chi-square, or
+        F where the level of the noise is estimated."""
+        if self.level is None:
+            return float(chi2.ppf(confidence, parameters))
+        return float(parameters * fisher.ppf(confidence, parameters, self.degrees_of_freedom))
 
     @property
     def outlier_limit(self) -> float:
@@ -86,14 +124,59 @@ class Fit:
             return np.abs(self.normalised) > self.outlier_limit
 
 
-def fit(problem: Problem, z: Array, estimators: Mapping[str, Estimator]) -> list[Fit]:
-    """Lets every estimator loose on the readings z (m,), of which those that are NaN are missing."""
+def fit(problem: Problem, z: Array, estimators: Mapping[str, Estimator], *, level_unknown: bool = False) -> list[Fit]:
+    """Lets every estimator loose on the readings z (m,), of which those that are NaN are missing.
+
+    `level_unknown`: R is known up to a factor, which is estimated from the residuals of each fit.
+    """
     present = np.flatnonzero(~np.isnan(z))
     given = problem if len(present) == len(z) else _restricted(problem, present)
     order = _succession(problem.measurement, present)
-    return [
-        _fit_one(label, estimator, given, z[present], present, len(z), order) for label, estimator in estimators.items()
-    ]
+    one = _fit_with_level if level_unknown else _fit_one
+    return [one(label, estimator, given, z[present], present, len(z), order) for label, estimator in estimators.items()]
+
+
+def _fit_with_level(label: str, estimator: Estimator, problem: Problem, z: Array, *where: Any) -> Fit:
+    """Fits until the level that R assumes is that of the residuals, since estimators measure their steps by it."""
+    spread = float(np.sqrt(np.mean(problem.R.whiten(z) ** 2)))
+    level, found = spread or 1.0, None
+    for _ in range(_MOST_LEVELS):
+        assumed = level
+        again = _fit_one(label, estimator, _scaled(problem, assumed), z, *where)
+        if found is not None and again.status is not Status.CONVERGED and found.status is Status.CONVERGED:
+            break
+        found = again
+        free = found.degrees_of_freedom
+        level = assumed * float(np.sqrt(found.chi_square / free)) if free > 0 else np.nan
+        found = _with_level(found, level / assumed, level)
+        # Residuals of round-off would make steps of round-off count.
+        level = max(level, _SMALLEST_LEVEL * spread)
+        if not np.isfinite(level) or abs(level / assumed - 1.0) < _SAME_LEVEL:
+            break
+    assert found is not None
+    return found
+
+
+def _scaled(problem: Problem, level: float) -> Problem:
+    return replace(problem, R=Covariance(problem.R.factor * level))
+
+
+def _with_level(found: Fit, factor: float, level: float) -> Fit:
+    """The fit as it is with R multiplied by factor^2; residuals in their own deviations, which are then estimated.
+
+    An internally studentised residual r becomes t = r sqrt((f - 1) / (f - r^2)), Student's t with f - 1 degrees of
+    freedom (Cook and Weisberg, Residuals and Influence in Regression, 1982, eq. 2.2.8), and that the normal deviate
+    that is as probable.
+    """
+    free = found.degrees_of_freedom
+    with np.errstate(all="ignore"):
+        r = found.normalised / factor
+        t = r * np.sqrt((free - 1) / np.maximum(free - r**2, 0.0))
+        deviates = np.sign(r) * norm.isf(student.sf(np.abs(t), free - 1)) if free > 1 else np.full(len(r), np.nan)
+        # So improbable that it underflows: a deviate beyond every limit.
+        deviates = np.where(np.isinf(deviates), np.sign(r) * _FARTHEST, deviates)
+        covariance, chi_square = found.covariance * factor**2, found.chi_square / factor**2
+    return replace(found, covariance=covariance, chi_square=chi_square, normalised=deviates, level=level)
 
 
 def _restricted(problem: Problem, rows: Array) -> Problem:

@@ -21,7 +21,10 @@ from ipe_bench.measurements.base import Measurement
 
 def header(model: Measurement) -> list[str]:
     """The columns of a readings file of this model."""
-    return [*model.index, f"reading [{model.reading_unit}]" if model.reading_unit else "reading"]
+    return [
+        *dict.fromkeys((*model.index, *model.input_columns)),
+        f"reading [{model.reading_unit}]" if model.reading_unit else "reading",
+    ]
 
 
 def write_readings(path: Path, model: Measurement, z: Array) -> None:
@@ -30,7 +33,7 @@ def write_readings(path: Path, model: Measurement, z: Array) -> None:
     Raises:
         UserError: the file is there already.
     """
-    labels = zip(*model.index.values(), strict=True)
+    labels = zip(*{**model.index, **model.input_columns}.values(), strict=True)
     rows = [[*label, "" if math.isnan(value) else repr(float(value))] for label, value in zip(labels, z, strict=True)]
     _write(path, header(model), rows)
 
@@ -60,17 +63,17 @@ def read_readings(path: Path, model: Measurement) -> Array:
     """
     if not path.is_file():
         raise UserError(f"readings={path}: there is no such file")
-    heading, rows = _table(path)
-    wanted = header(model)
+    heading, rows = cells_of(path)
+    wanted = [*model.index, header(model)[-1]]
     _check_header(path, heading, wanted)
-    places = {_label(label): i for i, label in enumerate(zip(*model.index.values(), strict=True))}
+    places = {comparable(label): i for i, label in enumerate(zip(*model.index.values(), strict=True))}
     z = np.full(model.m, np.nan)
     seen: dict[int, int] = {}
     for number, row in rows:
         cells = dict(zip(heading, row, strict=False))
         label = tuple(cells.get(name, "") for name in model.index)
         said = ", ".join(f"{name}={value}" for name, value in zip(model.index, label, strict=True))
-        place = places.get(_label(label))
+        place = places.get(comparable(label))
         if place is None:
             raise UserError(
                 f"readings={path}: row {number}: {model.name} has no reading {said}; correct or remove the row"
@@ -80,7 +83,7 @@ def read_readings(path: Path, model: Measurement) -> Array:
                 f"readings={path}: row {number}: {said} stands in row {seen[place]} already; keep one of them"
             )
         seen[place] = number
-        z[place] = _reading(cells.get(wanted[-1], ""), f"readings={path}: row {number}, column {wanted[-1]}")
+        z[place] = number_in(cells.get(wanted[-1], ""), f"readings={path}: row {number}, column {wanted[-1]}")
     if len(seen) < model.m:
         absent = next(label for i, label in enumerate(zip(*model.index.values(), strict=True)) if i not in seen)
         said = ", ".join(f"{name}={value}" for name, value in zip(model.index, absent, strict=True))
@@ -93,7 +96,7 @@ def read_readings(path: Path, model: Measurement) -> Array:
     return z
 
 
-def _table(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+def cells_of(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Header and numbered rows as text, from CSV or Parquet."""
     if path.suffix == ".parquet":
         import pyarrow as pa
@@ -129,7 +132,7 @@ def _check_header(path: Path, heading: Sequence[str], wanted: Sequence[str]) -> 
         raise UserError(f"readings={path}: column {repeated[0]} stands there twice; keep one")
 
 
-def _label(values: Sequence[Any]) -> tuple[Any, ...]:
+def comparable(values: Sequence[Any]) -> tuple[Any, ...]:
     """Labels compared as numbers where they are numbers: 3 and 3.0 are one."""
     return tuple(_number(value) for value in values)
 
@@ -141,7 +144,7 @@ def _number(value: Any) -> Any:
         return str(value).strip()
 
 
-def _reading(text: str, where: str) -> float:
+def number_in(text: str, where: str) -> float:
     if not text.strip():
         return math.nan
     try:

@@ -14,6 +14,7 @@ import numpy as np
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import write_atomically
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.real.fits import FIT_LEVEL, Fit
 from ipe_bench.report.words import p_value
@@ -21,7 +22,7 @@ from ipe_bench.report.words import p_value
 if TYPE_CHECKING:
     from rich.console import Group
 
-SCHEMA = 1
+SCHEMA = 2
 RESULT = "estimate.json"
 RESIDUALS = "residuals.csv"
 _FIGURES = tuple(f"{name}{suffix}" for name in ("residuals", "ellipses") for suffix in (".png", ".pdf"))
@@ -29,6 +30,7 @@ _MOST_OUTLIERS = 8
 _FEW = 0.05
 """Above this share of outliers it is the model that is wrong, and a list of readings says nothing."""
 _ALIKE = 0.02
+_FITS = {True: "yes", False: "NO", None: "not tested"}
 _NARROW = 90
 """Columns of a terminal below which the table of verdicts goes without the residual deviation."""
 
@@ -121,6 +123,8 @@ def _described(model: Measurement, z: Array, fits: Sequence[Fit]) -> dict[str, A
                 "degrees_of_freedom": one.degrees_of_freedom,
                 "p": _numbers(one.p_value),
                 "fits": one.fits,
+                "passes": one.passes,
+                "noise_level_estimated": None if one.level is None else _numbers(one.level),
                 "residual_deviation": _numbers(one.residual_deviation),
                 "whiteness": {
                     "test": "Ljung-Box, p from simulated fits",
@@ -201,7 +205,7 @@ def _estimates(name: str, model: Measurement, fits: Sequence[Fit], width: int) -
     from rich.markup import escape
     from rich.table import Table
 
-    columns = [(f.label, [with_error(*pair) for pair in zip(f.x, f.standard_errors, strict=True)]) for f in fits]
+    columns = [(_heading(f), _cells(f)) for f in fits]
     widths = [max(map(len, (label, *cells))) + 2 for label, cells in columns]
     fixed = max(len("parameter"), *(len(p.name) for p in model.parameters))
     fixed += 2 + max(len("unit"), *(len(p.unit) for p in model.parameters))
@@ -225,6 +229,22 @@ def _estimates(name: str, model: Measurement, fits: Sequence[Fit], width: int) -
         start = stop
 
 
+def _heading(one: Fit) -> str:
+    return one.label if one.passes else f"{one.label}: {_failing(one)}"
+
+
+def _failing(one: Fit) -> str:
+    """Why a fit is not an answer."""
+    return "MISFIT" if one.status is Status.CONVERGED else one.status.label.replace("_", " ").upper()
+
+
+def _cells(one: Fit) -> list[str]:
+    """Estimates with their errors; what is not an answer stands in brackets, without errors that would be wrong."""
+    if one.passes:
+        return [with_error(*pair) for pair in zip(one.x, one.standard_errors, strict=True)]
+    return [f"({value:.4g})" if math.isfinite(value) else "-" for value in one.x]
+
+
 def _verdicts(fits: Sequence[Fit], width: int) -> Any:
     from rich.markup import escape
     from rich.table import Table
@@ -241,7 +261,7 @@ def _verdicts(fits: Sequence[Fit], width: int) -> Any:
         numbers = [f"{one.residual_deviation:.4g}", f"{one.chi_square:.4g}", str(one.degrees_of_freedom)]
         numbers += [p_value(one.p_value), p_value(one.whiteness.p_value), str(int(one.outliers.sum()))]
         status = one.status.label.replace("_", " ")
-        table.add_row(escape(one.label), status, *numbers[width < _NARROW :], "yes" if one.fits else "NO")
+        table.add_row(escape(one.label), status, *numbers[width < _NARROW :], _FITS[one.fits])
     return table
 
 
@@ -252,8 +272,31 @@ def _notes(fits: Sequence[Fit], width: int) -> Any:
         f"fits: p of chi-square is at least {FIT_LEVEL:g}. white p: Ljung-Box; small where successive residuals"
         " resemble each other." + (" deviation: of the residuals, in the readings' unit." if width >= _NARROW else ""),
         *(f"{one.label}: {one.message}" for one in fits if one.message),
+        *_on_levels(fits),
     ]
+    failing = [one.label for one in fits if not one.passes]
+    if failing:
+        lines.append(
+            f"In brackets: {', '.join(failing)}. Not an answer: errors are not given, for they would be wrong."
+        )
     return Text("\n".join(lines), style="dim")
+
+
+def _on_levels(fits: Sequence[Fit]) -> Iterator[str]:
+    """What is to be said where the level of the noise is estimated."""
+    unknown = [one for one in fits if one.level is not None]
+    if not unknown:
+        return
+    yield (
+        "The level of the noise is estimated from the residuals: standard errors are scaled by it, intervals are those"
+        " of Student's t, and the size of the residuals cannot test the model."
+    )
+    suspect = [one.label for one in unknown if one.whiteness.p_value < FIT_LEVEL]
+    if suspect:
+        yield (
+            f"{', '.join(suspect)}: successive residuals resemble each other (white p below {FIT_LEVEL:g}); the model"
+            " is in doubt, and standard errors are too small."
+        )
 
 
 def _outliers(model: Measurement, fits: Sequence[Fit]) -> Iterator[Any]:

@@ -6,6 +6,7 @@ come from it. Recording and compilation are in `trace` and `kernel`.
 
 from __future__ import annotations
 
+import dataclasses
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -15,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.base import Measurement
+from ipe_bench.measurements.base import Input, Measurement
+from ipe_bench.measurements.ode import sampling
 from ipe_bench.measurements.ode.kernel import Recording, integrate, record
 
 _COMPLEX_STEP = 1e-100
@@ -40,6 +42,9 @@ class OdeMeasurement(Measurement):
     """The unit of `times`, `step` and t."""
     step: float | None
     """The longest integration step in seconds; each interval between readings is divided evenly."""
+    sampled: tuple[float, ...] | None = None
+    """Times of the readings in place of the usual ones, where a subclass has a field of that name: a readings file may
+    bring its own."""
 
     @property
     @abstractmethod
@@ -75,9 +80,21 @@ class OdeMeasurement(Measurement):
         )
         return {
             "case": cases.ravel().tolist(),
-            f"time [{self.time_unit}]": times.ravel().tolist(),
+            sampling.time_heading(self.time_unit): times.ravel().tolist(),
             "output": [self.outputs[i] for i in outputs.ravel()],
         }
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        if "sampled" not in getattr(self, "__dataclass_fields__", {}):
+            return ()
+        return sampling.inputs(self.time_unit, self.outputs, len(self.cases))
+
+    def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
+        def at(times: tuple[float, ...]) -> Measurement:
+            return self if np.array_equal(times, self.times) else dataclasses.replace(self, sampled=times)  # type: ignore[type-var]
+
+        return sampling.sampled(columns, self.outputs, len(self.cases), at)
 
     @cached_property
     def epochs(self) -> tuple[NDArray[np.intp], ...]:
