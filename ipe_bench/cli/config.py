@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,11 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.estimators.base import Estimator
+from ipe_bench.measurements.known import Informed, Known
 from ipe_bench.noise import ModelNoise, Unknown
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
+from ipe_bench.priors.gaussian import GaussianPrior
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.provenance import TARGET
 from ipe_bench.trials.scenario import Scenario
@@ -53,6 +55,8 @@ class Schema:
     """What simulates the readings, where it differs from what the estimators assume."""
     noise: Any = MISSING
     prior: Any = MISSING
+    parameters: Any = None
+    """What is known of the parameters: parameters.NAME.fixed=, .nominal=, .deviation=, .lower=, .upper=, .positive=."""
     execution: Any = MISSING
     estimators: dict[str, Any] = field(default_factory=dict)
 
@@ -151,14 +155,14 @@ def assemble(config: DictConfig, *, estimating: bool = False) -> Job:
     noise = parts["noise"]
     if estimating and isinstance(noise, ModelNoise):
         noise = noise.of(parts["measurement"]) or Unknown()
-    scenario = Scenario(
-        parts["measurement"],
-        noise,
-        parts["prior"],
-        plain["error_scale"],
-        plain["seed"],
-        None if truth is None else construct(truth, "truth_measurement"),
-    )
+    truth = None if truth is None else construct(truth, "truth_measurement")
+    measurement, prior = parts["measurement"], parts["prior"]
+    known = _known(plain["parameters"])
+    if known:
+        measurement = Informed(measurement, known)
+        truth = None if truth is None else Informed(truth, known)
+        prior = _prior(prior, measurement)
+    scenario = Scenario(measurement, noise, prior, plain["error_scale"], plain["seed"], truth)
     estimators: dict[str, Estimator] = {}
     for label, options in plain["estimators"].items():
         if not isinstance(options, Mapping):
@@ -170,6 +174,37 @@ def assemble(config: DictConfig, *, estimating: bool = False) -> Job:
             )
         estimators[str(label)] = construct(options, f"estimators.{label}")
     return Job(scenario, estimators, parts["execution"], plain["trials"], plain["block_size"], plain["output"])
+
+
+def _known(given: Any) -> tuple[Known, ...]:
+    """What the key `parameters` says of each."""
+    if given is None:
+        return ()
+    if not isinstance(given, Mapping):
+        raise UserError("parameters: give each what is known of it, such as parameters.NAME.fixed=0.1")
+    found = []
+    for name, options in given.items():
+        where = f"parameters.{name}"
+        if not isinstance(options, Mapping):
+            raise UserError(f"{where}={options}: say what that is, such as {where}.fixed={options}")
+        target = f"{Known.__module__}.{Known.__qualname__}"
+        found.append(construct({TARGET: target, "name": str(name), **options}, where))
+    return tuple(found)
+
+
+def _prior(prior: GaussianPrior, model: Informed) -> GaussianPrior:
+    """The prior with the deviations that are known of single parameters."""
+    if prior.deviations is None:
+        return replace(prior, deviations=model.prior_deviations)
+    names = [p.name for p in model.whole.parameters]
+    if len(prior.deviations) != len(names):
+        raise UserError(
+            f"prior.deviations: has {len(prior.deviations)} numbers; give one for each of {len(names)} parameters"
+        )
+    general = dict(zip(names, prior.deviations, strict=True))
+    own = {one.name for one in model.known if one.deviation is not None}
+    known = zip(model.natural_parameters, model.prior_deviations, strict=True)
+    return replace(prior, deviations=tuple(d if p.name in own else general[p.name] for p, d in known))
 
 
 def refuse_silent_traps(overrides: Sequence[str]) -> None:

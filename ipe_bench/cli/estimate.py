@@ -22,7 +22,7 @@ from ipe_bench.cli.config import CONFIG_ERRORS, Job, assemble, explain, prepare,
 from ipe_bench.noise import Certified, Gaussian, ModelNoise, Noise, Unknown
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.real.fits import fit
-from ipe_bench.real.sources import SIGMA, Readings, open_readings
+from ipe_bench.real.sources import SIGMA, Readings, open_together
 from ipe_bench.runs.provenance import describe, fingerprint
 
 
@@ -71,13 +71,24 @@ def _measurement_name(arguments: Sequence[str], job: Job) -> str:
 def _readings(config: DictConfig, job: Job) -> tuple[Job, Array]:
     """The readings (m,) of the file, or those that come with the model; with the latter, their own noise."""
     if config.readings is not None:
-        found = open_readings(Path(config.readings), job.scenario.measurement)
+        found = open_together(_files(config), job.scenario.measurement)
         noise = _noise(config, job, found)
         return replace(job, scenario=replace(job.scenario, measurement=found.model, noise=noise)), found.z
     recorded = job.scenario.measurement.recorded
     if recorded is None:
         raise UserError("readings: is not given; write readings=FILE (see `ipe-bench list measurement -v`)")
     return replace(job, scenario=replace(job.scenario, noise=Certified())), recorded.z
+
+
+def _files(config: DictConfig) -> list[Path]:
+    """The files that `readings` names, one or several."""
+    given = config.readings
+    names = list(given) if OmegaConf.is_list(given) else [given]
+    if not names or any(not isinstance(name, str) for name in names):
+        raise UserError(f"readings={given}: name a file, or several as readings=[a.csv,b.csv]")
+    if len(set(names)) < len(names):
+        raise UserError(f"readings={given}: names a file twice, which would count its readings twice")
+    return [Path(name) for name in names]
 
 
 def _noise(config: DictConfig, job: Job, found: Readings) -> Noise:
@@ -99,7 +110,7 @@ def _noise(config: DictConfig, job: Job, found: Readings) -> Noise:
 def _command(config: DictConfig, job: Job) -> dict[str, Any]:
     """What tells this command from others: what was asked for, whatever the file holds today."""
     return {
-        "readings": None if config.readings is None else str(Path(config.readings).resolve()),
+        "readings": None if config.readings is None else [str(path.resolve()) for path in _files(config)],
         "scenario": describe(job.scenario),
         "estimators": {label: describe(estimator) for label, estimator in job.estimators.items()},
     }
@@ -108,8 +119,9 @@ def _command(config: DictConfig, job: Job) -> dict[str, Any]:
 def _provenance(config: DictConfig, job: Job) -> dict[str, Any]:
     readings = None
     if config.readings is not None:
-        path = Path(config.readings)
-        readings = {"file": str(config.readings), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+        readings = [
+            {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()} for path in _files(config)
+        ]
     return {
         "written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "readings": readings,

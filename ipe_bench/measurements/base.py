@@ -162,6 +162,24 @@ class Measurement(Named, ABC):
         """The physical size (n,) of one unit of x, in each parameter's own unit."""
         return np.array([p.size for p in self.parameters])
 
+    @property
+    def natural_parameters(self) -> tuple[Parameter, ...]:
+        """The n unknowns as users know them, where those of x are their logarithms, say."""
+        return self.parameters
+
+    def natural(self, x: Array) -> Array:
+        """Their values (trials, n), each in its own unit."""
+        return x * self.sizes
+
+    def natural_slope(self, x: Array) -> Array:
+        """The derivative of each value by its own entry of x (trials, n)."""
+        return np.broadcast_to(self.sizes, x.shape)
+
+    @property
+    def fixed(self) -> Mapping[str, float]:
+        """Values of parameters that are known and not estimated, by name."""
+        return {}
+
     def jacobian(self, x: Array) -> Array:
         """dh/dx at each trial: (trials, n) -> (trials, m, n); complex step where analytic, else central differences."""
         return differentiate(self.simulate, x, analytic=self.analytic)
@@ -213,6 +231,28 @@ class Restricted(Measurement):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         return self.whole.parameters
+
+    @property
+    def natural_parameters(self) -> tuple[Parameter, ...]:
+        return self.whole.natural_parameters
+
+    def natural(self, x: Array) -> Array:
+        return self.whole.natural(x)
+
+    def natural_slope(self, x: Array) -> Array:
+        return self.whole.natural_slope(x)
+
+    @property
+    def fixed(self) -> Mapping[str, float]:
+        return self.whole.fixed
+
+    @property
+    def reading_unit(self) -> str:  # type: ignore[override]
+        return self.whole.reading_unit
+
+    @property
+    def own_parameters(self) -> Sequence[str]:
+        return self.whole.own_parameters
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:

@@ -53,6 +53,13 @@ class Fit:
     iterations: int
     simulations: float
     """Evaluations of the model, a Jacobian counting n."""
+    model: Measurement
+    """What was fitted, without the readings that are missing."""
+    inner: Array
+    """The estimates (n,) as the estimator knows them: in multiples of sizes, of logarithms where parameters have
+    bounds."""
+    inner_covariance: Array
+    """Of those (n, n)."""
     level: float | None = None
     """The factor by which the readings are noisier than R says, where it is estimated from the residuals; R and all
     that rests on it, the covariance included, have been multiplied by it already. None: R is known."""
@@ -105,6 +112,13 @@ class Fit:
         where the level of the noise is estimated."""
         tail = (1.0 - confidence) / 2.0
         return float(norm.isf(tail) if self.level is None else student.isf(tail, self.degrees_of_freedom))
+
+    def interval(self, confidence: float = 0.95) -> tuple[Array, Array]:
+        """Confidence intervals (n,), (n,) from the standard errors; inside of its bounds where a parameter has some."""
+        with np.errstate(invalid="ignore"):
+            half = self.half_width(confidence) * np.sqrt(np.diagonal(self.inner_covariance))
+        ends = self.model.natural(np.stack([self.inner - half, self.inner + half]))
+        return ends.min(axis=0), ends.max(axis=0)
 
     def region(self, parameters: int, confidence: float = 0.95) -> float:
         """The squared distance, in standard errors, to the edge of a joint region of so many parameters: chi-square, or
@@ -175,8 +189,14 @@ def _with_level(found: Fit, factor: float, level: float) -> Fit:
         deviates = np.sign(r) * norm.isf(student.sf(np.abs(t), free - 1)) if free > 1 else np.full(len(r), np.nan)
         # So improbable that it underflows: a deviate beyond every limit.
         deviates = np.where(np.isinf(deviates), np.sign(r) * _FARTHEST, deviates)
-        covariance, chi_square = found.covariance * factor**2, found.chi_square / factor**2
-    return replace(found, covariance=covariance, chi_square=chi_square, normalised=deviates, level=level)
+        return replace(
+            found,
+            covariance=found.covariance * factor**2,
+            inner_covariance=found.inner_covariance * factor**2,
+            chi_square=found.chi_square / factor**2,
+            normalised=deviates,
+            level=level,
+        )
 
 
 def _restricted(problem: Problem, rows: Array) -> Problem:
@@ -226,12 +246,13 @@ def _fit_one(
     else:
         own, white = np.full(len(z), np.nan), Whiteness(np.nan, 0, np.nan)
     P = np.full((n, n), np.nan) if estimates.covariance is None else estimates.covariance[0]
+    slope = model.natural_slope(estimates.x)[0]
     return Fit(
         label,
         Status(int(estimates.status[0])),
         message,
-        estimates.x[0] * model.sizes,
-        P * np.outer(model.sizes, model.sizes),
+        model.natural(estimates.x)[0],
+        P * np.outer(slope, slope),
         _at(rows, r, m),
         _at(rows, own, m),
         float(np.sum(w**2)),
@@ -239,6 +260,9 @@ def _fit_one(
         white,
         int(estimates.iterations[0]),
         float(estimates.simulations[0] + n * estimates.jacobians[0]),
+        model,
+        estimates.x[0],
+        P,
     )
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Input, Measurement
+from ipe_bench.measurements.joint import Joint
 from ipe_bench.real import readings
 
 SIGMA = "sigma"
@@ -32,6 +33,24 @@ class Readings:
     """(m,); NaN where a reading is missing."""
     deviations: Array | None = None
     """(m,): standard deviations where the file has them; NaN where the reading is missing."""
+
+
+def open_together(paths: Sequence[Path], model: Measurement) -> Readings:
+    """The readings of one file or of several; the latter share the parameters that are not a file's own.
+
+    Raises:
+        UserError: a file is absent or does not hold readings of this model, or files differ in what they know.
+    """
+    found = [open_readings(path, model) for path in paths]
+    if len(found) == 1:
+        return found[0]
+    for one, path in zip(found, paths, strict=True):
+        if (one.deviations is None) != (found[0].deviations is None):
+            with_sigma, without = (paths[0], path) if one.deviations is None else (path, paths[0])
+            raise UserError(f"readings={without}: has no column {SIGMA}, as {with_sigma} has; give it one, too")
+    deviations = [one.deviations for one in found if one.deviations is not None]
+    joint = Joint(tuple(one.model for one in found))
+    return Readings(joint, np.concatenate([one.z for one in found]), np.concatenate(deviations) if deviations else None)
 
 
 def open_readings(path: Path, model: Measurement) -> Readings:

@@ -104,20 +104,22 @@ def write_fits(
 
 
 def _described(model: Measurement, z: Array, fits: Sequence[Fit]) -> dict[str, Any]:
-    names = [p.name for p in model.parameters]
+    names = [p.name for p in model.natural_parameters]
     labels = _reading_labels(model)
     return {
         "measurement": model.name,
         "reading_unit": model.reading_unit,
         "readings_present": int(np.isfinite(z).sum()),
         "readings_missing": int(np.isnan(z).sum()),
-        "parameters": [{"name": p.name, "unit": p.unit} for p in model.parameters],
+        "fixed": dict(model.fixed),
+        "parameters": [{"name": p.name, "unit": p.unit} for p in model.natural_parameters],
         "estimators": {
             one.label: {
                 "status": one.status.label,
                 "message": one.message,
                 "estimates": dict(zip(names, _numbers(one.x), strict=True)),
                 "standard_errors": dict(zip(names, _numbers(one.standard_errors), strict=True)),
+                "intervals95": dict(zip(names, _numbers(np.transpose(one.interval())), strict=True)),
                 "correlation": _numbers(one.correlation),
                 "chi_square": _numbers(one.chi_square),
                 "degrees_of_freedom": one.degrees_of_freedom,
@@ -207,8 +209,8 @@ def _estimates(name: str, model: Measurement, fits: Sequence[Fit], width: int) -
 
     columns = [(_heading(f), _cells(f)) for f in fits]
     widths = [max(map(len, (label, *cells))) + 2 for label, cells in columns]
-    fixed = max(len("parameter"), *(len(p.name) for p in model.parameters))
-    fixed += 2 + max(len("unit"), *(len(p.unit) for p in model.parameters))
+    fixed = max(len("parameter"), *(len(p.name) for p in model.natural_parameters))
+    fixed += 2 + max(len("unit"), *(len(p.unit) for p in model.natural_parameters))
     start = 0
     while start < len(columns):
         stop, room = start + 1, width - fixed - widths[start]
@@ -221,7 +223,7 @@ def _estimates(name: str, model: Measurement, fits: Sequence[Fit], width: int) -
         table.add_column("unit", no_wrap=True)
         for label, _ in columns[start:stop]:
             table.add_column(escape(label), justify="right", overflow="fold")
-        for i, parameter in enumerate(model.parameters):
+        for i, parameter in enumerate(model.natural_parameters):
             cells = [cells[i] for _, cells in columns[start:stop]]
             table.add_row(escape(parameter.name), escape(parameter.unit), *cells)
         yield table
@@ -275,6 +277,8 @@ def _notes(fits: Sequence[Fit], width: int) -> Any:
         *_on_levels(fits),
     ]
     failing = [one.label for one in fits if not one.passes]
+    if fits[0].model.fixed:
+        lines.append("Fixed: " + ", ".join(f"{name} = {value:g}" for name, value in fits[0].model.fixed.items()))
     if failing:
         lines.append(
             f"In brackets: {', '.join(failing)}. Not an answer: errors are not given, for they would be wrong."

@@ -111,14 +111,14 @@ def most_correlated(correlation: Array, most: int = MOST_PAIRS) -> list[tuple[in
     return pairs[:most]
 
 
-def ellipse(P: Array, level: float = LEVEL, points: int = 181) -> Array:
+def ellipse(P: Array, level: float = LEVEL, points: int = 181, edge: float | None = None) -> Array:
     """The boundary (points, 2) of the region about zero in which an error of covariance P (2, 2) lies with that
-    probability."""
+    probability; or, where P is itself estimated, at the squared distance `edge` in deviations."""
     # Scaled first: the parameters' units must not decide what is singular.
     d = np.sqrt(np.diagonal(P))
     values, vectors = np.linalg.eigh(P / np.outer(d, d))
     turn = np.linspace(0.0, 2 * np.pi, points)
-    circle = np.sqrt(chi2.ppf(level, 2)) * np.column_stack([np.cos(turn), np.sin(turn)])
+    circle = np.sqrt(chi2.ppf(level, 2) if edge is None else edge) * np.column_stack([np.cos(turn), np.sin(turn)])
     return (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T * d
 
 
@@ -142,7 +142,7 @@ def _ellipses(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look])
         near = []
         for one, linewidth in zip(told, widths, strict=True):
             offset = one.x[[i, j]] - centre
-            outline = offset + ellipse(one.covariance[pick])
+            outline = offset + ellipse(one.covariance[pick], edge=one.region(2, LEVEL))
             style = look[one.label]
             ax.plot(
                 *outline.T, color=style.color, linestyle=style.dash, linewidth=linewidth, label=common.text(one.label)
@@ -161,7 +161,7 @@ def _ellipses(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look])
         ax.yaxis.set_major_locator(MaxNLocator(5))
         ax.ticklabel_format(style="sci", scilimits=(-3, 4), useMathText=True)
         for set_label, k in ((ax.set_xlabel, i), (ax.set_ylabel, j)):
-            parameter = model.parameters[k]
+            parameter = model.natural_parameters[k]
             unit = f" [{parameter.unit}]" if parameter.unit else ""
             sign = "+" if best.x[k] < 0 else "−"
             set_label(common.text(f"{parameter.name} {sign} {abs(best.x[k]):.5g}{unit}"))
