@@ -14,7 +14,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from ipe_bench import baselines, measurements, noise, priors, solvers
-    from ipe_bench.api import run
+    from ipe_bench.api import estimate, run
     from ipe_bench.basics.errors import UserError
     from ipe_bench.basics.statuses import Status
     from ipe_bench.estimators.base import Estimates, Estimator
@@ -34,6 +34,7 @@ _HOMES = {
     "Scenario": "trials.scenario",
     "Status": "basics.statuses",
     "UserError": "basics.errors",
+    "estimate": "api",
     "run": "api",
 }
 _ROOMS = ("baselines", "measurements", "noise", "priors", "solvers")
@@ -50,6 +51,7 @@ __all__ = [
     "UserError",
     "__version__",
     "baselines",
+    "estimate",
     "measurements",
     "noise",
     "priors",

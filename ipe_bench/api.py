@@ -14,9 +14,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import cores, library_versions
 from ipe_bench.estimators.base import Estimator
+from ipe_bench.measurements.base import Measurement
+from ipe_bench.noise.base import Noise
+from ipe_bench.priors.gaussian import GaussianPrior
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.provenance import describe, fingerprint
 from ipe_bench.runs.schedule import RunLog, Watcher, perform, plan, work_through
@@ -25,6 +31,8 @@ from ipe_bench.trials.scenario import Scenario
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from ipe_bench.report.answer import Answer
 
 BLOCK_SIZE = 250
 
@@ -85,6 +93,50 @@ def compute(
     identifier = _write_record(store, scenarios, estimators, trials)
     with RunLog(store.directory / "log" / f"{identifier}.log") as log:
         return work_through(tasks, execution, store, watch or (lambda progress: None), log)
+
+
+def estimate(
+    measurement: Measurement,
+    readings: Path | str | Sequence[Path | str] | Array,
+    estimators: Mapping[str, Estimator] | None = None,
+    *,
+    noise: Noise | None = None,
+    prior: GaussianPrior | None = None,
+    error_scale: float = 1.0,
+) -> Answer:
+    """Estimates from real readings: a file, several files that share parameters, or the readings z (m,) themselves.
+
+    Without `noise`, what the file says of it (a column sigma) or the model; where neither does, its level is estimated.
+    Without estimators, Levenberg-Marquardt. The answer shows itself in a notebook; `answer.table()` is a frame.
+
+    Raises:
+        UserError: a file does not hold readings of the model, or an estimator lacks what it needs.
+    """
+    from ipe_bench.baselines import LevenbergMarquardt
+    from ipe_bench.noise import Gaussian, ModelNoise, Unknown
+    from ipe_bench.real.examination import examine
+    from ipe_bench.real.fits import fit
+    from ipe_bench.real.sources import Readings, open_together
+    from ipe_bench.report.answer import Answer
+
+    if isinstance(readings, np.ndarray):
+        if readings.shape != (measurement.m,):
+            raise UserError(f"readings: have shape {readings.shape}, and the model has {measurement.m} readings")
+        found = Readings(measurement, np.asarray(readings, dtype=float))
+    else:
+        paths = [readings] if isinstance(readings, str | Path) else list(readings)
+        found = open_together([Path(path) for path in paths], measurement)
+    if found.deviations is not None:
+        known = tuple(np.where(np.isfinite(found.deviations), found.deviations, 1.0).tolist())
+        if noise is not None and not isinstance(noise, Unknown):
+            raise UserError("noise: is given, and the file has a column sigma, too; leave one of them out")
+        noise = Unknown(known) if isinstance(noise, Unknown) else Gaussian(known)
+    noise = noise or ModelNoise().of(found.model) or Unknown()
+    scenario = Scenario(found.model, noise, prior or GaussianPrior(), error_scale)
+    estimators = estimators or {"levenberg_marquardt": LevenbergMarquardt()}
+    check([scenario], estimators, trials=1, estimating=True)
+    fits = fit(scenario.problem, found.z, estimators, level_unknown=noise.estimated)
+    return Answer(found.model.name, found.model, found.z, fits, examine(scenario.problem, found.z, fits))
 
 
 def check(

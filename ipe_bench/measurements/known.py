@@ -1,4 +1,4 @@
-"""What is known of a model's parameters before anything is measured: values, starts, bounds, and how far off they may be.
+"""What is known of parameters before anything is measured: values, starts, bounds, and how far off they may be.
 
 A model in which that is so is the model in other coordinates: fixed parameters are gone, and bounded ones run over all
 numbers, so that no estimator and no draw can leave the bounds.
@@ -70,9 +70,9 @@ def informed(model: Measurement, known: Sequence[Known]) -> Measurement:
 class Informed(Measurement):
     """A model of which some parameters are fixed, bounded or start elsewhere.
 
-    x counts the parameters that are left. A bounded one is ln((v - lower) / (v0 - lower)), ln((upper - v0) / (upper - v))
-    or the difference of the logits of v and its start v0, and is named accordingly; its size is such that one unit of
-    x moves v by as much at v0 as before.
+    x counts the parameters that are left. A bounded one is ln((v - lower) / (v0 - lower)), or
+    ln((upper - v0) / (upper - v)), or the difference of the logits of v and its start v0, and is named accordingly; its
+    size is such that one unit of x moves v by as much at v0 as before.
     """
 
     whole: Measurement

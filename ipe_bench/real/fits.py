@@ -63,6 +63,9 @@ class Fit:
     level: float | None = None
     """The factor by which the readings are noisier than R says, where it is estimated from the residuals; R and all
     that rests on it, the covariance included, have been multiplied by it already. None: R is known."""
+    beaten: bool = False
+    """Whether another estimator's sum of squares is so much smaller that chance does not explain it: tested where the
+    level is estimated, because there nothing else tells a wrong answer."""
 
     @property
     def standard_errors(self) -> Array:
@@ -99,7 +102,9 @@ class Fit:
 
     @property
     def fits(self) -> bool | None:
-        """Whether the residuals are as small as R says; None where that cannot be tested."""
+        """Whether the residuals are as small as R says, or as small as they can be; None where neither can be told."""
+        if self.beaten:
+            return False
         return self.p_value >= FIT_LEVEL if self.testable else None
 
     @property
@@ -147,7 +152,21 @@ def fit(problem: Problem, z: Array, estimators: Mapping[str, Estimator], *, leve
     given = problem if len(present) == len(z) else _restricted(problem, present)
     order = _succession(problem.measurement, present)
     one = _fit_with_level if level_unknown else _fit_one
-    return [one(label, estimator, given, z[present], present, len(z), order) for label, estimator in estimators.items()]
+    where = present, len(z), order
+    found = [one(label, estimator, given, z[present], *where) for label, estimator in estimators.items()]
+    return _compared(found) if level_unknown else found
+
+
+def _compared(fits: list[Fit]) -> list[Fit]:
+    """The fits, those marked that lie outside of the joint confidence region of the best (F test: Bates and Watts,
+    Nonlinear Regression Analysis and Its Applications, 1988, section 6.1)."""
+    sums = {one.label: one.chi_square * one.level**2 for one in fits if one.level is not None}
+    least, free = min((v for v in sums.values() if np.isfinite(v)), default=np.nan), fits[0].degrees_of_freedom
+    if not (np.isfinite(least) and free > 0):
+        return fits
+    n = len(fits[0].x)
+    limit = least * (1 + n / free * float(fisher.isf(FIT_LEVEL, n, free)))
+    return [replace(one, beaten=not sums.get(one.label, np.nan) <= limit) for one in fits]
 
 
 def _fit_with_level(label: str, estimator: Estimator, problem: Problem, z: Array, *where: Any) -> Fit:
@@ -197,6 +216,12 @@ def _with_level(found: Fit, factor: float, level: float) -> Fit:
             normalised=deviates,
             level=level,
         )
+
+
+def present_part(problem: Problem, rows: NDArray[np.intp], level: float | None = None) -> Problem:
+    """The problem of the readings that are there, R multiplied by an estimated level."""
+    part = problem if len(rows) == problem.R.m else _restricted(problem, rows)
+    return part if level is None else _scaled(part, level)
 
 
 def _restricted(problem: Problem, rows: Array) -> Problem:

@@ -30,7 +30,8 @@ class Ode(Measurement):
         start    a: 0.5  b: 0.03  c: 0.8  d: 0.02  y0: 6
 
     A parameter is a name with a start; it has no unit but that which the formulas give it, and its size is the
-    magnitude of its start. `initial` may hold parameters, but neither states nor t; a state that is absent there starts at 0.
+    magnitude of its start. `initial` may hold parameters, but neither states nor t; a state that is absent there starts
+    at 0.
     A readings file has the columns time, reading, and with several outputs `output`.
     """
 

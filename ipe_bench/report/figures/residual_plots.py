@@ -99,7 +99,7 @@ def _abscissa(model: Measurement) -> tuple[Array, str]:
             continue
         values = np.array(column, dtype=float)
         alike = all(np.ptp(values[rows]) == 0 for rows in model.epochs)
-        if alike and np.corrcoef(values, epoch)[0, 1] > 0.99:
+        if alike and np.ptp(values) > 0 and np.ptp(epoch) > 0 and np.corrcoef(values, epoch)[0, 1] > 0.99:
             return values, name
     return epoch, "epoch"
 
