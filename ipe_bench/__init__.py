@@ -4,6 +4,8 @@
 
     bench = ib.Scenario(ib.measurements.Gins(), ib.noise.Quantization(step=0.02286), error_scale=33.0)
     table = ib.run(bench, {"newton": ib.solvers.Newton(max_iterations=20), "ekf": ib.baselines.EKF()}, trials=200)
+    fits = ib.estimate(ib.measurements.Gins(), "my.csv", noise=ib.noise.Quantization(step=0.02286))
+    ib.load("outputs/paper").groupby(["estimator", "error_scale"])["nees"].mean()
 
 Importing it costs nothing: each name is loaded when it is first used.
 """
@@ -14,12 +16,12 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from ipe_bench import baselines, measurements, noise, priors, solvers
-    from ipe_bench.api import estimate, run
+    from ipe_bench.api import check, estimate, load, report, run, status
     from ipe_bench.basics.errors import UserError
     from ipe_bench.basics.statuses import Status
     from ipe_bench.estimators.base import Estimates, Estimator
     from ipe_bench.estimators.ipe import IPE
-    from ipe_bench.measurements.base import Measurement
+    from ipe_bench.measurements.base import Measurement, Parameter
     from ipe_bench.measurements.problem import Problem
     from ipe_bench.noise.base import Noise
     from ipe_bench.trials.scenario import Scenario
@@ -30,12 +32,12 @@ _HOMES = {
     "Estimator": "estimators.base",
     "Measurement": "measurements.base",
     "Noise": "noise.base",
+    "Parameter": "measurements.base",
     "Problem": "measurements.problem",
     "Scenario": "trials.scenario",
     "Status": "basics.statuses",
     "UserError": "basics.errors",
-    "estimate": "api",
-    "run": "api",
+    **dict.fromkeys(("check", "estimate", "load", "report", "run", "status"), "api"),
 }
 _ROOMS = ("baselines", "measurements", "noise", "priors", "solvers")
 
@@ -45,18 +47,23 @@ __all__ = [
     "Estimator",
     "Measurement",
     "Noise",
+    "Parameter",
     "Problem",
     "Scenario",
     "Status",
     "UserError",
     "__version__",
     "baselines",
+    "check",
     "estimate",
+    "load",
     "measurements",
     "noise",
     "priors",
+    "report",
     "run",
     "solvers",
+    "status",
 ]
 
 

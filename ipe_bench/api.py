@@ -1,8 +1,9 @@
-"""The whole bench as one function: scenarios and estimators in, a table of statistics out. It knows no Hydra."""
+"""The whole bench as functions: what the command line does, it does by these. They know no Hydra."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import datetime
 import functools
 import platform
@@ -21,10 +22,12 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import cores, library_versions
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
+from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.priors.gaussian import GaussianPrior
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.provenance import describe, fingerprint
+from ipe_bench.runs.results import Results, require_results
 from ipe_bench.runs.schedule import RunLog, Watcher, perform, plan, work_through
 from ipe_bench.runs.store import TRUTH, Cell, Store
 from ipe_bench.trials.scenario import Scenario
@@ -32,9 +35,12 @@ from ipe_bench.trials.scenario import Scenario
 if TYPE_CHECKING:
     import pandas as pd
 
+    from ipe_bench.plugins.conformance import Finding
+    from ipe_bench.report import ReportResult
     from ipe_bench.report.answer import Answer
 
 BLOCK_SIZE = 250
+Directories = Path | str | Sequence[Path | str]
 
 
 def run(
@@ -50,11 +56,19 @@ def run(
     """Runs every estimator on the same trials of every scenario and summarises what is known of them.
 
     `estimators` maps labels to estimators. What `output` holds already is not computed again; without `output` nothing
-    is kept. Returns the tidy summary: a row per scenario, estimator and parameter, plus the parameter `all`. What could
-    not be computed is left out, with a warning that says why.
+    is kept. Returns the tidy summary: a row per scenario, estimator and parameter, plus the parameter `all`, the root
+    mean square over parameters of error over bound; `rmse` and its kin are in the parameter's own unit. What could not
+    be computed is left out, with a warning that says why.
+
+    >>> import ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
+    >>> table = ib.run(bench, {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}, trials=20)
+    >>> table[table["parameter"] == "all"].set_index("estimator")["converged"].to_dict()
+    {'newton': 1.0, 'linear': 1.0}
 
     Raises:
         UserError: what was asked for cannot be computed; nothing has been computed then.
+        StorageError: nothing can be stored any more.
     """
     from ipe_bench.statistics import summarize
 
@@ -65,6 +79,197 @@ def run(
         for failure in compute(scenarios, estimators, trials, folder, **options):
             warnings.warn(f"failed: {failure}", stacklevel=2)
         return summarize([folder])
+
+
+def load(directories: Directories) -> pd.DataFrame:
+    """Every stored trial of one directory or of several: a row per trial and estimator.
+
+    Columns that say what a row belongs to: measurement, noise, prior, error_scale, seed, estimator, every key of the
+    config that differs between scenarios, and `estimator.KEY` for options that differ under one label. Then what the
+    trial came to: `error_NAME` and `deviation_NAME` (as the estimator reports it) per parameter, status, message,
+    iterations, simulations, jacobians, time_s, crlb_distance, nees, fit_p, solved, success; and the truth `x_NAME` with
+    its bounds `crlb_NAME` and `bayes_NAME`. Parameters are in multiples of their sizes. What a row does not have is
+    NaN. What is missing or damaged is a warning, and stale results are left out.
+
+    >>> import tempfile, ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = ib.run(bench, {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}, 20, output=folder)
+    ...     rows = ib.load(folder)
+    >>> rows.groupby("estimator", sort=False)["trial"].count().to_dict()
+    {'newton': 20, 'linear': 20}
+    >>> rows["measurement"].unique().tolist(), bool((rows["x_c0"] + rows["error_c0"]).notna().all())
+    (['polynomial'], True)
+
+    Raises:
+        UserError: no run ever wrote to a directory.
+    """
+    from ipe_bench.statistics.collect import collect, trials_frame
+
+    paths = _paths(directories)
+    require_results(paths)
+    collection = collect(paths)
+    frame = trials_frame(collection)
+    for problem in collection.problems:
+        warnings.warn(problem, stacklevel=2)
+    return frame
+
+
+def report(directories: Directories, output: Path | str | None = None) -> ReportResult:
+    """Writes summary.csv, tables/, figures/ and report.html from what is stored, into `output` or the first directory.
+
+    The result names the files, and has the summary itself and a line per piece that is missing, failed or damaged.
+
+    >>> import ipe_bench as ib
+    >>> ib.report("outputs/nowhere")
+    Traceback (most recent call last):
+    ipe_bench.basics.errors.UserError: outputs/nowhere: holds no results of ipe-bench; give the output folder of a run
+
+    Raises:
+        UserError: no run ever wrote to a directory.
+        StorageError: the files cannot be written.
+    """
+    from ipe_bench.report import write_report
+
+    require_results(_paths(directories))
+    return write_report(directories, output)
+
+
+def status(directories: Directories) -> pd.DataFrame:
+    """How far everything is that runs asked for: a row per scenario and estimator.
+
+    Columns: measurement, noise, prior, error_scale, seed, estimator (`truth` for the truth and its bounds); the numbers
+    of trials `expected`, `done`, `missing`, `failed` and `stale`; and `messages`, why trials failed. The list
+    `attrs["problems"]` has a line for everything that is missing, failed or damaged; it is empty where all is there.
+
+    >>> import tempfile, ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = ib.run(bench, {"newton": ib.solvers.Newton()}, trials=20, output=folder)
+    ...     table = ib.status(folder)
+    >>> table[["estimator", "expected", "done"]].values.tolist(), table.attrs["problems"]
+    ([['truth', 20, 20], ['newton', 20, 20]], [])
+
+    Raises:
+        UserError: no run ever wrote to a directory.
+    """
+    import pandas as pd
+
+    paths = _paths(directories)
+    require_results(paths)
+    results = Results.read(paths)
+    counts = ("expected", "done", "missing", "failed", "stale")
+    rows = [
+        {**cell.names, **{name: getattr(cell, name) for name in counts}, "messages": "; ".join(cell.messages)}
+        for cell in results.cells
+    ]
+    frame = pd.DataFrame(rows)
+    frame.attrs["problems"] = results.problems
+    return frame
+
+
+def estimate(
+    model: Measurement,
+    readings: Path | str | Sequence[Path | str] | Array,
+    estimators: Mapping[str, Estimator] | None = None,
+    *,
+    noise: Noise | None = None,
+    prior: GaussianPrior | None = None,
+    error_scale: float | None = None,
+) -> Answer:
+    """Parameters from real readings, by every estimator: estimates, standard errors, residuals and a test of the fit.
+
+    `readings` is a CSV file (see `ipe_bench.real.readings`), several that share parameters, or an array z (m,) in the
+    model's order and unit; NaN is missing. Without `estimators`: `linear_lse`, `fixed_point`, `levenberg_marquardt` and
+    `progressive`. `noise` states R. Without it R is what the file says in its column sigma, or the model of its own
+    noise; where neither does, the readings are taken for independent and equally noisy, and the level is estimated from
+    the residuals (`Unknown`): then their size cannot test the fit. Filters and `map_lm` need to know how far from the
+    model's nominal point the parameters may be: `error_scale` is the standard deviation of each in multiples of its
+    size, and `prior` widens or narrows some. `x` and `covariance` of a fit are in the parameters' own units. The answer
+    is the sequence of the fits; it shows itself in a notebook, and `table()` is a frame.
+
+    >>> import ipe_bench as ib
+    >>> model = ib.measurements.Polynomial()
+    >>> trial = ib.Scenario(model, ib.noise.Gaussian(0.01), error_scale=3.0).draw(0, 1)
+    >>> for fit in ib.estimate(model, trial.z[0], noise=ib.noise.Gaussian(0.01)):
+    ...     print(fit.label, fit.status.label, fit.fits)
+    linear_lse converged False
+    fixed_point converged True
+    levenberg_marquardt converged True
+    progressive converged True
+
+    Raises:
+        UserError: a file does not hold this model's readings, the array has another shape, or an estimator needs
+            what is not given.
+    """
+    from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
+    from ipe_bench.noise.own import ModelNoise, Unknown
+    from ipe_bench.real.examination import examine
+    from ipe_bench.real.fits import fit
+    from ipe_bench.real.sources import Readings, noise_of, open_together
+    from ipe_bench.report.answer import Answer
+    from ipe_bench.solvers import FixedPoint, Progressive
+
+    if estimators is None:
+        estimators = {
+            "linear_lse": LinearLSE(),
+            "fixed_point": FixedPoint(),
+            "levenberg_marquardt": LevenbergMarquardt(),
+            "progressive": Progressive(),
+        }
+    if isinstance(readings, np.ndarray):
+        z = np.array(readings, dtype=float)
+        if z.shape != (model.m,):
+            raise UserError(
+                f"readings: has shape {z.shape}; give the {model.m} readings of {model.name}, NaN where missing"
+            )
+        found = Readings(model, z)
+    else:
+        paths = [readings] if isinstance(readings, str | Path) else readings
+        found = open_together([Path(path) for path in paths], model)
+    known = noise_of(found, noise) or ModelNoise().of(found.model) or Unknown()
+    problem = _real_problem(found.model, known, prior, error_scale)
+    if lacking := _needs(problem, estimators):
+        remedy = "; give error_scale" if error_scale is None and prior is None else ""
+        raise UserError("; ".join(lacking) + remedy)
+    fits = fit(problem, found.z, estimators, level_unknown=known.estimated)
+    return Answer(found.model.name, found.model, found.z, fits, examine(problem, found.z, fits))
+
+
+def _real_problem(model: Measurement, noise: Noise, prior: GaussianPrior | None, error_scale: float | None) -> Problem:
+    """What estimators are told where readings are real: a prior only where somebody states one."""
+    known = prior is not None or error_scale is not None
+    scale = 1.0 if error_scale is None else error_scale
+    problem = Scenario(model, noise, prior or GaussianPrior(), scale).problem
+    return problem if known else dataclasses.replace(problem, prior_deviation=None)
+
+
+def check(component: Any) -> list[Finding]:
+    """Whether a component keeps the promises that every component makes: a finding per check, with its complaint.
+
+    `component` is a measurement model, noise, prior or estimator, or the folder of a plugin, all of whose options are
+    checked. A finding whose `complaint` is empty passed.
+
+    >>> import ipe_bench as ib
+    >>> findings = ib.check(ib.noise.Gaussian(0.1))
+    >>> [f.check for f in findings if f.complaint]
+    []
+
+    Raises:
+        UserError: there is no plugin in the folder.
+    """
+    from ipe_bench.plugins.conformance import check_component
+    from ipe_bench.plugins.discovery import components_in
+
+    if isinstance(component, Path | str):
+        parts = components_in(Path(component))
+    else:
+        parts = [(getattr(component, "name", type(component).__name__), component)]
+    return [finding for name, part in parts for finding in check_component(name, part)]
+
+
+def _paths(directories: Directories) -> list[Path]:
+    return [Path(d) for d in ([directories] if isinstance(directories, Path | str) else directories)]
 
 
 def compute(
@@ -83,63 +288,24 @@ def compute(
         UserError: what was asked for cannot be computed, or the folder cannot be written to; nothing is computed then.
         StorageError: nothing can be stored any more.
     """
-    check(scenarios, estimators, trials, block_size)
+    validate(scenarios, estimators, trials, block_size)
     # Absolute: workers may have another working folder.
     store = Store(Path(output).absolute())
     store.prepare()
     execution = execution or Serial()
-    tasks = [task for scenario in scenarios for task in plan(store, _cells(scenario, estimators), trials, block_size)]
+    cells = [_cells(scenario, estimators) for scenario in scenarios]
+    results = Results.read([store.directory], keys={cell.key for part in cells for cell in part})
+    aside = results.set_aside()
+    tasks = [task for part in cells for task in plan(store.directory, part, results, trials, block_size)]
     execution.warm_up(perform, len(tasks))
     identifier = _write_record(store, scenarios, estimators, trials)
     with RunLog(store.directory / "log" / f"{identifier}.log") as log:
+        for line in aside:
+            log.warning(line)
         return work_through(tasks, execution, store, watch or (lambda progress: None), log)
 
 
-def estimate(
-    measurement: Measurement,
-    readings: Path | str | Sequence[Path | str] | Array,
-    estimators: Mapping[str, Estimator] | None = None,
-    *,
-    noise: Noise | None = None,
-    prior: GaussianPrior | None = None,
-    error_scale: float = 1.0,
-) -> Answer:
-    """Estimates from real readings: a file, several files that share parameters, or the readings z (m,) themselves.
-
-    Without `noise`, what the file says of it (a column sigma) or the model; where neither does, its level is estimated.
-    Without estimators, Levenberg-Marquardt. The answer shows itself in a notebook; `answer.table()` is a frame.
-
-    Raises:
-        UserError: a file does not hold readings of the model, or an estimator lacks what it needs.
-    """
-    from ipe_bench.baselines import LevenbergMarquardt
-    from ipe_bench.noise import Gaussian, ModelNoise, Unknown
-    from ipe_bench.real.examination import examine
-    from ipe_bench.real.fits import fit
-    from ipe_bench.real.sources import Readings, open_together
-    from ipe_bench.report.answer import Answer
-
-    if isinstance(readings, np.ndarray):
-        if readings.shape != (measurement.m,):
-            raise UserError(f"readings: have shape {readings.shape}, and the model has {measurement.m} readings")
-        found = Readings(measurement, np.asarray(readings, dtype=float))
-    else:
-        paths = [readings] if isinstance(readings, str | Path) else list(readings)
-        found = open_together([Path(path) for path in paths], measurement)
-    if found.deviations is not None:
-        known = tuple(np.where(np.isfinite(found.deviations), found.deviations, 1.0).tolist())
-        if noise is not None and not isinstance(noise, Unknown):
-            raise UserError("noise: is given, and the file has a column sigma, too; leave one of them out")
-        noise = Unknown(known) if isinstance(noise, Unknown) else Gaussian(known)
-    noise = noise or ModelNoise().of(found.model) or Unknown()
-    scenario = Scenario(found.model, noise, prior or GaussianPrior(), error_scale)
-    estimators = estimators or {"levenberg_marquardt": LevenbergMarquardt()}
-    check([scenario], estimators, trials=1, estimating=True)
-    fits = fit(scenario.problem, found.z, estimators, level_unknown=noise.estimated)
-    return Answer(found.model.name, found.model, found.z, fits, examine(scenario.problem, found.z, fits))
-
-
-def check(
+def validate(
     scenarios: Sequence[Scenario],
     estimators: Mapping[str, Estimator],
     trials: int,
@@ -164,14 +330,18 @@ def check(
             mistakes.append("noise=unknown: has no level to simulate with; choose another noise, or use `estimate`")
         if scenario.noise.real and trials != 1:
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
-        for label, estimator in estimators.items():
-            for need in estimator.missing(scenario.problem):
-                name = scenario.measurement.name
-                mistakes.append(
-                    f"estimators.{label}: needs {need}, which measurement={name} does not have; leave it out"
-                )
+        mistakes += _needs(scenario.problem, estimators)
     if mistakes:
         raise UserError("; ".join(dict.fromkeys(mistakes)))
+
+
+def _needs(problem: Problem, estimators: Mapping[str, Estimator]) -> list[str]:
+    """A line for everything that an estimator needs and the problem does not have."""
+    return [
+        f"estimators.{label}: needs {need}, which measurement={problem.measurement.name} does not have; leave it out"
+        for label, estimator in estimators.items()
+        for need in estimator.missing(problem)
+    ]
 
 
 def _cells(scenario: Scenario, estimators: Mapping[str, Estimator]) -> list[Cell]:
@@ -187,7 +357,7 @@ def _write_record(store: Store, scenarios: Sequence[Scenario], estimators: Mappi
         "trials": trials,
         "scenarios": [describe(s) for s in scenarios],
         "estimators": {label: describe(e) for label, e in estimators.items()},
-        "cells": [{"key": c.key, "identity_key": c.footer["identity_key"], "names": c.footer["names"]} for c in cells],
+        "cells": [{"key": c.key, "identity_key": c.footer["identity_key"], "names": c.names} for c in cells],
         "libraries": library_versions(),
         "machine": {"host": platform.node(), "system": platform.platform(), "cores": cores()},
         "git_commit": _git_commit(Path.cwd()),

@@ -19,7 +19,7 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
 from ipe_bench.runs.store import Cell, Store
 from ipe_bench.trials.scenario import Scenario
-from ipe_bench.trials.scoring import GATE
+from ipe_bench.trials.thresholds import GATE
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,9 @@ class Status(IntEnum):
     TIMEOUT = 7, "the time limit was reached"
     ERROR = 8, "the estimator or the model raised an exception"
 
+    def __str__(self) -> str:
+        return self.label
+
     @property
     def label(self) -> str:
         """The name in tables: lower case."""

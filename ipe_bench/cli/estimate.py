@@ -9,21 +9,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from ipe_bench.api import check
+from ipe_bench.api import validate
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import library_versions
 from ipe_bench.cli import console
 from ipe_bench.cli.config import CONFIG_ERRORS, Job, assemble, explain, prepare, refuse_silent_traps, rewrite
-from ipe_bench.noise import Certified, Gaussian, ModelNoise, Noise, Unknown
+from ipe_bench.noise import Certified, ModelNoise, Noise
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.real.examination import examine
 from ipe_bench.real.fits import fit
-from ipe_bench.real.sources import SIGMA, Readings, open_together
+from ipe_bench.real.sources import noise_of, open_together
 from ipe_bench.runs.provenance import describe, fingerprint
 
 _STANDARD_ESTIMATORS = ("solver=[fixed_point]", "baseline=[linear_lse,levenberg_marquardt]")
@@ -32,9 +31,6 @@ _STANDARD_ESTIMATORS = ("solver=[fixed_point]", "baseline=[linear_lse,levenberg_
 
 def main(arguments: Sequence[str]) -> int:
     """Estimates with every chosen estimator, prints tables and writes files; exit code 1 where none converged."""
-    flags = [a for a in arguments if a.startswith("-")]
-    if flags:
-        raise UserError(f"{flags[0]}: estimate takes overrides such as measurement=gins readings=FILE, and no flags")
     refuse_silent_traps(arguments)
     prepare()
     try:
@@ -50,7 +46,7 @@ def main(arguments: Sequence[str]) -> int:
         job = replace(job, output=config.output)
     job, z = _readings(config, job)
     problem = job.scenario.problem
-    check([job.scenario], job.estimators, trials=1, estimating=True)
+    validate([job.scenario], job.estimators, trials=1, estimating=True)
 
     from ipe_bench.report.answer import Answer, claim, render, write_fits
 
@@ -75,7 +71,7 @@ def _readings(config: DictConfig, job: Job) -> tuple[Job, Array]:
     """The readings (m,) of the file, or those that come with the model; with the latter, their own noise."""
     if config.readings is not None:
         found = open_together(_files(config), job.scenario.measurement)
-        noise = _noise(config, job, found)
+        noise = noise_of(found, _stated(config, job)) or job.scenario.noise
         return replace(job, scenario=replace(job.scenario, measurement=found.model, noise=noise)), found.z
     recorded = job.scenario.measurement.recorded
     if recorded is None:
@@ -94,20 +90,11 @@ def _files(config: DictConfig) -> list[Path]:
     return [Path(name) for name in names]
 
 
-def _noise(config: DictConfig, job: Job, found: Readings) -> Noise:
-    """What is known of the errors: the deviations of the file, unless the level is said to be unknown."""
-    noise = job.scenario.noise
-    if found.deviations is None:
-        return noise
-    deviations = tuple(np.where(np.isfinite(found.deviations), found.deviations, 1.0).tolist())
-    if isinstance(noise, Unknown) and not config.noise["_target_"].endswith(ModelNoise.__name__):
-        return Unknown(deviations)
-    if not config.noise["_target_"].endswith(ModelNoise.__name__) or config.noise.get("deviation") is not None:
-        raise UserError(
-            f"readings={config.readings}: has a column {SIGMA}, and noise is given too; leave one of them out, or set "
-            "noise=unknown to take the column for relative weights"
-        )
-    return Gaussian(deviations)
+def _stated(config: DictConfig, job: Job) -> Noise | None:
+    """The noise that a user has chosen, not that which stands in for it."""
+    standard = config.noise["_target_"].endswith(ModelNoise.__name__)
+    told = not standard or config.noise.get("deviation") is not None or config.noise.get("step") is not None
+    return job.scenario.noise if told else None
 
 
 def _command(config: DictConfig, job: Job) -> dict[str, Any]:

@@ -14,23 +14,21 @@ from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
 
 
-def main(arguments: Sequence[str]) -> int:
-    """One line per option; with -v the parameters and the readings file of each measurement."""
-    verbose = any(a in ("-v", "--verbose") for a in arguments)
-    names = [a for a in arguments if not a.startswith("-")]
+def main(groups: Sequence[str], verbose: bool) -> int:
+    """One line per option; where verbose, the parameters and the readings file of each measurement."""
     known = plugins.groups()
-    single = [name for name in names if name.startswith("measurement/")]
-    for name in names:
+    single = [name for name in groups if name.startswith("measurement/")]
+    for name in groups:
         if name not in known and name not in single:
             raise UserError(f"{name}: {unknown(name, known, 'group')}")
     out = console()
+    models = {option.name: option for option in plugins.options("measurement")}
     for name in single:
         model = name.removeprefix("measurement/")
-        there = {option.name: option for option in plugins.options("measurement")}
-        if model not in there:
-            raise UserError(f"{name}: {unknown(model, there, 'option')}")
-        _describe_measurement(out, there[model])
-    for group in [name for name in names if name not in single] or (() if single else known):
+        if model not in models:
+            raise UserError(f"{name}: {unknown(model, models, 'option')}")
+        _describe_measurement(out, models[model])
+    for group in [name for name in groups if name not in single] or (() if single else known):
         table = Table(title=group, title_justify="left", title_style="bold", box=None, pad_edge=False, expand=False)
         for heading in ("option", "what it is", "from"):
             table.add_column(heading, overflow="fold", no_wrap=heading == "option")

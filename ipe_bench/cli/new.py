@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import keyword
 import re
-from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -15,11 +14,8 @@ from ipe_bench.plugins import discovery as plugins
 KINDS = ("solver", "baseline", "measurement", "noise")
 
 
-def main(arguments: Sequence[str]) -> int:
+def main(kind: str, name: str) -> int:
     """Writes plugins/NAME in the working folder."""
-    if len(arguments) != 2:
-        raise UserError("new: write `ipe-bench new KIND NAME`, with KIND one of " + ", ".join(KINDS))
-    kind, name = arguments
     if kind not in KINDS:
         raise UserError(f"{kind}: {unknown(kind, KINDS, 'kind')}")
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):

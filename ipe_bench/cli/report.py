@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console
+from ipe_bench.runs.results import require_results
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -16,9 +17,7 @@ def main(arguments: Sequence[str]) -> int:
     directories = [Path(a) for a in arguments if not a.startswith("output=")]
     if not directories:
         raise UserError("report: name at least one directory of results, such as outputs/paper")
-    for directory in directories:
-        if not (directory / "trials").is_dir():
-            raise UserError(f"{directory}: holds no results (there is no folder trials in it)")
+    require_results(directories)
     return show(directories, Path(outputs[0]) if outputs else directories[0])
 
 

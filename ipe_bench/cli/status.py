@@ -8,36 +8,38 @@ from rich.table import Table
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console
-from ipe_bench.runs.store import TRUTH
-from ipe_bench.statistics.inventory import Inventory, take_inventory, title
+from ipe_bench.runs.results import Results, require_results
+from ipe_bench.runs.store import TRUTH, title
+
+_COUNTS = ("missing", "failed", "stale")
 
 
 def main(arguments: Sequence[str]) -> int:
-    """One table per directory; exit code 1 where anything that was asked for is not there."""
+    """One table per directory; exit code 1 where anything that was asked for is not there, or anything is damaged."""
     if not arguments:
         raise UserError("status: name at least one directory of results, such as outputs/paper")
-    inventories = [(directory, take_inventory(directory)) for directory in arguments]
-    for directory, inventory in inventories:
-        _show(directory, inventory)
-    return 0 if all(inventory.complete for _, inventory in inventories) else 1
+    require_results(arguments)
+    found = [Results.read([directory]) for directory in arguments]
+    for directory, results in zip(arguments, found, strict=True):
+        _show(directory, results)
+    return 1 if any(results.problems for results in found) else 0
 
 
-def _show(directory: str, inventory: Inventory) -> None:
+def _show(directory: str, results: Results) -> None:
     out = console()
     table = Table(title=directory, title_justify="left", title_style="bold", box=None, pad_edge=False)
-    for heading in ("scenario", "estimator", "done", "missing", "failed", "stale"):
-        table.add_column(heading, justify="left" if heading in ("scenario", "estimator") else "right", overflow="fold")
-    for cell in inventory.cells:
+    for heading in ("scenario", "estimator"):
+        table.add_column(heading, overflow="fold")
+    for heading in ("done", *_COUNTS):
+        table.add_column(heading, justify="right", overflow="fold")
+    for cell in results.cells:
         label = "(truth)" if cell.names["estimator"] == TRUTH else cell.names["estimator"]
-        numbers = (str(n) if n else "" for n in (cell.missing, cell.failed, cell.stale))
-        table.add_row(title(cell.names), label, f"{cell.done} of {cell.expected or cell.done}", *numbers)
+        counts = (str(getattr(cell, name) or "") for name in _COUNTS)
+        table.add_row(title(cell.names), label, f"{cell.done} of {cell.expected or cell.done}", *counts)
     out.print(table)
-    for path in inventory.damaged:
-        out.print(f"damaged: {path}; the next run sets it aside and computes it again", markup=False)
-    for cell in inventory.cells:
-        for message in cell.messages:
-            out.print(f"failed: {cell.names['estimator']} on {title(cell.names)}: {message}", markup=False)
-    if inventory.complete:
-        out.print("complete")
+    for problem in results.problems:
+        out.print(problem, markup=False, soft_wrap=True)
+    if results.problems:
+        out.print("not complete: the same command as before computes what is missing, failed or damaged")
     else:
-        out.print("not complete: the same command as before computes what is missing or failed")
+        out.print("complete")

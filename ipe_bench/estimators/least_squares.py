@@ -21,6 +21,13 @@ from ipe_bench.estimators.driver import Solver, Standing, iterate
 from ipe_bench.measurements.counted import Counted, Tally
 from ipe_bench.measurements.problem import Problem
 
+_VISIBLE = 1e-8
+"""The smallest share by which the objective must have decreased to have decreased at all."""
+_FLAT = 30
+"""Steps without a visible decrease after which a nearly stationary point is as good as it gets,"""
+_STATIONARY = 1e-3
+"""where nearly means: within this part of a deviation along every column of J."""
+
 
 @dataclass(frozen=True)
 class Objective:
@@ -77,9 +84,14 @@ class Slope:
     size: Array
     """Its largest entry (trials,) in standard deviations of the local bound (J'J)^-1; infinite where J has not full
     rank."""
+    stationary: Array
+    """The largest part (trials,) of the residual along one column of J, in deviations: zero at a stationary point of
+    whatever rank."""
+    Q: Array | None = None
+    """(trials, m, n), where a method asks for it."""
 
     @classmethod
-    def of(cls, J: Array, r: Array) -> Slope:
+    def of(cls, J: Array, r: Array, *, keep_Q: bool = False) -> Slope:
         missing = max(J.shape[2] - J.shape[1], 0)
         # Fewer readings than parameters: rows of zeros keep U square, and deficient.
         J, r = np.pad(J, ((0, 0), (0, missing), (0, 0))), np.pad(r, ((0, 0), (0, missing)))
@@ -94,7 +106,20 @@ class Slope:
         newton = -multiply(inverse_U, gradient)
         deviation = np.sqrt(np.sum(inverse_U**2, axis=2))
         size = np.abs(newton / deviation).max(axis=1)
-        return cls(U, gradient, columns, newton, np.where(np.isfinite(size), size, np.inf))
+        size = np.where(np.isfinite(size), size, np.inf)
+        along = np.abs(multiply(U.swapaxes(1, 2), gradient)) / np.where(columns > 0, columns, 1.0)
+        kept = Q[:, : r.shape[1] - missing] if keep_Q else None
+        return cls(U, gradient, columns, newton, size, along.max(axis=1), kept)
+
+    def towards(self, r: Array) -> Slope:
+        """The same Jacobian with another residual r (trials, m): a chord. It needs Q."""
+        assert self.Q is not None
+        gradient = multiply(self.Q.swapaxes(1, 2), r)
+        inverse_U, _ = inverse(np.where(np.isfinite(self.size)[:, None, None], self.U, np.nan))
+        newton = -multiply(inverse_U, gradient)
+        size = np.abs(newton / np.sqrt(np.sum(inverse_U**2, axis=2))).max(axis=1)
+        size = np.where(np.isfinite(size), size, np.inf)
+        return dataclasses.replace(self, gradient=gradient, newton=newton, size=size)
 
     def damped(self, weights: Array) -> tuple[Array, Array]:
         """The step that minimises |r + J s|^2 + |weights s|^2, and the decrease of |r + J s|^2 + that it predicts."""
@@ -121,20 +146,38 @@ class Descent:
     growth: Array
     scale: Array
     """What damping measures steps by: the diagonal of D (trials, n)."""
+    regular: Mask
+    """Where J had full rank at the start: an end without it is then a place, and no property of the problem."""
+    mark: Array
+    """The objective when it last decreased visibly,"""
+    idle: NDArray[np.int64]
+    """and how many steps ago."""
 
     @classmethod
-    def at(cls, objective: Objective, x: Array, lam: float = 0.0) -> Descent:
+    def at(cls, objective: Objective, x: Array, lam: float = 0.0, *, keep_Q: bool = False) -> Descent:
         """The state at the start."""
         r = objective.residual(x)
-        slope = Slope.of(objective.jacobian(x), r)
+        slope = Slope.of(objective.jacobian(x), r, keep_Q=keep_Q)
         trials = len(x)
         scale = np.where(slope.columns > 0, slope.columns, 1.0)
-        far = np.full(trials, np.inf)
-        return cls(x, r, squared(r), slope, far, np.full(trials, lam), np.full(trials, 2.0), scale)
+        far, regular = np.full(trials, np.inf), np.isfinite(slope.size)
+        cost, idle = squared(r), np.zeros(trials, np.int64)
+        damping, growth = np.full(trials, lam), np.full(trials, 2.0)
+        return cls(x, r, cost, slope, far, damping, growth, scale, regular, cost, idle)
 
     def reach(self, step: Array) -> Array:
         """The length (trials,) of a step in standard deviations of the readings that it moves."""
         return np.abs(step * np.linalg.norm(self.slope.U, axis=1)).max(axis=1)
+
+    def watched(self, cost: Array) -> tuple[Array, NDArray[np.int64]]:
+        """`mark` and `idle` after a step to an objective of that cost."""
+        visible = cost < self.mark * (1 - _VISIBLE)
+        return np.where(visible, cost, self.mark), np.where(visible, 0, self.idle + 1)
+
+    @property
+    def settled(self) -> Mask:
+        """Where nothing can be gained: the answer is there, however badly the Jacobian or round-off behaves."""
+        return (self.idle >= _FLAT) & (self.slope.stationary <= _STATIONARY) & self.regular
 
     @property
     def rankless(self) -> Mask:
@@ -146,7 +189,9 @@ class Descent:
         known = np.isfinite(self.cost) & finite(self.slope.gradient)
         level = np.where(known, np.sqrt(self.cost), np.nan)
         ending = np.where(self.rankless, Status.SINGULAR, Status.STALLED)
-        return Standing(self.slope.size, level, self.moved, stuck, ending)
+        size = np.where(self.rankless & self.regular, self.slope.stationary, self.slope.size)
+        size = np.where(self.settled, 0.0, size)
+        return Standing(size, level, self.moved, stuck, ending)
 
 
 @dataclass(frozen=True)
@@ -161,6 +206,9 @@ class Minima:
     """(J' R^-1 J)^-1 (trials, n, n), with P0^-1 inside where the prior counts; NaN where it does not exist."""
     chi_square: Array
     """|R^-1/2 (h(x) - z)|^2 (trials,), of the readings alone."""
+    bulk: Array
+    """The median magnitude (trials,) of the readings' residuals in deviations: .67 where R is right, and little more
+    where it is wrong for some of them only."""
 
     @property
     def converged(self) -> Mask:
@@ -197,8 +245,9 @@ def minimize(
     # U^-1 U^-T: inverting U'U would lose twice the digits, and with them the sign of a variance.
     inverse_U, _ = inverse(ended.state.slope.U)
     covariance = np.matmul(inverse_U, inverse_U.swapaxes(1, 2))
-    chi_square = squared(ended.state.r[:, : objective.readings])
-    return Minima(ended.x, ended.status, ended.iterations, ended.history, covariance, chi_square)
+    r = ended.state.r[:, : objective.readings]
+    bulk = np.median(np.abs(r), axis=1)
+    return Minima(ended.x, ended.status, ended.iterations, ended.history, covariance, squared(r), bulk)
 
 
 def squared(r: Array) -> Array:

@@ -1,19 +1,23 @@
-"""The Levenberg-Marquardt method."""
+"""The Levenberg-Marquardt method, plain or with geodesic acceleration."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ipe_bench.basics.batches import put
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, finite, multiply
 from ipe_bench.estimators.driver import Solver, Standing
 from ipe_bench.estimators.least_squares import Descent, Objective, Slope, squared
 
 _LARGEST_DAMPING = 1e30
 _ROUND_OFF = 1e-8
 """A predicted decrease below this share of the objective cannot be seen in the objective any more."""
+_PROBE = 0.1
+"""The share of a step over which its curvature is measured."""
+_MOST_BENT = 0.75
+"""A correction for curvature is believed where twice its length is at most this share of the step's."""
 
 
 @dataclass(frozen=True)
@@ -21,45 +25,80 @@ class LevenbergMarquardtMethod(Solver[Descent]):
     """The step minimises |r + J s|^2 + lambda |D s|^2, and lambda follows the gain ratio.
 
     D = 1 / `deviation` (n,), the metric of a prior covariance; None: Marquardt's, the column norms of J, which only
-    grow (More, in Numerical Analysis, LNM 630, 1978). lambda by Nielsen's rule (Madsen, Nielsen, Tingleff, Methods for
+    grow (More, in Numerical Analysis, LNM 630, 1978); or, with `sizes`, the parameters' own magnitudes at the start,
+    scaled as a whole to J there. lambda by Nielsen's rule (Madsen, Nielsen, Tingleff, Methods for
     Non-Linear Least Squares Problems, 2004, eq. 2.21).
     """
 
     damping: float
     """lambda at the start."""
     deviation: Array | None = None
+    sizes: float | None = None
+    """What is taken for the magnitude of a parameter that begins nearer to zero; None: not this metric."""
+    by_residual: bool = False
+    """lambda begins at the mean squared residual where that is larger: far away, `damping` alone would be none."""
+    geodesic: bool = False
+    """Bends each step along the curvature of the readings, for one more simulation (Transtrum and Sethna, 2012,
+    arXiv 1201.5885)."""
 
     def begin(self, objective: Objective, x: Array) -> Descent:
-        return Descent.at(objective, x, self.damping)
+        state = Descent.at(objective, x, self.damping, keep_Q=self.geodesic)
+        if self.deviation is not None:
+            state = replace(state, scale=np.broadcast_to(1.0 / self.deviation, state.scale.shape))
+        elif self.sizes is not None:
+            magnitude = np.maximum(np.abs(x), self.sizes)
+            whole = np.linalg.norm(state.slope.columns * magnitude, axis=1)
+            state = replace(state, scale=np.where(whole > 0, whole, 1.0)[:, None] / magnitude)
+        if not self.by_residual:
+            return state
+        far = np.nan_to_num(state.cost / state.r.shape[1], nan=1.0, posinf=1.0)
+        return replace(state, lam=np.maximum(state.lam, far))
 
     def step(self, objective: Objective, state: Descent) -> Descent:
-        step, predicted = state.slope.damped(np.sqrt(state.lam)[:, None] * self._metric(state))
-        r = objective.residual(state.x + step)
+        weights = np.sqrt(state.lam)[:, None] * state.scale
+        step, predicted = state.slope.damped(weights)
+        bent, believed = self._bend(objective, state, weights, step)
+        r = objective.residual(state.x + bent)
         cost = squared(r)
         gain = (state.cost - cost) / predicted
         invisible = (predicted <= _ROUND_OFF * state.cost) & (np.abs(cost - state.cost) <= 2 * _ROUND_OFF * state.cost)
         taken = (gain > 0) | invisible
-        eased = state.lam * np.maximum(1 / 3, 1 - (2 * np.clip(np.where(invisible, 1.0, gain), 0, 1) - 1) ** 3)
-        x = np.where(taken[:, None], state.x + step, state.x)
+        factor = np.maximum(1 / 3, 1 - (2 * np.clip(np.where(invisible, 1.0, gain), 0, 1) - 1) ** 3)
+        factor = np.where(believed, factor, np.maximum(factor, 1.0))
+        x = np.where(taken[:, None], state.x + bent, state.x)
         r = np.where(taken[:, None], r, state.r)
         slope = state.slope
         if taken.any():
-            slope = put(slope, taken, Slope.of(objective.subset(taken).jacobian(x[taken]), r[taken]))
+            there = Slope.of(objective.subset(taken).jacobian(x[taken]), r[taken], keep_Q=self.geodesic)
+            slope = put(slope, taken, there)
+        cost = np.where(taken, cost, state.cost)
         return Descent(
             x,
             r,
-            np.where(taken, cost, state.cost),
+            cost,
             slope,
             state.reach(step),
-            np.where(taken, eased, state.lam * state.growth),
+            np.where(taken, state.lam * factor, state.lam * state.growth),
             np.where(taken, 2.0, 2.0 * state.growth),
-            np.fmax(state.scale, slope.columns),
+            np.fmax(state.scale, slope.columns) if self.deviation is None and self.sizes is None else state.scale,
+            state.regular,
+            *state.watched(cost),
         )
 
     def standing(self, objective: Objective, before: Descent | None, state: Descent) -> Standing:
         """Damping goes on where J lacks rank, until it can gain nothing more."""
         return state.standing(stuck=state.lam > _LARGEST_DAMPING)
 
-    def _metric(self, state: Descent) -> Array:
-        """The diagonal of D (trials, n)."""
-        return state.scale if self.deviation is None else np.broadcast_to(1.0 / self.deviation, state.scale.shape)
+    def _bend(self, objective: Objective, state: Descent, weights: Array, step: Array) -> tuple[Array, Array]:
+        """The step v + a / 2 with the geodesic acceleration a, and where a is small enough beside v to be believed."""
+        if not self.geodesic:
+            return step, np.ones(len(step), dtype=bool)
+        Q = state.slope.Q
+        assert Q is not None
+        probe = objective.residual(state.x + _PROBE * step)
+        curvature = multiply(Q.swapaxes(1, 2), probe - state.r) / _PROBE - multiply(state.slope.U, step)
+        curvature = np.where(finite(curvature)[:, None], 2.0 / _PROBE * curvature, 0.0)
+        a, _ = replace(state.slope, gradient=curvature).damped(weights)
+        length, correction = (np.linalg.norm(v * state.scale, axis=1) for v in (step, a))
+        believed = 2 * correction <= _MOST_BENT * length
+        return step + np.where(believed[:, None], 0.5 * a, 0.0), believed

@@ -184,6 +184,20 @@ class Measurement(Named, ABC):
         """dh/dx at each trial: (trials, n) -> (trials, m, n); complex step where analytic, else central differences."""
         return differentiate(self.simulate, x, analytic=self.analytic)
 
+    def coarse_jacobian(self, x: Array) -> Array:
+        """dh/dx near enough for the steps of an iteration, |I - J~+ J| below 0.01, where that is cheaper; else exact.
+        A trial's bits depend on that trial's x alone. Covariances and tests of convergence want `jacobian`."""
+        return self.jacobian(x)
+
+    @property
+    def jacobian_cost(self) -> float:
+        """What a Jacobian costs, in simulations of the same trial."""
+        return float(self.n if self.analytic else 2 * self.n)
+
+    @property
+    def coarse_jacobian_cost(self) -> float:
+        return self.jacobian_cost
+
     def linearization(self) -> Array:
         """The matrix H (m, n) of eq. (1) about the nominal point."""
         return self.jacobian(self.nominal[None])[0]
@@ -202,15 +216,14 @@ class Measurement(Named, ABC):
         """dh/dx in `rows(stop)` alone."""
         return self.jacobian(x)[:, self.rows(stop)]
 
+    def coarse_jacobian_until(self, x: Array, stop: int) -> Array:
+        """`coarse_jacobian` in `rows(stop)` alone."""
+        return self.coarse_jacobian(x)[:, self.rows(stop)]
+
     @property
     def recorded(self) -> Recorded | None:
         """Real readings that come with this model; None where it has none."""
         return None
-
-    def suited_to(self, error_scale: float) -> Measurement:
-        """This model, accurate enough for parameters of that error scale (an integration step, say)."""
-        del error_scale
-        return self
 
 
 @dataclass(frozen=True)
@@ -299,11 +312,20 @@ class Restricted(Measurement):
         J = self.whole.jacobian(x) if self.stop is None else self.whole.jacobian_until(x, self.stop)
         return J[:, self._among_arrived]
 
+    def coarse_jacobian(self, x: Array) -> Array:
+        J = self.whole.coarse_jacobian(x) if self.stop is None else self.whole.coarse_jacobian_until(x, self.stop)
+        return J[:, self._among_arrived]
+
+    @property
+    def jacobian_cost(self) -> float:
+        return self.whole.jacobian_cost
+
+    @property
+    def coarse_jacobian_cost(self) -> float:
+        return self.whole.coarse_jacobian_cost
+
     def linearization(self) -> Array:
         return self.whole.linearization()[self._rows]
-
-    def suited_to(self, error_scale: float) -> Measurement:
-        return Restricted(self.whole.suited_to(error_scale), self.kept, self.stop)
 
 
 def differentiate(h: Any, x: Array, *, analytic: bool) -> Array:

@@ -13,6 +13,11 @@ from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.measurements.base import Measurement
 
 
+def cost(simulations: Array, jacobians: Array, jacobian_cost: float) -> Array:
+    """What trials cost (trials,), in simulations: a Jacobian counts as `jacobian_cost` of them."""
+    return simulations + jacobian_cost * jacobians
+
+
 @dataclass
 class Tally:
     """What a batch has cost and what went wrong in it, by trial; shared by all views of one batch."""
@@ -28,7 +33,7 @@ class Tally:
 
     def cost(self, n: int) -> Array:
         """Simulations (trials,), a Jacobian counting n."""
-        return self.simulations + n * self.jacobians
+        return cost(self.simulations, self.jacobians, n)
 
     def failed(self, rows: NDArray[np.intp]) -> Mask:
         """Which of the trials `rows` an exception has ended."""

@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.base import Parameter
 from ipe_bench.measurements.gins import Gins
-from ipe_bench.measurements.ode.kernel import integrate
+from ipe_bench.measurements.ode.kernel import Kernel
+from ipe_bench.measurements.ode.source import Equations, simulation_source
+from ipe_bench.measurements.ode.tableau import DOP853
 
 _ARCSEC = np.pi / 180 / 3600
 _DRIFTS = slice(4, 7)
 """Where dx, dy and dz stand among the parameters."""
+_SENSED, _CONSTANT = 4, 7
+"""Errors of the accelerometers, and with them the three rotations of the platform."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +31,7 @@ class RicherGins(Gins):
 
     Random walk of the drifts: each reading interval of each case begins with an independent increment of deviation
     `gyro_random_walk` times the root of the interval, and the drift is constant within it, so the integration goes from
-    reading to reading and stays as exact as that of `Gins`.
+    reading to reading and keeps the tolerance of `Gins`.
     """
 
     gyro_random_walk: float = 0.0
@@ -59,62 +62,85 @@ class RicherGins(Gins):
         angles = np.repeat([self.accelerometer_misalignment * _ARCSEC, self.platform_misalignment * _ARCSEC], [2, 3])
         return np.concatenate([[quadratic, quadratic], angles, walk])
 
-    def simulate_until(self, x: Array, stop: int) -> Array:
+    def _simulate(self, x: Array, rows: NDArray[np.intp], steps: NDArray[np.int64], offset: Array, z: Array) -> None:
         if x.shape[1] == self.n:
-            return super().simulate_until(x, stop)
-        return self._velocities(x, stop) - self.offset[self.rows(stop)]
+            super()._simulate(x, rows, steps, offset, z)
+        else:
+            z[rows] = self._walked(x[rows], steps, z.shape[1] // 8) - offset[self.rows(z.shape[1] // 8)]
 
-    def _velocities(self, x: Array, stop: int) -> Array:
+    def _rates(self, x: Array) -> tuple[Array, float]:
+        """With the farthest that the drifts walk; such a trial is tested however slowly it turns."""
+        if x.shape[1] == self.n:
+            return super()._rates(x)
+        walk = np.abs(self._walk(x)).reshape(len(x), -1).max(axis=1)
+        rates = super()._rates(np.ascontiguousarray(x[:, : self.n]))[0] + np.sqrt(3.0) * walk
+        return np.maximum(rates, np.nextafter(self.trusted_angle / self._longest, np.inf)), np.inf
+
+    def _walk(self, x: Array) -> Array:
+        """How far the drifts have walked: (trials x cases, intervals, axes) in rad/s."""
+        increments = x[:, self.n + _CONSTANT :].reshape(len(x) * len(self.cases), self.readings_per_case, 3)
+        return np.cumsum(increments, axis=1)
+
+    def _walked(self, x: Array, steps: NDArray[np.int64], stop: int) -> Array:
         """Integrates from reading to reading, with the drifts of each interval: (trials, readings)."""
-        motion, cases = self._motion, len(self.cases)
-        constant = x[:, : motion.n]
-        walk = np.cumsum(x[:, motion.n :].reshape(len(x) * cases, self.readings_per_case, 3), axis=1)
-        p, c = motion._lanes(constant)
-        y = motion._start(p, c)
+        walk, cases = self._walk(x), len(self.cases)
+        constant = np.concatenate([x[:, : self.n] * self.si_sizes, x[:, self.n : self.n + _CONSTANT]], axis=1)
+        p = np.repeat(constant, cases, axis=0)
+        y = self._tilted(p, np.tile(self.cases, (len(x), 1)))
         interval = np.array([60.0 * self.interval_min])
-        substeps = np.ceil(interval / self.step - 1e-9).astype(np.int64)
-        first = np.arange(len(p)) * motion.states
         z = np.empty((len(p), stop, 2))
         for k in range(stop):
-            inputs = np.concatenate([p, c], axis=1)
+            inputs = np.concatenate([p[:, : self.n + _SENSED], y], axis=1)
             inputs[:, _DRIFTS] += walk[:, k]
-            after = np.empty_like(y)
             # The right-hand side does not depend on time, so every interval may begin at 0.
-            integrate(motion._plain, y, inputs, interval, np.maximum(substeps, 1), after, first)
-            y, z[:, k] = after, after[:, :2]
-        return z.reshape(len(x), -1)
+            self._motion.run(
+                inputs,
+                np.ones(inputs.shape[1]),
+                np.zeros((1, 0)),
+                np.arange(len(p)),
+                interval,
+                steps[k : k + 1],
+                np.zeros(self.states),
+                y.reshape(-1),
+            )
+            z[:, k] = y[:, :2]
+        return z.reshape(len(x), cases * stop * 2)
 
-    @cached_property
-    def _motion(self) -> _Motion:
-        return _Motion(**{f.name: getattr(self, f.name) for f in fields(Gins)})
-
-
-@dataclass(frozen=True)
-class _Motion(Gins):
-    """The equations of motion with the constant errors among the parameters, and the whole state as output."""
-
-    outputs = tuple(f"y{i}" for i in range(Gins.states))
-
-    @cached_property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (*super().parameters, *(Parameter(name) for name in ("qx", "qy", "mxy", "myx", "px", "py", "pz")))
-
-    @cached_property
-    def si_sizes(self) -> Array:
-        return np.concatenate([Gins(gravity=self.gravity).si_sizes, np.ones(7)])
-
-    def start(self, p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
+    def _tilted(self, p: Array, c: Array) -> Array:
         """The platform is turned about x, then y, then z: true up and Earth axis turn the other way in its axes."""
-        y = super().start(p, c)
-        up, earth = _turned(y[2:5], p[15:18]), _turned(y[5:8], p[15:18])
-        return [*y[:2], *up, *earth, *y[8:11]]
+        y = self.start(list(p.T), list(c.T))
+        turns = list(p[:, self.n + _SENSED :].T)
+        y = [*y[:2], *_turned(y[2:5], turns), *_turned(y[5:8], turns), *y[8:11]]
+        return np.stack([np.broadcast_to(v, len(p)) for v in y], axis=1)
 
-    def sensed(self, f: Sequence[Any], p: Sequence[Any]) -> tuple[Any, Any]:
+    @cached_property
+    def _motion(self) -> Kernel:
+        """From one reading to the next: the parameters, the errors of the accelerometers and the state, as it was."""
+        moving = _Motion(**{f.name: getattr(self, f.name) for f in fields(Gins)})
+        given = self.n + _SENSED
+
+        def start(p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
+            return p[given:]
+
+        def read(t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
+            return y
+
+        equations = Equations(self.states, given + self.states, 0, self.states, start, moving.rhs, read)
+        return Kernel(simulation_source, equations, DOP853)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {k: v for k, v in super().__getstate__().items() if k != "_motion"}
+
+
+class _Motion(Gins):
+    """The equations of motion with the errors of the accelerometers behind the parameters."""
+
+    def acceleration(self, u: Sequence[Any], p: Sequence[Any]) -> tuple[Any, Any]:
+        bx, by, kx, ky = p[:4]
         qx, qy, mxy, myx = p[11:15]
-        return f[0] + qx * f[0] * f[0] + mxy * f[1], f[1] + qy * f[1] * f[1] + myx * f[0]
-
-    def read(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
-        return y
+        fx, fy = self.gravity * u[0], self.gravity * u[1]
+        x, y = fx + qx * fx * fx + mxy * fy, fy + qy * fy * fy + myx * fx
+        return (1.0 + kx) * x + bx, (1.0 + ky) * y + by
 
 
 def _turned(v: Sequence[Any], angles: Sequence[NDArray[Any]]) -> list[Any]:

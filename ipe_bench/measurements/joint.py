@@ -139,6 +139,3 @@ class Joint(Measurement):
         for part, places, start in zip(self.parts, self._places, self._starts, strict=False):
             H[start : start + part.m, places] = part.linearization()
         return H
-
-    def suited_to(self, error_scale: float) -> Measurement:
-        return Joint(tuple(part.suited_to(error_scale) for part in self.parts))

@@ -256,9 +256,6 @@ class Informed(Measurement):
             x = self.inner((found.x * self.whole.sizes)[None, self._free])[0]
         return Recorded(found.z, found.R, x)
 
-    def suited_to(self, error_scale: float) -> Measurement:
-        return replace(self, whole=self.whole.suited_to(error_scale))
-
 
 @dataclass(frozen=True)
 class _Transformation:

@@ -18,9 +18,10 @@ class LotkaVolterra(OdeMeasurement):
     """
 
     years: int = 20
-    step: float | None = 0.125
+    step: float | None = None
     sampled: tuple[float, ...] | None = None
     """Times of the readings in years, in place of one a year."""
+    tolerance = 1e-6
     states, outputs, time_unit, reading_unit = 2, ("prey", "predators"), "year", "thousand"
     usual_noise = UsualNoise(0.5)
     parameters = tuple(Parameter(name, size=0.02 * value) for name, value in _VALUES.items())  # type: ignore[assignment]

@@ -16,6 +16,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimator, estimate_safely
 from ipe_bench.measurements.base import Measurement, differentiate
+from ipe_bench.measurements.counted import cost
 from ipe_bench.measurements.polynomial import Polynomial
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
@@ -137,8 +138,8 @@ def accounts_for_itself(estimator: Estimator) -> None:
     estimates = estimator.estimate(problem, z)
     known = {int(status) for status in Status if status is not Status.RUNNING}
     assert set(estimates.status.tolist()) <= known, "a status is none of ipe_bench.Status"
-    cost = estimates.simulations + problem.measurement.n * estimates.jacobians
-    assert (cost > 0).all(), "simulations and jacobians are not counted"
+    spent = cost(estimates.simulations, estimates.jacobians, problem.measurement.n)
+    assert (spent > 0).all(), "simulations and jacobians are not counted"
     P = estimates.covariance
     if P is not None:
         usable = np.isfinite(P).all(axis=(1, 2))
@@ -166,10 +167,6 @@ def _points(model: Measurement, trials: int = 4) -> Array:
     return model.nominal + 0.1 * np.random.default_rng(11).standard_normal((trials, model.n))
 
 
-def _suited(model: Measurement) -> Measurement:
-    return model.suited_to(1.0)
-
-
 def names_its_readings(model: Measurement) -> None:
     """Has more readings than parameters, each with its own label, and units."""
     assert model.m > model.n, f"{model.m} readings are too few for {model.n} parameters"
@@ -184,7 +181,6 @@ def names_its_readings(model: Measurement) -> None:
 
 def simulates_batches(model: Measurement) -> None:
     """Simulates a batch as its trials one by one, bit for bit."""
-    model = _suited(model)
     x = _points(model)
     z = model.simulate(x)
     assert z.shape == (len(x), model.m), f"simulate returns {z.shape}, and not {(len(x), model.m)}"
@@ -196,7 +192,6 @@ def simulates_batches(model: Measurement) -> None:
 
 def differentiates(model: Measurement) -> None:
     """Has the Jacobian that differences of its readings show."""
-    model = _suited(model)
     x = _points(model)
     J = model.jacobian(x)
     assert J.shape == (len(x), model.m, model.n), f"jacobian returns {J.shape}"
@@ -214,7 +209,6 @@ def orders_its_epochs(model: Measurement) -> None:
         return
     rows = np.sort(np.concatenate(model.epochs))
     assert np.array_equal(rows, np.arange(model.m)), "the epochs do not hold every reading once"
-    model = _suited(model)
     x, stop = _points(model), max(1, len(model.epochs or ()) // 2)
     prefix, whole = model.simulate_until(x, stop), model.simulate(x)[:, model.rows(stop)]
     assert np.allclose(prefix, whole, rtol=1e-12, atol=1e-12 * np.abs(whole).max()), "a prefix differs from the whole"

@@ -15,13 +15,26 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.plugins.construct import register_package
+from ipe_bench.plugins.construct import construct, register_package
 
 ENTRY_POINTS = "ipe_bench.plugins"
 ESTIMATOR_GROUPS = ("solver", "baseline")
+COMPONENT_GROUPS = ("measurement", "noise", "prior", *ESTIMATOR_GROUPS)
 _PACKAGE_HEADER = re.compile(r"^#\s*@package\s+(\S+)", re.MULTILINE)
+
+
+class _Loader(yaml.SafeLoader):
+    """Takes 1e-6 for a number, as Hydra does; YAML 1.1 wants 1.0e-6."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?\d[\d_]*(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
+)
 
 
 @dataclass(frozen=True)
@@ -50,6 +63,11 @@ class Option:
             if line.startswith("#") and not _PACKAGE_HEADER.match(line):
                 return line.lstrip("# ").strip()
         return ""
+
+    @property
+    def config(self) -> Any:
+        """What the file says, as plain data."""
+        return yaml.load(self.path.read_text(encoding="utf-8"), _Loader)
 
     @property
     def package(self) -> str | None:
@@ -153,6 +171,23 @@ def options(group: str | None = None) -> list[Option]:
                         f"{path}: {labels[label].path} is called {label} too, and only one of them would run"
                     )
     return [o for o in found.values() if group is None or o.group == group]
+
+
+def components_in(folder: Path) -> list[tuple[str, Any]]:
+    """Every component that the options of a plugin's folder describe, constructed, with GROUP=NAME for a name.
+
+    Raises:
+        UserError: there is no plugin in the folder.
+    """
+    if not folder.is_dir():
+        raise UserError(f"{folder}: there is no such folder")
+    if not add_folder(folder):
+        raise UserError(f"{folder}: holds no package with a folder conf in it; see `ipe-bench new`")
+    return [
+        (f"{o.group}={o.name}", construct(o.config, o.package or o.group))
+        for o in options()
+        if o.path.is_relative_to(folder.resolve()) and o.group in COMPONENT_GROUPS
+    ]
 
 
 def groups() -> list[str]:

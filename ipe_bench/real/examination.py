@@ -28,6 +28,12 @@ STARTS = 64
 """Points that the search for other minima begins from,"""
 _SPREADS = (1.0, 3.0)
 """drawn from the prior, half of them at so many times its deviations."""
+_WORK = 20_000_000
+"""Entries of Jacobians that one iteration of all draws or starts may come to: of very many readings there are fewer,"""
+_FEWEST = 4
+"""but so many at least."""
+_ENTRIES = 4_000_000
+"""of which so many are in memory at a time."""
 _TOLERANCE = 1e-8
 _MOST_STEPS = 200
 _SAME = 1e-2
@@ -219,6 +225,7 @@ class _Least:
         """Estimates from readings simulated at the estimate, started there, with noise of R; the draws are always the
         same ones (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 6.5)."""
         rng = np.random.Generator(np.random.Philox(0))
+        draws = _affordable(draws, self.J.size)
         factor = self.problem.R.factor
         e = rng.standard_normal((draws, len(self.z)))
         h = self.model.simulate(self.x[None])[0]
@@ -238,7 +245,7 @@ class _Least:
         n, problem = len(self.x), self.problem
         rng = np.random.Generator(np.random.Philox(1))
         spread = np.ones(n) if problem.prior_deviation is None else problem.prior_deviation
-        reach = np.repeat(_SPREADS, STARTS // len(_SPREADS))[:, None]
+        reach = np.repeat(_SPREADS, _affordable(STARTS, self.J.size) // len(_SPREADS))[:, None]
         starts = np.concatenate([self.x[None], problem.x0 + reach * spread * rng.standard_normal((len(reach), n))])
         minima = _minimise(problem, np.repeat(self.z[None], len(starts), axis=0), starts)
         return self._told_apart(minima)
@@ -264,7 +271,18 @@ class _Least:
         return found or [Minimum(self.model.natural(self.x[None])[0], self.chi_square, 1, True)]
 
 
+def _affordable(wanted: int, entries: int) -> int:
+    """How many minimisations to make of a Jacobian with so many entries."""
+    return min(wanted, max(_FEWEST, _WORK // entries))
+
+
 def _minimise(problem: Problem, z: Array, x: Array) -> Minima:
+    at_once = max(1, _ENTRIES // (z.shape[1] * x.shape[1]))
+    if len(x) > at_once:
+        parts = [_minimise(problem, z[k : k + at_once], x[k : k + at_once]) for k in range(0, len(x), at_once)]
+        fields = ("x", "status", "iterations", "covariance", "chi_square")
+        joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in fields}
+        return Minima(**joined, history=None)
     with np.errstate(all="ignore"):
         objective = Objective.of(problem, z, prior=False)
         return minimize(objective, LevenbergMarquardtMethod(1e-3), x, tolerance=_TOLERANCE, max_iterations=_MOST_STEPS)

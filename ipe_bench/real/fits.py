@@ -12,15 +12,16 @@ from scipy.stats import chi2, norm
 from scipy.stats import f as fisher
 from scipy.stats import t as student
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimator, estimate_safely
 from ipe_bench.measurements.base import Measurement, Restricted
+from ipe_bench.measurements.counted import cost
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.real.residuals import Whiteness, explained, normalised, outlier_limit, whiteness
+from ipe_bench.trials.thresholds import FIT_LEVEL
 
-FIT_LEVEL = 1e-3
-"""A model fits where chi-square is no less probable than this."""
 _MOST_LEVELS = 6
 """Fits in search of the level of the noise,"""
 _SAME_LEVEL = 1e-3
@@ -181,6 +182,11 @@ def _fit_with_level(label: str, estimator: Estimator, problem: Problem, z: Array
         found = again
         free = found.degrees_of_freedom
         level = assumed * float(np.sqrt(found.chi_square / free)) if free > 0 else np.nan
+        if level == 0.0:
+            raise UserError(
+                "noise: is not given and cannot be estimated from the residuals, which are zero; state it, as in"
+                " noise.deviation=0.1"
+            )
         found = _with_level(found, level / assumed, level)
         # Residuals of round-off would make steps of round-off count.
         level = max(level, _SMALLEST_LEVEL * spread)
@@ -284,7 +290,7 @@ def _fit_one(
         len(z) - n,
         white,
         int(estimates.iterations[0]),
-        float(estimates.simulations[0] + n * estimates.jacobians[0]),
+        float(cost(estimates.simulations, estimates.jacobians, n)[0]),
         model,
         estimates.x[0],
         P,

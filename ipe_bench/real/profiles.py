@@ -6,6 +6,7 @@ Applied Statistics 37, 1988; Bates and Watts, Nonlinear Regression Analysis and 
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -127,8 +128,7 @@ class _Looked:
     def crossing(self, sign: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
         """The first neighbours between which the profile rises over q."""
         points = self.side(sign)
-        pairs = zip(points, points[1:], strict=False)
-        return next(((a, b) for a, b in pairs if a[1] < self.q <= b[1]), None)
+        return next(((a, b) for a, b in itertools.pairwise(points) if a[1] < self.q <= b[1]), None)
 
     def end(self, sign: int) -> float:
         """The distance to the end of the interval, by linear interpolation."""

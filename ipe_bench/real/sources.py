@@ -17,6 +17,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Input, Measurement
 from ipe_bench.measurements.joint import Joint
+from ipe_bench.noise import Gaussian, Noise, Unknown
 from ipe_bench.real import readings
 
 SIGMA = "sigma"
@@ -51,6 +52,25 @@ def open_together(paths: Sequence[Path], model: Measurement) -> Readings:
     deviations = [one.deviations for one in found if one.deviations is not None]
     joint = Joint(tuple(one.model for one in found))
     return Readings(joint, np.concatenate([one.z for one in found]), np.concatenate(deviations) if deviations else None)
+
+
+def noise_of(found: Readings, stated: Noise | None) -> Noise | None:
+    """What is known of the errors: what a user states, or the deviations in the file; None where neither says.
+
+    Raises:
+        UserError: both do.
+    """
+    if found.deviations is None:
+        return stated
+    deviations = tuple(np.where(np.isfinite(found.deviations), found.deviations, 1.0).tolist())
+    if isinstance(stated, Unknown):
+        return Unknown(deviations)
+    if stated is not None:
+        raise UserError(
+            f"noise: is given, and the readings have a column {SIGMA}, too; leave one of them out, or set noise=unknown"
+            " to take the column for relative weights"
+        )
+    return Gaussian(deviations)
 
 
 def open_readings(path: Path, model: Measurement) -> Readings:

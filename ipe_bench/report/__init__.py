@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import types
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,29 +32,29 @@ class ReportResult:
     """Mean correct digits per estimator and start, on certified readings; empty where there are none."""
 
 
-def write_report(directories: Sequence[Path | str], output: Path | str) -> ReportResult:
-    """Writes summary.csv, tables/, figures/ and report.html under `output` from what is stored in the directories.
+def write_report(directories: Path | str | Sequence[Path | str], output: Path | str | None = None) -> ReportResult:
+    """Writes summary.csv, tables/, figures/ and report.html from what is stored, under `output` or the first directory.
 
     Raises:
         UserError: a directory does not exist.
     """
-    from ipe_bench.basics.files import write_atomically
-    from ipe_bench.report.certified_tables import without_certified, write_certified
+    from ipe_bench.basics.files import write_text
+    from ipe_bench.report.certified_tables import certified_tables, without_certified
     from ipe_bench.report.figures import draw_all
     from ipe_bench.report.html import render_page
     from ipe_bench.report.tables import all_tables, write_tables
     from ipe_bench.statistics.analysis import analyse
 
+    directories = [directories] if isinstance(directories, Path | str) else list(directories)
     analysis = analyse(directories)
-    output = Path(output)
+    output = Path(directories[0] if output is None else output)
     folder = output / "figures"
     folder.mkdir(parents=True, exist_ok=True)
     summary_path = output / "summary.csv"
-    write_atomically(summary_path, lambda temporary: analysis.summary.to_csv(temporary, index=False))
-    tables = all_tables(analysis)
+    write_text(summary_path, analysis.summary.to_csv(index=False))
+    certified_shown, certified = certified_tables(analysis.collection)
+    tables = [*certified_shown, *all_tables(analysis)]
     table_paths = write_tables(analysis, tables, output / "tables")
-    certified_paths, certified = write_certified(analysis.collection, output / "tables")
-    table_paths += certified_paths
     figures: list[Path] = []
     shown = []
     pictured = without_certified(analysis)
@@ -62,7 +64,7 @@ def write_report(directories: Sequence[Path | str], output: Path | str) -> Repor
         shown.append((drawing.name, drawing.title, drawing.caption, png.read_bytes()))
     page = render_page(analysis, tables, shown)
     report = output / "report.html"
-    write_atomically(report, lambda temporary: temporary.write_text(page, encoding="utf-8"))
+    write_text(report, page)
     return ReportResult(
         analysis.summary,
         summary_path,
@@ -73,3 +75,15 @@ def write_report(directories: Sequence[Path | str], output: Path | str) -> Repor
         analysis.stale,
         certified,
     )
+
+
+class _Callable(types.ModuleType):
+    """`ipe_bench.report` is this room once it is imported, and a public function before: so the room can be called."""
+
+    def __call__(
+        self, directories: Path | str | Sequence[Path | str], output: Path | str | None = None
+    ) -> ReportResult:
+        return write_report(directories, output)
+
+
+sys.modules[__name__].__class__ = _Callable

@@ -19,9 +19,10 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.real.examination import Examination
-from ipe_bench.real.fits import FIT_LEVEL, Fit
+from ipe_bench.real.fits import Fit
 from ipe_bench.report import examined
 from ipe_bench.report.words import p_value
+from ipe_bench.trials.thresholds import FIT_LEVEL
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -98,8 +99,15 @@ class Answer:
         least = self.examination is None or self.examination.least
         return least and any(one.passes for one in self.fits)
 
-    def __getitem__(self, label: str) -> Fit:
-        return next(one for one in self.fits if one.label == label)
+    def __iter__(self) -> Iterator[Fit]:
+        return iter(self.fits)
+
+    def __len__(self) -> int:
+        return len(self.fits)
+
+    def __getitem__(self, which: str | int) -> Fit:
+        """By label or place."""
+        return self.fits[which] if isinstance(which, int) else next(f for f in self.fits if f.label == which)
 
     def table(self) -> pd.DataFrame:
         """A row per estimator and parameter: estimate, standard error, 95 % interval, and whether the fit passes."""

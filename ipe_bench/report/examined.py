@@ -62,8 +62,8 @@ def remarks(found: Examination, labels: Labels) -> Iterator[str]:
         best = found.minima[0]
         where = ", ".join(f"{n} = {v:.5g}" for n, v in zip(names, best.x, strict=True))
         yield (
-            f"NOT THE LEAST MINIMUM: chi-square is {best.chi_square:.5g} at {where}; start there, or choose an estimator"
-            " that searches, such as multiscale_lm."
+            f"NOT THE LEAST MINIMUM: chi-square is {best.chi_square:.5g} at {where}; start there, or choose an"
+            " estimator that searches, such as multiscale_lm."
         )
     others = found.ambiguous
     if others:

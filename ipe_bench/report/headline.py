@@ -20,18 +20,18 @@ def headline(analysis: Analysis) -> str:
         return "Nothing is stored yet, so there is nothing to find."
     rows = analysis.summary[analysis.summary["parameter"] == ALL]
     best = best_estimator(analysis)
-    mine = rows[rows["estimator"] == best].sort_values("error_scale")
-    trials = int(mine["trials"].sum())
-    success = float((mine["success"] * mine["trials"]).sum() / trials)
-    scales = sorted(mine["error_scale"].unique())
+    own = rows[rows["estimator"] == best].sort_values("error_scale")
+    trials = int(own["trials"].sum())
+    success = float((own["success"] * own["trials"]).sum() / trials)
+    scales = sorted(own["error_scale"].unique())
     reach = f"error scale {plain(scales[0])}"
     if len(scales) > 1:
         reach = f"error scales {plain(scales[0])} to {plain(scales[-1])}"
-    scenarios = f" in {len(mine)} scenarios" if len(mine) > len(scales) else ""
+    scenarios = f" in {len(own)} scenarios" if len(own) > len(scales) else ""
     sentence = f"At {reach}{scenarios}, {best} succeeds in {percent(success)} of {trials:,} trials"
-    over = mine["rmse_over_linear_bound"].to_numpy()
+    over = own["rmse_over_linear_bound"].to_numpy()
     if np.isfinite(over).any():
-        worst = mine.iloc[int(np.nanargmax(over))]
+        worst = own.iloc[int(np.nanargmax(over))]
         sentence += (
             f", and where it does worst (scale {plain(worst['error_scale'])}) the root mean square error of the trials"
             f" it solves is {short(worst['rmse_over_linear_bound'])} times the linear bound"

@@ -20,6 +20,13 @@ Shown = tuple[str, str, str, bytes]
 MOST_ROWS = 2000
 """Rows of one table on the page; its CSV file has all."""
 MOST_RUNS = 20
+_SECTIONS = (
+    ("figures", "Figures"),
+    ("tables", "Tables"),
+    ("theory", "Theory beside what happened"),
+    ("provenance", "Configuration and provenance"),
+    ("definitions", "Definitions"),
+)
 
 
 def render_page(analysis: Analysis, tables: Sequence[Table], figures: Sequence[Shown]) -> str:
@@ -36,7 +43,11 @@ def render_page(analysis: Analysis, tables: Sequence[Table], figures: Sequence[S
         expected=collection.expected,
         complete=collection.complete,
         problems=[*collection.problems, *collection.stale],
-        tables=[_table(t) for t in tables],
+        title=", ".join(d.resolve().name or str(d) for d in collection.directories),
+        computed=collection.runs[-1].started[:16].replace("T", " ") if collection.runs else "",
+        sections=_SECTIONS if any(t.appendix for t in tables) else [s for s in _SECTIONS if s[0] != "theory"],
+        tables=[_table(t) for t in tables if not t.appendix],
+        theory=[_table(t) for t in tables if t.appendix],
         figures=[
             {"name": name, "title": title, "caption": caption, "data": base64.b64encode(png).decode()}
             for name, title, caption, png in figures

@@ -11,11 +11,11 @@ from typing import Any
 
 import pandas as pd
 
-from ipe_bench.basics.files import write_atomically
-from ipe_bench.report.words import duration, p_value, percent, plain, precise, short
+from ipe_bench.basics.files import write_text
+from ipe_bench.report.words import p_value, percent, plain, short, shower
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.comparisons import ALPHA
-from ipe_bench.statistics.profiles import BUDGETS, RATIOS
+from ipe_bench.statistics.records import SCORES, STATISTICS, Statistic, Where
 from ipe_bench.statistics.summary import ALL
 
 
@@ -44,6 +44,8 @@ class Table:
     caption: str
     columns: Sequence[Column]
     data: pd.DataFrame
+    appendix: bool = False
+    """Whether it stands behind the figures: theory beside what happened."""
 
     @property
     def rows(self) -> Iterator[tuple[Cell, ...]]:
@@ -80,8 +82,9 @@ def all_tables(analysis: Analysis) -> list[Table]:
     """Every table that the data allow, in the order of the report."""
     if analysis.summary.empty:
         return []
-    tables = [overview(analysis), costs(analysis), contraction(analysis), comparisons(analysis), ranks(analysis)]
+    tables = [overview(analysis), costs(analysis), comparisons(analysis), ranks(analysis)]
     tables += [parameters(analysis), endings(analysis)]
+    tables += [contraction(analysis), covariances(analysis), iterations(analysis)]
     return [t for t in tables if t is not None]
 
 
@@ -97,25 +100,9 @@ def overview(analysis: Analysis) -> Table:
     rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
     scores = analysis.scores
     best = list(scores["leads"])
-    columns = [
-        *_head(analysis, rows),
-        words("estimator", rows["estimator"], best),
-        column("trials", rows["trials"], lambda v: f"{v:d}"),
-        column("converged", rows["converged"], percent),
-        column("solved", rows["solved"], percent),
-        column("success", rows["success"], percent),
-        interval("95 % of success", rows["success_low"], rows["success_high"], percent),
-        column("false root", rows["false_root"], percent),
-        column("rmse / bound", rows["rmse_over_linear_bound"], short),
-        interval("95 % of rmse", rows["rmse_low"], rows["rmse_high"], short),
-        column("rmse, common", rows["rmse_common"], short),
-        column("efficiency", rows["efficiency"], short),
-        column("capped error", scores["capped_error"], short, best),
-        column("NEES / n", rows["nees"], short),
-        interval("NEES limits", rows["nees_low"], rows["nees_high"], short),
-        column("coverage", rows["coverage95"], percent),
-        column("misfit", rows["misfit"], lambda v: percent(v) if math.isfinite(v) else "-"),
-    ]
+    columns = [*_head(analysis, rows), words("estimator", rows["estimator"], best)]
+    columns += statistics("overview", STATISTICS, rows)
+    columns += statistics("overview", SCORES, scores, best)
     caption = (
         "Shares are of all trials. rmse / bound: root mean square over parameters of error over linear bound, on the"
         " trials that the estimator solved; common: on those that every estimator solved. misfit: trials whose"
@@ -125,31 +112,80 @@ def overview(analysis: Analysis) -> Table:
     return Table("overview", "Overview", caption, columns, rows)
 
 
+def statistics(
+    where: Where, records: Sequence[Statistic], rows: pd.DataFrame, best: Sequence[bool] | None = None
+) -> list[Column]:
+    """The columns of the statistics that are shown in that table."""
+    columns: list[Column] = []
+    for record in records:
+        if where not in record.where:
+            continue
+        show = shower(record.kind, where)
+        title = record.titles.get(where, record.title)
+        if record.kind == "word":
+            columns.append(words(title, rows[record.name], best))
+        else:
+            columns.append(column(title, rows[record.name], show, best))
+        if where in record.limits_titles:
+            low, high = (rows[name] for name in record.columns[1:])
+            columns.append(interval(record.limits_titles[where], low, high, show))
+    return columns
+
+
 def costs(analysis: Analysis) -> Table:
     """What a trial costs, and what is needed to come close to the estimator's own limit."""
     rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
     scores = analysis.scores
-    columns = [
-        *_head(analysis, rows),
-        words("estimator", rows["estimator"]),
-        column("iterations", rows["iterations_median"], short),
-        column("iterations, 95 %", rows["iterations_p95"], short),
-        column("simulations", rows["simulations_median"], short),
-        column("to 0.05 σ of limit", scores["cost_to_limit_median"], short),
-        column("order", scores["order_median"], short),
-        column("histories", scores["histories"], lambda v: f"{v:d}"),
-        column("time", rows["time_median_s"], duration),
-    ]
+    columns = [*_head(analysis, rows), words("estimator", rows["estimator"])]
+    columns += statistics("costs", STATISTICS, rows)
+    columns += statistics("costs", SCORES, scores)
     names = [*analysis.setting_columns, "error_scale", "estimator"]
-    names += ["cost_median", "cost_to_limit_median", "order_median", "histories"]
-    data = rows[["iterations_median", "iterations_p95", "simulations_median", "time_median_s"]]
+    data = [rows[_stored("costs", STATISTICS)], scores[_stored("costs", SCORES)]]
     caption = (
         "Medians per trial over all trials. A Jacobian counts as many simulations as there are"
         " parameters. To 0.05 σ of limit: cost until all further iterates are within 0.05 standard deviations of the"
         " last one, over the converged trials with a stored history. Order: the last observed order of convergence of"
         " these trials, 1 linear and 2 quadratic."
     )
-    return Table("costs", "Costs", caption, columns, pd.concat([scores[names], data], axis=1))
+    return Table("costs", "Costs", caption, columns, pd.concat([scores[names], *data], axis=1))
+
+
+def _stored(where: Where, records: Sequence[Statistic]) -> list[str]:
+    return [name for record in records if where in record.where for name in record.columns]
+
+
+def covariances(analysis: Analysis) -> Table | None:
+    """What theory says of the scatter of the frozen root, beside the scatter."""
+    rows = analysis.summary[(analysis.summary["parameter"] == ALL) & analysis.summary["eq_14"].notna()]
+    if rows.empty:
+        return None
+    columns = [*_head(analysis, rows), words("estimator", rows["estimator"])]
+    columns += statistics("covariances", STATISTICS, rows)
+    caption = (
+        "Standard deviations over the linear bound of eq. (5), root mean square over parameters, of the estimators that"
+        " solve eq. (11), over solved trials. rmse is what happened (Monte Carlo); reported is the sandwich at the"
+        " estimate, which holds to first order; eq. (14) takes the compensation error for independent of the noise,"
+        " which it is not. A false root is a converged trial at another root than the truth leads to."
+    )
+    data = rows[[*analysis.setting_columns, "error_scale", "estimator", *_stored("covariances", STATISTICS)]]
+    return Table("covariances", "Covariance of the frozen root", caption, columns, data, appendix=True)
+
+
+def iterations(analysis: Analysis) -> Table | None:
+    """The paper's bounds on the iterations beside the iterates."""
+    scores = analysis.scores
+    rows = scores[(scores["eq_18_trials"] > 0) | scores["eq_23_observed"].notna()]
+    if rows.empty:
+        return None
+    columns = [*_head(analysis, rows), words("estimator", rows["estimator"])]
+    columns += statistics("iterations", SCORES, rows)
+    caption = (
+        "Over the first trials, whose iterates are stored. Eq. (18) bounds fixed-point iteration where K of eq. (15) is"
+        " below 1; eq. (23) bounds Newton's method by the curvature M of its g. Constants are taken at the truth, the"
+        " last iterate stands for the root."
+    )
+    data = rows[[*analysis.setting_columns, "error_scale", "estimator", *_stored("iterations", SCORES)]]
+    return Table("iterations", "Bounds on the iterations", caption, columns, data, appendix=True)
 
 
 def contraction(analysis: Analysis) -> Table | None:
@@ -161,15 +197,15 @@ def contraction(analysis: Analysis) -> Table | None:
     for name, title in (("K", "K"), ("norm", "infinity norm"), ("radius", "spectral radius")):
         columns += [
             column(f"{title}, median", rows[f"contraction_{name}_median"], short),
-            column("largest", rows[f"contraction_{name}_max"], short),
-            column("below 1", rows[f"contraction_{name}_below_1"], percent),
+            column(f"{title}, largest", rows[f"contraction_{name}_max"], short),
+            column(f"{title} below 1", rows[f"contraction_{name}_below_1"], percent),
         ]
     caption = (
         "Of g' = I - H⁺J at the truth, over all trials. K of eq. (15) below 1, or the infinity norm below 1, in a whole"
         " neighbourhood is sufficient for fixed-point iteration to converge there; the spectral radius below 1 is"
         " necessary and sufficient close to the root, and is the rate at which the error shrinks."
     )
-    return Table("contraction", "Contraction", caption, columns, rows)
+    return Table("contraction", "Contraction", caption, columns, rows, appendix=True)
 
 
 def comparisons(analysis: Analysis) -> Table | None:
@@ -228,24 +264,9 @@ def ranks(analysis: Analysis) -> Table | None:
 def parameters(analysis: Analysis) -> Table:
     """Every parameter in its own unit."""
     rows = analysis.summary[analysis.summary["parameter"] != ALL]
-    columns = [
-        *_head(analysis, rows),
-        words("estimator", rows["estimator"]),
-        words("parameter", rows["parameter"]),
-        words("unit", rows["unit"]),
-        column("bias", rows["bias"], precise),
-        column("std", rows["std"], precise),
-        column("rmse", rows["rmse"], precise),
-        interval("95 % of rmse", rows["rmse_low"], rows["rmse_high"], precise),
-        column("linear bound", rows["linear_bound"], precise),
-        column("CRLB", rows["crlb"], precise),
-        column("rmse / bound", rows["rmse_over_linear_bound"], short),
-        column("efficiency", rows["efficiency"], short),
-        column("median abs error", rows["median_abs_error"], precise),
-        column("95 % abs error", rows["q95_abs_error"], precise),
-        column("NEES", rows["nees"], short),
-        column("coverage", rows["coverage95"], percent),
-    ]
+    columns = [*_head(analysis, rows)]
+    columns += [words(name, rows[name]) for name in ("estimator", "parameter", "unit")]
+    columns += statistics("parameters", STATISTICS, rows)
     caption = (
         "In each parameter's own unit. Bias, std, rmse, bounds and NEES are over solved trials; median and 95 % of the"
         " absolute error, and coverage, over all trials."
@@ -292,107 +313,67 @@ def markdown(table: Table) -> str:
 
 LONG = 45
 """Rows from which on a LaTeX table runs over pages."""
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "{": r"\{",
-    "}": r"\}",
-    "$": r"\$",
-    "&": r"\&",
-    "#": r"\#",
-    "%": r"\%",
-    "_": r"\_\allowbreak{}",
-    "^": r"\textasciicircum{}",
-    "~": r"\textasciitilde{}",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    "|": r"\textbar{}",
-    '"': r"\textquotedbl{}",
+_SIGNS = {
     "µ": r"\ensuremath{\mu}",
     "σ": r"\ensuremath{\sigma}",
     "√": r"\ensuremath{\surd}",
     "×": r"\ensuremath{\times}",
     "²": r"\textsuperscript{2}",
     "–": "--",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    '"': r"\textquotedbl{}",
 }
 _NUMBER = re.compile(r"-?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
 def latex(table: Table) -> str:
-    """Booktabs and siunitx; to be read into a document with `\\input`."""
-    kind = "longtable" if len(table) > LONG else "tabular"
+    """Booktabs and siunitx, written by pandas; to be read into a document with `\\input`."""
+    # Two columns may share a title, but pandas tells columns apart by it: blanks at the end differ.
+    titles = [column.title + " " * i for i, column in enumerate(table.columns)]
+    texts = [[cell.text for cell in column.cells] for column in table.columns]
+    cells = pd.DataFrame(dict(zip(titles, texts, strict=True)), dtype=object)
+    bold = [["textbf:--rwrap;" if cell.best else "" for cell in column.cells] for column in table.columns]
+    style = cells.style.hide(axis="index").format_index(_show_signs, axis=1, escape="latex")
+    for title, column in zip(titles, table.columns, strict=True):
+        style = style.format(_set_numbers if column.numeric else _show_signs, subset=[title], escape="latex")
+    style = style.apply(lambda _: pd.DataFrame(dict(zip(titles, bold, strict=True)), index=cells.index), axis=None)
     shape = "".join("r" if c.numeric else "l" for c in table.columns)
-    title = " & ".join(f"\\multicolumn{{1}}{{{'r' if c.numeric else 'l'}}}{{{escape(c.title)}}}" for c in table.columns)
-    lines = [
-        f"% {' '.join(table.title.split())}. Needs \\usepackage{{booktabs, longtable, siunitx, amsmath}} and",
-        "% \\usepackage[T1]{fontenc}.",
-        f"\\begin{{{kind}}}{{@{{}}{shape}@{{}}}}",
-        "\\toprule",
-        title + r" \\",
-        "\\midrule",
-    ]
-    if kind == "longtable":
-        lines.append("\\endhead")
-    for row in table.rows:
-        cells = [_number(c.text) if col.numeric else escape(c.text) for c, col in zip(row, table.columns, strict=True)]
-        cells = [f"\\textbf{{{t}}}" if c.best else t for t, c in zip(cells, row, strict=True)]
-        lines.append(" & ".join(cells) + r" \\")
-    lines += ["\\bottomrule", f"\\end{{{kind}}}"]
-    return "\n".join(lines) + "\n"
+    text = style.to_latex(
+        hrules=True, environment="longtable" if len(table) > LONG else None, column_format=f"@{{}}{shape}@{{}}"
+    )
+    needs = "\\usepackage{booktabs, longtable, siunitx, amsmath} and \\usepackage[T1]{fontenc}"
+    return f"% {' '.join(table.title.split())}. Needs {needs}.\n{text}"
 
 
-def escape(text: str) -> str:
-    """Any text as LaTeX that shows it; characters that pdflatex may lack by their number."""
-    result = []
-    for char in " ".join(text.split()):
-        if char in _LATEX:
-            result.append(_LATEX[char])
-        elif char.isascii() and char.isprintable():
-            result.append(char)
-        else:
-            result.append(f"\\texttt{{U+{ord(char):04X}}}")
-    return "".join(result)
+def _show_signs(escaped: object) -> str:
+    """What pandas' escaping leaves: signs beyond ASCII, those that pdflatex may lack by their number."""
+    return "".join(
+        _SIGNS.get(char, char if char.isascii() and char.isprintable() else f"\\texttt{{U+{ord(char):04X}}}")
+        for char in " ".join(str(escaped).split())
+    )
 
 
-def _number(text: str) -> str:
-    """Numbers in a numeric cell set by siunitx, what stands around them escaped."""
-    result, reached = [], 0
-    for match in _NUMBER.finditer(text):
-        result.append(escape(text[reached : match.start()]) if text[reached : match.start()].strip() else "")
-        if text[reached : match.start()].strip() == "to":
-            result[-1] = "--"
-        result.append(f"\\num{{{match.group().replace(',', '')}}}")
-        reached = match.end()
-    rest = text[reached:].strip()
-    result.append(("\\," if reached and rest else "") + escape(rest))
-    return "".join(result)
+def _set_numbers(escaped: object) -> str:
+    """The numbers of a cell set by siunitx, which groups digits by its own rules."""
+    text = _NUMBER.sub(lambda m: f"\\num{{{m.group().replace(',', '')}}}", _show_signs(escaped))
+    return text.replace(r"} \%", r"}\,\%")
 
 
 def write_tables(analysis: Analysis, tables: Sequence[Table], folder: Path) -> tuple[Path, ...]:
     """Writes each table as CSV (all columns, full precision), Markdown and LaTeX, and the profiles as CSV."""
-    paths = []
-
-    def write(name: str, content: str) -> None:
-        path = folder / name
-        write_atomically(path, lambda temporary: temporary.write_text(content, encoding="utf-8"))
+    paths = [path for table in tables for path in write_table(table, folder)]
+    if len(analysis.profiles):
+        path = folder / "profiles.csv"
+        write_text(path, analysis.profiles.to_csv(index=False))
         paths.append(path)
-
-    for table in tables:
-        write(f"{table.name}.csv", table.data.to_csv(index=False))
-        write(f"{table.name}.md", markdown(table))
-        write(f"{table.name}.tex", latex(table))
-    if analysis.profiles.trials:
-        write("profiles.csv", _profiles(analysis).to_csv(index=False))
     return tuple(paths)
 
 
-def _profiles(analysis: Analysis) -> pd.DataFrame:
-    """The curves of both profiles: estimator, kind, abscissa, share."""
-    profiles = analysis.profiles
-    parts = []
-    for label in profiles.trials:
-        for kind, x, y in (
-            ("performance", RATIOS, profiles.performance(label)),
-            ("data", BUDGETS, profiles.data(label)),
-        ):
-            parts.append(pd.DataFrame({"estimator": label, "profile": kind, "at": x, "share": y}))
-    return pd.concat(parts)
+def write_table(table: Table, folder: Path) -> list[Path]:
+    """Writes one table in each format."""
+    texts = {".csv": table.data.to_csv(index=False), ".md": markdown(table), ".tex": latex(table)}
+    for suffix, text in texts.items():
+        write_text(folder / f"{table.name}{suffix}", text)
+    return [folder / f"{table.name}{suffix}" for suffix in texts]

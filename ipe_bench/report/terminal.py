@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from ipe_bench.report.words import compact, duration, percent, short
-from ipe_bench.statistics.summary import ALL, STATISTICS
+from ipe_bench.report.words import compact, shower
+from ipe_bench.statistics.records import STATISTICS, Statistic
+from ipe_bench.statistics.summary import ALL, COLUMNS
 
 if TYPE_CHECKING:
     from rich.console import Group
 
-_HEADINGS = ("trials", "solved", "success", "rmse/bound", "95 %", "NEES", "misfit", "sims", "time")
-_NOT_SETTINGS = {*STATISTICS, "parameter", "unit", "estimator", "error_scale"}
+_SHOWN = tuple(record for record in STATISTICS if "terminal" in record.where)
+_NOT_SETTINGS = {*COLUMNS, "parameter", "unit", "estimator", "error_scale"}
 
 
 def render(summary: pd.DataFrame, certified: pd.DataFrame | None = None) -> Group:
@@ -52,11 +54,13 @@ def render(summary: pd.DataFrame, certified: pd.DataFrame | None = None) -> Grou
         )
         table.add_column("scale", justify="right", no_wrap=True)
         table.add_column("estimator", overflow="fold", min_width=12)
-        for name in _HEADINGS[alike:]:
-            table.add_column(name, justify="right", no_wrap=True)
+        # The number of trials stands in the title where it is the same for all.
+        shown = [record for record in _SHOWN if not (alike and record.name == "trials")]
+        for heading in _headings(shown):
+            table.add_column(heading, justify="right", no_wrap=True)
         for scale, block in part.groupby("error_scale", sort=False):
             for i, (_, row) in enumerate(block.iterrows()):
-                table.add_row(f"{scale:g}" if i == 0 else "", escape(str(row["estimator"])), *_cells(row)[alike:])
+                table.add_row(f"{scale:g}" if i == 0 else "", escape(str(row["estimator"])), *_cells(shown, row))
             table.add_section()
         parts.append(table)
     note = (
@@ -98,15 +102,16 @@ def _digits(averages: pd.DataFrame) -> list[Any]:
     return [table, Text(note, style="dim"), Text()]
 
 
-def _cells(row: Any) -> list[str]:
-    return [
-        f"{int(row['trials'])}",
-        percent(row["solved"]),
-        percent(row["success"]),
-        short(row["rmse_over_linear_bound"]),
-        f"{compact(row['rmse_low'])}-{compact(row['rmse_high'])}" if math.isfinite(row["rmse_low"]) else "-",
-        short(row["nees"]),
-        percent(row["misfit"]) if math.isfinite(row["misfit"]) else "-",
-        short(row["simulations_median"]),
-        duration(row["time_median_s"], 2),
-    ]
+def _headings(records: Sequence[Statistic]) -> Iterator[str]:
+    for record in records:
+        yield record.titles.get("terminal", record.title)
+        if "terminal" in record.limits_titles:
+            yield record.limits_titles["terminal"]
+
+
+def _cells(records: Sequence[Statistic], row: Any) -> Iterator[str]:
+    for record in records:
+        yield shower(record.kind, "terminal")(row[record.name])
+        if "terminal" in record.limits_titles:
+            low, high = (row[name] for name in record.columns[1:])
+            yield f"{compact(low)}-{compact(high)}" if math.isfinite(low) else "-"

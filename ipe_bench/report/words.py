@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
+
+from ipe_bench.statistics.records import Kind, Where
 
 
 def plain(value: Any) -> str:
@@ -74,3 +77,15 @@ def p_value(p: float) -> str:
     if not math.isfinite(p):
         return "-"
     return f"{p:.3f}" if p >= 1e-3 else f"{p:.0e}" if p > 1e-300 else "<1e-300"
+
+
+def shower(kind: Kind, where: Where) -> Callable[[Any], str]:
+    """How values of that kind are written in that table."""
+    return {
+        "count": lambda v: f"{int(v):d}",
+        "share": percent,
+        "number": short,
+        "physical": precise if where == "parameters" else short,
+        "seconds": (lambda v: duration(v, 2)) if where == "terminal" else duration,
+        "word": str,
+    }[kind]

@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 
 TARGET = "_target_"
+WITHOUT_NUMBERS = frozenset(f"ipe_bench.basics.{name}" for name in ("errors", "files", "machine", "naming", "statuses"))
+"""Modules that no number of a result comes from: they word messages, write files, name things."""
 
 
 def describe(value: Any) -> Any:
@@ -45,18 +47,15 @@ def fingerprint(components: Iterable[Any]) -> dict[str, Any]:
 
     The source of a component is the module of its class with all modules of its package that it imports, so a change in
     anything that it computes with changes the digest, and a new file elsewhere does not. The scoring of trials counts
-    as part of it.
+    as part of it. Comments, docstrings, the texts of exceptions and the modules of `WITHOUT_NUMBERS` do not: a change
+    of prose leaves every stored result valid.
     """
     modules = set(_import_closure("ipe_bench.trials.scoring"))
     for component in components:
         for cls in _classes(component):
             modules |= _import_closure(cls.__module__)
     packages = sorted({m.split(".")[0] for m in modules})
-    digest = hashlib.sha256()
-    for module in sorted(modules):
-        digest.update(module.encode())
-        digest.update(_source_of(module))
-        digest.update(_data_of(module))
+    digest = hashlib.sha256("".join(f"{m} {_digest_of(m)}\n" for m in sorted(modules)).encode())
     return {"versions": {p: package_version(p) for p in packages}, "source": digest.hexdigest()[:16]}
 
 
@@ -94,7 +93,7 @@ def _import_closure(module: str) -> frozenset[str]:
     waiting = [module]
     while waiting:
         name = waiting.pop()
-        if name not in found:
+        if name not in found and name not in WITHOUT_NUMBERS:
             found.add(name)
             waiting.extend(_imports(name))
     return frozenset(found)
@@ -102,12 +101,12 @@ def _import_closure(module: str) -> frozenset[str]:
 
 @functools.cache
 def _imports(module: str) -> tuple[str, ...]:
-    spec = importlib.util.find_spec(module)
-    if spec is None or spec.origin is None:
+    path = _path_of(module)
+    if path is None or path.suffix != ".py":
         return ()
-    package = module if spec.submodule_search_locations is not None else module.rpartition(".")[0]
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     names: set[str] = set()
-    for node in ast.walk(ast.parse(_source_of(module))):
+    for node in ast.walk(_tree_of(path)):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -127,17 +126,64 @@ def _is_module(name: str) -> bool:
 
 
 @functools.cache
-def _data_of(module: str) -> bytes:
-    """The JSON files beside a module: tables that it computes with."""
+def _path_of(module: str) -> Path | None:
     spec = importlib.util.find_spec(module)
-    if spec is None or spec.origin is None:
-        return b""
-    return b"".join(path.read_bytes() for path in sorted(Path(spec.origin).parent.glob("*.json")))
+    return None if spec is None or spec.origin is None or not Path(spec.origin).is_file() else Path(spec.origin)
 
 
 @functools.cache
-def _source_of(module: str) -> bytes:
-    spec = importlib.util.find_spec(module)
-    if spec is None or spec.origin is None or not Path(spec.origin).is_file():
-        return b""
-    return Path(spec.origin).read_bytes().replace(b"\r\n", b"\n")
+def _tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_bytes())
+
+
+@functools.cache
+def _digest_of(module: str) -> str:
+    """What a module computes with: its code, and the JSON files beside it, tables of constants."""
+    path = _path_of(module)
+    if path is None:
+        return ""
+    code = numerical_code(_tree_of(path)).encode() if path.suffix == ".py" else path.read_bytes()
+    tables = b"".join(table.read_bytes() for table in sorted(path.parent.glob("*.json")))
+    return hashlib.sha256(code + tables).hexdigest()
+
+
+def numerical_code(tree: Any) -> str:
+    """Source as one text in which nothing stands that no number depends on: comments, layout, docstrings (also those
+    of fields), and the words of exceptions that are raised.
+
+    Unlike that of `ast.dump`, it is the same in every version of Python that parses the source to the same tree.
+    """
+    parts: list[str] = []
+    _spell(tree, parts, raised=False)
+    return "".join(parts)
+
+
+def _spell(node: Any, parts: list[str], *, raised: bool) -> None:
+    if raised and isinstance(node, ast.Constant) and isinstance(node.value, str):
+        parts.append("words")
+    elif isinstance(node, ast.AST):
+        raised |= isinstance(node, ast.Raise)
+        parts.append(f"{type(node).__name__}(")
+        for name, value in ast.iter_fields(node):
+            # An empty field is one that another version of Python does not know.
+            if (
+                (value is None and not isinstance(node, ast.Constant))
+                or value == []
+                or name in ("kind", "type_comment")
+            ):
+                continue
+            parts.append(f"{name}=")
+            _spell(value, parts, raised=raised)
+        parts.append(")")
+    elif isinstance(node, list):
+        parts.append("[")
+        for item in node:
+            if not (isinstance(item, ast.Expr) and _is_text(item.value)):
+                _spell(item, parts, raised=raised)
+        parts.append("]")
+    else:
+        parts.append(repr(node))
+
+
+def _is_text(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) and isinstance(node.value, str)

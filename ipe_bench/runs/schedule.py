@@ -21,7 +21,8 @@ from threadpoolctl import threadpool_limits
 
 from ipe_bench.runs.execution.base import FATAL, Execution, Failure
 from ipe_bench.runs.provenance import class_modules, fingerprint
-from ipe_bench.runs.store import Cell, Store
+from ipe_bench.runs.results import Results
+from ipe_bench.runs.store import Cell, Store, describe_names
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import HISTORIES, Block
 
@@ -42,7 +43,7 @@ class Task:
 
     @property
     def trusted(self) -> bool:
-        """Whether it runs nothing but our own code, which neither ends the process nor hangs."""
+        """Whether it runs only code of this package, which neither ends its process nor runs without end."""
         parts = [part for cell in self.cells for part in (cell.scenario, cell.estimator) if part is not None]
         return all(name.startswith("ipe_bench.") for name in class_modules(parts))
 
@@ -77,15 +78,15 @@ class Progress:
 Watcher = Callable[[Progress], None]
 
 
-def plan(store: Store, cells: Sequence[Cell], trials: int, block_size: int) -> list[Task]:
-    """Blocks on a fixed grid, each with the cells that lack some of its trials."""
+def plan(directory: Path, cells: Sequence[Cell], results: Results, trials: int, block_size: int) -> list[Task]:
+    """Blocks on a fixed grid, each with the cells of one scenario that lack some of its trials."""
     lacking: dict[tuple[int, int], list[Cell]] = {}
     for cell in cells:
-        for start, stop in store.missing(cell, trials):
+        for start, stop in results.missing(cell.key, trials):
             edges = [start, *range((start // block_size + 1) * block_size, stop, block_size), stop]
             for edge in itertools.pairwise(edges):
                 lacking.setdefault(edge, []).append(cell)
-    return [Task(store.directory, tuple(cells), *edge) for edge, cells in sorted(lacking.items())]
+    return [Task(directory, tuple(cells), *edge) for edge, cells in sorted(lacking.items())]
 
 
 def perform(task: Task) -> Iterator[Done | str]:
@@ -185,7 +186,7 @@ class Ledger:
         """Notes that a cell of a task is stored, or has failed for good."""
         self.left[id(cell.scenario), task.start, task.stop] -= 1
         self.trials += _weight(task, cell)
-        what = f"{describe_cell(cell)}, trials {task.start} to {task.stop}"
+        what = f"{describe_names(cell.names)}, trials {task.start} to {task.stop}"
         if failure is None:
             self.log.info(f"{what}: stored" + ("" if seconds is None else f" after {seconds:.3g} s"))
         else:
@@ -242,7 +243,7 @@ def work_through(
             culprit, *rest = left
             tries[culprit.key, task.start, task.stop] += 1
             if event.failure.status == "died" and tries[culprit.key, task.start, task.stop] < TRIES:
-                where = f"{describe_cell(culprit)}, trials {task.start} to {task.stop}"
+                where = f"{describe_names(culprit.names)}, trials {task.start} to {task.stop}"
                 log.warning(f"{where}: {event.failure.message}; trying it again")
                 again.append(Task(task.directory, (culprit,), task.start, task.stop))
             else:
@@ -252,12 +253,6 @@ def work_through(
         tasks = again
     log.info(f"done, {len(ledger.failures)} failed")
     return tuple(ledger.failures)
-
-
-def describe_cell(cell: Cell) -> str:
-    """A cell in a line for people."""
-    scenario = cell.scenario
-    return f"{cell.label} on {scenario.measurement.name}, error_scale={scenario.error_scale:g}, seed={scenario.seed}"
 
 
 def _weight(task: Task, cell: Cell) -> int:

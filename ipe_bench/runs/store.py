@@ -1,8 +1,8 @@
-"""Results on disk: one Parquet file per scenario, estimator and block, found again by what was computed.
+"""Results are written here: one Parquet file per scenario, estimator and block, found again by what was computed.
 
-A file's name is a digest of the constructed objects, the versions and the numerical source; how many trials there are
+A file's name is a digest of the constructed objects and of the numerical source; how many trials there are
 and how they were cut into blocks is not part of it, so the results of one key are a union of ranges. A file appears
-under its name complete or not at all.
+under its name complete or not at all. Reading is left to `runs.results`.
 """
 
 from __future__ import annotations
@@ -11,11 +11,10 @@ import contextlib
 import datetime
 import hashlib
 import json
-import logging
 import socket
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -34,8 +33,6 @@ from ipe_bench.runs.execution.base import Failure
 from ipe_bench.runs.provenance import canonical_json, describe, fingerprint
 from ipe_bench.trials.bounds import linear_bound
 from ipe_bench.trials.scenario import Scenario
-
-log = logging.getLogger(__name__)
 
 SCHEMA = 1
 FOOTER = b"ipe_bench"
@@ -60,16 +57,32 @@ class Cell:
 
     @cached_property
     def key(self) -> str:
-        """Sixteen hexadecimal digits that stand for the identity, the schema, the versions and the source."""
-        return _digest({"schema": SCHEMA, "identity": self.identity, **self.made_by})
+        """Sixteen hexadecimal digits that stand for the identity, the schema and the numerical source.
+
+        Not for the version: a release that changes no number leaves what is stored valid.
+        """
+        return _digest({"schema": SCHEMA, "identity": self.identity, "source": self.made_by["source"]})
 
     @cached_property
     def made_by(self) -> dict[str, Any]:
         return fingerprint([self.scenario] if self.estimator is None else [self.scenario, self.estimator])
 
+    @property
+    def names(self) -> dict[str, Any]:
+        """What people call it by."""
+        scenario = self.scenario
+        return {
+            "measurement": scenario.measurement.name,
+            "noise": scenario.noise.name,
+            "prior": scenario.prior.name,
+            "error_scale": scenario.error_scale,
+            "seed": scenario.seed,
+            "estimator": self.label,
+        }
+
     @cached_property
     def footer(self) -> dict[str, Any]:
-        """All that a reader of the file needs to know; see `Footer`."""
+        """All that a reader of the file needs to know."""
         scenario, model = self.scenario, self.scenario.measurement
         return {
             "schema": SCHEMA,
@@ -78,14 +91,7 @@ class Cell:
             "identity_key": _digest(self.identity),
             **self.made_by,
             "libraries": library_versions(),
-            "names": {
-                "measurement": model.name,
-                "noise": scenario.noise.name,
-                "prior": scenario.prior.name,
-                "error_scale": scenario.error_scale,
-                "seed": scenario.seed,
-                "estimator": self.label,
-            },
+            "names": self.names,
             "bound": "bayes" if self.estimator is not None and "prior" in self.estimator.needs else "crlb",
             "equation": None if self.estimator is None else self.estimator.equation,
             "parameters": [describe(p) for p in model.parameters],
@@ -95,61 +101,6 @@ class Cell:
 
 def _digest(value: Any) -> str:
     return hashlib.sha256(canonical_json(value).encode()).hexdigest()[:16]
-
-
-@dataclass(frozen=True)
-class Piece:
-    """One stored file: trials start to stop of the cell with that key."""
-
-    path: Path
-    key: str
-    start: int
-    stop: int
-
-    @classmethod
-    def parse(cls, path: Path) -> Piece | None:
-        """The piece that a file name states; None where the name is not one of ours."""
-        parts = path.stem.split("-")
-        if len(parts) != 3 or not (parts[1].isdigit() and parts[2].isdigit()):
-            return None
-        return cls(path, parts[0], int(parts[1]), int(parts[2]))
-
-    def footer(self) -> dict[str, Any]:
-        """The stored footer.
-
-        Raises:
-            DamagedFile: the file is truncated, or not one of ours.
-        """
-        try:
-            metadata = pq.read_metadata(self.path).metadata or {}
-            return json.loads(metadata[FOOTER])
-        except (pa.ArrowException, OSError, KeyError, ValueError) as error:
-            raise DamagedFile(self.path, error) from error
-
-    def check(self) -> None:
-        """Reads all of it.
-
-        Raises:
-            DamagedFile: it is truncated, not one of ours, or does not hold the rows that its name states.
-        """
-        self.footer()
-        rows = self.table().num_rows
-        if rows != self.stop - self.start:
-            raise DamagedFile(self.path, ValueError(f"{rows} rows"))
-
-    def table(self, columns: Sequence[str] | None = None) -> pa.Table:
-        try:
-            return pq.read_table(self.path, columns=columns)
-        except (pa.ArrowException, OSError) as error:
-            raise DamagedFile(self.path, error) from error
-
-
-class DamagedFile(Exception):
-    """A stored file that cannot be read."""
-
-    def __init__(self, path: Path, reason: Exception) -> None:
-        super().__init__(f"{path}: cannot be read as a result of ipe-bench ({type(reason).__name__})")
-        self.path = path
 
 
 class Store:
@@ -183,33 +134,6 @@ class Store:
                     if time.time() - path.stat().st_mtime > _ABANDONED_S:
                         path.unlink()
 
-    def pieces(self) -> Iterator[Piece]:
-        """All stored files with a name of ours, in order of name."""
-        for path in sorted(self.trials.glob("*.parquet")):
-            piece = Piece.parse(path)
-            if piece is not None:
-                yield piece
-
-    def missing(self, cell: Cell, trials: int) -> list[tuple[int, int]]:
-        """The ranges of trials 0 to `trials` that no stored file of this cell covers."""
-        return gaps([(p.start, p.stop) for p in self._pieces_of(cell)], 0, trials)
-
-    def _pieces_of(self, cell: Cell) -> Iterator[Piece]:
-        for path in self.trials.glob(f"{cell.key}-*.parquet"):
-            piece = Piece.parse(path)
-            if piece is None:
-                continue
-            try:
-                piece.check()
-            except DamagedFile:
-                # Set aside, never deleted: it is computed again under its own name.
-                aside = path.with_suffix(".damaged")
-                with contextlib.suppress(FileNotFoundError):  # another run may have done so at this moment
-                    path.rename(aside)
-                log.warning("%s: is damaged; set aside as %s and computed again", path, aside.name)
-                continue
-            yield piece
-
     def write(self, cell: Cell, start: int, stop: int, columns: Mapping[str, Array]) -> Path:
         """Stores the rows of trials start to stop."""
         path = self._write(self.trials / f"{cell.key}-{start}-{stop}.parquet", cell, columns)
@@ -226,7 +150,7 @@ class Store:
         record = {
             "key": cell.key,
             "identity_key": cell.footer["identity_key"],
-            "names": cell.footer["names"],
+            "names": cell.names,
             "start": start,
             "stop": stop,
             "status": failure.status,
@@ -237,14 +161,6 @@ class Store:
         }
         path = self.failed / f"{cell.key}-{start}-{stop}.json"
         return self._write_json(path, record)
-
-    def failures(self) -> list[dict[str, Any]]:
-        """What could not be computed and has not been computed since; see `write_failure`."""
-        records = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(self.failed.glob("*.json"))]
-        ranges: dict[str, list[tuple[int, int]]] = {}
-        for piece in self.pieces():
-            ranges.setdefault(piece.key, []).append((piece.start, piece.stop))
-        return [r for r in records if gaps(ranges.get(r["key"], []), r["start"], r["stop"])]
 
     def write_history(self, cell: Cell, columns: Mapping[str, Array]) -> Path:
         """Stores the iterates of the first trials."""
@@ -292,3 +208,16 @@ def gaps(covered: Iterable[tuple[int, int]], start: int, stop: int) -> list[tupl
             found.append((reached, first))
         reached = max(reached, last)
     return [*found, (reached, stop)] if reached < stop else found
+
+
+def title(names: Mapping[str, Any]) -> str:
+    """The scenario of a cell in a line for people."""
+    scale = names.get("error_scale")
+    parts = [names.get("measurement"), names.get("noise"), None if scale is None else f"error scale {scale:g}"]
+    return ", ".join(str(part) for part in (*parts, f"seed {names.get('seed')}") if part is not None)
+
+
+def describe_names(names: Mapping[str, Any]) -> str:
+    """A cell in a line for people."""
+    estimator = "the truth" if names.get("estimator") == TRUTH else str(names.get("estimator"))
+    return f"{estimator} on {title(names)}"

@@ -2,6 +2,7 @@
 
 from ipe_bench.estimators.ipe import IPE, State, System
 from ipe_bench.solvers.anderson import Anderson
+from ipe_bench.solvers.auto import Auto
 from ipe_bench.solvers.broyden import Broyden
 from ipe_bench.solvers.damped_newton import DampedNewton
 from ipe_bench.solvers.fixed_point import FixedPoint
@@ -13,6 +14,7 @@ from ipe_bench.solvers.steepest_descent import SteepestDescent
 __all__ = [
     "IPE",
     "Anderson",
+    "Auto",
     "Broyden",
     "DampedNewton",
     "FixedPoint",

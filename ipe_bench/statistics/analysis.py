@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,29 +14,22 @@ import pandas as pd
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.statistics.collect import Collection, Group, collect
-from ipe_bench.statistics.comparisons import (
-    Outcomes,
-    Ranking,
-    capped_error,
-    common,
-    compare_pairs,
-    leaders,
-    rank_over_scenarios,
-)
+from ipe_bench.statistics.comparisons import Outcomes, Ranking, compare_pairs, leaders, rank_over_scenarios
+from ipe_bench.statistics.histories import History, trial_label
 from ipe_bench.statistics.intervals import bootstrap_rms, quantile, quantiles
-from ipe_bench.statistics.profiles import Profiles, distances_to_limit, iterations_to_limit
-from ipe_bench.statistics.summary import Sample, common_trials, identifier, summary_rows, to_frame
-from ipe_bench.statistics.theory import orders_of
+from ipe_bench.statistics.profiles import Profiles
+from ipe_bench.statistics.records import SCORES, rows_of
+from ipe_bench.statistics.sample import Sample, Shared
+from ipe_bench.statistics.summary import summary_rows, to_frame
 
 PROBABILITIES = np.unique(np.concatenate([np.linspace(0, 1, 101), [0.001, 0.005, 0.025, 0.975, 0.995, 0.999]]))
 """Where the distribution of errors is tabulated."""
-NIS = "extra_nis"
-"""Where filters report their normalised innovations squared."""
 
 
 @dataclass(frozen=True)
 class Analysis:
-    """Tables that figures, tables and the page are drawn from. Each starts with the scenario's columns."""
+    """Tidy tables that figures, tables and the page are drawn from. Each starts with the scenario's columns; those of a
+    scenario under an estimator add `scenario`, its number, and `estimator`."""
 
     collection: Collection
     summary: pd.DataFrame
@@ -47,15 +40,17 @@ class Analysis:
     pairs: pd.DataFrame
     """Every pair of estimators on every scenario; see `comparisons.Pair`."""
     scores: pd.DataFrame
-    """Per scenario (numbered) and estimator: capped mean error, whether it leads significantly, and median costs."""
+    """Per scenario and estimator: capped mean error, whether it leads significantly, and median costs."""
     ranking: Ranking | None
-    profiles: Profiles
-    distributions: Mapping[tuple[int, str], Array]
-    """By number of scenario and estimator, the quantiles of the Mahalanobis error at `PROBABILITIES`."""
-    correlations: Mapping[tuple[int, str], Array]
-    """By number of scenario and estimator, the correlation of the parameters' errors over solved trials."""
-    convergence: Mapping[tuple[int, str], list[Array]]
-    """By number of scenario and estimator, each stored trial's distances of iterates from the last, in deviations."""
+    profiles: pd.DataFrame
+    """Estimator, profile (performance or data), `at` (cost ratio or budget) and share, over all scenarios."""
+    distributions: pd.DataFrame
+    """Quantiles of the Mahalanobis error: probability (of `PROBABILITIES`) and distance."""
+    correlations: pd.DataFrame
+    """Of the parameters' errors over solved trials: row, column (both parameters' names) and value."""
+    convergence: pd.DataFrame
+    """Of each converged trial with a stored history: trial, iteration, and the iterate's distance from the last one
+    in deviations of the bound."""
     contraction: pd.DataFrame
     """Per scenario, how much the fixed-point iteration contracts at the truth; empty where no file says so."""
 
@@ -86,93 +81,89 @@ def analyse(directories: Sequence[Path | str]) -> Analysis:
         UserError: a directory does not exist.
     """
     collection = collect(directories)
-    rows: list[dict[str, Any]] = []
-    by_group: list[dict[str, Any]] = []
-    endings: list[dict[str, Any]] = []
-    pairs: list[dict[str, Any]] = []
-    scores: list[dict[str, Any]] = []
-    ranked: list[dict[str, float]] = []
-    profiles = Profiles()
-    distributions: dict[Any, Array] = {}
-    correlations: dict[Any, Array] = {}
-    convergence: dict[Any, list[Array]] = {}
-    contraction: list[dict[str, Any]] = []
-    for number, (scenario, groups) in enumerate(collection.scenarios.items()):
-        solved_by_all = common_trials(collection, groups)
-        outcomes: dict[str, Outcomes] = {}
-        mine: dict[str, dict[str, Any]] = {}
-        n = 1
-        contraction += _contraction_rows(collection, groups[0])
-        for group in groups:
-            sample = Sample.load(collection, group, optional=["message", NIS])
-            if len(sample) == 0:
-                continue
-            n = sample.error.shape[1]
-            rows += summary_rows(sample, solved_by_all)
-            by_group += _group_rows(sample)
-            endings += _ending_rows(sample)
-            where = (number, group.estimator)
-            outcomes[group.estimator] = one = outcomes_of(sample)
-            distributions[where] = quantiles(one.distance, PROBABILITIES)
-            correlations[where] = _correlation(sample)
-            steps = _convergence(collection, group, sample)
-            if steps:
-                convergence[where] = [d for d, _ in steps]
-            mine[group.estimator] = head(group) | {
-                "scenario": number,
-                "capped_error": np.nan,
-                "cost_median": quantile(one.cost, 0.5),
-                "cost_to_limit_median": quantile(np.array([c for _, c in steps]), 0.5),
-                "histories": len(steps),
-                "order_median": quantile(np.array([o[-1] for d, _ in steps if len(o := orders_of(d))]), 0.5),
-            }
-            if NIS in sample.scalars:
-                values = sample.scalars[NIS]
-                mine[group.estimator][NIS] = float(np.mean(values[np.isfinite(values)])) if len(values) else np.nan
-        for label, one in common(outcomes).items():
-            mine[label]["capped_error"] = capped_error(one, n)
-        compared = compare_pairs(outcomes)
-        scored = {label: row["capped_error"] for label, row in mine.items()}
-        ahead = leaders(scored, compared)
-        pairs += [dict(zip(_scenario_names(groups), scenario, strict=True)) | asdict(p) for p in compared]
-        scores += [row | {"leads": label in ahead} for label, row in mine.items()]
-        ranked.append(scored)
-        profiles.add(outcomes)
+    rows = _Rows()
+    for number, groups in enumerate(collection.scenarios.values()):
+        _add_scenario(rows, collection, number, groups)
     return Analysis(
-        collection,
-        to_frame(rows),
-        pd.DataFrame(by_group),
-        pd.DataFrame(endings),
-        pd.DataFrame(pairs),
-        pd.DataFrame(scores),
-        rank_over_scenarios(ranked),
-        profiles,
-        distributions,
-        correlations,
-        convergence,
-        pd.DataFrame(contraction),
+        collection=collection,
+        summary=to_frame(rows.summary),
+        by_group=pd.DataFrame(rows.by_group),
+        endings=pd.DataFrame(rows.endings),
+        pairs=pd.DataFrame(rows.pairs),
+        scores=pd.DataFrame(rows.scores),
+        ranking=rank_over_scenarios(rows.ranked),
+        profiles=rows.profiles.frame(),
+        distributions=_joined(rows.distributions, ("probability", "distance")),
+        correlations=_joined(rows.correlations, ("row", "column", "value")),
+        convergence=_joined(rows.convergence, ("trial", "iteration", "distance")),
+        contraction=pd.DataFrame(rows.contraction),
     )
+
+
+@dataclass
+class _Rows:
+    """What one scenario after another adds to; see `Analysis`."""
+
+    summary: list[dict[str, Any]] = field(default_factory=list)
+    by_group: list[dict[str, Any]] = field(default_factory=list)
+    endings: list[dict[str, Any]] = field(default_factory=list)
+    pairs: list[dict[str, Any]] = field(default_factory=list)
+    scores: list[dict[str, Any]] = field(default_factory=list)
+    contraction: list[dict[str, Any]] = field(default_factory=list)
+    distributions: list[pd.DataFrame] = field(default_factory=list)
+    correlations: list[pd.DataFrame] = field(default_factory=list)
+    convergence: list[pd.DataFrame] = field(default_factory=list)
+    ranked: list[dict[str, float]] = field(default_factory=list)
+    profiles: Profiles = field(default_factory=Profiles)
+
+
+def _joined(parts: Sequence[pd.DataFrame], columns: Sequence[str]) -> pd.DataFrame:
+    if not parts:
+        return pd.DataFrame(columns=["scenario", "estimator", *columns])
+    return pd.concat(parts, ignore_index=True)
+
+
+def _add_scenario(rows: _Rows, collection: Collection, number: int, groups: Sequence[Group]) -> None:
+    shared = Shared.among(collection, groups)
+    outcomes: dict[str, Outcomes] = {}
+    scores: list[dict[str, Any]] = []
+    rows.contraction += _contraction_rows(collection, groups[0])
+    for group in groups:
+        sample = Sample.load(collection, group, shared)
+        if len(sample) == 0:
+            continue
+        where = numbered(group, number)
+        rows.summary += summary_rows(sample)
+        rows.by_group += _group_rows(sample)
+        rows.endings += _ending_rows(sample)
+        scores.append(where | rows_of(SCORES, sample)[-1])
+        outcomes[group.estimator] = outcome = outcomes_of(sample)
+        rows.distributions.append(_distribution(where, outcome))
+        rows.correlations.append(_correlation_rows(where, sample))
+        rows.convergence += [_convergence_rows(where, history) for history in sample.histories]
+    compared = compare_pairs(outcomes)
+    capped = {row["estimator"]: row["capped_error"] for row in scores}
+    ahead = leaders(capped, compared)
+    rows.pairs += [dict(groups[0].columns) | asdict(pair) for pair in compared]
+    rows.scores += [row | {"leads": row["estimator"] in ahead} for row in scores]
+    rows.ranked.append(capped)
+    rows.profiles.add(outcomes)
 
 
 def head(group: Group) -> dict[str, Any]:
     return dict(group.columns) | {"estimator": group.estimator}
 
 
-def _scenario_names(groups: Sequence[Group]) -> list[str]:
-    return list(groups[0].columns)
+def numbered(group: Group, number: int) -> dict[str, Any]:
+    """The columns that a frame of one scenario and estimator starts with."""
+    return dict(group.columns) | {"scenario": number, "estimator": group.estimator}
 
 
 def outcomes_of(sample: Sample) -> Outcomes:
     """What comparisons and profiles need of a sample, by ascending seed and trial."""
-    ids = identifier(sample.ids)
-    distance = np.sqrt(sample.scalars["crlb_distance"])
-    distance[~np.isfinite(distance)] = np.inf
-    cost = sample.cost
-    success = sample.scalars["success"]
-    if np.all(ids[1:] > ids[:-1]):
-        return Outcomes(ids, distance, success, cost)
-    order = np.argsort(ids, kind="stable")
-    return Outcomes(ids[order], distance[order], success[order], cost[order])
+    order = np.argsort(sample.number, kind="stable")
+    values = (sample.number, sample.distance, sample.scalars["success"], sample.cost)
+    return Outcomes(*(v[order] for v in values))
 
 
 def _group_rows(sample: Sample) -> list[dict[str, Any]]:
@@ -216,7 +207,7 @@ def _ending_rows(sample: Sample) -> list[dict[str, Any]]:
         message = "" if messages is None or messages[i] is None else str(messages[i])
         ending = (str(sample.scalars["status"][i]), message)
         counts[ending] += 1
-        first.setdefault(ending, f"seed {sample.ids[i, 0]}, trial {sample.ids[i, 1]}")
+        first.setdefault(ending, trial_label(*sample.ids[i]))
     shown = counts.most_common(MESSAGES)
     rest = sum(counts.values()) - sum(count for _, count in shown)
     result = [
@@ -237,6 +228,17 @@ def _reason(status: str) -> str:
     return reasons.get(status, "")
 
 
+def _distribution(where: dict[str, Any], outcome: Outcomes) -> pd.DataFrame:
+    return pd.DataFrame(where | {"probability": PROBABILITIES, "distance": quantiles(outcome.distance, PROBABILITIES)})
+
+
+def _correlation_rows(where: dict[str, Any], sample: Sample) -> pd.DataFrame:
+    names = [str(p["name"]) for p in sample.parameters]
+    n = len(names)
+    values = _correlation(sample).ravel()
+    return pd.DataFrame(where | {"row": np.repeat(names, n), "column": np.tile(names, n), "value": values})
+
+
 def _correlation(sample: Sample) -> Array:
     """(n, n); NaN where an error does not vary or there are too few trials."""
     used = sample.error[sample.solved]
@@ -251,25 +253,6 @@ def _correlation(sample: Sample) -> Array:
         return covariance / np.outer(deviation, deviation)
 
 
-def _convergence(collection: Collection, group: Group, sample: Sample) -> list[tuple[Array, float]]:
-    """Of each converged trial with a stored history: distances from the last iterate, and the cost of coming close.
-
-    The cost of iterate k is taken as its share (k + 1) / (iterates) of the trial's whole cost.
-    """
-    names = [p["name"] for p in sample.parameters]
-    columns = [f"x_{name}" for name in names]
-    result: list[tuple[Array, float]] = []
-    for cell, _ in group.cells:
-        rows = collection.load_history(cell, [*columns, "iteration"])
-        if rows is None:
-            continue
-        x = np.stack([rows[c] for c in columns], axis=1)
-        for trial in np.unique(rows["trial"]):
-            at = np.flatnonzero((sample.ids[:, 0] == cell.seed) & (sample.ids[:, 1] == trial))
-            history = x[rows["trial"] == trial]
-            if len(at) == 0 or not sample.converged[at[0]] or len(history) < 2:
-                continue
-            distances = distances_to_limit(history, sample.crlb[at[0]])
-            cost = float(sample.cost[at[0]])
-            result.append((distances, cost * (iterations_to_limit(distances) + 1) / len(history)))
-    return result
+def _convergence_rows(where: dict[str, Any], history: History) -> pd.DataFrame:
+    iteration = np.arange(len(history.distances))
+    return pd.DataFrame(where | {"trial": history.trial, "iteration": iteration, "distance": history.distances})

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest, chi2, friedmanchisquare, studentized_range, wilcoxon
+from scipy.stats import binomtest, friedmanchisquare, studentized_range, wilcoxon
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.trials.scoring import GATE
 
 TIE = 1e-3
 """Errors closer than this, in standard deviations, are equal: round-off is never a difference."""
@@ -24,7 +23,7 @@ ALPHA = 0.05
 
 @dataclass(frozen=True)
 class Outcomes:
-    """What comparisons need of one estimator's trials on one scenario."""
+    """What comparisons need of an estimator's trials on one scenario."""
 
     ids: Array
     """(trials,) ascending: one number per (seed, trial)."""
@@ -45,10 +44,10 @@ class Outcomes:
 def common(outcomes: Mapping[str, Outcomes]) -> dict[str, Outcomes]:
     """The outcomes on the trials that every estimator has, in the same order."""
     shared: Array | None = None
-    for one in outcomes.values():
-        if shared is None or not np.array_equal(shared, one.ids):
-            shared = one.ids if shared is None else np.intersect1d(shared, one.ids, assume_unique=True)
-    return {} if shared is None else {label: one.at(shared) for label, one in outcomes.items()}
+    for outcome in outcomes.values():
+        if shared is None or not np.array_equal(shared, outcome.ids):
+            shared = outcome.ids if shared is None else np.intersect1d(shared, outcome.ids, assume_unique=True)
+    return {} if shared is None else {label: outcome.at(shared) for label, outcome in outcomes.items()}
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ class Pair:
     median_difference: float
     """Median of first's error less second's, in standard deviations of the bound."""
     p_error: float
-    """Wilcoxon's signed-rank test of the differences that are no ties, Holm-corrected over the pairs."""
+    """Wilcoxon's signed-rank test of the differences that are not ties, Holm-corrected over the pairs."""
     only_first: int
     """Trials in which the first alone succeeds."""
     only_second: int
@@ -130,14 +129,6 @@ def holm(p: Sequence[float]) -> Array:
     corrected = np.empty(len(values))
     corrected[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
     return corrected
-
-
-def capped_error(one: Outcomes, n: int) -> float:
-    """Mean error of the trials, each at most the radius of the success gate, so that failing badly is failing once."""
-    if len(one.distance) == 0:
-        return float("nan")
-    radius = float(np.sqrt(chi2.isf(GATE, n)))
-    return float(np.minimum(one.distance, radius).mean())
 
 
 def leaders(scores: Mapping[str, float], pairs: Sequence[Pair]) -> set[str]:

@@ -1,7 +1,4 @@
-"""What accuracy costs: performance and data profiles, and the cost of coming close to an estimator's own limit.
-
-The cost of a trial is its number of simulations, a Jacobian counting n; a trial without success costs infinitely much.
-"""
+"""What success costs: performance and data profiles. A trial without success costs infinitely much."""
 
 from __future__ import annotations
 
@@ -9,12 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+import pandas as pd
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.comparisons import Outcomes, common
 
-CLOSE = 0.05
-"""An iterate within this many standard deviations of the last one is as good as the last one."""
 RATIOS = np.unique(np.round(np.geomspace(1, 1000, 181), 6))
 BUDGETS = np.unique(np.round(np.geomspace(1, 100_000, 301)))
 
@@ -29,7 +25,7 @@ class Profiles:
 
     def add(self, outcomes: Mapping[str, Outcomes]) -> None:
         paired = common(outcomes)
-        costs = {label: np.where(one.success, one.cost, np.inf) for label, one in paired.items()}
+        costs = {label: np.where(o.success, o.cost, np.inf) for label, o in paired.items()}
         if not costs:
             return
         best = np.full(len(next(iter(costs.values()))), np.inf)
@@ -56,14 +52,12 @@ class Profiles:
         """Share of trials solved within `BUDGETS` simulations (Moré and Wild, SIAM J. Optim. 20, 2009)."""
         return self.within_budget[label] / max(1, self.trials[label])
 
-
-def distances_to_limit(history: Array, deviation: Array) -> Array:
-    """Largest component of each iterate's (iterates, n) distance from the last one, in standard deviations (n,)."""
-    with np.errstate(invalid="ignore"):
-        return np.abs((history - history[-1]) / deviation).max(axis=1)
-
-
-def iterations_to_limit(distances: Array) -> int:
-    """The first iterate from which on all are within `CLOSE` of the last."""
-    far = np.flatnonzero(~(distances <= CLOSE))
-    return int(far[-1]) + 1 if len(far) else 0
+    def frame(self) -> pd.DataFrame:
+        """Both profiles of every estimator: estimator, profile, `at` (ratio or budget) and share."""
+        parts = [
+            pd.DataFrame({"estimator": label, "profile": profile, "at": at, "share": share(label)})
+            for label in self.trials
+            for profile, at, share in (("performance", RATIOS, self.performance), ("data", BUDGETS, self.data))
+        ]
+        columns = ["estimator", "profile", "at", "share"]
+        return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)

@@ -1,4 +1,5 @@
-"""How much the fixed-point iteration contracts at a point, eq. (15)."""
+"""What the paper's theorems ask of the model at a point: how much fixed-point iteration contracts there, eq. (15), and
+how much Newton's g bends, eq. (23)."""
 
 from __future__ import annotations
 
@@ -6,14 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array, finite
-from ipe_bench.estimators.ipe import FrozenSystem
-from ipe_bench.measurements.problem import Problem
+from ipe_bench.basics.linalg import Array, finite, solve
+from ipe_bench.measurements.base import Measurement
 
 
 @dataclass(frozen=True)
 class Contraction:
-    """How much g(x) = x - F(x) contracts at a point, from g' = I - H+ J. Each is (trials,)."""
+    """How much g(x) = x - F(x) contracts at a point, from g' = I - H+ J. Each is (trials,).
+
+    Lengths are in multiples of the parameters' units; K and the infinity norm depend on the units, the radius does not.
+    """
 
     K: Array
     """n max abs(dg_i/dx_j), eq. (15). Below 1 is sufficient for the fixed-point theorem, and far from necessary."""
@@ -21,15 +24,6 @@ class Contraction:
     """Below 1 in a neighbourhood is sufficient as well, and is never above K."""
     spectral_radius: Array
     """Below 1 is necessary and sufficient for local convergence, and is the asymptotic rate."""
-
-
-def contraction(problem: Problem, x: Array) -> Contraction:
-    """The contraction of the fixed-point iteration at x (trials, n): at the truth, the start or the estimate.
-
-    Lengths are in multiples of the parameters' units; K and the infinity norm depend on the units, the radius does not.
-    """
-    z = np.zeros((len(x), problem.measurement.m))
-    return contraction_of(FrozenSystem.at_nominal(problem, z).J(x))
 
 
 def contraction_of(J_F: Array) -> Contraction:
@@ -43,3 +37,22 @@ def contraction_of(J_F: Array) -> Contraction:
         infinity_norm=size.sum(axis=2).max(axis=1),
         spectral_radius=np.where(bad, np.nan, radius),
     )
+
+
+def curvature(model: Measurement, H_plus: Array, x: Array) -> Array:
+    """M of eq. (23) at x (trials, n): the largest abs(d2 g_i / dx_j dx_k) of Newton's g, where at a root
+    d2g = J_F^-1 d2F, by central differences of J_F = H+ dh/dx, for H+ (1, n, m). (trials,), NaN where J_F is singular.
+    """
+    trials, n = x.shape
+    J_F = np.matmul(H_plus, model.jacobian(x))
+    step = 1e-4 * np.maximum(1.0, np.abs(x))
+    largest = np.zeros(trials)
+    for k in range(n):
+        shift = np.zeros((trials, n))
+        shift[:, k] = step[:, k]
+        rise = np.matmul(H_plus, model.jacobian(x + shift) - model.jacobian(x - shift))
+        second = rise / (2 * step[:, k])[:, None, None]  # d2F_i / dx_j dx_k
+        for j in range(n):
+            bent, _ = solve(J_F, second[:, :, j])
+            largest = np.maximum(largest, np.abs(bent).max(axis=1))
+    return largest

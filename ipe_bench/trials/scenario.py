@@ -74,13 +74,13 @@ class Scenario:
         """What the estimators are told."""
         if self.noise.real:
             return recorded_problem(self.measurement)
-        model = self.measurement.suited_to(self.error_scale)
+        model = self.measurement
         return Problem(model, self.noise.covariance(model.m), self.prior.deviation(model.n, self.error_scale))
 
     @cached_property
     def simulator(self) -> Measurement:
         """The model that the readings come from."""
-        return self.problem.measurement if self.truth is None else self.truth.suited_to(self.error_scale)
+        return self.measurement if self.truth is None else self.truth
 
     def draw(self, start: int, stop: int) -> Trials:
         """Trials start to stop. Trial t has random streams of its own, so it is the same in whatever block it is drawn.

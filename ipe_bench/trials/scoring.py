@@ -13,21 +13,31 @@ import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, Mask, deviations, information, inverse, pseudo_inverse, quadratic_form, solve
+from ipe_bench.basics.linalg import (
+    Array,
+    Mask,
+    deviations,
+    information,
+    inverse,
+    multiply,
+    pseudo_inverse,
+    quadratic_form,
+    solve,
+)
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Equation, Estimates, Estimator, estimate_safely
 from ipe_bench.measurements.counted import Counted
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.trials.contraction import contraction_of
+from ipe_bench.trials.contraction import contraction_of, curvature
 from ipe_bench.trials.roots import frozen_root, least_squares_root
 from ipe_bench.trials.scenario import Scenario, Trials
+from ipe_bench.trials.thresholds import GATE, SAME_ROOT
 
-GATE = 1e-6
-"""A success lies inside the ellipsoid that all but this share of efficient estimates lie in."""
-SAME_ROOT = 1e-3
-"""Two roots closer than this, in standard deviations of the Cramér-Rao bound, are one."""
 HISTORIES = 20
 """Trials whose iterates are kept: the first ones of a scenario."""
+
+CURVED = 5
+"""Trials in which M of eq. (23) is computed, which takes 2 n Jacobians each: the first ones of a scenario."""
 
 Columns = dict[str, Array]
 
@@ -72,7 +82,8 @@ class Block:
         return deviations(inverse(self.crlb_information)[0])
 
     def truth_columns(self) -> Columns:
-        """The truth and its bounds, in multiples of the parameters' units, and the contraction of eq. (15) there."""
+        """The truth and its bounds, in multiples of the parameters' units, what the noise alone makes of the linear
+        estimate, and what the paper's theorems ask of the model there."""
         names = [p.name for p in self.problem.measurement.parameters]
         bayes = deviations(inverse(self.bayes_information)[0])
         H_plus, _ = pseudo_inverse(self.problem.H[None], self.problem.R)
@@ -82,10 +93,25 @@ class Block:
             **_by_parameter("x", names, self.trials.x),
             **_by_parameter("crlb", names, self.crlb_deviation),
             **_by_parameter("bayes", names, bayes),
+            **_by_parameter("linear_error", names, multiply(H_plus, self.trials.z - self.readings_at(self.trials.x))),
             "contraction_K": contracts.K,
             "contraction_norm": contracts.infinity_norm,
             "contraction_radius": contracts.spectral_radius,
+            "curvature_M": self._curvature(H_plus),
         }
+
+    def readings_at(self, x: Array) -> Array:
+        """h(x) (trials, m) for x (trials, n); NaN where the model fails."""
+        return Counted.uncounted(self.problem.measurement, len(x)).simulate(x, np.arange(len(x)))
+
+    def _curvature(self, H_plus: Array) -> Array:
+        """M of eq. (23) at the truth, for the first trials and NaN for the others."""
+        kept = max(0, min(CURVED, self.trials.stop) - self.trials.start)
+        M = np.full(len(self.trials.x), np.nan)
+        if kept and np.isfinite(H_plus).all():
+            with np.errstate(all="ignore"):
+                M[:kept] = curvature(self.problem.measurement, H_plus, self.trials.x[:kept])
+        return M
 
     @cached_property
     def _roots(self) -> dict[tuple[Equation, float], Array]:
@@ -112,9 +138,9 @@ class Block:
     def _fit_probability(self, x: Array) -> Array:
         """The chi-square test of the residuals at x (trials, n): the chance of ones at least this large if the model
         and R are right; NaN where there are none. It needs no truth, so whoever estimates can ask for it too."""
-        model = Counted.uncounted(self.problem.measurement, len(x))
-        r = self.problem.R.whiten(self.trials.z - model.simulate(x, np.arange(len(x))))
-        return chdtrc(model.measurement.m - model.measurement.n, np.sum(r**2, axis=1))
+        model = self.problem.measurement
+        r = self.problem.R.whiten(self.trials.z - self.readings_at(x))
+        return chdtrc(model.m - model.n, np.sum(r**2, axis=1))
 
     def score(self, estimator: Estimator, estimates: Estimates) -> Columns:
         """Each trial's error, cost, status and distances, as columns."""
@@ -125,12 +151,13 @@ class Block:
         bound = self.bayes_information if "prior" in estimator.needs else self.crlb_information
         distance = quadratic_form(bound, error)
         solved = converged & np.isfinite(error).all(axis=1)
+        apart = np.full(len(error), np.nan)
         if estimator.equation is not None:
             # An estimator that scales its prior solves an equation of its own.
             inflation = getattr(estimator, "prior_inflation", 1.0) if estimator.equation == "map" else 1.0
             root = self.reference_root(estimator.equation, inflation)
-            apart = np.abs(estimates.x - root) / self.crlb_deviation
-            solved &= apart.max(axis=1) <= SAME_ROOT
+            apart = (np.abs(estimates.x - root) / self.crlb_deviation).max(axis=1)
+            solved &= apart <= SAME_ROOT
         trials = len(error)
         P = estimates.covariance
         squared = np.full(trials, np.nan) if P is None else nees(error, P)
@@ -148,6 +175,7 @@ class Block:
             "crlb_distance": quadratic_form(self.crlb_information, error),
             "nees": squared,
             "fit_p": self._fit_probability(estimates.x),
+            "root_distance": apart,
             "solved": solved,
             "success": np.isfinite(distance) & (distance <= chdtri(model.n, GATE)),
             **{f"extra_{name}": values for name, values in estimates.extras.items()},
@@ -158,7 +186,7 @@ def nees(error: Array, P: Array) -> Array:
     """The normalised estimation error squared e' P^-1 e of each trial (trials,): chi-square with n degrees where the
     reported P is right.
 
-    error (trials, n) and P (trials, n, n). Infinite where P is no covariance (not positive definite) or the error is
+    error (trials, n) and P (trials, n, n). Infinite where P is not a covariance (not positive definite) or the error is
     not finite; NaN where no P is reported.
     """
     reported = np.isfinite(P).all(axis=(1, 2))

@@ -49,7 +49,7 @@ def one_thread(monkeypatch):
 
 @pytest.fixture(scope="module")
 def trials():
-    model = LotkaVolterra()
+    model = LotkaVolterra(step=0.125)
     x = model.nominal + np.random.default_rng(0).normal(size=(TRIALS, 6))
     return model, x
 

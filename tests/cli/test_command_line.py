@@ -107,6 +107,11 @@ MISTAKES = {
     "added key": (["run", "+trails=3"], "did you mean trials?"),
     "unknown command": (["rum"], "did you mean run?"),
     "unknown group": (["list", "solvers"], "did you mean solver?"),
+    "unknown flag": (["list", "--verbos"], "list: --verbos: there is no such flag; did you mean --verbose?"),
+    "unknown flag of all": (["--versio"], "did you mean --version?"),
+    "flag of another command": (["estimate", "-m"], "estimate: -m: there is no such flag"),
+    "word too many": (["new", "solver", "a", "b"], "new: b: is a word too many"),
+    "word too few": (["new", "solver"], "new: the following arguments are required: NAME"),
     "no directory": (["report", "nowhere"], "holds no results"),
     "no readings": (["estimate"], "readings: is not given"),
     "absent readings": (["estimate", "readings=absent.csv"], "absent.csv: there is no such file"),
@@ -185,7 +190,8 @@ LOADED = """
 import sys
 from ipe_bench.cli.main import main
 main(["--help"])
-print(sorted(m for m in ("pandas", "seaborn", "filterpy", "numba", "hydra") if m in sys.modules))
+main(["list", "--help"])
+print(sorted(m for m in ("pandas", "seaborn", "filterpy", "numba", "hydra", "numpy", "rich") if m in sys.modules))
 """
 
 
@@ -285,3 +291,20 @@ def test_every_command_has_help(tmp_path, monkeypatch, capsys, command):
     monkeypatch.chdir(tmp_path)
     assert main([command, "--help"]) == 0
     assert f"ipe-bench {command}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("words", [[], ["help"], ["-h"]])
+def test_the_bare_program_says_what_there_is(capsys, words):
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    for command in ("run", "estimate", "report", "status", "list", "new", "check"):
+        assert f"\n    {command} " in text
+
+
+def test_flags_stand_anywhere_among_the_words_of_a_command(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    texts = []
+    for words in (["solver", "noise", "-v"], ["solver", "-v", "noise"], ["--verbose", "solver", "noise"]):
+        assert main(["list", *words]) == 0
+        texts.append(capsys.readouterr().out)
+    assert texts[0] == texts[1] == texts[2] != ""

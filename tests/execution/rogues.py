@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,6 +64,11 @@ def square(task):
     yield from (task * i for i in range(3))
     if task == 2:
         raise ValueError("two\nis refused")
+
+
+def leave_a_child(task):
+    yield subprocess.Popen(["sleep", "3600"]).pid
+    time.sleep(3600)
 
 
 def doze(task):

@@ -23,9 +23,8 @@ from ipe_bench.basics.errors import StorageError, UserError  # noqa: F401
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.runs.execution import Auto, Dask, Event, Failure, Processes, Serial
-from ipe_bench.runs.store import Store
+from ipe_bench.runs.results import Results
 from ipe_bench.solvers import Newton
-from ipe_bench.statistics.inventory import take_inventory
 
 GOOD = {"linear_lse": LinearLSE(), "newton": Newton()}
 
@@ -37,11 +36,12 @@ def scenario(**changes) -> Scenario:
 def stored(directory: Path) -> dict[str, np.ndarray]:
     """Every number that a run stored, timings aside, by file and column."""
     numbers = {}
-    for piece in Store(directory).pieces():
-        table = piece.table()
-        for name in table.column_names:
-            if name != "time_s":
-                numbers[f"{piece.path.name}:{name}"] = table[name].to_numpy()
+    for cell in Results.read([directory]).stored.values():
+        for piece in cell.pieces:
+            _, table = piece.read()
+            for name in table.column_names:
+                if name != "time_s":
+                    numbers[f"{piece.path.name}:{name}"] = table[name].to_numpy()
     return numbers
 
 
@@ -94,7 +94,7 @@ def test_a_run_completes_when_a_worker_is_killed(tmp_path, reference, execution)
     assert (tmp_path / "killed").exists()
     there = stored(tmp_path)
     assert_same({name: there[name] for name in reference}, reference)
-    assert take_inventory(tmp_path).complete
+    assert Results.read([tmp_path]).problems == []
 
 
 @pytest.mark.parametrize(
@@ -117,24 +117,25 @@ def test_one_estimator_that_fails_loses_nothing_but_itself(tmp_path, reference, 
     assert message in failure
     assert "rogue" in failure
     assert_same(stored(tmp_path), {name: values for name, values in reference.items() if "-0-10." in name})
-    rogue = next(cell for cell in take_inventory(tmp_path).cells if cell.names["estimator"] == "rogue")
+    rogue = next(cell for cell in Results.read([tmp_path]).cells if cell.names["estimator"] == "rogue")
     assert (rogue.done, rogue.failed, rogue.missing) == (0, 10, 0)
 
 
 def test_an_exception_in_an_estimator_is_a_status_and_no_failure(tmp_path):
     assert compute([scenario()], {"rogue": Rogue("raise")}, 5, tmp_path, execution=Processes(1)) == ()
-    table = next(p.table() for p in Store(tmp_path).pieces() if "status" in p.table().column_names)
-    assert set(table["status"].to_pylist()) == {"error"}
-    assert set(table["message"].to_pylist()) == {"ArithmeticError: rogue"}
+    results = Results.read([tmp_path])
+    rows = results.load(next(cell for cell in results.stored.values() if cell.label == "rogue"), None)
+    assert set(rows["status"]) == {"error"}
+    assert set(rows["message"]) == {"ArithmeticError: rogue"}
 
 
 def test_what_failed_is_tried_again_by_the_next_run(tmp_path):
     estimators = {"rogue": Rogue("exit", until=str(tmp_path / "repaired"))}
     assert len(compute([scenario()], estimators, 10, tmp_path, execution=Processes(1))) == 1
-    assert len(Store(tmp_path).failures()) == 1
+    assert len(Results.read([tmp_path]).failures) == 1
     (tmp_path / "repaired").touch()
     assert compute([scenario()], estimators, 10, tmp_path, execution=Processes(1)) == ()
-    assert Store(tmp_path).failures() == []
+    assert Results.read([tmp_path]).failures == ()
     assert list((tmp_path / "failed").iterdir()) == []
 
 
@@ -192,6 +193,36 @@ def test_stopping_a_run_ends_its_workers():
     assert gone_within(5, pid)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="ends sessions with POSIX means")
+def test_what_an_estimator_started_ends_with_its_worker():
+    # The first step has a minute in any case, for loading compiled code; those after it have what was asked for.
+    events = list(Processes(1, block_timeout_s=0.3).run(rogues.leave_a_child, [0]))
+    assert events[-1].failure is not None
+    assert events[-1].failure.status == "timeout"
+    assert gone_within(5, events[0].step)
+
+
+def test_a_worker_that_dies_between_two_runs_is_replaced():
+    pids = []
+    for _ in range(2):
+        events = list(Processes(1).run(rogues.surroundings, [0]))
+        assert events[-1].failure is None
+        pids.append(events[0].step[0])
+        os.kill(pids[-1], signal.SIGTERM)
+        gone_within(5, pids[-1])
+    assert pids[0] != pids[1]
+
+
+def test_a_script_needs_no_guard_against_being_imported_by_its_workers(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import rogues\nfrom ipe_bench.runs.execution import Processes\nprint('begins')\n"
+        "print([event.step for event in Processes(2).run(rogues.square, [1]) if not event.ended])\n"
+    )
+    ran = subprocess.run([sys.executable, script], env=environment(), capture_output=True, text=True, check=True)
+    assert ran.stdout.splitlines() == ["begins", "[0, 1, 2]"]
+
+
 def test_workers_end_when_their_parent_is_killed(tmp_path):
     code = "import rogues; from ipe_bench.runs.execution import Processes\n"
     code += "for event in Processes(1).run(rogues.doze, [0]): print(event.step, flush=True)"
@@ -228,8 +259,7 @@ except StorageError as error:
     sys.exit(42)
 """
     assert subprocess.run([sys.executable, "-c", code], env=environment(), check=False).returncode == 42
-    for piece in Store(tmp_path).pieces():
-        piece.table()
+    assert not Results.read([tmp_path]).damaged
     assert [path for path in tmp_path.rglob("*") if path.suffix == ".tmp"] == []
 
 
@@ -239,6 +269,7 @@ except StorageError as error:
         ({"workers": 0}, "workers=0"),
         ({"block_timeout_s": 0.0}, "block_timeout_s"),
         ({"memory_limit_gb": -1.0}, "memory"),
+        ({"memory_limit_gb": float("inf")}, "memory"),
     ],
 )
 @pytest.mark.parametrize("kind", [Processes, Dask])
@@ -254,7 +285,7 @@ def test_source_that_changed_since_the_run_began_is_not_mixed_in(tmp_path, monke
     failures = compute([scenario()], {"linear_lse": LinearLSE()}, 10, tmp_path, execution=Serial())
     assert len(failures) == 2
     assert "numerical source" in failures[0]
-    assert list(Store(tmp_path).pieces()) == []
+    assert not Results.read([tmp_path]).stored
 
 
 @pytest.mark.slow
@@ -268,7 +299,7 @@ assert compute([scenario()], GOOD, 40, {str(tmp_path)!r}, execution=Processes(2)
     runs = [subprocess.Popen([sys.executable, "-c", code], env=environment()) for _ in range(2)]
     assert [one.wait() for one in runs] == [0, 0]
     assert_same(stored(tmp_path), reference)
-    assert take_inventory(tmp_path).complete
+    assert Results.read([tmp_path]).problems == []
 
 
 @pytest.mark.slow

@@ -18,8 +18,8 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.cli.status import main as status
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
-from ipe_bench.runs.store import Store, gaps
-from ipe_bench.statistics.inventory import take_inventory
+from ipe_bench.runs.results import Results, require_results
+from ipe_bench.runs.store import gaps
 
 SCENARIO = Scenario(Bent(0.02), Gaussian(0.1), GaussianPrior(), 1.0)
 ESTIMATORS = {"linear_lse": LinearLSE()}
@@ -39,9 +39,9 @@ def test_gaps_are_what_no_range_holds(covered, start, length):
 
 def test_a_complete_run_is_complete(tmp_path, capsys):
     compute([SCENARIO], ESTIMATORS, 20, tmp_path, block_size=10)
-    inventory = take_inventory(tmp_path)
-    assert inventory.complete
-    assert [(c.names["estimator"], c.expected, c.done) for c in inventory.cells] == [
+    results = Results.read([tmp_path])
+    assert results.problems == []
+    assert [(c.names["estimator"], c.expected, c.done) for c in results.cells] == [
         ("truth", 20, 20),
         ("linear_lse", 20, 20),
     ]
@@ -51,17 +51,17 @@ def test_a_complete_run_is_complete(tmp_path, capsys):
 
 def test_a_block_that_is_gone_is_missing_and_a_cut_one_is_damaged(tmp_path, capsys):
     compute([SCENARIO], ESTIMATORS, 30, tmp_path, block_size=10)
-    gone, cut, *_ = sorted(Store(tmp_path).pieces(), key=lambda p: (p.key, p.start))
-    gone.path.unlink()
-    cut.path.write_bytes(cut.path.read_bytes()[:100])
-    inventory = take_inventory(tmp_path)
-    assert inventory.damaged == (cut.path,)
-    assert sorted((c.done, c.missing, c.failed) for c in inventory.cells) == [(10, 20, 0), (30, 0, 0)]
+    gone, cut, *_ = sorted((tmp_path / "trials").glob("*.parquet"))
+    gone.unlink()
+    cut.write_bytes(cut.read_bytes()[:100])
+    results = Results.read([tmp_path])
+    assert list(results.damaged) == [cut]
+    assert sorted((c.done, c.missing, c.failed) for c in results.cells) == [(10, 20, 0), (30, 0, 0)]
     assert status([str(tmp_path)]) == 1
     assert "damaged" in capsys.readouterr().out
     compute([SCENARIO], ESTIMATORS, 30, tmp_path, block_size=10)
-    assert take_inventory(tmp_path).complete
-    assert cut.path.with_suffix(".damaged").exists()
+    assert Results.read([tmp_path]).problems == []
+    assert cut.with_suffix(".damaged").exists()
 
 
 def test_results_of_other_source_are_stale_and_not_done(tmp_path, monkeypatch):
@@ -71,9 +71,9 @@ def test_results_of_other_source_are_stale_and_not_done(tmp_path, monkeypatch):
     monkeypatch.setattr("ipe_bench.runs.store.fingerprint", changed)
     monkeypatch.setattr("ipe_bench.runs.schedule.fingerprint", changed)
     compute([dataclasses.replace(SCENARIO)], ESTIMATORS, 10, tmp_path)
-    assert [(c.expected, c.done, c.stale) for c in take_inventory(tmp_path).cells] == [(10, 10, 20), (10, 10, 20)]
+    assert [(c.expected, c.done, c.stale) for c in Results.read([tmp_path]).cells] == [(10, 10, 20), (10, 10, 20)]
 
 
 def test_a_folder_without_results_is_a_mistake(tmp_path):
     with pytest.raises(UserError, match="holds no results"):
-        take_inventory(tmp_path)
+        require_results([tmp_path])

@@ -1,12 +1,16 @@
 """The gimballed INS: closed forms, other integrators, and the reference values of its linear bound."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from gins_reference import velocities
 from scipy.integrate import DOP853, solve_ivp
 
 from ipe_bench.measurements import Gins
+from ipe_bench.measurements.base import Restricted
+from ipe_bench.measurements.ode.levels import Search
 
 STEP = 0.075 * 0.3048
 LINEAR_BOUND = [
@@ -16,7 +20,7 @@ LINEAR_BOUND = [
 
 @pytest.fixture(scope="module")
 def gins():
-    return Gins().suited_to(100.0)
+    return Gins()
 
 
 def draw(scale, trials=2, seed=0):
@@ -51,7 +55,7 @@ def test_an_injected_velocity_swings_likewise():
 
 @pytest.mark.parametrize("scale", [1.0, 33.0, 100.0])
 def test_readings_agree_with_an_adaptive_integrator(scale):
-    model = Gins().suited_to(scale)
+    model = Gins()
     x = draw(scale, 1, seed=int(scale))
     z = model.simulate(x).reshape(4, 30, 2)
     for p, sign in ((list(x[0] * model.si_sizes), 1.0), ([0.0] * 11, -1.0)):
@@ -69,12 +73,117 @@ def test_readings_agree_with_an_adaptive_integrator(scale):
     assert np.abs(z[:2]).max() < 1e-6
 
 
-@pytest.mark.parametrize("scale", [300.0, 600.0, 1000.0, 2000.0])
-def test_the_step_keeps_its_promise_at_large_errors(scale):
-    model = Gins().suited_to(scale)
-    x = draw(scale, 100, seed=5)
-    finer = replace(model, step=model.step / 3)
-    assert np.abs(model.simulate(x) - finer.simulate(x)).max() < 1e-6
+def errors_beside_scipy(scale, trials):
+    x = draw(scale, trials, seed=int(scale))
+    reference = np.concatenate([velocities(x[i : i + 10]) for i in range(0, trials, 10)])
+    # The model is not told the scale: the step follows from each x.
+    return np.abs(Gins().simulate(x) - (reference - velocities(np.zeros((1, 11))))).max(axis=1)
+
+
+@pytest.mark.parametrize("scale", [300.0, 3000.0])
+def test_every_step_keeps_its_promise_whatever_the_scale(scale):
+    assert errors_beside_scipy(scale, 4).max() < 1e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scale", "limit"), [(300.0, 1e-6), (1000.0, 1e-6), (3000.0, 1e-6), (10000.0, 2e-6)])
+def test_every_step_keeps_its_promise_in_many_trials(scale, limit):
+    assert errors_beside_scipy(scale, 60).max() < limit
+
+
+def lopsided(trials, seed):
+    """Draws in which few parameters dominate, which a bound from their sizes alone would judge wrongly."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(3, trials, 11))
+    x[0] *= rng.random((trials, 11)) < 0.2
+    x[1] *= np.arange(11) < 4
+    x[2] *= np.arange(11) == rng.integers(0, 11, (trials, 1))
+    return x.reshape(-1, 11)
+
+
+@pytest.mark.parametrize("scale", [100.0, 300.0, 1000.0, 5000.0])
+def test_every_step_keeps_its_promise_where_few_parameters_dominate(scale):
+    x = scale * lopsided(40, seed=4)
+    assert np.abs(Gins().simulate(x) - Gins(step=3.75).simulate(x)).max() < 1e-6
+
+
+def test_trials_that_are_trusted_without_a_test_keep_it_too():
+    """Scaled to the rate up to which nothing is tested, and there the coarsest steps are taken."""
+    x, model = lopsided(150, seed=6), Gins()
+    low, high = np.zeros(len(x)), np.full(len(x), 1e6)
+    for _ in range(60):
+        middle = (low + high) / 2
+        fits = model._rates(middle[:, None] * x)[0] * model._longest <= model.trusted_angle
+        low, high = np.where(fits, middle, low), np.where(fits, high, middle)
+    x = low[:, None] * x
+    assert (model.simulate(x) == Gins(step=180.0).simulate(x)).all()
+    assert np.abs(model.simulate(x) - Gins(step=10.0).simulate(x)).max() < 1e-7
+
+
+def test_other_experiments_are_not_trusted_untested():
+    assert Gins().trusted_angle > 0
+    assert Gins(readings_per_case=60).trusted_angle == 0
+    assert Gins(interval_min=1.0).trusted_angle == 0
+    long = Gins(interval_min=30.0, readings_per_case=6)
+    x = draw(1000.0, 20, seed=8)
+    assert np.abs(long.simulate(x) - replace(long, step=5.0).simulate(x)).max() < 1e-6
+
+
+def test_bits_of_a_trial_depend_on_itself_alone_where_steps_differ(monkeypatch):
+    """In one batch of several levels, alone, in another order, up to a stop, and after other calls or none."""
+    x = np.concatenate([draw(scale, 8, seed=9) for scale in (33.0, 1000.0, 3000.0, 10000.0)])
+    model = Gins()
+    z, J = model.simulate(x), model.jacobian(x)
+    assert len(set(model._search(x, model.offset).places.tolist())) >= 5
+    for threads in ("1", "2"):
+        monkeypatch.setenv("IPE_BENCH_THREADS", threads)
+        assert (Gins().jacobian(x[::-1]) == J[::-1]).all()
+        assert (Gins().simulate(x[::-1]) == z[::-1]).all()
+        assert (np.concatenate([Gins().simulate(row[None]) for row in x]) == z).all()
+        assert (np.concatenate([Gins().jacobian(row[None]) for row in x]) == J).all()
+    rows = model.rows(11)
+    for fresh in (model, Gins()):
+        assert (fresh.simulate_until(x, 11) == z[:, rows]).all()
+        assert (fresh.jacobian_until(x, 11) == J[:, rows]).all()
+
+
+def test_the_jacobian_takes_the_steps_of_the_simulation():
+    x, model = draw(3000.0, 6, seed=10), Gins()
+    for row in x:
+        z = model.simulate(row[None])
+        level = model._ladder[model._search(row[None], model.offset).places[0]]
+        fixed = Gins(step=180.0 / level)
+        assert (model.jacobian(row[None]) == fixed.jacobian(row[None])).all()
+        np.testing.assert_allclose(z, fixed.simulate(row[None]), atol=1e-8)
+
+
+def test_one_search_serves_a_simulation_and_the_jacobian_at_the_same_point(monkeypatch):
+    searches = []
+    run = Search.run
+    monkeypatch.setattr(Search, "run", lambda self, start: searches.append(len(start)) or run(self, start))
+    model, x = Gins(), draw(3000.0, 7, seed=11)
+    model.simulate(x)
+    model.jacobian(x[2:])
+    model.simulate_until(x[:5], 3)
+    assert searches == [7]
+
+
+@pytest.mark.parametrize("scale", [1e5, 1e7, 1e12, np.inf, np.nan])
+def test_what_diverges_costs_no_more_than_the_shortest_step(scale):
+    x = np.concatenate([scale * np.ones((2, 11)), draw(33.0, 2)])
+    model = Gins()
+    z = model.simulate(x)
+    assert (model._ladder[model._search(x, model.offset).places] <= 64).all()
+    assert (z[2:] == model.simulate(x[2:])).all()
+    assert model.jacobian(x).shape == (4, 240, 11)
+
+
+def test_a_model_knows_the_same_after_a_copy():
+    model, x = Gins(), draw(3000.0, 3)
+    z = model.simulate(x)
+    copy = pickle.loads(pickle.dumps(model))
+    assert copy == model
+    assert (copy.simulate(x) == z).all()
 
 
 def test_the_jacobian_is_that_of_the_same_formula_in_complex_arithmetic(gins):
@@ -91,6 +200,58 @@ def test_the_jacobian_is_that_of_the_same_formula_in_complex_arithmetic(gins):
             y = y + 180.0 * sum(DOP853.B[s] * slopes[s] for s in range(12))
             exact = y[:2].imag / 1e-100
             assert np.abs(J[k, i] - exact).max() < 1e-9 * np.abs(exact).max()
+
+
+class Plain(Gins):
+    """Without its equations of small deviations: the tangents of the whole state."""
+
+    variation = None
+
+
+@pytest.mark.parametrize("scale", [1.0, 33.0, 300.0, 3000.0])
+def test_eight_deviations_say_what_eleven_tangents_say(scale):
+    """To the error that the integration leaves in either."""
+    x = draw(scale, 10, seed=12)
+    exact, reduced = Plain().jacobian(x), Gins().jacobian(x)
+    assert (np.abs(reduced - exact) / np.abs(exact).max(axis=1, keepdims=True)).max() < 1e-9
+
+
+def test_a_jacobian_costs_what_the_kernel_computes():
+    """Eight deviations in eleven directions, beside eleven states: operations counted, not time."""
+    assert 10.5 < Gins().jacobian_cost < 11.5
+    assert Plain().jacobian_cost > 1.3 * Gins().jacobian_cost
+    assert Gins().coarse_jacobian_cost < 3.0
+    assert Restricted.until(Gins(), 5).jacobian_cost == Gins().jacobian_cost
+    assert Gins(step=60.0).coarse_jacobian_cost == Gins().jacobian_cost
+
+
+@pytest.mark.parametrize("scale", [33.0, 300.0, 1000.0, 3000.0])
+def test_steps_with_a_coarse_jacobian_contract(scale):
+    model, x = Gins(), draw(scale, 40, seed=13)
+    J, coarse = model.jacobian(x), model.coarse_jacobian(x)
+    left = [np.linalg.norm(np.eye(11) - np.linalg.pinv(c) @ j, 2) for c, j in zip(coarse, J, strict=True)]
+    assert max(left) < 0.01
+
+
+def test_bits_of_a_coarse_jacobian_depend_on_the_trial_alone():
+    x = np.concatenate([draw(scale, 5, seed=14) for scale in (33.0, 1000.0, 3000.0)])
+    model = Gins()
+    coarse = model.coarse_jacobian(x)
+    assert not (coarse == model.jacobian(x)).all(axis=(1, 2)).any()
+    assert (np.concatenate([Gins().coarse_jacobian(row[None]) for row in x]) == coarse).all()
+    assert (Gins().coarse_jacobian(x[::-1]) == coarse[::-1]).all()
+    assert (Gins().coarse_jacobian_until(x, 4) == coarse[:, model.rows(4)]).all()
+    assert (Restricted.until(model, 4).coarse_jacobian(x) == coarse[:, model.rows(4)]).all()
+
+
+def test_parameters_are_taken_in_any_layout_and_left_alone():
+    model, x = Gins(), draw(33.0, 5)
+    z, J = model.simulate(x), model.jacobian(x)
+    locked, strided = x.copy(), np.asfortranarray(np.repeat(x, 2, axis=0))[::2]
+    locked.flags.writeable = False
+    for same in (locked, strided):
+        assert (model.simulate(same) == z).all()
+        assert (model.jacobian(same) == J).all()
 
 
 def test_the_linear_bound_is_the_reference(gins):

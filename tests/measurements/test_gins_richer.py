@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from gins_reference import velocities
 
 from ipe_bench.baselines import GaussNewton
 from ipe_bench.basics.errors import UserError
@@ -22,7 +23,7 @@ def scenario(scale: float = 33.0, **errors: float) -> Scenario:
 
 
 def test_without_its_errors_it_is_gins():
-    model, rich = Gins().suited_to(33.0), RicherGins().suited_to(33.0)
+    model, rich = Gins(), RicherGins()
     x = 33.0 * np.random.default_rng(0).normal(size=(3, 11))
     z = rich.simulate(np.pad(x, ((0, 0), (0, len(rich.nuisance_deviation)))))
     np.testing.assert_allclose(z, model.simulate(x), atol=1e-9)
@@ -31,7 +32,7 @@ def test_without_its_errors_it_is_gins():
 
 def test_a_constant_walk_is_a_drift():
     """An increment at the start of a case and none after it is that drift in this case."""
-    model, rich = Gins().suited_to(33.0), RicherGins().suited_to(33.0)
+    model, rich = Gins(), RicherGins()
     extra = np.zeros((1, len(rich.nuisance_deviation)))
     walk = extra[:, 7:].reshape(4, 30, 3)
     walk[:, 0, 1] = 5.0 * model.si_sizes[5]
@@ -39,6 +40,19 @@ def test_a_constant_walk_is_a_drift():
     drift = np.zeros((1, 11))
     drift[0, 5] = 5.0
     np.testing.assert_allclose(z, model.simulate(drift), atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [33.0, 3000.0])
+def test_a_random_walk_keeps_the_tolerance_of_gins(scale):
+    """Beside SciPy, from reading to reading."""
+    rich = RicherGins(gyro_random_walk=0.05)
+    rng = np.random.default_rng(5)
+    increments = rich.nuisance_deviation * rng.normal(size=367)
+    x = np.concatenate([scale * rng.normal(size=11), increments])[None]
+    walk = np.cumsum(increments[7:].reshape(1, 4, 30, 3), axis=2)
+    reference = velocities(x[:, :11], walk) - velocities(np.zeros((1, 11)))
+    assert np.abs(rich.simulate(x) - reference).max() < 1e-6
+    assert (rich.simulate_until(x, 7) == rich.simulate(x)[:, rich.rows(7)]).all()
 
 
 def test_a_finer_step_changes_nothing_to_a_micrometre_per_second():

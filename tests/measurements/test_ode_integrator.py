@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 from scipy.integrate import DOP853
 
-from ipe_bench.measurements import OdeMeasurement, Parameter, ode
+from ipe_bench.measurements import LotkaVolterra, OdeMeasurement, Parameter, Polynomial, ode
 from ipe_bench.measurements.base import differentiate
+from ipe_bench.measurements.ode import tableau
+from ipe_bench.measurements.ode.coarse import contraction
+from ipe_bench.measurements.ode.kernel import load
+from ipe_bench.measurements.ode.levels import coarser, ladder
+from ipe_bench.runs import provenance
 
 
 @dataclass(frozen=True)
@@ -73,6 +78,13 @@ def rk8(model, x, step):
     return np.array(z).reshape(len(model.cases), len(model.times), -1).ravel()
 
 
+def test_the_coefficients_are_those_of_scipy():
+    for mine, theirs in ((tableau.DOP853.B, DOP853.B[:12]), (tableau.DOP853.C, DOP853.C[:12])):
+        assert mine == tuple(theirs)
+    for s, row in enumerate(tableau.DOP853.A):
+        assert row == tuple(DOP853.A[s, :s])
+
+
 def test_the_solution_is_of_eighth_order():
     x = np.array([[4.0, 0.7]])
     errors = [np.abs(Pulse(step).simulate(x) - Pulse().solution(x)).max() for step in (0.5, 0.25, 0.125)]
@@ -129,6 +141,134 @@ def test_a_trial_that_overflows_leaves_its_neighbours_alone():
     z = Pulse(0.5).simulate(x)
     assert not np.isfinite(z[1]).all()
     assert (z[[0, 2]] == Pulse(0.5).simulate(x[[0, 2]])).all()
+
+
+@dataclass(frozen=True)
+class Chosen(Cases):
+    """The same at a tolerance: the first output within 1e-9, the second within 1e-6."""
+
+    step: float | None = None
+    tolerance = (1e-9, 1e-6)
+
+
+def test_steps_that_follow_the_parameters_hold_the_tolerance_of_each_output():
+    x = np.random.default_rng(4).normal(size=(60, 2)) * [3.0, 1.0]
+    model = Chosen()
+    off = np.abs(model.simulate(x) - Cases(1 / 64).simulate(x)).reshape(60, -1, 2)
+    assert off[..., 0].max() < 1e-9
+    assert off[..., 1].max() < 1e-6
+    assert len(set(model._search(x, np.zeros(12)).places.tolist())) >= 3
+
+
+def test_a_trial_that_is_not_a_number_does_not_move_where_the_others_begin():
+    x = np.random.default_rng(6).normal(size=(5, 2))
+    spoilt = np.concatenate([x, [[np.nan, 1.0]]])
+    assert (Chosen().simulate(spoilt)[:5] == Chosen().simulate(x)).all()
+
+
+def test_a_coarse_jacobian_contracts_where_it_was_measured_and_beyond():
+    model = Chosen()
+    x = model.nominal + np.random.default_rng(7).normal(size=(30, 2))
+    J, coarse = model.jacobian(x), model.coarse_jacobian(x)
+    assert max(contraction(c, j) for c, j in zip(coarse, J, strict=True)) < 0.01
+    fixed = Cases(0.5)
+    assert (fixed.coarse_jacobian(x) == fixed.jacobian(x)).all()
+
+
+def test_a_loose_tolerance_leaves_less_room_for_coarse_tangents():
+    """Readings that are themselves only just accurate need tangents at nearly their own step."""
+
+    class Tight(Chosen):
+        nominal = np.ones(2)  # type: ignore[assignment]
+
+    class Loose(Tight):
+        tolerance = (0.03, 0.03)
+
+    assert Loose()._coarseness.level(16) > Tight()._coarseness.level(16) >= 3
+    x = Loose().nominal + 0.3 * np.random.default_rng(8).normal(size=(30, 2))
+    J, coarse = Loose().jacobian(x), Loose().coarse_jacobian(x)
+    assert max(contraction(c, j) for c, j in zip(coarse, J, strict=True)) < 0.01
+
+
+def test_the_contraction_of_a_scaled_jacobian_is_known():
+    """With (1 + d) J in place of J a step overshoots by d / (1 + d)."""
+    J = np.random.default_rng(9).normal(size=(9, 3)) * [1.0, 1e6, 1e-6]
+    assert contraction(1.25 * J, J) == pytest.approx(0.2)
+    assert contraction(J, J) < 1e-14
+    assert contraction(np.nan * J, J) == np.inf
+
+
+def test_other_models_state_what_their_jacobians_cost():
+    assert Polynomial().jacobian_cost == (Polynomial().n if Polynomial().analytic else 2 * Polynomial().n)
+    x = Polynomial().nominal[None]
+    assert (Polynomial().coarse_jacobian(x) == Polynomial().jacobian(x)).all()
+
+    class Differences(Polynomial):
+        analytic = False
+
+    assert Differences().jacobian_cost == 2 * Polynomial().n
+
+
+def test_what_generates_machine_code_is_part_of_the_source_that_results_depend_on(monkeypatch):
+    """It is imported by generated modules alone, and yet a change to it makes stored results those of other code."""
+    before = provenance.fingerprint([LotkaVolterra()])["source"]
+    read, changed = provenance._digest_of, "ipe_bench.measurements.ode.machine_code"
+    monkeypatch.setattr(provenance, "_digest_of", lambda module: read(module) + "#" * (module == changed))
+    assert provenance.fingerprint([LotkaVolterra()])["source"] != before
+
+
+def test_a_first_compilation_says_so_once(tmp_path, monkeypatch, caplog):
+    monkeypatch.setenv("IPE_BENCH_CACHE", str(tmp_path))
+    with caplog.at_level("INFO"):
+        assert load("answer = 42  # of a first compilation\n").answer == 42
+        assert load.__wrapped__("answer = 42  # of a first compilation\n").answer == 42
+    assert [record.message for record in caplog.records] == [
+        f"compiling an integrator, once per machine: it is kept in {tmp_path}"
+    ]
+
+
+@dataclass(frozen=True)
+class Transient(OdeMeasurement):
+    """y' = -a (y - cos t), y(0) = 0, read often at first and rarely later."""
+
+    tolerance = 1e-8
+    states, outputs, nominal = 1, ("y",), np.array([2.0])  # type: ignore[assignment]
+    parameters = (Parameter("a"),)
+
+    @property
+    def times(self):
+        return np.array([0.01, 0.02, 0.05, 0.1, 2.0, 10.0])
+
+    def start(self, p, c):
+        return (0.0,)
+
+    def rhs(self, t, y, p, c):
+        return (-p[0] * (y[0] - np.cos(t)),)
+
+    def read(self, t, y, p, c):
+        return y
+
+
+def test_a_stiff_start_read_unevenly_holds_the_tolerance():
+    x = np.array([[0.5], [2.0], [30.0], [200.0]])
+    a, t = x, Transient().times
+    exact = a / (1 + a * a) * (a * np.cos(t) + np.sin(t) - a * np.exp(-a * t))
+    assert np.abs(Transient().simulate(x) - exact).max() < 1e-8
+
+
+def test_without_a_tolerance_or_a_step_the_model_says_what_is_missing():
+    class Silent(Pulse):
+        tolerance = None
+
+    with pytest.raises(ValueError, match="state `tolerance`"):
+        Silent(step=None).simulate(np.ones((1, 2)))
+
+
+def test_the_ladder_of_levels():
+    assert ladder(64).tolist() == [1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64]
+    assert ladder(1.0).tolist() == [1, 2]
+    levels = ladder(768)
+    assert [levels[coarser(i)] for i in range(1, 8)] == [1, 2, 2, 3, 4, 6, 8]
 
 
 def test_a_wrong_number_of_derivatives_is_refused():

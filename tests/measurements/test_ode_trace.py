@@ -1,11 +1,9 @@
-"""Recording of arithmetic: what is emitted computes what was written, and its tangent is the derivative."""
-
-import math
+"""Recording of arithmetic: its program computes what was written, and its tangent is the derivative."""
 
 import numpy as np
 import pytest
 
-from ipe_bench.measurements.ode.trace import Graph, emit, tangent
+from ipe_bench.measurements.ode.trace import Graph, Program, separate, substitute, tangent
 
 FUNCTIONS = {
     "add": lambda a, b: a + b + 2.0,
@@ -31,11 +29,31 @@ FUNCTIONS = {
 }
 
 
+OPERATIONS = {
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "div": lambda a, b: a / b,
+    "pow": lambda a, b: a**b,
+    "neg": lambda a: -a,
+    "fma": lambda a, b, c: a * b + c,
+    "fms": lambda a, b, c: a * b - c,
+    "fnma": lambda a, b, c: c - a * b,
+}
+
+
 def run(outputs, **values):
-    source, terms = emit(outputs, indent="")
-    scope = {"math": math, **values}
-    exec(source, scope)
-    return [eval(term, scope) for term in terms]
+    """What the program of these outputs computes, operation by operation."""
+    graph = outputs[0].graph
+    program = Program.of(outputs, [graph.input(name) for name in values])
+    numbers = list(values.values())
+    for name, *operands in program.operations:
+        if name == "constant":
+            numbers.append(operands[0])
+        else:
+            function = OPERATIONS.get(name) or getattr(np, name)
+            numbers.append(function(*(numbers[i] for i in operands)))
+    return [numbers[i] for i in program.outputs]
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
@@ -63,9 +81,35 @@ def test_numpy_functions_work_on_arrays_of_expressions():
 def test_equal_expressions_are_computed_once_and_constants_are_folded():
     graph = Graph()
     a = graph.input("a")
-    source, _ = emit([np.sin(a + 1.0) + np.sin(a + 1.0) * (2.0 * 3.0), 0.0 * a + 1.0 * a])
-    assert source.count("math.sin") == 1
-    assert "6.0" in source
+    program = Program.of([np.sin(a + 1.0) + np.sin(a + 1.0) * (2.0 * 3.0), 0.0 * a + 1.0 * a], [a])
+    assert [name for name, *_ in program.operations].count("sin") == 1
+    assert ("constant", 6.0) in program.operations
+
+
+def test_a_product_is_fused_into_the_sum_that_alone_uses_it():
+    graph = Graph()
+    a, b, c = graph.inputs("v", 3)
+    names = [
+        [name for name, *_ in Program.of(outputs, [a, b, c]).operations]
+        for outputs in ([a * b + c], [c + a * b], [a * b - c], [c - a * b], [a * b + c, a * b])
+    ]
+    assert names == [["fma"], ["fma"], ["fms"], ["fnma"], ["mul", "add"]]
+
+
+def test_what_a_direction_drives_is_gathered_before_it_is_multiplied():
+    """d/dt of (p q y + q) y along p and q: linear in dy, with one source that is a number of the trial."""
+    graph = Graph()
+    (y, p, q), dy, (dp, dq) = graph.inputs("v", 3), graph.input("dy"), graph.inputs("dp", 2)
+    tangents = tangent([(p * q * y + q) * y], {y: dy, p: dp, q: dq})
+    outputs, sources = separate(tangents, [dy], [dp, dq])
+    assert len(sources) == 1
+    values = {"v0": 1.5, "v1": 0.3, "v2": -2.0, "dy": 0.7}
+    for direction in ((1.0, 0.0), (0.0, 1.0), (0.4, -3.0)):
+        along = {e: graph.constant(v) for e, v in zip((dp, dq), direction, strict=True)}
+        (source,) = run([substitute(sources[0], along)], **values)
+        (split,) = run(outputs, **values, source0=source)
+        (whole,) = run(tangents, **values, dp0=direction[0], dp1=direction[1])
+        assert split == pytest.approx(whole, rel=1e-14)
 
 
 def test_a_branch_on_an_unknown_value_is_refused_with_the_remedy():

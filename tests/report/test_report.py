@@ -13,18 +13,21 @@ from html.parser import HTMLParser
 import numpy as np
 import pandas as pd
 import pytest
+from markupsafe import escape
 from rich.console import Console
 from synthetic_store import Synthetic
 
 from ipe_bench.noise import Quantization
 from ipe_bench.report import write_report
+from ipe_bench.report.definitions import DEFINITIONS
 from ipe_bench.report.figures.ranks import cliques
 from ipe_bench.report.headline import headline
 from ipe_bench.report.style import looks
-from ipe_bench.report.tables import all_tables, escape, latex, markdown
+from ipe_bench.report.tables import Table, all_tables, interval, latex, markdown, words
 from ipe_bench.report.terminal import render
 from ipe_bench.report.words import compact, duration, percent, short
 from ipe_bench.statistics import analyse
+from ipe_bench.statistics.records import SCORES, STATISTICS, frame_columns
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -132,10 +135,46 @@ def test_markdown_rows_have_as_many_cells_as_their_head(synthetic):
 
 
 def test_latex_escapes_every_special_character():
-    text = escape("a_b & 50 % $x$ {y} #1 ~ ^ \\ < > µ 中")
+    shown = words("a & b_c", ["a_b & 50 % $x$ {y} #1 ~ ^ \\ < > µ 中"])
+    head, cell = re.findall(r"^(.*) \\\\$", latex(Table("t", "T", "", [shown], pd.DataFrame())), re.MULTILINE)
+    text = head + cell
     assert re.sub(r"\\([&%$#{}_]|[a-zA-Z]+)", "", text).count("$") == 0
     assert r"\&" in text
     assert r"\texttt{U+4E2D}" in text
+
+
+def test_a_record_is_all_that_a_statistic_needs(result):
+    """Its column, its definition, and its heading in every table that it names, the terminal's among them."""
+    page = result.report.read_text(encoding="utf-8")
+    tables = {t.name: t for t in all_tables(analyse([result.report.parent]))}
+    out = io.StringIO()
+    Console(file=out, width=300).print(render(result.summary))
+    for record in (*STATISTICS, *SCORES):
+        assert (record.title, record.definition) in DEFINITIONS
+        assert str(escape(record.definition)) in page
+        for where in record.where:
+            headings = [record.titles.get(where, record.title), record.limits_titles.get(where, "")]
+            if where == "terminal":
+                assert all(h in out.getvalue() for h in headings)
+            elif where in tables:
+                assert {*headings, ""} <= {*(c.title for c in tables[where].columns), ""}
+    assert set(frame_columns(STATISTICS)) <= set(result.summary.columns)
+
+
+def test_latex_intervals_read_right():
+    shown = [
+        interval("95 %", [0.996, 1234.5], [1.0, 14520.0], percent),
+        interval("twice", [1.5e-7, float("nan")], [2.0, 1.0], short),
+        interval("twice", [0.0, -1.25], [0.00004, 2.0], short),
+    ]
+    text = latex(Table("t", "T", "", shown, pd.DataFrame()))
+    assert r"\num{99.6}\,\% to \num{100}\,\%" in text
+    assert r"\num{1.5e-07} to \num{2}" in text
+    assert r"\num{-1.250} to \num{2}" in text
+    assert "to\\num" not in text
+    assert text.count("twice") == 2
+    for part in ("toprule", "midrule", "bottomrule"):
+        assert text.count(part) == 1
 
 
 @pytest.mark.slow

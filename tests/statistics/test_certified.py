@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ipe_bench.api import check, compute
+from ipe_bench.api import compute, validate
 from ipe_bench.baselines import LinearLSE, MultiscaleLM
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Nist, Polynomial
@@ -57,7 +57,7 @@ def test_the_report_writes_the_table_and_draws_nothing_over_error_scales(folder)
 
 def test_more_than_one_trial_is_refused_before_any_work():
     with pytest.raises(UserError, match=r"trials=10: certified readings are one trial"):
-        check([scenario("Misra1a")], ESTIMATORS, 10)
+        validate([scenario("Misra1a")], ESTIMATORS, 10)
 
 
 def test_a_model_without_real_readings_is_refused():

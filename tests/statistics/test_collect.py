@@ -11,9 +11,10 @@ from synthetic_store import Pretender
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.runs.execution.base import Failure
+from ipe_bench.runs.results import merge_ranges
 from ipe_bench.runs.store import FOOTER
 from ipe_bench.statistics import analyse
-from ipe_bench.statistics.collect import collect, config_leaves, differing, merge_ranges
+from ipe_bench.statistics.collect import collect, config_leaves, differing
 
 
 @pytest.fixture

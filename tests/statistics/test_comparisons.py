@@ -17,7 +17,8 @@ from ipe_bench.statistics.comparisons import (
     signed_rank,
     tied_ranks,
 )
-from ipe_bench.statistics.profiles import BUDGETS, RATIOS, Profiles, distances_to_limit, iterations_to_limit
+from ipe_bench.statistics.histories import distances_to_limit, iterations_to_limit
+from ipe_bench.statistics.profiles import BUDGETS, RATIOS, Profiles
 
 
 def outcomes(distance, success=None, cost=None, ids=None):
@@ -176,5 +177,6 @@ def test_known_differences_are_found_in_a_store(synthetic):
     # A Jacobian counts as three simulations here.
     assert set(analysis.scores[analysis.scores["estimator"] == "bad"]["cost_median"]) == {4.0}
     # Efficient errors are uncorrelated here, up to 1 / sqrt(300).
-    for matrix in analysis.correlations.values():
+    for _, rows in analysis.correlations.groupby(["scenario", "estimator"]):
+        matrix = rows["value"].to_numpy().reshape(3, 3)
         np.testing.assert_allclose(matrix, np.eye(3), atol=0.25)

@@ -18,6 +18,7 @@ from ipe_bench.api import compute
 from ipe_bench.baselines import LinearLSE
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
+from ipe_bench.runs.results import Results
 from ipe_bench.runs.store import Cell, Store
 from ipe_bench.solvers import FixedPoint, Newton
 
@@ -27,9 +28,9 @@ def scenario(**changes) -> Scenario:
 
 
 def rows(store: Store, cell: Cell) -> dict:
-    tables = sorted((p.start, p.table()) for p in store.pieces() if p.key == cell.key)
-    names = [n for n in tables[0][1].column_names if n != "time_s"]
-    return {n: np.concatenate([t[n].to_numpy(zero_copy_only=False) for _, t in tables]) for n in names}
+    results = Results.read([store.directory])
+    found = results.load(results.stored[cell.key], None)
+    return {name: values for name, values in found.items() if name != "time_s"}
 
 
 class Counting:
@@ -131,7 +132,7 @@ def test_a_damaged_file_is_set_aside_and_computed_again(tmp_path, damage):
 
 def test_the_footer_says_what_the_file_holds(tmp_path):
     compute([scenario()], {"linear_lse": LinearLSE()}, 10, tmp_path)
-    footers = [piece.footer() for piece in Store(tmp_path).pieces()]
+    footers = [cell.footer for cell in Results.read([tmp_path]).stored.values()]
     assert {f["names"]["estimator"] for f in footers} == {"truth", "linear_lse"}
     assert all(f["identity"]["scenario"]["measurement"]["bend"] == 0.02 for f in footers)
     assert all(set(f["versions"]) >= {"ipe_bench"} for f in footers)
@@ -152,9 +153,10 @@ def test_a_raising_estimator_is_a_status_and_the_others_are_complete(tmp_path):
     rates = frame[frame["parameter"] == "all"].set_index("estimator")["converged"]
     assert rates["linear_lse"] == 1.0
     assert rates["broken"] == 0.0
-    table = next(p.table() for p in Store(tmp_path).pieces() if p.footer()["names"]["estimator"] == "broken")
-    assert set(table["status"].to_pylist()) == {"error"}
-    assert set(table["message"].to_pylist()) == {"RuntimeError: out of order"}
+    results = Results.read([tmp_path])
+    stored = results.load(next(c for c in results.stored.values() if c.label == "broken"), None)
+    assert set(stored["status"]) == {"error"}
+    assert set(stored["message"]) == {"RuntimeError: out of order"}
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ A model is one class, here a pendulum of unknown length and damping that is rele
 
     @dataclass(frozen=True)
     class Pendulum(OdeMeasurement):
-        step: float | None = 0.05                              # longest integration step, in the unit of the times
+        tolerance = 1e-9                                       # of a reading, in the reading's unit
         states, outputs, reading_unit = 2, ("angle",), "rad"
 
         @property
@@ -35,6 +35,7 @@ else that does not ask for a value (no if, no comparison, no array of floats fil
 come machine code for whole batches and the exact Jacobian; nothing else is to be written. `cases` adds experiments that
 share the parameters and differ in constants c, and `si_sizes` the sizes of parameters that are shown in other units.
 
-The method is of eighth order at a fixed step: halve `step` and look at how far the readings move, until they move less
-than the noise by some orders of magnitude. `lotka_volterra` is a small model of this kind, `gins` a large one.
+The method is of eighth order. Each trial's step follows from its own parameters: it is halved until half the step shows
+that the readings hold `tolerance`, and the Jacobian uses the same. `step` fixes it for all trials instead, and `rate`
+may say where the search begins. `lotka_volterra` is a small model of this kind, `gins` a large one.
 """

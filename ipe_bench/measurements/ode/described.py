@@ -18,6 +18,11 @@ from ipe_bench.measurements.base import Input, Measurement, Parameter
 from ipe_bench.measurements.ode import sampling
 from ipe_bench.measurements.ode.model import OdeMeasurement
 
+_SHARE = 1e-8
+"""Of the largest reading, what the integration may leave unless told otherwise."""
+_TRIAL_STEPS = 16
+"""Steps within the shortest interval that tell how large readings are."""
+
 
 @dataclass(frozen=True)
 class Ode(Measurement):
@@ -45,8 +50,10 @@ class Ode(Measurement):
     """What is read at each time; none: every state."""
     times: tuple[float, ...] = ()
     """When it is read; a readings file brings its own."""
-    step: float = 0.1
-    """The longest integration step."""
+    tolerance: float | None = None
+    """The error that the integration may leave in a reading; None: 1e-8 of the largest reading at the start."""
+    step: float | None = None
+    """A longest integration step for all, in place of the tolerance."""
     unit: str = ""
     """Of the readings."""
     time_unit: str = ""
@@ -54,7 +61,7 @@ class Ode(Measurement):
     """Parameters of which every file of readings has its own, where there are several."""
 
     def __post_init__(self) -> None:
-        require_positive(self, "step")
+        require_positive(self, "step", "tolerance")
         if not self.rates:
             raise UserError("rates: is empty; give each state its rate, such as rates.y=-k*y")
         for name in self.initial:
@@ -176,8 +183,17 @@ class _Engine(OdeMeasurement):
         return self.described.time_unit
 
     @property
-    def step(self) -> float:  # type: ignore[override]
+    def step(self) -> float | None:  # type: ignore[override]
         return self.described.step
+
+    @cached_property
+    def tolerance(self) -> float:  # type: ignore[override]
+        if self.described.tolerance is not None:
+            return self.described.tolerance
+        intervals = np.diff(self.times, prepend=0.0)
+        trial = replace(self.described, step=float(intervals[intervals > 0].min()) / _TRIAL_STEPS)
+        largest = float(np.abs(trial.engine.simulate(self.nominal[None])).max())
+        return _SHARE * largest if 0 < largest < np.inf else _SHARE
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

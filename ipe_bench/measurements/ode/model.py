@@ -1,15 +1,16 @@
 """Measurement models whose readings are taken from the solution of ordinary differential equations.
 
 The author writes the right-hand side once, in plain arithmetic; the batched compiled integrator and the exact Jacobian
-come from it. Recording and compilation are in `trace` and `kernel`.
+come from it. Recording and compilation are in `trace`, `source` and `kernel`, the choice of steps in `levels`.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
+from types import ModuleType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,18 +19,22 @@ from numpy.typing import NDArray
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Input, Measurement
 from ipe_bench.measurements.ode import sampling
-from ipe_bench.measurements.ode.kernel import Recording, integrate, record
+from ipe_bench.measurements.ode.coarse import CONTRACTION, MOST_RK4, Coarseness, contraction
+from ipe_bench.measurements.ode.kernel import Kernel, load
+from ipe_bench.measurements.ode.levels import Found, Indices, Remembered, Search, grouped, ladder
+from ipe_bench.measurements.ode.source import Equations, Variation, jacobian_source, rate_source, simulation_source
+from ipe_bench.measurements.ode.tableau import DOP853, RK4
 
-_COMPLEX_STEP = 1e-100
-_BLOCK = 256
-"""Trials whose derivatives are integrated together: few enough to stay in the cache."""
+_STAYS = ("_readings_kernel", "_rk4_kernel", "_rate_module", "_jacobian_kernel", "_equations", "_remembered")
+_ANGLE_AT_START = 0.7
+"""Radians over which the first step that is tried lets the solution turn."""
 
 
 class OdeMeasurement(Measurement):
     """Readings of y' = rhs(t, y, p, c) at given times, for one or more cases that share the parameters.
 
-    A subclass states `states`, `outputs`, `step`, `parameters` and `times`, and writes `start`, `rhs` and `read`; the
-    package's docstring has an example. p are the parameters in SI units (x times `si_sizes`), c the constants of a
+    A subclass states `states`, `outputs`, `tolerance`, `parameters` and `times`, and writes `start`, `rhs` and `read`;
+    the package's docstring has an example. p are the parameters in SI units (x times `si_sizes`), c the constants of a
     case. The three functions use + - * / ** and NumPy's elementary functions on the entries of their arguments, and
     nothing that asks for a value (no if, no comparison). z has C order over (case, time, output); a time is an epoch.
     """
@@ -40,11 +45,19 @@ class OdeMeasurement(Measurement):
     """The names of what is read at each time."""
     time_unit: ClassVar[str] = "s"
     """The unit of `times`, `step` and t."""
-    step: float | None
-    """The longest integration step in seconds; each interval between readings is divided evenly."""
     sampled: tuple[float, ...] | None = None
     """Times of the readings in place of the usual ones, where a subclass has a field of that name: a readings file may
     bring its own."""
+    tolerance: float | Sequence[float] | None = None
+    """The error that the integration may leave in a reading, in `reading_unit`; or one such error for each output.
+    Each trial's step follows from it and from the trial's parameters."""
+    step: float | None = None
+    """A longest step for all trials, in place of `tolerance`; each interval between readings is divided evenly."""
+    shortest_step: float = 0.0
+    """Steps do not become shorter than about this, however wild the parameters, nor than 1/1024 of the usual interval
+    between readings: what an iterate that diverges may cost."""
+    trusted_angle: float = 0.0
+    """A step that is at most this over `rate` is known to hold the tolerance; 0: every trial is tested."""
 
     @property
     @abstractmethod
@@ -72,6 +85,15 @@ class OdeMeasurement(Measurement):
     @abstractmethod
     def read(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
         """What the instruments show of the state, one entry per output."""
+
+    @property
+    def variation(self) -> Variation | None:
+        """Equations of small deviations in fewer numbers than the state has, where the model knows them."""
+        return None
+
+    rate: Callable[[Sequence[Any]], Any] | None = None
+    """A method rate(p), recorded like `rhs`: how fast the solution may turn, grow or decay, per unit of time. It says
+    with which step the search begins; where there is none, it begins with that of the nominal parameters."""
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
@@ -106,76 +128,257 @@ class OdeMeasurement(Measurement):
         return self.simulate_until(x, len(self.times))
 
     def simulate_until(self, x: Array, stop: int) -> Array:
-        p, c = self._lanes(x)
-        per_case = stop * len(self.outputs)
-        z = np.empty((len(x), len(self.cases) * per_case))
-        first = per_case * np.arange(len(p))
-        self._integrate(self._plain, self._start(p, c), np.concatenate([p, c], axis=1), stop, z, first)
+        return self._shown(x, stop, self._zeros)
+
+    def _shown(self, x: Array, stop: int, offset: Array) -> Array:
+        """Readings less the offset (m,)."""
+        x = _own(x)
+        z = np.empty((len(x), len(self._cases) * stop * len(self.outputs)))
+        common = self._common_steps(x)
+        if common is not None:
+            self._simulate(x, np.arange(len(x)), common, offset, z)
+            return z
+        found = self._search(x, offset)
+        if len(found.computed) == len(x):
+            return self._prefix(found.z, stop)
+        z[found.computed] = self._prefix(found.z, stop)
+        others = np.delete(np.arange(len(x)), found.computed)
+        for place, rows in grouped(found.places[others], others):
+            self._simulate(x, rows, self._steps(place), offset, z)
         return z
+
+    def _common_steps(self, x: Array) -> NDArray[np.int64] | None:
+        """The steps to each time that are the same for all trials, fixed or known to do; None where trials differ."""
+        if self.step is not None:
+            return self._fixed_steps
+        return self._parts if self.trusted_angle and self._rates(x)[1] * self._longest <= self.trusted_angle else None
+
+    def _simulate(self, x: Array, rows: Indices, steps: NDArray[np.int64], offset: Array, z: Array) -> None:
+        """Fills these rows of z (trials, readings), as many times as it has room for, with so many steps to each."""
+        times = self._times[: z.shape[1] // (len(self._cases) * len(self.outputs))]
+        self._readings_kernel.run(x, self._si_sizes, self._cases, rows, times, steps, offset, z.reshape(-1))
+
+    @cached_property
+    def _zeros(self) -> Array:
+        return np.zeros(self.m)
+
+    @cached_property
+    def _si_sizes(self) -> Array:
+        return _own(self.si_sizes)
+
+    @cached_property
+    def _cases(self) -> Array:
+        return _own(self.cases)
+
+    @cached_property
+    def _times(self) -> Array:
+        return _own(self.times)
+
+    def _prefix(self, z: Array, stop: int) -> Array:
+        if stop == len(self.times):
+            return z
+        shape = (len(z), len(self.cases), len(self.times), len(self.outputs))
+        return z.reshape(shape)[:, :, :stop].reshape(len(z), len(self.cases) * stop * len(self.outputs))
+
+    def _search(self, x: Array, offset: Array) -> Found:
+        """The level of each trial, and the readings of those whose level had to be looked for."""
+        places = self._trusted(x)
+        unknown = np.flatnonzero(places < 0)
+        places[unknown] = self._remembered.look_up(x[unknown])
+        unknown = unknown[places[unknown] < 0]
+        if not len(unknown):
+            return Found(places, unknown, np.empty((0, self.m)))
+        found = self._find(x[unknown], self._first_guess(x[unknown]), offset)
+        self._remembered.keep(x[unknown], found.places)
+        places[unknown] = found.places
+        return Found(places, unknown[found.computed], found.z)
+
+    def _find(self, x: Array, start: Indices, offset: Array) -> Found:
+        def simulate(rows: Indices, level: int, z: Array) -> None:
+            self._simulate(x, rows, level * self._parts, offset, z)
+
+        return Search(self._ladder, self._tolerances, simulate).run(start)
+
+    def _trusted(self, x: Array) -> Indices:
+        """The coarsest level for trials of which it is known to do, -1 for the others."""
+        if self.trusted_angle == 0:
+            return np.full(len(x), -1)
+        return np.where(self._rates(x)[0] * self._longest <= self.trusted_angle, 0, -1)
+
+    def _rates(self, x: Array) -> tuple[Array, float]:
+        """The rate of each trial, and the fastest of all; not a number where nothing is known."""
+        rates = np.full(len(x), np.nan)
+        return rates, self._rate_module.rates(x, self._si_sizes, rates) if self._rate_module else np.inf
+
+    @cached_property
+    def _rate_module(self) -> ModuleType | None:
+        return load(rate_source(self._equations)) if self._equations.rate else None
+
+    @cached_property
+    def _longest(self) -> float:
+        """The longest step of the coarsest level."""
+        return float(np.max(np.diff(self.times, prepend=0.0) / self._parts))
+
+    def _first_guess(self, x: Array) -> Indices:
+        """Where on the ladder the search begins: steps of half a radian, or what the nominal parameters need."""
+        top = len(self._ladder) - 1
+        if self._rate_module is None:
+            return np.where(np.isfinite(x).all(axis=1), self._nominal_place, top)
+        wanted = np.nan_to_num(self._rates(x)[0] * self._longest / _ANGLE_AT_START, nan=np.inf)
+        return np.clip(np.searchsorted(self._ladder, wanted), 1, top)
+
+    @cached_property
+    def _nominal_place(self) -> int:
+        return max(1, int(self._find(_own(self.nominal[None]), np.array([1]), self._zeros).places[0]))
+
+    @cached_property
+    def _remembered(self) -> Remembered:
+        return Remembered()
+
+    @cached_property
+    def _parts(self) -> NDArray[np.int64]:
+        """Steps to each time at level 1: one, and more where the interval is longer than usual."""
+        intervals = np.diff(self.times, prepend=0.0)
+        return np.maximum(np.ceil(intervals / np.median(intervals) - 1e-9), 1).astype(np.int64)
+
+    @cached_property
+    def _ladder(self) -> NDArray[np.int64]:
+        usual = float(np.median(np.diff(self.times, prepend=0.0)))
+        finest = 1024.0 if self.shortest_step <= 0 else usual / self.shortest_step
+        return ladder(min(finest + 1e-9, 1024.0))
+
+    @cached_property
+    def _tolerances(self) -> Array:
+        """What each reading (m,) may be off by."""
+        if self.tolerance is None:
+            raise ValueError(f"{self.name}: state `tolerance`, the error that a reading may have, or a fixed `step`")
+        per_output = np.broadcast_to(np.asarray(self.tolerance, dtype=float), len(self.outputs))
+        return np.tile(per_output, self.m // len(self.outputs))
+
+    def _steps(self, place: int) -> NDArray[np.int64]:
+        return self._ladder[place] * self._parts
+
+    @cached_property
+    def _fixed_steps(self) -> NDArray[np.int64]:
+        assert self.step is not None
+        intervals = np.diff(self.times, prepend=0.0)
+        return np.maximum(np.ceil(intervals / self.step - 1e-9), 1).astype(np.int64)
 
     def jacobian(self, x: Array) -> Array:
         return self.jacobian_until(x, len(self.times))
 
+    def coarse_jacobian(self, x: Array) -> Array:
+        return self.coarse_jacobian_until(x, len(self.times))
+
     def jacobian_until(self, x: Array, stop: int) -> Array:
-        """dh/dx by the variational equations, integrated by the same compiled formula as the readings."""
-        J = np.empty((len(x), len(self.cases) * stop * len(self.outputs), self.n))
-        for begin in range(0, len(x), _BLOCK):
-            block = slice(begin, begin + _BLOCK)
-            self._differentiate(x[block], stop, J[block])
+        """dh/dx by the variational equations, integrated by the same formula and steps as the readings of that x."""
+        x = _own(x)
+        J = self._empty_jacobian(x, stop)
+        for rows, steps in self._grouped_by_steps(x):
+            self._differentiate(self._jacobian_kernel, x, rows, steps, J)
         return J
 
-    def _differentiate(self, x: Array, stop: int, J: Array) -> None:
-        """Fills J (trials, readings, n): a lane for each trial, direction and case."""
-        trials, n = x.shape
-        p, c = self._lanes(np.repeat(x, n, axis=0))
-        direction = np.repeat(np.tile(np.eye(n), (trials, 1)), len(self.cases), axis=0) * self.si_sizes
-        y = self._start(p + 1j * _COMPLEX_STEP * direction, c)
-        y0 = np.concatenate([np.real(y), np.imag(y) / _COMPLEX_STEP], axis=1)
-        inputs = np.concatenate([p, c, direction], axis=1)
-        shape = (trials, len(self.cases), stop * len(self.outputs), n)
-        first = np.arange(J.size).reshape(shape)[:, :, 0].swapaxes(1, 2).ravel()
-        self._integrate(self._tangent, y0, inputs, stop, J, first, stride=n)
+    def coarse_jacobian_until(self, x: Array, stop: int) -> Array:
+        """dh/dx with longer steps, or by a cheaper formula, where that was measured to contract; see `coarse`."""
+        if self.step is not None:
+            return self.jacobian_until(x, stop)
+        x = _own(x)
+        J, places, trusted = self._empty_jacobian(x, stop), self._search(x, self._zeros).places, self._trusted(x) == 0
+        for place, rows in grouped(np.where(trusted, -1, places), np.arange(len(x))):
+            kernel, level = self._coarsened(place)
+            self._differentiate(kernel, x, rows, level * self._parts, J)
+        return J
 
-    def _lanes(self, x: Array) -> tuple[Array, Array]:
-        """Parameters and constants of every initial value problem: each trial in each case."""
-        p = np.repeat(x * self.si_sizes, len(self.cases), axis=0)
-        return p, np.tile(self.cases, (len(x), 1))
-
-    def _start(self, p: NDArray[Any], c: Array) -> NDArray[Any]:
-        return np.stack(np.broadcast_arrays(*self.start(list(p.T), list(c.T)), p[:, 0])[:-1], axis=1)
-
-    def _integrate(
-        self,
-        recording: Recording,
-        y0: Array,
-        inputs: Array,
-        stop: int,
-        out: Array,
-        first: NDArray[np.int64],
-        stride: int = 1,
-    ) -> None:
-        if self.step is None:
-            raise ValueError(f"{self.name}: the integration step is not chosen yet; see suited_to")
-        times = np.asarray(self.times[:stop], dtype=float)
-        substeps = np.ceil(np.diff(times, prepend=0.0) / self.step - 1e-9).astype(np.int64)
-        integrate(recording, y0, inputs, times, np.maximum(substeps, 1), out, first, stride)
+    def _coarsened(self, place: int) -> tuple[Kernel, int]:
+        """The formula and the level for the tangents of trials at this place; -1 for those that are trusted."""
+        level = 1 if place < 0 else int(self._ladder[place])
+        if level > 2 or self._coarseness.rk4 is None:
+            return self._jacobian_kernel, self._coarseness.level(level)
+        # The formula of fourth order loses more by what a trial turns faster than the nominal one: 2^4 and 3^4 in hand.
+        return self._rk4_kernel, self._coarseness.rk4 * (1 if place < 0 else level + 1)
 
     @cached_property
-    def _plain(self) -> Recording:
-        return self._record(varying=0)
+    def _coarseness(self) -> Coarseness:
+        """Measured at the nominal parameters."""
+        x, everything = _own(self.nominal[None]), len(self.times)
+        level, J = int(self._ladder[self._search(x, self._zeros).places[0]]), self.jacobian(x)
+        rk4 = next(
+            (k for k in range(1, MOST_RK4 + 1) if level <= 2 and self._contraction(x, k, J) <= CONTRACTION), None
+        )
+        # Half the level; where that is half a step, every second reading.
+        every = slice(None) if level > 1 else slice(1, None, 2)
+        rows = np.arange(self.m).reshape(len(self._cases), everything, -1)[:, every].ravel()
+        times, steps = self._times[every], max(1, level // 2) * self._parts[every]
+        z, coarse = np.empty((1, len(rows))), np.empty((1, len(rows), self.n))
+        given = (x, self._si_sizes, self._cases, np.arange(1), np.ascontiguousarray(times), steps)
+        self._readings_kernel.run(*given, np.zeros(len(rows)), z.reshape(-1))
+        self._jacobian_kernel.run(*given, coarse.reshape(-1))
+        with np.errstate(all="ignore"):
+            off = np.abs(z - self._shown(x, everything, self._zeros)[:, rows]) / self._tolerances[rows]
+            sensitivity = contraction(coarse[0], J[0, rows]) / off.max()
+        return Coarseness(rk4, float(sensitivity) if np.isfinite(sensitivity) else np.inf)
+
+    def _contraction(self, x: Array, rk4: int, J: Array) -> float:
+        coarse = np.empty_like(J)
+        self._differentiate(self._rk4_kernel, x, np.arange(1), rk4 * self._parts, coarse)
+        return contraction(coarse[0], J[0])
+
+    def _empty_jacobian(self, x: Array, stop: int) -> Array:
+        return np.empty((len(x), len(self._cases) * stop * len(self.outputs), self.n))
+
+    def _differentiate(self, kernel: Kernel, x: Array, rows: Indices, steps: NDArray[np.int64], J: Array) -> None:
+        """Fills these rows of J (trials, readings, n), as many times as it has room for."""
+        times = self._times[: J.shape[1] // (len(self._cases) * len(self.outputs))]
+        kernel.run(x, self._si_sizes, self._cases, rows, times, steps, J.reshape(-1))
+
+    @property
+    def jacobian_cost(self) -> float:
+        """Arithmetic operations of a step with all tangents, over those of a simulation's step."""
+        return self._jacobian_kernel.operations / self._readings_kernel.operations
+
+    @property
+    def coarse_jacobian_cost(self) -> float:
+        """At the nominal parameters, or where they are at a level above 2; in simulations at the trial's level."""
+        if self.step is not None:
+            return self.jacobian_cost
+        place = int(self._search(_own(self.nominal[None]), self._zeros).places[0])
+        trusted = self._trusted(_own(self.nominal[None]))[0] == 0
+        kernel, level = self._coarsened(-1 if trusted else place)
+        return kernel.operations * level / (self._readings_kernel.operations * int(self._ladder[place]))
+
+    def _grouped_by_steps(self, x: Array) -> list[tuple[Indices, NDArray[np.int64]]]:
+        """The trials that share a level, and its steps."""
+        everyone, common = np.arange(len(x)), self._common_steps(x)
+        if common is not None:
+            return [(everyone, common)]
+        places = self._search(x, self._zeros).places
+        return [(rows, self._steps(place)) for place, rows in grouped(places, everyone)]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what is compiled and remembered, which stays with a process."""
+        return {k: v for k, v in self.__dict__.items() if k not in _STAYS}
 
     @cached_property
-    def _tangent(self) -> Recording:
-        return self._record(varying=self.n)
+    def _readings_kernel(self) -> Kernel:
+        return Kernel(simulation_source, self._equations, DOP853)
 
-    def _record(self, *, varying: int) -> Recording:
-        n = self.n
+    @cached_property
+    def _jacobian_kernel(self) -> Kernel:
+        return Kernel(jacobian_source, self._equations, DOP853)
 
-        def rhs(t: Any, y: Sequence[Any], p: Sequence[Any]) -> Sequence[Any]:
-            return self.rhs(t, y, p[:n], p[n:])
+    @cached_property
+    def _rk4_kernel(self) -> Kernel:
+        return Kernel(jacobian_source, self._equations, RK4)
 
-        def read(t: Any, y: Sequence[Any], p: Sequence[Any]) -> Sequence[Any]:
-            return self.read(t, y, p[:n], p[n:])
+    @cached_property
+    def _equations(self) -> Equations:
+        constants, outputs = self.cases.shape[1], len(self.outputs)
+        return Equations(
+            self.states, self.n, constants, outputs, self.start, self.rhs, self.read, self.variation, self.rate
+        )
 
-        inputs = n + self.cases.shape[1]
-        return record(rhs, read, self.states, inputs, len(self.outputs), varying=varying)
+
+def _own(x: Array) -> Array:
+    """The same numbers as the compiled code takes them: contiguous, and not marked as read-only."""
+    x = np.ascontiguousarray(x, dtype=float)
+    return x if x.flags.writeable else x.copy()

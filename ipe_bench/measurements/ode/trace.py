@@ -1,14 +1,15 @@
 """Records plain arithmetic as an expression graph, and differentiates it.
 
 A right-hand side written once in ordinary Python arithmetic is called with `Expression` objects instead of numbers.
-What comes back knows every operation, so it can be written out as straight-line source (`emit`) or differentiated
-exactly in forward mode (`tangent`). Turning source into machine code is left to `kernel`.
+What comes back knows every operation, so it can be listed as a straight-line program (`Program`) or differentiated
+exactly in forward mode (`tangent`). Turning programs into machine code is left to `machine_code`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -17,7 +18,7 @@ Operand: TypeAlias = "Expression | float"
 
 _FUNCTIONS = ("sin", "cos", "tan", "arctan", "exp", "log", "sqrt", "sinh", "cosh", "tanh")
 _IN_MATH = {"arctan": "atan"}
-_BINARY = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
+_BINARY = ("add", "sub", "mul", "div")
 _UFUNCS = {"add": "add", "subtract": "sub", "multiply": "mul", "divide": "div", "true_divide": "div", "power": "pow"}
 
 
@@ -71,6 +72,12 @@ class Graph:
                 return self.apply("sqrt", args[0])
             case ("neg", _) if args[0].operation == "neg":
                 return args[0].operands[0]
+            case ("add", _) if args[1].operation == "neg":
+                return self.apply("sub", args[0], args[1].operands[0])
+            case ("add", _) if args[0].operation == "neg":
+                return self.apply("sub", args[1], args[0].operands[0])
+            case ("sub", _) if args[1].operation == "neg":
+                return self.apply("add", args[0], args[1].operands[0])
         return None
 
 
@@ -207,16 +214,51 @@ def _partials(e: Expression) -> list[Expression]:
     raise TypeError(f"no derivative is known for {e.operation}")
 
 
-def _in_order(outputs: Iterable[Expression]) -> list[Expression]:
-    """Every expression that the outputs need, operands before their users."""
+def in_order(outputs: Iterable[Expression], stop: Collection[Expression] = ()) -> list[Expression]:
+    """Every expression that the outputs need, operands before their users; what `stop` is computed from is left out."""
+    ends = {e.order for e in stop}
     needed: dict[int, Expression] = {}
     stack = list(outputs)
     while stack:
         e = stack.pop()
         if e.order not in needed:
             needed[e.order] = e
-            stack.extend(a for a in e.operands if isinstance(a, Expression))
+            if e.order not in ends:
+                stack.extend(operands(e))
     return [needed[order] for order in sorted(needed)]
+
+
+def operands(e: Expression) -> list[Expression]:
+    return [a for a in e.operands if isinstance(a, Expression)]
+
+
+def dependent(outputs: Iterable[Expression], inputs: Iterable[Expression]) -> set[Expression]:
+    """Those among the outputs and what they need that depend on any of the inputs."""
+    found = set(inputs)
+    for e in in_order(outputs):
+        if any(a in found for a in operands(e)):
+            found.add(e)
+    return found
+
+
+def border(outputs: Sequence[Expression], varying: Collection[Expression]) -> list[Expression]:
+    """What the varying expressions need, or the outputs are, without being varying or a number."""
+    used = [a for e in in_order(outputs) if e in varying for a in operands(e)]
+    distinct = {e.order: e for e in [*used, *outputs] if e not in varying and e.value is None}
+    return [distinct[order] for order in sorted(distinct)]
+
+
+def substitute(e: Expression, values: Mapping[Expression, Expression]) -> Expression:
+    """The expression with some inputs replaced, and simplified."""
+    known: dict[int, Expression] = {}
+    for a in in_order([e]):
+        if a in values:
+            known[a.order] = values[a]
+        elif a.operation in ("input", "constant"):
+            known[a.order] = a
+        else:
+            known[a.order] = a.graph.apply(a.operation, *(known[o.order] for o in operands(a)))
+    return known[e.order]
 
 
 def tangent(outputs: Sequence[Expression], direction: Mapping[Expression, Expression]) -> list[Expression]:
@@ -225,7 +267,7 @@ def tangent(outputs: Sequence[Expression], direction: Mapping[Expression, Expres
         return []
     zero = outputs[0].graph.constant(0.0)
     along: dict[int, Expression] = {}
-    for e in _in_order(outputs):
+    for e in in_order(outputs):
         if e.operation in ("input", "constant"):
             along[e.order] = direction.get(e, zero)
             continue
@@ -241,26 +283,130 @@ def tangent(outputs: Sequence[Expression], direction: Mapping[Expression, Expres
     return [along[e.order] for e in outputs]
 
 
-def emit(outputs: Sequence[Expression], indent: str = "    ") -> tuple[str, list[str]]:
-    """Straight-line source that computes the outputs, and the term that stands for each of them."""
-    terms: dict[int, str] = {}
-    lines: list[str] = []
-    for e in _in_order(outputs):
-        if e.operation == "constant":
-            terms[e.order] = repr(e.value)
+def separate(
+    tangents: Sequence[Expression], moving: Sequence[Expression], direction: Sequence[Expression]
+) -> tuple[list[Expression], list[Expression]]:
+    """Tangents, linear in the tangents of the state (`moving`) and in a `direction` of the parameters, with whatever
+    depends on the direction alone replaced by inputs source0, source1, ...; and what these stand for.
+
+    The sources are gathered before they are multiplied, so a direction along one parameter has few that are not zero.
+    """
+    parts: dict[int, _Parts] = {e.order: _Parts(e, None) for e in moving}
+    parts |= {e.order: _Parts(None, e) for e in direction}
+    sources: dict[Expression, Expression] = {}
+
+    def joined(part: _Parts) -> Expression:
+        if part.source is None:
+            assert part.homogeneous is not None
+            return part.homogeneous
+        name = sources.setdefault(part.source, part.source.graph.input(f"source{len(sources)}"))
+        return name if part.homogeneous is None else part.homogeneous + name
+
+    for e in in_order(tangents):
+        own = [parts.get(a.order) for a in operands(e)]
+        if e.order in parts or not any(own):
             continue
-        if e.operation == "input":
-            terms[e.order] = e.operands[0]
-            continue
-        args = [terms[a.order] for a in e.operands]
-        if e.operation in _BINARY:
-            source = f"{args[0]} {_BINARY[e.operation]} {args[1]}"
-        elif e.operation == "pow":
-            source = f"{args[0]} ** {args[1]}"
-        elif e.operation == "neg":
-            source = f"-{args[0]}"
-        else:
-            source = f"math.{_IN_MATH.get(e.operation, e.operation)}({args[0]})"
-        terms[e.order] = f"_{e.order}"
-        lines.append(f"{indent}_{e.order} = {source}\n")
-    return "".join(lines), [terms[e.order] for e in outputs]
+        parts[e.order] = _linear(e, own, joined)
+    outputs = [joined(parts[e.order]) if e.order in parts else e for e in tangents]
+    return outputs, list(sources)
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """A linear expression: what depends on the state's tangents, plus what depends on the direction alone."""
+
+    homogeneous: Expression | None
+    source: Expression | None
+
+
+def _linear(e: Expression, own: list[_Parts | None], joined: Any) -> _Parts:
+    apply = e.graph.apply
+    if e.operation == "neg":
+        (part,) = own
+        assert part is not None
+        return _Parts(*(None if v is None else apply("neg", v) for v in (part.homogeneous, part.source)))
+    if e.operation in ("add", "sub"):
+        first, second = (part or _Parts(None, None) for part in own)
+        pairs = ((first.homogeneous, second.homogeneous), (first.source, second.source))
+        return _Parts(*(_sum(e.operation, a, b) for a, b in pairs))
+    place = next(i for i, part in enumerate(own) if part is not None)
+    part = own[place]
+    assert part is not None
+    if e.operation not in ("mul", "div") or (e.operation == "div" and place == 1) or all(own):
+        raise TypeError(f"a tangent is not linear: {e.operation}")
+
+    def scaled(value: Expression) -> Expression:
+        return apply(e.operation, *(value if i == place else a for i, a in enumerate(operands(e))))
+
+    if part.homogeneous is None:
+        assert part.source is not None
+        return _Parts(None, scaled(part.source))
+    return _Parts(scaled(joined(part)), None)
+
+
+def _sum(operation: str, a: Expression | None, b: Expression | None) -> Expression | None:
+    if a is None or b is None:
+        return (-b if operation == "sub" else b) if b is not None else a
+    return a.graph.apply(operation, a, b)
+
+
+@dataclass(frozen=True)
+class Program:
+    """Straight-line arithmetic on numbered values: first the inputs, then the result of each operation.
+
+    An operation is its name and the numbers of its operands, or ("constant", value). A product that is added to
+    something and used nowhere else is part of a fused multiply-add, which rounds once: ("fma", a, b, c) is a b + c,
+    ("fms", a, b, c) is a b - c, ("fnma", a, b, c) is c - a b. So the bits do not hang on what a compiler contracts.
+    """
+
+    inputs: int
+    operations: tuple[tuple[Any, ...], ...]
+    outputs: tuple[int, ...]
+
+    @classmethod
+    def of(cls, outputs: Sequence[Expression], inputs: Sequence[Expression]) -> Program:
+        """Computes the outputs from the inputs, which may be expressions that are computed elsewhere."""
+        given = set(inputs)
+        needed = [e for e in in_order(outputs, inputs) if e not in given]
+        uses: dict[int, int] = {}
+        for used in [*(a for e in needed for a in operands(e)), *outputs]:
+            uses[used.order] = uses.get(used.order, 0) + 1
+        fused = {e.order: found for e in needed if (found := _fusion(e, uses, given))}
+        inside = {product.order for _, product, _ in fused.values()}
+        number = {e.order: i for i, e in enumerate(inputs)}
+        operations: list[tuple[Any, ...]] = []
+        for e in needed:
+            if e.order not in inside:
+                operations.append(_operation(e, fused.get(e.order), number))
+                number[e.order] = len(inputs) + len(operations) - 1
+        return cls(len(inputs), tuple(operations), tuple(number[e.order] for e in outputs))
+
+
+_Fusion: TypeAlias = "tuple[str, Expression, Expression]"
+"""The name of the fused operation, the product in it, and the other operand."""
+
+
+def _fusion(e: Expression, uses: Mapping[int, int], inputs: Collection[Expression]) -> _Fusion | None:
+    if e.operation not in ("add", "sub"):
+        return None
+    a, b = operands(e)
+
+    def is_product(v: Expression) -> bool:
+        return v.operation == "mul" and uses[v.order] == 1 and v not in inputs
+
+    if is_product(a):
+        return ("fma" if e.operation == "add" else "fms"), a, b
+    if is_product(b):
+        return ("fma" if e.operation == "add" else "fnma"), b, a
+    return None
+
+
+def _operation(e: Expression, fusion: _Fusion | None, number: Mapping[int, int]) -> tuple[Any, ...]:
+    if fusion is not None:
+        name, product, other = fusion
+        return (name, *(number[a.order] for a in (*operands(product), other)))
+    if e.operation == "constant":
+        return ("constant", e.value)
+    if e.operation == "input":
+        raise ValueError(f"the program has no input {e.operands[0]}")
+    return (e.operation, *(number[a.order] for a in operands(e)))

@@ -10,7 +10,7 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, Look
 from ipe_bench.statistics.analysis import Analysis
-from ipe_bench.statistics.profiles import CLOSE
+from ipe_bench.statistics.histories import CLOSE
 
 FLOOR = 1e-10
 """Distances below this are drawn here: round-off."""
@@ -19,14 +19,18 @@ FLOOR = 1e-10
 def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
     from matplotlib.ticker import MaxNLocator
 
+    stored = {
+        where: [rows["distance"].to_numpy() for _, rows in part.groupby("trial", sort=False)]
+        for where, part in analysis.convergence.groupby(["scenario", "estimator"], sort=False)
+    }
     for setting in common.settings(analysis.scores, analysis.setting_columns):
         there = {}
         for label, one in look.items():
-            mine = [analysis.convergence.get((setting.scenario(s), label), []) for s in setting.scales]
+            mine = [stored.get((setting.scenario(s), label), []) for s in setting.scales]
             # A direct estimate has a start and an end, and nothing between: there is no convergence to see.
             if any(len(d) > 2 for part in mine for d in part):
                 there[label] = one
-        scales = [s for s in setting.scales if any((setting.scenario(s), e) in analysis.convergence for e in there)]
+        scales = [s for s in setting.scales if any((setting.scenario(s), e) in stored for e in there)]
         scales = common.spread(scales)
         if not there or not scales:
             continue
@@ -35,7 +39,7 @@ def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
         for scale, ax in zip(scales, axes, strict=True):
             longest = 1
             for label in there:
-                distances = analysis.convergence.get((setting.scenario(scale), label))
+                distances = stored.get((setting.scenario(scale), label))
                 if not distances:
                     continue
                 table = _padded(distances)

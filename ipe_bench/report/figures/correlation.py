@@ -26,8 +26,13 @@ def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
         scale = max(setting.scales)
         where = setting.scenario(scale)
         best = best_estimator(analysis, setting.rows)
-        shown = [e for e in dict.fromkeys([REFERENCE, best]) if (where, e) in analysis.correlations]
-        tables = {e: analysis.correlations[where, e] for e in shown}
+        rows = analysis.correlations[analysis.correlations["scenario"] == where]
+        n = len(names)
+        tables = {
+            e: rows.loc[rows["estimator"] == e, "value"].to_numpy().reshape(n, n)
+            for e in dict.fromkeys([REFERENCE, best])
+            if e in set(rows["estimator"])
+        }
         tables = {e: t for e, t in tables.items() if np.isfinite(t).any()}
         if not tables:
             continue

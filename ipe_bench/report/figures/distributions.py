@@ -11,7 +11,7 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, Look
 from ipe_bench.statistics.analysis import PROBABILITIES, Analysis
-from ipe_bench.trials.scoring import GATE
+from ipe_bench.trials.thresholds import GATE
 
 
 def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
@@ -24,9 +24,11 @@ def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
         medians = {}
         for scale, ax in zip(scales, axes, strict=True):
             for label in there:
-                values = analysis.distributions.get((setting.scenario(scale), label))
-                if values is None:
+                frame = analysis.distributions
+                rows = frame[(frame["scenario"] == setting.scenario(scale)) & (frame["estimator"] == label)]
+                if rows.empty:
                     continue
+                values = rows["distance"].to_numpy()
                 medians[scale, label] = values[np.searchsorted(PROBABILITIES, 0.5)]
                 shown = np.isfinite(values) & (values > 0)
                 ax.plot(

@@ -39,7 +39,7 @@ def draw(found: Examination) -> Iterator[Drawing]:
         common.legend_below(fig, axes)
     told = "; ".join(f"{names[i].name} {found.profiles[i].low:.4g} to {found.profiles[i].high:.4g}" for i in bent)
     caption = (
-        "How chi-square rises when one parameter is held and the others adapt to it, beside the parabola that a standard"
-        f" error stands for. The interval is where the profile stays below the line: {told}."
+        "How chi-square rises when one parameter is held and the others adapt to it, beside the parabola that a"
+        f" standard error stands for. The interval is where the profile stays below the line: {told}."
     )
     yield Drawing("likelihood", "Profiles of the likelihood", caption, fig)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 import numpy as np
+import pandas as pd
 
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
@@ -15,8 +16,8 @@ from ipe_bench.statistics.profiles import BUDGETS, RATIOS
 
 
 def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
-    profiles = analysis.profiles
-    there = {label: one for label, one in look.items() if profiles.trials.get(label)}
+    performance, data = (_shares(analysis.profiles, profile) for profile in ("performance", "data"))
+    there = {label: one for label, one in look.items() if label in performance}
     if len(there) < 2:
         return
     fig, axes = common.panels(2, height=3.2, extra=0.3 + 0.2 * len(there) / 5)
@@ -24,8 +25,8 @@ def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
     for label, one in there.items():
         style = one.line | {"drawstyle": "steps-post", "markersize": 4.5, "linewidth": 1.4}
         offset = list(there).index(label) * 3
-        left.plot(RATIOS, profiles.performance(label), label=common.text(label), markevery=(offset, 45), **style)
-        right.plot(BUDGETS, profiles.data(label), label=common.text(label), markevery=(offset, 45), **style)
+        left.plot(RATIOS, performance[label], label=common.text(label), markevery=(offset, 45), **style)
+        right.plot(BUDGETS, data[label], label=common.text(label), markevery=(offset, 45), **style)
     for ax, x, title in (
         (left, "cost over the cheapest estimator's", "performance profile"),
         (right, "simulations per trial", "data profile"),
@@ -36,13 +37,13 @@ def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
         ax.set_xlabel(x)
         ax.set_ylabel("share of trials with success")
         ax.set_title(title)
-    left.set_xlim(1, _end(RATIOS, [profiles.performance(e) for e in there]))
-    right.set_xlim(1, _end(BUDGETS, [profiles.data(e) for e in there]))
+    left.set_xlim(1, _end(RATIOS, [performance[e] for e in there]))
+    right.set_xlim(1, _end(BUDGETS, [data[e] for e in there]))
     for ax in axes:
         common.log_ticks(ax.xaxis, *ax.get_xlim())
     common.legend_below(fig, axes)
-    final = {label: float(profiles.data(label)[-1]) for label in there}
-    first = {label: float(profiles.performance(label)[0]) for label in there}
+    final = {label: float(data[label][-1]) for label in there}
+    first = {label: float(performance[label][0]) for label in there}
     robust, cheap = max(final, key=lambda e: final[e]), max(first, key=lambda e: first[e])
     caption = (
         "All trials of all scenarios. Left (Dolan and Moré): share of trials in which an estimator succeeds at a cost"
@@ -52,6 +53,11 @@ def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
         f" ({percent(final[robust])})."
     )
     yield Drawing("profiles", "Performance and data profiles", caption, fig)
+
+
+def _shares(profiles: pd.DataFrame, profile: str) -> dict[str, np.ndarray]:
+    part = profiles[profiles["profile"] == profile]
+    return {str(label): rows["share"].to_numpy() for label, rows in part.groupby("estimator", sort=False)}
 
 
 def _end(x: np.ndarray, curves: list[np.ndarray]) -> float:

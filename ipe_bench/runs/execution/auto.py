@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from ipe_bench.runs.execution.base import Event, Work
+from ipe_bench.runs.execution.base import Event, Task, Work
 from ipe_bench.runs.execution.processes import Processes
 from ipe_bench.runs.execution.serial import Serial
 
 
 @dataclass(frozen=True)
 class Auto(Processes):
-    """Worker processes as in `Processes`, except for a single task that says of itself that it is trusted.
+    """Worker processes as in `Processes`, except that a single task that is trusted runs in this process.
 
     A worker takes seconds to start, which a job of one block does not win back; compiled models use every core without.
     """
 
-    def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
+    def run(self, work: Work, tasks: Sequence[Task]) -> Iterator[Event]:
         limited = self.block_timeout_s is not None or self.memory_limit_gb is not None
-        if len(tasks) == 1 and not limited and getattr(tasks[0], "trusted", False):
+        if len(tasks) == 1 and not limited and tasks[0].trusted:
             return Serial().run(work, tasks)
         return super().run(work, tasks)
 

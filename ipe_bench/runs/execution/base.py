@@ -6,13 +6,26 @@ import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 from ipe_bench.basics.errors import StorageError, UserError, describe_exception
 from ipe_bench.basics.naming import Named
 
+
+class Task(Protocol):
+    """What an execution runs: anything that can be pickled."""
+
+    @property
+    def trusted(self) -> bool:
+        """Whether it runs only code that neither ends its process nor runs without end."""
+        ...
+
+
 Work = Callable[[Any], Iterable[Any]]
 """Does a task in steps: what it yields after each step is handed on, and proves that it is alive."""
+
+_LONGEST = 1e9
+"""Seconds, and 1e9 bytes, beyond which no limit is meant: thirty years, and more memory than there is."""
 
 FATAL = (UserError, StorageError)
 """Exceptions that concern the whole run: they end it, where any other is a failure of one task."""
@@ -48,7 +61,7 @@ class Execution(Named, ABC):
     """Where tasks run. A new execution is a frozen dataclass that writes `run`."""
 
     @abstractmethod
-    def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
+    def run(self, work: Work, tasks: Sequence[Task]) -> Iterator[Event]:
         """Yields an event per step, and one with `ended` per task; an exception in `work` fails its task alone.
 
         Closing the iterator, or an exception of `FATAL`, stops what is under way.
@@ -67,5 +80,5 @@ def check_limits(workers: int | None, block_timeout_s: float | None, memory_limi
     if workers is not None and workers < 1:
         raise UserError(f"workers={workers}: give a whole number above 0, or null")
     for option, value in (("block_timeout_s", block_timeout_s), ("memory_limit_gb", memory_limit_gb)):
-        if value is not None and not value > 0:
-            raise UserError(f"{option}={value}: give a number above 0, or null for no limit")
+        if value is not None and not 0 < value < _LONGEST:
+            raise UserError(f"{option}={value}: give a number above 0 and below {_LONGEST:g}, or null for no limit")

@@ -13,7 +13,7 @@ from typing import Any
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.machine import cores
-from ipe_bench.runs.execution.base import FATAL, Event, Execution, Failure, Work, check_limits
+from ipe_bench.runs.execution.base import FATAL, Event, Execution, Failure, Task, Work, check_limits
 from ipe_bench.runs.execution.processes import supervise
 
 _CONNECT_S = 30
@@ -46,7 +46,7 @@ class Dask(Execution):
         if self.address is not None and (self.jobqueue is not None or self.workers is not None or self.options):
             raise UserError(f"address={self.address}: goes with no workers, jobqueue or options; leave out either")
 
-    def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
+    def run(self, work: Work, tasks: Sequence[Task]) -> Iterator[Event]:
         if not tasks:
             return
         client = self._client()

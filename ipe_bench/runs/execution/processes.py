@@ -1,8 +1,11 @@
 """Tasks in worker processes of this machine, each watched on its own.
 
 A pool of joblib or concurrent.futures breaks as a whole when one worker dies, does not say which task it died of, and
-cannot stop one task. Here each worker has a pipe of its own: the task of a dead worker is known, a task that exceeds
-its time is ended with its worker, and the others never notice.
+cannot stop one task. Pebble's does both, but all its workers share one pipe and its locks: a worker that dies between
+two tasks breaks the pool for good, scripts need a `__main__` guard, the steps of a task need a pipe and deadlines of
+their own anyway, and inside a Dask worker it cannot start processes. Here each worker has a pipe of its own: the task
+of a dead worker is known, a task that exceeds its time is ended with its worker and the processes that it started, and
+the others never notice.
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ import cloudpickle
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.machine import cores
-from ipe_bench.runs.execution.base import Event, Execution, Failure, Work, check_limits
+from ipe_bench.runs.execution.base import Event, Execution, Failure, Task, Work, check_limits
 
 _THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
@@ -54,14 +57,14 @@ class Processes(Execution):
     block_timeout_s: float | None = None
     """Seconds that one estimator may take for one block; None: no limit."""
     memory_limit_gb: float | None = None
-    """Memory that one worker may use, in 1e9 bytes; None: no limit. Linux only."""
+    """Memory that one worker may use, in 1e9 bytes; None: no limit. Linux only; see `worker.enforce`."""
 
     def __post_init__(self) -> None:
         check_limits(self.workers, self.block_timeout_s, self.memory_limit_gb)
         if self.memory_limit_gb is not None and not sys.platform.startswith("linux"):
             raise UserError(f"memory_limit_gb={self.memory_limit_gb}: can be enforced on Linux only; give null")
 
-    def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
+    def run(self, work: Work, tasks: Sequence[Task]) -> Iterator[Event]:
         workers = min(self.workers or cores(), len(tasks))
         if workers == 0:
             return iter(())
@@ -74,7 +77,7 @@ class Processes(Execution):
 
 def supervise(
     work: Work,
-    tasks: Sequence[Any],
+    tasks: Sequence[Task],
     workers: int,
     threads: int,
     step_timeout_s: float | None,
@@ -102,6 +105,7 @@ def supervise(
                 worker = busy[connection]  # pyright: ignore[reportArgumentType]
                 kind, value = worker.receive()
                 if kind == "started":
+                    worker.started = True
                     worker.extend(None if step_timeout_s is None else max(step_timeout_s, _PREPARATION_S))
                 elif kind == "step":
                     worker.extend(step_timeout_s)
@@ -110,6 +114,9 @@ def supervise(
                     del busy[worker.connection]
                     if kind != "died":
                         _give_back(worker)
+                    elif worker.served and not worker.started:  # it was ending while it was handed the task
+                        waiting.appendleft(worker.index)
+                        continue
                     if kind == "fatal":
                         raise value
                     yield Event(worker.index, ended=True, failure=value)
@@ -135,7 +142,7 @@ class _Worker:
         handle = there.fileno()
         command = [sys.executable, "-P", "-m", "ipe_bench.runs.execution.worker", str(handle)]
         if memory_limit_gb is not None:
-            command.append(str(int(memory_limit_gb * 1e9)))
+            command.append(str(memory_limit_gb))
         path = os.pathsep.join(p or os.getcwd() for p in sys.path)
         options: dict[str, Any] = {"pass_fds": (handle,)}
         if sys.platform == "win32":
@@ -152,11 +159,16 @@ class _Worker:
         there.close()
         self.index = -1
         self.deadline = math.inf
+        self.served = False
+        """Whether it has ended a task before this one."""
+        self.started = False
+        """Whether it has begun with this one."""
 
     def begin(self, index: int, threads: int, payload: bytes) -> bool:
         """Hands it a task; False where the process is no longer there."""
         self.index = index
         self.deadline = math.inf
+        self.started = False
         try:
             self.connection.send((sys.path, threads, payload))
         except OSError:
@@ -188,9 +200,17 @@ class _Worker:
         # One that has closed its pipe is on its way out: give it the time to leave its own exit code.
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(0.1)
+            self._end_children()
             return
+        self._end_children()
         self.process.kill()
         self.process.wait()
+
+    def _end_children(self) -> None:
+        """Ends what the worker started: its session is of its own, and outlives it."""
+        if sys.platform != "win32":
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(self.process.pid, signal.SIGKILL)
 
 
 def _describe_exit(code: int) -> str:
@@ -222,6 +242,7 @@ def _take(memory_limit_gb: float | None) -> _Worker:
 
 
 def _give_back(worker: _Worker) -> None:
+    worker.served = True
     with _lock:
         _idle.setdefault((os.getpid(), worker.memory_limit_gb), []).append(worker)
 

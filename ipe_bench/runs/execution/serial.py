@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from ipe_bench.runs.execution.base import FATAL, Event, Execution, Failure, Work
+from ipe_bench.runs.execution.base import FATAL, Event, Execution, Failure, Task, Work
 
 
 @dataclass(frozen=True)
@@ -16,7 +15,7 @@ class Serial(Execution):
     Nothing stands between an estimator and this process: one that never returns, or ends the process, ends the run.
     """
 
-    def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
+    def run(self, work: Work, tasks: Sequence[Task]) -> Iterator[Event]:
         for index, task in enumerate(tasks):
             failure = None
             try:

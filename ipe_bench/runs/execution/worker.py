@@ -1,6 +1,7 @@
-"""The process that a task runs in: `python -m ipe_bench.runs.execution.worker FD [MEMORY_LIMIT_BYTES]`.
+"""The process that a task runs in: `python -m ipe_bench.runs.execution.worker FD [MEMORY_LIMIT_GB]`.
 
-It imports next to nothing before it listens, computes with one thread in BLAS, and ends when its parent ends.
+It imports next to nothing before it listens, computes with one thread in BLAS, holds itself to
+`execution.memory_limit_gb`, and ends when its parent ends.
 """
 
 from __future__ import annotations
@@ -20,11 +21,11 @@ IDLE_S = 300.0
 """A worker that nobody has used for so long ends by itself."""
 
 
-def main(handle: int, memory_limit: int | None) -> None:
+def main(handle: int, memory_limit_gb: float | None) -> None:
     # Ctrl-C is the parent's business: it ends its workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if memory_limit is not None:
-        _limit_memory(memory_limit)
+    if memory_limit_gb is not None:
+        enforce(memory_limit_gb)
     connection = _connection(handle)
     messages: queue.SimpleQueue[Any] = queue.SimpleQueue()
     # Reading in a thread, so that the end of the parent is noticed in the middle of a task.
@@ -48,7 +49,14 @@ def _listen(connection: Connection, messages: queue.SimpleQueue[Any]) -> None:
         try:
             messages.put(connection.recv())
         except (EOFError, OSError):
-            os._exit(0)
+            _end()
+
+
+def _end() -> None:
+    """Ends this process at once, and with it those that a task has started: its session holds nothing else."""
+    if sys.platform != "win32" and os.getsid(0) == os.getpid():
+        os.killpg(0, signal.SIGKILL)
+    os._exit(0)
 
 
 def _perform(connection: Connection, payload: bytes) -> tuple[str, Any]:
@@ -75,12 +83,14 @@ def _connection(handle: int) -> Connection:
     return Connection(handle)
 
 
-def _limit_memory(limit: int) -> None:
+def enforce(memory_limit_gb: float) -> None:
+    """Has every allocation of this process beyond the limit, in 1e9 bytes, end in a MemoryError."""
     import resource
 
     # Data, not address space: compiled code and thread pools reserve far more addresses than they use.
+    limit = int(memory_limit_gb * 1e9)
     resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else None)
+    main(int(sys.argv[1]), float(sys.argv[2]) if len(sys.argv) > 2 else None)

@@ -1,11 +1,11 @@
-"""NEES, limits, coverage and the verdict, against simulated truth and published values."""
+"""NEES, limits and the verdict, against simulated truth and published values."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from ipe_bench.statistics.consistency import assess, clopper_pearson, coverage, mean_limits
+from ipe_bench.statistics.consistency import clopper_pearson, mean_limits, verdict
 from ipe_bench.trials.scoring import nees
 
 
@@ -38,21 +38,27 @@ def test_limits_hold_what_they_promise():
 
 
 @pytest.mark.parametrize(
-    ("claimed", "verdict"),
+    ("claimed", "expected"),
     [(1.0, "consistent"), (1.5, "pessimistic"), (0.8, "optimistic"), (0.05, "diverged but confident")],
 )
-def test_verdict(claimed, verdict):
-    found = assess(nees(*draw(1000, claimed)), 3)
-    assert found.verdict == verdict
-    assert found.nees == pytest.approx(1 / claimed**2, rel=0.1)
+def test_verdict(claimed, expected):
+    values = nees(*draw(1000, claimed))
+    assert verdict(values, 3) == expected
+    assert values.mean() / 3 == pytest.approx(1 / claimed**2, rel=0.1)
 
 
 def test_a_few_divergences_that_chance_does_not_explain_are_named():
     error, P = draw(1000)
     error[:30] *= 1e3
-    assert assess(nees(error, P), 3).verdict == "diverged but confident"
+    assert verdict(nees(error, P), 3) == "diverged but confident"
     P[:30] *= 1e6  # the same errors, owned up to
-    assert assess(nees(error, P), 3).outside == 0.0
+    assert verdict(nees(error, P), 3) == "consistent"
+
+
+def test_divergences_that_may_be_one_in_a_hundred_are_not_named_so():
+    error, P = draw(1000)
+    error[:10] *= 1e3
+    assert verdict(nees(error, P), 3) == "optimistic"
 
 
 def test_what_is_no_covariance_or_no_estimate():
@@ -66,30 +72,9 @@ def test_what_is_no_covariance_or_no_estimate():
     assert np.isnan(values[0])
     assert np.isinf(values[1:5]).all()
     assert np.isfinite(values[5])
-    found = assess(values, 3)
-    assert found.trials == 5
-    assert found.outside == pytest.approx(4 / 5)
+    # One made no claim, and of five claims four are beyond any gate.
+    assert verdict(values, 3) == "diverged but confident"
 
 
 def test_nothing_claimed_nothing_judged():
-    found = assess(np.full(5, np.nan), 3)
-    assert found.verdict == "unknown"
-    assert np.isnan(found.nees)
-
-
-def test_nis_has_limits_of_its_own():
-    rng = np.random.default_rng(4)
-    nis = rng.chisquare(40, size=300) / 40
-    found = assess(nees(*draw(300)), 3, nis=nis, readings=40)
-    assert found.nis_low < found.nis < found.nis_high
-    assert (found.nis_low, found.nis_high) == mean_limits(40, 300)
-
-
-def test_coverage_of_consistent_errors():
-    error, P = draw(2000)
-    deviation = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-    share, limits = coverage(error, deviation)
-    assert share == pytest.approx(np.full(3, 0.95), abs=4 * np.sqrt(0.05 * 0.95 / 2000))
-    assert ((limits[0] < share) & (share < limits[1])).all()
-    error[:, 0] = np.nan
-    assert coverage(error, deviation)[0][0] == 0.0
+    assert verdict(np.full(5, np.nan), 3) == "-"

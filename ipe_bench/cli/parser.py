@@ -1,0 +1,127 @@
+"""What each command may be given, and what `--help` says of it. What follows `run` is for Hydra, its help too."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+from ipe_bench.basics.errors import UserError, unknown
+
+_ABOUT = """\
+ipe-bench: which estimator to trust with nonlinear measurements
+
+  ipe-bench run +experiment=paper                 the paper's experiment
+  ipe-bench run error_scale=33 "solver=[fixed_point,newton]" "baseline=[linear_lse]"
+  ipe-bench run -m error_scale=1,10,100 seed=1,2  sweeps; any Hydra flag works after run (--cfg job, --info, ...)
+  ipe-bench estimate readings=FILE.csv            parameters from real readings
+"""
+_CODES = """\
+`ipe-bench COMMAND --help` says more of one command.
+Exit codes: 0 done; 1 done, but some pieces failed or are missing; 2 a mistake in what was asked for; 130 Ctrl-C.
+"""
+_ESTIMATE = """
+  ipe-bench estimate readings=FILE.csv                          the default model, gins
+  ipe-bench estimate measurement=ranging readings=FILE.parquet
+  ipe-bench estimate measurement=gins readings=FILE.csv "solver=[newton]" "baseline=[gauss_newton,ekf]"
+  ipe-bench estimate measurement=nist/misra1a                   readings that come with the model
+
+readings=FILE       CSV or Parquet; `ipe-bench list measurement -v` says which rows and columns a model wants.
+                    A missing reading keeps its row, with an empty cell.
+noise.deviation=X   the standard deviation of a reading; standard errors and tests rest on it.
+error_scale=X       how far the parameters may lie from the nominal point: the prior of filters and map_lm.
+output=DIR          where the files go: outputs/estimate-MODEL unless given, or outputs/estimate-MODEL-2 and so on
+                    where another command has written there. Nothing of another command is overwritten.
+
+Files: estimate.json (estimates, standard errors, correlations, tests, versions), residuals.csv, and as PNG and PDF
+residuals (normalised, by time) and ellipses (95 % regions of the most correlated pairs of parameters).
+"""
+
+
+_REPORT = """
+Nothing is computed again.
+
+  ipe-bench report DIR                            into DIR itself
+  ipe-bench report DIR1 DIR2 output=DIR           several folders together, into DIR
+"""
+
+
+class Parser(argparse.ArgumentParser):
+    """One that raises a UserError where argparse would print its usage and exit."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False, **options)
+
+    def error(self, message: str) -> NoReturn:
+        raise UserError(f"{self.command}: {message}; see `{self.prog} --help`")
+
+    @property
+    def command(self) -> str:
+        """The command's name, to begin a message with."""
+        return self.prog.partition(" ")[2]
+
+    def parse(self, words: Sequence[str]) -> argparse.Namespace:
+        """The values of these words.
+
+        Raises:
+            UserError: a flag or a word that the command does not take, or one that it wants is not there.
+        """
+        values, surplus = self.parse_known_intermixed_args(words)
+        for word in surplus:
+            if word.startswith("-"):
+                flags = [flag for action in self._actions for flag in action.option_strings]
+                raise UserError(f"{self.command}: {word}: {unknown(word, flags, 'flag')}")
+            raise UserError(f"{self.command}: {word}: is a word too many; see `{self.prog} --help`")
+        return values
+
+
+def parsers() -> tuple[Parser, dict[str, Parser]]:
+    """The parser of the bare program, and those of its commands by name."""
+    program = Parser(prog="ipe-bench", description=_ABOUT, epilog=_CODES, usage="ipe-bench COMMAND ...")
+    program.add_argument("--version", action="store_true", help="print the version")
+    commands = program.add_subparsers(metavar="COMMAND", title="commands", prog="ipe-bench", parser_class=Parser)
+    found: dict[str, Parser] = {}
+
+    def add(name: str, what: str, codes: str = "", more: str = "") -> Parser:
+        epilog = f"Exit codes: {codes}; 2 a mistake in what was asked for." if codes else None
+        found[name] = commands.add_parser(
+            name, help=what, description=f"ipe-bench {name}: {what}\n{more}", epilog=epilog
+        )
+        return found[name]
+
+    add("run", "simulate, estimate, store and report")
+    estimate = add(
+        "estimate",
+        "parameters from real readings, and whether the model fits them",
+        "0 an estimator converged; 1 none did",
+        _ESTIMATE,
+    )
+    estimate.add_argument("arguments", metavar="KEY=VALUE", nargs="*", help="whatever `ipe-bench run` takes")
+    report = add(
+        "report",
+        "tables, figures and report of what is stored",
+        "0 done; 1 done, but something that was asked for is missing",
+        _REPORT,
+    )
+    report.add_argument("arguments", metavar="DIR", nargs="*", help="folders of results, such as outputs/paper")
+    status = add(
+        "status", "what is done, missing, failed and stale in folders of results", "0 complete; 1 not complete"
+    )
+    status.add_argument("arguments", metavar="DIR", nargs="*", help="folders of results, such as outputs/paper")
+    options = add("list", "what there is to choose from, and where it comes from")
+    options.add_argument("groups", metavar="GROUP", nargs="*", help="solver, baseline, measurement, ... or all")
+    options.add_argument(
+        *("-v", "--verbose"),
+        action="store_true",
+        help="with each measurement's parameters and the columns of its readings file",
+    )
+    new = add("new", "a working plugin to start from, in plugins/NAME")
+    new.add_argument("kind", metavar="KIND", help="solver, baseline, measurement or noise")
+    new.add_argument("name", metavar="NAME", help="small letters, digits and underscores")
+    check = add(
+        "check",
+        "whether a plugin keeps the promises that every component makes",
+        "0 all checks passed; 1 some failed",
+    )
+    check.add_argument("folders", metavar="DIR", nargs="*", help="folders of plugins, such as plugins/my_plugin")
+    return program, found

@@ -1,0 +1,166 @@
+"""Attempts at least squares by growing windows of data: several candidates per trial, the best of which go on."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.basics.batches import put, take
+from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.least_squares import Minima, Objective
+from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
+from ipe_bench.measurements.base import Restricted
+from ipe_bench.measurements.counted import Counted
+from ipe_bench.solvers.search import Search
+
+_SLOW_GROWTH = 1.4
+_CAREFUL_ITERATIONS = (60, 30)
+"""In the first window of a careful attempt, and in later ones."""
+_FIRST_DRAWS = 16
+_KEPT = (8, 4, 2, 2, 1)
+"""Candidates that each window keeps, of 16; in proportion of more, until one is left."""
+_GIVEN_UP = (np.inf, 1e6, 1e3)
+"""The mean squared residual above which a window's fit is a wrong one: in the first window, the second, and later."""
+_ONE = (0.03, 0.003)
+"""Candidates closer than this, in deviations of the prior, are one: in the first window, and later."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Where the candidates of some trials have come; every field has the candidates in front."""
+
+    x: Array
+    owner: NDArray[np.intp]
+    """The trial (candidates,) that each belongs to."""
+    iterations: NDArray[np.int64]
+    path: list[Array] | None
+    """The iterates so far, where a history was asked for."""
+
+    @classmethod
+    def at(cls, x: Array, owner: NDArray[np.intp], history: bool) -> Candidates:
+        return cls(x, owner, np.zeros(len(x), np.int64), [row[None] for row in x] if history else None)
+
+    def moved(self, minima: Minima) -> Candidates:
+        """The same candidates where a minimisation has led them."""
+        path = self.path
+        if path is not None and minima.history is not None:
+            path = [np.concatenate([old, new[1:]]) for old, new in zip(path, minima.history, strict=True)]
+        return Candidates(minima.x, self.owner, self.iterations + minima.iterations, path)
+
+
+@dataclass(frozen=True)
+class Windows(Search):
+    """From the nominal point, then carefully from there, then from 16, 32 and 64 draws of the prior."""
+
+    attempts = 5
+    enough = 1
+
+    def attempt(self, k: int, rows: NDArray[np.intp], before: Minima | None) -> Minima:
+        """The k-th attempt for the trials `rows`: window after window, then all data without the prior.
+
+        `before` is the best of the attempts so far: without a prior it says how far draws should reach.
+        """
+        prior = self.prior
+        metric = np.ones(self.problem.measurement.n) if prior is None else prior
+        there = self._begin(k, rows, metric if prior is not None or before is None else _reach(before, self.problem.x0))
+        method = LevenbergMarquardtMethod(self.options.damping, metric, by_residual=k > 0, geodesic=k > 0)
+        for number, (epochs, arrived) in enumerate(self._windows(k)):
+            objective = self._window(there.owner, epochs, arrived, prior)
+            limit = _CAREFUL_ITERATIONS[min(number, 1)] if k else self.options.window_iterations
+            minima = self.minimize(
+                objective, there.owner, method, there.x, tolerance=self.options.window_tolerance, limit=limit
+            )
+            fit = minima.chi_square if prior is None else minima.chi_square + _far(minima.x, self.problem.x0, prior)
+            per_reading = np.where(np.isfinite(fit), fit, np.inf) / objective.readings
+            there = take(there.moved(minima), self._kept(k, number, there.owner, minima.x / metric, per_reading))
+        last = LevenbergMarquardtMethod(self.options.damping, metric)
+        tolerance, limit = self.options.tolerance, self.options.max_iterations
+        minima = self.minimize(self.whole(there.owner), there.owner, last, there.x, tolerance=tolerance, limit=limit)
+        there = there.moved(minima)
+        return self._best(rows, there, replace(minima, iterations=there.iterations, history=there.path))
+
+    def _begin(self, k: int, rows: NDArray[np.intp], spread: Array) -> Candidates:
+        """The nominal point twice, then draws about it."""
+        x0, n = self.problem.x0, self.problem.measurement.n
+        draws = np.zeros((1, n))
+        if k > 1:
+            count = _FIRST_DRAWS * 2 ** (k - 2)
+            draws = np.random.Generator(np.random.Philox(k)).standard_normal((count, n))
+        spread = np.broadcast_to(spread, (len(rows), n))
+        x = (x0 + spread[:, None] * draws).reshape(-1, n)
+        return Candidates.at(x, np.repeat(rows, len(draws)), self.history)
+
+    def _windows(self, k: int) -> Iterator[tuple[int, NDArray[np.intp]]]:
+        """Each window's number of epochs and its readings; all data are left to the last pass."""
+        model = self.problem.measurement
+        assert model.epochs is not None
+        growth = min(self.options.growth, _SLOW_GROWTH) if k else self.options.growth
+        for stop in window_stops(len(model.epochs), growth):
+            yield stop, model.rows(stop)
+
+    def _window(
+        self, owner: NDArray[np.intp], epochs: int, arrived: NDArray[np.intp], prior: Array | None
+    ) -> Objective:
+        """The objective of each candidate in a window."""
+        problem, model = self.problem, self.problem.measurement
+        assert model.epochs is not None
+        window = Counted(Restricted.until(model, epochs), self.spent(owner), epochs / len(model.epochs))
+        R, z = problem.R.restricted(arrived), self.z[np.ix_(owner, arrived)]
+        return Objective(window, R, z, np.arange(len(owner)), problem.x0, prior)
+
+    def _kept(self, k: int, number: int, owner: NDArray[np.intp], x: Array, per_reading: Array) -> NDArray[np.intp]:
+        """The candidates that go on: of each trial the best few that differ and are not given up; one in any case in
+        the last attempt, and where there is no fit at all: that ends with its own status."""
+        most = _KEPT[min(number, len(_KEPT) - 1)] * (2 ** max(k - 2, 0) if number < 2 else 1)
+        limit = _GIVEN_UP[min(number, len(_GIVEN_UP) - 1)]
+        order = np.lexsort((per_reading, owner))
+        kept: list[int] = []
+        for _, group in itertools.groupby(order.tolist(), key=lambda i: owner[i]):
+            chosen: list[int] = []
+            for i in group:
+                alike = any(np.abs(x[i] - x[j]).max() <= _ONE[min(number, 1)] for j in chosen)
+                good = per_reading[i] <= limit or (not chosen and (k == self.last or np.isinf(per_reading[i])))
+                if len(chosen) < most and good and not alike:
+                    chosen.append(i)
+            kept += chosen
+        return np.array(sorted(kept), dtype=np.intp)
+
+    def _best(self, rows: NDArray[np.intp], there: Candidates, minima: Minima) -> Minima:
+        """Of each trial's candidates the best; a trial that has none left has not arrived."""
+        n = self.problem.measurement.n
+        trials = len(rows)
+        result = Minima(
+            np.repeat(self.problem.x0[None], trials, axis=0),
+            np.full(trials, Status.MAX_ITERATIONS, np.int8),
+            np.zeros(trials, np.int64),
+            [self.problem.x0[None]] * trials if self.history else None,
+            np.full((trials, n, n), np.nan),
+            np.full(trials, np.inf),
+            np.full(trials, np.inf),
+        )
+        fit = np.where(np.isfinite(minima.chi_square), minima.chi_square, np.inf)
+        order = np.lexsort((fit, ~minima.converged, there.owner))
+        owner, first = np.unique(there.owner[order], return_index=True)
+        return put(result, np.searchsorted(rows, owner), take(minima, order[first]))
+
+
+def window_stops(epochs: int, growth: float) -> list[int]:
+    """How many epochs each window has, the last one short of all: 1, 2, 4, 8, 16 of 30 for growth 2."""
+    lengths = itertools.takewhile(lambda length: length < epochs, (growth**i for i in itertools.count()))
+    return sorted({round(length) for length in lengths} - {epochs})
+
+
+def _far(x: Array, x0: Array, prior: Array) -> Array:
+    """The prior's part of the objective."""
+    return np.sum(((x - x0) / prior) ** 2, axis=1)
+
+
+def _reach(before: Minima, x0: Array) -> Array:
+    """How far draws reach without a prior (trials, n): as far as the attempts before have led."""
+    distance = np.abs(before.x - x0)
+    return np.maximum(1.0, np.where(np.isfinite(distance), distance, 1.0))

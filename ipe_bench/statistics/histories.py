@@ -1,0 +1,107 @@
+"""What iterations did on their way to the limit: cost of coming close, orders of convergence, and the paper's bounds.
+
+A history is the iterates (iterates, n) of one converged trial, in multiples of the parameters' units; the last one
+stands for the limit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ipe_bench.basics.linalg import Array
+
+CLOSE = 0.05
+"""An iterate within this many standard deviations of the last one is as good as the last one."""
+FLOOR = 1e-9
+"""Distances below this are round-off."""
+
+
+@dataclass(frozen=True)
+class History:
+    """How a converged trial came to its limit."""
+
+    row: int
+    """The trial's row in its sample."""
+    trial: str
+    """The trial as readers name it."""
+    iterates: Array
+    distances: Array
+    """(iterates,) from the last iterate, in deviations of the bound."""
+    cost: float
+    """Of the whole trial."""
+
+    @property
+    def cost_to_limit(self) -> float:
+        """The cost of coming close; that of iterate k is its share (k + 1) / (iterates) of the trial's whole cost."""
+        return self.cost * (iterations_to_limit(self.distances) + 1) / len(self.iterates)
+
+
+def trial_label(seed: int, trial: int) -> str:
+    return f"seed {seed}, trial {trial}"
+
+
+def distances_to_limit(history: Array, deviation: Array) -> Array:
+    """Largest component of each iterate's (iterates, n) distance from the last one, in standard deviations (n,)."""
+    with np.errstate(invalid="ignore"):
+        return np.abs((history - history[-1]) / deviation).max(axis=1)
+
+
+def iterations_to_limit(distances: Array) -> int:
+    """The first iterate from which on all are within `CLOSE` of the last."""
+    far = np.flatnonzero(~(distances <= CLOSE))
+    return int(far[-1]) + 1 if len(far) else 0
+
+
+def orders_of(errors: Array, floor: float = FLOOR) -> Array:
+    """log(e_(k+1) / e_k) / log(e_k / e_(k-1)) of successive errors (iterates,), where they decrease above the floor:
+    1 where convergence is linear, 2 where it is quadratic."""
+    e = errors[: int(np.argmax(errors <= floor)) if (errors <= floor).any() else len(errors)]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        orders = np.log(e[2:] / e[1:-1]) / np.log(e[1:-1] / e[:-2])
+    decreasing = (e[2:] < e[1:-1]) & (e[1:-1] < e[:-2])
+    return orders[decreasing]
+
+
+@dataclass(frozen=True)
+class FixedPointBound:
+    """Eq. (18) against what happened, for one trial. Each is (iterates,), in the largest parameter error."""
+
+    bound: Array
+    """K^k / (1 - K) |x_1 - x_0|, infinite where K >= 1. The paper's print lost the k (Burden and Faires have it)."""
+    error: Array
+    """|x_k - limit|."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether no iterate is farther from the limit than the bound (and round-off) allows."""
+        return bool(np.all(self.error <= self.bound + 1e-12 * (1.0 + self.error.max())))
+
+    @property
+    def ratio(self) -> float:
+        """The largest error over its bound among the iterates between the first and the last."""
+        between = slice(1, -1)
+        with np.errstate(all="ignore"):
+            ratios = self.error[between] / self.bound[between]
+        return float(ratios[self.error[between] > FLOOR].max(initial=0.0))
+
+
+def fixed_point_bound(iterates: Array, K: float, limit: Array | None = None) -> FixedPointBound:
+    """Eq. (18) for iterates (iterates, n) with a constant K that holds along them; at a single point K is not a
+    proven bound. `limit` (n,) is the last iterate where it is not given."""
+    limit = iterates[-1] if limit is None else limit
+    step = np.abs(iterates[1] - iterates[0]).max()
+    powers = K ** np.arange(len(iterates))
+    bound = powers / (1 - K) * step if K < 1 else np.full(len(iterates), np.inf)
+    return FixedPointBound(bound, np.abs(iterates - limit).max(axis=1))
+
+
+def observed_constant(iterates: Array, limit: Array | None = None, floor: float = FLOOR) -> float:
+    """The largest 2 e_(k+1) / (n^2 e_k^2) above the floor: the least M with which eq. (23),
+    e_(k+1) <= n^2 M / 2 e_k^2, explains the iterates (iterates, n); NaN where they are over too soon."""
+    limit = iterates[-1] if limit is None else limit
+    errors = np.abs(iterates - limit).max(axis=1)
+    usable = (errors[:-1] > floor) & (errors[1:] > floor)
+    ratios = 2 * errors[1:][usable] / (iterates.shape[1] ** 2 * errors[:-1][usable] ** 2)
+    return float(ratios.max()) if len(ratios) else np.nan

@@ -1,0 +1,655 @@
+"""Every statistic, each in one record: what it is called and means, over which trials, how it is computed and shown.
+
+`summary.csv`, the appendix of the report, tables and the terminal are read from these lists: who adds a record adds it
+everywhere. How trials are read and how numbers are set in type is left to others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from scipy.stats import chi2, norm
+
+from ipe_bench.basics.linalg import Array
+from ipe_bench.statistics.consistency import clopper_pearson, mean_limits, verdict
+from ipe_bench.statistics.histories import CLOSE, FixedPointBound, fixed_point_bound, observed_constant, orders_of
+from ipe_bench.statistics.intervals import LARGEST_SAMPLE, RESAMPLES, bootstrap_rms, quantile, quantiles
+from ipe_bench.statistics.sample import FIT, NIS, Sample, root_mean
+from ipe_bench.trials.thresholds import FIT_LEVEL, GATE, SAME_ROOT
+
+Kind = Literal["count", "share", "number", "physical", "seconds", "word"]
+"""How a value is written; `report.words` knows each."""
+Where = Literal["overview", "costs", "parameters", "terminal", "covariances", "iterations"]
+"""A table; its columns are in the order of the records."""
+Limits = tuple[Any, Any]
+
+
+@dataclass(frozen=True)
+class Statistic:
+    """One statistic of a scenario under an estimator.
+
+    `overall` gives its value over all parameters; `each` gives those of the parameters (n,) in their own units, and
+    where there is none, it is a property of whole trials, the same in every row. `limits` and `each_limits` give an
+    interval, whose ends are columns of their own.
+    """
+
+    name: str
+    """Its column; the ends of its interval are `name_low` and `name_high`."""
+    title: str
+    over: str
+    """The trials that count."""
+    meaning: str
+    overall: Callable[[Sample], Any]
+    each: Callable[[Sample], Array] | None = None
+    limits: Callable[[Sample], Limits] | None = None
+    each_limits: Callable[[Sample], Limits] | None = None
+    kind: Kind = "number"
+    where: tuple[Where, ...] = ()
+    """The tables that show it."""
+    titles: Mapping[Where, str] = field(default_factory=dict)
+    """Its heading in tables where that is not `title`."""
+    limits_titles: Mapping[Where, str] = field(default_factory=dict)
+    """The headings of its interval, in tables that show that."""
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        return (self.name,) if self.limits is None else (self.name, f"{self.name}_low", f"{self.name}_high")
+
+    @property
+    def definition(self) -> str:
+        return f"{self.meaning} Over {self.over}."
+
+    def columns_of(self, sample: Sample) -> dict[str, list[Any]]:
+        """Its columns, a value for each parameter and one for all together."""
+        values = [_row_values(self.overall, self.each, sample)]
+        if self.limits is not None:
+            ends = self.limits(sample)
+            each = (None, None) if self.each_limits is None else self.each_limits(sample)
+            values += [_column(sample.n, end, own) for end, own in zip(ends, each, strict=True)]
+        return dict(zip(self.columns, values, strict=True))
+
+
+def _row_values(overall: Callable[[Sample], Any], each: Callable[[Sample], Array] | None, sample: Sample) -> list[Any]:
+    return _column(sample.n, overall(sample), None if each is None else each(sample))
+
+
+def _column(n: int, overall: Any, each: Array | None) -> list[Any]:
+    return [overall] * (n + 1) if each is None else [*each.tolist(), overall]
+
+
+def frame_columns(statistics: Sequence[Statistic]) -> tuple[str, ...]:
+    return tuple(column for s in statistics for column in s.columns)
+
+
+def rows_of(statistics: Sequence[Statistic], sample: Sample) -> list[dict[str, Any]]:
+    """A row per parameter and one over all: the columns of all the statistics."""
+    columns = {name: values for s in statistics for name, values in s.columns_of(sample).items()}
+    return [{name: values[i] for name, values in columns.items()} for i in range(sample.n + 1)]
+
+
+# How they are computed -----------------------------------------------------------------------------------------------
+
+
+def _share(mask: Array) -> float:
+    return float(mask.mean())
+
+
+def _success_limits(s: Sample) -> Limits:
+    return clopper_pearson(int(s.scalars["success"].sum()), len(s))
+
+
+def _misfit(s: Sample) -> float:
+    # Residuals that are not finite do not fit.
+    return _share(~(s.scalars[FIT] >= FIT_LEVEL)) if FIT in s.scalars else np.nan
+
+
+def _bias(s: Sample) -> Array:
+    return s.error[s.solved].mean(axis=0) if s.solved.any() else np.full(s.n, np.nan)
+
+
+def _std(s: Sample) -> Array:
+    return s.error[s.solved].std(axis=0, ddof=1) if s.solved.sum() > 1 else np.full(s.n, np.nan)
+
+
+def _rmse_common(s: Sample) -> Array:
+    return root_mean(s.error, s.solved & s.solved_by_all)
+
+
+def _crlb(s: Sample) -> Array:
+    return root_mean(s.crlb, s.solved)
+
+
+def _bayes(s: Sample) -> Array:
+    return root_mean(s.bayes, s.solved)
+
+
+def _applying_bound(s: Sample) -> Array:
+    return root_mean(s.bound, s.solved)
+
+
+def _reported(s: Sample) -> Array:
+    return root_mean(s.deviation, s.solved & np.isfinite(s.deviation).all(axis=1))
+
+
+def _eq_14(s: Sample) -> Array:
+    """Eq. (14): eq. (5) plus the mean square of H+ dN, which at a root of eq. (11) is the error less H+ v."""
+    if s.group.footer.get("equation") != "frozen":
+        return np.full(s.n, np.nan)
+    compensation = root_mean(s.error - s.linear_error, s.solved)
+    return np.sqrt(s.linear_bound**2 + compensation**2)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _over_linear_bound(values: Callable[[Sample], Array]) -> Callable[[Sample], float]:
+    """The root mean square over parameters of values (n,) over the linear bound."""
+    return lambda s: _rms(values(s) / s.linear_bound)
+
+
+def _in_units(values: Callable[[Sample], Array]) -> Callable[[Sample], Array]:
+    return lambda s: values(s) * s.sizes
+
+
+def _ratio(a: Any, b: Any) -> Array:
+    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    with np.errstate(all="ignore"):
+        return np.where(b > 0, a / b, np.nan)
+
+
+def _rmse(s: Sample) -> Array:
+    return s.rmse
+
+
+def _rmse_limits(s: Sample) -> Limits:
+    squares = np.mean(np.where(s.solved[:, None], s.normalised, 0.0) ** 2, axis=1, keepdims=True)
+    low, high = bootstrap_rms(squares, s.solved)
+    return float(low[0]), float(high[0])
+
+
+def _rmse_limits_each(s: Sample) -> Limits:
+    low, high = bootstrap_rms(np.where(s.solved[:, None], s.error, 0.0) ** 2, s.solved)
+    return low * s.sizes, high * s.sizes
+
+
+def _efficiency(s: Sample) -> float:
+    bound, rmse = _over_linear_bound(_applying_bound)(s), _over_linear_bound(_rmse)(s)
+    return float(_ratio(bound, rmse))
+
+
+def _efficiency_each(s: Sample) -> Array:
+    return _ratio(_applying_bound(s) * s.sizes, s.rmse * s.sizes)
+
+
+def _error_quantile(q: float) -> tuple[Callable[[Sample], float], Callable[[Sample], Array]]:
+    def overall(s: Sample) -> float:
+        return quantile(np.sqrt(np.mean(s.normalised**2, axis=1)), q)
+
+    def each(s: Sample) -> Array:
+        return np.array([quantiles(np.abs(column), np.array([q]))[0] for column in s.error.T]) * s.sizes
+
+    return overall, each
+
+
+def _nees(s: Sample) -> float:
+    known = s.reports_covariance and s.solved.any()
+    return float(np.mean(s.scalars["nees"][s.solved]) / s.n) if known else np.nan
+
+
+def _nees_each(s: Sample) -> Array:
+    if not (s.reports_covariance and s.solved.any()):
+        return np.full(s.n, np.nan)
+    return np.mean(_errors_over_reported(s)[s.solved] ** 2, axis=0)
+
+
+def _errors_over_reported(s: Sample) -> Array:
+    with np.errstate(all="ignore"):
+        return np.abs(s.error) / s.deviation
+
+
+def _nees_limits(s: Sample) -> Limits:
+    return mean_limits(s.n, int(s.solved.sum())) if s.reports_covariance else (np.nan, np.nan)
+
+
+def _nees_limits_each(s: Sample) -> Limits:
+    low, high = mean_limits(1, int(s.solved.sum())) if s.reports_covariance else (np.nan, np.nan)
+    return np.full(s.n, low), np.full(s.n, high)
+
+
+def _coverage(s: Sample) -> float:
+    return _share(s.scalars["nees"] <= chi2.ppf(0.95, s.n)) if s.reports_covariance else np.nan
+
+
+def _coverage_each(s: Sample) -> Array:
+    if not s.reports_covariance:
+        return np.full(s.n, np.nan)
+    return (_errors_over_reported(s) <= norm.isf(0.025)).mean(axis=0)
+
+
+def _false_root_distance(s: Sample) -> float:
+    wrong = s.converged & ~s.solved
+    known = "root_distance" in s.scalars and wrong.any()
+    return quantile(s.scalars["root_distance"][wrong], 0.5) if known else np.nan
+
+
+def _capped_error(s: Sample) -> float:
+    if not s.present.any():
+        return np.nan
+    return float(np.minimum(s.distance[s.present], gate_radius(s.n)).mean())
+
+
+def gate_radius(n: int) -> float:
+    """The Mahalanobis distance at which success ends."""
+    return float(np.sqrt(chi2.isf(GATE, n)))
+
+
+def _is(s: Sample, method: str) -> bool:
+    """Whether the estimator iterates by that method on the frozen equation; told by its description alone."""
+    target = str((s.group.footer["identity"]["estimator"] or {}).get("_target_", ""))
+    return s.group.footer.get("equation") == "frozen" and target.rpartition(".")[2] == method
+
+
+def _fixed_point_bounds(s: Sample) -> list[FixedPointBound]:
+    """Eq. (18) for each stored history of fixed-point iteration whose K at the truth is below 1."""
+    if not _is(s, "FixedPoint"):
+        return []
+    return [fixed_point_bound(h.iterates, float(K)) for h in s.histories if (K := s.truth["contraction_K"][h.row]) < 1]
+
+
+def _constants(s: Sample) -> Array:
+    """(histories, 2): the least M of eq. (23) that explains each stored history of Newton's method, and M at the truth;
+    without those that are over too soon to tell."""
+    if not _is(s, "Newton"):
+        return np.empty((0, 2))
+    pairs = [(observed_constant(h.iterates), float(s.truth["curvature_M"][h.row])) for h in s.histories]
+    return np.array([pair for pair in pairs if np.isfinite(pair).all()]).reshape(-1, 2)
+
+
+def _mean_nis(s: Sample) -> float:
+    values = s.scalars[NIS]
+    return float(np.mean(values[np.isfinite(values)])) if np.isfinite(values).any() else np.nan
+
+
+_EVERYWHERE: tuple[Where, ...] = ("overview", "terminal")
+_MEDIAN, _Q95 = _error_quantile(0.5), _error_quantile(0.95)
+
+STATISTICS: tuple[Statistic, ...] = (
+    Statistic("trials", "trials", "all trials", "Their number.", len, kind="count", where=_EVERYWHERE),
+    Statistic(
+        "converged",
+        "converged",
+        "all trials",
+        "Share in which the estimating equation holds within the tolerance. The other endings are named with their"
+        " messages.",
+        lambda s: _share(s.converged),
+        kind="share",
+        where=("overview",),
+    ),
+    Statistic(
+        "solved",
+        "solved",
+        "all trials",
+        f"Share that converged to the root, within {SAME_ROOT:g} standard deviations, that the same estimating equation"
+        " reaches when it is started at the truth. Filters and the linear LSE solve no equation: for them it means that"
+        " they finished.",
+        lambda s: _share(s.solved),
+        kind="share",
+        where=_EVERYWHERE,
+    ),
+    Statistic(
+        "success",
+        "success",
+        "all trials",
+        "Share whose error lies inside the ellipsoid of the bound at the truth that all but a share of"
+        f" {GATE:g} of efficient estimates lie in (chi-square quantile); the Bayesian bound's for estimators that use a"
+        " prior. Interval: Clopper and Pearson, Biometrika 26, 1934.",
+        lambda s: int(s.scalars["success"].sum()) / len(s),
+        limits=_success_limits,
+        kind="share",
+        where=_EVERYWHERE,
+        limits_titles={"overview": "95 % of success"},
+    ),
+    Statistic(
+        "false_root",
+        "false root",
+        "all trials",
+        "Share that converged and is not solved: another root of the same equation.",
+        lambda s: _share(s.converged & ~s.solved),
+        kind="share",
+        where=("overview", "covariances"),
+    ),
+    Statistic(
+        "false_root_distance",
+        "false root at",
+        "converged trials that are not solved",
+        "Median distance from the right root, in standard deviations of the Cramér-Rao bound, of the parameter that is"
+        " farthest off.",
+        _false_root_distance,
+        where=("covariances",),
+    ),
+    Statistic(
+        "bias",
+        "bias",
+        "solved trials",
+        "Mean error.",
+        _over_linear_bound(_bias),
+        _in_units(_bias),
+        kind="physical",
+        where=("parameters",),
+    ),
+    Statistic(
+        "std",
+        "std",
+        "solved trials",
+        "Standard deviation of the error (n - 1).",
+        _over_linear_bound(_std),
+        _in_units(_std),
+        kind="physical",
+        where=("parameters",),
+    ),
+    Statistic(
+        "rmse",
+        "rmse",
+        "solved trials",
+        "Root mean square error. Interval: 95 % percentile bootstrap over trials,"
+        f" {RESAMPLES} resamples, the same for every estimator; above {LARGEST_SAMPLE} trials, groups of consecutive"
+        " trials are resampled (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, ch. 13).",
+        _over_linear_bound(_rmse),
+        _in_units(_rmse),
+        limits=_rmse_limits,
+        each_limits=_rmse_limits_each,
+        kind="physical",
+        where=("overview", "parameters", "terminal", "covariances"),
+        titles={"overview": "rmse / bound", "terminal": "rmse/bound"},
+        limits_titles={"overview": "95 % of rmse", "parameters": "95 % of rmse", "terminal": "95 %"},
+    ),
+    Statistic(
+        "rmse_common",
+        "rmse, common",
+        "trials that every estimator of the scenario solved",
+        "Root mean square error.",
+        _over_linear_bound(_rmse_common),
+        _in_units(_rmse_common),
+        where=("overview",),
+    ),
+    Statistic(
+        "linear_bound",
+        "linear bound",
+        "no trials: the same for all",
+        "Standard deviation of the linear least-squares estimate, eq. (5), if the model were linear.",
+        lambda s: 1.0,
+        lambda s: s.linear_bound * s.sizes,
+        kind="physical",
+        where=("parameters",),
+    ),
+    Statistic(
+        "crlb",
+        "CRLB",
+        "solved trials",
+        "Cramér-Rao bound (J' R⁻¹ J)⁻¹ at the truth: root mean square of its standard deviation.",
+        _over_linear_bound(_crlb),
+        _in_units(_crlb),
+        kind="physical",
+        where=("parameters", "covariances"),
+    ),
+    Statistic(
+        "bayes_bound",
+        "Bayesian bound",
+        "solved trials",
+        "(J' R⁻¹ J + P₀⁻¹)⁻¹ at the truth, which estimators that use a prior are compared with: root mean square of its"
+        " standard deviation (Van Trees, Detection, Estimation, and Modulation Theory I, 1968, sec. 2.4).",
+        _over_linear_bound(_bayes),
+        _in_units(_bayes),
+        kind="physical",
+    ),
+    Statistic(
+        "reported",
+        "reported",
+        "solved trials",
+        "Root mean square of the standard deviation that the estimator itself reports: eq. (5) for the linear LSE, the"
+        " sandwich (H⁺J)⁻¹ H⁺RH⁺' (H⁺J)⁻ᵀ at the estimate for the frozen root.",
+        _over_linear_bound(_reported),
+        _in_units(_reported),
+        kind="physical",
+        where=("covariances",),
+    ),
+    Statistic(
+        "eq_14",
+        "eq. (14)",
+        "solved trials",
+        "Standard deviation by eq. (14), eq. (5) with the compensation error N(x) - N(x̂) of a root of eq. (11) added"
+        " as if it were independent of the noise. It is not: x̂ is made from the noise, and the cross terms that"
+        " eq. (14) leaves out are of the same order. The sandwich has them, to first order.",
+        _over_linear_bound(_eq_14),
+        _in_units(_eq_14),
+        kind="physical",
+        where=("covariances",),
+    ),
+    Statistic(
+        "rmse_over_linear_bound",
+        "rmse / bound",
+        "solved trials",
+        "Root mean square error over the linear bound.",
+        _over_linear_bound(_rmse),
+        lambda s: _ratio(s.rmse * s.sizes, s.linear_bound * s.sizes),
+        where=("parameters",),
+    ),
+    Statistic(
+        "efficiency",
+        "efficiency",
+        "solved trials",
+        "Bound over rmse, as standard deviations: 1 for an efficient estimator. The bound is the Bayesian one for"
+        " estimators that use a prior.",
+        _efficiency,
+        _efficiency_each,
+        where=("overview", "parameters"),
+    ),
+    Statistic(
+        "median_abs_error",
+        "median abs error",
+        "all trials",
+        "Median of the absolute error, what is not finite counting as infinite; over all parameters, of each trial's"
+        " root mean square over parameters of error over linear bound.",
+        *_MEDIAN,
+        kind="physical",
+        where=("parameters",),
+    ),
+    Statistic(
+        "q95_abs_error",
+        "95 % abs error",
+        "all trials",
+        "95 % quantile of the same.",
+        *_Q95,
+        kind="physical",
+        where=("parameters",),
+    ),
+    Statistic(
+        "nees",
+        "NEES / n",
+        "solved trials",
+        "Mean of e' P⁻¹ e / n with the covariance P that the estimator reports: 1 where it is right; per parameter, of"
+        " squared error over reported variance. Limits: 95 % chi-square (Bar-Shalom, Li and Kirubarajan, Estimation"
+        " with Applications to Tracking and Navigation, 2001, sec. 5.4).",
+        _nees,
+        _nees_each,
+        limits=_nees_limits,
+        each_limits=_nees_limits_each,
+        where=("overview", "parameters", "terminal"),
+        titles={"parameters": "NEES", "terminal": "NEES"},
+        limits_titles={"overview": "NEES limits"},
+    ),
+    Statistic(
+        "coverage95",
+        "coverage",
+        "all trials",
+        "Share whose truth lies inside the estimator's own 95 % ellipsoid; per parameter, interval. What is not finite"
+        " counts as not covered.",
+        _coverage,
+        _coverage_each,
+        kind="share",
+        where=("overview", "parameters"),
+    ),
+    Statistic(
+        "verdict",
+        "verdict",
+        "converged trials with a reported covariance",
+        "Whether the reported covariance is honest. Diverged but confident: surely more than 1 % of the trials lie"
+        f" where it says that a share of {GATE:g} should; optimistic, pessimistic: the mean NEES lies above or below"
+        " its 95 % limits.",
+        lambda s: verdict(s.scalars["nees"][s.converged], s.n),
+        kind="word",
+        where=("overview",),
+    ),
+    Statistic(
+        "misfit",
+        "misfit",
+        "all trials",
+        "Share whose residuals fail the chi-square test: |R^-1/2 (z - h(x))|² is larger than it would be in"
+        " 0.1 % of trials if model and noise were right. It needs no truth, so it is known for real readings too.",
+        _misfit,
+        kind="share",
+        where=_EVERYWHERE,
+    ),
+    Statistic(
+        "iterations_median",
+        "iterations",
+        "all trials",
+        "Median.",
+        lambda s: quantile(s.scalars["iterations"], 0.5),
+        where=("costs",),
+    ),
+    Statistic(
+        "iterations_p95",
+        "iterations, 95 %",
+        "all trials",
+        "95 % quantile.",
+        lambda s: quantile(s.scalars["iterations"], 0.95),
+        where=("costs",),
+    ),
+    Statistic(
+        "simulations_median",
+        "simulations",
+        "all trials",
+        "Median cost of a trial, a Jacobian counting as many simulations as there are parameters.",
+        lambda s: quantile(s.cost, 0.5),
+        where=("costs", "terminal"),
+        titles={"terminal": "sims"},
+    ),
+    Statistic(
+        "time_median_s",
+        "time",
+        "all trials",
+        "Median wall clock of a trial, a batch's shared evenly.",
+        lambda s: quantile(s.scalars["time_s"], 0.5),
+        kind="seconds",
+        where=("costs", "terminal"),
+    ),
+)
+"""The columns of `summary.csv`, in order."""
+
+SCORES: tuple[Statistic, ...] = (
+    Statistic(
+        "capped_error",
+        "capped error",
+        "the trials that every estimator of the scenario has",
+        "Mean Mahalanobis error sqrt(e' J' R⁻¹ J e), the error in standard deviations of the Cramér-Rao bound, about √n"
+        " when efficient; each trial's counts at most the radius of the gate of success, so that failing badly is"
+        " failing once.",
+        _capped_error,
+        where=("overview",),
+    ),
+    Statistic("cost_median", "cost", "all trials", "Median cost of a trial.", lambda s: quantile(s.cost, 0.5)),
+    Statistic(
+        "cost_to_limit_median",
+        f"to {CLOSE:g} σ of limit",
+        "converged trials with a stored history",
+        f"Median cost until all further iterates are within {CLOSE:g} standard deviations of the last, in every"
+        " parameter; iterate k of K is taken to cost (k + 1) / (K + 1) of the trial.",
+        lambda s: quantile(np.array([h.cost_to_limit for h in s.histories]), 0.5),
+        where=("costs",),
+    ),
+    Statistic(
+        "histories",
+        "histories",
+        "converged trials with a stored history",
+        "Their number.",
+        lambda s: len(s.histories),
+        kind="count",
+        where=("costs",),
+    ),
+    Statistic(
+        "order_median",
+        "order",
+        "converged trials with a stored history",
+        "Median of the last observed order of convergence: 1 linear, 2 quadratic.",
+        lambda s: quantile(np.array([o[-1] for h in s.histories if len(o := orders_of(h.distances))]), 0.5),
+        where=("costs",),
+    ),
+    Statistic(
+        "eq_18_trials",
+        "K below 1",
+        "converged trials of fixed-point iteration with a stored history",
+        "Number of those in which the K of eq. (15) at the truth is below 1, so that eq. (18) says something.",
+        lambda s: len(_fixed_point_bounds(s)),
+        kind="count",
+        where=("iterations",),
+    ),
+    Statistic(
+        "eq_18_holds",
+        "eq. (18) holds",
+        "those trials in which K is below 1",
+        "Share in which no iterate is farther from the limit than K^k / (1 - K) times the first step, eq. (18) with the"
+        " k that the print lost (Burden and Faires, Numerical Analysis, have it). K is that at the truth: the theorem"
+        " wants the largest on the way, so this is an observation and no proof.",
+        lambda s: _share(np.array([b.holds for b in bounds])) if (bounds := _fixed_point_bounds(s)) else np.nan,
+        kind="share",
+        where=("iterations",),
+    ),
+    Statistic(
+        "eq_18_error_over_bound",
+        "error / bound of eq. (18)",
+        "those trials in which K is below 1",
+        "Median of the largest distance of an iterate after the first from the limit, over its bound.",
+        lambda s: quantile(np.array([b.ratio for b in _fixed_point_bounds(s)]), 0.5),
+        where=("iterations",),
+    ),
+    Statistic(
+        "eq_23_observed",
+        "M observed",
+        "converged trials of Newton's method with a stored history",
+        "Median of the least M with which eq. (23), |x_(k+1) - root| <= n² M / 2 |x_k - root|², explains the history;"
+        " the last iterate stands for the root.",
+        lambda s: quantile(_constants(s)[:, 0], 0.5),
+        where=("iterations",),
+    ),
+    Statistic(
+        "eq_23_M",
+        "M at the truth",
+        "the same trials",
+        "Median of the largest |∂²g_i / ∂x_j ∂x_k| of Newton's g at the truth, by central differences. The theorem"
+        " wants the largest over a neighbourhood.",
+        lambda s: quantile(_constants(s)[:, 1], 0.5),
+        where=("iterations",),
+    ),
+    Statistic(
+        "eq_23_holds",
+        "eq. (23) holds",
+        "the same trials",
+        "Share in which the least M that explains the history is at most M at the truth.",
+        lambda s: _share(constants[:, 0] <= constants[:, 1]) if len(constants := _constants(s)) else np.nan,
+        kind="share",
+        where=("iterations",),
+    ),
+    Statistic(
+        NIS,
+        "NIS",
+        "all trials of filters",
+        "Mean normalised innovation squared over the number of readings: like NEES, but it needs no truth.",
+        lambda s: _mean_nis(s) if NIS in s.scalars else np.nan,
+    ),
+)
+"""Further columns of `Analysis.scores`."""

@@ -1,0 +1,150 @@
+"""`import ipe_bench as ib` is enough for all that the command line does, and costs nothing until it is used."""
+
+from __future__ import annotations
+
+import doctest
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ipe_bench as ib
+from ipe_bench import api
+
+HEAVY = ("pandas", "matplotlib", "seaborn", "hydra", "omegaconf", "filterpy", "numba", "rich")
+FUNCTIONS = ("check", "estimate", "load", "report", "run", "status")
+
+
+@pytest.mark.parametrize("use", ["pass", "ib.Scenario, ib.Status, ib.UserError, ib.Estimator", "ib.noise.Gaussian"])
+def test_nothing_heavy_is_imported_until_it_is_used(use):
+    script = f"import sys, ipe_bench as ib\n{use}\nprint(*[name for name in {HEAVY} if name in sys.modules])"
+    loaded = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert loaded.split() == []
+
+
+def test_every_public_name_is_there_and_explains_itself():
+    for name in ib.__all__:
+        thing = getattr(ib, name)
+        assert name == "__version__" or inspect.getdoc(thing), name
+
+
+@pytest.mark.parametrize("name", [n for n in ib.__all__ if n not in ("__version__",)])
+def test_the_examples_in_the_docstrings_come_out_as_they_say(name):
+    thing = getattr(api, name, None) or getattr(ib, name)
+    options = doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
+    runner = doctest.DocTestRunner(optionflags=options)
+    found = doctest.DocTestFinder(recurse=False).find(thing, name)
+    for test in found:
+        runner.run(test)
+    assert runner.summarize(verbose=False).failed == 0
+    assert name not in FUNCTIONS or runner.summarize(verbose=False).attempted > 0, f"{name} has no example"
+
+
+def test_the_python_of_the_readme_runs_as_it_stands(tmp_path, monkeypatch):
+    readme = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    assert [line for line in code.splitlines() if "import" in line] == ["import ipe_bench as ib"]
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(code.replace("trials=200", "trials=20"), names)
+    assert set(names["table"]["estimator"]) == {"newton", "ekf"}
+    assert names["rows"].groupby("estimator")["nees"].mean().loc["ekf"] > names["rows"]["nees"].min()
+    assert [fit.label for fit in names["fits"]] == ["linear_lse", "fixed_point", "levenberg_marquardt", "progressive"]
+
+
+@pytest.fixture(scope="module")
+def polynomial() -> ib.Scenario:
+    return ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
+
+
+def test_rows_of_trials_say_what_they_belong_to(tmp_path, polynomial):
+    bent = ib.Scenario(ib.measurements.Polynomial(strength=0.001), ib.noise.Gaussian(0.01), error_scale=3.0, seed=1)
+    estimators = {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}
+    ib.run([polynomial, bent], estimators, 12, output=tmp_path, block_size=5)
+    rows = ib.load(tmp_path)
+    assert len(rows) == 2 * 2 * 12
+    belongs = ["measurement", "noise", "error_scale", "seed", "estimator", "measurement.strength", "trial"]
+    assert not rows[belongs].isna().any().any()
+    assert not rows.duplicated(belongs).any()
+    assert rows.groupby("seed")["measurement.strength"].unique().map(list).to_dict() == {0: [0.005], 1: [0.001]}
+    drawn = polynomial.draw(0, 12).x
+    found = rows[(rows["estimator"] == "newton") & (rows["seed"] == 0)].sort_values("trial")
+    names = [p.name for p in polynomial.measurement.parameters]
+    np.testing.assert_array_equal(found[[f"x_{name}" for name in names]], drawn)
+    estimates = ib.solvers.Newton().estimate(polynomial.problem, polynomial.draw(0, 12).z)
+    np.testing.assert_array_equal(found[[f"error_{name}" for name in names]], estimates.x - drawn)
+
+
+def test_an_estimate_needs_no_scenario_and_finds_what_was_simulated(polynomial):
+    drawn = polynomial.draw(0, 1)
+    fits = ib.estimate(
+        polynomial.measurement, drawn.z[0], {"lm": ib.baselines.LevenbergMarquardt()}, noise=polynomial.noise
+    )
+    assert fits[0].status is ib.Status.CONVERGED
+    assert (np.abs(fits[0].x - drawn.x[0]) < 5 * fits[0].standard_errors).all()
+
+
+def test_a_file_and_an_array_are_estimated_alike(tmp_path, polynomial):
+    from ipe_bench.real.readings import write_readings
+
+    z = polynomial.draw(0, 1).z[0]
+    z[3] = np.nan
+    write_readings(tmp_path / "z.csv", polynomial.measurement, z)
+    chosen = {"lm": ib.baselines.LevenbergMarquardt()}
+    for readings in (tmp_path / "z.csv", str(tmp_path / "z.csv")):
+        (of_file,) = ib.estimate(polynomial.measurement, readings, chosen, noise=polynomial.noise)
+        (of_array,) = ib.estimate(polynomial.measurement, z, chosen, noise=polynomial.noise)
+        np.testing.assert_array_equal(of_file.x, of_array.x)
+
+
+def test_noise_that_nobody_states_is_estimated_from_the_residuals(polynomial):
+    """As `scipy.optimize.curve_fit` does without `absolute_sigma`: another implementation of the same definition."""
+    from scipy.optimize import curve_fit
+
+    model, z = polynomial.measurement, polynomial.draw(0, 1).z[0]
+    (found,) = ib.estimate(model, z, {"lm": ib.baselines.LevenbergMarquardt(tolerance=1e-9)}, noise=ib.noise.Unknown())
+    x, P = curve_fit(lambda _, *x: model.simulate(np.array([x]))[0], np.zeros(model.m), z, np.zeros(model.n))
+    np.testing.assert_allclose(found.x, x * model.sizes, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(found.covariance, P * np.outer(model.sizes, model.sizes), rtol=1e-3, atol=1e-12)
+    assert found.fits is None
+    assert np.isnan(found.p_value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "words"),
+    [
+        ((np.zeros(3),), {}, "give the 40 readings"),
+        (("nowhere.csv",), {}, "no such file"),
+        ((np.zeros(40), {"map": ib.baselines.MapLM()}), {}, "needs prior"),
+        ((np.zeros(40),), {"noise": ib.noise.Unknown()}, "noise: is not given and cannot be estimated"),
+    ],
+)
+def test_mistakes_in_an_estimate_are_one_line(polynomial, arguments, options, words):
+    with pytest.raises(ib.UserError, match=words):
+        ib.estimate(polynomial.measurement, *arguments, **options)
+
+
+def test_status_and_report_agree_and_the_report_is_still_a_function_afterwards(tmp_path, polynomial):
+    ib.run(polynomial, {"newton": ib.solvers.Newton()}, 10, output=tmp_path, block_size=5)
+    assert ib.status(tmp_path).attrs["problems"] == []
+    next((tmp_path / "trials").glob("*-5-10.parquet")).unlink()
+    problems = ib.status(tmp_path).attrs["problems"]
+    assert len(problems) == 1
+    for _ in range(2):  # the second call finds the room `report` where the function was
+        result = ib.report(tmp_path, tmp_path / "elsewhere")
+        assert list(result.problems) == problems
+    assert result.report == tmp_path / "elsewhere" / "report.html"
+    with pytest.warns(UserWarning, match="missing"):
+        ib.load([tmp_path])
+
+
+def test_check_takes_a_component_or_the_folder_of_a_plugin():
+    assert not any(finding.complaint for finding in ib.check(ib.noise.Gaussian(0.1)))
+    folder = Path(__file__).parents[2] / "plugins" / "relaxed_fixed_point"
+    findings = ib.check(folder)
+    assert {finding.component for finding in findings} == {"solver=relaxed"}
+    assert any(finding.complaint for finding in ib.check(3))

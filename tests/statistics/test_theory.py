@@ -1,0 +1,207 @@
+"""The paper's theory against systems whose answers are known in closed form, and as it stands in a report."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_models import Bent
+
+from ipe_bench.api import compute
+from ipe_bench.baselines import LinearLSE
+from ipe_bench.basics.linalg import Covariance, information, inverse, pseudo_inverse
+from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.ipe import FrozenSystem
+from ipe_bench.measurements import Gins, Polynomial
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.noise import Gaussian, Quantization
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.report.tables import all_tables
+from ipe_bench.solvers import FixedPoint, Newton
+from ipe_bench.statistics import analyse
+from ipe_bench.statistics.histories import fixed_point_bound, observed_constant, orders_of
+from ipe_bench.trials.contraction import contraction_of, curvature
+from ipe_bench.trials.roots import frozen_root
+from ipe_bench.trials.scenario import Scenario
+from ipe_bench.trials.scoring import CURVED, SAME_ROOT, Block
+
+
+def contraction(problem, x):
+    H_plus, _ = pseudo_inverse(problem.H[None], problem.R)
+    return contraction_of(np.matmul(H_plus, problem.measurement.jacobian(x)))
+
+
+def test_a_linear_model_contracts_at_once():
+    problem = Problem(Bent(), Covariance(np.full(12, 0.3)), None)
+    found = contraction(problem, np.random.default_rng(0).normal(size=(5, 3)))
+    for values in (found.K, found.infinity_norm, found.spectral_radius):
+        np.testing.assert_allclose(values, 0.0, atol=1e-12)
+
+
+def test_the_three_contractions_stand_in_order():
+    scenario = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), 33.0)
+    trials = scenario.draw(0, 30)
+    found = contraction(scenario.problem, trials.x)
+    assert (found.spectral_radius <= found.infinity_norm * (1 + 1e-12)).all()
+    assert (found.infinity_norm <= found.K * (1 + 1e-12)).all()
+    # K says nothing here, and all trials converge.
+    assert np.median(found.K) > 1
+    assert (found.spectral_radius < 1).all()
+    assert (FixedPoint().estimate(scenario.problem, trials.z).status == Status.CONVERGED).all()
+
+
+def test_eq_18_holds_with_the_k_that_the_print_lost():
+    """g(x) = x/2 has K = 1/2 and |x_k| = 2^-k, where the bound is 2^-k as well: sharp."""
+    iterates = 0.5 ** np.arange(12)[:, None]
+    found = fixed_point_bound(iterates, 0.5, np.zeros(1))
+    np.testing.assert_allclose(found.bound, found.error, rtol=1e-12)
+    assert found.holds
+    assert found.ratio == pytest.approx(1.0)
+    assert not fixed_point_bound(iterates, 0.4, np.zeros(1)).holds
+    assert np.isinf(fixed_point_bound(iterates, 1.5, np.zeros(1)).bound).all()
+
+
+def test_eq_18_holds_on_gins_at_scale_1():
+    scenario = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), 1.0)
+    trials = scenario.draw(0, 10)
+    histories = FixedPoint(tolerance=1e-9).estimate(scenario.problem, trials.z, history=True).history
+    root = frozen_root(scenario.problem, trials.z, trials.x)
+    for iterates, x in zip(histories, root, strict=True):
+        K = 1.05 * contraction(scenario.problem, iterates).K.max()
+        assert K < 1
+        bound = fixed_point_bound(iterates, K, x)
+        assert (bound.error[:3] <= bound.bound[:3]).all()
+
+
+def test_orders_of_sequences_are_recovered():
+    linear = 0.3 ** np.arange(10)
+    assert orders_of(linear)[-1] == pytest.approx(1.0, abs=1e-9)
+    assert orders_of(0.5 ** (2.0 ** np.arange(6)))[-1] == pytest.approx(2.0, abs=1e-9)
+    assert len(orders_of(linear[:2])) == 0
+
+
+def test_orders_on_gins_are_linear_and_quadratic():
+    scenario = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), 100.0)
+    trials = scenario.draw(0, 20)
+    problem = scenario.problem
+    root = frozen_root(problem, trials.z, trials.x)
+    deviation = np.sqrt(np.diagonal(FrozenSystem.at_nominal(problem, trials.z).covariance()[0]))
+    orders = {}
+    for solver in (FixedPoint(), Newton()):
+        histories = solver.estimate(problem, trials.z, history=True).history
+        errors = [np.abs((h - x) / deviation).max(axis=1) for h, x in zip(histories, root, strict=True)]
+        orders[type(solver)] = np.median([o[-1] for e in errors if len(o := orders_of(e, 1e-5))])
+    assert 0.8 < orders[FixedPoint] < 1.2
+    assert 1.7 < orders[Newton] < 2.3
+
+
+def test_the_constant_of_eq_23_is_that_of_a_quadratic():
+    """h(x) = A x + b (A x)^2 with one parameter: F'' = 2 b H+ A^2 and F' = H+ (A + 2 b A^2 x)."""
+    scenario = Scenario(Polynomial(unknowns=1, strength=0.1), Gaussian(0.01), GaussianPrior(), 1.0)
+    problem, trials = scenario.problem, scenario.draw(0, 1)
+    root = frozen_root(problem, trials.z, trials.x)
+    iterates = Newton(start="nominal").estimate(problem, trials.z, history=True).history[0]
+    H_plus, _ = pseudo_inverse(problem.H[None], problem.R)
+    M = curvature(problem.measurement, H_plus, root)[0]
+    u, s = root[0, 0], 0.1
+    np.testing.assert_allclose(M, (s + s**2 * u) / (1 + s * u + s**2 * u**2 / 2), rtol=1e-5)
+    assert 0.5 * M < observed_constant(iterates, root[0]) < 2 * M
+
+
+def test_eq_23_takes_the_largest_second_derivative_over_all_pairs():
+    """A square model whose second derivatives are known: h = (x + x y, y + 3 y^2) at 0 has the largest, 6, in y, y."""
+
+    class Square(Bent):
+        def jacobian(self, x):
+            ones, zeros = np.ones(len(x)), np.zeros(len(x))
+            rows = [[ones + x[:, 1], x[:, 0]], [zeros, ones + 6 * x[:, 1]]]
+            return np.array(rows).transpose(2, 0, 1)
+
+    found = curvature(Square(), np.eye(2)[None], np.zeros((2, 2)))
+    np.testing.assert_allclose(found, 6.0, rtol=1e-9)
+
+
+def test_stored_contraction_is_that_of_the_model_at_the_truth():
+    scenario = Scenario(Polynomial(strength=0.02), Gaussian(0.01), GaussianPrior(), 1.0)
+    block = Block.draw(scenario, 0, CURVED + 3)
+    columns = block.truth_columns()
+    model = scenario.measurement
+    slope = np.eye(4) - np.linalg.pinv(model.matrix) @ model.jacobian(block.trials.x)
+    np.testing.assert_allclose(columns["contraction_K"], 4 * np.abs(slope).max(axis=(1, 2)), rtol=1e-9)
+    np.testing.assert_allclose(columns["contraction_norm"], np.abs(slope).sum(axis=2).max(axis=1), rtol=1e-9)
+    radius = [np.abs(np.linalg.eigvals(s)).max() for s in slope]
+    np.testing.assert_allclose(columns["contraction_radius"], radius, rtol=1e-7)
+    # M is stored for the first trials of the scenario, whatever the block.
+    assert np.isfinite(columns["curvature_M"]).tolist() == [True] * CURVED + [False] * 3
+    later = Block.draw(scenario, CURVED - 1, CURVED + 3).truth_columns()
+    assert np.array_equal(later["curvature_M"], columns["curvature_M"][CURVED - 1 :], equal_nan=True)
+
+
+@pytest.fixture(scope="module")
+def analysis(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("theory")
+    scenarios = [
+        Scenario(Polynomial(strength=0.02), Gaussian(0.1), GaussianPrior(), 1.0),
+        Scenario(Polynomial(strength=0.02), Gaussian(0.1), GaussianPrior(), 5.0),
+    ]
+    estimators = {"linear_lse": LinearLSE(), "fixed_point": FixedPoint(), "newton": Newton()}
+    assert compute(scenarios, estimators, 400, folder) == ()
+    return analyse([folder])
+
+
+def test_eq_14_and_the_sandwich_stand_beside_what_happened(analysis):
+    """Eq. (14) is H+ R H+' + E[c c'] with c = H+ (N(x) - N(x^)); the same from the model's own values."""
+    total = analysis.summary[analysis.summary["parameter"] == "all"].set_index(["estimator", "error_scale"])
+    scenario = Scenario(Polynomial(strength=0.02), Gaussian(0.1), GaussianPrior(), 5.0)
+    block = Block.draw(scenario, 0, 400)
+    estimates, columns = block.estimate(Newton())
+    solved = columns["solved"]
+    problem, x, truth = scenario.problem, estimates.x[solved], block.trials.x[solved]
+    H_plus, _ = pseudo_inverse(problem.H[None], problem.R)
+    model = problem.measurement
+    dN = model.simulate(truth) - model.simulate(x) - (truth - x) @ problem.H.T
+    c = dN @ H_plus[0].T
+    system = FrozenSystem.at_nominal(problem, block.trials.z)
+    linear = np.diagonal(system.covariance()[0])
+    expected = np.sqrt(np.mean((linear + np.mean(c**2, axis=0)) / linear))
+    newton = total.loc[("newton", 5.0)]
+    assert newton["eq_14"] == pytest.approx(expected, rel=1e-4)
+    assert newton["eq_14"] > 1.01
+    sandwich = np.diagonal(system.sandwich(estimates.x)[solved].mean(axis=0))
+    assert newton["reported"] == pytest.approx(np.sqrt(np.mean(sandwich / linear)), rel=1e-9)
+    crlb = np.diagonal(inverse(information(model.jacobian(truth), problem.R))[0].mean(axis=0))
+    assert newton["crlb"] == pytest.approx(np.sqrt(np.mean(crlb / linear)), rel=1e-9)
+    # To first order the sandwich is what happens; eq. (14) is not.
+    assert newton["reported"] == pytest.approx(newton["rmse"], rel=0.08)
+    assert np.isnan(total.loc[("linear_lse", 5.0), "eq_14"])
+
+
+def test_bounds_on_iterations_are_in_the_report(analysis):
+    scores = analysis.scores.set_index(["estimator", "error_scale"])
+    fixed, newton = scores.loc[("fixed_point", 1.0)], scores.loc[("newton", 5.0)]
+    assert fixed["eq_18_trials"] > 0
+    assert fixed["eq_18_holds"] == 1.0
+    assert 0 < fixed["eq_18_error_over_bound"] < 1
+    assert newton["eq_23_M"] > 0
+    assert newton["eq_18_trials"] == 0
+    names = [t.name for t in all_tables(analysis) if t.appendix]
+    assert names == ["contraction", "covariances", "iterations"]
+
+
+def test_root_distance_is_what_solved_is_judged_by():
+    scenario = Scenario(Polynomial(strength=0.02), Gaussian(0.1), GaussianPrior(), 5.0)
+    block = Block.draw(scenario, 0, 50)
+    estimates, columns = block.estimate(Newton())
+    moved = columns["root_distance"] <= SAME_ROOT
+    assert (columns["solved"] == (moved & (estimates.status == Status.CONVERGED))).all()
+    root = frozen_root(scenario.problem, block.trials.z, block.trials.x)
+    expected = (np.abs(estimates.x - root) / block.crlb_deviation).max(axis=1)
+    np.testing.assert_array_equal(columns["root_distance"], expected)
+
+
+def test_false_roots_say_how_far_off_they_are(synthetic):
+    e = 0.1 * np.random.default_rng(0).normal(size=(60, 3))
+    solved = np.arange(60) >= 20
+    synthetic.add(synthetic.scenario(), "one", e, solved=solved, root_distance=np.where(solved, 0.0, 7.0))
+    total = analyse([synthetic.directory]).summary.iloc[-1]
+    assert total["false_root"] == pytest.approx(1 / 3)
+    assert total["false_root_distance"] == 7.0

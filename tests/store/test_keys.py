@@ -1,0 +1,112 @@
+"""What is stored stays valid whatever is written about the code, and not one constant longer."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import ipe_bench
+from ipe_bench.runs.provenance import numerical_code
+
+KEYS = """
+import ipe_bench as ib
+from ipe_bench.runs.store import Cell
+bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
+for name, estimator in {"ukf": ib.baselines.UKF(), "newton": ib.solvers.Newton(), "truth": None}.items():
+    print(name, Cell(bench, name, estimator).key)
+"""
+
+
+@pytest.fixture
+def copy(tmp_path) -> Path:
+    """A copy of the package to edit."""
+    ignored = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(Path(ipe_bench.__file__).parent, tmp_path / "ipe_bench", ignore=ignored)
+    return tmp_path
+
+
+def keys(copy: Path) -> dict[str, str]:
+    environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [sys.executable, "-c", KEYS]
+    lines = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=True).stdout
+    return dict(line.split() for line in lines.splitlines())
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert old in text, f"{path.name} says {old} no more"
+    path.write_text(text.replace(old, new), encoding="utf-8")
+
+
+def test_prose_edited_anywhere_leaves_every_key_as_it_was(copy):
+    before = keys(copy)
+    edited = 0
+    for path in (copy / "ipe_bench").rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        new = re.sub(r'^( *)"""', r'\1# A remark.\n\1"""In other words: ', text, flags=re.MULTILINE) + "\n# The end.\n"
+        try:
+            ast.parse(new)
+        except SyntaxError:  # an end of a docstring was taken for a beginning
+            new = text + "\n# The end.\n"
+        edited += new.count("In other words")
+        path.write_text(new, encoding="utf-8")
+    assert edited > 200
+    assert keys(copy) == before
+
+
+def test_a_changed_constant_makes_stale_what_was_computed_with_it_and_nothing_else(copy):
+    before = keys(copy)
+    edit(copy / "ipe_bench/report/style.py", "\n", "\nUNSEEN = 3\n")
+    edit(copy / "ipe_bench/basics/errors.py", "give a number above 0", "give a larger number")
+    assert keys(copy) == before
+    edit(copy / "ipe_bench/baselines/sequential.py", "import numpy as np\n", "import numpy as np\nFACTOR = 2\n")
+    after = keys(copy)
+    assert {name for name in before if before[name] != after[name]} == {"ukf"}
+    edit(copy / "ipe_bench/trials/scoring.py", "SAME_ROOT = 1e-3", "SAME_ROOT = 2e-3")
+    after = keys(copy)
+    assert all(before[name] != after[name] for name in before)
+
+
+def code(source: str) -> str:
+    return numerical_code(ast.parse(source))
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("x = 1", "x=1 # one"),
+        ('def f():\n    "Does."\n    return 1', 'def f():\n    """Does\n    it."""\n    return 1'),
+        ('class A:\n    x: int = 1\n    "An x."', "class A:\n    x: int = 1"),
+        ("raise ValueError(f'{x}: too large')", "raise ValueError(f'{x}: not small enough')"),
+    ],
+)
+def test_prose_is_no_part_of_the_code(one, other):
+    assert code(one) == code(other)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("x = 1", "x = 2"),
+        ("x = 1", "x = 1.0"),
+        ("x = None", "x = ..."),
+        ("x = 'a'", "x = 'b'"),
+        ("x = []", "x = [None]"),
+        ("raise ValueError('a')", "raise KeyError('a')"),
+        ("raise E(1)", "raise E(2)"),
+        ("f(a, b)", "f(b, a)"),
+        ("f(a, k=b)", "f(a, b)"),
+        ("def f(a=1): pass", "def f(*, a=1): pass"),
+        ("x + y - z", "x + (y - z)"),
+        ("if a: b\nc", "if a:\n  b\n  c"),
+    ],
+)
+def test_whatever_can_change_a_number_is(one, other):
+    assert code(one) != code(other)
