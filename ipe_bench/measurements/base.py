@@ -72,7 +72,8 @@ class Measurement(Named, ABC):
     """A model z = h(x) + v, without the noise v.
 
     x is (trials, n) in multiples of the parameters' sizes, h(x) is (trials, m) in `reading_unit`, and a trial's
-    readings depend on that trial's x alone, bit for bit. n parameters, m readings, m > n.
+    readings depend on that trial's x alone, bit for bit. n parameters, m readings, m >= n; where
+    m = n the readings can be met exactly, and no fit can be tested.
     """
 
     analytic: ClassVar[bool] = False

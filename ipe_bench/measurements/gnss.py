@@ -112,7 +112,7 @@ class Gnss(Measurement):
             raise UserError("position: there is no up near the centre of the Earth; set frame=ecef")
         if self.rounds < 1:
             raise UserError(f"rounds={self.rounds}: give at least 1")
-        if self.m <= self.n:
+        if self.m < self.n:
             raise UserError(f"satellites: {self.m} readings are too few for {self.n} parameters")
 
     @cached_property

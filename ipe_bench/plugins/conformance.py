@@ -168,8 +168,8 @@ def _points(model: Measurement, trials: int = 4) -> Array:
 
 
 def names_its_readings(model: Measurement) -> None:
-    """Has more readings than parameters, each with its own label, and units."""
-    assert model.m > model.n, f"{model.m} readings are too few for {model.n} parameters"
+    """Has at least as many readings as parameters, each with its own label, and units."""
+    assert model.m >= model.n, f"{model.m} readings are too few for {model.n} parameters"
     lengths = {name: len(column) for name, column in model.index.items()}
     assert set(lengths.values()) == {model.m}, f"the columns of index have lengths {lengths}, and not {model.m}"
     labels = list(zip(*model.index.values(), strict=True))

@@ -6,7 +6,7 @@ One least-squares minimum is examined, whichever estimator found it. Profiles ha
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -280,8 +280,8 @@ def _minimise(problem: Problem, z: Array, x: Array) -> Minima:
     at_once = max(1, _ENTRIES // (z.shape[1] * x.shape[1]))
     if len(x) > at_once:
         parts = [_minimise(problem, z[k : k + at_once], x[k : k + at_once]) for k in range(0, len(x), at_once)]
-        fields = ("x", "status", "iterations", "covariance", "chi_square")
-        joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in fields}
+        names = [f.name for f in fields(Minima) if f.name != "history"]
+        joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         return Minima(**joined, history=None)
     with np.errstate(all="ignore"):
         objective = Objective.of(problem, z, prior=False)

@@ -155,19 +155,22 @@ def fit(problem: Problem, z: Array, estimators: Mapping[str, Estimator], *, leve
     one = _fit_with_level if level_unknown else _fit_one
     where = present, len(z), order
     found = [one(label, estimator, given, z[present], *where) for label, estimator in estimators.items()]
-    return _compared(found) if level_unknown else found
+    return _compared(found)
 
 
 def _compared(fits: list[Fit]) -> list[Fit]:
-    """The fits, those marked that lie outside of the joint confidence region of the best (F test: Bates and Watts,
-    Nonlinear Regression Analysis and Its Applications, 1988, section 6.1)."""
-    sums = {one.label: one.chi_square * one.level**2 for one in fits if one.level is not None}
-    least, free = min((v for v in sums.values() if np.isfinite(v)), default=np.nan), fits[0].degrees_of_freedom
-    if not (np.isfinite(least) and free > 0):
+    """The fits; where the size of residuals tests nothing, those are marked that lie outside of the joint confidence
+    region of the best (Bates and Watts, Nonlinear Regression Analysis and Its Applications, 1988, section 6.1)."""
+    if not fits or fits[0].testable:
         return fits
-    n = len(fits[0].x)
-    limit = least * (1 + n / free * float(fisher.isf(FIT_LEVEL, n, free)))
-    return [replace(one, beaten=not sums.get(one.label, np.nan) <= limit) for one in fits]
+    sums = [one.chi_square * (1.0 if one.level is None else one.level**2) for one in fits]
+    n, free = len(fits[0].x), fits[0].degrees_of_freedom
+    least = min((value for value in sums if np.isfinite(value)), default=np.nan)
+    if fits[0].level is None:
+        limit = least + float(chi2.isf(FIT_LEVEL, n))
+    else:
+        limit = least * (1 + n / free * float(fisher.isf(FIT_LEVEL, n, free))) if free > 0 else np.inf
+    return [replace(one, beaten=not value <= limit) for one, value in zip(fits, sums, strict=True)]
 
 
 def _fit_with_level(label: str, estimator: Estimator, problem: Problem, z: Array, *where: Any) -> Fit:

@@ -92,7 +92,7 @@ def read_readings(path: Path, model: Measurement) -> Array:
             f"readings={path}: has {len(seen)} of {model.m} rows; the first absent one is {said} "
             "(a missing reading keeps its row, with an empty cell)"
         )
-    if np.isnan(z).sum() > model.m - model.n - 1:
+    if np.isnan(z).sum() > model.m - model.n:
         raise UserError(f"readings={path}: {int((~np.isnan(z)).sum())} readings are too few for {model.n} parameters")
     return z
 

@@ -140,6 +140,8 @@ class Block:
         and R are right; NaN where there are none. It needs no truth, so whoever estimates can ask for it too."""
         model = self.problem.measurement
         r = self.problem.R.whiten(self.trials.z - self.readings_at(x))
+        if model.m <= model.n:
+            return np.full(len(x), np.nan)  # nothing is left to test
         return chdtrc(model.m - model.n, np.sum(r**2, axis=1))
 
     def score(self, estimator: Estimator, estimates: Estimates) -> Columns:
@@ -149,7 +151,7 @@ class Block:
         error = estimates.x - self.trials.x
         converged = estimates.status == Status.CONVERGED
         bound = self.bayes_information if "prior" in estimator.needs else self.crlb_information
-        distance = quadratic_form(bound, error)
+        distance = np.maximum(quadratic_form(bound, error), 0.0)  # round-off where J lacks rank
         solved = converged & np.isfinite(error).all(axis=1)
         apart = np.full(len(error), np.nan)
         if estimator.equation is not None:
@@ -172,7 +174,7 @@ class Block:
             "simulations": estimates.simulations,
             "jacobians": estimates.jacobians,
             "time_s": estimates.seconds,
-            "crlb_distance": quadratic_form(self.crlb_information, error),
+            "crlb_distance": np.maximum(quadratic_form(self.crlb_information, error), 0.0),
             "nees": squared,
             "fit_p": self._fit_probability(estimates.x),
             "root_distance": apart,

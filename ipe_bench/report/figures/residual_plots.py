@@ -21,6 +21,8 @@ MOST_ESTIMATORS = 12
 """Estimators with a panel of residuals; `residuals.csv` has all."""
 MOST_PAIRS = 9
 LEVEL = 0.95
+_MANY = 5000
+"""Points from which on they are pixels in the PDF, too."""
 _BENT = 30.0
 """Normalised residuals beyond this are drawn on a logarithmic axis: a model that does not fit at all."""
 _NEAR = 10.0
@@ -51,7 +53,16 @@ def _residuals(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look]
         for i, at in enumerate((limit, -limit)):
             common.bound_line(ax, at, "" if i else "limit for outliers")
         good = known & ~out
-        ax.plot(x[good], one.normalised[good], linestyle="", marker="o", markersize=3, alpha=0.75, color=style.color)
+        ax.plot(
+            x[good],
+            one.normalised[good],
+            linestyle="",
+            marker="o",
+            markersize=3,
+            alpha=0.75,
+            color=style.color,
+            rasterized=len(x) > _MANY,
+        )
         if out.any():
             ax.plot(x[out], one.normalised[out], linestyle="", marker="x", markersize=5, color=style.color)
             ax.plot(
