@@ -122,7 +122,8 @@ class Examination:
     @property
     def ambiguous(self) -> list[Minimum]:
         """Other minima that fit as well."""
-        return [one for one in self.minima[1:] if one.as_good]
+        apart = _SAME * self.standard_errors
+        return [one for one in self.minima if one.as_good and (np.abs(one.x - self.x) > apart).any()]
 
 
 def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BOOTSTRAPS) -> Examination | None:
