@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.errors import StorageError, UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import cores, library_versions
 from ipe_bench.estimators.base import Estimator
@@ -302,7 +302,11 @@ def compute(
     with RunLog(store.directory / "log" / f"{identifier}.log") as log:
         for line in aside:
             log.warning(line)
-        return work_through(tasks, execution, store, watch or (lambda progress: None), log)
+        failures = work_through(tasks, execution, store, watch or (lambda progress: None), log)
+    store.require()
+    if not (store.runs / f"{identifier}.json").is_file():
+        raise StorageError(f"{store.directory}: lost the record of this run; the same command computes what is missing")
+    return failures
 
 
 def validate(

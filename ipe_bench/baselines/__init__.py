@@ -3,20 +3,28 @@
 from ipe_bench.baselines.ckf import CKF
 from ipe_bench.baselines.ekf import EKF
 from ipe_bench.baselines.enkf import EnKF
+from ipe_bench.baselines.es_mda import EsMda
 from ipe_bench.baselines.gauss_newton import GaussNewton
+from ipe_bench.baselines.iplf import IPLF
 from ipe_bench.baselines.iterated_ekf import IteratedEKF
 from ipe_bench.baselines.levenberg_marquardt import LevenbergMarquardt
 from ipe_bench.baselines.linear_lse import LinearLSE
+from ipe_bench.baselines.lm_iekf import LMIEKF
 from ipe_bench.baselines.map_lm import MapLM
 from ipe_bench.baselines.multiscale_lm import MultiscaleLM
+from ipe_bench.baselines.multistart import Multistart
+from ipe_bench.baselines.recursive_update import RecursiveUpdate
 from ipe_bench.baselines.scipy_least_squares import LeastSquares
 from ipe_bench.baselines.ukf import UKF
 
 __all__ = [
     "CKF",
     "EKF",
+    "IPLF",
+    "LMIEKF",
     "UKF",
     "EnKF",
+    "EsMda",
     "GaussNewton",
     "IteratedEKF",
     "LeastSquares",
@@ -24,4 +32,6 @@ __all__ = [
     "LinearLSE",
     "MapLM",
     "MultiscaleLM",
+    "Multistart",
+    "RecursiveUpdate",
 ]

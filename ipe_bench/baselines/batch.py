@@ -6,8 +6,8 @@ from abc import abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ipe_bench.basics.errors import UserError, require_counts, require_positive
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Count, Positive
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import Solver
 from ipe_bench.estimators.ipe import Start, begin
@@ -21,20 +21,14 @@ class Batch(Estimator):
 
     start: Start = "nominal"
     """Where the iteration begins: at the linear LSE, eq. (16), or at the nominal point."""
-    max_iterations: int = 100
+    max_iterations: Count = 100
     """Steps tried."""
-    tolerance: float = 1e-6
+    tolerance: Positive = 1e-6
     """Largest Gauss-Newton step in standard deviations of the local bound: the gradient in whitened units."""
-    budget: float | None = None
+    budget: Positive | None = None
     """Simulations that a trial may cost, a Jacobian counting n; None: no limit."""
 
     equation: ClassVar = "least_squares"
-
-    def __post_init__(self) -> None:
-        if self.start not in ("linear_lse", "nominal"):
-            raise UserError(f"start={self.start}: choose linear_lse or nominal")
-        require_positive(self, "tolerance", "budget")
-        require_counts(self, "max_iterations")
 
     def objective(self, problem: Problem, z: Array) -> Objective:
         """What is minimised for readings z (trials, m)."""

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from threading import Lock
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Gt
 
 from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric, turned
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Whole
+from ipe_bench.basics.streams import own_bits
 
 
 @dataclass(frozen=True)
@@ -24,21 +25,12 @@ class EnKF(Sequential):
     sqrt(2 / members): more members than parameters are needed, and many more for a P to be believed.
     """
 
-    members: int = 100
-    seed: int = 0
+    members: Annotated[int, Gt(1)] = 100
+    seed: Whole = 0
     """A trial's random stream depends on this and on its readings: on nothing else in the batch."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.members < 2:
-            raise UserError(f"members={self.members}: give a whole number above 1")
-        if self.seed < 0:
-            raise UserError(f"seed={self.seed}: give a whole number from 0 up")
-
     def track(self, P0: Array, Q: Array, z: Array) -> EnKFTrack:
-        digest = hashlib.sha256(np.ascontiguousarray(z, dtype=float).tobytes()).digest()
-        stream = np.random.Philox(np.random.SeedSequence([self.seed, *np.frombuffer(digest, dtype=np.uint32).tolist()]))
-        return EnKFTrack(P0, Q, self.members, stream)
+        return EnKFTrack(P0, Q, self.members, own_bits(self.seed, z))
 
 
 class EnKFTrack(Track):

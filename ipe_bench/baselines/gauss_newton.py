@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ipe_bench.baselines.batch import Batch
-from ipe_bench.basics.errors import require_positive
+from ipe_bench.basics.options import Positive
 from ipe_bench.estimators.driver import Solver
 from ipe_bench.estimators.gauss_newton import GaussNewtonMethod
 from ipe_bench.estimators.ipe import Start
@@ -19,12 +19,8 @@ class GaussNewton(Batch):
     where the model is not nearly linear between start and minimum."""
 
     start: Start = "linear_lse"
-    damping: float | None = None
+    damping: Positive | None = None
     """The initial lambda of Levenberg-Marquardt with Marquardt's scaling; None: no damping."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_positive(self, "damping")
 
     def method(self, objective: Objective) -> Solver[Descent]:
         return GaussNewtonMethod() if self.damping is None else LevenbergMarquardtMethod(self.damping)

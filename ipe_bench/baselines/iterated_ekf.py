@@ -8,8 +8,8 @@ import numpy as np
 
 from ipe_bench.baselines.ekf import EKFTrack, turned_by_slopes
 from ipe_bench.baselines.sequential import Sequential, squared_innovation
-from ipe_bench.basics.errors import require_counts, require_positive
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Count, Positive
 
 
 @dataclass(frozen=True)
@@ -17,17 +17,12 @@ class IteratedEKF(Sequential):
     """An EKF that linearises each epoch's readings again at its updated estimate until that stays: Gauss-Newton on the
     epoch's readings and the prior that the earlier epochs left (Bell and Cathey, IEEE TAC 38, 1993)."""
 
-    max_iterations: int = 20
+    max_iterations: Count = 20
     """Linearisations per epoch; one that has not settled by then goes on from where it is."""
-    tolerance: float = 1e-3
+    tolerance: Positive = 1e-3
     """Largest change of a parameter, in deviations of the updated P, at which an epoch is done."""
 
     slopes = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_counts(self, "max_iterations")
-        require_positive(self, "tolerance")
 
     def track(self, P0: Array, Q: Array, z: Array) -> IteratedEKFTrack:
         return IteratedEKFTrack(P0, Q, self.max_iterations, self.tolerance)

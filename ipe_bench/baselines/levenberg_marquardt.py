@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ipe_bench.baselines.batch import Batch
-from ipe_bench.basics.errors import require_positive
+from ipe_bench.basics.options import Positive
 from ipe_bench.estimators.driver import Solver
 from ipe_bench.estimators.least_squares import Descent, Objective
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
@@ -16,12 +16,8 @@ class LevenbergMarquardt(Batch):
     """Gauss-Newton whose step is kept short, with Marquardt's scaling, as long as the fit does not improve as predicted
     (Marquardt, J. SIAM 11, 1963; More, LNM 630, 1978)."""
 
-    damping: float = 1e-3
+    damping: Positive = 1e-3
     """lambda at the start."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_positive(self, "damping")
 
     def method(self, objective: Objective) -> Solver[Descent]:
         return LevenbergMarquardtMethod(self.damping)

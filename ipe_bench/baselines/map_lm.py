@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ipe_bench.baselines.batch import Batch
-from ipe_bench.basics.errors import require_positive
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Positive
 from ipe_bench.estimators.driver import Solver
 from ipe_bench.estimators.least_squares import Descent, Objective
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
@@ -21,17 +21,13 @@ class MapLM(Batch):
     Reports (J' R^-1 J + P0^-1)^-1.
     """
 
-    damping: float = 1.0
+    damping: Positive = 1.0
     """lambda at the start."""
-    prior_inflation: float = 1.0
+    prior_inflation: Positive = 1.0
     """Times the prior's standard deviations."""
 
     needs = frozenset({"prior"})
     equation = "map"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_positive(self, "damping", "prior_inflation")
 
     def objective(self, problem: Problem, z: Array) -> Objective:
         return Objective.of(problem, z, prior=True, inflation=self.prior_inflation)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.errors import require_counts, require_positive
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Count, Positive
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.least_squares import Minima, Objective, minimize
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
@@ -26,18 +26,14 @@ class MultiscaleLM(Estimator):
     Costs about twice as much as one Levenberg-Marquardt.
     """
 
-    max_iterations: int = 1000
+    max_iterations: Count = 1000
     """Of each of the two minimisations."""
-    tolerance: float = 1e-10
+    tolerance: Positive = 1e-10
     """Largest Gauss-Newton step in standard deviations of the local bound."""
-    damping: float = 1e-4
+    damping: Positive = 1e-4
     """The first damping factor, relative to the squared norm of J."""
 
     equation = "least_squares"
-
-    def __post_init__(self) -> None:
-        require_counts(self, "max_iterations")
-        require_positive(self, "tolerance", "damping")
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         objective = Objective.of(problem, z, prior=False)

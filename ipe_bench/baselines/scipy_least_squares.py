@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Ge, doc
 
 from ipe_bench.basics.errors import UserError, describe_exception
 from ipe_bench.basics.linalg import Array, Covariance, pseudo_inverse
+from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Equation, Estimates, Estimator, one_by_one
 from ipe_bench.estimators.ipe import Start, begin
 from ipe_bench.measurements.problem import Problem
 
-_METHODS = ("trf", "lm", "dogbox")
-_LOSSES = ("linear", "soft_l1", "huber", "cauchy", "arctan")
-_STARTS = ("linear_lse", "nominal")
 _OUT_OF_EVALUATIONS = 0
 """SciPy's status for it."""
+
+Rounding = Annotated[float, Ge(float(np.finfo(float).eps)), doc("a number of at least 2.3e-16, the rounding of a 1")]
 
 
 @dataclass(frozen=True)
@@ -36,32 +37,22 @@ class LeastSquares(Estimator):
     start: Start = "linear_lse"
     loss: Literal["linear", "soft_l1", "huber", "cauchy", "arctan"] = "linear"
     """Anything but linear bounds what one bad reading can do; `lm` knows linear only."""
-    f_scale: float = 1.0
+    f_scale: Positive = 1.0
     """The residual, in deviations of the reading, from which a robust loss begins to flatten."""
-    ftol: float = 1e-14
+    ftol: Rounding = 1e-14
     """Relative decrease of the cost. At SciPy's 1e-8 the last step may still be a thousandth of a deviation."""
-    xtol: float = 1e-12
-    gtol: float = 1e-12
-    max_nfev: int | None = None
+    xtol: Rounding = 1e-12
+    gtol: Rounding = 1e-12
+    max_nfev: Count | None = None
     """Evaluations of h after which the trial ends as max_iterations; None: SciPy's limit, 100 n."""
-    tolerance: float = 1e-4
+    tolerance: Positive = 1e-4
     """Largest Gauss-Newton step still to go, in reported deviations, of a converged trial. SciPy cannot promise less
     than about 1e-5: it watches the cost, which is flat there."""
 
     def __post_init__(self) -> None:
-        for key, choices in (("method", _METHODS), ("start", _STARTS), ("loss", _LOSSES)):
-            if getattr(self, key) not in choices:
-                raise UserError(f"{key}={getattr(self, key)}: choose one of {', '.join(choices)}")
+        super().__post_init__()
         if self.method == "lm" and self.loss != "linear":
             raise UserError(f"loss={self.loss}: method=lm knows loss=linear only; choose method=trf or dogbox")
-        for key in ("ftol", "xtol", "gtol"):
-            if not getattr(self, key) >= np.finfo(float).eps:
-                raise UserError(f"{key}={getattr(self, key)}: give a number of at least 2.3e-16, the rounding of a 1")
-        for key in ("f_scale", "tolerance"):
-            if not getattr(self, key) > 0:
-                raise UserError(f"{key}={getattr(self, key)}: give a number above 0")
-        if self.max_nfev is not None and self.max_nfev < 1:
-            raise UserError(f"max_nfev={self.max_nfev}: give a whole number above 0, or null")
 
     @property
     def equation(self) -> Equation | None:  # type: ignore[override]

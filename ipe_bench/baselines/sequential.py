@@ -9,24 +9,22 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import LinAlgWarning
 
+from ipe_bench.baselines.epochs import Epoch, arrivals
 from ipe_bench.basics.errors import UserError, describe_exception
-from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import NonNegative, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
-from ipe_bench.measurements.base import Measurement, Restricted
-from ipe_bench.measurements.counted import Counted, Tally
+from ipe_bench.measurements.counted import Tally
 from ipe_bench.measurements.problem import Problem
 
-_POINTS_AT_ONCE = 8192
-"""Points of one call of the model: bounds the memory that a large ensemble takes."""
 _LARGEST = 1e150
 
 
@@ -71,21 +69,15 @@ class Sequential(Estimator):
     the filter is consistent (`ipe_bench.statistics.consistency.mean_limits` has the limits).
     """
 
-    prior_inflation: float = 1.0
+    prior_inflation: Positive = 1.0
     """The filter's prior deviations over the scenario's: in life a prior is never exact."""
-    process_noise: float = 0.0
+    process_noise: NonNegative = 0.0
     """Standard deviation of the parameters' random walk from one epoch to the next, in prior deviations (before
     inflation). The parameters are constants, so anything above 0 makes the filter forget."""
 
     needs: ClassVar[frozenset[Need]] = frozenset({"epochs", "prior"})
     slopes: ClassVar[bool] = False
     """True where `Track.update` wants dh/dx; then there is one point per trial."""
-
-    def __post_init__(self) -> None:
-        if not 0 < self.prior_inflation < np.inf:
-            raise UserError(f"prior_inflation={self.prior_inflation}: give a number above 0")
-        if not 0 <= self.process_noise < np.inf:
-            raise UserError(f"process_noise={self.process_noise}: give 0 or a number above")
 
     @abstractmethod
     def track(self, P0: Array, Q: Array, z: Array) -> Track:
@@ -110,7 +102,7 @@ class _Run:
         trials, n = len(z), problem.measurement.n
         self.d = np.asarray(problem.prior_deviation, dtype=float)
         self.tally = Tally.zeros(trials)
-        self.epochs = list(_arrivals(problem))
+        self.epochs = list(arrivals(problem))
         self.status = np.full(trials, Status.RUNNING, dtype=np.int8)
         self.messages: dict[int, str] = {}
         self.iterates = [[np.zeros(n)] for _ in range(trials)]
@@ -165,7 +157,7 @@ class _Run:
             self.end(trial, Status.CONVERGED)
         return self.collect(history=history)
 
-    def advance(self, epoch: _Epoch, waiting: list[int]) -> list[int]:
+    def advance(self, epoch: Epoch, waiting: list[int]) -> list[int]:
         """Reads the model at the points of the waiting trials and hands each its share; returns who waits still."""
         wanted = {t: self.attempt(t, lambda t: self.tracks[t].points()) for t in waiting}
         wanted = {t: points for t, points in wanted.items() if points is not None}
@@ -212,64 +204,6 @@ class _Run:
             messages=self.messages,
             history=iterates if history else None,
             extras={"nis": nis},
-        )
-
-
-@dataclass(frozen=True)
-class _Epoch:
-    """The readings that arrive together, as a model of their own that computes nothing later."""
-
-    number: int
-    model: Measurement
-    rows: NDArray[np.intp]
-    R: Covariance
-    share: float
-    """The cost of this model's readings over that of all."""
-
-    def whitened(self, z: Array) -> Array:
-        return self.R.whiten(z[self.rows])
-
-    def read(self, x: Array, trials: NDArray[np.intp], tally: Tally, *, slopes: bool) -> tuple[Array, Array | None]:
-        """Whitened h (trials, points, m) at x (trials, points, n), and dh/dx (trials, m, n) where it is asked for."""
-        points, n = x.shape[1:]
-        model = Counted(self.model, tally, self.share * points)
-        count = min(len(trials), -(-len(trials) * points // _POINTS_AT_ONCE))
-        pieces = np.array_split(np.arange(len(trials)), count)
-        h = [self.R.whiten(model.simulate(x[p].reshape(-1, n), np.repeat(trials[p], points))) for p in pieces]
-        # In C order whatever the model returned: BLAS rounds otherwise where the strides are other.
-        h = np.ascontiguousarray(np.concatenate(h)).reshape(len(trials), points, -1)
-        if not slopes:
-            return h, None
-        H = [self.R.whiten_jacobian(model.jacobian(x[p, 0], trials[p])) for p in pieces]
-        return h, np.ascontiguousarray(np.concatenate(H))
-
-
-def _arrivals(problem: Problem) -> Iterator[_Epoch]:
-    """The epochs in order of arrival."""
-    model = problem.measurement
-    assert model.epochs is not None
-    # A model some of whose readings are missing is measured through the whole one, which can stop early.
-    whole, kept = (model.whole, np.array(model.kept)) if isinstance(model, Restricted) else (model, np.arange(model.m))
-    stop, arrived = 0, np.empty(0, dtype=np.intp)
-    assert whole.epochs is not None
-    for number, rows in enumerate(model.epochs, start=1):
-        rows = np.sort(rows)
-        while not np.isin(kept[rows], arrived).all():
-            stop += 1
-            arrived = whole.rows(stop)
-        _refuse_correlation(problem.R, rows)
-        part = Restricted(whole, tuple(kept[rows].tolist()), stop)
-        yield _Epoch(number, part, rows, problem.R.restricted(rows), stop / len(whole.epochs))
-
-
-def _refuse_correlation(R: Covariance, rows: NDArray[np.intp]) -> None:
-    if R.factor.ndim == 1:
-        return
-    across = R.matrix()[rows]
-    across[:, rows] = 0.0
-    if across.any():
-        raise UserError(
-            "noise: its errors are correlated between epochs, which a filter cannot use; choose a batch estimator"
         )
 
 

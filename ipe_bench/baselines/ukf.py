@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Gt, Le
 
 from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric, turned
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Finite, NonNegative
 
 
 @dataclass(frozen=True)
@@ -20,17 +21,10 @@ class UKF(Sequential):
     of -1e6 and costs as many digits; 0.1 does not.
     """
 
-    alpha: float = 0.1
-    beta: float = 2.0
+    alpha: Annotated[float, Gt(0), Le(1)] = 0.1
+    beta: Finite = 2.0
     """2 is best for Gaussian parameters."""
-    kappa: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 < self.alpha <= 1:
-            raise UserError(f"alpha={self.alpha}: give a number above 0 and up to 1")
-        if not self.kappa >= 0:
-            raise UserError(f"kappa={self.kappa}: give 0 or a number above")
+    kappa: NonNegative = 0.0
 
     def track(self, P0: Array, Q: Array, z: Array) -> UKFTrack:
         from filterpy.kalman import MerweScaledSigmaPoints

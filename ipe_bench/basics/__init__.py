@@ -1,1 +1,1 @@
-"""What every room uses: arrays and batches, statuses, errors, files, and what this machine offers."""
+"""What the whole package uses: arrays and batches, statuses, errors, files, and what this machine offers."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import socket
 import uuid
@@ -38,3 +39,24 @@ def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
 def write_text(path: Path, text: str) -> None:
     """Writes a text file in one piece; see `write_atomically`."""
     write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+_SEAL = b"ipe_bench_sha256:"
+BLANK_SEAL = (_SEAL + b"0" * 64).decode()
+"""Stands in content that is to be sealed where the digest goes."""
+
+
+def seal(content: bytes) -> bytes:
+    """The content with the SHA-256 digest of all of it in place of the last `BLANK_SEAL` in it."""
+    at = content.rindex(BLANK_SEAL.encode()) + len(_SEAL)
+    return content[:at] + hashlib.sha256(content).hexdigest().encode() + content[at + 64 :]
+
+
+def is_sealed(content: bytes) -> bool | None:
+    """Whether not one bit has changed since `seal`; None where there is no seal at all."""
+    at = content.rfind(_SEAL)
+    if at < 0:
+        return None
+    at += len(_SEAL)
+    blank = content[:at] + b"0" * 64 + content[at + 64 :]
+    return hashlib.sha256(blank).hexdigest().encode() == content[at : at + 64]

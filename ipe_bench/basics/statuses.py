@@ -28,6 +28,9 @@ class Status(IntEnum):
     def __str__(self) -> str:
         return self.label
 
+    def __format__(self, spec: str) -> str:
+        return format(self.label, spec)
+
     @property
     def label(self) -> str:
         """The name in tables: lower case."""

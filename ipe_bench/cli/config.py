@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -21,6 +22,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.known import Informed, Known
+from ipe_bench.measurements.nist import datasets
 from ipe_bench.noise import ModelNoise, Unknown
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
@@ -99,9 +101,36 @@ _OPEN = re.compile(r"^(?:parameters|(?:truth_)?measurement\.(?:start|columns|ini
 
 
 def rewrite(overrides: Sequence[str]) -> list[str]:
-    """Overrides in Hydra's own words: truth_measurement= chooses from the group measurement, formulas stand in quotes
-    that the shell has taken off, and entries are added where users name them."""
-    return [words for o in overrides for words in (_from_file(o) if _FILE.match(o) else [_in_hydras_words(o)])]
+    """Overrides in Hydra's own words: truth_measurement= chooses from the group measurement, measurement=nist/NAME is
+    measurement=nist with that data set, formulas stand in quotes that the shell has taken off, and entries are added
+    where users name them."""
+    expanded = [words for o in overrides for words in (_from_file(o) if _FILE.match(o) else [_in_hydras_words(o)])]
+    return [part for override in expanded for part in _nist(override)]
+
+
+def _nist(override: str) -> list[str]:
+    """measurement=nist/misra1a, also in a sweep or as a pattern, as the option and its data set.
+
+    Raises:
+        UserError: there is no such data set, or other models stand in one sweep with them.
+    """
+    key, _, value = override.partition("=")
+    if key.lstrip("+") not in ("measurement", "measurement@truth_measurement") or "nist/" not in value:
+        return [override]
+    known = {name.lower(): name for name in datasets()}
+    pattern = re.fullmatch(r"glob\(nist/(.*)\)", value)
+    if pattern:
+        names = fnmatch.filter(known, pattern.group(1))
+    else:
+        options = [option.strip() for option in value.split(",")]
+        if not all(option.startswith("nist/") for option in options):
+            raise UserError(f"{override}: a sweep over measurement=nist has no other models in it; run them one by one")
+        names = [option.removeprefix("nist/").lower() for option in options]
+    if wrong := [name for name in names if name not in known]:
+        raise UserError(f"measurement=nist/{wrong[0]}: {unknown(wrong[0], known, 'data set')}")
+    if not names:
+        raise UserError(f"{override}: fits no data set; write measurement=nist measurement.dataset=Misra1a")
+    return [f"{key}=nist", f"{key.rpartition('@')[2].lstrip('+')}.dataset={','.join(known[name] for name in names)}"]
 
 
 def _from_file(override: str) -> list[str]:

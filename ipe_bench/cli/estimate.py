@@ -18,6 +18,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import library_versions
 from ipe_bench.cli import console
 from ipe_bench.cli.config import CONFIG_ERRORS, Job, assemble, explain, prepare, refuse_silent_traps, rewrite
+from ipe_bench.measurements import Nist
 from ipe_bench.noise import Certified, ModelNoise, Noise
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.real.examination import examine
@@ -62,9 +63,12 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _measurement_name(arguments: Sequence[str], job: Job) -> str:
-    """The option that was chosen (nist/misra1a), which says more than the class."""
+    """The option that was chosen, which says more than the class, or NIST's data set (nist/misra1a)."""
+    model = job.scenario.measurement
+    if isinstance(model, Nist):
+        return f"nist/{model.dataset.lower()}"
     chosen = [a.partition("=")[2] for a in arguments if a.startswith("measurement=")]
-    return chosen[-1] if chosen else job.scenario.measurement.name
+    return chosen[-1] if chosen else model.name
 
 
 def _readings(config: DictConfig, job: Job) -> tuple[Job, Array]:

@@ -20,8 +20,10 @@ from ipe_bench.basics.errors import StorageError, UserError
 from ipe_bench.cli.config import CONFIG_ERRORS, Job, assemble, explain, prepare, refuse_silent_traps, rewrite
 from ipe_bench.cli.progress import shown_progress
 from ipe_bench.cli.report import show
+from ipe_bench.measurements import Nist
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.runs.execution import Serial
+from ipe_bench.runs.store import digest
 
 _FLAGS_WITH_VALUE = {"--cfg", "-c", "--package", "-p", "--config-name", "-cn", "--config-path", "-cp"}
 _FLAGS_WITH_VALUE |= {"--config-dir", "-cd", "--experimental-rerun"}
@@ -151,12 +153,20 @@ def _explain_os_error(error: OSError) -> Exception:
 
 
 def _title(job: Job) -> str:
-    """What a job is about, for its progress bar: the option that was chosen, and what is drawn."""
+    """What a job is about, for its progress bar: the option that was chosen, what is drawn, and what a sweep sets."""
     scenario = job.scenario
-    chosen = HydraConfig.get().runtime.choices.get("measurement", scenario.measurement.name)
-    if scenario.noise.real:
-        return str(chosen)
-    return f"{chosen}, error scale {scenario.error_scale:g}, seed {scenario.seed}"
+    hydra_config = HydraConfig.get()
+    chosen = hydra_config.runtime.choices.get("measurement", scenario.measurement.name)
+    if isinstance(scenario.measurement, Nist):
+        chosen = f"{chosen} {scenario.measurement.dataset}"
+    parts = [str(chosen)]
+    if not scenario.noise.real:
+        parts += [f"error scale {scenario.error_scale:g}", f"seed {scenario.seed}"]
+    if hydra_config.mode == RunMode.MULTIRUN:
+        said = ("measurement=", "error_scale=", "seed=", "trials=", "output=", "name=", "block_size=", "execution")
+        settings = [o for o in hydra_config.overrides.task if not o.lstrip("+").startswith(said)]
+        parts += [o if len(o) <= 40 else f"{o[:30]}… #{digest(o)[:6]}" for o in settings]
+    return ", ".join(parts)
 
 
 def write_trial(job: Job, path: Path, trial: int) -> None:

@@ -9,7 +9,7 @@ from rich.table import Table
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console
 from ipe_bench.runs.results import Results, require_results
-from ipe_bench.runs.store import TRUTH, title
+from ipe_bench.runs.store import TRUTH
 
 _COUNTS = ("missing", "failed", "stale")
 
@@ -35,7 +35,7 @@ def _show(directory: str, results: Results) -> None:
     for cell in results.cells:
         label = "(truth)" if cell.names["estimator"] == TRUTH else cell.names["estimator"]
         counts = (str(getattr(cell, name) or "") for name in _COUNTS)
-        table.add_row(title(cell.names), label, f"{cell.done} of {cell.expected or cell.done}", *counts)
+        table.add_row(cell.title, label, f"{cell.done} of {cell.expected or cell.done}", *counts)
     out.print(table)
     for problem in results.problems:
         out.print(problem, markup=False, soft_wrap=True)

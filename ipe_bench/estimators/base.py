@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import describe_exception
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Component
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.counted import Tally
 from ipe_bench.measurements.problem import Problem
@@ -65,6 +66,8 @@ class Estimates:
     """For each trial the iterates (iterations + 1, n), where they were asked for."""
     extras: dict[str, Array] = field(default_factory=dict)
     """Further numbers per trial (trials,) that this estimator reports, by name: NIS of a filter, say."""
+    alternatives: list[Array] | None = None
+    """For each trial the other answers (count, n) that fit its readings as well, of estimators that look for them."""
 
     def __post_init__(self) -> None:
         for name in ("iterations", "simulations", "jacobians", "seconds"):
@@ -102,6 +105,7 @@ class Estimates:
             messages={int(s) + i: m for s, p in zip(starts, parts, strict=False) for i, m in p.messages.items()},
             seconds=np.concatenate([p.seconds for p in parts]),
             history=None if any(h is None for h in histories) else [x for h in histories if h for x in h],
+            alternatives=_joined_alternatives(parts),
             extras={
                 k: np.concatenate([p.extras.get(k, u) for p, u in zip(parts, unknown, strict=True)]) for k in names
             },
@@ -114,7 +118,15 @@ class Estimates:
         return cls(np.full((trials, n), np.nan), status, messages=dict.fromkeys(range(trials), message))
 
 
-class Estimator(ABC):
+def _joined_alternatives(parts: Sequence[Estimates]) -> list[Array] | None:
+    """Those of all parts; none for the trials of a part that knows of none."""
+    if all(p.alternatives is None for p in parts):
+        return None
+    none = [[np.zeros((0, p.x.shape[1]))] * len(p.x) for p in parts]
+    return [x for p, empty in zip(parts, none, strict=True) for x in (p.alternatives or empty)]
+
+
+class Estimator(Component, ABC):
     """Turns readings into parameters. A new estimator is a frozen dataclass that writes `estimate`.
 
     The trials of a batch are independent: a trial's result is the same, bit for bit, in whatever batch it stands, and

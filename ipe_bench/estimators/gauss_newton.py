@@ -6,22 +6,22 @@ from dataclasses import dataclass, replace
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.estimators.driver import Solver, Standing
-from ipe_bench.estimators.least_squares import Descent, Objective, Slope, squared
+from ipe_bench.estimators.least_squares import Descent, Residuals, Slope, squared
 
 
 @dataclass(frozen=True)
 class GaussNewtonMethod(Solver[Descent]):
     """x <- x - (J' R^-1 J)^-1 J' R^-1 (h(x) - z), undamped."""
 
-    def begin(self, objective: Objective, x: Array) -> Descent:
+    def begin(self, objective: Residuals, x: Array) -> Descent:
         return Descent.at(objective, x)
 
-    def step(self, objective: Objective, state: Descent) -> Descent:
+    def step(self, objective: Residuals, state: Descent) -> Descent:
         x = state.x + state.slope.newton
         r = objective.residual(x)
         slope = Slope.of(objective.jacobian(x), r)
         return replace(state, x=x, r=r, cost=squared(r), slope=slope, moved=state.reach(state.slope.newton))
 
-    def standing(self, objective: Objective, before: Descent | None, state: Descent) -> Standing:
+    def standing(self, objective: Residuals, before: Descent | None, state: Descent) -> Standing:
         """Where J lacks rank there is no step."""
         return state.standing(stuck=state.rankless)

@@ -14,7 +14,7 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.errors import UserError, require_counts, require_positive
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import (
     Array,
     Covariance,
@@ -26,6 +26,7 @@ from ipe_bench.basics.linalg import (
     pseudo_inverse,
     solve,
 )
+from ipe_bench.basics.options import Count, Positive
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import Solver, Standing, iterate
 from ipe_bench.measurements.counted import Counted, Tally
@@ -118,8 +119,8 @@ class FrozenSystem:
         return dataclasses.replace(self, H_plus=H_plus, deviation=deviation)
 
     def subset(self, kept: Mask) -> FrozenSystem:
-        own = {} if len(self.H_plus) == 1 else {"H_plus": self.H_plus[kept], "deviation": self.deviation[kept]}
-        return dataclasses.replace(self, z=self.z[kept], rows=self.rows[kept], **own)
+        slopes = {} if len(self.H_plus) == 1 else {"H_plus": self.H_plus[kept], "deviation": self.deviation[kept]}
+        return dataclasses.replace(self, z=self.z[kept], rows=self.rows[kept], **slopes)
 
     def relinearized(self, x: Array) -> FrozenSystem:
         """The same readings with H+ of dh/dx at x (trials, n), for each trial its own; a deficient one is singular."""
@@ -173,19 +174,13 @@ class IPE(Solver[S], Estimator, Generic[S]):
 
     start: Start = "linear_lse"
     """Where the iteration begins: at the linear LSE, eq. (16), or at the nominal point."""
-    max_iterations: int = 100
-    tolerance: float = 1e-6
+    max_iterations: Count = 100
+    tolerance: Positive = 1e-6
     """Largest abs(F_i) in standard deviations of the linear bound, eq. (5)."""
-    budget: float | None = None
+    budget: Positive | None = None
     """Simulations that a trial may cost, a Jacobian counting n; None: no limit."""
 
     equation = "frozen"
-
-    def __post_init__(self) -> None:
-        if self.start not in ("linear_lse", "nominal"):
-            raise UserError(f"start={self.start}: choose linear_lse or nominal")
-        require_positive(self, "tolerance", "budget")
-        require_counts(self, "max_iterations")
 
     def init(self, system: System, x: Array, F: Array) -> S:
         """The state at the start x (trials, n), where the residual is F."""

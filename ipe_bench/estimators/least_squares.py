@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,22 @@ _FLAT = 30
 """Steps without a visible decrease after which a nearly stationary point is as good as it gets,"""
 _STATIONARY = 1e-3
 """where nearly means: within this part of a deviation along every column of J."""
+
+
+class Residuals(Protocol):
+    """What the methods of this room minimise the squares of, for the trials of a batch."""
+
+    def residual(self, x: Array, /) -> Array:
+        """The residuals (trials, m) at x (trials, n), of unit variance."""
+        ...
+
+    def jacobian(self, x: Array, /) -> Array:
+        """Their derivative (trials, m, n)."""
+        ...
+
+    def subset(self, kept: Mask, /) -> Residuals:
+        """The same for some of the trials."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -132,7 +148,7 @@ class Slope:
 
 @dataclass(frozen=True)
 class Descent:
-    """What the methods of this room carry from step to step; every field has the trials in front."""
+    """What these methods carry from step to step; every field has the trials in front."""
 
     x: Array
     r: Array
@@ -154,7 +170,7 @@ class Descent:
     """and how many steps ago."""
 
     @classmethod
-    def at(cls, objective: Objective, x: Array, lam: float = 0.0, *, keep_Q: bool = False) -> Descent:
+    def at(cls, objective: Residuals, x: Array, lam: float = 0.0, *, keep_Q: bool = False) -> Descent:
         """The state at the start."""
         r = objective.residual(x)
         slope = Slope.of(objective.jacobian(x), r, keep_Q=keep_Q)
@@ -235,7 +251,7 @@ def minimize(
     budget: float | None = None,
     history: bool = False,
 ) -> Minima:
-    """Minimises the objective from x (trials, n) by a method of this room.
+    """Minimises the objective from x (trials, n) by Gauss-Newton or Levenberg-Marquardt.
 
     Converged is where the Gauss-Newton step, which is the gradient in whitened units, is at most `tolerance` standard
     deviations of the local bound in every parameter. An iteration is a step tried, taken or not.

@@ -9,7 +9,7 @@ import numpy as np
 from ipe_bench.basics.batches import put
 from ipe_bench.basics.linalg import Array, finite, multiply
 from ipe_bench.estimators.driver import Solver, Standing
-from ipe_bench.estimators.least_squares import Descent, Objective, Slope, squared
+from ipe_bench.estimators.least_squares import Descent, Residuals, Slope, squared
 
 _LARGEST_DAMPING = 1e30
 _ROUND_OFF = 1e-8
@@ -41,7 +41,7 @@ class LevenbergMarquardtMethod(Solver[Descent]):
     """Bends each step along the curvature of the readings, for one more simulation (Transtrum and Sethna, 2012,
     arXiv 1201.5885)."""
 
-    def begin(self, objective: Objective, x: Array) -> Descent:
+    def begin(self, objective: Residuals, x: Array) -> Descent:
         state = Descent.at(objective, x, self.damping, keep_Q=self.geodesic)
         if self.deviation is not None:
             state = replace(state, scale=np.broadcast_to(1.0 / self.deviation, state.scale.shape))
@@ -54,7 +54,7 @@ class LevenbergMarquardtMethod(Solver[Descent]):
         far = np.nan_to_num(state.cost / state.r.shape[1], nan=1.0, posinf=1.0)
         return replace(state, lam=np.maximum(state.lam, far))
 
-    def step(self, objective: Objective, state: Descent) -> Descent:
+    def step(self, objective: Residuals, state: Descent) -> Descent:
         weights = np.sqrt(state.lam)[:, None] * state.scale
         step, predicted = state.slope.damped(weights)
         bent, believed = self._bend(objective, state, weights, step)
@@ -85,11 +85,11 @@ class LevenbergMarquardtMethod(Solver[Descent]):
             *state.watched(cost),
         )
 
-    def standing(self, objective: Objective, before: Descent | None, state: Descent) -> Standing:
+    def standing(self, objective: Residuals, before: Descent | None, state: Descent) -> Standing:
         """Damping goes on where J lacks rank, until it can gain nothing more."""
         return state.standing(stuck=state.lam > _LARGEST_DAMPING)
 
-    def _bend(self, objective: Objective, state: Descent, weights: Array, step: Array) -> tuple[Array, Array]:
+    def _bend(self, objective: Residuals, state: Descent, weights: Array, step: Array) -> tuple[Array, Array]:
         """The step v + a / 2 with the geodesic acceleration a, and where a is small enough beside v to be believed."""
         if not self.geodesic:
             return step, np.ones(len(step), dtype=bool)

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import MinLen
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Positive
 from ipe_bench.measurements.base import Input, Measurement, Parameter, UsualNoise
 from ipe_bench.measurements.triad import Magnitudes, attitudes
 
@@ -34,33 +35,25 @@ class Accelerometer(Magnitudes):
     in another form: its symmetric matrix is the polar factor of T K.
     """
 
-    counts: tuple[tuple[float, float, float], ...] | None = None
+    counts: Annotated[tuple[tuple[float, float, float], ...], MinLen(10)] | None = None
     """Counts r_k (attitudes, 3); None: those of a triad as presumed, in 26 directions."""
     bias: tuple[float, float, float] = (32768.0, 32768.0, 32768.0)
-    """The presumed bias in counts,"""
-    scale: tuple[float, float, float] = (0.0024, 0.0024, 0.0024)
-    """scale factors in m/s^2 per count,"""
+    """The presumed bias in counts; with the two that follow, the nominal point."""
+    scale: tuple[Positive, Positive, Positive] = (0.0024, 0.0024, 0.0024)
+    """The presumed scale factors in m/s^2 per count."""
     misalignment: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """and angles ayz, azy, azx in rad: the nominal point."""
-    gravity: float = 9.80665
+    """The presumed angles ayz, azy, azx in rad."""
+    gravity: Positive = 9.80665
     """Local gravity in m/s^2."""
-    bias_size: float = 50.0
-    """What one unit of error is: of a bias in counts,"""
-    scale_size: float = 0.02
-    """of a scale factor, as a fraction of it,"""
-    misalignment_size: float = 0.01
-    """of an angle in rad."""
+    bias_size: Positive = 50.0
+    """What one unit of error of a bias is, in counts."""
+    scale_size: Positive = 0.02
+    """What one unit of error of a scale factor is, as a fraction of it."""
+    misalignment_size: Positive = 0.01
+    """What one unit of error of an angle is, in rad."""
 
     reading_unit = "m/s^2"
     usual_noise = UsualNoise(5e-3)
-
-    def __post_init__(self) -> None:
-        if self.counts is not None and (np.shape(self.counts)[1:] != (3,) or len(self.counts) < 10):
-            raise UserError("counts: give three numbers for each of at least 10 attitudes")
-        if min(self.scale) <= 0:
-            raise UserError(f"scale={list(self.scale)}: give three numbers above 0")
-        if self.gravity <= 0:
-            raise UserError(f"gravity={self.gravity}: give a number above 0")
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:

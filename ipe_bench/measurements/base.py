@@ -1,7 +1,7 @@
 """What a measurement model is: parameters in, readings out, with names, units and the order in which readings arrive.
 
 A new model is a frozen dataclass that derives from `Measurement` and writes `simulate`; everything else has a default.
-Noise, priors and estimators are left to their own rooms.
+Noise, priors and estimators are left to others.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.naming import Named
+from ipe_bench.basics.options import Component
 
 _COMPLEX_STEP = 1e-100
 _CENTRAL_STEP = float(np.finfo(float).eps ** (1 / 3))
@@ -68,7 +69,7 @@ class Recorded:
     """The answer (n,) that somebody certifies, in multiples of the parameters' sizes."""
 
 
-class Measurement(Named, ABC):
+class Measurement(Component, Named, ABC):
     """A model z = h(x) + v, without the noise v.
 
     x is (trials, n) in multiples of the parameters' sizes, h(x) is (trials, m) in `reading_unit`, and a trial's
@@ -236,6 +237,9 @@ class Restricted(Measurement):
     """Rows of the whole model's z, ascending."""
     stop: int | None = None
     """Where the rows all lie within the first `stop` epochs: nothing later is computed."""
+
+    def __post_init__(self) -> None:
+        """Made in every window and epoch, and of no user's options: there is nothing to check."""
 
     @classmethod
     def until(cls, whole: Measurement, stop: int) -> Restricted:

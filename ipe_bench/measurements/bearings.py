@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import MinLen
 from numpy.typing import NDArray
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Positive
 from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise
 
 
@@ -29,28 +30,20 @@ class Bearings(Measurement):
     Electronic Systems 17, 1981). Estimators that linearise at the nominal point then say that H lacks rank.
     """
 
-    legs: tuple[tuple[float, float, float], ...] = ((900.0, 90.0, 6.0), (900.0, 330.0, 6.0))
+    legs: Annotated[tuple[tuple[float, float, float], ...], MinLen(1)] = ((900.0, 90.0, 6.0), (900.0, 330.0, 6.0))
     """The observer's legs: duration in s, course in degrees from north, speed in m/s."""
-    interval: float = 60.0
+    interval: Positive = 60.0
     """Time between bearings in s; the first is taken at time 0."""
     target: tuple[float, float, float, float] = (3000.0, 5000.0, -3.0, 1.0)
     """The presumed target (east and north in m, in m/s): the nominal point."""
-    position_size: float = 250.0
-    """What one unit of error is: of each coordinate in m,"""
-    velocity_size: float = 0.25
-    """and of each velocity in m/s."""
+    position_size: Positive = 250.0
+    """What one unit of error of a coordinate is, in m."""
+    velocity_size: Positive = 0.25
+    """What one unit of error of a velocity is, in m/s."""
 
     reading_unit = "deg"
     usual_noise = UsualNoise(0.5)
     analytic = True
-
-    def __post_init__(self) -> None:
-        if not self.interval > 0:
-            raise UserError(f"interval={self.interval}: give a number above 0")
-        if np.shape(self.legs) != (len(self.legs), 3) or len(self.legs) == 0:
-            raise UserError("legs: give duration, course and speed for each leg")
-        if len(self.target) != 4:
-            raise UserError("target: give east, north, and their rates")
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.options import Positive
 from ipe_bench.measurements.base import Parameter, Recorded, UsualNoise
 from ipe_bench.measurements.ode.model import OdeMeasurement
 
@@ -33,32 +35,24 @@ class Bock(OdeMeasurement):
     Physics 18, 1981, and his thesis (Bonner Mathematische Schriften 183, 1987). A noise of 0.05 is customary.
     """
 
-    mu: float = 60.0
-    readings: int = 10
+    mu: Positive = 60.0
+    readings: Annotated[int, Ge(2)] = 10
     """Times at which both states are read: 1/readings, 2/readings, ..., 1."""
     guess: float = 1.0
     """The presumed p: the nominal point."""
     initial: bool = False
     """Whether the initial values are unknown too; they are presumed to be (0, pi)."""
-    size: float = 0.1
+    size: Positive = 0.1
     """What one unit of error is, of each parameter."""
-    deviation: float = 0.05
+    deviation: Positive = 0.05
     """The standard deviation that R states of the recorded readings."""
-    step: float | None = 0.0025
+    step: Positive | None = 0.0025
 
     states, outputs = 2, ("x1", "x2")
 
     @property
     def usual_noise(self) -> UsualNoise:  # type: ignore[override]
         return UsualNoise(self.deviation)
-
-    def __post_init__(self) -> None:
-        if self.mu <= 0:
-            raise UserError(f"mu={self.mu}: give a rate above 0")
-        if self.readings < 2:
-            raise UserError(f"readings={self.readings}: give at least 2 times")
-        if self.deviation <= 0 or self.size <= 0:
-            raise UserError(f"deviation={self.deviation}, size={self.size}: give numbers above 0")
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:

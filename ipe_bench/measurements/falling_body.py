@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Positive
 from ipe_bench.measurements.base import Parameter, UsualNoise
 from ipe_bench.measurements.ode.model import OdeMeasurement
 
@@ -35,38 +37,32 @@ class FallingBody(OdeMeasurement):
     """
 
     altitude: float = 3e5 * _FOOT
-    """Presumed altitude at the start in m,"""
+    """Presumed altitude at the start in m; with the two that follow, the nominal point."""
     velocity: float = 2e4 * _FOOT
-    """velocity in m/s,"""
-    ballistic: float = 3e-5 / _FOOT
-    """and ballistic coefficient in 1/m."""
+    """Presumed velocity in m/s."""
+    ballistic: Positive = 3e-5 / _FOOT
+    """Presumed ballistic coefficient in 1/m."""
     radar_distance: float = 1e5 * _FOOT
     """M in m."""
     radar_altitude: float = 1e5 * _FOOT
     """H in m."""
     density_decay: float = 5e-5 / _FOOT
     """gamma in 1/m: the density of the air falls with altitude like exp(-gamma h)."""
-    interval: float = 1.0
+    interval: Positive = 1.0
     """Time between ranges in s."""
-    readings: int = 60
-    altitude_size: float = 1e3 * _FOOT
-    """What one unit of error is: of the altitude in m,"""
-    velocity_size: float = 2e3 * _FOOT
-    """of the velocity in m/s,"""
-    ballistic_size: float = float(np.log(1e-3 / 3e-5))
-    """and of the logarithm of the ballistic coefficient."""
-    step: float | None = 0.5
+    readings: Annotated[int, Ge(4)] = 60
+    altitude_size: Positive = 1e3 * _FOOT
+    """What one unit of error of the altitude is, in m."""
+    velocity_size: Positive = 2e3 * _FOOT
+    """What one unit of error of the velocity is, in m/s."""
+    ballistic_size: Positive = float(np.log(1e-3 / 3e-5))
+    """What one unit of error of the logarithm of the ballistic coefficient is."""
+    step: Positive | None = 0.5
     sampled: tuple[float, ...] | None = None
     """Times of the ranges in s, in place of equal intervals."""
 
     states, outputs, reading_unit = 2, ("range",), "m"
     usual_noise = UsualNoise(100 * _FOOT)
-
-    def __post_init__(self) -> None:
-        if self.ballistic <= 0:
-            raise UserError(f"ballistic={self.ballistic}: give a presumed coefficient above 0")
-        if self.readings < 4:
-            raise UserError(f"readings={self.readings}: give at least 4 for 3 parameters")
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:

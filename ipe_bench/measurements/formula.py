@@ -51,6 +51,7 @@ class Formula(Measurement):
     """Parameters of which every file of readings has its own, where there are several."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name, value in self.start.items():
             if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
                 raise UserError(f"start.{name}={value}: give a finite number")

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Count, Positive
 from ipe_bench.measurements.base import Parameter, UsualNoise
 from ipe_bench.measurements.ode.model import OdeMeasurement
 from ipe_bench.measurements.ode.source import Variation
@@ -50,9 +51,9 @@ class Gins(OdeMeasurement):
     gravity: float = 9.80665
     earth_rate: float = 7.292115e-5
     injected_ft_per_s: float = 1500.0
-    interval_min: float = 3.0
-    readings_per_case: int = 30
-    step: float | None = None
+    interval_min: Positive = 3.0
+    readings_per_case: Count = 30
+    step: Positive | None = None
 
     reading_unit = "m/s"
     usual_noise = UsualNoise(step=0.02286)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import NonNegative
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.ode.kernel import Kernel
 from ipe_bench.measurements.ode.source import Equations, simulation_source
@@ -34,22 +34,17 @@ class RicherGins(Gins):
     reading to reading and keeps the tolerance of `Gins`.
     """
 
-    gyro_random_walk: float = 0.0
+    gyro_random_walk: NonNegative = 0.0
     """Of each drift, deg/h per root hour."""
-    accelerometer_quadratic: float = 0.0
+    accelerometer_quadratic: NonNegative = 0.0
     """Output that grows with the square of the specific force along each level axis, micro-g per g^2."""
-    accelerometer_misalignment: float = 0.0
+    accelerometer_misalignment: NonNegative = 0.0
     """Angle by which each level accelerometer senses the other level axis, arc seconds. Sensing the vertical axis would
     be a bias, which the model has."""
-    platform_misalignment: float = 0.0
+    platform_misalignment: NonNegative = 0.0
     """Initial rotation of the platform about each of its axes, arc seconds."""
 
     name = "gins_richer"
-
-    def __post_init__(self) -> None:
-        for f in fields(RicherGins)[-4:]:
-            if not (np.isfinite(getattr(self, f.name)) and getattr(self, f.name) >= 0):
-                raise UserError(f"{f.name}={getattr(self, f.name)}: give a number from 0 up")
 
     @cached_property
     def nuisance_deviation(self) -> Array:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Count, Positive
 from ipe_bench.measurements.base import Input, Measurement, Parameter, UsualNoise
 
 LIGHT = 299792458.0
@@ -82,13 +83,13 @@ class Gnss(Measurement):
     """The presumed position in m (ECEF): the nominal point, with clocks of 0."""
     frame: Literal["enu", "ecef"] = "enu"
     """In which axes the position is estimated: east, north, up, or x, y, z."""
-    rounds: int = 1
-    position_size: float = 1000.0
-    """What one unit of error is, in m: of each coordinate,"""
-    clock_size: float = 1000.0
-    """of each clock,"""
-    offset_size: float = 10.0
-    """and of the offset of each further constellation."""
+    rounds: Count = 1
+    position_size: Positive = 1000.0
+    """What one unit of error of a coordinate is, in m."""
+    clock_size: Positive = 1000.0
+    """What one unit of error of a clock is, in m."""
+    offset_size: Positive = 10.0
+    """What one unit of error of the offset of a further constellation is, in m."""
     earth_rate: float = EARTH_RATE
     """In rad/s; 0 for beacons and readings whose rotation is taken off already."""
 
@@ -97,21 +98,18 @@ class Gnss(Measurement):
     analytic = True
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         given = {"constellations": self.constellations, "times": self.times}
         if self.satellites is None:
             for name, column in given.items():
                 if column is not None:
                     raise UserError(f"{name}: give satellites as well, three coordinates for each reading")
         else:
-            if np.shape(self.satellites) != (len(self.satellites), 3):
-                raise UserError("satellites: give three coordinates for each reading")
             for name, column in given.items():
                 if column is not None and len(column) != len(self.satellites):
                     raise UserError(f"{name}: {len(column)} entries for {len(self.satellites)} satellites")
         if self.frame == "enu" and math.hypot(*self.position) < _LEAST_RADIUS:
             raise UserError("position: there is no up near the centre of the Earth; set frame=ecef")
-        if self.rounds < 1:
-            raise UserError(f"rounds={self.rounds}: give at least 1")
         if self.m < self.n:
             raise UserError(f"satellites: {self.m} readings are too few for {self.n} parameters")
 

@@ -30,6 +30,7 @@ class Joint(Measurement):
         return self.parts[0].name
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         units = {part.reading_unit for part in self.parts}
         if len(units) > 1:
             raise UserError(f"readings: the files have readings in different units: {', '.join(sorted(units))}")

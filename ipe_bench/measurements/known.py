@@ -83,6 +83,7 @@ class Informed(Measurement):
         return self.whole.name
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         names = [p.name for p in self.whole.parameters]
         for one in self.known:
             if one.name not in names:

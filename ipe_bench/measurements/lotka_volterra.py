@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ipe_bench.basics.options import Count, Positive
 from ipe_bench.measurements.base import Parameter, UsualNoise
 from ipe_bench.measurements.ode.model import OdeMeasurement
 
@@ -17,8 +18,8 @@ class LotkaVolterra(OdeMeasurement):
     The values are those of the Hudson's Bay pelts (Carpenter, Predator-Prey Population Dynamics, Stan, 2018).
     """
 
-    years: int = 20
-    step: float | None = None
+    years: Count = 20
+    step: Positive | None = None
     sampled: tuple[float, ...] | None = None
     """Times of the readings in years, in place of one a year."""
     tolerance = 1e-6

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Count, Finite
 from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise
 
 
@@ -25,21 +26,20 @@ class Polynomial(Measurement):
     reading fixes one u, and N(x) = s u^2 / 2 + s^2 u^3 / 6 in the words of eq. (24). Each reading is an epoch.
     """
 
-    unknowns: int = 4
+    unknowns: Count = 4
     """n, the number of parameters."""
-    count: int = 40
+    count: Count = 40
     """m, the number of readings."""
-    strength: float = 0.005
+    strength: Finite = 0.005
     """s, by how much the readings bend per unit of x."""
 
     analytic = True
     usual_noise = UsualNoise(0.01)
 
     def __post_init__(self) -> None:
-        if self.unknowns < 1 or self.count <= self.unknowns:
-            raise UserError(f"count={self.count}: give more readings than unknowns, and at least one unknown")
-        if not np.isfinite(self.strength):
-            raise UserError(f"strength={self.strength}: give a finite number; 0 is the linear model")
+        super().__post_init__()
+        if self.count <= self.unknowns:
+            raise UserError(f"count={self.count}: give more readings than unknowns")
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:

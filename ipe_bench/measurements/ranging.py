@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Count, Positive
 from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise
 
 _BEACONS = (
@@ -41,19 +42,20 @@ class Ranging(Measurement):
     """East, north, up of each beacon in m."""
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The presumed position of the receiver in m: the nominal point."""
-    rounds: int = 3
-    position_size: float = 10.0
-    """What one unit of error is, in m: of each coordinate,"""
-    clock_size: float = 10.0
-    """and of the clock."""
+    rounds: Count = 3
+    position_size: Positive = 10.0
+    """What one unit of error of a coordinate is, in m."""
+    clock_size: Positive = 10.0
+    """What one unit of error of the clock bias is, in m."""
 
     reading_unit = "m"
     usual_noise = UsualNoise(0.1)
     analytic = True
 
     def __post_init__(self) -> None:
-        if np.shape(self.beacons) != (len(self.beacons), 3) or len(self.beacons) * self.rounds < 5:
-            raise UserError("beacons: give three coordinates for each, and at least 5 readings over all rounds")
+        super().__post_init__()
+        if len(self.beacons) * self.rounds < 5:
+            raise UserError("beacons: give at least 5 readings over all rounds")
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Count, Positive
 from ipe_bench.measurements.base import Parameter, UsualNoise
 from ipe_bench.measurements.ode.model import OdeMeasurement
 
 State = Literal["susceptible", "infected", "removed"]
-_STATES = ("susceptible", "infected", "removed")
+_STATES: tuple[State, ...] = get_args(State)
 
 
 @dataclass(frozen=True)
@@ -34,22 +35,22 @@ class Sir(OdeMeasurement):
     leaves residuals of about 20 boys there.
     """
 
-    population: float = 763.0
+    population: Positive = 763.0
     """N."""
-    infection: float = 1.66
-    """Presumed beta per day,"""
-    recovery: float = 0.44
-    """gamma per day,"""
-    infected: float = 1.0
-    """and I(0)."""
-    days: int = 14
+    infection: Positive = 1.66
+    """Presumed beta per day; with the two that follow, the nominal point."""
+    recovery: Positive = 0.44
+    """Presumed gamma per day."""
+    infected: Positive = 1.0
+    """Presumed I(0)."""
+    days: Count = 14
     observed: tuple[State, ...] = ("infected",)
     """What is counted each day."""
-    rate_size: float = 0.1
-    """What one unit of error is: of the logarithm of each rate,"""
-    infected_size: float = 0.3
-    """and of the logarithm of the odds I(0) / S(0)."""
-    step: float | None = 0.125
+    rate_size: Positive = 0.1
+    """What one unit of error of the logarithm of a rate is."""
+    infected_size: Positive = 0.3
+    """What one unit of error of the logarithm of the odds I(0) / S(0) is."""
+    step: Positive | None = 0.125
     sampled: tuple[float, ...] | None = None
     """Times of the readings in days, in place of one at the end of each day."""
 
@@ -57,12 +58,10 @@ class Sir(OdeMeasurement):
     usual_noise = UsualNoise(20.0)
 
     def __post_init__(self) -> None:
-        for name in ("population", "infection", "recovery", "infected"):
-            if not getattr(self, name) > 0:
-                raise UserError(f"{name}={getattr(self, name)}: give a number above 0")
+        super().__post_init__()
         if self.infected >= self.population:
             raise UserError(f"infected={self.infected}: give fewer than the population of {self.population:g}")
-        if not self.observed or len(set(self.observed)) < len(self.observed) or set(self.observed) - set(_STATES):
+        if not self.observed or len(set(self.observed)) < len(self.observed):
             raise UserError(f"observed={list(self.observed)}: choose some of {', '.join(_STATES)}, each once")
         if self.days * len(self.observed) < 4:
             raise UserError(f"days={self.days}: give at least 4 readings for 3 parameters")

@@ -10,13 +10,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import MinLen
 from numpy.typing import NDArray
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Positive
 from ipe_bench.measurements.base import Input, Measurement, Parameter, UsualNoise
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -74,25 +75,23 @@ class Triad(Magnitudes):
     and Technology 11, 2000.
     """
 
-    outputs: tuple[tuple[float, float, float], ...] | None = None
+    outputs: Annotated[tuple[tuple[float, float, float], ...], MinLen(10)] | None = None
     """Outputs r_k of the triad (attitudes, 3) in `unit`; None: a field of `field` in 26 directions."""
-    field: float = 1.0
+    field: Positive = 1.0
     """The magnitude about which sizes are chosen, in `unit`."""
     unit: str = "g"
-    bias_size: float = 2e-3
-    """What one unit of error is: of a bias, as a fraction of `field`,"""
-    scale_size: float = 2e-3
-    """of a scale factor,"""
-    misalignment_size: float = 2e-3
-    """of a misalignment in rad."""
+    bias_size: Positive = 2e-3
+    """What one unit of error of a bias is, as a fraction of `field`."""
+    scale_size: Positive = 2e-3
+    """What one unit of error of a scale factor is."""
+    misalignment_size: Positive = 2e-3
+    """What one unit of error of a misalignment is, in rad."""
     bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """The presumed bias in `unit`, then errors of scale (plain numbers) and alignment (rad): the nominal point."""
+    """The presumed bias in `unit`; with the two that follow, the nominal point."""
     scale: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The presumed scale-factor errors, as plain numbers."""
     misalignment: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        if self.outputs is not None and (np.shape(self.outputs)[1:] != (3,) or len(self.outputs) < 10):
-            raise UserError("outputs: give three numbers for each of at least 10 attitudes")
+    """The presumed misalignments in rad."""
 
     @property
     def reading_unit(self) -> str:

@@ -9,9 +9,15 @@ import numpy as np
 
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.naming import Named
+from ipe_bench.basics.options import Component
+
+GINS_STEP = 0.02286
+"""The velocity read-outs' step of 0.075 ft/s in m/s: what noises are set to, since GINS is the standard model."""
+GINS_DEVIATION = 0.0065991136
+"""That step over the root of 12."""
 
 
-class Noise(Named, ABC):
+class Noise(Component, Named, ABC):
     """Errors of readings. A new noise is a frozen dataclass that writes `corrupt` and `covariance`."""
 
     real: ClassVar[bool] = False

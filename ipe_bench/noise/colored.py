@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from annotated_types import Ge, Gt, Lt
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
-from ipe_bench.noise.base import Noise
+from ipe_bench.basics.options import Count, Positive
+from ipe_bench.noise.base import GINS_DEVIATION, Noise
 
 
 @dataclass(frozen=True)
@@ -22,22 +24,14 @@ class Colored(Noise):
     estimators are told: `white`, R = deviation^2 I, which is the mistake that the paper warns of; or `full`, the truth.
     """
 
-    deviation: float
+    deviation: Positive = GINS_DEVIATION
     """Standard deviation of each reading, in the unit of the readings."""
-    correlation: float = 0.5
+    correlation: Annotated[float, Gt(-1), Lt(1)] = 0.5
     """Of successive readings of one instrument."""
-    channels: int = 1
-    length: int | None = None
+    channels: Count = 1
+    length: Count | None = None
     """Readings per instrument in one series; None: all of them."""
     assumed: Literal["white", "full"] = "white"
-
-    def __post_init__(self) -> None:
-        if not -1 < self.correlation < 1:
-            raise UserError(f"correlation={self.correlation}: give a number between -1 and 1")
-        if self.channels < 1 or (self.length is not None and self.length < 1):
-            raise UserError(f"channels={self.channels}, length={self.length}: give whole numbers above 0")
-        if self.assumed not in ("white", "full"):
-            raise UserError(f"assumed={self.assumed}: choose white or full")
 
     def _series(self, m: int) -> tuple[int, int, int]:
         """How m readings divide: (series after one another, length, channels)."""
@@ -60,8 +54,8 @@ class Colored(Noise):
         if self.assumed == "white":
             return Covariance(np.full(m, self.deviation))
         apart = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
-        one = np.kron(self.correlation**apart, np.eye(channels))
-        return Covariance(np.linalg.cholesky(self.deviation**2 * np.kron(np.eye(repeats), one)))
+        series = np.kron(self.correlation**apart, np.eye(channels))
+        return Covariance(np.linalg.cholesky(self.deviation**2 * np.kron(np.eye(repeats), series)))
 
 
 @dataclass(frozen=True)
@@ -73,23 +67,15 @@ class Correlated(Noise):
     is what estimators are told: `full`, R itself; or `white`, its diagonal.
     """
 
-    deviation: float = 1.0
+    deviation: Positive = GINS_DEVIATION
     """Standard deviation of each reading, in the unit of the readings."""
-    correlation: float = 0.5
+    correlation: Annotated[float, Ge(0), Lt(1)] = 0.5
     """Of two readings of one block."""
-    block: int | None = None
+    block: Count | None = None
     """Readings per block; None: all are one."""
     matrix: tuple[tuple[float, ...], ...] | None = None
     """R (m, m); where it is given, the three options above play no part."""
     assumed: Literal["white", "full"] = "full"
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.correlation < 1:
-            raise UserError(f"correlation={self.correlation}: give a number from 0 to below 1")
-        if self.block is not None and self.block < 1:
-            raise UserError(f"block={self.block}: give a whole number above 0")
-        if self.assumed not in ("white", "full"):
-            raise UserError(f"assumed={self.assumed}: choose white or full")
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         return h + _factor(self, len(h)) @ rng.standard_normal(len(h))
@@ -106,8 +92,8 @@ def _factor(noise: Correlated, m: int) -> Array:
         block = m if noise.block is None else noise.block
         if m % block:
             raise UserError(f"block={block}: {m} readings do not divide into such blocks")
-        one = (1 - noise.correlation) * np.eye(block) + noise.correlation
-        R = noise.deviation**2 * np.kron(np.eye(m // block), one)
+        within = (1 - noise.correlation) * np.eye(block) + noise.correlation
+        R = noise.deviation**2 * np.kron(np.eye(m // block), within)
     else:
         R = np.array(noise.matrix, dtype=float)
         if R.shape != (m, m) or not np.allclose(R, R.T):
@@ -115,4 +101,4 @@ def _factor(noise: Correlated, m: int) -> Array:
     try:
         return np.linalg.cholesky(R)
     except np.linalg.LinAlgError:
-        raise UserError("matrix: is no covariance: it is not positive definite") from None
+        raise UserError("matrix: is not a covariance: it is not positive definite") from None

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError, require_positive
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
-from ipe_bench.noise.base import Noise
+from ipe_bench.basics.options import Positive
+from ipe_bench.noise.base import GINS_DEVIATION, Noise
 
 
 @dataclass(frozen=True)
@@ -16,15 +17,7 @@ class Gaussian(Noise):
     """z = h + v with independent v of the given standard deviation, in the unit of the readings; or of one for each
     reading."""
 
-    deviation: float | tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.deviation, tuple):
-            require_positive(self, "deviation")
-            return
-        for i, value in enumerate(self.deviation):
-            if not 0 < value < np.inf:
-                raise UserError(f"deviation[{i}]={value}: give a number above 0")
+    deviation: Positive | tuple[Positive, ...] = GINS_DEVIATION
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         return h + self._deviations(len(h)) * rng.standard_normal(h.shape)
@@ -42,11 +35,8 @@ class Gaussian(Noise):
 class NoNoise(Noise):
     """z = h exactly, while estimators assume readings of the nominal standard deviation."""
 
-    deviation: float
+    deviation: Positive = GINS_DEVIATION
     name = "none"
-
-    def __post_init__(self) -> None:
-        require_positive(self, "deviation")
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         return h

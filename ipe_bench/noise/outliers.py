@@ -7,9 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
-from ipe_bench.noise.base import Noise
+from ipe_bench.basics.options import Positive, Share
+from ipe_bench.noise.base import GINS_DEVIATION, Noise
 
 
 @dataclass(frozen=True)
@@ -20,17 +20,11 @@ class Outliers(Noise):
     or `total`, the variance of the mixture, deviation^2 (1 - share + share factor^2).
     """
 
-    deviation: float
+    deviation: Positive = GINS_DEVIATION
     """Standard deviation of a good reading, in the unit of the readings."""
-    share: float = 0.05
-    factor: float = 10.0
+    share: Share = 0.05
+    factor: Positive = 10.0
     assumed: Literal["nominal", "total"] = "nominal"
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.share <= 1:
-            raise UserError(f"share={self.share}: give a number from 0 to 1")
-        if self.assumed not in ("nominal", "total"):
-            raise UserError(f"assumed={self.assumed}: choose nominal or total")
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         gross = rng.random(h.shape) < self.share

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError, require_positive
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.options import Positive
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.gaussian import Gaussian
@@ -22,7 +23,7 @@ class Unknown(Noise):
     possible. `weights` are standard deviations of the readings up to a common factor; None: they are equal.
     """
 
-    weights: tuple[float, ...] | None = None
+    weights: tuple[Positive, ...] | None = None
 
     estimated = True
 
@@ -42,15 +43,10 @@ class ModelNoise(Noise):
     A scenario never holds it: it holds what `of` makes of it.
     """
 
-    deviation: float | tuple[float, ...] | None = None
+    deviation: Positive | tuple[Positive, ...] | None = None
     """Standard deviation of the readings in their unit, or one for each."""
-    step: float | None = None
+    step: Positive | None = None
     """The step of a read-out that is rounded."""
-
-    def __post_init__(self) -> None:
-        require_positive(self, "step")
-        if self.deviation is not None:
-            Gaussian(self.deviation)
 
     def of(self, model: Measurement) -> Noise | None:
         """The noise meant for this model; None where neither the model nor an option says what it is."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.basics.errors import require_positive
 from ipe_bench.basics.linalg import Array, Covariance
-from ipe_bench.noise.base import Noise
+from ipe_bench.basics.options import Positive
+from ipe_bench.noise.base import GINS_STEP, Noise
 
 _UNIFORM_DEVIATION = 1 / np.sqrt(12)
 
@@ -22,13 +22,10 @@ class Quantization(Noise):
     rounding and taken off again: then the error is uniform and independent of h, which at small h it otherwise is not.
     """
 
-    step: float
+    step: Positive = GINS_STEP
     """In the unit of the readings."""
-    deviation: float | None = None
+    deviation: Positive | None = None
     dither: bool = False
-
-    def __post_init__(self) -> None:
-        require_positive(self, "step", "deviation")
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         shift = self.step * (rng.random(h.shape) - 0.5) if self.dither else 0.0

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Gt
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
-from ipe_bench.noise.base import Noise
+from ipe_bench.basics.options import Positive
+from ipe_bench.noise.base import GINS_DEVIATION, Noise
 
 
 @dataclass(frozen=True)
@@ -18,14 +20,10 @@ class StudentT(Noise):
     Estimators are told the true covariance R = deviation^2 I; what they do not know is the shape.
     """
 
-    deviation: float
+    deviation: Positive = GINS_DEVIATION
     """Standard deviation of the errors, in the unit of the readings."""
-    degrees_of_freedom: float = 3.0
+    degrees_of_freedom: Annotated[float, Gt(2)] = 3.0
     """Above 2, for a finite variance; the smaller, the heavier the tails."""
-
-    def __post_init__(self) -> None:
-        if not self.degrees_of_freedom > 2:
-            raise UserError(f"degrees_of_freedom={self.degrees_of_freedom}: give a number above 2")
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         # The variance of Student's t is nu / (nu - 2).

@@ -1,7 +1,7 @@
 """The promises that every component makes, as checks that anybody can run on theirs.
 
 Third parties test their solvers, estimators, models and noises with the same checks as ours are tested with. A check is
-a function that raises an AssertionError whose message is for the author; what it is to be is its first line.
+a function that raises an AssertionError whose message is for the author; its docstring opens with the promise.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def describes_itself(component: Any) -> None:
         json.dumps(description)
     except TypeError as error:
         raise AssertionError(
-            f"a field is no plain data ({error}); give it numbers, texts, lists or components"
+            f"a field is not plain data ({error}); give it numbers, texts, lists or components"
         ) from None
 
 
@@ -133,11 +133,11 @@ def leaves_its_input_alone(estimator: Estimator) -> None:
 
 
 def accounts_for_itself(estimator: Estimator) -> None:
-    """Reports known statuses, counts of its cost, and a covariance that is one."""
+    """Reports known statuses, counts of its cost, and a symmetric, positive covariance."""
     problem, _, z = _readings()
     estimates = estimator.estimate(problem, z)
     known = {int(status) for status in Status if status is not Status.RUNNING}
-    assert set(estimates.status.tolist()) <= known, "a status is none of ipe_bench.Status"
+    assert set(estimates.status.tolist()) <= known, "a status is not one of ipe_bench.Status"
     spent = cost(estimates.simulations, estimates.jacobians, problem.measurement.n)
     assert (spent > 0).all(), "simulations and jacobians are not counted"
     P = estimates.covariance

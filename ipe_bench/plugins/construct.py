@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import types
-import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
-from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.errors import UserError, describe_exception, unknown
+from ipe_bench.basics.options import checked, option_types
 from ipe_bench.runs.provenance import TARGET
 
 _registered_packages: set[str] = {"ipe_bench"}
@@ -44,78 +43,38 @@ def construct(config: Any, where: str) -> Any:
 
 
 def _find_class(target: Any, where: str) -> type:
+    where = f"{where}.{TARGET}={target}"
     module_name, _, class_name = str(target).rpartition(".")
     if module_name.split(".")[0] not in _registered_packages:
         known = ", ".join(sorted(_registered_packages))
-        raise UserError(f"{where}.{TARGET}={target}: only classes of these packages are constructed: {known}")
+        raise UserError(f"{where}: only classes of these packages are constructed: {known}")
     try:
         cls = getattr(importlib.import_module(module_name), class_name)
     except (ImportError, AttributeError) as error:
-        raise UserError(f"{where}.{TARGET}={target}: {error}") from None
+        raise UserError(f"{where}: {error}") from None
+    except (Exception, SystemExit) as error:
+        raise UserError(f"{where}: its module cannot be imported ({describe_exception(error)})") from error
     if not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
-        raise UserError(f"{where}.{TARGET}={target}: is no component (a component is a frozen dataclass)")
+        raise UserError(f"{where}: is not a component (a component is a frozen dataclass)")
+    if missing := sorted(getattr(cls, "__abstractmethods__", ())):
+        raise UserError(f"{where}: is abstract; choose a class that writes {', '.join(missing)}")
     return cls
 
 
 def _instantiate(cls: type, options: dict[str, Any], where: str) -> Any:
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
-    _check_options(options, fields, where)
-    hints = typing.get_type_hints(cls)
-    for name, value in options.items():
-        options[name] = _checked(value, hints[name], f"{where}.{name}")
-    required = [
-        name
-        for name, f in fields.items()
-        if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING and name not in options
-    ]
-    if required:
-        raise UserError(f"{where}.{required[0]}: is not given; give it a value")
+    for name in options:
+        if name not in fields:
+            raise UserError(f"{where}.{name}: {unknown(name, fields, 'option')}")
+    required = [f.name for f in fields.values() if f.default is f.default_factory and f.name not in options]
     try:
+        # A class of a plugin need not be a `Component`, nor call its `__post_init__`.
+        types = option_types(cls)
+        options = {name: checked(value, types[name], name) for name, value in options.items()}
+        if required:
+            raise UserError(f"{required[0]}: is not given; give it a value")
         return cls(**options)
     except UserError as error:
         raise UserError(f"{where}.{error}") from None
-
-
-def _check_options(options: Iterable[str], known: Iterable[str], where: str) -> None:
-    for name in options:
-        if name not in known:
-            raise UserError(f"{where}.{name}: {unknown(name, known, 'option')}")
-
-
-def _checked(value: Any, hint: Any, where: str) -> Any:
-    """The value, converted where the type allows (1 for 1.0), else a UserError."""
-    if hint is Any or isinstance(hint, typing.TypeVar):
-        return value
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (typing.Union, types.UnionType):
-        for argument in arguments:
-            try:
-                return _checked(value, argument, where)
-            except UserError:
-                continue
-        raise UserError(f"{where}={value}: give {_describe_type(hint)}")
-    if origin is typing.Literal:
-        if value not in arguments:
-            raise UserError(f"{where}={value}: choose {' or '.join(map(str, arguments))}")
-        return value
-    if origin is tuple and isinstance(value, tuple):
-        if len(arguments) == 2 and arguments[1] is Ellipsis:
-            return tuple(_checked(v, arguments[0], f"{where}[{i}]") for i, v in enumerate(value))
-        if len(arguments) == len(value):
-            return tuple(_checked(v, a, f"{where}[{i}]") for i, (v, a) in enumerate(zip(value, arguments, strict=True)))
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    plain = origin or hint
-    if isinstance(plain, type) and isinstance(value, plain) and not (plain in (int, float) and isinstance(value, bool)):
-        return value
-    raise UserError(f"{where}={value}: give {_describe_type(hint)}")
-
-
-def _describe_type(hint: Any) -> str:
-    names = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", type(None): "null"}
-    arguments = typing.get_args(hint)
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return " or ".join(_describe_type(a) for a in arguments)
-    if typing.get_origin(hint) is tuple:
-        return "a list"
-    return names.get(hint, getattr(hint, "__name__", str(hint)))
+    except ValueError as error:
+        raise UserError(f"{where}: {' '.join(str(error).split())}") from error

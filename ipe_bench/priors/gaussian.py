@@ -9,26 +9,23 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Component, NonNegative
 
 
 @dataclass(frozen=True)
-class GaussianPrior:
+class GaussianPrior(Component):
     """N(x0, (error_scale x unit)^2), independent parameters; `deviations` widens or narrows some of them.
 
     Estimators that use a prior are told this distribution.
     """
 
-    deviations: tuple[float, ...] | None = None
+    deviations: tuple[NonNegative, ...] | None = None
     """Per parameter, in multiples of its unit, at error scale 1; None: 1 for each."""
     name: ClassVar[str] = "gaussian"
 
     def __post_init__(self) -> None:
-        if self.deviations is None:
-            return
-        for i, value in enumerate(self.deviations):
-            if not 0 <= value < np.inf:
-                raise UserError(f"deviations[{i}]={value}: give 0 or a number above")
-        if not any(self.deviations):
+        super().__post_init__()
+        if self.deviations is not None and not any(self.deviations):
             raise UserError("deviations: give at least one that is above 0")
 
     def deviation(self, n: int, error_scale: float) -> Array:

@@ -276,9 +276,9 @@ def _fit_one(
     w = problem.R.whiten(r)
     if np.isfinite(w).all() and np.isfinite(J).all():
         Q = explained(J, problem.R)
-        own, white = normalised(w, Q, problem.R), whiteness(w, Q, order)
+        scaled, white = normalised(w, Q, problem.R), whiteness(w, Q, order)
     else:
-        own, white = np.full(len(z), np.nan), Whiteness(np.nan, 0, np.nan)
+        scaled, white = np.full(len(z), np.nan), Whiteness(np.nan, 0, np.nan)
     P = np.full((n, n), np.nan) if estimates.covariance is None else estimates.covariance[0]
     slope = model.natural_slope(estimates.x)[0]
     return Fit(
@@ -288,7 +288,7 @@ def _fit_one(
         model.natural(estimates.x)[0],
         P * np.outer(slope, slope),
         _at(rows, r, m),
-        _at(rows, own, m),
+        _at(rows, scaled, m),
         float(np.sum(w**2)),
         len(z) - n,
         white,

@@ -106,14 +106,14 @@ def cells_of(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
         try:
             table = pq.read_table(path)
         except (pa.ArrowException, OSError) as error:
-            raise UserError(f"readings={path}: is no readable Parquet file") from error
+            raise UserError(f"readings={path}: is not a readable Parquet file") from error
         columns = [["" if v is None else str(v) for v in column.to_pylist()] for column in table.columns]
         return table.column_names, list(enumerate(map(list, zip(*columns, strict=True)), 1))
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             lines = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(c.strip() for c in row)]
     except (UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"readings={path}: is no readable CSV file ({error})") from error
+        raise UserError(f"readings={path}: is not a readable CSV file ({error})") from error
     if not lines:
         raise UserError(f"readings={path}: is empty")
     return [name.strip() for name in lines[0][1]], lines[1:]
@@ -152,8 +152,8 @@ def number_in(text: str, where: str) -> float:
         value = float(text)
     except ValueError:
         raise UserError(
-            f"{where}: '{text}' is no number; correct it, or leave the cell empty if it is missing"
+            f"{where}: '{text}' is not a number; correct it, or leave the cell empty if it is missing"
         ) from None
     if not math.isfinite(value):
-        raise UserError(f"{where}: {text} is no reading; leave the cell empty if it is missing")
+        raise UserError(f"{where}: {text} is not a reading; leave the cell empty if it is missing")
     return value

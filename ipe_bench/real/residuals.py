@@ -16,7 +16,9 @@ from ipe_bench.basics.linalg import Array, Covariance
 OUTLIER_LEVEL = 0.01
 """Chance that good readings of a whole file give an outlier somewhere."""
 DRAWS = 1999
-"""Simulated fits behind the test of whiteness: its p is a multiple of 1 / (DRAWS + 1)."""
+"""Simulated fits behind the test of whiteness."""
+LEAST_P = 1 / (DRAWS + 1)
+"""Its p is a multiple of this; the least says only that no simulated fit was as extreme."""
 _LONGEST_LAG = 10
 _DRAWS_AT_ONCE = 250
 _MANY = 20_000
@@ -80,29 +82,27 @@ def whiteness(w: Array, Q: Array, series: NDArray[np.intp], draws: int = DRAWS) 
     same ones.
     """
     lags = min(_LONGEST_LAG, max(1, series.shape[1] // 5))
-    there = series >= 0
-    pairs = [int(np.sum(there[:, :-k] & there[:, k:])) for k in range(1, lags + 1)]
-    if Q.shape[1] >= len(w):
+    exists = series >= 0
+    pairs = [int(np.sum(exists[:, :-k] & exists[:, k:])) for k in range(1, lags + 1)]
+    if Q.shape[1] >= len(w) or not (np.isfinite(w).all() and w.any() and any(pairs)):
         return Whiteness(np.nan, lags, np.nan)
-    if not (np.isfinite(w).all() and w.any() and any(pairs)):
-        return Whiteness(np.nan, lags, np.nan)
-    seen = float(_ljung_box(w[None], series, pairs)[0])
+    observed = float(_ljung_box(w[None], series, pairs)[0])
     if len(w) > _MANY:
-        return Whiteness(seen, lags, float(chdtrc(lags, seen)))
+        return Whiteness(observed, lags, float(chdtrc(lags, observed)))
     rng = np.random.Generator(np.random.Philox(0))
     as_large = 0
     for start in range(0, draws, _DRAWS_AT_ONCE):
         noise = rng.standard_normal((min(_DRAWS_AT_ONCE, draws - start), len(w)))
         # Where one reading is left over, all Q are the same but for round-off.
-        as_large += int(np.sum(_ljung_box(noise - (noise @ Q) @ Q.T, series, pairs) >= seen * (1 - 1e-9)))
-    return Whiteness(seen, lags, (1 + as_large) / (1 + draws))
+        as_large += int(np.sum(_ljung_box(noise - (noise @ Q) @ Q.T, series, pairs) >= observed * (1 - 1e-9)))
+    return Whiteness(observed, lags, (1 + as_large) / (1 + draws))
 
 
 def _ljung_box(w: Array, series: NDArray[np.intp], pairs: list[int]) -> Array:
     """Q (fits,) of residuals w (fits, m); a pair with a missing reading counts nowhere."""
-    there = series >= 0
-    placed = np.where(there, w[:, series], 0.0)
-    count, total = int(there.sum()), np.sum(placed**2, axis=(1, 2))
+    exists = series >= 0
+    placed = np.where(exists, w[:, series], 0.0)
+    count, total = int(exists.sum()), np.sum(placed**2, axis=(1, 2))
     Q = np.zeros(len(w))
     for k, number in enumerate(pairs, 1):
         if number:

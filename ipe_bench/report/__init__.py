@@ -49,7 +49,6 @@ def write_report(directories: Path | str | Sequence[Path | str], output: Path | 
     analysis = analyse(directories)
     output = Path(directories[0] if output is None else output)
     folder = output / "figures"
-    folder.mkdir(parents=True, exist_ok=True)
     summary_path = output / "summary.csv"
     write_text(summary_path, analysis.summary.to_csv(index=False))
     certified_shown, certified = certified_tables(analysis.collection)
@@ -58,10 +57,9 @@ def write_report(directories: Path | str | Sequence[Path | str], output: Path | 
     figures: list[Path] = []
     shown = []
     pictured = without_certified(analysis)
-    for drawing in draw_all(pictured) if pictured.collection.groups else ():
-        png, pdf = drawing.save(folder)
-        figures += [png, pdf]
-        shown.append((drawing.name, drawing.title, drawing.caption, png.read_bytes()))
+    for drawn in draw_all(pictured, folder):
+        figures += drawn.files
+        shown.append((drawn.name, drawn.title, drawn.caption, drawn.files[0].read_bytes()))
     page = render_page(analysis, tables, shown)
     report = output / "report.html"
     write_text(report, page)

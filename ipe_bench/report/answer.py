@@ -20,6 +20,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.real.examination import Examination
 from ipe_bench.real.fits import Fit
+from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report import examined
 from ipe_bench.report.words import p_value
 from ipe_bench.trials.thresholds import FIT_LEVEL
@@ -347,7 +348,7 @@ def _verdicts(fits: Sequence[Fit], width: int) -> Any:
     table.add_column("fits", no_wrap=True)
     for one in fits:
         numbers = [f"{one.residual_deviation:.4g}", f"{one.chi_square:.4g}", str(one.degrees_of_freedom)]
-        numbers += [p_value(one.p_value), p_value(one.whiteness.p_value), str(int(one.outliers.sum()))]
+        numbers += [p_value(one.p_value), p_value(one.whiteness.p_value, LEAST_P), str(int(one.outliers.sum()))]
         status = one.status.label.replace("_", " ")
         table.add_row(escape(one.label), status, *numbers[width < _NARROW :], _FITS[one.fits])
     return table

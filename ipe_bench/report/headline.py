@@ -50,15 +50,19 @@ def headline(analysis: Analysis) -> str:
     return " ".join(sentences).replace(" %", "\u00a0%")
 
 
-def best_estimator(analysis: Analysis, scenarios: pd.DataFrame | None = None) -> str:
+def best_estimator(analysis: Analysis) -> str:
+    """The estimator that `best_of` finds over all scenarios."""
+    return best_of(analysis.scores, analysis.summary)
+
+
+def best_of(scores: pd.DataFrame, summary: pd.DataFrame) -> str:
     """The estimator with the smallest mean capped error over the scenarios that most estimators have.
 
-    Of those within `NEAR` of it the one that solves most, and of those the cheapest. `scenarios` narrows it to the
-    scores of some scenarios.
+    Of those within `NEAR` of it the one that solves most, and of those the cheapest. Both frames are of the same
+    scenarios and estimators, in the same order.
     """
-    scores = analysis.scores if scenarios is None else scenarios
-    solved = analysis.summary.loc[analysis.summary["parameter"] == ALL, "solved"].to_numpy()
-    scores = scores.assign(solved=pd.Series(solved, index=analysis.scores.index))
+    solved = summary.loc[summary["parameter"] == ALL, "solved"].to_numpy()
+    scores = scores.assign(solved=solved)
     counts = scores.groupby("estimator", sort=False).size()
     scores = scores[scores["estimator"].isin(counts.index[counts == counts.max()])]
     means = scores.groupby("estimator", sort=False)[["capped_error", "solved", "cost_median"]].mean()

@@ -8,13 +8,31 @@ from dataclasses import dataclass
 from typing import Any
 
 # Okabe and Ito's palette (Color Universal Design, 2008), its yellow and black replaced by colours that show on white
-# paper; ordered so that neighbours differ in lightness too.
-COLORS = ("#0072B2", "#E69F00", "#D55E00", "#56B4E9", "#009E73", "#CC79A7", "#882255", "#777777", "#332288")
-MARKERS = ("o", "s", "D", "^", "v", "P", "*", "<", ">", "p", "h")
-DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1, 1.5)), (0, (5, 2, 1, 2)))
+# paper; ordered so that neighbours differ in lightness too. The last five are those farthest from all before in OKLab,
+# the smallest distance over normal, protanopic and deuteranopic sight (Machado et al., 2009).
+COLORS = (
+    "#0072B2",
+    "#E69F00",
+    "#D55E00",
+    "#56B4E9",
+    "#009E73",
+    "#CC79A7",
+    "#882255",
+    "#777777",
+    "#332288",
+    "#785A00",
+    "#D200B4",
+    "#96B487",
+    "#6900FF",
+    "#1E4B00",
+)
+MARKERS = ("o", "s", "D", "^", "v", "P", "d", "<", ">", "p", "h")
+DASHES: tuple[Any, ...] = ("", (5, 2), (1, 1.5), (5, 2, 1, 2))
+"""As seaborn and matplotlib take them: lengths on and off, nothing for a solid line."""
 REFERENCE = "linear_lse"
 """The estimator that others are held against: black and crossed, whoever else is there."""
 BOUND_COLOR = "#444444"
+BOUND_DASH = (0, (2, 2))
 
 
 @dataclass(frozen=True)
@@ -23,7 +41,11 @@ class Look:
 
     color: str
     marker: str
-    dash: Any
+    dash: Any = ""
+
+    @property
+    def linestyle(self) -> Any:
+        return (0, self.dash) if self.dash else "-"
 
     @property
     def line(self) -> dict[str, Any]:
@@ -31,7 +53,7 @@ class Look:
         return {
             "color": self.color,
             "marker": self.marker,
-            "linestyle": self.dash,
+            "linestyle": self.linestyle,
             "markersize": 5.5,
             "markeredgecolor": "white",
             "markeredgewidth": 0.6,
@@ -39,16 +61,16 @@ class Look:
         }
 
 
-def looks(estimators: Sequence[str]) -> dict[str, Look]:
-    """A look per label; 9 colours, 11 markers and 4 dashes have no common divisor that would make two alike soon."""
-    result: dict[str, Look] = {}
-    rest = [e for e in estimators if e != REFERENCE]
-    if REFERENCE in estimators:
-        result[REFERENCE] = Look("#000000", "X", (0, (5, 2)))
-    for i, label in enumerate(rest):
-        dash = DASHES[(i // len(COLORS)) % len(DASHES)]
-        result[label] = Look(COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)], dash)
-    return {label: result[label] for label in estimators}
+def looks(labels: Sequence[str]) -> dict[str, Look]:
+    """A look per label. 14 colours come before one is repeated, then with another dash and another marker; 11 markers
+    and 14 colours have no common divisor, so that 616 labels differ."""
+    rest = [label for label in labels if label != REFERENCE]
+    result = {
+        label: Look(COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)], DASHES[(i // len(COLORS)) % len(DASHES)])
+        for i, label in enumerate(rest)
+    }
+    result[REFERENCE] = Look("#000000", "X", (5, 2))
+    return {label: result[label] for label in labels}
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from ipe_bench.report.words import compact, shower
+from ipe_bench.report.words import compact, plain, shower
 from ipe_bench.statistics.records import STATISTICS, Statistic
 from ipe_bench.statistics.summary import ALL, COLUMNS
 
@@ -38,7 +38,9 @@ def render(summary: pd.DataFrame, certified: pd.DataFrame | None = None) -> Grou
     parts: list[Any] = []
     for values, part in rows.groupby(columns, dropna=False, sort=False):
         named = dict(zip(columns, values if isinstance(values, tuple) else (values,), strict=True))
-        title = ", ".join(str(v) if k in ("measurement", "noise") else f"{k}={v}" for k, v in named.items() if _says(v))
+        title = ", ".join(
+            str(v) if k in ("measurement", "noise") else f"{k}={plain(v)}" for k, v in named.items() if _says(v)
+        )
         counts = part["trials"].unique()
         alike = len(counts) == 1
         if alike:
@@ -73,8 +75,8 @@ def render(summary: pd.DataFrame, certified: pd.DataFrame | None = None) -> Grou
 
 
 def _says(value: Any) -> bool:
-    """Whether a setting is worth a place in a title: not where it is absent or zero."""
-    return not (isinstance(value, float) and (math.isnan(value) or value == 0.0))
+    """Whether a setting is spoken of in a title: not where it is absent, as an option of another class is."""
+    return value is not None and not (isinstance(value, float) and math.isnan(value))
 
 
 def _digits(averages: pd.DataFrame) -> list[Any]:

@@ -72,10 +72,13 @@ def duration(seconds: float, figures: int = 3) -> str:
     return f"{value:.{decimals}f} {unit}"
 
 
-def p_value(p: float) -> str:
-    """A probability; very small ones by their order."""
+def p_value(p: float, least: float = 0.0) -> str:
+    """A probability; very small ones by their order. One that was counted among simulations cannot be less than
+    `least`: at that it is a limit, not a value."""
     if not math.isfinite(p):
         return "-"
+    if p <= least and least > 0:
+        return f"≤{p_value(least)}"
     return f"{p:.3f}" if p >= 1e-3 else f"{p:.0e}" if p > 1e-300 else "<1e-300"
 
 

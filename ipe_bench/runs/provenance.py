@@ -9,6 +9,8 @@ import hashlib
 import importlib.metadata
 import importlib.util
 import json
+import sys
+import uuid
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,20 +18,30 @@ from typing import Any
 import numpy as np
 
 TARGET = "_target_"
-WITHOUT_NUMBERS = frozenset(f"ipe_bench.basics.{name}" for name in ("errors", "files", "machine", "naming", "statuses"))
-"""Modules that no number of a result comes from: they word messages, write files, name things."""
+WITHOUT_NUMBERS = tuple(
+    f"ipe_bench.{name}"
+    for name in (
+        *("basics.errors", "basics.files", "basics.machine", "basics.naming", "basics.statuses"),
+        *("runs", "statistics", "real", "plugins", "report", "api", "cli"),
+    )
+)
+"""Modules and rooms that no number of a trial comes from: they word messages, name, store, summarise and show."""
+_SESSION = uuid.uuid4().hex
+"""Stands for source that no file holds, as of a notebook: what it computed is nobody's but this session's."""
 
 
 def describe(value: Any) -> Any:
-    """A component as plain JSON data: its class and all its fields."""
+    """A component as plain JSON data: its class and all its fields. Equal numbers are one number: 10.0 is 10."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         cls = type(value)
         fields = {f.name: describe(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return {TARGET: f"{cls.__module__}.{cls.__qualname__}", **fields}
     if isinstance(value, np.ndarray):
-        return value.tolist()
+        return describe(value.tolist())
     if isinstance(value, np.generic):
-        return value.item()
+        return describe(value.item())
+    if isinstance(value, float) and value.is_integer() and abs(value) < 2**53:
+        return int(value)
     if isinstance(value, list | tuple):
         return [describe(v) for v in value]
     if isinstance(value, Mapping):
@@ -65,13 +77,13 @@ def class_modules(component: Any) -> set[str]:
 
 
 def _classes(component: Any) -> list[type]:
-    """The class of a component and of the components inside it."""
+    """The class of a component with its bases, and those of the components inside it."""
     if isinstance(component, tuple | list):
         return [cls for item in component for cls in _classes(item)]
     if not dataclasses.is_dataclass(component) or isinstance(component, type):
         return []
     inner = [cls for f in dataclasses.fields(component) for cls in _classes(getattr(component, f.name))]
-    return [type(component), *inner]
+    return [*(cls for cls in type(component).__mro__ if cls.__module__ not in ("builtins", "abc", "typing")), *inner]
 
 
 @functools.cache
@@ -93,7 +105,7 @@ def _import_closure(module: str) -> frozenset[str]:
     waiting = [module]
     while waiting:
         name = waiting.pop()
-        if name not in found and name not in WITHOUT_NUMBERS:
+        if name not in found and not f"{name}.".startswith(tuple(f"{n}." for n in WITHOUT_NUMBERS)):
             found.add(name)
             waiting.extend(_imports(name))
     return frozenset(found)
@@ -121,14 +133,18 @@ def _imports(module: str) -> tuple[str, ...]:
 def _is_module(name: str) -> bool:
     try:
         return importlib.util.find_spec(name) is not None
-    except ModuleNotFoundError:
+    except (ValueError, ImportError):
         return False
 
 
 @functools.cache
 def _path_of(module: str) -> Path | None:
-    spec = importlib.util.find_spec(module)
-    return None if spec is None or spec.origin is None or not Path(spec.origin).is_file() else Path(spec.origin)
+    try:
+        spec = importlib.util.find_spec(module)
+        origin = None if spec is None else spec.origin
+    except (ValueError, ImportError):  # a script, a notebook, or a module that was made by hand
+        origin = getattr(sys.modules.get(module), "__file__", None)
+    return Path(origin) if origin is not None and Path(origin).is_file() else None
 
 
 @functools.cache
@@ -141,7 +157,7 @@ def _digest_of(module: str) -> str:
     """What a module computes with: its code, and the JSON files beside it, tables of constants."""
     path = _path_of(module)
     if path is None:
-        return ""
+        return "" if hasattr(sys.modules.get(module), "__path__") else _SESSION
     code = numerical_code(_tree_of(path)).encode() if path.suffix == ".py" else path.read_bytes()
     tables = b"".join(table.read_bytes() for table in sorted(path.parent.glob("*.json")))
     return hashlib.sha256(code + tables).hexdigest()

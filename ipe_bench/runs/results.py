@@ -7,143 +7,29 @@ is used, or named with what is wrong with it; nothing is guessed, mixed or delet
 
 from __future__ import annotations
 
-import json
+import itertools
+import os
+from collections import Counter
 from collections.abc import Collection as Keys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.runs.pieces import Failed, Foreign, Outdated, Piece, Run, Unusable, read_history
 from ipe_bench.runs.provenance import canonical_json
-from ipe_bench.runs.store import FOOTER, SCHEMA, TRUTH, Store, describe_names, gaps
+from ipe_bench.runs.store import TRUTH, Store, describe_names, gaps, title
+from ipe_bench.runs.verified import Verified, signature
 
-FOOTER_KEYS = frozenset({"key", "identity", "identity_key", "names", "parameters", "linear_bound", "bound", "equation"})
 _KEPT_BYTES = 1 << 28
 """Rows that are kept in memory after they were read, so that no file is read twice where memory allows."""
-
-
-class Unusable(Exception):
-    """A file that does not hold what its name and place promise."""
-
-
-@dataclass(frozen=True)
-class Piece:
-    """One stored file: trials start to stop of the cell with that key."""
-
-    path: Path
-    key: str
-    start: int
-    stop: int
-
-    @classmethod
-    def parse(cls, path: Path) -> Piece:
-        """The piece that a file name states.
-
-        Raises:
-            Unusable: the name is not one of ours.
-        """
-        parts = path.stem.split("-")
-        if len(parts) != 3 or not (parts[1].isdigit() and parts[2].isdigit()):
-            raise Unusable("foreign: its name is not one of ipe-bench")
-        return cls(path, parts[0], int(parts[1]), int(parts[2]))
-
-    def read(self) -> tuple[dict[str, Any], pa.Table]:
-        """Its footer and its rows.
-
-        Raises:
-            Unusable: it is damaged, or not one of ours.
-        """
-        footer, table = read_table(self.path)
-        if not footer.keys() >= FOOTER_KEYS or footer.get("schema") != SCHEMA:
-            raise Unusable("foreign: was written by another version of the format")
-        if footer["key"] != self.key:
-            raise Unusable(f"foreign: its footer belongs to {footer['key']}")
-        if table.num_rows != self.stop - self.start:
-            raise Unusable(f"damaged: has {table.num_rows} of {self.stop - self.start} rows")
-        return footer, table
-
-
-def read_table(path: Path) -> tuple[dict[str, Any], pa.Table]:
-    """The footer and the rows of a Parquet file of ours, the rows without metadata, so that tables join.
-
-    Raises:
-        Unusable: it cannot be read, or has no footer of ours.
-    """
-    try:
-        with pq.ParquetFile(path) as file:
-            table = file.read(use_threads=False)
-    except (pa.ArrowException, OSError) as error:
-        raise Unusable(f"damaged or cut short: cannot be read ({type(error).__name__})") from error
-    text = (table.schema.metadata or {}).get(FOOTER)
-    if text is None:
-        raise Unusable("foreign: has no footer of ipe-bench")
-    try:
-        footer = json.loads(text)
-    except ValueError:
-        raise Unusable("damaged: its footer cannot be read") from None
-    if not isinstance(footer, dict):
-        raise Unusable("foreign: its footer is not one of ipe-bench")
-    return footer, table.replace_schema_metadata(None)
-
-
-def _read_record(path: Path, keys: Iterable[str], numbers: Sequence[str], kind: str) -> dict[str, Any]:
-    """A JSON record that has these keys, those in `numbers` being whole."""
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        whole = record.keys() >= {*keys, *numbers} and all(int(record[name]) >= 0 for name in numbers)
-    except (OSError, ValueError, TypeError, AttributeError):
-        whole, record = False, {}
-    if not whole:
-        raise Unusable(f"foreign: is not a record of a {kind}")
-    return record
-
-
-@dataclass(frozen=True)
-class Run:
-    """One record of runs/: what was going to be computed."""
-
-    path: Path
-    record: Mapping[str, Any]
-
-    @classmethod
-    def read(cls, path: Path) -> Run:
-        """Raises: Unusable, where it is not such a record."""
-        record = _read_record(path, ("cells",), ("trials",), "run")
-        if not (
-            isinstance(record["cells"], list)
-            and all(isinstance(c, dict) and c.keys() >= {"key", "identity_key", "names"} for c in record["cells"])
-        ):
-            raise Unusable("foreign: is not a record of a run")
-        return cls(path, record)
-
-    @property
-    def started(self) -> str:
-        return str(self.record.get("started", ""))
-
-
-@dataclass(frozen=True)
-class Failed:
-    """One record of failed/: trials that could not be computed, and why."""
-
-    key: str
-    start: int
-    stop: int
-    reason: str
-
-    @classmethod
-    def read(cls, path: Path) -> Failed:
-        """Raises: Unusable, where it is not such a record."""
-        record = _read_record(path, ("key", "status", "message"), ("start", "stop"), "failure")
-        reason = f"{record['status']}: {record['message']}"
-        return cls(record["key"], int(record["start"]), int(record["stop"]), reason)
 
 
 @dataclass(frozen=True)
@@ -185,8 +71,9 @@ class StoredCell:
         return _count(self.covered)
 
     @property
-    def written(self) -> float:
-        return max(p.path.stat().st_mtime for p in self.pieces)
+    def written(self) -> int:
+        """When the youngest of its files was; 0 where they went away meanwhile."""
+        return max((found[1] for p in self.pieces if (found := signature(p.path)) is not None), default=0)
 
 
 @dataclass(frozen=True)
@@ -204,6 +91,13 @@ class CellState:
     """Trials that another version of the source computed; they do not count as done."""
     messages: tuple[str, ...]
     """Why trials failed."""
+    tag: str = ""
+    """The beginning of its key, where other cells have the same names."""
+
+    @property
+    def title(self) -> str:
+        """Its scenario in a line for people."""
+        return title(self.names) + (f" (#{self.tag})" if self.tag else "")
 
     @property
     def complete(self) -> bool:
@@ -212,7 +106,7 @@ class CellState:
     @property
     def problems(self) -> Iterator[str]:
         """A line for what is wrong with it, if anything."""
-        who = describe_names(self.names)
+        who = describe_names(self.names) + (f" (#{self.tag})" if self.tag else "")
         for line in self.messages if self.failed else ():
             yield f"failed: {who}: {self.failed} of {self.expected} expected trials: {line}"
         if self.missing:
@@ -231,14 +125,18 @@ class Results:
     """What could not be computed, whether or not it was since."""
     damaged: dict[Path, str] = field(default_factory=dict)
     """What is wrong with each file that is left out."""
+    foreign: set[Path] = field(default_factory=set)
+    """Those of them whose names are not ours."""
+    outdated: list[Path] = field(default_factory=list)
+    """Files in the format of an older version."""
     further: list[str] = field(default_factory=list)
-    """Problems that showed later: a line for each."""
+    """Problems that are not one file's: a line for each."""
     _kept: dict[Path, pa.Table] = field(default_factory=dict, repr=False)
     _kept_bytes: int = 0
 
     @classmethod
     def read(cls, directories: Sequence[Path | str], keys: Keys[str] | None = None) -> Self:
-        """What is stored under the directories, or the files of the cells with these keys alone.
+        """What is stored under the directories, or the trials of the cells with these keys alone.
 
         Raises:
             UserError: a directory does not exist.
@@ -248,43 +146,74 @@ class Results:
             if not path.is_dir():
                 raise UserError(f"{path}: there is no such directory; give one that a run wrote to")
         results = cls(paths)
-        runs: list[Run] = []
-        attempts: list[Failed] = []
-        found: dict[str, tuple[dict[str, Any], list[Piece]]] = {}
         for path in paths:
-            store = Store(path)
-            files = [f for f in sorted(store.trials.glob("*.parquet")) if keys is None or _key_in(f.name) in keys]
-            for file in files:
-                with results.naming(file):
-                    piece = Piece.parse(file)
-                    footer, table = piece.read()
-                    results._keep(file, table)
-                    found.setdefault(piece.key, (footer, []))[1].append(piece)
-            if keys is not None:
-                continue
-            records = sorted(store.runs.glob("*.json"))
-            for file in records:
-                with results.naming(file):
-                    runs.append(Run.read(file))
-            for file in sorted(store.failed.glob("*.json")):
-                with results.naming(file):
-                    attempts.append(Failed.read(file))
-            if not files and not records:
-                results.problem(f"{path}: holds no results of ipe-bench")
-        results.runs = tuple(sorted(runs, key=lambda r: (r.started, r.path.name)))
-        results.attempts = tuple(attempts)
-        for key, (footer, pieces) in found.items():
-            ordered = sorted(pieces, key=lambda p: (p.start, p.stop, str(p.path)))
-            results.stored[key] = StoredCell(footer, tuple(ordered))
+            results._read_directory(Store(path), keys)
+        results.runs = tuple(sorted(results.runs, key=lambda r: (r.started, r.path.name)))
+        for key, cell in results.stored.items():
+            ordered = sorted(cell.pieces, key=lambda p: (p.start, p.stop, str(p.path)))
+            results.stored[key] = replace(cell, pieces=tuple(ordered))
         return results
+
+    def _read_directory(self, store: Store, keys: Keys[str] | None) -> None:
+        verified = Verified(store.directory)
+        trials, runs = self._files(store.trials, ".parquet", keys), self._files(store.runs, ".json")
+        found: dict[str, list[Piece]] = {}
+        footers: dict[str, Mapping[str, Any]] = {}
+        for path in trials:
+            with self.naming(path):
+                piece = Piece.parse(path)
+                footer = verified.footer(path, piece.key)
+                if footer is None:
+                    before = signature(path)
+                    footer, table = piece.read()
+                    self._keep(path, table)
+                    verified.note(path, before, footer)
+                found.setdefault(piece.key, []).append(piece)
+                footers[piece.key] = footer
+        for path in self._files(store.histories, ".parquet", keys):
+            if not verified.knows(path):
+                with self.naming(path):
+                    before = signature(path)
+                    self._keep(path, read_history(path)[1])
+                    verified.note(path, before)
+        for path in runs:
+            # A run that only asks what it lacks need not know what others were to compute.
+            if keys is None or not verified.knows(path):
+                with self.naming(path):
+                    before = signature(path)
+                    self.runs += (Run.read(path),)
+                    verified.note(path, before)
+        for path in self._files(store.failed, ".json"):
+            with self.naming(path):
+                self.attempts += (Failed.read(path),)
+        for key, pieces in found.items():
+            before_these = self.stored[key].pieces if key in self.stored else ()
+            self.stored[key] = StoredCell(footers[key], (*before_these, *pieces))
+        if keys is None and not trials and not runs:
+            self.problem(f"{store.directory}: holds no results of ipe-bench")
+        verified.save()
+
+    def _files(self, folder: Path, suffix: str, keys: Keys[str] | None = None) -> list[Path]:
+        """What lies in a folder under a name with that suffix; with `keys`, what belongs to their cells alone."""
+        try:
+            names = sorted(os.listdir(folder)) if os.path.lexists(folder) else []
+        except OSError as error:
+            self.problem(f"{folder}: cannot be listed ({error.strerror or error}); what is in it is left out")
+            names = []
+        ours = [n for n in names if n.endswith(suffix) and not n.startswith(".")]
+        return [folder / n for n in ours if keys is None or n.removesuffix(suffix).partition("-")[0] in keys]
 
     @contextmanager
     def naming(self, path: Path) -> Iterator[None]:
         """Where an `Unusable` becomes a line that names the file."""
         try:
             yield
+        except Outdated:
+            self.outdated.append(path)
         except Unusable as error:
             self.damaged[path] = str(error)
+            if isinstance(error, Foreign):
+                self.foreign.add(path)
 
     @property
     def problems(self) -> list[str]:
@@ -308,6 +237,10 @@ class Results:
             f" source {cell.footer.get('source')}, key {cell.key}); left out"
             for _, stale in self._rivals.values()
             for cell in stale
+        ] + [
+            f"stale: {folder}: {sum(path.parent == folder for path in self.outdated)} files were written by an older"
+            " version of ipe-bench; left out"
+            for folder in dict.fromkeys(path.parent for path in self.outdated)
         ]
 
     @property
@@ -363,6 +296,13 @@ class Results:
     @cached_property
     def cells(self) -> tuple[CellState, ...]:
         """How far every cell is: those that runs asked for in their order, then others that are there."""
+        names = [*(n for _, _, n in self._asked_for.values())]
+        names += [c.names for i, (c, _) in self._rivals.items() if i not in self._asked_for and c is not None]
+        alike = Counter(map(describe_names, names))
+
+        def tag(key: str, names: Mapping[str, Any]) -> str:
+            return key[:6] if alike[describe_names(names)] > 1 else ""
+
         failures: dict[str, list[Failed]] = {}
         for failure in self.failures:
             failures.setdefault(failure.key, []).append(failure)
@@ -373,21 +313,35 @@ class Results:
             done, missing = trials - _count(lacking), _count(untried)
             stale = sum(cell.trials for cell in self._rivals.get(identity, (None, []))[1])
             messages = tuple(dict.fromkeys(f.reason for f in lost))
-            states.append(CellState(names, trials, done, trials - done - missing, missing, stale, messages))
+            counts = trials, done, trials - done - missing, missing, stale
+            states.append(CellState(names, *counts, messages, tag(key, names)))
         for identity, (cell, old) in self._rivals.items():
             if identity not in self._asked_for and cell is not None:
-                states.append(CellState(cell.names, 0, cell.trials, 0, 0, sum(c.trials for c in old), ()))
+                counts = 0, cell.trials, 0, 0, sum(c.trials for c in old)
+                states.append(CellState(cell.names, *counts, (), tag(cell.key, cell.names)))
         return tuple(states)
 
     def set_aside(self) -> list[str]:
-        """Renames what is damaged, so that it is computed again under its own name; returns a line for each file."""
+        """Renames what is damaged, so that it is computed again under its own name; returns a line for each file.
+
+        Nothing is deleted, and what has a foreign name stays. Where the iterates of a cell are damaged, the block that
+        they belong to counts as missing from now on.
+        """
         lines = []
         for path, reason in self.damaged.items():
-            # Never deleted. Another run may have done so at this moment.
-            aside = path.with_suffix(".damaged")
-            with suppress(FileNotFoundError):
-                path.rename(aside)
+            if path in self.foreign:
+                continue
+            aside = next(p for p in _names_aside(path) if not os.path.lexists(p))
+            with suppress(FileNotFoundError):  # another run may have done so at this moment
+                try:
+                    path.rename(aside)
+                except OSError as error:
+                    lines.append(f"{path}: {reason}; cannot be set aside ({error.strerror or error})")
+                    continue
                 lines.append(f"{path}: {reason}; set aside as {aside.name} and computed again")
+            if path.parent.name == "histories" and path.stem in self.stored:
+                cell = self.stored[path.stem]
+                self.stored[path.stem] = replace(cell, pieces=tuple(p for p in cell.pieces if p.start > 0))
         return lines
 
     def _covered(self, key: str) -> Sequence[tuple[int, int]]:
@@ -440,18 +394,18 @@ class Results:
         """The iterates of a cell's first trials in order; None where none are stored."""
         for directory in self.directories:
             path = Store(directory).histories / f"{cell.key}.parquet"
-            if not path.is_file():
+            if path in self.damaged or not path.is_file():
                 continue
             with self.naming(path):
-                _, table = read_table(path)
-                if any(name not in table.column_names for name in ("trial", *columns)):
-                    raise Unusable("damaged: a column is missing")
+                table = self._kept[path] if path in self._kept else read_history(path)[1]
                 return {name: table[name].to_numpy() for name in ("trial", *columns)}
         return None
 
 
-def _key_in(name: str) -> str:
-    return name.partition("-")[0]
+def _names_aside(path: Path) -> Iterator[Path]:
+    yield path.with_suffix(".damaged")
+    for number in itertools.count(2):
+        yield path.with_suffix(f".damaged-{number}")
 
 
 def require_results(directories: Iterable[Path | str]) -> None:

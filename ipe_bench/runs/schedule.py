@@ -116,9 +116,12 @@ def perform(task: Task) -> Iterator[Done | str]:
 def _compute_cell(store: Store, block: Block, cell: Cell) -> None:
     start, stop = block.trials.start, block.trials.stop
     if cell.estimator is None:
-        store.write(cell, start, stop, block.truth_columns())
+        columns = block.truth_columns()
+        store.require()
+        store.write(cell, start, stop, columns)
         return
     estimates, columns = block.estimate(cell.estimator)
+    store.require()
     if start == 0 and estimates.history is not None:
         store.write_history(cell, _history_columns(cell.scenario, estimates.history[:HISTORIES]))
     store.write(cell, start, stop, columns)

@@ -24,17 +24,18 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.files import write_atomically
+from ipe_bench.basics.errors import StorageError, UserError
+from ipe_bench.basics.files import BLANK_SEAL, seal, write_atomically
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import library_versions
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.runs.execution.base import Failure
 from ipe_bench.runs.provenance import canonical_json, describe, fingerprint
+from ipe_bench.runs.rows import Rule, cast, faults, history_rules, trial_rules
 from ipe_bench.trials.bounds import linear_bound
 from ipe_bench.trials.scenario import Scenario
 
-SCHEMA = 1
+SCHEMA = 2
 FOOTER = b"ipe_bench"
 TRUTH = "truth"
 """Stands in place of an estimator's label in the files that hold the truth and its bounds."""
@@ -61,7 +62,7 @@ class Cell:
 
         Not for the version: a release that changes no number leaves what is stored valid.
         """
-        return _digest({"schema": SCHEMA, "identity": self.identity, "source": self.made_by["source"]})
+        return key_of(self.identity, self.made_by["source"])
 
     @cached_property
     def made_by(self) -> dict[str, Any]:
@@ -80,6 +81,11 @@ class Cell:
             "estimator": self.label,
         }
 
+    @property
+    def parameters(self) -> list[str]:
+        """The names of the parameters."""
+        return [p.name for p in self.scenario.measurement.parameters]
+
     @cached_property
     def footer(self) -> dict[str, Any]:
         """All that a reader of the file needs to know."""
@@ -88,7 +94,7 @@ class Cell:
             "schema": SCHEMA,
             "key": self.key,
             "identity": self.identity,
-            "identity_key": _digest(self.identity),
+            "identity_key": digest(self.identity),
             **self.made_by,
             "libraries": library_versions(),
             "names": self.names,
@@ -99,8 +105,14 @@ class Cell:
         }
 
 
-def _digest(value: Any) -> str:
+def digest(value: Any) -> str:
+    """Sixteen hexadecimal digits that stand for plain data."""
     return hashlib.sha256(canonical_json(value).encode()).hexdigest()[:16]
+
+
+def key_of(identity: Mapping[str, Any], source: str) -> str:
+    """The key of a cell; see `Cell.key`."""
+    return digest({"schema": SCHEMA, "identity": identity, "source": source})
 
 
 class Store:
@@ -128,15 +140,29 @@ class Store:
             raise UserError(
                 f"output={self.directory}: cannot be written to ({reason}); choose another folder"
             ) from None
-        for folder in (self.trials, self.histories, self.runs, self.failed):
+        for folder in (self.directory, *(f for f in self.directory.iterdir() if f.is_dir() and not f.is_symlink())):
             for path in folder.glob(".*.tmp"):
                 with contextlib.suppress(OSError):
                     if time.time() - path.stat().st_mtime > _ABANDONED_S:
                         path.unlink()
 
+    def require(self) -> None:
+        """Refuses to go on in a folder that went away: what it held is missing, and would not be missed.
+
+        Raises:
+            StorageError: it did.
+        """
+        if not self.trials.is_dir():
+            raise StorageError(f"{self.directory}: went away while it was being filled; the same command starts anew")
+
     def write(self, cell: Cell, start: int, stop: int, columns: Mapping[str, Array]) -> Path:
-        """Stores the rows of trials start to stop."""
-        path = self._write(self.trials / f"{cell.key}-{start}-{stop}.parquet", cell, columns)
+        """Stores the rows of trials start to stop.
+
+        Raises:
+            ValueError: they are not what rows of trials are, and would be refused when they are read.
+        """
+        path = self.trials / f"{cell.key}-{start}-{stop}.parquet"
+        self._write(path, cell, columns, trial_rules(cell.parameters, truth=cell.estimator is None), start)
         with contextlib.suppress(OSError):
             (self.failed / f"{cell.key}-{start}-{stop}.json").unlink()
         return path
@@ -164,23 +190,38 @@ class Store:
 
     def write_history(self, cell: Cell, columns: Mapping[str, Array]) -> Path:
         """Stores the iterates of the first trials."""
-        return self._write(self.histories / f"{cell.key}.parquet", cell, columns)
-
-    def _write(self, path: Path, cell: Cell, columns: Mapping[str, Array]) -> Path:
-        arrays = [_arrow(values) for values in columns.values()]
-        table = pa.Table.from_arrays(arrays, names=list(columns), metadata={FOOTER: canonical_json(cell.footer)})
-        write_atomically(path, lambda temporary: pq.write_table(table, temporary, compression="zstd"))
+        path = self.histories / f"{cell.key}.parquet"
+        self._write(path, cell, columns, history_rules(cell.parameters))
         return path
+
+    def _write(
+        self, path: Path, cell: Cell, columns: Mapping[str, Array], rules: Mapping[str, Rule], start: int | None = None
+    ) -> None:
+        rows = cast(columns, rules)
+        for fault in faults(rows, rules, start):
+            raise ValueError(f"{describe_names(cell.names)}: what is to be stored {fault}")
+        content = encode(rows, cell.footer)
+        write_atomically(path, lambda temporary: temporary.write_bytes(content))
 
     def write_run(self, identifier: str, record: Mapping[str, Any]) -> Path:
         """States, before any work, what a run is going to compute."""
         path = self.runs / f"{identifier}.json"
-        return self._write_json(path, record)
+        return self._write_json(path, {"run": identifier, **record})
 
     def _write_json(self, path: Path, record: Mapping[str, Any]) -> Path:
-        text = json.dumps(record, indent=1, default=str)
-        write_atomically(path, lambda temporary: temporary.write_text(text + "\n", encoding="utf-8"))
+        text = json.dumps({"schema": SCHEMA, **record, "seal": BLANK_SEAL}, indent=1, default=str)
+        content = seal(text.encode())
+        write_atomically(path, lambda temporary: temporary.write_bytes(content))
         return path
+
+
+def encode(columns: Mapping[str, Array], footer: Mapping[str, Any]) -> bytes:
+    """A Parquet file with these columns and this footer, and the digest of all of it."""
+    metadata = {FOOTER: canonical_json(footer).encode(), b"seal": BLANK_SEAL.encode()}
+    table = pa.Table.from_arrays([_arrow(v) for v in columns.values()], names=list(columns), metadata=metadata)
+    buffer = pa.BufferOutputStream()
+    pq.write_table(table, buffer, compression="zstd")
+    return seal(buffer.getvalue().to_pybytes())
 
 
 def _arrow(values: Array) -> pa.Array:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.basics.options import Count
 from ipe_bench.estimators.ipe import IPE, State, System
 
 _DEPENDENT = 1e-12
@@ -30,12 +30,7 @@ class Anderson(IPE[AndersonState]):
     evaluation a step. Depth 1 is a secant method; depth n is one of Broyden's.
     """
 
-    depth: int = 5
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.depth < 1:
-            raise UserError(f"depth={self.depth}: give a whole number above 0")
+    depth: Count = 5
 
     def init(self, system: System, x: Array, F: Array) -> AndersonState:
         none = np.zeros((*x.shape, min(self.depth, x.shape[1])))

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Lt
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.errors import UserError, require_positive
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import Solver, Standing, iterate
@@ -41,19 +44,14 @@ class Auto(Estimator):
     The one Jacobian of the first stage is the covariance's, and as with every solver not counted where it ends there.
     """
 
-    tolerance: float = 1e-6
+    tolerance: Positive = 1e-6
     """Largest Gauss-Newton step still to go, in standard deviations of the local bound."""
-    fit_level: float = 1e-6
+    fit_level: Annotated[float, Ge(0), Lt(1)] = 1e-6
     """Residuals less probable than this are taken for those of a wrong minimum."""
-    budget: float | None = None
+    budget: Positive | None = None
     """Simulations that a trial may cost, a Jacobian counting n; None: no limit."""
 
     equation = "least_squares"
-
-    def __post_init__(self) -> None:
-        require_positive(self, "tolerance", "budget")
-        if not 0 <= self.fit_level < 1:
-            raise UserError(f"fit_level={self.fit_level}: give a probability from 0 to below 1")
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         quick, tally = self._quick(problem, z, history)

@@ -7,7 +7,6 @@ from typing import Literal
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, multiply
 from ipe_bench.estimators.ipe import IPE, State, System
 
@@ -29,11 +28,6 @@ class Broyden(IPE[BroydenState]):
 
     initial: Literal["jacobian", "identity"] = "jacobian"
     """B at the start: J(x)^-1, or I, which makes the first step one of fixed-point iteration and needs no Jacobian."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.initial not in ("jacobian", "identity"):
-            raise UserError(f"initial={self.initial}: choose jacobian or identity")
 
     def init(self, system: System, x: Array, F: Array) -> BroydenState:
         n = x.shape[1]

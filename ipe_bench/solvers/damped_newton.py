@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Gt, Lt
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Whole
 from ipe_bench.estimators.ipe import IPE, State, System
 
 
@@ -18,16 +20,9 @@ class DampedNewton(IPE):
     Newton's method near a root. A trial whose |F| decreases for no t stays where it is, and has stalled.
     """
 
-    decrease: float = 1e-4
+    decrease: Annotated[float, Gt(0), Lt(1)] = 1e-4
     """The share of the decrease that the slope promises which is enough."""
-    halvings: int = 30
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 < self.decrease < 1:
-            raise UserError(f"decrease={self.decrease}: give a number between 0 and 1")
-        if self.halvings < 0:
-            raise UserError(f"halvings={self.halvings}: give a whole number from 0 up")
+    halvings: Whole = 30
 
     def step(self, system: System, state: State) -> State:
         direction = -system.solve(system.J(state.x), state.F)

@@ -7,12 +7,14 @@ nothing; here is the judge, and when to stop.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Gt, Lt
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.errors import UserError, require_counts, require_positive
 from ipe_bench.basics.linalg import Array, Mask, finite
+from ipe_bench.basics.options import Count, Positive, Whole
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.least_squares import Minima
@@ -48,39 +50,29 @@ class Progressive(Estimator):
     25, 2025); the damping in the prior's metric, the judge and the pruned restarts are added here.
     """
 
-    growth: float = 2.0
+    growth: Annotated[float, Gt(1)] = 2.0
     """Each window has about this many times the epochs of the one before; the first has one epoch."""
     use_prior: bool = True
-    prior_inflation: float = 1.0
+    prior_inflation: Positive = 1.0
     """Times the prior's standard deviations."""
-    damping: float = 1.0
+    damping: Positive = 1.0
     """lambda at the start of every window."""
-    window_tolerance: float = 0.1
+    window_tolerance: Positive = 0.1
     """Where a window's fit is good enough: the Gauss-Newton step in standard deviations."""
-    window_iterations: int = 10
+    window_iterations: Count = 10
     """Of the first attempt."""
-    max_iterations: int = 60
+    max_iterations: Count = 60
     """Steps of the last pass."""
-    tolerance: float = 1e-6
+    tolerance: Positive = 1e-6
     """Of the last pass: the Gauss-Newton step in standard deviations of the local bound."""
-    restarts: int | None = None
+    restarts: Whole | None = None
     """Further attempts at a trial that fails the test; None: four with windows, eleven without."""
-    fit_level: float = 1e-6
+    fit_level: Annotated[float, Ge(0), Lt(1)] = 1e-6
     """Residuals less probable than this are taken for those of a wrong minimum."""
-    budget: float | None = None
+    budget: Positive | None = None
     """Simulations that a trial may cost, a Jacobian counting n and a window its share; None: no limit."""
 
     equation = "least_squares"
-
-    def __post_init__(self) -> None:
-        if not self.growth > 1:
-            raise UserError(f"growth={self.growth}: give a number above 1")
-        require_positive(self, "prior_inflation", "damping", "window_tolerance", "tolerance", "budget")
-        require_counts(self, "window_iterations", "max_iterations")
-        if self.restarts is not None:
-            require_counts(self, "restarts", least=0)
-        if not 0 <= self.fit_level < 1:
-            raise UserError(f"fit_level={self.fit_level}: give a probability from 0 to below 1")
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         kind = Stages if problem.measurement.epochs is None else Windows

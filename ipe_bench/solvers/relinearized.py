@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.errors import UserError, require_counts, require_positive
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, finite, information, inverse
+from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import Solver, Standing, iterate
@@ -51,22 +52,19 @@ class Relinearized(Solver[Round], Estimator):
     solver: IPE[Any] = field(default_factory=FixedPoint)
     """What a round iterates. Its own start, limits and tolerance have no say here."""
     start: Start = "linear_lse"
-    inner_iterations: int = 5
+    inner_iterations: Count = 5
     """Steps of the solver before H is evaluated again."""
-    max_iterations: int = 30
+    max_iterations: Count = 30
     """Rounds, each with a new H."""
-    tolerance: float = 1e-6
+    tolerance: Positive = 1e-6
     """Largest abs(F_i(x_k)) at the linearisation there, in standard deviations of the local bound."""
-    budget: float | None = None
+    budget: Positive | None = None
     """Simulations that a trial may cost, a Jacobian counting n; None: no limit."""
 
     equation = "least_squares"
 
     def __post_init__(self) -> None:
-        if self.start not in ("linear_lse", "nominal"):
-            raise UserError(f"start={self.start}: choose linear_lse or nominal")
-        require_positive(self, "tolerance", "budget")
-        require_counts(self, "inner_iterations", "max_iterations")
+        super().__post_init__()
         for option in fields(self.solver):
             if option.name in _ONLY_A_STEP and getattr(self.solver, option.name) != option.default:
                 raise UserError(f"solver.{option.name}: has no effect inside relinearized; set {option.name} beside it")
@@ -77,11 +75,11 @@ class Relinearized(Solver[Round], Estimator):
 
     def step(self, system: FrozenSystem, state: Round) -> Round:
         """One round: inner steps from the last linearisation, then a new one where they end."""
-        own = system.with_slope(state.H_plus, state.deviation)
+        linearized = system.with_slope(state.H_plus, state.deviation)
         ended = iterate(
-            own,
+            linearized,
             self.solver,
-            self.solver.init(own, state.x, state.F),
+            self.solver.init(linearized, state.x, state.F),
             tolerance=self.tolerance,
             max_iterations=self.inner_iterations,
             budget=self.budget,

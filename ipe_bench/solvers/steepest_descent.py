@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.basics.options import Count
 from ipe_bench.estimators.ipe import IPE, State, System
 
 _HALVINGS = 40
@@ -20,6 +21,8 @@ class SteepestDescent(IPE):
     of fixed-point iteration. Slow near a root, but g decreases from anywhere; where it no longer does, a local minimum
     of g that is no root, the step is zero and the trial has stalled.
     """
+
+    max_iterations: Count = field(default=500, kw_only=True)
 
     def step(self, system: System, state: State) -> State:
         x, g = state.x, _squared(state.F)

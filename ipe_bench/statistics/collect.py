@@ -6,18 +6,20 @@ What is there, and what is wrong with it, `runs.results` says; what the numbers 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench.runs.provenance import TARGET, canonical_json
 from ipe_bench.runs.results import Results, Run, StoredCell
-from ipe_bench.runs.store import TRUTH
+from ipe_bench.runs.store import TRUTH, digest
 
 if TYPE_CHECKING:
     import pandas as pd
 
 NAMES = ("measurement", "noise", "prior", "error_scale", "seed", "estimator")
+_LONGEST = 34
+"""Letters of a value in a table or a heading."""
 ALWAYS_COLUMNS = ("measurement", "noise", "error_scale", "estimator")
 
 
@@ -102,9 +104,10 @@ def trials_frame(collection: Collection) -> pd.DataFrame:
 def config_leaves(description: Any, prefix: str = "") -> dict[str, tuple[str, Any]]:
     """Dotted keys with (class that holds the leaf, plain value); a component's own class stands under its own key."""
     if not isinstance(description, Mapping):
-        if isinstance(description, list) and any(isinstance(v, Mapping | list) for v in description):
+        if isinstance(description, list) and any(isinstance(v, Mapping) for v in description):
             description = {str(i): v for i, v in enumerate(description)}
         else:
+            # A list is one value, however long: two of different lengths differ.
             value = canonical_json(description) if isinstance(description, list) else description
             return {prefix: ("", value)}
     holder = str(description.get(TARGET, ""))
@@ -139,33 +142,60 @@ def differing(descriptions: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _groups(cells: Sequence[StoredCell], runs: Sequence[Run]) -> tuple[Group, ...]:
+    """One group per scenario and estimator: what was constructed decides which those are, and names only show it."""
     truths = {cell.scenario_id: cell for cell in cells if cell.label == TRUTH}
     estimates = [cell for cell in cells if cell.label != TRUTH]
-    scenarios = [cell.footer["identity"]["scenario"] for cell in estimates]
-    extra = [k for k in differing(scenarios) if k not in ("seed", "error_scale")]
+    extra = [k for k in differing([_scenario(cell) for cell in estimates]) if k != "error_scale"]
     extra = [k for k in extra if not _stands_in_a_name(k, estimates)]
     options = _option_columns(estimates)
-    order = _estimator_order(runs)
-    found: dict[tuple[str, str], tuple[dict[str, Any], str, dict[str, Any], list[StoredCell]]] = {}
+    found: dict[tuple[str, str, str], list[StoredCell]] = {}
     for cell in estimates:
-        leaves = config_leaves(cell.footer["identity"]["scenario"])
-        columns = {k: cell.footer["names"].get(k) for k in ("measurement", "noise")}
-        columns |= {k: _shown(leaves.get(k, ("", None))[1]) for k in extra}
-        columns["error_scale"] = cell.footer["names"].get("error_scale")
-        own = config_leaves(cell.footer["identity"]["estimator"])
-        mine = {k: _shown(own.get(k, ("", None))[1]) for k in options.get(cell.label, ())}
-        estimator = cell.label
-        if mine:
-            estimator += " (" + ", ".join(f"{k}={v}" for k, v in mine.items()) + ")"
-        where = (canonical_json(columns), estimator)
-        mine = {f"estimator.{k}": v for k, v in mine.items()}
-        found.setdefault(where, (columns, estimator, mine, []))[3].append(cell)
-    groups = []
-    for columns, estimator, mine, members in found.values():
+        what = canonical_json(_scenario(cell)), cell.label, canonical_json(cell.footer["identity"]["estimator"])
+        found.setdefault(what, []).append(cell)
+    groups: dict[tuple[str, str, str], Group] = {}
+    for what, members in found.items():
+        first = members[0]
+        leaves = config_leaves(_scenario(first))
+        columns = {k: first.names[k] for k in ("measurement", "noise")}
+        columns |= {k: _shown(leaves[k][1]) if k in leaves else None for k in extra}
+        columns["error_scale"] = first.names["error_scale"]
+        own = config_leaves(first.footer["identity"]["estimator"])
+        chosen = {k: _shown(own[k][1]) if k in own else None for k in options.get(first.label, ())}
+        label = first.label + (f" ({', '.join(f'{k}={v}' for k, v in chosen.items())})" if chosen else "")
         pairs = tuple((m, truths.get(m.scenario_id)) for m in sorted(members, key=lambda m: (m.seed, m.key)))
-        groups.append(Group(columns, estimator, mine, pairs))
-    groups.sort(key=lambda g: (*map(_sortable, g.columns.values()), order.get(g.label, len(order)), g.estimator))
-    return tuple(groups)
+        groups[what] = Group(columns, label, {f"estimator.{k}": v for k, v in chosen.items()}, pairs)
+    order = _estimator_order(runs)
+    return tuple(
+        sorted(
+            _told_apart(groups),
+            key=lambda g: (*map(_sortable, g.columns.values()), order.get(g.label, len(order)), g.estimator),
+        )
+    )
+
+
+def _scenario(cell: StoredCell) -> dict[str, Any]:
+    """What a scenario was constructed from, but for its seed: only seeds are pooled."""
+    return {key: value for key, value in cell.footer["identity"]["scenario"].items() if key != "seed"}
+
+
+def _told_apart(groups: Mapping[tuple[str, str, str], Group]) -> list[Group]:
+    """The groups; those that no column tells apart get one that does, a digest of their config."""
+    scenarios: dict[str, set[str]] = {}
+    estimators: dict[tuple[str, str], set[str]] = {}
+    for (scenario, _, estimator), group in groups.items():
+        scenarios.setdefault(canonical_json(group.columns), set()).add(scenario)
+        estimators.setdefault((scenario, group.estimator), set()).add(estimator)
+    alike = any(len(different) > 1 for different in scenarios.values())
+    result = []
+    for (scenario, _, estimator), group in groups.items():
+        if alike:
+            scale = group.columns["error_scale"]
+            columns = {k: v for k, v in group.columns.items() if k != "error_scale"}
+            group = replace(group, columns=columns | {"config": digest(scenario)[:6], "error_scale": scale})
+        if len(estimators[scenario, group.estimator]) > 1:
+            group = replace(group, estimator=f"{group.estimator} (#{digest(estimator)[:6]})")
+        result.append(group)
+    return result
 
 
 def _stands_in_a_name(key: str, cells: Sequence[StoredCell]) -> bool:
@@ -175,7 +205,7 @@ def _stands_in_a_name(key: str, cells: Sequence[StoredCell]) -> bool:
         return False
     values: dict[Any, set[str]] = {}
     for cell in cells:
-        leaf = config_leaves(cell.footer["identity"]["scenario"]).get(key)
+        leaf = config_leaves(_scenario(cell)).get(key)
         values.setdefault(cell.footer["names"].get(component), set()).add(canonical_json(leaf))
     return all(len(v) == 1 for v in values.values())
 
@@ -200,9 +230,11 @@ def _estimator_order(runs: Iterable[Run]) -> dict[str, int]:
 
 
 def _shown(value: Any) -> Any:
-    """A leaf as it stands in a table: a class by its own name."""
+    """A leaf as it stands in a table: a class by its own name, a long list by its beginning and a digest of it all."""
     if isinstance(value, str) and value.count(".") >= 2 and value.replace(".", "_").isidentifier():
         return value.rpartition(".")[2]
+    if isinstance(value, str) and len(value) > _LONGEST:
+        return f"{value[: _LONGEST - 10]}… #{digest(value)[:6]}"
     return value
 
 

@@ -68,12 +68,12 @@ def _first_root(
     equations: Callable[[Array], Any], attempts: Sequence[tuple[Solver[Any], int]], z: Array, x_start: Array
 ) -> Array:
     """Where the first method that converges ends: each has that many iterations from x_start."""
-    x, rest = np.full(x_start.shape, np.nan), np.arange(len(z))
+    x, missing = np.full(x_start.shape, np.nan), np.arange(len(z))
     for method, limit in attempts:
-        if len(rest):
+        if len(missing):
             ended: Ended[Any] = iterate(
-                equations(z[rest]), method, x_start[rest], tolerance=_TOLERANCE, max_iterations=limit
+                equations(z[missing]), method, x_start[missing], tolerance=_TOLERANCE, max_iterations=limit
             )
-            x = put(x, rest[ended.converged], ended.x[ended.converged])
-            rest = rest[~ended.converged]
+            x = put(x, missing[ended.converged], ended.x[ended.converged])
+            missing = missing[~ended.converged]
     return x

@@ -60,7 +60,7 @@ class Scenario:
         if self.noise.real and self.measurement.recorded is None:
             raise UserError(
                 f"noise=certified: measurement={self.measurement.name} comes with no readings of its own; choose "
-                "another noise, or one of measurement=nist/..."
+                "another noise, or measurement=nist"
             )
         if self.truth is not None and (self.truth.n, self.truth.m) != (self.measurement.n, self.measurement.m):
             raise UserError(

@@ -1,7 +1,7 @@
 """Trials through estimators: draws a block of a scenario, lets estimators loose on it, and scores what they return.
 
 A block is a range of trials; its result depends on nothing but the scenario, the estimator and the range. Storing,
-distributing and summarising blocks is left to other rooms.
+distributing and summarising blocks is left to others.
 """
 
 from __future__ import annotations
@@ -149,17 +149,20 @@ class Block:
         model = self.problem.measurement
         names = [p.name for p in model.parameters]
         error = estimates.x - self.trials.x
-        converged = estimates.status == Status.CONVERGED
+        # Whatever the estimator says: what is not finite has not converged.
+        finite = np.isfinite(error).all(axis=1)
+        status = np.where((estimates.status == Status.CONVERGED) & ~finite, Status.NONFINITE, estimates.status)
+        converged = status == Status.CONVERGED
         bound = self.bayes_information if "prior" in estimator.needs else self.crlb_information
         distance = np.maximum(quadratic_form(bound, error), 0.0)  # round-off where J lacks rank
-        solved = converged & np.isfinite(error).all(axis=1)
+        solved = converged
         apart = np.full(len(error), np.nan)
         if estimator.equation is not None:
             # An estimator that scales its prior solves an equation of its own.
             inflation = getattr(estimator, "prior_inflation", 1.0) if estimator.equation == "map" else 1.0
             root = self.reference_root(estimator.equation, inflation)
             apart = (np.abs(estimates.x - root) / self.crlb_deviation).max(axis=1)
-            solved &= apart <= SAME_ROOT
+            solved = solved & (apart <= SAME_ROOT)
         trials = len(error)
         P = estimates.covariance
         squared = np.full(trials, np.nan) if P is None else nees(error, P)
@@ -168,7 +171,7 @@ class Block:
             "trial": np.arange(self.trials.start, self.trials.stop),
             **_by_parameter("error", names, error),
             **_by_parameter("deviation", names, deviation),
-            "status": np.array([Status(s).label for s in estimates.status], dtype=object),
+            "status": np.array([Status(s).label for s in status], dtype=object),
             "message": np.array([estimates.messages.get(i, "") for i in range(trials)], dtype=object),
             "iterations": estimates.iterations,
             "simulations": estimates.simulations,

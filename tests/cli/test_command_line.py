@@ -88,7 +88,7 @@ MISTAKES = {
     "infinite scale": (["run", "error_scale=inf"], "give a finite number above 0"),
     "huge seed": (["run", "seed=99999999999999999999"], "seed=99999999999999999999: give a whole number from 0 to"),
     "negative noise": (["run", "noise.step=-1"], "noise.step=-1.0: give a number above 0"),
-    "noise that is no number": (["run", "noise=gaussian", "noise.deviation=nan"], "noise.deviation=nan"),
+    "noise that is not a number": (["run", "noise=gaussian", "noise.deviation=nan"], "noise.deviation=nan"),
     "prior of two": (["run", "prior.deviations=[1,2]"], "prior.deviations: has 2 numbers; give one for each of 11"),
     "negative prior": (["run", "prior.deviations=[-1]"], "prior.deviations[0]=-1.0: give 0 or a number above"),
     "negative budget": (["run", "estimators.fixed_point.budget=-1"], "estimators.fixed_point.budget=-1.0"),
@@ -113,6 +113,12 @@ MISTAKES = {
     "word too many": (["new", "solver", "a", "b"], "new: b: is a word too many"),
     "word too few": (["new", "solver"], "new: the following arguments are required: NAME"),
     "no directory": (["report", "nowhere"], "holds no results"),
+    "no data set": (["run", "measurement=nist/boxbot"], "measurement=nist/boxbot: there is no such data set; did you"),
+    "no data set by its key": (
+        ["run", "measurement=nist", "measurement.dataset=Iris"],
+        "measurement.dataset=Iris: cho",
+    ),
+    "data sets with others": (["run", "-m", "measurement=nist/boxbod,gins"], "run them one by one"),
     "no readings": (["estimate"], "readings: is not given"),
     "absent readings": (["estimate", "readings=absent.csv"], "absent.csv: there is no such file"),
 }
@@ -136,10 +142,13 @@ def test_a_sweep_whose_patterns_match_nothing_says_so(tmp_path):
 
 SPOILED = {
     "239 rows": (lambda lines: [*lines[:9], *lines[10:]], "has 239 of 240 rows; the first absent one is case=1"),
-    "NaN": (lambda lines: [*lines[:5], "1,9.0,vx,NaN", *lines[6:]], "row 6, column reading [m/s]: NaN is no reading"),
+    "NaN": (
+        lambda lines: [*lines[:5], "1,9.0,vx,NaN", *lines[6:]],
+        "row 6, column reading [m/s]: NaN is not a reading",
+    ),
     "text": (
         lambda lines: [*lines[:5], "1,9.0,vx,fast", *lines[6:]],
-        "row 6, column reading [m/s]: 'fast' is no number",
+        "row 6, column reading [m/s]: 'fast' is not a number",
     ),
     "column": (lambda lines: [lines[0].replace("axis", "axes"), *lines[1:]], "column axis is missing"),
     "unit": (lambda lines: [lines[0].replace("m/s", "ft/s"), *lines[1:]], "column reading [ft/s]: the unit must be"),
@@ -175,6 +184,39 @@ def test_nothing_is_overwritten(readings):
     assert result.returncode == 2
     assert "is not overwritten" in result.stderr
     assert readings.read_text() == before
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        (["measurement=nist/boxbod"], ["measurement=nist", "measurement.dataset=BoxBOD"]),
+        (["measurement=nist/BoxBOD,nist/dan", "seed=1"], None),
+        (["measurement=nist/danwood, nist/enso"], ["measurement=nist", "measurement.dataset=DanWood,ENSO"]),
+        (["measurement=glob(nist/mgh1*)"], ["measurement=nist", "measurement.dataset=MGH17,MGH10"]),
+        (["truth_measurement=nist/enso"], ["measurement@truth_measurement=nist", "truth_measurement.dataset=ENSO"]),
+        (["measurement=nist", "measurement.dataset=ENSO"], ["measurement=nist", "measurement.dataset=ENSO"]),
+    ],
+)
+def test_a_data_set_may_be_written_as_an_option_of_its_own(overrides, expected):
+    from ipe_bench.basics.errors import UserError
+    from ipe_bench.cli.config import rewrite
+
+    if expected is None:
+        with pytest.raises(UserError, match="nist/dan: there is no such data set; did you mean danwood"):
+            rewrite(overrides)
+    else:
+        assert rewrite(overrides) == expected
+
+
+def test_data_sets_are_swept_by_either_spelling(tmp_path):
+    certified = ("noise=certified", "trials=1", "measurement.start=1,2")
+    first = ipe_bench("run", "-m", "measurement=nist/misra1a,nist/boxbod", *certified, folder=tmp_path)
+    assert first.returncode == 0, first.stderr
+    assert "nist BoxBOD" in first.stderr
+    again = ipe_bench(
+        "run", "-m", "measurement=nist", "measurement.dataset=Misra1a,BoxBOD", *certified, folder=tmp_path
+    )
+    assert again.stderr.count("nothing left to compute") == 4
 
 
 def test_hydras_own_flags_work_after_run(tmp_path):

@@ -11,7 +11,8 @@ from omegaconf import OmegaConf
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
-from ipe_bench.measurements import Polynomial
+from ipe_bench.measurements import Nist, Polynomial
+from ipe_bench.measurements.nist import datasets
 from ipe_bench.noise import Gaussian, Noise
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.conformance import check_component
@@ -34,6 +35,11 @@ def complaints(component) -> str:
 @pytest.mark.parametrize("option", OURS, ids=lambda o: f"{o.group}={o.name}")
 def test_every_option_of_ours_keeps_its_promises(option):
     assert not complaints(component(option))
+
+
+@pytest.mark.parametrize("dataset", datasets())
+def test_every_certified_problem_keeps_its_promises(dataset):
+    assert not complaints(Nist(dataset))
 
 
 class Faulty(Estimator):

@@ -69,7 +69,7 @@ def test_a_changed_constant_makes_stale_what_was_computed_with_it_and_nothing_el
     edit(copy / "ipe_bench/baselines/sequential.py", "import numpy as np\n", "import numpy as np\nFACTOR = 2\n")
     after = keys(copy)
     assert {name for name in before if before[name] != after[name]} == {"ukf"}
-    edit(copy / "ipe_bench/trials/scoring.py", "SAME_ROOT = 1e-3", "SAME_ROOT = 2e-3")
+    edit(copy / "ipe_bench/trials/thresholds.py", "SAME_ROOT = 1e-3", "SAME_ROOT = 2e-3")
     after = keys(copy)
     assert all(before[name] != after[name] for name in before)
 
@@ -110,3 +110,55 @@ def test_prose_is_no_part_of_the_code(one, other):
 )
 def test_whatever_can_change_a_number_is(one, other):
     assert code(one) != code(other)
+
+
+SCRIPT = """
+from dataclasses import dataclass
+import ipe_bench as ib
+
+FACTOR = 2.0
+
+@dataclass(frozen=True)
+class Scaled(ib.baselines.LinearLSE):
+    def estimate(self, problem, z, *, history=False):
+        estimates = super().estimate(problem, z)
+        estimates.x = FACTOR * estimates.x
+        return estimates
+
+bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
+ib.run(bench, {"scaled": Scaled()}, 5, output="out")
+print(ib.status("out")["stale"].sum())
+"""
+
+
+@pytest.mark.parametrize("given", ["file", "input"])
+def test_an_estimator_can_stand_in_a_script_and_what_it_computed_before_an_edit_is_stale(tmp_path, given):
+    def stale(text: str) -> int:
+        (tmp_path / "script.py").write_text(text, encoding="utf-8")
+        command = [sys.executable, *(["script.py"] if given == "file" else ["-"])]
+        options = {"cwd": tmp_path, "capture_output": True, "text": True, "check": True}
+        return int(subprocess.run(command, input=text, **options).stdout)
+
+    assert stale(SCRIPT) == 0
+    # What came from a file is known again; what came from nowhere is of that session alone.
+    assert stale(SCRIPT + "# a remark") == (0 if given == "file" else 5)
+    assert stale(SCRIPT.replace("FACTOR = 2.0", "FACTOR = 3.0")) == (5 if given == "file" else 10)
+
+
+def test_a_base_class_in_another_module_is_part_of_the_source(copy):
+    edit(copy / "ipe_bench/baselines/linear_lse.py", "import annotations\n", "import annotations\nFACTOR = 2\n")
+    (copy / "mine.py").write_text(
+        "from dataclasses import dataclass\nimport ipe_bench as ib\n"
+        "@dataclass(frozen=True)\nclass Mine(ib.baselines.LinearLSE):\n    pass\n",
+        encoding="utf-8",
+    )
+
+    def source() -> str:
+        code = "from mine import Mine; from ipe_bench.runs.provenance import fingerprint; print(fingerprint([Mine()]))"
+        environment = {**os.environ, "PYTHONPATH": str(copy)}
+        command = [sys.executable, "-c", code]
+        return subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=True).stdout
+
+    before = source()
+    edit(copy / "ipe_bench/baselines/linear_lse.py", "FACTOR = 2", "FACTOR = 3")
+    assert source() != before

@@ -15,6 +15,7 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.options import Positive
 from ipe_bench.measurements.base import Measurement, Parameter, Recorded
 from ipe_bench.measurements.mgh.problems import PROBLEMS, Minimum, Problem
 
@@ -48,18 +49,17 @@ class Mgh(Measurement):
     in the test drivers of MINPACK.
     """
 
-    function: str
+    function: str = "kowalik_osborne"
     """A name as in `functions()`, such as rosenbrock."""
-    start: float = 1.0
+    start: Positive = 1.0
     """The multiple of the standard start; the paper uses 1, 10 and 100."""
 
     analytic = True
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.function not in PROBLEMS:
             raise UserError(f"function={self.function}: choose one of {', '.join(PROBLEMS)}")
-        if not (math.isfinite(self.start) and self.start > 0):
-            raise UserError(f"start={self.start}: give a multiple of the standard start above 0, such as 1, 10 or 100")
 
     @property
     def _problem(self) -> Problem:

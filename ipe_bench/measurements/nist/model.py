@@ -57,18 +57,17 @@ class Nist(Measurement):
     observation y; for Nelson it is log(y), as NIST fits it.
     """
 
-    dataset: str
-    """A name as NIST writes it, such as Misra1a; see `datasets()`."""
+    dataset: str = "Misra1a"
+    """A name as NIST writes it; see `datasets()`."""
     start: Literal[1, 2] = 1
     """Which starting point: 1 is far from the solution, 2 is near."""
 
     analytic = True
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.dataset not in FORMULAS:
             raise UserError(f"dataset={self.dataset}: choose one of {', '.join(FORMULAS)}")
-        if self.start not in (1, 2):
-            raise UserError(f"start={self.start}: choose 1 or 2")
 
     @property
     def _table(self) -> dict[str, Any]:

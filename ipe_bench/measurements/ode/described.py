@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.errors import UserError, require_positive
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Positive
 from ipe_bench.measurements.arithmetic import Arithmetic, read
 from ipe_bench.measurements.base import Input, Measurement, Parameter
 from ipe_bench.measurements.ode import sampling
@@ -50,9 +51,9 @@ class Ode(Measurement):
     """What is read at each time; none: every state."""
     times: tuple[float, ...] = ()
     """When it is read; a readings file brings its own."""
-    tolerance: float | None = None
+    tolerance: Positive | None = None
     """The error that the integration may leave in a reading; None: 1e-8 of the largest reading at the start."""
-    step: float | None = None
+    step: Positive | None = None
     """A longest integration step for all, in place of the tolerance."""
     unit: str = ""
     """Of the readings."""
@@ -61,7 +62,7 @@ class Ode(Measurement):
     """Parameters of which every file of readings has its own, where there are several."""
 
     def __post_init__(self) -> None:
-        require_positive(self, "step", "tolerance")
+        super().__post_init__()
         if not self.rates:
             raise UserError("rates: is empty; give each state its rate, such as rates.y=-k*y")
         for name in self.initial:

@@ -1,32 +1,22 @@
-"""Figures: each module draws one kind of figure from an analysis."""
+"""Figures: each module draws one kind of figure from what it declares to read; `gallery` keeps a folder of them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from ipe_bench.report.figures.drawing import FORMATS, Drawing, Figure
+from ipe_bench.report.figures.gallery import Drawn, draw_all
 
-from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.style import house_style, looks
-from ipe_bench.statistics.analysis import Analysis
+__all__ = ["FIGURES", "FORMATS", "Drawing", "Drawn", "Figure", "draw_all"]
 
-__all__ = ["Drawing", "draw_all"]
-
-
-def draw_all(analysis: Analysis) -> Iterator[Drawing]:
-    """Every figure that the data allow, in the order of the report."""
-    from ipe_bench.report.figures import (
-        convergence,
-        correlation,
-        cost,
-        distributions,
-        error_scale,
-        nees,
-        profile_curves,
-        ranks,
-        success,
-    )
-
-    look = looks(analysis.collection.estimators)
-    rooms = (error_scale, success, distributions, nees, convergence, cost, profile_curves, ranks, correlation)
-    with house_style():
-        for room in rooms:
-            yield from room.draw(analysis, look)
+FIGURES = (
+    "error_scale",
+    "success",
+    "settings",
+    "distributions",
+    "nees",
+    "convergence",
+    "cost",
+    "profile_curves",
+    "ranks",
+    "correlation",
+)
+"""The modules, in the order of the report; a new figure is a module with a FIGURE, and its name here."""

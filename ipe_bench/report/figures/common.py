@@ -1,16 +1,14 @@
-"""What figures share: settings, panels, axes, legends and the words of captions."""
+"""What figures share: panels, axes, curves that stay apart, legends and the words of captions."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from ipe_bench.report.style import BOUND_COLOR, Look
+from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, Look
 from ipe_bench.report.words import plain
 
 if TYPE_CHECKING:
@@ -18,55 +16,12 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-MOST_SETTINGS = 6
-"""Settings that have figures of their own; the tables have all."""
 MOST_PANELS = 6
-
-
-@dataclass(frozen=True)
-class Setting:
-    """The rows of one measurement, noise and whatever else differs, over all error scales."""
-
-    suffix: str
-    """What its figures' file names end in; empty where there is one setting."""
-    label: str
-    rows: pd.DataFrame
-
-    @property
-    def scales(self) -> list[float]:
-        return sorted({float(s) for s in self.rows["error_scale"]})
-
-    def scenario(self, scale: float) -> int:
-        """The number of the scenario at that error scale, where the rows are those of `Analysis.scores`."""
-        return int(self.rows.loc[self.rows["error_scale"] == scale, "scenario"].iloc[0])
-
-
-def settings(frame: pd.DataFrame, columns: Sequence[str]) -> list[Setting]:
-    """Splits a table by everything but the error scale; the first `MOST_SETTINGS` of them."""
-    if frame.empty:
-        return []
-    groups = list(frame.groupby(list(columns), dropna=False, sort=False))
-    varying = [c for c in columns if len(set(frame[c].astype(str))) > 1]
-    result: list[Setting] = []
-    for number, (values, rows) in enumerate(groups[:MOST_SETTINGS], 1):
-        key: tuple[Any, ...] = values if isinstance(values, tuple) else (values,)
-        # An option that this setting does not have is not spoken of.
-        named = {c: v for c, v in zip(columns, key, strict=True) if not pd.isna(v)}
-        shown = [str(named[c]) for c in ("measurement", "noise") if c in named]
-        shown += [f"{c}={plain(named[c])}" for c in varying if c in named and c not in ("measurement", "noise")]
-        suffix = "" if len(groups) == 1 else "_" + slug("_".join(plain(named[c]) for c in varying if c in named))
-        if any(suffix == other.suffix for other in result):
-            suffix += f"_{number}"
-        label = ", ".join(shown)
-        if number == MOST_SETTINGS < len(groups):
-            label += f" ({len(groups) - number} further settings are in the tables)"
-        result.append(Setting(suffix, label, rows))
-    return result
-
-
-def slug(words: str) -> str:
-    """Letters, digits and dashes that are safe in a file name."""
-    return re.sub(r"[^A-Za-z0-9.]+", "-", words).strip("-.")[:40]
+FEW = 20
+"""A point that fewer trials carry is hollow and has no interval."""
+COINCIDE = 0.015
+"""Points nearer than this part of the axis lie upon each other."""
+UPON = "Where points coincide, each marker lies smaller upon the one before it."
 
 
 def text(value: Any) -> str:
@@ -84,12 +39,15 @@ def figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def panels(count: int, height: float = 2.7, extra: float = 0.5, *, most_across: int = 3) -> tuple[Figure, list[Axes]]:
-    """A figure with that many panels, unused ones switched off; `extra` inches are for the legend."""
-    across = min(most_across, count)
+def panels(
+    count: int, look: Mapping[str, Look] | None = None, *, height: float = 2.7, most_across: int | None = None
+) -> tuple[Figure, list[Axes]]:
+    """A figure with that many panels, unused ones switched off, and room for the legend of the estimators."""
+    across = most_across or {4: 2, 7: 4, 8: 4}.get(count, 3)
+    across = min(across, count)
     down = -(-count // across)
-    width = {1: 5.2, 2: 8.0}.get(across, 9.2)
-    fig = figure(width, height * down + extra)
+    width = {1: 5.2, 2: 8.0, 3: 9.2}.get(across, 11.0)
+    fig = figure(width, height * down + 0.4 + 0.2 * len(look or ()) / 5)
     axes: list[Axes] = list(fig.subplots(down, across, squeeze=False).flat)
     for ax in axes[count:]:
         ax.set_axis_off()
@@ -103,22 +61,31 @@ def spread(values: Sequence[Any], most: int = MOST_PANELS) -> list[Any]:
     return [values[i] for i in np.unique(np.linspace(0, len(values) - 1, most).round().astype(int))]
 
 
-def scale_axis(ax: Axes, scales: Sequence[float]) -> None:
-    """A logarithmic axis of error scales that shows the scales themselves."""
-    ax.set_xscale("log")
-    positive = sorted({float(s) for s in scales if s > 0})
-    if not positive:
+def at_scale(frame: pd.DataFrame, scale: float) -> pd.DataFrame:
+    return frame[frame["error_scale"] == scale]
+
+
+def scale_axis(ax: Axes, scales: Sequence[float], labels: Sequence[str]) -> None:
+    """A logarithmic axis that shows the error scales themselves; where there is one alone, the labels side by side."""
+    if len(scales) == 1:
+        ax.set_xticks(range(len(labels)), [text(label) for label in labels], rotation=90)
+        ax.set_xlim(-0.6, len(labels) - 0.4)
+        ax.set_xlabel("")
         return
-    span = np.log10(positive[-1] / positive[0])
+    positive = sorted(s for s in scales if s > 0)
+    # A scale of zero has no place on a logarithmic axis: a decade below the smallest is as near as it gets.
+    least = positive[0] / 10 if len(positive) < len(scales) else positive[0]
+    ax.set_xscale("symlog", linthresh=positive[0], linscale=0.5) if least < positive[0] else ax.set_xscale("log")
+    span = np.log10(positive[-1] / least)
     # Neighbouring labels such as 10 and 11 would overlap: crowded ones go.
-    kept: list[float] = []
+    kept: list[float] = [] if least == positive[0] else [0.0]
     for s in positive:
-        if not kept or np.log10(s / kept[-1]) > 0.1 * span:
+        if not kept or np.log10(s / max(kept[-1], least)) > 0.1 * span:
             kept.append(s)
     ax.set_xticks(kept, [plain(s) for s in kept])
     ax.set_xticks([], minor=True)
     margin = 10 ** max(0.06 * span, 0.15)
-    ax.set_xlim(positive[0] / margin, positive[-1] * margin)
+    ax.set_xlim(-0.3 * positive[0] if least < positive[0] else least / margin, positive[-1] * margin)
     ax.set_xlabel("error scale")
 
 
@@ -142,7 +109,7 @@ def log_ticks(axis: Axis, low: float, high: float) -> None:
     """Labels that do not crowd: powers of ten, and 2 and 5 between where those are few."""
     from matplotlib.ticker import LogFormatterMathtext, LogLocator, NullLocator
 
-    if high / low < 30:
+    if high / low < 200:
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.set_major_formatter("{x:g}")
     else:
@@ -151,33 +118,122 @@ def log_ticks(axis: Axis, low: float, high: float) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def dodge(look: Mapping[str, Look], label: str, scales: Sequence[float]) -> float:
-    """A factor near one that sets estimators a little apart on a logarithmic axis: equal results stay visible."""
-    if len(look) < 2:
-        return 1.0
-    positive = [s for s in scales if s > 0]
-    span = max(np.log10(max(positive) / min(positive)), 1.0) if positive else 1.0
-    place = list(look).index(label) / (len(look) - 1) - 0.5
-    return float(10 ** (place * 0.05 * span))
+def shares(ax: Axes, label: str) -> None:
+    """A vertical axis from none to all."""
+    ax.set_ylim(-0.03, 1.03)
+    ax.yaxis.set_major_formatter(lambda v, _: f"{100 * v:.0f} %")
+    ax.set_ylabel(label)
 
 
-def curve(ax: Axes, x: Any, y: Any, low: Any, high: Any, look: Look, label: str) -> None:
-    """A line with markers, and its interval as bars."""
-    x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-    low, high = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
-    ax.plot(x, y, label=text(label), **look.line)
-    good = np.isfinite(y) & np.isfinite(low) & np.isfinite(high)
-    if good.any():
-        ax.vlines(x[good], low[good], high[good], color=look.color, linewidth=1.1, alpha=0.8)
+def seaborn_style(look: Mapping[str, Look], by: str = "estimator") -> dict[str, Any]:
+    """Arguments of seaborn's functions that give every label its own colour and dash."""
+    return {
+        "hue": by,
+        "hue_order": list(look),
+        "palette": {label: one.color for label, one in look.items()},
+        "style": by,
+        "style_order": list(look),
+        "legend": False,
+    }
+
+
+def curves(
+    ax: Axes,
+    rows: pd.DataFrame,
+    y: str,
+    look: Mapping[str, Look],
+    scales: Sequence[float],
+    *,
+    interval: tuple[str, str] | None = None,
+    by: str = "estimator",
+    trials: str = "solved_trials",
+) -> None:
+    """A column over the error scales, a line with markers per label, on an axis whose limits are set already.
+
+    Points stand at their scale exactly: markers that coincide are told apart by size. A line is broken where a value is
+    missing; a point that fewer than `FEW` trials carry is hollow and has no interval.
+    """
+    import seaborn as sns
+
+    scale_axis(ax, scales, list(look))
+    place = {label: i for i, label in enumerate(look)}
+    rows = rows[rows[by].isin(list(look))].sort_values("error_scale", kind="stable")
+    rows = rows.assign(x=rows["error_scale"] if len(scales) > 1 else rows[by].map(place).astype(float))
+    rows = rows.assign(run=rows.groupby(by)[y].transform(lambda values: values.isna().cumsum()))
+    rows = rows[np.isfinite(rows[y])]
+    if rows.empty:
+        return
+    rows = rows.assign(depth=_depths(ax, rows, y, look, by))
+    style = seaborn_style(look, by)
+    if len(scales) > 1:
+        dashes = {label: one.dash for label, one in look.items()}
+        sns.lineplot(rows, x="x", y=y, ax=ax, dashes=dashes, units="run", estimator=None, linewidth=1.4, **style)
+    few = rows[trials] < FEW
+    if interval is not None:
+        low, high = interval
+        sure = rows[~few & np.isfinite(rows[low]) & np.isfinite(rows[high])]
+        ax.vlines(sure["x"], sure[low], sure[high], colors=[look[e].color for e in sure[by]], linewidth=1.0, alpha=0.8)
+    markers = {label: one.marker for label, one in look.items()}
+    areas = {d: (5.5 + min(2.5, 9 / len(look)) * d) ** 2 for d in range(len(look))}
+    points = style | {"markers": markers, "size": "depth", "sizes": areas, "linewidth": 0.6, "zorder": 3, "alpha": 1.0}
+    if (~few).any():
+        sns.scatterplot(rows[~few], x="x", y=y, ax=ax, **points)
+    if few.any():
+        sns.scatterplot(rows[few], x="x", y=y, ax=ax, **points)
+        _hollow(ax)
+    ax.set(xlabel="error scale" if len(scales) > 1 else "", ylabel="")
+
+
+def _hollow(ax: Axes) -> None:
+    """Empties the markers drawn last, and says in the legend what that means."""
+    from matplotlib.lines import Line2D
+
+    marks = ax.collections[-1]
+    marks.set(edgecolor=marks.get_facecolor(), facecolor="white", linewidth=1.2)
+    look = {"marker": "o", "color": "white", "markeredgecolor": BOUND_COLOR, "markersize": 6}
+    ax.add_line(Line2D([], [], label=f"hollow: fewer than {FEW} trials", **look))
+
+
+def _depths(ax: Axes, rows: pd.DataFrame, y: str, look: Mapping[str, Look], by: str) -> pd.Series:
+    """How many later markers lie upon each point's."""
+    transform = ax.yaxis.get_transform().transform
+    low, high = transform(np.asarray(ax.get_ylim()))
+    heights = pd.Series((transform(rows[y].to_numpy(dtype=float)) - low) / (high - low), index=rows.index)
+    order = rows[by].map({label: i for i, label in enumerate(look)})
+
+    def depth(points: pd.Series) -> list[int]:
+        later = order[points.index].to_numpy()[:, None] < order[points.index].to_numpy()
+        return list((later & (np.abs(points.to_numpy()[:, None] - points.to_numpy()) < COINCIDE)).sum(axis=1))
+
+    return heights.groupby(rows["x"]).transform(depth).astype(int)
+
+
+def lines(
+    ax: Axes, rows: pd.DataFrame, x: str, y: str, look: Mapping[str, Look], *, every: int = 1, **style: Any
+) -> None:
+    """A line per estimator through points that are already dense, with a marker at every so many: each estimator's at
+    other ones, so that markers stand side by side where curves coincide."""
+    import seaborn as sns
+
+    present = [label for label in look if label in set(rows["estimator"])]
+    dashes = {label: one.dash for label, one in look.items()}
+    before = len(ax.lines)
+    style = {"linewidth": 1.4, "estimator": None, "dashes": dashes} | style
+    sns.lineplot(rows, x=x, y=y, ax=ax, **style, **seaborn_style(look))
+    for i, (line, label) in enumerate(zip(ax.lines[before:], present, strict=True)):
+        line.set(marker=look[label].marker, markevery=(every * i // len(present), every), markersize=5)
+        line.set(markeredgecolor="white", markeredgewidth=0.5)
 
 
 def bound_line(ax: Axes, at: float, label: str) -> None:
-    ax.axhline(at, color=BOUND_COLOR, linestyle=(0, (2, 2)), linewidth=1.0, label=label, zorder=1)
+    ax.axhline(at, color=BOUND_COLOR, linestyle=BOUND_DASH, linewidth=1.0, label=label, zorder=1)
 
 
-def legend_below(fig: Figure, axes: Sequence[Axes]) -> None:
-    """One legend for all panels, under them."""
-    handles: dict[str, Any] = {}
+def legend_below(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | None = None) -> None:
+    """One legend for all panels, under them: the estimators, then whatever in the panels has a label."""
+    from matplotlib.lines import Line2D
+
+    handles: dict[str, Any] = {text(label): Line2D([], [], **one.line) for label, one in (look or {}).items()}
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
@@ -188,17 +244,20 @@ def legend_below(fig: Figure, axes: Sequence[Axes]) -> None:
     fig.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=columns)
 
 
-def by_estimator(rows: pd.DataFrame, look: Mapping[str, Look]) -> Iterator[tuple[str, pd.DataFrame]]:
-    """The rows of each estimator in the order of the looks, by ascending error scale."""
-    for label in look:
-        mine = rows[rows["estimator"] == label]
-        if len(mine):
-            yield label, mine.sort_values("error_scale")
-
-
 def enumerate_few(items: Sequence[str], most: int = 6) -> str:
     """'a, b and 3 others'."""
     items = list(items)
     if len(items) > most:
         return ", ".join(items[:most]) + f" and {len(items) - most} others"
     return ", ".join(items)
+
+
+def values_of(rows: pd.DataFrame, column: str, *, most: int = 20) -> str:
+    """'a 1.02, b 3.4': a column by estimator, in three figures."""
+    pairs = zip(rows["estimator"], rows[column], strict=True)
+    return enumerate_few([f"{e} {v:.3g}" for e, v in pairs if np.isfinite(v)], most)
+
+
+def sentence(*parts: str) -> str:
+    """The parts of a caption that say something, one after another."""
+    return " ".join(part for part in parts if part)

@@ -6,129 +6,211 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from ipe_bench.report.figures import common
-from ipe_bench.report.figures.common import Setting
-from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.style import COLORS, DASHES, MARKERS, REFERENCE, Look
-from ipe_bench.statistics.analysis import Analysis
+from ipe_bench.report.figures.drawing import Drawing, Figure
+from ipe_bench.report.figures.views import View
+from ipe_bench.report.style import BOUND_DASH, COLORS, MARKERS, REFERENCE, Look
+from ipe_bench.report.words import plain
 from ipe_bench.statistics.summary import ALL
 
+TOGETHER = "all parameters together"
+_TOGETHER = Look("#000000", "o")
 NEAR = 2.0
-"""The last panel shows errors up to this multiple of the bound."""
+"""The panel of efficiency shows errors up to this multiple of the bound."""
+MOST_GROUPS = 8
+"""Groups of parameters that have a panel each; more are shown by all parameters together."""
 
 
-def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
-    parameters = {g.columns["measurement"]: g.footer["parameters"] for g in analysis.collection.groups}
-    equations = {g.estimator: g.footer["equation"] for g in analysis.collection.groups}
-    for setting in common.settings(analysis.summary, analysis.setting_columns):
-        mine = parameters[setting.rows["measurement"].iloc[0]]
-        there = [e for e in look if e in set(setting.rows["estimator"])]
-        if REFERENCE in there:
-            yield _paper_figure("figure_2", 2, REFERENCE, setting, mine)
-        frozen = [e for e in there if equations[e] == "frozen"]
-        iterated = next((e for e in ("fixed_point", "newton", *frozen) if e in there), None)
-        if iterated:
-            yield _paper_figure("figure_3", 3, iterated, setting, mine)
-    totals = common.settings(analysis.summary[analysis.summary["parameter"] == ALL], analysis.setting_columns)
-    for setting, total in zip(common.settings(analysis.by_group, analysis.setting_columns), totals, strict=True):
-        yield _all_estimators(setting, total, look)
+def draw(view: View) -> Iterator[Drawing]:
+    if view.totals.empty:
+        return
+    if REFERENCE in view.look:
+        yield _paper_figure(view, 2, REFERENCE)
+    frozen = [label for label, equation in view.equations.items() if equation == "frozen"]
+    iterated = next((e for e in ("fixed_point", "newton", *frozen) if e in view.look), None)
+    if iterated:
+        yield _paper_figure(view, 3, iterated)
+    yield _all_estimators(view)
 
 
-def _paper_figure(name: str, number: int, estimator: str, setting: Setting, parameters: Sequence[Any]) -> Drawing:
+def _paper_figure(view: View, number: int, estimator: str) -> Drawing:
     """The paper's figure: a panel per group of parameters in Table 1 units, and one of all in units of the bound."""
-    rows = setting.rows[setting.rows["estimator"] == estimator]
-    members: dict[str, list[Any]] = {}
-    for p in parameters:
-        members.setdefault(p.get("group") or p["name"], []).append(p)
-    if len(members) > 11:
-        members = {"all parameters": list(parameters)}
-    fig, axes = common.panels(len(members) + 1, extra=0.1)
-    by_name = {p["name"]: rows[rows["parameter"] == p["name"]].sort_values("error_scale") for p in parameters}
-    ends = [
-        by_name[p["name"]][c].to_numpy() / float(p["size"])
-        for p in parameters
-        for c in ("rmse_low", "rmse_high", "linear_bound")
-    ]
-    for (group, inside), ax in zip(members.items(), axes, strict=False):
-        for i, p in enumerate(inside):
-            mine, unit = by_name[p["name"]], float(p["size"])
-            look = Look(COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)], DASHES[0])
-            low, high = mine["rmse_low"] / unit, mine["rmse_high"] / unit
-            common.curve(ax, mine["error_scale"], mine["rmse"] / unit, low, high, look, p["name"])
-            bound = mine["linear_bound"] / unit
-            ax.plot(mine["error_scale"], bound, color=look.color, linestyle=(0, (2, 2)), linewidth=1.0)
-        common.scale_axis(ax, setting.scales)
-        common.decades(ax, np.concatenate(ends))
-        ax.set_title(common.text(group))
-        sizes = {f"{common.plain(float(p['size']))} {p['unit']}".strip() for p in inside}
-        ax.set_ylabel(common.text(f"rms error [{sizes.pop()}]" if len(sizes) == 1 else "rms error [unit inputs]"))
-        if len(inside) <= 8:
-            ax.legend(loc="best", ncols=2 if len(inside) > 2 else 1)
-    last = axes[len(members)]
-    for i, p in enumerate(parameters):
-        mine = by_name[p["name"]]
-        label = "each parameter" if i == 0 else None
-        last.plot(mine["error_scale"], mine["rmse_over_linear_bound"], color="#aaaaaa", linewidth=0.8, label=label)
-    mine = rows[rows["parameter"] == ALL].sort_values("error_scale")
-    together = Look("#000000", "o", "-")
-    common.curve(last, mine["error_scale"], mine["rmse"], mine["rmse_low"], mine["rmse_high"], together, "all together")
-    common.bound_line(last, 1.0, "linear bound")
-    common.scale_axis(last, setting.scales)
-    common.decades(last, np.append(rows["rmse_over_linear_bound"], 1.0))
-    last.set_title("over the linear bounds")
-    last.set_ylabel("rms error / linear bound")
-    last.legend(loc="best")
-    when = "before iteration" if estimator == REFERENCE else "after iteration"
-    seen = "; ".join(
-        f"{v:.3g} at scale {common.plain(s)}" for s, v in zip(mine["error_scale"], mine["rmse"], strict=True)
-    )
-    caption = (
-        f"Root mean square error of {estimator} per parameter over the trials that it solved, in multiples of the unit"
-        " inputs (Table 1 of the paper), with 95 % bootstrap intervals; dashed: the linear bound, eq. (5). Last panel:"
-        f" the same over the bounds; all parameters together are at {seen}. {setting.label}."
-    )
-    return Drawing(f"{name}{setting.suffix}", f"The paper's figure {number}, error {when} ({estimator})", caption, fig)
-
-
-def _all_estimators(setting: Setting, total: Setting, look: Mapping[str, Look]) -> Drawing:
-    rows = setting.rows
-    look = {label: one for label, one in look.items() if label in set(rows["estimator"])}
-    names = list(dict.fromkeys(rows["group"]))
-    # One group alone, or too many to show, are shown by all parameters together.
-    shown = names if 2 <= len(names) <= 8 else [ALL]
-    fig, axes = common.panels(len(shown) + 1, extra=0.4 + 0.2 * (len(look) / 5))
-    ends = np.concatenate([rows[["low", "high"]].to_numpy().ravel(), total.rows["rmse_high"].to_numpy(), [1.0]])
-    for name, ax in zip(shown, axes, strict=False):
-        part = rows[rows["group"] == name]
-        if name == ALL:
-            part = total.rows.rename(columns={"rmse_low": "low", "rmse_high": "high"})
-        for label, mine in common.by_estimator(part, look):
-            x = mine["error_scale"] * common.dodge(look, label, setting.scales)
-            common.curve(ax, x, mine["rmse"], mine["low"], mine["high"], look[label], label)
+    totals = view.totals[view.totals["estimator"] == estimator]
+    rows = _in_units(view, estimator)
+    groups = _groups(view.parameters)
+    fig, axes = common.panels(len(groups) + 1)
+    ends = rows[["rmse_low", "rmse_high", "linear_bound"]].to_numpy()
+    for (group, inside), ax in zip(groups.items(), axes, strict=False):
+        look = {p["name"]: Look(COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)]) for i, p in enumerate(inside)}
         common.decades(ax, ends)
-        ax.set_title("all parameters" if name == ALL else common.text(name))
-    near = axes[-1]
-    for label, mine in common.by_estimator(total.rows, look):
-        x = mine["error_scale"] * common.dodge(look, label, setting.scales)
-        y = mine["rmse"].to_numpy()
-        y = np.where(y <= NEAR, y, np.nan)
-        common.curve(near, x, y, mine["rmse_low"], mine["rmse_high"], look[label], label)
-    near.set_title(f"all parameters, up to {common.plain(NEAR)} bounds")
-    highs = total.rows["rmse_high"].to_numpy()
-    highs = highs[np.isfinite(highs) & (total.rows["rmse"].to_numpy() <= NEAR)]
-    near.set_ylim(0.9, max(1.15, min(NEAR, 1.03 * highs.max(initial=1.0))))
-    for ax in axes:
-        common.bound_line(ax, 1.0, "linear bound")
-        common.scale_axis(ax, setting.scales)
-        ax.set_ylabel("rms error / linear bound")
-    common.legend_below(fig, axes)
-    top = total.rows[total.rows["error_scale"] == max(setting.scales)]
-    seen = [f"{e} {v:.3g}" for e, v in zip(top["estimator"], top["rmse"], strict=True) if np.isfinite(v)]
-    caption = (
-        "Root mean square error over the linear bound, per group of parameters and over all, on the trials that each"
-        " estimator solved, with 95 % bootstrap intervals; estimators are set a little apart so that equal ones show."
-        f" At scale {common.plain(max(setting.scales))}: {common.enumerate_few(seen, 20) or 'nobody solved any trial'}."
-        f" {setting.label}."
+        _bounds(ax, rows, look, view)
+        common.curves(ax, rows, "rmse", look, view.scales, interval=("rmse_low", "rmse_high"), by="parameter")
+        sizes = {f"{plain(float(p['size']))} {p['unit']}".strip() for p in inside}
+        ax.set_ylabel(common.text(f"rms error [{sizes.pop()}]" if len(sizes) == 1 else "rms error [unit inputs]"))
+        ax.set_title(common.text(group))
+        if len(inside) > 1 and len(view.scales) > 1:
+            lines = {common.text(name): _handle(one) for name, one in look.items()}
+            ax.legend(list(lines.values()), list(lines), loc="best", ncols=2 if len(inside) > 2 else 1)
+        elif len(inside) == 1:
+            ax.set_title(common.text(group if group == inside[0]["name"] else f"{group} ({inside[0]['name']})"))
+    _over_bounds(axes[-1], rows, totals, view)
+    common.legend_below(fig, axes, {TOGETHER: _TOGETHER})
+    when = "before iteration" if estimator == REFERENCE else "after iteration"
+    seen = _at_scales(totals, "rmse")
+    caption = common.sentence(
+        f"Root mean square error of {estimator} per parameter over the trials that it solved ({_missing(totals)}), in"
+        " multiples of the unit inputs (Table 1 of the paper), with 95 % bootstrap intervals; dotted: the linear bound,"
+        " eq. (5). Last panel: the same over the bounds, and all parameters together",
+        f"at {seen}. {view.label}.",
     )
-    return Drawing(f"error_against_scale{setting.suffix}", "Error against error scale, all estimators", caption, fig)
+    name = f"figure_{number}{view.suffix}"
+    return Drawing(name, f"The paper's figure {number}, error {when} ({estimator})", caption, fig)
+
+
+def _in_units(view: View, estimator: str) -> pd.DataFrame:
+    """An estimator's rows of each parameter, in multiples of its unit input."""
+    rows = view["summary"]
+    rows = rows[(rows["estimator"] == estimator) & (rows["parameter"] != ALL)]
+    sizes = rows["parameter"].map({p["name"]: float(p["size"]) for p in view.parameters}).to_numpy()
+    units = {c: rows[c] / sizes for c in ("rmse", "rmse_low", "rmse_high", "linear_bound")}
+    return rows.assign(**units, solved_trials=(rows["solved"] * rows["trials"]).round())
+
+
+def _groups(parameters: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for p in parameters:
+        groups.setdefault(p.get("group") or p["name"], []).append(p)
+    return groups if len(groups) <= 11 else {"all parameters": list(parameters)}
+
+
+def _bounds(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look], view: View) -> None:
+    """Each parameter's linear bound in its colour: dotted over the scales, a level mark where there is one scale."""
+    for i, (label, one) in enumerate(look.items()):
+        bound = rows[rows["parameter"] == label].sort_values("error_scale")
+        if len(view.scales) > 1:
+            ax.plot(bound["error_scale"], bound["linear_bound"], color=one.color, linestyle=BOUND_DASH, linewidth=1.0)
+        else:
+            ax.hlines(bound["linear_bound"], i - 0.3, i + 0.3, color=one.color, linestyle=BOUND_DASH, linewidth=1.0)
+
+
+def _over_bounds(ax: Any, rows: pd.DataFrame, totals: pd.DataFrame, view: View) -> None:
+    ratio = "rmse_over_linear_bound"
+    together = {"together": _TOGETHER}
+    common.decades(ax, np.append(rows[ratio], [1.0, *totals["rmse_low"], *totals["rmse_high"]]))
+    if len(view.scales) > 1:
+        table = rows.pivot_table(index="error_scale", columns="parameter", values=ratio)
+        lines = ax.plot(table.index, table, color="#aaaaaa", linewidth=0.8)
+    else:
+        lines = ax.plot(np.zeros(len(rows)), rows[ratio], "_", color="#aaaaaa")
+    lines[0].set_label("each parameter")
+    interval = ("rmse_low", "rmse_high")
+    totals = totals.assign(parameter="together")
+    common.curves(ax, totals, "rmse", together, view.scales, interval=interval, by="parameter")
+    common.bound_line(ax, 1.0, "bound")
+    _mark_missing(ax, totals, view)
+    ax.set(title="over the linear bounds", ylabel="rms error / linear bound")
+
+
+def _mark_missing(ax: Any, totals: pd.DataFrame, view: View) -> None:
+    """Writes how many trials are behind the points of one estimator, wherever some are missing."""
+    lacking = totals[totals["solved_trials"] < totals["trials"]]
+    for scale, value, solved, trials in zip(
+        lacking["error_scale"], lacking["rmse"], lacking["solved_trials"], lacking["trials"], strict=True
+    ):
+        if not np.isfinite(value):
+            continue
+        x = scale if len(view.scales) > 1 else 0.0
+        note = f"{solved:.0f} of {trials}"
+        ax.annotate(note, (x, value), xytext=(-4, 5), textcoords="offset points", ha="right", fontsize=6.5)
+
+
+def _all_estimators(view: View) -> Drawing:
+    totals, look = view.totals, view.look
+    counts = totals[["error_scale", "estimator", "trials", "solved_trials"]]
+    by_group = view["by_group"].merge(counts, on=["error_scale", "estimator"])
+    names = list(dict.fromkeys(by_group["group"]))
+    together = totals.assign(group=ALL, low=totals["rmse_low"], high=totals["rmse_high"])
+    if 2 <= len(names) <= MOST_GROUPS:
+        shown = by_group
+    else:
+        # One group alone, or too many to show, are shown by all parameters together.
+        shown, names = together, [ALL]
+    lacking = bool((totals["solved_trials"] < totals["trials"]).any())
+    fig, axes = common.panels(len(names) + 1 + lacking, look)
+    ends = np.concatenate([shown[["low", "high", "rmse"]].to_numpy().ravel(), totals["crlb"], [1.0]])
+    for name, ax in zip(names, axes, strict=False):
+        common.decades(ax, ends)
+        rows = shown[shown["group"] == name]
+        common.curves(ax, rows, "rmse", look, view.scales, interval=("low", "high"))
+        common.bound_line(ax, 1.0, "bound")
+        ax.set_title("all parameters" if name == ALL else common.text(name))
+        ax.set_ylabel("rms error / linear bound")
+    efficiency = axes[len(names)]
+    _efficiency(efficiency, totals, look, view)
+    if lacking:
+        common.shares(axes[-1], "")
+        common.curves(axes[-1], totals, "solved", look, view.scales, trials="trials")
+        common.shares(axes[-1], f"share of {_trials(totals)} trials")
+        axes[-1].set_title("trials behind the points")
+    common.legend_below(fig, axes, look)
+    top = common.at_scale(totals, view.scales[-1])
+    seen = common.values_of(top, "rmse") or "nobody solved any trial"
+    caption = common.sentence(
+        "Root mean square error over the linear bound, per group of parameters and over all, on the trials that each"
+        " estimator solved, with 95 % bootstrap intervals. Efficiency: over the bound that applies at that scale,"
+        f" as far as {plain(NEAR)}.",
+        "Last panel: the share of trials that the others are over." if lacking else "All trials were solved.",
+        common.UPON,
+        f"At scale {plain(view.scales[-1])}: {seen}. {view.label}.",
+    )
+    name = f"error_against_scale{view.suffix}"
+    title = "Error against error scale" if len(view.scales) > 1 else f"Error at error scale {plain(view.scales[0])}"
+    return Drawing(name, f"{title}, all estimators", caption, fig)
+
+
+def _efficiency(ax: Any, totals: pd.DataFrame, look: Mapping[str, Look], view: View) -> None:
+    """Errors over the bound at the truth, where they are near it."""
+    ratio = 1 / totals["efficiency"]
+    per_bound = ratio / totals["rmse"]
+    rows = totals.assign(
+        ratio=ratio.where(ratio <= NEAR), low=totals["rmse_low"] * per_bound, high=totals["rmse_high"] * per_bound
+    )
+    highs = rows["high"].where(rows["ratio"].notna() & np.isfinite(rows["high"]))
+    low, high = np.nanmin([0.9, *rows["ratio"]]), np.nanmax([1.1, *highs])
+    ax.set_ylim(0.92 * low, 1.04 * min(high, NEAR))
+    common.curves(ax, rows, "ratio", look, view.scales, interval=("low", "high"))
+    common.bound_line(ax, 1.0, "bound")
+    ax.set(title=f"all parameters, up to {plain(NEAR)} bounds", ylabel="rms error / bound at that scale")
+
+
+def _handle(look: Look) -> Any:
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], **look.line)
+
+
+def _trials(totals: pd.DataFrame) -> str:
+    counts = sorted(set(totals["trials"]))
+    return plain(counts[0]) if len(counts) == 1 else f"{plain(counts[0])} to {plain(counts[-1])}"
+
+
+def _missing(totals: pd.DataFrame) -> str:
+    """How many trials an estimator solved, where it did not solve all."""
+    lacking = totals[totals["solved_trials"] < totals["trials"]]
+    seen = [
+        f"{solved:.0f} of {trials} at scale {plain(scale)}"
+        for scale, solved, trials in zip(
+            lacking["error_scale"], lacking["solved_trials"], lacking["trials"], strict=True
+        )
+    ]
+    return common.enumerate_few(seen, 12) or f"all of {_trials(totals)}"
+
+
+def _at_scales(totals: pd.DataFrame, column: str) -> str:
+    pairs = zip(totals["error_scale"], totals[column], strict=True)
+    return "; ".join(f"{v:.3g} at scale {plain(s)}" for s, v in pairs if np.isfinite(v)) or "no scale"
+
+
+FIGURE = Figure(draw, ("summary", "by_group"), main=True)

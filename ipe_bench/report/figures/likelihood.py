@@ -22,7 +22,7 @@ def draw(found: Examination) -> Iterator[Drawing]:
         return
     with house_style():
         across = {1: 1, 2: 2, 3: 3, 4: 2}.get(len(bent), 3)
-        fig, axes = common.panels(len(bent), height=2.6, extra=0.4, most_across=across)
+        fig, axes = common.panels(len(bent), height=2.6, most_across=across)
         for i, ax in zip(bent, axes, strict=True):
             one, estimate, deviation = found.profiles[i], found.x[i], found.standard_errors[i]
             known = np.isfinite(one.zeta) & (np.abs(one.zeta) <= 2.5 * found.half_width)

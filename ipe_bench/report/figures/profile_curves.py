@@ -2,65 +2,58 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
-import numpy as np
 import pandas as pd
 
 from ipe_bench.report.figures import common
-from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.style import Look
+from ipe_bench.report.figures.drawing import Drawing, Figure
+from ipe_bench.report.figures.views import View
 from ipe_bench.report.words import percent
-from ipe_bench.statistics.analysis import Analysis
-from ipe_bench.statistics.profiles import BUDGETS, RATIOS
+
+PANELS = (
+    ("performance", "performance profile", "cost over the cheapest estimator's"),
+    ("data", "data profile", "simulations per trial"),
+)
 
 
-def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
-    performance, data = (_shares(analysis.profiles, profile) for profile in ("performance", "data"))
-    there = {label: one for label, one in look.items() if label in performance}
-    if len(there) < 2:
+def draw(view: View) -> Iterator[Drawing]:
+    profiles = view["profiles"]
+    look = view.with_look(profiles["estimator"])
+    if len(look) < 2:
         return
-    fig, axes = common.panels(2, height=3.2, extra=0.3 + 0.2 * len(there) / 5)
-    left, right = axes
-    for label, one in there.items():
-        style = one.line | {"drawstyle": "steps-post", "markersize": 4.5, "linewidth": 1.4}
-        offset = list(there).index(label) * 3
-        left.plot(RATIOS, performance[label], label=common.text(label), markevery=(offset, 45), **style)
-        right.plot(BUDGETS, data[label], label=common.text(label), markevery=(offset, 45), **style)
-    for ax, x, title in (
-        (left, "cost over the cheapest estimator's", "performance profile"),
-        (right, "simulations per trial", "data profile"),
-    ):
+    fig, axes = common.panels(2, look, height=3.2)
+    for (profile, title, heading), ax in zip(PANELS, axes, strict=True):
+        rows = profiles[profiles["profile"] == profile]
+        end = _end(rows)
+        rows = rows[rows["at"] <= end]
+        common.shares(ax, "")
+        every = max(2, rows["at"].nunique() // 5)
+        common.lines(ax, rows, "at", "share", look, every=every, drawstyle="steps-post")
         ax.set_xscale("log")
-        ax.set_ylim(-0.03, 1.03)
-        ax.yaxis.set_major_formatter(lambda v, _: f"{100 * v:.0f} %")
-        ax.set_xlabel(x)
-        ax.set_ylabel("share of trials with success")
-        ax.set_title(title)
-    left.set_xlim(1, _end(RATIOS, [performance[e] for e in there]))
-    right.set_xlim(1, _end(BUDGETS, [data[e] for e in there]))
-    for ax in axes:
-        common.log_ticks(ax.xaxis, *ax.get_xlim())
-    common.legend_below(fig, axes)
-    final = {label: float(data[label][-1]) for label in there}
-    first = {label: float(performance[label][0]) for label in there}
-    robust, cheap = max(final, key=lambda e: final[e]), max(first, key=lambda e: first[e])
-    caption = (
+        # A little before 1, so that markers at 1 are whole.
+        ax.set_xlim(0.93, end)
+        common.log_ticks(ax.xaxis, 1.0, end)
+        common.shares(ax, "share of trials with success")
+        ax.set(title=title, xlabel=heading)
+    common.legend_below(fig, axes, look)
+    first = profiles[profiles["profile"] == "performance"].groupby("estimator", sort=False)["share"].first()
+    final = profiles[profiles["profile"] == "data"].groupby("estimator", sort=False)["share"].last()
+    caption = common.sentence(
         "All trials of all scenarios. Left (Dolan and Moré): share of trials in which an estimator succeeds at a cost"
         " of at most the abscissa times that of the cheapest success. Right (Moré and Wild): share in which it succeeds"
-        " within that many simulations, a Jacobian counting as many as there are parameters."
-        f" {cheap} is the cheapest most often ({percent(first[cheap])}); {robust} succeeds most often"
-        f" ({percent(final[robust])})."
+        " within that many simulations, a Jacobian counting as many as there are parameters.",
+        f"{first.idxmax()} is the cheapest most often ({percent(first.max())}); {final.idxmax()} succeeds most often"
+        f" ({percent(final.max())}).",
     )
     yield Drawing("profiles", "Performance and data profiles", caption, fig)
 
 
-def _shares(profiles: pd.DataFrame, profile: str) -> dict[str, np.ndarray]:
-    part = profiles[profiles["profile"] == profile]
-    return {str(label): rows["share"].to_numpy() for label, rows in part.groupby("estimator", sort=False)}
-
-
-def _end(x: np.ndarray, curves: list[np.ndarray]) -> float:
+def _end(rows: pd.DataFrame) -> float:
     """A little behind the point from which on no curve rises."""
-    rising = [int(np.argmax(curve >= curve[-1])) for curve in curves]
-    return float(max(x[min(max(rising) + 12, len(x) - 1)], 4.0))
+    top = rows.groupby("estimator")["share"].transform("max")
+    arrived = rows[rows["share"] >= top].groupby("estimator")["at"].min()
+    return max(1.5 * float(arrived.max()), 4.0)
+
+
+FIGURE = Figure(draw, ("profiles",), together=True)

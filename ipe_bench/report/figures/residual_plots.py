@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -12,6 +13,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.real.fits import Fit
+from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, Look, house_style, looks
@@ -38,64 +40,61 @@ def draw_fits(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]:
 
 
 def _residuals(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look]) -> Iterator[Drawing]:
-    from matplotlib.ticker import MaxNLocator
-
     shown = [one for one in fits if np.isfinite(one.normalised).any()][:MOST_ESTIMATORS]
     if not shown:
         return
     x, heading = _abscissa(model)
-    across = 1 if len(shown) == 1 else 2 if len(shown) in (2, 4) else 3
-    fig, axes = common.panels(len(shown), height=2.6, extra=0.4, most_across=across)
+    fig, axes = common.panels(len(shown), height=2.6, most_across={2: 2, 4: 2}.get(len(shown), 3))
     for one, ax in zip(shown, axes, strict=True):
-        known, out, limit = np.isfinite(one.normalised), one.outliers, one.outlier_limit
-        style = look[one.label]
-        ax.axhline(0.0, color=BOUND_COLOR, linewidth=0.6, zorder=1)
-        for i, at in enumerate((limit, -limit)):
-            common.bound_line(ax, at, "" if i else "limit for outliers")
-        good = known & ~out
-        ax.plot(
-            x[good],
-            one.normalised[good],
-            linestyle="",
-            marker="o",
-            markersize=3,
-            alpha=0.75,
-            color=style.color,
-            rasterized=len(x) > _MANY,
-        )
-        if out.any():
-            ax.plot(x[out], one.normalised[out], linestyle="", marker="x", markersize=5, color=style.color)
-            ax.plot(
-                x[out],
-                one.normalised[out],
-                linestyle="",
-                marker="o",
-                markersize=10 if out.mean() < 0.1 else 5,
-                fillstyle="none",
-                color="#C00000",
-                label="outlier",
-            )
-        largest = float(np.abs(one.normalised[known]).max())
-        if largest > _BENT:
-            ax.set_yscale("symlog", linthresh=10.0, linscale=1.0)
-        else:
-            edge = 1.15 * max(largest, limit)
-            ax.set_ylim(-edge, edge)
-            ax.yaxis.set_major_locator(MaxNLocator(7, integer=True))
-        tests = f"fit p {p_value(one.p_value)}, white p {p_value(one.whiteness.p_value)}"
+        _residual_panel(ax, x, one, look[one.label].color)
+        tests = f"fit p {p_value(one.p_value)}, white p {p_value(one.whiteness.p_value, LEAST_P)}"
         ax.set_title(f"{common.text(one.label)}\n{tests}")
-        ax.set_xlabel(common.text(heading))
-        ax.set_ylabel("residual / its deviation")
+        ax.set(xlabel=common.text(heading), ylabel="residual / its deviation")
     common.legend_below(fig, axes)
     parts = [f"{one.label} {int(one.outliers.sum())}" for one in shown]
-    caption = (
+    caption = common.sentence(
         "Normalised residuals of the readings; each is standard normal where the model and the noise are right."
         f" Beyond ±{shown[0].outlier_limit:.2f} a reading is an outlier: {common.enumerate_few(parts, 12)}."
-        " p is that of chi-square, white that of the Ljung-Box test."
+        " p is that of chi-square, white that of the Ljung-Box test.",
+        f"{len(fits) - len(shown)} further estimators: see residuals.csv." if len(fits) > len(shown) else "",
     )
-    if len(fits) > len(shown):
-        caption += f" {len(fits) - len(shown)} further estimators: see residuals.csv."
     yield Drawing("residuals", "Residuals", caption, fig)
+
+
+def _residual_panel(ax: Any, x: Array, one: Fit, color: str) -> None:
+    import seaborn as sns
+    from matplotlib.ticker import MaxNLocator
+
+    known, out, limit = np.isfinite(one.normalised), one.outliers, one.outlier_limit
+    ax.axhline(0.0, color=BOUND_COLOR, linewidth=0.6, zorder=1)
+    common.bound_line(ax, limit, "limit for outliers")
+    common.bound_line(ax, -limit, "")
+    good = known & ~out
+    sns.scatterplot(
+        x=x[good],
+        y=one.normalised[good],
+        s=9,
+        alpha=0.75,
+        linewidth=0,
+        color=color,
+        legend=False,
+        ax=ax,
+        rasterized=len(x) > _MANY,
+    )
+    if out.any():
+        sns.scatterplot(
+            x=x[out], y=one.normalised[out], s=25, marker="x", linewidth=1.2, color=color, legend=False, ax=ax
+        )
+        ring = {"s": 100 if out.mean() < 0.1 else 25, "facecolor": "none", "edgecolor": "#C00000", "linewidth": 1.0}
+        sns.scatterplot(x=x[out], y=one.normalised[out], label="outlier", legend=False, ax=ax, **ring)
+    largest = float(np.abs(one.normalised[known]).max())
+    if largest > _BENT:
+        ax.set_yscale("symlog", linthresh=10.0, linscale=1.0)
+        ax.set_ylim(-1.6 * largest, 1.6 * largest)
+    else:
+        edge = 1.15 * max(largest, limit)
+        ax.set_ylim(-edge, edge)
+        ax.yaxis.set_major_locator(MaxNLocator(7, integer=True))
 
 
 def _abscissa(model: Measurement) -> tuple[Array, str]:
@@ -134,56 +133,54 @@ def ellipse(P: Array, level: float = LEVEL, points: int = 181, edge: float | Non
 
 
 def _ellipses(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look]) -> Iterator[Drawing]:
-    from matplotlib.ticker import MaxNLocator
-
     # Where an estimator did not converge, its covariance says nothing of the true values.
-    told = [f for f in fits if f.status is Status.CONVERGED and (f.standard_errors > 0).all()]
-    if not told or model.n < 2:
+    converged = [f for f in fits if f.status is Status.CONVERGED and (f.standard_errors > 0).all()]
+    if not converged or model.n < 2:
         return
-    best = min(told, key=lambda f: f.chi_square)
+    best = min(converged, key=lambda f: f.chi_square)
     pairs = most_correlated(best.correlation)
-    across = {1: 1, 2: 2, 3: 3, 4: 2}.get(len(pairs), 3)
-    fig, axes = common.panels(len(pairs), height=2.7, extra=0.5, most_across=across)
-    away: dict[str, None] = {}
-    # Equal ellipses lie on top of each other: the later ones are thinner, so that all are seen.
-    widths = np.linspace(4.0, 1.0, len(told)) if len(told) > 1 else [1.6]
-    for (i, j), ax in zip(pairs, axes, strict=True):
-        pick = np.ix_([i, j], [i, j])
-        centre, d = best.x[[i, j]], best.standard_errors[[i, j]]
-        near = []
-        for one, linewidth in zip(told, widths, strict=True):
-            offset = one.x[[i, j]] - centre
-            outline = offset + ellipse(one.covariance[pick], edge=one.region(2, LEVEL))
-            style = look[one.label]
-            ax.plot(
-                *outline.T, color=style.color, linestyle=style.dash, linewidth=linewidth, label=common.text(one.label)
-            )
-            ax.plot(*offset, color=style.color, marker=style.marker, markersize=5, markeredgecolor="white")
-            if (np.abs(offset) <= _NEAR * d).all():
-                near.append(outline)
-            else:
-                away[one.label] = None
-        edges = np.concatenate(near)
-        low, high = edges.min(axis=0), edges.max(axis=0)
-        margin = 0.08 * (high - low)
-        ax.set_xlim(low[0] - margin[0], high[0] + margin[0])
-        ax.set_ylim(low[1] - margin[1], high[1] + margin[1])
-        ax.xaxis.set_major_locator(MaxNLocator(4))
-        ax.yaxis.set_major_locator(MaxNLocator(5))
-        ax.ticklabel_format(style="sci", scilimits=(-3, 4), useMathText=True)
-        for set_label, k in ((ax.set_xlabel, i), (ax.set_ylabel, j)):
+    fig, axes = common.panels(len(pairs), look, most_across={4: 2}.get(len(pairs), 3))
+    seen: set[str] = set()
+    away: set[str] = set()
+    for pair, ax in zip(pairs, axes, strict=True):
+        near = _ellipse_panel(ax, list(pair), best, converged, look)
+        seen |= near
+        away |= {f.label for f in converged} - near
+        for set_label, k in zip((ax.set_xlabel, ax.set_ylabel), pair, strict=True):
             parameter = model.natural_parameters[k]
             unit = f" [{parameter.unit}]" if parameter.unit else ""
             sign = "+" if best.x[k] < 0 else "−"
             set_label(common.text(f"{parameter.name} {sign} {abs(best.x[k]):.5g}{unit}"))
-        ax.set_title(f"correlation {best.correlation[i, j]:.3f}")
-    common.legend_below(fig, axes)
+        ax.set_title(f"correlation {best.correlation[pair]:.3f}".replace("-", "−"))
+    common.legend_below(fig, axes, {label: one for label, one in look.items() if label in seen})
     count = model.n * (model.n - 1) // 2
     which = f"the {len(pairs)} most correlated of {count} pairs" if count > len(pairs) else "each pair of parameters"
-    caption = (
+    out_of_view = common.enumerate_few([label for label in look if label in away])
+    caption = common.sentence(
         f"Regions that hold the true values with {LEVEL:.0%} probability if the model and the noise are right, for"
-        f" {which}, about the estimates of {best.label}."
+        f" {which}, about the estimates of {best.label}. Equal ones are drawn narrower upon each other.",
+        f"Out of view in some panels: {out_of_view}." if away else "",
     )
-    if away:
-        caption += f" Out of view in some panels: {common.enumerate_few(list(away))}."
     yield Drawing("ellipses", "Covariance ellipses", caption, fig)
+
+
+def _ellipse_panel(ax: Any, pair: list[int], best: Fit, fits: Sequence[Fit], look: Mapping[str, Look]) -> set[str]:
+    """Draws the ellipses of two parameters whose centres are near the best fit's; returns whose they are."""
+    from matplotlib.ticker import MaxNLocator
+
+    offsets = {one.label: one.x[pair] - best.x[pair] for one in fits}
+    near = [f for f in fits if (np.abs(offsets[f.label]) <= _NEAR * best.standard_errors[pair]).all()]
+    outlines = []
+    for one, linewidth in zip(near, np.linspace(4.0 if len(near) > 1 else 1.6, 1.0, len(near)), strict=True):
+        outlines.append(offsets[one.label] + ellipse(one.covariance[np.ix_(pair, pair)], edge=one.region(2, LEVEL)))
+        style = look[one.label]
+        ax.plot(*outlines[-1].T, color=style.color, linestyle=style.linestyle, linewidth=linewidth)
+        ax.plot(*offsets[one.label], color=style.color, marker=style.marker, markersize=5, markeredgecolor="white")
+    edges = np.concatenate(outlines)
+    low, high = edges.min(axis=0), edges.max(axis=0)
+    margin = 0.08 * (high - low)
+    ax.set(xlim=(low[0] - margin[0], high[0] + margin[0]), ylim=(low[1] - margin[1], high[1] + margin[1]))
+    ax.xaxis.set_major_locator(MaxNLocator(4))
+    ax.yaxis.set_major_locator(MaxNLocator(5))
+    ax.ticklabel_format(style="sci", scilimits=(-3, 4), useMathText=True)
+    return {one.label for one in near}

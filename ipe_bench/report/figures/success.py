@@ -2,45 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 from ipe_bench.report.figures import common
-from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.style import Look
-from ipe_bench.report.words import percent
-from ipe_bench.statistics.analysis import Analysis
-from ipe_bench.statistics.summary import ALL
+from ipe_bench.report.figures.drawing import Drawing, Figure
+from ipe_bench.report.figures.views import View
+from ipe_bench.report.words import percent, plain
 
 
-def draw(analysis: Analysis, look: Mapping[str, Look]) -> Iterator[Drawing]:
-    rows = analysis.summary[analysis.summary["parameter"] == ALL] if len(analysis.summary) else analysis.summary
-    for setting in common.settings(rows, analysis.setting_columns):
-        there = {label: one for label, one in look.items() if label in set(setting.rows["estimator"])}
-        fig, axes = common.panels(2, height=3.0, extra=0.3 + 0.2 * len(there) / 5)
-        for ax, column, title in zip(
-            axes, ("success", "solved"), ("success: inside the gate", "solved: the right root"), strict=True
-        ):
-            for label, mine in common.by_estimator(setting.rows, there):
-                if column == "solved" and label not in analysis.with_equation:
-                    continue
-                x = mine["error_scale"] * common.dodge(there, label, setting.scales)
-                if column == "success":
-                    low, high = mine["success_low"], mine["success_high"]
-                else:
-                    low = high = mine["solved"]
-                common.curve(ax, x, mine[column], low, high, there[label], label)
-            common.scale_axis(ax, setting.scales)
-            ax.set_ylim(-0.03, 1.03)
-            ax.yaxis.set_major_formatter(lambda v, _: f"{100 * v:.0f} %")
-            ax.set_ylabel("share of all trials")
-            ax.set_title(title)
-        common.legend_below(fig, axes)
-        top = setting.rows[setting.rows["error_scale"] == max(setting.scales)].sort_values("success", ascending=False)
-        seen = [f"{e} {percent(v)}" for e, v in zip(top["estimator"], top["success"], strict=True)]
-        caption = (
-            "Left: share of trials whose error lies inside the chi-square gate of the bound's ellipsoid, with"
-            " Clopper-Pearson 95 % intervals. Right: share that ended at the root belonging to the truth, of those that"
-            " solve an equation. At scale"
-            f" {common.plain(max(setting.scales))} succeed: {common.enumerate_few(seen, 20)}. {setting.label}."
-        )
-        yield Drawing(f"success_against_scale{setting.suffix}", "Success against error scale", caption, fig)
+def draw(view: View) -> Iterator[Drawing]:
+    totals = view.totals
+    if totals.empty:
+        return
+    look = view.with_look(totals["estimator"])
+    rooted = {label: one for label, one in look.items() if view.equations[label] is not None}
+    fig, axes = common.panels(2 if rooted else 1, look, height=3.0)
+    for ax, column, title, seen in zip(
+        axes,
+        ("success", "solved"),
+        ("success: inside the gate", "solved: the right root"),
+        (look, rooted),
+        strict=False,
+    ):
+        common.shares(ax, "share of all trials")
+        interval = ("success_low", "success_high") if column == "success" else None
+        common.curves(ax, totals, column, seen, view.scales, interval=interval, trials="trials")
+        common.shares(ax, "share of all trials")
+        ax.set_title(title)
+    common.legend_below(fig, axes, look)
+    top = common.at_scale(totals, view.scales[-1]).sort_values("success", ascending=False, kind="stable")
+    ranked = [f"{e} {percent(v)}" for e, v in zip(top["estimator"], top["success"], strict=True)]
+    caption = common.sentence(
+        "Left: share of trials whose error lies inside the chi-square gate of the bound's ellipsoid, with"
+        " Clopper-Pearson 95 % intervals.",
+        "Right: share that ended at the root belonging to the truth, of those that solve an equation."
+        if rooted
+        else "",
+        common.UPON,
+        f"At scale {plain(view.scales[-1])} succeed: {common.enumerate_few(ranked, 20)}. {view.label}.",
+    )
+    title = "Success against error scale" if len(view.scales) > 1 else f"Success at error scale {plain(view.scales[0])}"
+    yield Drawing(f"success_against_scale{view.suffix}", title, caption, fig)
+
+
+FIGURE = Figure(draw, ("summary",), main=True)

@@ -6,10 +6,13 @@ import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
+
+from annotated_types import Gt, Lt, doc
 
 from ipe_bench.basics.errors import StorageError, UserError, describe_exception
 from ipe_bench.basics.naming import Named
+from ipe_bench.basics.options import Component
 
 
 class Task(Protocol):
@@ -26,6 +29,8 @@ Work = Callable[[Any], Iterable[Any]]
 
 _LONGEST = 1e9
 """Seconds, and 1e9 bytes, beyond which no limit is meant: thirty years, and more memory than there is."""
+Limit = Annotated[float, Gt(0), Lt(_LONGEST), doc(f"a number above 0 and below {_LONGEST:g}")]
+"""Of time or memory."""
 
 FATAL = (UserError, StorageError)
 """Exceptions that concern the whole run: they end it, where any other is a failure of one task."""
@@ -57,7 +62,7 @@ class Event:
     failure: Failure | None = None
 
 
-class Execution(Named, ABC):
+class Execution(Component, Named, ABC):
     """Where tasks run. A new execution is a frozen dataclass that writes `run`."""
 
     @abstractmethod
@@ -69,16 +74,3 @@ class Execution(Named, ABC):
 
     def warm_up(self, work: Work, tasks: int) -> None:
         """Starts what takes time to start before so many tasks can run, without waiting for it. May be left out."""
-
-
-def check_limits(workers: int | None, block_timeout_s: float | None, memory_limit_gb: float | None) -> None:
-    """Refuses limits that make no sense.
-
-    Raises:
-        UserError: naming the option.
-    """
-    if workers is not None and workers < 1:
-        raise UserError(f"workers={workers}: give a whole number above 0, or null")
-    for option, value in (("block_timeout_s", block_timeout_s), ("memory_limit_gb", memory_limit_gb)):
-        if value is not None and not 0 < value < _LONGEST:
-            raise UserError(f"{option}={value}: give a number above 0 and below {_LONGEST:g}, or null for no limit")

@@ -13,7 +13,8 @@ from typing import Any
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.machine import cores
-from ipe_bench.runs.execution.base import FATAL, Event, Execution, Failure, Task, Work, check_limits
+from ipe_bench.basics.options import Count
+from ipe_bench.runs.execution.base import FATAL, Event, Execution, Failure, Limit, Task, Work
 from ipe_bench.runs.execution.processes import supervise
 
 _CONNECT_S = 30
@@ -28,7 +29,7 @@ class Dask(Execution):
     reaches Dask. A task whose Dask worker dies is given to another one by Dask itself.
     """
 
-    workers: int | None = None
+    workers: Count | None = None
     """Workers to start; None: one per core here, one job in a batch system."""
     address: str | None = None
     """A running scheduler, such as tcp://10.0.0.1:8786, to use in place of starting one."""
@@ -36,13 +37,13 @@ class Dask(Execution):
     """A cluster class of dask-jobqueue, such as SLURMCluster, to start workers as jobs of a batch system."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Keyword arguments of the cluster class."""
-    block_timeout_s: float | None = None
+    block_timeout_s: Limit | None = None
     """Seconds that one estimator may take for one block; None: no limit."""
-    memory_limit_gb: float | None = None
+    memory_limit_gb: Limit | None = None
     """Memory that one estimating process may use, in 1e9 bytes; None: no limit."""
 
     def __post_init__(self) -> None:
-        check_limits(self.workers, self.block_timeout_s, self.memory_limit_gb)
+        super().__post_init__()
         if self.address is not None and (self.jobqueue is not None or self.workers is not None or self.options):
             raise UserError(f"address={self.address}: goes with no workers, jobqueue or options; leave out either")
 

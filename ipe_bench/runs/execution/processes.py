@@ -30,7 +30,8 @@ import cloudpickle
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.machine import cores
-from ipe_bench.runs.execution.base import Event, Execution, Failure, Task, Work, check_limits
+from ipe_bench.basics.options import Count
+from ipe_bench.runs.execution.base import Event, Execution, Failure, Limit, Task, Work
 
 _THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
@@ -52,15 +53,15 @@ class Processes(Execution):
     compiled models get several threads.
     """
 
-    workers: int | None = None
+    workers: Count | None = None
     """How many processes; None: one per core."""
-    block_timeout_s: float | None = None
+    block_timeout_s: Limit | None = None
     """Seconds that one estimator may take for one block; None: no limit."""
-    memory_limit_gb: float | None = None
+    memory_limit_gb: Limit | None = None
     """Memory that one worker may use, in 1e9 bytes; None: no limit. Linux only; see `worker.enforce`."""
 
     def __post_init__(self) -> None:
-        check_limits(self.workers, self.block_timeout_s, self.memory_limit_gb)
+        super().__post_init__()
         if self.memory_limit_gb is not None and not sys.platform.startswith("linux"):
             raise UserError(f"memory_limit_gb={self.memory_limit_gb}: can be enforced on Linux only; give null")
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Annotated
 
-from ipe_bench.basics.errors import UserError
+from annotated_types import Gt, Lt
+
+from ipe_bench.basics.options import Count
 from ipe_bench.solvers import IPE, State, System
 
 
@@ -16,12 +19,8 @@ class RelaxedFixedPoint(IPE):
     1 - w + w g (Burden and Faires, Numerical Analysis, section 7.4, for the linear case).
     """
 
-    relaxation: float = 0.7
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 0 < self.relaxation < 2:
-            raise UserError(f"relaxation={self.relaxation}: give a number between 0 and 2")
+    relaxation: Annotated[float, Gt(0), Lt(2)] = 0.7
+    max_iterations: Count = field(default=200, kw_only=True)
 
     def step(self, system: System, state: State) -> State:
         x = state.x - self.relaxation * state.F

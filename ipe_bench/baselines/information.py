@@ -1,0 +1,189 @@
+"""Filters whose algebra is ours: all trials at once, in square-root information form, epoch by epoch.
+
+The covariance is kept as a square root U of P^-1 = U'U, which a QR decomposition updates (Bierman, Factorization
+Methods for Discrete Sequential Estimation, 1977, ch. V): no S to invert and no P - K S K' to cancel, however wide the
+prior is beside the noise. What a filter makes of an epoch's readings is left to its own page.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.baselines.ensemble import read_members
+from ipe_bench.baselines.epochs import Epoch, arrivals
+from ipe_bench.basics.batches import put, take
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array, Mask, finite, inverse, multiply
+from ipe_bench.basics.options import Positive
+from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.base import Estimates, Estimator, Need
+from ipe_bench.estimators.least_squares import squared
+from ipe_bench.measurements.counted import Counted, Tally
+from ipe_bench.measurements.problem import Problem
+
+
+@dataclass(frozen=True)
+class Belief:
+    """N(mean, (U'U)^-1) for each trial, in prior deviations from the nominal point."""
+
+    mean: Array
+    """(trials, n)."""
+    U: Array
+    """(trials, n, n): any square root of the information."""
+
+    @property
+    def usable(self) -> Mask:
+        """Where the numbers are finite (trials,)."""
+        return finite(self.mean) & finite(self.U)
+
+    def root(self) -> Array:
+        """U^-1 (trials, n, n), so that P is it times its transpose; NaN where U is singular."""
+        return inverse(self.U)[0]
+
+    def given(self, J: Array, r: Array, at: Array) -> tuple[Belief, Array]:
+        """What is believed after readings of unit variance, linear in x: h(at) - z is r (trials, m), dh/dx is J.
+
+        Returns it with the squared innovations y' S^-1 y (trials,): chi-square with m degrees where the belief was
+        right (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4).
+        """
+        # The step s = x - at that minimises |U (s + at - mean)|^2 + |J s + r|^2.
+        rows = np.concatenate([self.U, J], axis=1)
+        wanted = -np.concatenate([multiply(self.U, at - self.mean), r], axis=1)
+        Q, U = np.linalg.qr(rows)
+        fitted = multiply(Q.swapaxes(1, 2), wanted)
+        step = multiply(inverse(U)[0], fitted)
+        return Belief(at + step, U), squared(wanted) - squared(fitted)
+
+
+@dataclass(frozen=True)
+class EpochReadings:
+    """The whitened readings z (trials, m) of an epoch, for the trials `rows`, and what was believed before them.
+
+    x is in prior deviations from the nominal point.
+    """
+
+    epoch: Epoch
+    problem: Problem
+    deviation: Array
+    """Of the scenario's prior (n,), in multiples of the parameters' units."""
+    tally: Tally
+    z: Array
+    rows: NDArray[np.intp]
+    belief: Belief
+
+    @property
+    def model(self) -> Counted:
+        return self.epoch.counted(self.tally)
+
+    def misfit(self, x: Array) -> Array:
+        """h(x) - z (trials, m), whitened."""
+        return self.epoch.R.whiten(self.model.simulate(self.physical(x), self.rows)) - self.z
+
+    def slope(self, x: Array) -> Array:
+        """dh/dx (trials, m, n), whitened."""
+        return self.epoch.R.whiten_jacobian(self.model.jacobian(self.physical(x), self.rows)) * self.deviation
+
+    def misfits(self, points: Array) -> Array:
+        """h - z (trials, points, m) at points (trials, points, n), whitened."""
+        return read_members(self.model, self.epoch.R, self.physical(points), self.rows) - self.z[:, None]
+
+    def subset(self, kept: NDArray[np.bool_]) -> EpochReadings:
+        return replace(self, z=self.z[kept], rows=self.rows[kept], belief=take(self.belief, kept))
+
+    def physical(self, x: Array) -> Array:
+        """In multiples of the parameters' units."""
+        return self.problem.x0 + x * self.deviation
+
+
+@dataclass(frozen=True)
+class InformationFilter(Estimator):
+    """What the filters of this room have in common: the prior, the epochs, failures and the report.
+
+    Reports its P, and as `extras["nis"]` the trial's squared innovations over their number: 1 on average where the
+    filter is consistent.
+    """
+
+    prior_inflation: Positive = 1.0
+    """The filter's prior deviations over the scenario's: in life a prior is never exact."""
+
+    needs: ClassVar[frozenset[Need]] = frozenset({"epochs", "prior"})
+
+    @abstractmethod
+    def update(self, readings: EpochReadings) -> tuple[Belief, Array]:
+        """What is believed after an epoch's readings, and the squared innovations (trials,) of the prediction."""
+
+    def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
+        for need in self.missing(problem):
+            raise UserError(f"measurement={problem.measurement.name}: has no {need}, which a filter needs")
+        with np.errstate(all="ignore"):
+            return _Pass(self, problem, z).estimates(history=history)
+
+
+class _Pass:
+    """One batch on its way through the epochs."""
+
+    def __init__(self, filter: InformationFilter, problem: Problem, z: Array) -> None:
+        self.filter, self.problem, self.z = filter, problem, z
+        trials, n = len(z), problem.measurement.n
+        deviation = problem.prior_used()
+        assert deviation is not None
+        self.deviation = deviation
+        self.tally = Tally.zeros(trials)
+        U0 = np.eye(n) / filter.prior_inflation
+        self.belief = Belief(np.zeros((trials, n)), np.repeat(U0[None], trials, axis=0))
+        self.nis = np.zeros(trials)
+        self.status = np.where(finite(z), Status.RUNNING, Status.NONFINITE).astype(np.int8)
+        self.messages = {int(i): "a reading is not a finite number" for i in np.flatnonzero(~finite(z))}
+        self.epochs = np.zeros(trials, np.int64)
+        self.path = [self.belief.mean]
+
+    def estimates(self, *, history: bool) -> Estimates:
+        for epoch in arrivals(self.problem):
+            rows = np.flatnonzero(self.status == Status.RUNNING)
+            if len(rows):
+                self.take_in(epoch, rows)
+        self.status[self.status == Status.RUNNING] = Status.CONVERGED
+        return self.report(history=history)
+
+    def take_in(self, epoch: Epoch, rows: NDArray[np.intp]) -> None:
+        """One epoch for the trials `rows`; those that fail keep what they believed before it."""
+        belief = take(self.belief, rows)
+        z = epoch.whitened(self.z[rows])
+        readings = EpochReadings(epoch, self.problem, self.deviation, self.tally, z, rows, belief)
+        after, nis = self.filter.update(readings)
+        raised, singular = self.tally.failed(rows), ~finite(after.root()) & after.usable
+        good = after.usable & np.isfinite(nis) & ~raised & ~singular
+        self.belief = put(self.belief, rows[good], take(after, good))
+        self.nis[rows[good]] += nis[good]
+        self.epochs[rows[good]] += 1
+        self.path.append(self.belief.mean)
+        lost = f"the model or the filter overflowed at epoch {epoch.number}"
+        self.end(rows[~good & ~raised & ~singular], Status.NONFINITE, lost)
+        self.end(rows[singular & ~raised], Status.SINGULAR, f"the information became singular at epoch {epoch.number}")
+        self.status[rows[raised]] = Status.ERROR
+
+    def end(self, rows: NDArray[np.intp], status: Status, message: str) -> None:
+        self.status[rows] = status
+        self.messages |= {int(i): message for i in rows}
+
+    def report(self, *, history: bool) -> Estimates:
+        finished = self.status == Status.CONVERGED
+        S = self.belief.root() * self.deviation[:, None]
+        P = np.where(finished[:, None, None], np.matmul(S, S.swapaxes(1, 2)), np.nan)
+        path = self.problem.x0 + np.array(self.path) * self.deviation
+        return Estimates(
+            x=path[-1],
+            status=self.status,
+            covariance=P,
+            iterations=self.epochs,
+            simulations=self.tally.simulations,
+            jacobians=self.tally.jacobians,
+            messages=self.messages | self.tally.messages,
+            history=[path[: count + 1, i] for i, count in enumerate(self.epochs)] if history else None,
+            extras={"nis": np.where(finished, self.nis / self.z.shape[1], np.nan)},
+        )

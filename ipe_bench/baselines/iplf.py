@@ -1,0 +1,176 @@
+"""The damped iterated posterior linearisation filter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ipe_bench.baselines.information import Belief, EpochReadings, InformationFilter
+from ipe_bench.basics.batches import put, take
+from ipe_bench.basics.linalg import Array, Mask, finite, multiply
+from ipe_bench.basics.options import Count, Positive
+from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.driver import Solver, Standing, iterate
+from ipe_bench.estimators.least_squares import squared
+
+_SHORTEST = 2.0**-10
+"""A share of a step below which no shorter one is tried: the covariance is brought up to date instead."""
+
+
+@dataclass(frozen=True)
+class IPLF(InformationFilter):
+    """Readings linearised by regression over the posterior itself, again and again (García-Fernández, Svensson,
+    Morelande, Särkkä, IEEE TSP 63(20), 2015), the mean damped as in Raitoharju, Svensson, García-Fernández and Piché
+    (IEEE SPL 25(4), 2018; arXiv 1704.01113).
+
+    At 2n cubature points of the posterior so far, h is about A x + b with an error of covariance Omega; that affine
+    model, of noise R + Omega, updates the prior. While the posterior is wide Omega is large and the readings say
+    little, so it narrows by degrees. The inner loop moves the mean at a fixed posterior covariance and Omega, by
+    Gauss-Newton steps halved until the misfit decreases; the outer loop brings the covariance and Omega up to date.
+    """
+
+    max_iterations: Count = 30
+    """Regressions per epoch; an epoch that has not settled by then goes on from where it is."""
+    inner_iterations: Count = 3
+    """Regressions between two covariances."""
+    tolerance: Positive = 1e-2
+    """Largest change, in deviations of the updated P and in share of them, at which an epoch is done."""
+
+    def update(self, readings: EpochReadings) -> tuple[Belief, Array]:
+        prior = readings.belief
+        method = PosteriorLinearization(self.inner_iterations, self.tolerance)
+        start = method.begin(readings, prior.mean)
+        ended = iterate(readings, method, start, tolerance=self.tolerance, max_iterations=self.max_iterations)
+        lost = (ended.status == Status.NONFINITE)[:, None]
+        belief = ended.state.proposal
+        return replace(belief, mean=np.where(lost, np.nan, belief.mean)), start.innovations
+
+
+@dataclass(frozen=True)
+class Affine:
+    """h(x) - z is about r + A (x - x0) with an error of covariance Omega, over N(x0, (U'U)^-1)."""
+
+    r: Array
+    """(trials, m)."""
+    A: Array
+    """(trials, m, n)."""
+    Omega: Array
+    """(trials, m, m)."""
+
+    @classmethod
+    def over(cls, readings: EpochReadings, x: Array, U: Array) -> Affine:
+        """By regression over 2n cubature points."""
+        n = x.shape[1]
+        S = np.sqrt(n) * Belief(x, U).root().swapaxes(1, 2)
+        d = readings.misfits(np.concatenate([x[:, None] + S, x[:, None] - S], axis=1))
+        r = d.mean(axis=1)
+        spread = d - r[:, None]
+        # A U^-1, since the points are U^-1 times sqrt(n) unit vectors.
+        B = (d[:, :n] - d[:, n:]).swapaxes(1, 2) / (2.0 * np.sqrt(n))
+        Omega = np.matmul(spread.swapaxes(1, 2), spread) / (2 * n) - np.matmul(B, B.swapaxes(1, 2))
+        return cls(r, np.matmul(B, U), Omega)
+
+
+@dataclass(frozen=True)
+class Linearized:
+    """Where an epoch stands; every field has the trials in front."""
+
+    x: Array
+    U: Array
+    """Of the covariance over which the readings are linearised."""
+    affine: Affine
+    W: Array
+    """(R + Omega)^-1/2 (trials, m, m)."""
+    cost: Array
+    """|W r|^2 + |U0 (x - x0)|^2 (trials,)."""
+    proposal: Belief
+    """The posterior by the present linearisation."""
+    innovations: Array
+    share: Array
+    """Of the step to the proposal's mean that is tried next."""
+    inner: Array
+    """Regressions since the covariance was brought up to date."""
+    change: Array
+    """What that changed, in deviations and in share of them; infinite before."""
+
+
+@dataclass(frozen=True)
+class PosteriorLinearization(Solver[Linearized]):
+    """The two loops of the damped filter for one epoch."""
+
+    inner_iterations: int
+    tolerance: float
+
+    def begin(self, readings: EpochReadings, x: Array) -> Linearized:
+        far = np.full(len(x), np.inf)
+        return _linearized(readings, x, readings.belief.U, far)
+
+    def step(self, readings: EpochReadings, state: Linearized) -> Linearized:
+        """One regression at the point that the last step proposes, and another where the covariance is renewed."""
+        x = state.x + state.share[:, None] * (state.proposal.mean - state.x)
+        affine = Affine.over(readings, x, state.U)
+        cost = _cost(readings, state.W, affine, x)
+        taken = cost < state.cost
+        state = replace(
+            state,
+            x=np.where(taken[:, None], x, state.x),
+            affine=put(state.affine, taken, take(affine, taken)),
+            cost=np.where(taken, cost, state.cost),
+            share=np.where(taken, 1.0, state.share / 2),
+            inner=state.inner + 1,
+        )
+        proposal, _ = _posterior(readings, state.W, state.affine, state.x)
+        state = replace(state, proposal=proposal)
+        to_go = _moved(proposal, state.x)
+        settled = (state.inner >= self.inner_iterations) & taken
+        settled |= (to_go <= self.tolerance) | (state.share < _SHORTEST)
+        if settled.any():
+            part = take(state, settled)
+            change = np.fmax(to_go[settled], _narrowed(part.U, part.proposal.U))
+            renewed = _linearized(readings.subset(settled), part.x, part.proposal.U, change)
+            state = put(state, settled, replace(renewed, innovations=part.innovations))
+        return state
+
+    def standing(self, readings: EpochReadings, before: Linearized | None, state: Linearized) -> Standing:
+        """Done where bringing the covariance up to date has changed neither it nor the mean."""
+        level = np.where(np.isfinite(state.cost) & state.proposal.usable, 1.0, np.nan)
+        return Standing(state.change, level, np.full(len(state.x), np.inf))
+
+
+def _linearized(readings: EpochReadings, x: Array, U: Array, change: Array) -> Linearized:
+    """The state at x once the readings are linearised over N(x, (U'U)^-1)."""
+    affine = Affine.over(readings, x, U)
+    W = _whitener(affine.Omega)
+    proposal, innovations = _posterior(readings, W, affine, x)
+    cost = _cost(readings, W, affine, x)
+    return Linearized(x, U, affine, W, cost, proposal, innovations, np.ones(len(x)), np.zeros(len(x)), change)
+
+
+def _posterior(readings: EpochReadings, W: Array, affine: Affine, x: Array) -> tuple[Belief, Array]:
+    return readings.belief.given(np.matmul(W, affine.A), multiply(W, affine.r), x)
+
+
+def _cost(readings: EpochReadings, W: Array, affine: Affine, x: Array) -> Array:
+    prior = readings.belief
+    return squared(multiply(W, affine.r)) + squared(multiply(prior.U, x - prior.mean))
+
+
+def _moved(belief: Belief, x: Array) -> Array:
+    """The largest distance (trials,) between x and the mean in deviations."""
+    return np.abs((belief.mean - x) / np.linalg.norm(belief.root(), axis=2)).max(axis=1)
+
+
+def _narrowed(U: Array, new: Array) -> Array:
+    """The largest relative change (trials,) of a deviation."""
+    old, new = (np.linalg.norm(Belief(u[:, 0], u).root(), axis=2) for u in (U, new))
+    return np.abs(new / old - 1.0).max(axis=1)
+
+
+def _whitener(Omega: Array) -> Array:
+    """(I + Omega)^-1/2 (trials, m, m), where rounding has left Omega an eigenvalue below zero as if it were zero."""
+    usable: Mask = finite(Omega)
+    Omega = np.where(usable[:, None, None], Omega, 0.0)
+    values, vectors = np.linalg.eigh((Omega + Omega.swapaxes(1, 2)) / 2)
+    scale = np.where(usable[:, None], 1.0 / np.sqrt(1.0 + np.maximum(values, 0.0)), np.nan)
+    return scale[:, :, None] * vectors.swapaxes(1, 2)

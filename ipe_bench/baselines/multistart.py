@@ -1,0 +1,129 @@
+"""Levenberg-Marquardt from many starts: the plainest way to look for a global minimum, and to see whether it is one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+from annotated_types import Ge, Lt
+from numpy.typing import NDArray
+
+from ipe_bench.basics.batches import put, take
+from ipe_bench.basics.linalg import Array, Mask, deviations, finite
+from ipe_bench.basics.options import Count, Positive, Whole
+from ipe_bench.basics.streams import normals, own_generators
+from ipe_bench.estimators.base import Estimates, Estimator
+from ipe_bench.estimators.least_squares import Minima, Objective, minimize
+from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
+from ipe_bench.measurements.counted import Tally
+from ipe_bench.measurements.problem import Problem
+
+_APART = 0.1
+"""Two minima further apart than this, in standard deviations of the local bound, are two."""
+
+
+@dataclass(frozen=True)
+class Multistart(Estimator):
+    """Levenberg-Marquardt from the nominal point, then from draws of the prior, until the residuals pass the
+    chi-square test; of all minima the lowest counts (Boender and Rinnooy Kan, Mathematical Programming 37, 1987,
+    on when such a search may stop).
+
+    After the first fit `confirmations` further starts look for another minimum that fits. Extras: `minima`, how many
+    distinct minima that fit were found, and `ambiguous`, 1 where there are several: then no residual can tell which is
+    the truth, and `alternatives` lists the others. That none was found is no proof that there is none.
+
+    Damping is in the metric of the prior. Where none is known it is in Marquardt's, and the starts are spread by the
+    size of the nominal point, or by 1 where that is zero.
+    """
+
+    starts: Count = 8
+    confirmations: Whole = 2
+    """Starts after the first fit, within `starts`."""
+    damping: Positive = 1e-3
+    """lambda at each start."""
+    max_iterations: Count = 100
+    """Steps tried from each start."""
+    tolerance: Positive = 1e-6
+    """Largest Gauss-Newton step in standard deviations of the local bound."""
+    fit_level: Annotated[float, Ge(0), Lt(1)] = 1e-6
+    """Residuals less probable than this are taken for those of a wrong minimum."""
+    seed: Whole = 0
+    """A trial's random stream depends on this and on its readings: on nothing else in the batch."""
+    budget: Positive | None = None
+    """Simulations that a trial may cost, a Jacobian counting n; None: no limit."""
+
+    equation = "least_squares"
+
+    def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
+        objective = Objective.of(problem, z, prior=False)
+        tally, x0, trials = objective.model.tally, problem.x0, len(z)
+        draws = normals(own_generators(self.seed, z), self.starts - 1, len(x0))
+        fitting: list[list[Array]] = [[] for _ in range(trials)]
+        best = self._descend(objective, problem, np.repeat(x0[None], trials, axis=0), history)
+        fits = self._note(best, np.arange(trials), fitting, z.shape[1])
+        confirmed = np.where(fits, 0, -1)
+        for k in range(self.starts - 1):
+            affordable = tally.cost(len(x0)) < (np.inf if self.budget is None else self.budget)
+            hopeless = ~finite(z) | tally.failed(np.arange(trials))
+            rows = np.flatnonzero((confirmed < self.confirmations) & affordable & ~hopeless)
+            if not len(rows):
+                break
+            x = x0 + _spread(problem) * draws[rows, k]
+            again = self._descend(objective.subset(rows), problem, x, history)
+            fits = self._note(again, rows, fitting, z.shape[1])
+            confirmed[rows] += (confirmed[rows] >= 0) | fits
+            better = _is_better(again, take(best, rows))
+            spent = best.iterations.copy()
+            spent[rows] += again.iterations
+            best = replace(put(best, rows[better], take(again, better)), iterations=spent)
+        return self._report(best, tally, fitting, z.shape[1])
+
+    def _descend(self, objective: Objective, problem: Problem, x: Array, history: bool) -> Minima:
+        return minimize(
+            objective,
+            LevenbergMarquardtMethod(self.damping, problem.prior_used()),
+            x,
+            tolerance=self.tolerance,
+            max_iterations=self.max_iterations,
+            budget=self.budget,
+            history=history,
+        )
+
+    def _note(self, found: Minima, rows: NDArray[np.intp], fitting: list[list[Array]], readings: int) -> Mask:
+        """Adds minima that fit and were not known to `fitting`; which of the trials `rows` found one that fits."""
+        fits: Mask = found.converged & (found.fit_probability(readings) >= self.fit_level)
+        deviation = deviations(found.covariance)
+        for i in np.flatnonzero(fits):
+            known = fitting[rows[i]]
+            if all(_apart(x, found.x[i], deviation[i]) for x in known):
+                known.append(found.x[i])
+        return fits
+
+    def _report(self, best: Minima, tally: Tally, fitting: list[list[Array]], readings: int) -> Estimates:
+        estimates = best.estimates(tally, readings)
+        minima = np.array([len(known) for known in fitting], dtype=float)
+        estimates.extras |= {"minima": minima, "ambiguous": (minima > 1).astype(float)}
+        deviation = deviations(best.covariance)
+        estimates.alternatives = [
+            np.array([other for other in known if _apart(other, x, d)]).reshape(-1, len(x))
+            for known, x, d in zip(fitting, best.x, deviation, strict=True)
+        ]
+        return estimates
+
+
+def _spread(problem: Problem) -> Array:
+    """Standard deviations (n,) of the starts."""
+    if problem.prior_deviation is not None:
+        return problem.prior_deviation
+    return np.where(problem.x0 == 0, 1.0, np.abs(problem.x0))
+
+
+def _is_better(new: Minima, old: Minima) -> Mask:
+    """Where a new minimum counts rather than the old one: it converged and is lower, or the old one had no end."""
+    return new.converged & (~(new.chi_square >= old.chi_square) | ~old.converged)
+
+
+def _apart(a: Array, b: Array, deviation: Array) -> bool:
+    """Whether two minima (n,) are two."""
+    return bool((np.abs(a - b) / deviation).max() > _APART)

@@ -1,0 +1,224 @@
+"""What the options of a component may be: a constraint stands in the field's type, and `Component` reads it.
+
+Types that options share have a name here; a constraint of one option stands in its class, as
+`Annotated[float, Gt(1)]` with the words of annotated-types. Where in a config an option stands is left to
+`plugins.construct`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import numbers
+import types
+import typing
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Annotated, Any
+
+import numpy as np
+from annotated_types import BaseMetadata, DocInfo, Ge, GroupedMetadata, Gt, Le, Lt, MaxLen, MinLen, Predicate
+
+from ipe_bench.basics.errors import UserError, describe_exception
+
+FINITE = Predicate(math.isfinite)
+
+Finite = Annotated[float, FINITE]
+Positive = Annotated[float, Gt(0), FINITE]
+NonNegative = Annotated[float, Ge(0), FINITE]
+Share = Annotated[float, Ge(0), Le(1)]
+Count = Annotated[int, Gt(0)]
+Whole = Annotated[int, Ge(0)]
+
+_COMPARISONS = {
+    Gt: lambda value, bound: value > bound.gt,
+    Ge: lambda value, bound: value >= bound.ge,
+    Lt: lambda value, bound: value < bound.lt,
+    Le: lambda value, bound: value <= bound.le,
+    MinLen: lambda value, bound: len(value) >= bound.min_length,
+    MaxLen: lambda value, bound: len(value) <= bound.max_length,
+    Predicate: lambda value, bound: bound.func(value),
+}
+_NOUNS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", type(None): "null"}
+
+
+class Component:
+    """What a config describes: a frozen dataclass whose fields are its options and its identity.
+
+    A class whose options must suit one another writes `__post_init__` and calls this one first.
+    """
+
+    def __post_init__(self) -> None:
+        """Checks each option by its type, and keeps it as that type has it: 1 as 1.0, a list as a tuple.
+
+        Raises:
+            UserError: `KEY=VALUE: give ...`, by the option's name.
+        """
+        for name, hint in option_types(type(self)).items():
+            value = getattr(self, name)
+            suited = checked(value, hint, name)
+            if suited is not value:
+                object.__setattr__(self, name, suited)
+
+
+@functools.cache
+def option_types(cls: type) -> dict[str, Any]:
+    """The types, constraints included, of what the constructor of a dataclass takes.
+
+    Raises:
+        UserError: one of them cannot be read.
+    """
+    try:
+        hints = typing.get_type_hints(cls, include_extras=True)
+    except Exception as error:
+        raise UserError(
+            f"{cls.__module__}.{cls.__qualname__}: the type of an option cannot be read ({describe_exception(error)}); "
+            "its module must import it outside of TYPE_CHECKING"
+        ) from None
+    return {f.name: hints[f.name] for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
+
+
+def checked(value: Any, hint: Any, key: str) -> Any:
+    """The value, converted where the type allows (1 for 1.0, a list for a tuple).
+
+    Raises:
+        UserError: `KEY=VALUE: give ...`, where the value is not of the type or not within its constraints.
+    """
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if hint is Any or isinstance(hint, typing.TypeVar):
+        return value
+    if origin is Annotated:
+        return _constrained(value, arguments[0], arguments[1:], key)
+    if origin in (typing.Union, types.UnionType):
+        return _one_of(value, arguments, key)
+    if origin is typing.Literal:
+        return _choice(value, arguments, key)
+    if origin is tuple and isinstance(value, tuple | list | np.ndarray):
+        return _entries(value, arguments, key)
+    plain = origin or hint
+    if not isinstance(plain, type):
+        return value
+    if plain in (int, float):
+        return _number(value, plain, key)
+    if isinstance(value, plain):
+        return value
+    raise _refusal(value, describe_type(hint), key)
+
+
+def _refusal(value: Any, wanted: str, key: str) -> UserError:
+    text = " ".join(str(value).split())
+    return UserError(f"{key}={text if len(text) <= 60 else text[:57] + '...'}: give {wanted}")
+
+
+def _number(value: Any, kind: Any, key: str) -> Any:
+    """True and false are not numbers; NumPy's are."""
+    if type(value) is kind:
+        return value
+    accepted: type = numbers.Integral if kind is int else numbers.Real
+    if issubclass(type(value), accepted) and not isinstance(value, bool):
+        return kind(value)
+    raise _refusal(value, _NOUNS[kind], key)
+
+
+def _constrained(value: Any, kind: Any, metadata: Sequence[Any], key: str) -> Any:
+    try:
+        value = checked(value, kind, key)
+    except UserError:
+        if typing.get_origin(kind) is tuple:
+            raise  # it says which entry is wrong
+        raise _refusal(value, describe_type(Annotated[kind, *metadata]), key) from None
+    if not all(_COMPARISONS[type(bound)](value, bound) for bound in _bounds(metadata)):
+        raise _refusal(value, describe_type(Annotated[kind, *metadata]), key)
+    return value
+
+
+def _bounds(metadata: Iterable[Any]) -> list[Any]:
+    """The constraints among an annotation's metadata; an `Interval` is taken apart."""
+    flat: list[Any] = []
+    for item in metadata:
+        if type(item) in _COMPARISONS:
+            flat.append(item)
+        elif isinstance(item, GroupedMetadata):
+            flat += _bounds(item)
+        elif isinstance(item, BaseMetadata):
+            raise TypeError(f"{item}: is a constraint that options cannot have; write a Predicate")
+    return flat
+
+
+def _one_of(value: Any, alternatives: Sequence[Any], key: str) -> Any:
+    if isinstance(value, tuple | list | np.ndarray):
+        tuples = [a for a in alternatives if _is_tuple(a)]
+        if len(tuples) == 1:  # what is wrong with an entry is said of the entry
+            return checked(value, tuples[0], key)
+    options = [a for a in alternatives if a is not type(None)]
+    if value is None and len(options) < len(alternatives):
+        return None
+    for alternative in options:
+        try:
+            return checked(value, alternative, key)
+        except UserError as error:
+            if len(alternatives) == 2 and len(options) == 1:
+                raise UserError(f"{error} or null") from None
+    raise _refusal(value, " or ".join(map(describe_type, alternatives)), key)
+
+
+def _is_tuple(hint: Any) -> bool:
+    return typing.get_origin(typing.get_args(hint)[0] if typing.get_origin(hint) is Annotated else hint) is tuple
+
+
+def _choice(value: Any, choices: Sequence[Any], key: str) -> Any:
+    for choice in choices:
+        if isinstance(value, type(choice)) and isinstance(value, bool) == isinstance(choice, bool) and value == choice:
+            return choice
+    text = " ".join(str(value).split())
+    raise UserError(f"{key}={text}: choose one of {', '.join(map(str, choices))}")
+
+
+def _entries(value: Any, arguments: Sequence[Any], key: str) -> tuple[Any, ...]:
+    if len(arguments) == 2 and arguments[1] is Ellipsis:
+        arguments = [arguments[0]] * len(value)
+    if len(arguments) != len(value):
+        raise _refusal(value, _list_of(arguments), key)
+    return tuple(checked(v, a, f"{key}[{i}]") for i, (v, a) in enumerate(zip(value, arguments, strict=True)))
+
+
+def describe_type(hint: Any) -> str:
+    """What a user is to give: 'a number above 0 or null'."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated:
+        words = [c.documentation for c in arguments[1:] if isinstance(c, DocInfo)]
+        return words[0] if words else _with_bounds(describe_type(arguments[0]), _bounds(arguments[1:]))
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(map(describe_type, arguments))
+    if origin is typing.Literal:
+        return f"one of {', '.join(map(str, arguments))}"
+    if origin is tuple:
+        return _list_of(arguments)
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return "keys and values"
+    plain = origin or hint
+    return _NOUNS.get(plain) or f"a {getattr(plain, '__name__', plain)}"
+
+
+def _list_of(arguments: Sequence[Any]) -> str:
+    if len(arguments) == 2 and arguments[1] is Ellipsis:
+        return "a list"
+    nouns = {describe_type(a).removeprefix("a ") for a in arguments}
+    return f"a list of {len(arguments)}" + (f" {nouns.pop()}s" if len(nouns) == 1 else "")
+
+
+def _with_bounds(noun: str, bounds: Sequence[Any]) -> str:
+    """The noun with its constraints in words."""
+    limits = {type(b): b for b in bounds}
+    lower, upper = limits.get(Gt) or limits.get(Ge), limits.get(Lt) or limits.get(Le)
+    if MinLen in limits:
+        return f"{noun} of at least {limits[MinLen].min_length}"
+    if isinstance(lower, Gt) and isinstance(upper, Lt):
+        return f"{noun} between {lower.gt} and {upper.lt}"
+    if isinstance(lower, Gt):
+        return f"{noun} above {lower.gt}" + (f" and up to {upper.le}" if isinstance(upper, Le) else "")
+    if isinstance(lower, Ge) and upper is not None:
+        return f"{noun} from {lower.ge} to " + (f"below {upper.lt}" if isinstance(upper, Lt) else f"{upper.le}")
+    if isinstance(lower, Ge):
+        return f"{noun} from {lower.ge} up" if noun == _NOUNS[int] else f"{lower.ge} or {noun} above"
+    return "a finite number" if FINITE in bounds else noun

@@ -1,0 +1,26 @@
+"""Random streams that belong to a trial: the same numbers in whatever batch the trial stands."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+
+import numpy as np
+
+from ipe_bench.basics.linalg import Array
+
+
+def own_bits(seed: int, z: Array) -> np.random.Philox:
+    """The bits of one trial, which depend on `seed` and its readings z (m,), and on nothing else in the batch."""
+    digest = hashlib.sha256(np.ascontiguousarray(z, dtype=float).tobytes()).digest()
+    return np.random.Philox(np.random.SeedSequence([seed, *np.frombuffer(digest, dtype=np.uint32).tolist()]))
+
+
+def own_generators(seed: int, z: Array) -> list[np.random.Generator]:
+    """A generator for each trial of readings z (trials, m); see `own_bits`."""
+    return [np.random.Generator(own_bits(seed, row)) for row in z]
+
+
+def normals(generators: Sequence[np.random.Generator], *shape: int) -> Array:
+    """Standard normal numbers (trials, *shape), each trial's from its own generator."""
+    return np.array([g.standard_normal(shape) for g in generators]).reshape(len(generators), *shape)

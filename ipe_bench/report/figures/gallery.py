@@ -1,0 +1,240 @@
+"""A folder of figures: draws those whose contents have changed, keeps the others, and removes its own that are stale.
+
+`index.json` in the folder says what each file was drawn from. A digest covers the frames that a figure reads, the code
+that draws it and the libraries' versions; a file whose bytes are no longer those that were written is drawn again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import pickle
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from importlib import import_module, metadata, resources
+from pathlib import Path
+from typing import Any, Literal
+
+from ipe_bench.basics.files import write_text
+from ipe_bench.report.figures.drawing import FORMATS, Figure
+from ipe_bench.report.figures.views import View, views
+from ipe_bench.report.style import house_style
+from ipe_bench.statistics.analysis import Analysis
+
+INDEX = "index.json"
+SCHEMA = 1
+WORTH_HELP = 3
+"""So many figures to draw are worth a second process, which needs a second or more to start."""
+
+Which = Literal["all", "main", "none"]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure in its folder."""
+
+    name: str
+    title: str
+    caption: str
+    files: tuple[Path, ...]
+    """One per format, in the order asked for."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What the index says of one figure."""
+
+    name: str
+    title: str
+    caption: str
+    digests: dict[str, str] = field(default_factory=dict)
+    """By format, the digest of the file's bytes."""
+
+    def intact(self, folder: Path, kind: str) -> bool:
+        return kind in self.digests and _digest_of(folder / f"{self.name}.{kind}") == self.digests[kind]
+
+
+@dataclass(frozen=True)
+class Task:
+    """One kind of figure of one view: what is drawn, or kept, as a whole."""
+
+    figure: str
+    """The module's name."""
+    view: View
+    digest: str
+
+
+def draw_all(
+    analysis: Analysis,
+    folder: Path,
+    *,
+    which: Which = "all",
+    formats: Sequence[str] = FORMATS,
+    processes: int | None = None,
+) -> list[Drawn]:
+    """The figures that the data allow, in the order of the report, as files in the folder.
+
+    `which` is all, main (the few that answer the question) or none. A figure is drawn only where the folder does not
+    hold it already in these formats; with `processes` (by default 2 where there are so many CPUs) two draw at once.
+    What an earlier report left in the folder and is still right stays, whatever is asked for; what is not is removed.
+    """
+    tasks = {task.digest: task for task in _tasks(analysis)}
+    wanted = [d for d, task in tasks.items() if which == "all" or (which == "main" and _figure(task.figure).main)]
+    old = _read_index(folder)
+    missing = [d for d in wanted if not _is_there(old.get(d), folder, formats)]
+    entries = {d: _intact(old[d], folder) for d in tasks if d in old}
+    if missing:
+        folder.mkdir(parents=True, exist_ok=True)
+        known = {d: {kind for entry in entries.get(d, ()) for kind in entry.digests} for d in missing}
+        # What was drawn in another format before is drawn in that one too, so that all formats show the same.
+        lists = {d: [kind for kind in FORMATS if kind in formats or kind in known[d]] for d in missing}
+        jobs = [(tasks[d], lists[d]) for d in missing]
+        drawn = _draw(jobs, folder, processes or min(2, os.cpu_count() or 1))
+        entries |= dict(zip(missing, drawn, strict=True))
+    _tidy(folder, old, entries)
+    return [
+        Drawn(e.name, e.title, e.caption, tuple(folder / f"{e.name}.{kind}" for kind in formats))
+        for d in wanted
+        for e in entries[d]
+    ]
+
+
+def _tasks(analysis: Analysis) -> Iterator[Task]:
+    """Every kind of figure of every setting, or of all of them together."""
+    from ipe_bench.report.figures import FIGURES
+
+    if not analysis.collection.groups:
+        return
+    parts, whole = views(analysis)
+    for name in FIGURES:
+        figure = _figure(name)
+        for view in [whole] if figure.together else parts:
+            seen = view.only(figure.frames)
+            digest = hashlib.sha256(f"{name} {_drawn_with()} {seen.digest()}".encode())
+            yield Task(name, seen, digest.hexdigest())
+
+
+def _figure(name: str) -> Figure:
+    return import_module(f"ipe_bench.report.figures.{name}").FIGURE
+
+
+@cache
+def _drawn_with() -> str:
+    """A digest of the code that figures come from, and of the libraries."""
+    digest = hashlib.sha256()
+    for package in ("ipe_bench.report", "ipe_bench.report.figures", "ipe_bench.statistics", "ipe_bench.trials"):
+        for source in sorted(resources.files(package).iterdir(), key=lambda item: item.name):
+            if source.name.endswith(".py"):
+                digest.update(source.read_bytes())
+    for library in ("matplotlib", "seaborn", "pandas", "numpy"):
+        digest.update(f"{library} {metadata.version(library)}".encode())
+    return digest.hexdigest()
+
+
+def draw_task(task: Task, folder: Path, formats: Sequence[str]) -> list[Entry]:
+    """Draws a task's figures into the folder."""
+    entries = []
+    with house_style():
+        for drawing in _figure(task.figure).draw(task.view):
+            files = drawing.save(folder, formats)
+            digests = {kind: _digest_of(path) for kind, path in zip(formats, files, strict=True)}
+            entries.append(Entry(drawing.name, drawing.title, drawing.caption, digests))
+    return entries
+
+
+Job = tuple[Task, list[str]]
+
+
+def _draw(jobs: Sequence[Job], folder: Path, processes: int) -> list[list[Entry]]:
+    """The jobs' entries; a second process takes jobs from the end while this one takes them from the beginning."""
+    with tempfile.TemporaryDirectory(prefix="ipe-bench-figures-") as place:
+        desk = Path(place)
+        helper = _start_helper(jobs, folder, desk) if processes > 1 and len(jobs) >= WORTH_HELP else None
+        try:
+            done = {i: draw_task(jobs[i][0], folder, jobs[i][1]) for i in range(len(jobs)) if claim(desk, i)}
+            if helper is not None:
+                helper.wait()
+                done |= _reported(desk)
+        finally:
+            if helper is not None:
+                helper.kill()
+                helper.wait()
+        # What a helper took and did not bring back is drawn here, and raises here what stopped it there.
+        return [done[i] if i in done else draw_task(task, folder, formats) for i, (task, formats) in enumerate(jobs)]
+
+
+def _start_helper(jobs: Sequence[Job], folder: Path, desk: Path) -> subprocess.Popen[bytes] | None:
+    """A second Python that draws; not forked, since this process may have threads, and not by multiprocessing, which
+    would run the user's script again."""
+    (desk / "jobs").write_bytes(pickle.dumps((list(jobs), folder.absolute())))
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    command = [sys.executable, "-m", "ipe_bench.report.figures.helper", str(desk)]
+    with contextlib.suppress(OSError):
+        quiet = subprocess.DEVNULL
+        return subprocess.Popen(command, env=environment, stdin=quiet, stdout=quiet, stderr=quiet)
+    return None
+
+
+def claim(desk: Path, job: int) -> bool:
+    """Whether the job is this process's to do: the first to ask has it."""
+    try:
+        (desk / f"claimed-{job}").touch(exist_ok=False)
+    except FileExistsError:
+        return False
+    return True
+
+
+def _reported(desk: Path) -> dict[int, list[Entry]]:
+    return {int(path.name.removeprefix("done-")): pickle.loads(path.read_bytes()) for path in desk.glob("done-*")}
+
+
+def _is_there(entries: Sequence[Entry] | None, folder: Path, formats: Sequence[str]) -> bool:
+    return entries is not None and all(entry.intact(folder, kind) for entry in entries for kind in formats)
+
+
+def _intact(entries: Sequence[Entry], folder: Path) -> list[Entry]:
+    """The entries with those formats only whose files are as they were written."""
+    return [
+        Entry(e.name, e.title, e.caption, {kind: d for kind, d in e.digests.items() if e.intact(folder, kind)})
+        for e in entries
+    ]
+
+
+def _tidy(folder: Path, old: dict[str, list[Entry]], entries: dict[str, list[Entry]]) -> None:
+    """Writes the index, and removes the files of the old one that are in the new one no more."""
+
+    def files(index: dict[str, list[Entry]]) -> set[str]:
+        return {f"{entry.name}.{kind}" for known in index.values() for entry in known for kind in entry.digests}
+
+    for name in files(old) - files(entries):
+        (folder / name).unlink(missing_ok=True)
+    if entries == old:
+        return
+    drawn = {digest: [asdict(entry) for entry in known] for digest, known in entries.items()}
+    write_text(folder / INDEX, json.dumps({"schema": SCHEMA, "drawn": drawn}, indent=1, ensure_ascii=False) + "\n")
+
+
+def _read_index(folder: Path) -> dict[str, list[Entry]]:
+    """What the folder holds by digest; nothing where the index is missing, damaged or of another version."""
+    try:
+        index: Any = json.loads((folder / INDEX).read_text(encoding="utf-8"))
+        if index["schema"] != SCHEMA:
+            return {}
+        found = {digest: [Entry(**entry) for entry in entries] for digest, entries in index["drawn"].items()}
+        safe = all(Path(e.name).name == e.name and set(e.digests) <= set(FORMATS) for v in found.values() for e in v)
+        return found if safe else {}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
+
+
+def _digest_of(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return ""

@@ -1,0 +1,202 @@
+"""Options are checked by their types, alike from Python and from a config; and conf says what the classes say."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pytest
+from annotated_types import Ge, Gt, Interval, Le, Lt, MinLen, MultipleOf, doc
+from omegaconf import OmegaConf
+
+from ipe_bench.baselines import EKF, LevenbergMarquardt
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.options import Count, Finite, NonNegative, Positive, Share, Whole, checked
+from ipe_bench.measurements import Gins, Nist, Ranging
+from ipe_bench.noise import Gaussian
+from ipe_bench.plugins import discovery
+from ipe_bench.plugins.construct import construct, register_package
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.runs.execution import Processes
+from ipe_bench.solvers import Newton, Relinearized, SteepestDescent
+
+inf, nan = np.inf, np.nan
+
+
+@pytest.mark.parametrize(
+    ("hint", "good", "bad", "remedy"),
+    [
+        (Positive, [1e-300, 2, np.float32(0.5)], [0, -1, inf, nan, True, "1", None], "a number above 0"),
+        (NonNegative, [0, 1e300], [-1e-9, inf, nan, False], "0 or a number above"),
+        (Finite, [-1e300], [inf, -inf, nan], "a finite number"),
+        (Annotated[float, Gt(2)], [inf, 3], [2, nan], "a number above 2"),
+        (Share, [0, 1, 0.5], [-0.1, 1.1, nan], "a number from 0 to 1"),
+        (Count, [1, np.int64(7)], [0, 1.0, True, "3"], "a whole number above 0"),
+        (Whole, [0], [-1, 0.0], "a whole number from 0 up"),
+        (Annotated[float, Gt(0), Lt(1)], [0.5], [0, 1, nan], "a number between 0 and 1"),
+        (Annotated[float, Gt(0), Le(1)], [1], [0, 1.01], "a number above 0 and up to 1"),
+        (Annotated[float, Interval(ge=0, lt=1)], [0, 0.99], [1, -1], "a number from 0 to below 1"),
+        (Annotated[float, Ge(0), doc("a probability")], [0], [-1, "x"], "a probability"),
+        (Positive | None, [None, 3], [0, "null"], "a number above 0 or null"),
+        (bool, [True], [1, "true"], "true or false"),
+        (str, ["a"], [1, None], "a text"),
+        (Annotated[tuple[int, ...], MinLen(2)], [[1, 2], (1, 2, 3)], [(), (1,)], "a list of at least 2"),
+        (tuple[float, float], [(1, 2), np.ones(2)], [(1,), 3, "ab"], "a list of 2 numbers"),
+        (Mapping[str, Any], [{}], [[], 1], "keys and values"),
+        (Any, [object], [], ""),
+    ],
+)
+def test_a_type_accepts_what_it_means_and_says_what_it_wants(hint, good, bad, remedy):
+    for value in good:
+        checked(value, hint, "key")
+    for value in bad:
+        with pytest.raises(UserError, match=rf"^key=.*: give {remedy}$"):
+            checked(value, hint, "key")
+
+
+def test_a_choice_is_one_of_its_own_type():
+    assert checked(2, Literal[1, 2], "start") == 2
+    for value in (3, "1", True, 1.0):
+        with pytest.raises(UserError, match=r"^start=.*: choose one of 1, 2$"):
+            checked(value, Literal[1, 2], "start")
+
+
+def test_an_entry_of_a_list_is_named_by_its_place():
+    with pytest.raises(UserError, match=r"^beacons\[1\]\[2\]=up: give a number$"):
+        Ranging(beacons=((0.0, 0.0, 1.0), (0.0, 0.0, "up")))  # type: ignore[arg-type]
+    with pytest.raises(UserError, match=r"^deviations\[0\]=-1.0: give 0 or a number above$"):
+        GaussianPrior((-1.0,))
+
+
+def test_values_are_kept_as_their_type_has_them():
+    model = Ranging(position=[1, 2, 3], beacons=np.ones((5, 3)), rounds=np.int64(2))  # type: ignore[arg-type]
+    assert model.position == (1.0, 2.0, 3.0)
+    assert {type(v) for v in model.position} == {float}
+    assert type(model.rounds) is int
+    assert type(Newton(tolerance=1).tolerance) is float
+    assert hash(model) == hash(Ranging(position=(1.0, 2.0, 3.0), beacons=((1.0, 1.0, 1.0),) * 5, rounds=2))
+
+
+WRONG = [
+    (Newton, "tolerance", -1.0),
+    (Newton, "start", "home"),
+    (Relinearized, "budget", 0.0),
+    (LevenbergMarquardt, "damping", inf),
+    (EKF, "prior_inflation", nan),
+    (Gaussian, "deviation", True),
+    (Gins, "readings_per_case", 0),
+    (Nist, "dataset", "Iris"),
+    (Processes, "workers", 0),
+    (SteepestDescent, "max_iterations", "many"),
+]
+
+
+@pytest.mark.parametrize(("cls", "key", "value"), WRONG, ids=lambda v: getattr(v, "__name__", str(v)))
+def test_python_and_config_say_the_same_of_a_mistake(cls, key, value):
+    with pytest.raises(UserError) as from_python:
+        cls(**{key: value})
+    with pytest.raises(UserError) as from_config:
+        construct({"_target_": f"{cls.__module__}.{cls.__qualname__}", key: value}, "part")
+    assert str(from_config.value) == f"part.{from_python.value}"
+    assert str(from_python.value).startswith(f"{key}={value}: ")
+
+
+@dataclass(frozen=True)
+class Own:
+    """A plugin's class that knows nothing of `Component`, with a `__post_init__` of its own."""
+
+    size: Positive = 1.0
+    count: int = 1
+
+    def __post_init__(self) -> None:
+        if self.count > 9:
+            raise ValueError(f"count={self.count}:\nat most 9")
+
+
+@dataclass(frozen=True)
+class Deaf(Newton):
+    """A plugin's class whose `__post_init__` does not call ours."""
+
+    gain: Share = 0.5
+
+    def __post_init__(self) -> None:
+        pass
+
+
+@dataclass(frozen=True)
+class Unreadable:
+    option: Missing = 1  # type: ignore[name-defined]  # noqa: F821
+
+
+def test_what_a_plugins_class_does_not_check_is_checked_where_it_is_constructed():
+    register_package(__name__)
+    made = construct({"_target_": f"{__name__}.Own", "size": 2}, "part")
+    assert type(made.size) is float
+    for options, said in (
+        ({"_target_": "Own", "size": 0.0}, r"^part\.size=0\.0: give a number above 0$"),
+        ({"_target_": "Own", "sise": 1.0}, r"^part\.sise: there is no such option; did you mean size\?"),
+        ({"_target_": "Own", "count": 10}, r"^part: count=10: at most 9$"),
+        ({"_target_": "Deaf", "gain": 2.0}, r"^part\.gain=2\.0: give a number from 0 to 1$"),
+        ({"_target_": "Deaf", "tolerance": 0.0}, r"^part\.tolerance=0\.0: give a number above 0$"),
+        ({"_target_": "Unreadable"}, r"Unreadable: the type of an option cannot be read \(NameError"),
+        ({"_target_": "np"}, "is not a component"),
+    ):
+        with pytest.raises(UserError, match=said):
+            construct({**options, "_target_": f"{__name__}.{options['_target_']}"}, "part")
+
+
+def test_a_class_that_cannot_be_made_is_one_line(tmp_path, monkeypatch):
+    register_package("ipe_bench_broken")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    package = tmp_path / "ipe_bench_broken"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    for name, source in (("raises", "raise RuntimeError('no licence')"), ("leaves", "import sys; sys.exit(5)")):
+        (package / f"{name}.py").write_text(source)
+        with pytest.raises(UserError, match=r"part\._target_=.*: its module cannot be imported") as told:
+            construct({"_target_": f"ipe_bench_broken.{name}.X"}, "part")
+        assert "\n" not in str(told.value)
+    with pytest.raises(UserError, match=r"IPE: is abstract; choose a class that writes step$"):
+        construct({"_target_": "ipe_bench.estimators.ipe.IPE"}, "part")
+
+
+def test_a_constraint_that_is_not_known_is_a_bug_and_not_ignored():
+    with pytest.raises(TypeError, match="MultipleOf"):
+        checked(3, Annotated[int, MultipleOf(2)], "key")
+
+
+def test_constructing_takes_no_time_that_matters():
+    import time
+
+    Gins()
+    began = time.perf_counter()
+    for _ in range(1000):
+        Gins(latitude_deg=10.0)
+    assert time.perf_counter() - began < 1.0
+
+
+PRESETS = {
+    # Each is one way in which the truth may be richer; the class itself is GINS as it is.
+    ("measurement", "gins_misaligned"): {"accelerometer_misalignment", "platform_misalignment"},
+    ("measurement", "gins_nonlinear"): {"accelerometer_quadratic"},
+    ("measurement", "gins_random_walk"): {"gyro_random_walk"},
+    ("measurement", "gins_tilted"): {"platform_misalignment"},
+}
+
+
+@pytest.mark.parametrize(
+    "option",
+    [o for o in discovery.options() if o.group != "experiment"],
+    ids=lambda o: f"{o.group}={o.name}",
+)
+def test_conf_says_what_the_class_says(option):
+    config: Any = OmegaConf.to_container(OmegaConf.load(option.path))
+    component = construct(config, option.group)
+    fields = {f.name: f for f in dataclasses.fields(component) if f.init}
+    assert set(config) - {"_target_"} <= set(fields)
+    assert option.group in ("measurement", "execution") or set(fields) <= set(config), "an option that nobody sees"
+    differs = {name for name in fields if getattr(component, name) != getattr(type(component)(), name)}
+    assert differs == PRESETS.get((option.group, option.name), set())

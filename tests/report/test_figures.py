@@ -1,0 +1,397 @@
+"""Figures show what the frames hold: at its place, with what is missing, and none that is out of date."""
+
+# pyright: reportAttributeAccessIssue=false, reportIndexIssue=false, reportCallIssue=false, reportArgumentType=false
+# (matplotlib's collections are not typed)
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from synthetic_store import Pretender, Synthetic
+
+from ipe_bench.report.figures import (
+    FIGURES,
+    convergence,
+    correlation,
+    cost,
+    draw_all,
+    error_scale,
+    gallery,
+    nees,
+    success,
+)
+from ipe_bench.report.figures import settings as settings_figure
+from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.figures.views import View, views
+from ipe_bench.report.style import COLORS, REFERENCE, Look, house_style, looks
+from ipe_bench.statistics import analyse
+
+SCALES = (1.0, 10.0, 100.0)
+
+
+class Frozen(Pretender):
+    """Stands for an estimator that solves an equation."""
+
+    equation = "frozen"
+
+
+def fill(store: Synthetic, *, labels=(REFERENCE, "fixed_point", "two"), scales=SCALES, trials=60, solved=None, **given):
+    rng = np.random.default_rng(0)
+    for scale in scales:
+        scenario = store.scenario(error_scale=scale, **given)
+        error = 0.1 * rng.normal(size=(trials, scenario.measurement.n))
+        for label in labels:
+            count = (solved or {}).get((label, scale), trials)
+            estimator = Pretender() if label == REFERENCE else Frozen()
+            factor = scale if label == REFERENCE else 1.0
+            store.add(scenario, label, factor * error, solved=np.arange(trials) < count, estimator=estimator)
+
+
+def drawn(module, view: View) -> dict[str, Drawing]:
+    with house_style():
+        return {drawing.name: drawing for drawing in module.draw(view)}
+
+
+def only_view(store: Synthetic) -> View:
+    (view,), _ = views(analyse([store.directory]))
+    return view
+
+
+def points(ax) -> list[tuple[float, float, bool]]:
+    """x, y and whether it is hollow, of every marker of the scatter plots of a panel."""
+    from matplotlib.collections import PathCollection
+
+    found = []
+    for marks in ax.collections:
+        if isinstance(marks, PathCollection):
+            hollow = [bool(np.allclose(color[:3], 1.0)) for color in marks.get_facecolor()]
+            hollow *= len(marks.get_offsets()) // len(hollow)
+            # seaborn takes a logarithm and back.
+            found += [(round(float(x), 9), float(y), h) for (x, y), h in zip(marks.get_offsets(), hollow, strict=True)]
+    return found
+
+
+def bars(ax) -> list[float]:
+    """The abscissas of the intervals."""
+    from matplotlib.collections import LineCollection
+
+    return [
+        float(segment[0][0])
+        for lines in ax.collections
+        if isinstance(lines, LineCollection)
+        for segment in lines.get_segments()
+    ]
+
+
+@pytest.mark.parametrize("module", [error_scale, success, nees])
+def test_every_point_stands_at_its_error_scale(synthetic, module):
+    fill(synthetic)
+    for drawing in drawn(module, only_view(synthetic)).values():
+        found = [x for ax in drawing.figure.axes for x, *_ in points(ax)]
+        assert len(found) >= 3
+        assert set(found) == set(SCALES)
+
+
+def test_points_of_few_trials_are_hollow_without_an_interval_and_say_how_many(synthetic):
+    fill(synthetic, solved={("fixed_point", 100.0): 19, ("fixed_point", 10.0): 20})
+    drawings = drawn(error_scale, only_view(synthetic))
+    panel = next(ax for ax in drawings["figure_3"].figure.axes if ax.get_title() == "over the linear bounds")
+    assert {x for x, _, hollow in points(panel) if hollow} == {100.0}
+    assert sorted(bars(panel)) == [1.0, 10.0]
+    assert {note.get_text() for note in panel.texts} == {"19 of 60", "20 of 60"}
+    assert "(20 of 60 at scale 10, 19 of 60 at scale 100)" in drawings["figure_3"].caption
+    everyone = drawings["error_against_scale"].figure.axes
+    assert sum(hollow for _, _, hollow in points(everyone[0])) == 1
+    behind = next(ax for ax in everyone if ax.get_title() == "trials behind the points")
+    assert min(y for _, y, _ in points(behind)) == pytest.approx(19 / 60)
+    # Where nothing is missing there is no such panel.
+    fill(synthetic)
+    titles = [ax.get_title() for ax in drawn(error_scale, only_view(synthetic))["error_against_scale"].figure.axes]
+    assert "trials behind the points" not in titles
+
+
+def test_a_value_that_is_missing_breaks_the_line(synthetic):
+    fill(synthetic, solved={("two", 10.0): 0})
+    panel = drawn(error_scale, only_view(synthetic))["error_against_scale"].figure.axes[0]
+    color = looks([REFERENCE, "fixed_point", "two"])["two"].color
+    spans = [list(line.get_xdata()) for line in panel.lines if line.get_color() == color]
+    assert not any({1.0, 100.0} <= set(span) for span in spans)
+
+
+def test_markers_that_coincide_differ_in_size(synthetic):
+    fill(synthetic, labels=("fixed_point", "two", "three"))
+    panel = drawn(success, only_view(synthetic))["success_against_scale"].figure.axes[0]
+    (marks,) = panel.collections[-1:]
+    at_ten = marks.get_sizes()[np.isclose(marks.get_offsets()[:, 0], 10.0)]
+    assert len(set(np.round(at_ten, 3))) == 3
+
+
+def test_one_error_scale_sets_estimators_side_by_side(synthetic):
+    fill(synthetic, scales=(33.0,))
+    for module in (error_scale, success, nees):
+        for drawing in drawn(module, only_view(synthetic)).values():
+            for ax in drawing.figure.axes:
+                places = [x for x, *_ in points(ax)]
+                assert len(places) == len(set(places))
+    view = only_view(synthetic)
+    axes = drawn(success, view)["success_against_scale"].figure.axes
+    assert [t.get_text() for t in axes[0].get_xticklabels()] == list(view.look)
+
+
+def test_nees_bars_reach_one_exactly_inside_the_limits(synthetic):
+    fill(synthetic)
+    view = only_view(synthetic)
+    rows = view.totals.set_index(["estimator", "error_scale"])
+    axes = drawn(nees, view)["consistency"].figure.axes
+    from matplotlib.collections import LineCollection
+
+    reach = [
+        bool(segment[:, 1].min() <= 1 <= segment[:, 1].max())
+        for lines in axes[0].collections
+        if isinstance(lines, LineCollection)
+        for segment in lines.get_segments()
+    ]
+    inside = (rows["nees"] >= rows["nees_low"]) & (rows["nees"] <= rows["nees_high"])
+    assert sum(reach) == inside.sum()
+    assert 0 < sum(reach) < len(reach)
+
+
+def test_every_color_can_be_told_from_the_others():
+    """Distances in OKLab (B. Ottosson, 2020), where .02 is just noticed."""
+    first = np.array([[0.4122214708, 0.5363325363, 0.0514459929], [0.2119034982, 0.6806995451, 0.1073969566],
+                      [0.0883024619, 0.2817188376, 0.6299787005]])  # fmt: skip
+    second = np.array([[0.2104542553, 0.7936177850, -0.0040720468], [1.9779984951, -2.4285922050, 0.4505937099],
+                       [0.0259040371, 0.7827717662, -0.8086757660]])  # fmt: skip
+    rgb = np.array([[int(c[i : i + 2], 16) for i in (1, 3, 5)] for c in (*COLORS, "#000000")]) / 255
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    lab = np.cbrt(linear @ first.T) @ second.T
+    assert min(np.linalg.norm(a - b) for a, b in combinations(lab, 2)) > 0.1
+    look = looks([REFERENCE, *(f"e{i}" for i in range(60))])
+    assert len({one.color for one in list(look.values())[: len(COLORS) + 1]}) == len(COLORS) + 1
+    assert len({(one.color, one.marker) for one in look.values()}) == 61
+
+
+def histories(**trials: list[list[float]]) -> pd.DataFrame:
+    return pd.DataFrame(
+        [
+            {"error_scale": 1.0, "estimator": label, "trial": str(t), "iteration": k, "distance": d}
+            for label, several in trials.items()
+            for t, distances in enumerate(several)
+            for k, d in enumerate(distances)
+        ]
+    )
+
+
+def test_the_last_iterate_is_not_drawn_as_convergence():
+    """Its distance from itself is zero; trials that have come to it count as nearer than those under way."""
+    frame = histories(a=[[8.0, 4.0, 0.0], [6.0, 3.0, 2.0, 1.0, 0.0], [9.0, 0.0]])
+    found = convergence.median_distances(frame)
+    assert list(found["iteration"]) == [0, 1]
+    assert list(found["distance"]) == [8.0, 3.0]
+    assert convergence.median_distances(histories(a=[[3.0, 0.0]]))["distance"].tolist() == [3.0]
+
+
+def test_epochs_of_filters_are_no_iterations():
+    frame = histories(ekf=[[9.0, 5.0, 2.0, 0.0]], newton=[[9.0, 0.1, 0.001, 0.0]])
+    look = looks(["ekf", "newton"])
+    view = View("", "model", {"convergence": frame}, look, {"ekf": None, "newton": "frozen"})
+    (drawing,) = drawn(convergence, view).values()
+    (legend,) = drawing.figure.legends
+    words = [entry.get_text() for entry in legend.get_texts()]
+    assert "newton" in words
+    assert "ekf" not in words
+    assert "newton 2" in drawing.caption
+    alone = replace(view, frames={"convergence": histories(ekf=[[9.0, 5.0, 2.0, 0.0]])})
+    assert not drawn(convergence, alone)
+
+
+def test_the_correlation_names_its_scale_and_knows_no_negative_zero(synthetic):
+    fill(synthetic, trials=400)
+    (drawing,) = drawn(correlation, only_view(synthetic)).values()
+    panels = [ax for ax in drawing.figure.axes if ax.get_title()]
+    assert all("error scale 100" in ax.get_title() for ax in panels)
+    words = {t.get_text() for ax in panels for t in ax.texts}
+    # Independent errors: all correlations are zero to a digit, either sign.
+    assert "0.0" in words
+    assert not any(word in ("-0.0", "−0.0") for word in words)
+    assert correlation._two_figures(-0.26) == "−0.3"
+
+
+def test_efficient_is_the_mean_of_chi():
+    rng = np.random.default_rng(0)
+    for n in (1, 3, 11):
+        simulated = np.sqrt((rng.normal(size=(200_000, n)) ** 2).sum(axis=1)).mean() / np.sqrt(n)
+        assert cost.efficient(n) == pytest.approx(simulated, abs=4e-3)
+
+
+def test_settings_are_compared_in_one_panel_per_estimator(synthetic):
+    for sigma in (0.2, 0.4):
+        fill(synthetic, sigma=sigma)
+    _, whole = views(analyse([synthetic.directory]))
+    drawings = drawn(settings_figure, whole)
+    assert set(drawings) == {"settings_success", "settings_error"}
+    for drawing in drawings.values():
+        assert [ax.get_title() for ax in drawing.figure.axes if ax.axison] == list(whole.look)
+        words = [t.get_text() for t in drawing.figure.legends[0].get_texts()]
+        assert sum("0.2" in w for w in words) == sum("0.4" in w for w in words) == 1
+    (view, _), _ = views(analyse([synthetic.directory]))
+    assert not drawn(settings_figure, view)
+
+
+def test_long_settings_have_file_names_of_their_own(synthetic):
+    long = "x" * 120
+    for last in ("a", "b"):
+        fill(synthetic, names=(long + last, "c"), scales=(1.0,))
+    parts, _ = views(analyse([synthetic.directory]))
+    suffixes = [part.suffix for part in parts]
+    assert len(set(suffixes)) == 2
+    assert all(len(suffix) < 100 for suffix in suffixes)
+    # The name hangs on the setting alone, not on what else there is.
+    again = Synthetic(synthetic.directory.parent / "again")
+    for last in ("b", "c", "a"):
+        fill(again, names=(long + last, "c"), scales=(1.0,))
+    parts, _ = views(analyse([again.directory]))
+    assert set(suffixes) <= {part.suffix for part in parts}
+
+
+def test_a_figure_sees_what_it_declares_and_its_digest_knows_all_of_it(synthetic):
+    fill(synthetic)
+    view = only_view(synthetic)
+    narrow = view.only(("summary",))
+    with pytest.raises(KeyError):
+        narrow["scores"]
+    assert narrow.digest() == only_view(synthetic).only(("summary",)).digest()
+    frame = view["summary"].copy()
+    frame.loc[frame.index[0], "rmse"] *= 1 + 1e-15
+    assert replace(narrow, frames={"summary": frame}).digest() != narrow.digest()
+    for changed in ({"label": "other"}, {"look": {"two": Look("#000000", "o")}}, {"equations": {}}):
+        assert replace(narrow, **changed).digest() != narrow.digest()
+
+
+def test_every_module_with_a_figure_is_in_the_list():
+    folder = Path(gallery.__file__).parent
+    assert {p.stem for p in folder.glob("*.py") if "\nFIGURE = " in p.read_text(encoding="utf-8")} == set(FIGURES)
+
+
+@pytest.fixture
+def stored(synthetic, tmp_path):
+    fill(synthetic)
+    return analyse([synthetic.directory]), tmp_path / "figures"
+
+
+def times(folder: Path) -> dict[str, int]:
+    return {p.name: p.stat().st_mtime_ns for p in folder.iterdir()}
+
+
+def test_what_has_not_changed_is_not_drawn_again(stored, monkeypatch):
+    analysis, folder = stored
+    first = draw_all(analysis, folder, formats=("png",), processes=1)
+    before = times(folder)
+    monkeypatch.setattr(gallery, "draw_task", lambda *_: pytest.fail("drawn again"))
+    second = draw_all(analysis, folder, formats=("png",), processes=1)
+    assert second == first
+    assert times(folder) == before
+
+
+def test_only_what_shows_the_change_is_drawn_again(stored):
+    analysis, folder = stored
+    draw_all(analysis, folder, formats=("png",), processes=1)
+    before = times(folder)
+    scores = analysis.scores.assign(cost_median=analysis.scores["cost_median"] * 2)
+    draw_all(replace(analysis, scores=scores), folder, formats=("png",), processes=1)
+    changed = {name for name, time in times(folder).items() if before.get(name) != time}
+    assert {"cost_against_accuracy.png", "index.json"} <= changed
+    assert not {"success_against_scale.png", "error_against_scale.png", "profiles.png"} & changed
+
+
+def test_other_code_draws_again(stored, monkeypatch):
+    analysis, folder = stored
+    draw_all(analysis, folder, which="main", formats=("png",), processes=1)
+    before = times(folder)
+    monkeypatch.setattr(gallery, "_drawn_with", lambda: "other code")
+    draw_all(analysis, folder, which="main", formats=("png",), processes=1)
+    assert all(time != before[name] for name, time in times(folder).items())
+
+
+@pytest.mark.parametrize("damage", ["cut", "edited", "removed", "index"])
+def test_damaged_figures_are_drawn_again(stored, damage):
+    analysis, folder = stored
+    (picture, *_) = draw_all(analysis, folder, which="main", formats=("png",), processes=1)
+    path = picture.files[0]
+    whole = path.read_bytes()
+    if damage == "cut":
+        path.write_bytes(whole[:100])
+    elif damage == "edited":
+        path.write_bytes(whole[:-40] + bytes([whole[-40] ^ 1]) + whole[-39:])
+    elif damage == "removed":
+        path.unlink()
+    else:
+        (folder / "index.json").write_text('{"schema": 1, "drawn": [7]}')
+    draw_all(analysis, folder, which="main", formats=("png",), processes=1)
+    assert path.read_bytes() == whole
+
+
+def test_stale_figures_go_and_foreign_files_stay(synthetic, tmp_path):
+    folder = tmp_path / "figures"
+    fill(synthetic)
+    draw_all(analyse([synthetic.directory]), folder, which="main", formats=("png",), processes=1)
+    (folder / "mine.png").write_bytes(b"of the user")
+    assert (folder / "success_against_scale.png").exists()
+    fill(synthetic, sigma=0.4)
+    draw_all(analyse([synthetic.directory]), folder, which="main", formats=("png",), processes=1)
+    assert not (folder / "success_against_scale.png").exists()
+    assert len(list(folder.glob("success_against_scale_*.png"))) == 2
+    assert (folder / "mine.png").read_bytes() == b"of the user"
+
+
+def test_an_index_cannot_remove_files_elsewhere(stored):
+    analysis, folder = stored
+    folder.mkdir()
+    victim = folder.parent / "victim.png"
+    victim.write_bytes(b"precious")
+    entry = {"name": "../victim", "title": "", "caption": "", "digests": {"png": "0"}}
+    (folder / "index.json").write_text(json.dumps({"schema": 1, "drawn": {"0": [entry]}}))
+    draw_all(analysis, folder, which="none")
+    assert victim.exists()
+
+
+def test_main_none_and_formats(stored):
+    analysis, folder = stored
+    assert draw_all(analysis, folder, which="none") == []
+    assert not folder.exists()
+    main = draw_all(analysis, folder, which="main", formats=("png",), processes=1)
+    assert {d.name for d in main} == {"figure_2", "figure_3", "error_against_scale", "success_against_scale"}
+    assert {p.suffix for p in folder.iterdir()} == {".png", ".json"}
+    both = draw_all(analysis, folder, which="main", processes=1)
+    assert all(path.exists() for d in both for path in d.files)
+    assert {path.suffix for d in both for path in d.files} == {".png", ".pdf"}
+    # A PDF that is still right stays where none is asked for, and goes where it is no more.
+    draw_all(analysis, folder, which="none")
+    assert len(list(folder.glob("*.pdf"))) == len(main)
+    other = replace(analysis, summary=analysis.summary.assign(success=0.5))
+    draw_all(other, folder, which="none")
+    assert not list(folder.glob("*.p*"))
+
+
+def test_two_processes_draw_the_same_bytes(stored, tmp_path, monkeypatch):
+    analysis, folder = stored
+    alone = draw_all(analysis, folder, formats=("png",), processes=1)
+    # The helper gets everything: this process claims nothing.
+    monkeypatch.setattr(gallery, "claim", lambda *_: False)
+    helped = draw_all(analysis, tmp_path / "two", formats=("png",), processes=2)
+    assert [(d.name, d.caption) for d in helped] == [(d.name, d.caption) for d in alone]
+    for a, b in zip(alone, helped, strict=True):
+        assert a.files[0].read_bytes() == b.files[0].read_bytes()
+
+
+def test_a_helper_that_dies_costs_nothing_but_time(stored, monkeypatch):
+    analysis, folder = stored
+    monkeypatch.setattr(gallery.sys, "executable", shutil.which("false") or "/nonexistent")
+    found = draw_all(analysis, folder, which="main", formats=("png",), processes=2)
+    assert all(path.exists() for d in found for path in d.files)

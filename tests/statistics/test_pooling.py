@@ -1,0 +1,165 @@
+"""Only seeds are pooled; whatever else two experiments differ in is named wherever they are shown."""
+
+from __future__ import annotations
+
+import io
+import re
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+from synthetic_store import Pretender, Repeated
+
+import ipe_bench as ib
+from ipe_bench.cli.main import main
+from ipe_bench.noise import Correlated, Gaussian
+from ipe_bench.report.tables import overview
+from ipe_bench.report.terminal import render
+from ipe_bench.runs.store import Cell
+from ipe_bench.statistics import analyse
+from ipe_bench.statistics.collect import collect
+
+BEACONS = (
+    (1000.0, 0.0, 300.0),
+    (500.0, 866.0, 20.0),
+    (-500.0, 866.0, 300.0),
+    (-1000.0, 0.0, 20.0),
+    (0.0, -900.0, 50.0),
+)
+
+
+def errors(trials: int = 25, n: int = 3) -> np.ndarray:
+    return 0.1 * np.random.default_rng(0).normal(size=(trials, n))
+
+
+def titles_in(text: str) -> list[str]:
+    """The titles of tables, which may be broken into lines."""
+    return re.findall(r"[a-z_.]*(?:repeated|Repeated|Twice|polynomial|ranging),.*?trialsperrow", "".join(text.split()))
+
+
+def headings(directory) -> tuple[list[str], list[tuple[str, ...]]]:
+    """The titles in the terminal, and what tells the rows of the overview apart."""
+    analysis = analyse([directory])
+    out = io.StringIO()
+    Console(file=out, width=250).print(render(analysis.summary))
+    titles = titles_in(out.getvalue())
+    table = overview(analysis)
+    named = [column.title for column in table.columns].index("estimator") + 1
+    rows = [tuple(cell.text for cell in row[:named]) for row in table.rows]
+    return titles, rows
+
+
+def test_beacons_of_different_numbers_are_two_experiments(tmp_path):
+    scenarios = [
+        ib.Scenario(ib.measurements.Ranging(beacons=beacons), Gaussian(0.1), error_scale=1.0)
+        for beacons in (BEACONS, BEACONS[:4], (*BEACONS[:4], (0.0, -900.0, 51.0)))
+    ]
+    table = ib.run(scenarios, {"lse": ib.baselines.LinearLSE()}, 20, output=tmp_path)
+    rows = table[table["parameter"] == "all"]
+    assert rows["trials"].tolist() == [20, 20, 20]
+    assert rows["measurement.beacons"].nunique() == 3
+    for shown in headings(tmp_path):
+        assert len(set(shown)) == 3, shown
+
+
+def test_a_matrix_and_none_are_two_experiments(tmp_path):
+    model = ib.measurements.Polynomial(count=6)
+    noises = [Correlated(0.01), Correlated(0.01, matrix=tuple(map(tuple, 1e-4 * np.eye(6))))]
+    table = ib.run(
+        [ib.Scenario(model, noise) for noise in noises], {"lse": ib.baselines.LinearLSE()}, 20, output=tmp_path
+    )
+    rows = table[table["parameter"] == "all"]
+    assert rows["trials"].tolist() == [20, 20]
+    for shown in headings(tmp_path):
+        assert len(set(shown)) == 2, shown
+
+
+@dataclass(frozen=True)
+class Twice(Repeated):
+    """Another model under the name of the first."""
+
+    name = "repeated"
+
+
+def another_module() -> type:
+    """A class of the same name from another module."""
+    other = dataclass(frozen=True)(type("Repeated", (Repeated,), {"name": "repeated"}))
+    other.__qualname__, other.__module__ = "Repeated", "elsewhere.models"
+    return other
+
+
+@pytest.mark.parametrize("kind", [Twice, another_module()], ids=["class", "module"])
+def test_models_that_share_a_name_are_two_experiments(synthetic, kind):
+    scenario = synthetic.scenario()
+    synthetic.add(scenario, "one", errors())
+    synthetic.add(replace(scenario, measurement=kind()), "one", errors())
+    groups = collect([synthetic.directory]).groups
+    assert len(groups) == 2
+    assert groups[0].columns != groups[1].columns
+    for shown in headings(synthetic.directory):
+        assert len(set(shown)) == 2, shown
+
+
+def test_a_setting_of_zero_is_in_every_heading(tmp_path):
+    scenarios = [
+        ib.Scenario(ib.measurements.Polynomial(strength=strength), Gaussian(0.01)) for strength in (0.0, 0.005)
+    ]
+    ib.run(scenarios, {"lse": ib.baselines.LinearLSE()}, 20, output=tmp_path)
+    titles, rows = headings(tmp_path)
+    assert sum("measurement.strength=0:" in title for title in titles) == 1
+    assert {row[0] for row in rows} == {"0", "0.005"}
+
+
+def test_equal_numbers_of_another_type_are_one_experiment():
+    scenario = ib.Scenario(Repeated(), Gaussian(1.0), error_scale=2.0)
+    same = ib.Scenario(Repeated(sizes_given=(1, 10, 0.1)), Gaussian(1), error_scale=2, seed=np.int64(0))
+    assert Cell(scenario, "one", Pretender()).key == Cell(same, "one", Pretender()).key
+    assert Cell(scenario).key != Cell(replace(scenario, error_scale=2.5)).key
+
+
+def test_seeds_are_pooled_and_nothing_else(synthetic):
+    for seed in (0, 1, 2):
+        synthetic.add(synthetic.scenario(seed=seed), "one", errors())
+    synthetic.add(synthetic.scenario(sigma=0.3), "one", errors())
+    groups = collect([synthetic.directory]).groups
+    assert sorted(len(group.cells) for group in groups) == [1, 3]
+
+
+OPTIONS = st.fixed_dictionaries(
+    {
+        "repeats": st.sampled_from([2, 3]),
+        "names": st.sampled_from([("a", "b", "c"), ("a", "b"), ("c", "b", "a")]),
+        "sizes_given": st.sampled_from([(1.0,), (1.0, 2.0), (1.0, 2.0, 3.0)]),
+    }
+)
+
+
+@given(st.lists(OPTIONS, min_size=2, max_size=4, unique_by=lambda m: str(sorted(m.items()))))
+@settings(max_examples=15, deadline=None)
+def test_different_models_are_never_pooled_and_always_told_apart(tmp_path_factory, models):
+    from synthetic_store import Synthetic
+
+    store = Synthetic(tmp_path_factory.mktemp("store"))
+    for model in models:
+        store.add(store.scenario(**model), "one", errors(n=len(model["names"])))
+    groups = collect([store.directory]).groups
+    assert len(groups) == len(models)
+    assert all(a.columns != b.columns for a, b in combinations(groups, 2))
+
+
+def test_a_sweep_over_lists_names_what_differs_in_tables_status_and_files(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    one, other = ("[" + ",".join(str(list(b)).replace(" ", "") for b in part) + "]" for part in (BEACONS, BEACONS[:4]))
+    arguments = ["noise=gaussian", "noise.deviation=0.1", "trials=20", "solver=[]", "execution=serial", "output=out"]
+    assert main(["run", "-m", "measurement=ranging", f"measurement.beacons={one},{other}", *arguments]) == 0
+    titles = titles_in(capsys.readouterr().out)
+    assert len(titles) == len(set(titles)) == 2
+    table = ib.load("out")
+    assert table.groupby("measurement.beacons")["trial"].count().tolist() == [20, 20]
+    assert main(["status", "out"]) == 0
+    rows = [line for line in capsys.readouterr().out.splitlines() if "20 of 20" in line]
+    assert len(rows) == len(set(rows)) == 4
