@@ -21,6 +21,7 @@ from ipe_bench.measurements.polynomial import Polynomial
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.gaussian import Gaussian
+from ipe_bench.noise.own import ModelNoise
 from ipe_bench.priors.gaussian import GaussianPrior
 from ipe_bench.runs.provenance import describe
 from ipe_bench.trials.scenario import Scenario
@@ -219,8 +220,8 @@ def orders_its_epochs(model: Measurement) -> None:
 
 def states_its_covariance(noise: Noise) -> None:
     """States a covariance R that whitens as many readings as there are."""
-    if noise.real:
-        return  # R comes with the readings.
+    if noise.real or isinstance(noise, ModelNoise):
+        return  # R comes with the readings, or with the model.
     R = noise.covariance(6)
     assert R.m == 6, f"covariance(6) is for {R.m} readings"
     assert (R.deviations > 0).all(), "a standard deviation is not above 0"
@@ -228,7 +229,7 @@ def states_its_covariance(noise: Noise) -> None:
 
 def corrupts_reproducibly(noise: Noise) -> None:
     """Gives the same readings from the same random stream, and leaves h alone."""
-    if noise.real:
+    if noise.real or noise.estimated or isinstance(noise, ModelNoise):
         return  # Nothing is corrupted.
     h, offset = np.linspace(-1.0, 1.0, 6), np.zeros(6)
     copy = h.copy()
