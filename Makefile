@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test slow campaigns lint bench clean
+.PHONY: run test slow campaigns mutants lint bench clean
 
 run: .venv/ready
 	$(BIN)/ipe-bench run +experiment=paper
@@ -17,6 +17,11 @@ slow: .venv/ready
 # What takes the better part of an hour: hundreds of damaged files, wrong command lines, tables of error rates.
 campaigns: .venv/ready
 	$(BIN)/pytest -n auto -m campaign
+
+# Whether the tests notice changes on purpose, room by room, as a table in outputs/mutants. SAMPLE=40 draws that many.
+mutants: .venv/ready
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[mutants]"
+	$(BIN)/python tests/mutants/score.py $(if $(SAMPLE),--sample $(SAMPLE)) $(ROOMS)
 
 lint: .venv/ready
 	$(BIN)/ruff check
