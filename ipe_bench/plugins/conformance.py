@@ -366,10 +366,15 @@ def states_its_covariance(noise: Noise) -> None:
     assert (R.deviations > 0).all(), "a standard deviation is not above 0"
 
 
+def _draws_nothing(noise: Noise) -> bool:
+    """Whether readings are real, their level is estimated, or the noise only stands for that of a model."""
+    return noise.real or noise.estimated or isinstance(noise, ModelNoise)
+
+
 def corrupts_reproducibly(noise: Noise) -> None:
     """Gives the same readings from the same random stream, and leaves h alone."""
-    if noise.real or noise.estimated or isinstance(noise, ModelNoise):
-        return  # Nothing is corrupted.
+    if _draws_nothing(noise):
+        return
     h, offset = np.linspace(-1.0, 1.0, 6), np.zeros(6)
     copy = h.copy()
     first, second = (noise.corrupt(h, offset, np.random.default_rng(3)) for _ in range(2))
@@ -380,7 +385,7 @@ def corrupts_reproducibly(noise: Noise) -> None:
 
 def draws_what_it_states(noise: Noise) -> None:
     """Draws errors of mean zero whose variances and correlations are those of R."""
-    if noise.real or not noise.true_covariance:
+    if _draws_nothing(noise) or not noise.true_covariance:
         return
     m = 6
     R, rng = noise.covariance(m), np.random.default_rng(7)

@@ -1,7 +1,8 @@
 """Files of readings: one row per reading, with columns that say which reading it is, and the reading with its unit.
 
 The header for GINS is `case,time [min],axis,reading [m/s]`. Rows may stand in any order; an empty reading is missing.
-Cells are separated by commas; or by semicolons, and then a comma is a decimal point, as European spreadsheets write it.
+Cells are separated by commas or tabs; or by semicolons, and then a comma is a decimal point, as European spreadsheets
+write it.
 Nothing is guessed: what is not plainly a number, or not part of the table, is refused with its row.
 """
 
@@ -199,19 +200,32 @@ def _read_parquet(path: Path) -> Table:
 
 
 def _read_text(path: Path) -> Table:
+    text = _text_of(path)
+    first = next((line for line in text.splitlines() if line.strip()), "")
+    separator = next((sign for sign in ";\t" if sign in first), ",")
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
     try:
-        text = path.read_text(encoding="utf-8-sig")
-        first = next((line for line in text.splitlines() if line.strip()), "")
-        separator = ";" if ";" in first else ","
-        reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
         lines = [(reader.line_num, row) for row in reader if any(c.strip() for c in row)]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"readings={path}: is not a readable CSV file ({error}); save it as CSV in UTF-8") from error
+    except csv.Error as error:
+        raise UserError(
+            f"readings={path}: row {reader.line_num}: is not a readable CSV file ({error}); mend the quotes"
+        ) from error
     if not lines:
         raise UserError(f"readings={path}: is empty")
     rows = lines[1:]
     comma = separator == ";" and any(_WITH_COMMA.fullmatch(cell.strip()) for _, row in rows for cell in row)
     return Table(path, [name.strip() for name in lines[0][1]], rows, "," if comma else ".")
+
+
+def _text_of(path: Path) -> str:
+    data = path.read_bytes()
+    try:
+        return data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+    except UnicodeDecodeError as error:
+        row = data.count(b"\n", 0, error.start) + 1
+        raise UserError(
+            f"readings={path}: row {row}: is not a readable CSV file ({error.reason}); save it as CSV in UTF-8"
+        ) from error
 
 
 def _require_columns(table: Table, wanted: Sequence[str]) -> None:
@@ -227,6 +241,8 @@ def _require_columns(table: Table, wanted: Sequence[str]) -> None:
 
 def _miscounted(table: Table, number: int, row: Sequence[str]) -> str:
     """What is wrong with a row that has more or fewer cells than the header."""
+    if number == table.rows[0][0] and all(cell.strip() and table.number(cell) is None for cell in row):
+        return f"row {number}: looks like the header, which must be the first row; remove what stands above it"
     text = f"row {number}: has {len(row)} cells and the header {len(table.heading)}"
     if len(row) > len(table.heading) and table.decimal == ".":
         return f"{text}; with decimal commas, separate the cells by semicolons"
