@@ -26,6 +26,7 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.measurements.sir import Sir
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.gaussian import Gaussian
+from ipe_bench.noise.own import ModelNoise
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import Option, blame
 from ipe_bench.priors.gaussian import GaussianPrior
@@ -282,8 +283,8 @@ def _points(model: Measurement, trials: int = 4) -> Array:
 
 
 def names_its_readings(model: Measurement) -> None:
-    """Has more readings than parameters, each with its own label, and units."""
-    assert model.m > model.n, f"{model.m} readings are too few for {model.n} parameters"
+    """Has at least as many readings as parameters, each with its own label, and units."""
+    assert model.m >= model.n, f"{model.m} readings are too few for {model.n} parameters"
     lengths = {name: len(column) for name, column in model.index.items()}
     assert set(lengths.values()) == {model.m}, f"the columns of index have lengths {lengths}, and not {model.m}"
     labels = list(zip(*model.index.values(), strict=True))
@@ -358,17 +359,22 @@ def orders_its_epochs(model: Measurement) -> None:
 
 def states_its_covariance(noise: Noise) -> None:
     """States a covariance R that whitens as many readings as there are."""
-    if noise.real:
-        return  # R comes with the readings.
+    if noise.real or isinstance(noise, ModelNoise):
+        return  # R comes with the readings, or with the model.
     R = noise.covariance(6)
     assert R.m == 6, f"covariance(6) is for {R.m} readings"
     assert (R.deviations > 0).all(), "a standard deviation is not above 0"
 
 
+def _draws_nothing(noise: Noise) -> bool:
+    """Whether readings are real, their level is estimated, or the noise only stands for that of a model."""
+    return noise.real or noise.estimated or isinstance(noise, ModelNoise)
+
+
 def corrupts_reproducibly(noise: Noise) -> None:
     """Gives the same readings from the same random stream, and leaves h alone."""
-    if noise.real:
-        return  # Nothing is corrupted.
+    if _draws_nothing(noise):
+        return
     h, offset = np.linspace(-1.0, 1.0, 6), np.zeros(6)
     copy = h.copy()
     first, second = (noise.corrupt(h, offset, np.random.default_rng(3)) for _ in range(2))
@@ -379,7 +385,7 @@ def corrupts_reproducibly(noise: Noise) -> None:
 
 def draws_what_it_states(noise: Noise) -> None:
     """Draws errors of mean zero whose variances and correlations are those of R."""
-    if noise.real or not noise.true_covariance:
+    if _draws_nothing(noise) or not noise.true_covariance:
         return
     m = 6
     R, rng = noise.covariance(m), np.random.default_rng(7)
