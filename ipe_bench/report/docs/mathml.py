@@ -7,7 +7,6 @@ from typing import Any
 from docutils import nodes
 from latex2mathml.converter import convert
 
-
 _STYLE = "margin: 1rem 0; padding: .5rem 0; overflow-x: auto"
 
 
