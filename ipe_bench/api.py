@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ipe_bench.basics.errors import StorageError, UserError
+from ipe_bench.basics.errors import StorageError, UserError, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import cores, library_versions
 from ipe_bench.estimators.base import Estimator
@@ -139,6 +139,74 @@ def report(directories: Directories, output: Path | str | None = None) -> Report
 
     require_results(_paths(directories))
     return write_report(directories, output)
+
+
+def compare(
+    first_directory: Directories,
+    second_directory: Directories | None = None,
+    *,
+    first: str | None = None,
+    second: str | None = None,
+    alpha: float = 0.05,
+    anytime: bool = False,
+    fail_on: Sequence[str] = ("success", "error"),
+    output: Path | str | None = None,
+) -> pd.DataFrame:
+    """Whether a second version, setting or estimator is better or worse than a first, trial by trial.
+
+    Compares every estimator that both directories have, on every scenario that both have, or `first` of the first with
+    `second` of the second; without a second directory both are in the first one. Where no scenario is in both, those
+    are compared that differ in one setting alone. Trials are matched by seed and number; those of other seeds in their
+    order, which is right and gains nothing.
+
+    Returns a row per comparison and quantity: success (share; `change` is a difference), error (mean Mahalanobis error,
+    each trial's at most the radius of the gate; a ratio), cost in simulations (a ratio), and time, which is not tested.
+    `low` and `high` are the ends of the row's own interval, `p` is corrected over all rows (Holm), and `e` is evidence
+    that may be looked at after any number of trials; `finding` says what the second is: better, worse or neither
+    surely, by p below `alpha`, or by e where `anytime`. `attrs["worse"]` has a line for everything in `fail_on` that is
+    worse, `attrs["problems"]` for what is missing, `attrs["stale"]` for what older code computed, `attrs["notes"]` for
+    what is left out. With `output`, comparison.csv and figures are written there.
+
+    >>> import tempfile, ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = ib.run(bench, {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}, 20, output=folder)
+    ...     rows = ib.compare(folder, first="linear", second="newton")
+    >>> rows.set_index("quantity")["finding"].to_dict()
+    {'success': 'better', 'error': 'better', 'cost': 'worse', 'time': ''}
+
+    Raises:
+        UserError: there is nothing to compare.
+    """
+    import pandas as pd
+
+    from ipe_bench.statistics.between import JUDGED, compared, left_out
+    from ipe_bench.statistics.collect import collect
+
+    if not 0 < alpha < 1:
+        raise UserError(f"alpha={alpha}: give a number between 0 and 1")
+    if wrong := [name for name in fail_on if name not in JUDGED]:
+        raise UserError(f"fail_on={wrong[0]}: {unknown(wrong[0], JUDGED, 'quantity')}")
+    paths = [_paths(first_directory), _paths(first_directory if second_directory is None else second_directory)]
+    if second_directory is None and (first is None or second is None):
+        raise UserError("compare: one folder is compared with itself; name another, or first=LABEL and second=LABEL")
+    for part in paths:
+        require_results(part)
+    collections = [collect(part) for part in paths]
+    frame = pd.DataFrame(compared(*collections, (first, second), alpha=alpha, anytime=anytime))
+    worse = frame[(frame["finding"] == "worse") & frame["quantity"].isin(list(fail_on))]
+    frame.attrs["worse"] = [
+        f"{row['second']} in {row['quantity']}, {row['measurement']}, error scale {row['error_scale']}"
+        for row in worse.to_dict("records")
+    ]
+    for name in ("problems", "stale"):
+        frame.attrs[name] = list(dict.fromkeys(line for c in collections for line in getattr(c, name)))
+    frame.attrs["notes"] = left_out(*collections)
+    if output is not None:
+        from ipe_bench.report.comparison import write
+
+        write(frame, Path(output), alpha)
+    return frame
 
 
 def status(directories: Directories) -> pd.DataFrame:
