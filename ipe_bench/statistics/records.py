@@ -19,6 +19,7 @@ from ipe_bench.statistics.consistency import clopper_pearson, mean_limits, verdi
 from ipe_bench.statistics.histories import CLOSE, FixedPointBound, fixed_point_bound, observed_constant, orders_of
 from ipe_bench.statistics.intervals import LARGEST_SAMPLE, RESAMPLES, quantile, quantiles
 from ipe_bench.statistics.sample import FIT, NIS, Sample, root_mean
+from ipe_bench.statistics.sequences import rms_sequence, share_sequence
 from ipe_bench.trials.thresholds import EXPECTED, FEW, FIT_LEVEL, GATE, SAME_ROOT
 
 Kind = Literal["count", "share", "number", "physical", "seconds", "probability", "word"]
@@ -106,6 +107,21 @@ def _share(mask: Array) -> float:
 
 def _success_limits(s: Sample) -> Limits:
     return clopper_pearson(int(s.scalars["success"].sum()), len(s))
+
+
+def _success_sequence(s: Sample) -> Limits:
+    return share_sequence(int(s.scalars["success"].sum()), len(s))
+
+
+def _rmse_sequence(s: Sample) -> Limits:
+    together = np.mean(s.normalised[s.solved] ** 2, axis=1)
+    low, high = rms_sequence(together[:, None])
+    return float(low[0]), float(high[0])
+
+
+def _rmse_sequence_each(s: Sample) -> Limits:
+    low, high = rms_sequence(s.error[s.solved] ** 2)
+    return low * s.sizes, high * s.sizes
 
 
 def _misfit(s: Sample) -> float:
@@ -369,6 +385,17 @@ STATISTICS: tuple[Statistic, ...] = (
         limits_titles={"overview": "95 % of success"},
     ),
     Statistic(
+        "success_anytime",
+        "success, any time",
+        "all trials",
+        "The same share, with an interval of 95 % that stays valid however often one looks and whenever one stops: the"
+        " one for runs with `precision` (beta-binomial confidence sequence: Robbins, Ann. Math. Statist. 41, 1970;"
+        " Howard et al., Ann. Statist. 49, 2021).",
+        lambda s: int(s.scalars["success"].sum()) / len(s),
+        limits=_success_sequence,
+        kind="share",
+    ),
+    Statistic(
         "solved_trials",
         "solved trials",
         "all trials",
@@ -449,6 +476,19 @@ STATISTICS: tuple[Statistic, ...] = (
         kind="physical",
         where=("parameters", "covariances"),
         limits_titles={"parameters": "95 % of rmse"},
+    ),
+    Statistic(
+        "rmse_anytime",
+        "rmse, any time",
+        "solved trials",
+        "The same root mean square error, with an asymptotic interval of 95 % that stays valid however often one looks"
+        " and whenever one stops (Waudby-Smith et al., Ann. Statist. 52, 2024).",
+        _over_linear_bound(_rmse),
+        _in_units(_rmse),
+        limits=_rmse_sequence,
+        each_limits=_rmse_sequence_each,
+        given="solved",
+        kind="physical",
     ),
     Statistic(
         "rmse_common",
