@@ -192,7 +192,7 @@ class Measurement(Component, Named, ABC):
         return differentiate(self.simulate, x, analytic=self.analytic)
 
     def coarse_jacobian(self, x: Array) -> Array:
-        """dh/dx near enough for the steps of an iteration, |I - J~+ J| below 0.01, where that is cheaper; else exact.
+        """dh/dx near enough for the steps of an iteration, `|I - J~+ J|` below 0.01, where that is cheaper; else exact.
         A trial's bits depend on that trial's x alone. Covariances and tests of convergence want `jacobian`."""
         return self.jacobian(x)
 
