@@ -127,8 +127,9 @@ class Examination:
 
 
 def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BOOTSTRAPS) -> Examination | None:
-    """Examines the least of the minima that the estimators found; None where none of them is one."""
-    told = [one for one in fits if one.status is Status.CONVERGED and np.isfinite(one.chi_square)]
+    """Examines the least of the minima that the estimators found; None where none of them is one, as with a prior."""
+    found = [one for one in fits if one.status is Status.CONVERGED and np.isfinite(one.chi_square)]
+    told = [one for one in found if not one.with_prior]
     if not told:
         return None
     best = min(told, key=_sum_of_squares)

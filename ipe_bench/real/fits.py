@@ -73,6 +73,8 @@ class Fit:
     level: float | None = None
     """The factor by which the readings are noisier than R says, where it is estimated from the residuals; R and all
     that rests on it, the covariance included, have been multiplied by it already. None: R is known."""
+    with_prior: bool = False
+    """Whether the estimator was told a prior, so that x is not the least-squares estimate."""
     beaten: bool = False
     """Whether another estimator's sum of squares is so much smaller that chance does not explain it: tested where the
     level is estimated, because there nothing else tells a wrong answer."""
@@ -318,6 +320,7 @@ def _fit_one(
         model,
         estimates.x[0],
         P,
+        with_prior="prior" in estimator.needs,
     )
 
 

@@ -197,6 +197,7 @@ def _described(answer: Answer) -> dict[str, Any]:
                 "p": examined.numbers(one.p_value),
                 "fits": one.fits,
                 "passes": one.passes,
+                "with_prior": one.with_prior,
                 "noise_level_estimated": None if one.level is None else examined.numbers(one.level),
                 "residual_deviation": examined.numbers(one.residual_deviation),
                 "whiteness": {
@@ -362,6 +363,7 @@ def _notes(fits: Sequence[Fit], width: int) -> Any:
         " resemble each other." + (" deviation: of the residuals, in the readings' unit." if width >= _NARROW else ""),
         *(f"{one.label}: {one.message}" for one in fits if one.message),
         *_on_levels(fits),
+        *_on_priors(fits),
     ]
     failing = [one.label for one in fits if not one.passes]
     if fits[0].model.fixed:
@@ -387,6 +389,15 @@ def _on_levels(fits: Sequence[Fit]) -> Iterator[str]:
         yield (
             f"{', '.join(suspect)}: successive residuals resemble each other (white p below {FIT_LEVEL:g}); the model"
             " is in doubt, and standard errors are too small."
+        )
+
+
+def _on_priors(fits: Sequence[Fit]) -> Iterator[str]:
+    told = [one.label for one in fits if one.with_prior]
+    if told:
+        yield (
+            f"{', '.join(told)}: with a prior. Profiles, bootstrap and influence, where given, are of least squares"
+            " without it."
         )
 
 
@@ -435,7 +446,7 @@ def fragment(answer: Answer) -> str:
     names = ("estimator", "status", "chi-square", "degrees of freedom", "p", "white p", "outliers", "fits")
     head = "".join(f"<th>{name}</th>" for name in names)
     parts.append(f"<h3>Does the model fit?</h3><table><thead><tr>{head}</tr></thead><tbody>{verdicts}</tbody></table>")
-    notes = [*_on_levels(answer.fits)]
+    notes = [*_on_levels(answer.fits), *_on_priors(answer.fits)]
     if failing:
         notes.append(f"In brackets, and not an answer: {', '.join(failing)}.")
     found = answer.examination
