@@ -19,7 +19,7 @@ from ipe_bench.estimators.least_squares import Minima, Objective, minimize
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.real.fits import Fit, present_part
+from ipe_bench.real.fits import Fit, holding, present_part
 from ipe_bench.real.profiles import Profile, half_width, profiles
 
 CONFIDENCE = 0.95
@@ -134,8 +134,11 @@ def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BO
         return None
     best = min(told, key=_sum_of_squares)
     rows = np.flatnonzero(np.isfinite(z))
-    found = _Least.near(present_part(problem, rows, best.level), z[rows], best)
-    return None if found is None else found.examined(best.label, rows, len(z), bootstraps)
+    if best.held is not None:
+        # What is on its bound has no error; the others are examined with it held there.
+        problem, best = holding(problem, best.held_at), best.held
+    least = _Least.near(present_part(problem, rows, best.level), z[rows], best)
+    return None if least is None else least.examined(best.label, rows, len(z), bootstraps)
 
 
 def _sum_of_squares(one: Fit) -> float:

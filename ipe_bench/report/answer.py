@@ -198,6 +198,7 @@ def _described(answer: Answer) -> dict[str, Any]:
                 "fits": one.fits,
                 "passes": one.passes,
                 "with_prior": one.with_prior,
+                "on_bounds": {names[k]: value for k, value in one.held_at.items()},
                 "noise_level_estimated": None if one.level is None else examined.numbers(one.level),
                 "residual_deviation": examined.numbers(one.residual_deviation),
                 "whiteness": {
@@ -364,6 +365,7 @@ def _notes(fits: Sequence[Fit], width: int) -> Any:
         *(f"{one.label}: {one.message}" for one in fits if one.message),
         *_on_levels(fits),
         *_on_priors(fits),
+        *_on_bounds(fits),
     ]
     failing = [one.label for one in fits if not one.passes]
     if fits[0].model.fixed:
@@ -399,6 +401,17 @@ def _on_priors(fits: Sequence[Fit]) -> Iterator[str]:
             f"{', '.join(told)}: with a prior. Profiles, bootstrap and influence, where given, are of least squares"
             " without it."
         )
+
+
+def _on_bounds(fits: Sequence[Fit]) -> Iterator[str]:
+    for one in fits:
+        if one.held is not None:
+            names = [one.model.natural_parameters[k].name for k in one.held_at]
+            bounds = ", ".join(f"{name} = {value:g}" for name, value in zip(names, one.held_at.values(), strict=True))
+            yield (
+                f"{one.label}: on its bound: {bounds}; the readings want it beyond. It has no error, and those of the"
+                " others are with it held there."
+            )
 
 
 def _outliers(model: Measurement, fits: Sequence[Fit]) -> Iterator[Any]:
@@ -446,7 +459,7 @@ def fragment(answer: Answer) -> str:
     names = ("estimator", "status", "chi-square", "degrees of freedom", "p", "white p", "outliers", "fits")
     head = "".join(f"<th>{name}</th>" for name in names)
     parts.append(f"<h3>Does the model fit?</h3><table><thead><tr>{head}</tr></thead><tbody>{verdicts}</tbody></table>")
-    notes = [*_on_levels(answer.fits), *_on_priors(answer.fits)]
+    notes = [*_on_levels(answer.fits), *_on_priors(answer.fits), *_on_bounds(answer.fits)]
     if failing:
         notes.append(f"In brackets, and not an answer: {', '.join(failing)}.")
     found = answer.examination
