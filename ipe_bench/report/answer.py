@@ -239,8 +239,12 @@ def _residual_rows(answer: Answer) -> Iterator[list[Any]]:
         more: tuple[Array, ...] = ()
         if found is not None and one.label == found.label:
             more = (*_influences(found), found.fitted_errors, found.new_errors)
+        # Of the estimator that is examined, the readings that are missing are predicted, too.
+        fitted = z - one.residuals
+        if found is not None and more:
+            fitted = np.where(np.isnan(z), found.fitted, fitted)
         for i, label in enumerate(labels):
-            values = (z[i], z[i] - one.residuals[i], one.residuals[i], one.normalised[i])
+            values = (z[i], fitted[i], one.residuals[i], one.normalised[i])
             further = [_cell(column[i]) for column in more] or [""] * len(influence)
             outlier = "yes" if one.outliers[i] else "no"
             yield [one.label, *label, *map(_cell, values), outlier, *further]

@@ -177,6 +177,21 @@ def test_equations_in_a_file_are_a_model(estimate, tmp_path):
     assert list(of(answer, "estimates").values()) == pytest.approx(x, rel=1e-6)
 
 
+def test_a_unit_as_it_stands_and_a_row_without_a_reading_that_is_predicted(estimate, tmp_path):
+    (tmp_path / "a.csv").write_text("t [s],y [m/s^2]\n0,0.8\n1,2.3\n2,2.9\n3,4.2\n20,\n")
+    line = ("measurement=formula", "measurement.expression=a+b*t", "measurement.start.a=1", "measurement.start.b=1")
+    code, printed, answer = estimate(*line, *LM, "readings=a.csv", "measurement.unit=m/s^2", "noise.deviation=0.5")
+    assert code == 0, printed
+    assert answer["reading_unit"] == "m/s^2"
+    rows = (tmp_path / "outputs/estimate-formula/residuals.csv").read_text().splitlines()
+    last = dict(zip(rows[0].split(","), rows[-1].split(","), strict=True))
+    assert last["reading [m/s^2]"] == last["residual [m/s^2]"] == ""
+    assert float(last["fitted [m/s^2]"]) == pytest.approx(22.53, abs=1e-6)
+    # 0.5 sqrt(1/4 + 18.5^2 / 5), and with the 0.5 of a reading
+    assert float(last["fitted_error [m/s^2]"]) == pytest.approx(4.144272, rel=1e-5)
+    assert float(last["prediction_error [m/s^2]"]) == pytest.approx(4.174326, rel=1e-5)
+
+
 MISTAKES = {
     "noise twice": (
         ("readings=weighted.csv", "noise.deviation=0.3"),

@@ -137,6 +137,22 @@ def test_the_reading_that_carries_the_answer_is_named():
     assert found.influence.leverage.sum() == pytest.approx(2.0)
 
 
+@pytest.mark.parametrize("unknown", [False, True])
+def test_rows_without_a_reading_are_predicted_with_their_band(unknown):
+    """A straight line beyond its readings: the textbook's error of the line and of a further reading there."""
+    t = np.array([0.0, 1.0, 2.0, 3.0, 7.0, 20.0])
+    z = np.array([0.8, 2.3, 2.9, 4.2, np.nan, np.nan])
+    model = Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)})
+    found = examined(model, z, Unknown() if unknown else Gaussian(0.5), level_unknown=unknown)
+    b, a = np.polyfit(t[:4], z[:4], 1)
+    assert found.fitted == pytest.approx(a + b * t, rel=1e-7)
+    sigma = np.sqrt(np.sum((z[:4] - a - b * t[:4]) ** 2) / 2) if unknown else 0.5
+    of_line = sigma * np.sqrt(1 / 4 + (t - 1.5) ** 2 / np.sum((t[:4] - 1.5) ** 2))
+    assert found.fitted_errors == pytest.approx(of_line, rel=1e-5)
+    assert found.new_errors == pytest.approx(np.hypot(of_line, sigma), rel=1e-5)
+    assert np.isnan(found.influence.leverage).tolist() == [False] * 4 + [True] * 2
+
+
 def test_parameters_that_the_readings_do_not_tell_apart_are_the_least_observable_direction():
     rng = np.random.default_rng(0)
     t = np.linspace(0, 1, 20)
