@@ -413,6 +413,28 @@ def draws_what_it_states(noise: Noise) -> None:
         )
 
 
+def states_its_law(noise: Noise) -> None:
+    """Says by `whitened` how its errors are distributed, where they are not normal: the test of fit takes that law."""
+    from scipy.stats import ks_2samp
+
+    if _draws_nothing(noise) or not noise.true_covariance:
+        return
+    m, draws = 6, DRAWS // 5
+    rng = np.random.default_rng(9)
+    R = noise.covariance(m)
+    h = rng.uniform(-1000.0, 1000.0, (draws, m)) * R.deviations
+    w = R.whiten(np.array([noise.corrupt(row.copy(), np.zeros(m), rng) - row for row in h]))
+    stated = noise.whitened((draws, m), rng)
+    law = rng.standard_normal((draws, m)) if stated is None else stated
+    # Of each trial its chi-square, which is what the test of fit looks at, and one reading: trials are independent.
+    for what, found, said in (("reading", w[:, 0], law[:, 0]), ("chi-square", (w**2).sum(1), (law**2).sum(1))):
+        p = ks_2samp(found, said).pvalue
+        words = "normal, since there is no `whitened`" if stated is None else "what `whitened` draws"
+        assert p > 1e-6, (
+            f"the {what} of whitened errors is not distributed as {words} (Kolmogorov-Smirnov, p = {p:.1g})"
+        )
+
+
 Check = Callable[[Any], None]
 
 _CHECKS: dict[type, tuple[Check, ...]] = {
@@ -428,6 +450,6 @@ _CHECKS: dict[type, tuple[Check, ...]] = {
         keeps_a_history_if_asked,
     ),
     Measurement: (names_its_readings, simulates_batches, differentiates, orders_its_epochs),
-    Noise: (states_its_covariance, corrupts_reproducibly, draws_what_it_states),
+    Noise: (states_its_covariance, corrupts_reproducibly, draws_what_it_states, states_its_law),
     GaussianPrior: (),
 }

@@ -49,7 +49,10 @@ ROOMS = {
         ("tests/test_fit.py", "tests/statistics/test_theory.py", "tests/test_scenario.py", "tests/montecarlo"),
     ),
     "statistics": Room(("statistics/*.py",), ("tests/statistics", "tests/report/test_report.py")),
-    "noise": Room(("noise/*.py",), ("tests/noise", "tests/test_fit.py", "tests/plugins/test_conformance.py")),
+    "noise": Room(
+        ("noise/*.py",),
+        ("tests/noise", "tests/plugins/test_options.py", "tests/test_fit.py", "tests/montecarlo/test_fit_test.py"),
+    ),
     "filters": Room(
         tuple(
             f"baselines/{name}.py"
@@ -118,10 +121,13 @@ def _silent_lines(path: Path) -> list[tuple[tuple[int, int], tuple[int, int]]]:
             inner = [node.returns]
         elif isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
             inner = [node]
-        for part in inner:
-            if part is not None and part.end_lineno is not None and part.end_col_offset is not None:
-                spans.append(((part.lineno, part.col_offset), (part.end_lineno, part.end_col_offset)))
+        spans += [_span(part) for part in inner if part is not None]
     return spans
+
+
+def _span(node: ast.expr | ast.stmt) -> tuple[tuple[int, int], tuple[int, int]]:
+    last = node.end_lineno or node.lineno, node.end_col_offset or node.col_offset
+    return (node.lineno, node.col_offset), last
 
 
 def sample(specs: list[MutationSpec], number: int | None, seed: int) -> list[MutationSpec]:

@@ -15,7 +15,7 @@ from ipe_bench.measurements import Formula, Gnss, Nist, Ode, Polynomial, Ranging
 from ipe_bench.measurements.joint import Joint
 from ipe_bench.measurements.known import Informed, Known
 from ipe_bench.measurements.nist import datasets
-from ipe_bench.noise import Colored, Gaussian, Noise
+from ipe_bench.noise import Colored, Gaussian, Noise, Quantization
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.plugins.construct import construct
@@ -232,6 +232,14 @@ class Whitened(Colored):
 
 
 @dataclass(frozen=True)
+class Silent(Quantization):
+    """Does not say that its errors are uniform."""
+
+    def whitened(self, shape, rng):
+        return None
+
+
+@dataclass(frozen=True)
 class Forgetful(Noise):
     def corrupt(self, h, offset, rng):
         return h + np.random.default_rng().standard_normal(h.shape)
@@ -243,6 +251,7 @@ class Forgetful(Noise):
 @pytest.mark.parametrize(
     ("faulty", "complaint"),
     [
+        (Silent(1.0), "is not distributed as normal, since there is no `whitened`"),
         (Leaning(), "trial 0 differs"),
         (Rounding(), "trial 0 differs, by rounding alone: use stacked matmul"),
         (Averaging(), "trial 0 differs, by more than rounding"),
