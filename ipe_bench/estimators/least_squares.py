@@ -54,6 +54,7 @@ class Objective:
     z: Array
     rows: NDArray[np.intp]
     x0: Array
+    """The centre of the prior: (n,), or each trial's own (trials, n)."""
     prior_deviation: Array | None = None
 
     @classmethod
@@ -83,7 +84,8 @@ class Objective:
         return np.concatenate([J, prior], axis=1)
 
     def subset(self, kept: Mask) -> Objective:
-        return dataclasses.replace(self, z=self.z[kept], rows=self.rows[kept])
+        x0 = self.x0[kept] if self.x0.ndim == 2 else self.x0
+        return dataclasses.replace(self, z=self.z[kept], rows=self.rows[kept], x0=x0)
 
 
 @dataclass(frozen=True)
