@@ -17,7 +17,7 @@ from scipy.special import chdtrc
 from ipe_bench.basics.linalg import Array, Covariance, Mask, finite, inverse, multiply, solve
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
-from ipe_bench.estimators.driver import Solver, Standing, iterate
+from ipe_bench.estimators.driver import Ended, Solver, Standing, iterate
 from ipe_bench.measurements.counted import Counted, Tally
 from ipe_bench.measurements.problem import Problem
 
@@ -259,7 +259,11 @@ def minimize(
     deviations of the local bound in every parameter. An iteration is a step tried, taken or not.
     """
     limits: dict[str, Any] = {"tolerance": tolerance, "max_iterations": max_iterations, "budget": budget}
-    ended = iterate(objective, method, x, history=history, **limits)
+    return reached(objective, iterate(objective, method, x, history=history, **limits))
+
+
+def reached(objective: Objective, ended: Ended[Any]) -> Minima:
+    """What is known of the objective where an iteration of it, by states like `Descent`, ended."""
     # U^-1 U^-T: inverting U'U would lose twice the digits, and with them the sign of a variance.
     inverse_U, _ = inverse(ended.state.slope.U)
     covariance = np.matmul(inverse_U, inverse_U.swapaxes(1, 2))

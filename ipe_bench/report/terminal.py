@@ -25,17 +25,22 @@ _NOT_SETTINGS = {*COLUMNS, "parameter", "unit", "estimator", "error_scale"}
 
 
 def render(
-    summary: pd.DataFrame | Sequence[Mapping[str, Any]], certified: pd.DataFrame | None = None, width: int = WIDE
+    summary: pd.DataFrame | Sequence[Mapping[str, Any]],
+    certified: pd.DataFrame | None = None,
+    width: int = WIDE,
+    attained: pd.DataFrame | None = None,
 ) -> Group:
     """One table per setting (measurement, noise, and every option that differs), a section per error scale.
 
     `summary` is the frame or its rows. Columns that do not fit the width are left out, and named below. Runs on
-    certified readings, whose mean digits are in `certified`, share one table instead.
+    certified readings, whose mean digits are in `certified`, share one table instead, and so do those on problems of
+    known minimum, whose totals are in `attained`.
     """
     from rich.console import Group
     from rich.text import Text
 
     digits = [] if certified is None or certified.empty else _digits(certified)
+    digits += [] if attained is None or attained.empty else _attained(attained)
     listed: Sequence[Any] = summary if isinstance(summary, Sequence) else summary.to_dict("records")
     rows: list[Any] = [row for row in listed if row["parameter"] == ALL and row["noise"] != "certified"]
     if not rows:
@@ -141,6 +146,28 @@ def _digits(averages: pd.DataFrame) -> list[Any]:
     note = (
         "digits: log relative error against the certified answer, the fewest over a data set's parameters, at most 11,"
         " averaged over the data sets. solved: four digits or more."
+    )
+    return [table, Text(note, style="dim"), Text()]
+
+
+def _attained(totals: pd.DataFrame) -> list[Any]:
+    """Problems of known minimum that are solved."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    from ipe_bench.report.certified_tables import attained_columns
+
+    table = Table(title="Known minima", title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+    columns = attained_columns(totals.sort_values("solved", ascending=False, kind="stable", ignore_index=True))
+    for each in columns:
+        table.add_column(each.title, justify="right" if each.numeric else "left")
+    for row in zip(*(each.cells for each in columns), strict=True):
+        table.add_row(*(cell.text for cell in row))
+    note = (
+        "solved: the estimate's sum of squares is the least known one, to 1e-6; of these converged: where the status"
+        " says so. median cost: simulations, infinite where unsolved. within: solved within so many times n + 1"
+        " simulations."
     )
     return [table, Text(note, style="dim"), Text()]
 

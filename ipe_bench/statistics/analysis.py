@@ -12,6 +12,7 @@ import numpy as np
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
+from ipe_bench.statistics.attained import attained_table
 from ipe_bench.statistics.collect import Collection, Group, collect
 from ipe_bench.statistics.comparisons import (
     Outcomes,
@@ -64,6 +65,8 @@ class Analysis:
     distance is zero by definition, which says nothing of convergence."""
     contraction: pd.DataFrame
     """Per scenario, how much the fixed-point iteration contracts at the truth; empty where no file says so."""
+    attained: pd.DataFrame
+    """Which estimator attains known minima, over all scenarios; see `attained.attained_table`."""
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -143,6 +146,7 @@ def _analysis(collection: Collection, rows: _Rows, everywhere: set[str]) -> Anal
         correlations=_joined(rows.correlations, ("row", "column", "value")),
         convergence=_joined(rows.convergence, ("trial", "iteration", "distance")),
         contraction=pd.DataFrame(rows.contraction),
+        attained=attained_table(collection),
     )
 
 

@@ -16,6 +16,7 @@ FIGURES = (
     "convergence",
     "cost",
     "profile_curves",
+    "data_profile",
     "ranks",
     "correlation",
 )

@@ -34,6 +34,7 @@ FRAMES = (
     "correlations",
     "convergence",
     "profiles",
+    "attained",
 )
 
 
