@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
-from ipe_bench.report.words import compact, limits, plain, shown
+from ipe_bench.report.words import compact, limits, plain, reported, shown
 from ipe_bench.statistics.records import STATISTICS, Statistic
 from ipe_bench.statistics.summary import ALL, COLUMNS
 
@@ -65,7 +65,9 @@ def render(
         "efficiency: the bound that applies over the root mean square error, 1 at best, with its 95 % bootstrap"
         " interval: of the solved trials (their number in brackets where it is not all), and of all. Filters and the"
         " linear estimate solve no equation. NEES: 1 where the reported covariance is right. misfit: trials whose"
-        " residuals fail the test of fit at 0.1 %. sims, time: medians per trial, a Jacobian counting what it costs."
+        " residuals fail the test of fit at 0.1 %. "
+        + ("ambiguous: several minima fit. " if any(math.isfinite(row["ambiguous"]) for row in rows) else "")
+        + "sims, time: medians per trial, a Jacobian counting what it costs."
     )
     return Group(*digits, *parts, Text(note, style="dim"))
 
@@ -79,7 +81,7 @@ def _setting(title: str, part: Sequence[Mapping[str, Any]], width: int) -> tuple
     # The number of trials stands in the title where it is the same for all.
     counts = list({row["trials"] for row in part})
     alike = len(counts) == 1
-    shown = [record for record in _SHOWN if not (alike and record.name == "trials")]
+    shown = [r for r in _SHOWN if not (alike and r.name == "trials") and reported(r, part)]
     headings = ["scale", "estimator", *_headings(shown)]
     sections = [
         [[f"{scale:g}" if i == 0 else "", str(row["estimator"]), *_cells(shown, row)] for i, row in enumerate(block)]

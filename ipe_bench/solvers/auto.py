@@ -32,11 +32,9 @@ _NEAR = 1e-2
 """How near to its root, in deviations, fixed-point iteration brings a trial before the search goes on from there."""
 _CHORDS = 8
 _JACOBIANS = 3
-_BENT = 1e-4
-"""The part of a chord step that the next one may take back: the answer is then some ten-thousandths of a deviation off.
-"""
-_VISIBLE = 1e-4
-"""Steps of fewer deviations say nothing of how J changes."""
+_BENT = 100
+"""Times the tolerance: the part of a chord step that the next one may take back. The answer is then about as many
+deviations off. Steps of fewer deviations than this say nothing of how J changes."""
 _UNSETTLED = Status.MAX_ITERATIONS
 _CONFIRMATIONS = 4
 _DAMPING, _STEPS = 1e-3, 100
@@ -52,7 +50,7 @@ class Auto(Estimator):
 
     First the paper's fixed-point iteration, with H frozen at the nominal point, then Gauss-Newton steps with one
     Jacobian, that of the root which it has found: near to linear problems are solved so. A step of which the next one
-    takes back more than a ten-thousandth says that J has changed; then it is computed anew. Where all that does not
+    takes back more than a hundred tolerances says that J has changed; then it is computed anew. Where all that does not
     converge, or the residuals fail the test of the fit, `progressive`. Extras `stage` says which of the two answered, 1
     or 2. Cheapest first with a judge is how algorithm portfolios go (Gomes and Selman, Artificial Intelligence 126,
     2001); these stages and their judge, the calibrated test of the fit, are ours.
@@ -154,8 +152,8 @@ class Auto(Estimator):
         result, at, start = None, np.arange(len(rows)), before
         for _ in range(_JACOBIANS):
             objective = whole.subset(rows[at])
-            ended = iterate(objective, _Chord(), start.x, history=history, **limits)
-            bent = ended.converged & (ended.state.bend > _BENT)
+            ended = iterate(objective, _Chord(_BENT * self.tolerance), start.x, history=history, **limits)
+            bent = ended.converged & (ended.state.bend > _BENT * self.tolerance)
             minima = reached(objective, ended)
             minima = _after(start, replace(minima, status=np.where(bent, _UNSETTLED, minima.status).astype(np.int8)))
             result = minima if result is None else put(result, at, minima)
@@ -195,6 +193,9 @@ class _OnChords(Descent):
 class _Chord(Solver[_OnChords]):
     """Gauss-Newton steps with the Jacobian of the start, which is near enough to the end for it."""
 
+    visible: float
+    """Steps of fewer deviations are not judged by."""
+
     def begin(self, objective: Objective, x: Array) -> _OnChords:
         state = Descent.at(objective, x, keep_Q=True)
         return _OnChords(**vars(state), bend=np.zeros(len(x)))
@@ -203,7 +204,7 @@ class _Chord(Solver[_OnChords]):
         x = state.x + state.slope.newton
         r = objective.residual(x)
         slope = state.slope.towards(r)
-        bend = np.where(state.slope.size > _VISIBLE, slope.size / state.slope.size, 0.0)
+        bend = np.where(state.slope.size > self.visible, slope.size / state.slope.size, 0.0)
         moved = state.reach(state.slope.newton)
         return replace(state, x=x, r=r, cost=squared(r), slope=slope, moved=moved, bend=np.fmax(state.bend, bend))
 

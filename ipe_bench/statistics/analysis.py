@@ -25,6 +25,7 @@ from ipe_bench.statistics.comparisons import (
 )
 from ipe_bench.statistics.histories import History, trial_label
 from ipe_bench.statistics.intervals import quantile, quantiles, rms_interval
+from ipe_bench.statistics.portfolio import pooled, portfolio_row
 from ipe_bench.statistics.profiles import Profiles
 from ipe_bench.statistics.records import SCORES, capped_error, gate_radius, rows_of
 from ipe_bench.statistics.sample import Sample, Shared
@@ -65,6 +66,9 @@ class Analysis:
     distance is zero by definition, which says nothing of convergence."""
     contraction: pd.DataFrame
     """Per scenario, how much the fixed-point iteration contracts at the truth; empty where no file says so."""
+    portfolio: pd.DataFrame
+    """Per scenario, and over all of them where there are several (`scenario` is -1), the virtual best and the single
+    best estimator; see `portfolio.portfolio_row`."""
     attained: pd.DataFrame
     """Which estimator attains known minima, over all scenarios; see `attained.attained_table`."""
 
@@ -126,6 +130,7 @@ class Begun:
         for where, outcomes in self._scenarios:
             self._rows.pairs += [(where, pair) for pair in compare_pairs(outcomes)]
             self._rows.profiles.add({label: outcome for label, outcome in outcomes.items() if label in everywhere})
+        self._rows.portfolio += _portfolio_rows(self._scenarios, everywhere)
         self._scenarios.clear()
         return _analysis(self.collection, self._rows, everywhere)
 
@@ -146,6 +151,7 @@ def _analysis(collection: Collection, rows: _Rows, everywhere: set[str]) -> Anal
         correlations=_joined(rows.correlations, ("row", "column", "value")),
         convergence=_joined(rows.convergence, ("trial", "iteration", "distance")),
         contraction=pd.DataFrame(rows.contraction),
+        portfolio=pd.DataFrame(rows.portfolio),
         attained=attained_table(collection),
     )
 
@@ -163,6 +169,7 @@ class _Rows:
     distributions: list[dict[str, Any]] = field(default_factory=list)
     correlations: list[dict[str, Any]] = field(default_factory=list)
     convergence: list[dict[str, Any]] = field(default_factory=list)
+    portfolio: list[dict[str, Any]] = field(default_factory=list)
     replicates: list[tuple[int, int, str, float]] = field(default_factory=list)
     """Scenario, seed, estimator and capped error."""
     profiles: Profiles = field(default_factory=Profiles)
@@ -205,6 +212,18 @@ def _add_scenario(rows: _Rows, collection: Collection, number: int, groups: Sequ
         rows.convergence += [_convergence_rows(where, history) for history in sample.histories]
     rows.scores += scores
     return dict(groups[0].columns) | {"scenario": number}, outcomes
+
+
+def _portfolio_rows(scenarios: Sequence[_Compared], everywhere: set[str]) -> list[dict[str, Any]]:
+    """A row per scenario, and one over all of them with the estimators that are everywhere."""
+    rows = [where | row for where, outcomes in scenarios if (row := portfolio_row(outcomes))]
+    if len(rows) > 1:
+        labels = [label for label in scenarios[0][1] if label in everywhere]
+        together = portfolio_row(pooled([outcomes for _, outcomes in scenarios], labels))
+        if together:
+            nothing = dict.fromkeys(scenarios[0][0]) | {"error_scale": np.nan, "scenario": -1}
+            rows.append(nothing | together)
+    return rows
 
 
 def _everywhere(collection: Collection) -> set[str]:
