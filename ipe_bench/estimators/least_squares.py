@@ -165,7 +165,7 @@ class Descent:
     scale: Array
     """What damping measures steps by: the diagonal of D (trials, n)."""
     regular: Mask
-    """Where J had full rank at the start: an end without it is then a place, and no property of the problem."""
+    """Where J had full rank somewhere on the way: an end without it is then a place, and no property of the problem."""
     mark: Array
     """The objective when it last decreased visibly,"""
     idle: NDArray[np.int64]
