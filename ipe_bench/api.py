@@ -24,7 +24,6 @@ from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
-from ipe_bench.noise.gaussian import Gaussian
 from ipe_bench.priors.gaussian import GaussianPrior
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.provenance import describe, fingerprint
@@ -38,8 +37,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ipe_bench.plugins.conformance import Finding
-    from ipe_bench.real.fits import Fit
     from ipe_bench.report import ReportResult
+    from ipe_bench.report.answer import Answer
 
 BLOCK_SIZE = 250
 Directories = Path | str | Sequence[Path | str]
@@ -176,22 +175,23 @@ def status(directories: Directories) -> pd.DataFrame:
 
 def estimate(
     model: Measurement,
-    readings: Path | str | Array,
+    readings: Path | str | Sequence[Path | str] | Array,
     estimators: Mapping[str, Estimator] | None = None,
     *,
     noise: Noise | None = None,
     prior: GaussianPrior | None = None,
     error_scale: float | None = None,
-) -> list[Fit]:
+) -> Answer:
     """Parameters from real readings, by every estimator: estimates, standard errors, residuals and a test of the fit.
 
-    `readings` is a CSV file (see `ipe_bench.real.readings`) or an array z (m,) in the model's order and unit; NaN is
-    missing. Without `estimators`: `linear_lse`, `fixed_point`, `levenberg_marquardt` and `progressive`. `noise` states
-    R. Without it the readings are taken for independent and equally noisy, and their deviation is estimated from the
-    smallest residuals that an estimator leaves; then nothing is left to test the fit with, and `chi_square` is NaN.
-    Filters and `map_lm` need to know how far from the model's nominal point the parameters may be: `error_scale` is the
-    standard deviation of each in multiples of its size, and `prior` widens or narrows some. `x` and `covariance` of a
-    fit are in the parameters' own units.
+    `readings` is a CSV file (see `ipe_bench.real.readings`), several that share parameters, or an array z (m,) in the
+    model's order and unit; NaN is missing. Without `estimators`: `linear_lse`, `fixed_point`, `levenberg_marquardt` and
+    `progressive`. `noise` states R. Without it R is what the file says in its column sigma, or the model of its own
+    noise; where neither does, the readings are taken for independent and equally noisy, and the level is estimated from
+    the residuals (`Unknown`): then their size cannot test the fit. Filters and `map_lm` need to know how far from the
+    model's nominal point the parameters may be: `error_scale` is the standard deviation of each in multiples of its
+    size, and `prior` widens or narrows some. `x` and `covariance` of a fit are in the parameters' own units. The answer
+    is the sequence of the fits; it shows itself in a notebook, and `table()` is a frame.
 
     >>> import ipe_bench as ib
     >>> model = ib.measurements.Polynomial()
@@ -204,12 +204,15 @@ def estimate(
     progressive converged True
 
     Raises:
-        UserError: the file does not hold this model's readings, the array has another shape, or an estimator needs
+        UserError: a file does not hold this model's readings, the array has another shape, or an estimator needs
             what is not given.
     """
     from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
+    from ipe_bench.noise.own import ModelNoise, Unknown
+    from ipe_bench.real.examination import examine
     from ipe_bench.real.fits import fit
-    from ipe_bench.real.readings import read_readings
+    from ipe_bench.real.sources import Readings, noise_of, open_together
+    from ipe_bench.report.answer import Answer
     from ipe_bench.solvers import FixedPoint, Progressive
 
     if estimators is None:
@@ -219,24 +222,23 @@ def estimate(
             "levenberg_marquardt": LevenbergMarquardt(),
             "progressive": Progressive(),
         }
-    z = read_readings(Path(readings), model) if isinstance(readings, Path | str) else np.array(readings, dtype=float)
-    if z.shape != (model.m,):
-        raise UserError(
-            f"readings: has shape {z.shape}; give the {model.m} readings of {model.name}, NaN where missing"
-        )
-    problem = _real_problem(model, noise or Gaussian(1.0), prior, error_scale)
+    if isinstance(readings, np.ndarray):
+        z = np.array(readings, dtype=float)
+        if z.shape != (model.m,):
+            raise UserError(
+                f"readings: has shape {z.shape}; give the {model.m} readings of {model.name}, NaN where missing"
+            )
+        found = Readings(model, z)
+    else:
+        paths = [readings] if isinstance(readings, str | Path) else readings
+        found = open_together([Path(path) for path in paths], model)
+    known = noise_of(found, noise) or ModelNoise().of(found.model) or Unknown()
+    problem = _real_problem(found.model, known, prior, error_scale)
     if lacking := _needs(problem, estimators):
         remedy = "; give error_scale" if error_scale is None and prior is None else ""
         raise UserError("; ".join(lacking) + remedy)
-    if noise is not None:
-        return fit(problem, z, estimators, noise)
-    # The first round weighs all readings alike, which is all that finding the deviation takes.
-    found = [f.residual_deviation for f in fit(problem, z, estimators)]
-    deviation = np.nanmin(found) if np.isfinite(found).any() else np.nan
-    if not deviation > 0:
-        raise UserError("noise: is not given and cannot be estimated from the residuals; state it, as in Gaussian(0.1)")
-    problem = _real_problem(model, Gaussian(float(deviation)), prior, error_scale)
-    return [dataclasses.replace(f, chi_square=np.nan, p_value=np.nan) for f in fit(problem, z, estimators)]
+    fits = fit(problem, found.z, estimators, known)
+    return Answer(found.model.name, found.model, found.z, fits, examine(problem, found.z, fits))
 
 
 def _real_problem(model: Measurement, noise: Noise, prior: GaussianPrior | None, error_scale: float | None) -> Problem:
@@ -321,8 +323,9 @@ def validate(
     block_size: int = BLOCK_SIZE,
     *,
     untried: Sequence[Scenario] | None = None,
+    estimating: bool = False,
 ) -> None:
-    """Raises one UserError with everything that stands in the way of this run.
+    """Raises one UserError with everything that stands in the way of this run, or of `estimating` from real readings.
 
     Trials are drawn of the scenarios `untried` (all where it is None), to see whether numbers hold what is asked for.
     """
@@ -340,6 +343,8 @@ def validate(
     if not estimators:
         mistakes.append("there is no estimator; choose with solver= and baseline=")
     for scenario in scenarios:
+        if scenario.noise.estimated and not estimating:
+            mistakes.append("noise=unknown: has no level to simulate with; choose another noise, or use `estimate`")
         if scenario.noise.real and trials != 1:
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
         if untried is None or scenario in untried:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import fnmatch
+import json
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import cloudpickle
+import yaml
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
@@ -22,10 +24,12 @@ from omegaconf.errors import OmegaConfBaseException
 from ipe_bench.basics.errors import UserError, describe_exception, unknown
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
+from ipe_bench.measurements.known import Informed, Known
 from ipe_bench.measurements.nist import datasets
-from ipe_bench.noise.base import Noise
+from ipe_bench.noise import ModelNoise, Noise, Unknown
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
+from ipe_bench.priors.gaussian import GaussianPrior
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.provenance import TARGET, canonical_json, describe
 from ipe_bench.trials.scenario import Scenario
@@ -48,8 +52,8 @@ class Schema:
     trials: int = 1000
     block_size: int = 250
     """Trials per unit of work and of storage; changes no number."""
-    readings: str | None = None
-    """A file of real readings, for `estimate`."""
+    readings: Any = None
+    """A file of real readings, for `estimate`, or a list of files that are estimated together."""
     write_readings: str | None = None
     """Write the simulated readings of one trial to this file instead of running."""
     write_readings_trial: int = 0
@@ -58,6 +62,8 @@ class Schema:
     """What simulates the readings, where it differs from what the estimators assume."""
     noise: Any = MISSING
     prior: Any = MISSING
+    parameters: Any = None
+    """What is known of the parameters: parameters.NAME.fixed=, .nominal=, .deviation=, .lower=, .upper=, .positive=."""
     execution: Any = MISSING
     estimators: dict[str, Any] = field(default_factory=dict)
 
@@ -95,11 +101,20 @@ def prepare() -> None:
         registry.register(PluginSearchPath)
 
 
+_FORMULA = re.compile(
+    r"^(\+*(?:truth_)?measurement\.(?:expression|(?:initial|rates|outputs)\.\w+))=(?!['\"])(.*)$", re.DOTALL
+)
+_FILE = re.compile(r"^\+*(?:truth_)?measurement\.file=")
+_OPEN = re.compile(r"^(?:parameters|(?:truth_)?measurement\.(?:start|columns|initial|rates|outputs))\.")
+"""Keys to which users add entries of their own names."""
+
+
 def rewrite(overrides: Sequence[str]) -> list[str]:
-    """Overrides in Hydra's own words: truth_measurement= chooses from the group measurement, and measurement=nist/NAME
-    is measurement=nist with that data set."""
-    overrides = [re.sub(r"^(\+?)truth_measurement=", r"\1measurement@truth_measurement=", o) for o in overrides]
-    return [part for override in overrides for part in _nist(override)]
+    """Overrides in Hydra's own words: truth_measurement= chooses from the group measurement, measurement=nist/NAME is
+    measurement=nist with that data set, formulas stand in quotes that the shell has taken off, and entries are added
+    where users name them."""
+    expanded = [words for o in overrides for words in (_from_file(o) if _FILE.match(o) else [_in_hydras_words(o)])]
+    return [part for override in expanded for part in _nist(override)]
 
 
 def _nist(override: str) -> list[str]:
@@ -127,8 +142,47 @@ def _nist(override: str) -> list[str]:
     return [f"{key}=nist", f"{key.rpartition('@')[2].lstrip('+')}.dataset={','.join(known[name] for name in names)}"]
 
 
-def assemble(config: DictConfig) -> Job:
-    """The scenario, the estimators and the execution that a composed config describes; UserError by key."""
+def _from_file(override: str) -> list[str]:
+    """A model's options from a YAML file, as if each had been typed there."""
+    key, _, name = override.partition("=")
+    try:
+        content = yaml.safe_load(Path(name).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{override}: cannot be read ({error.__class__.__name__}); name a YAML file") from None
+    except yaml.YAMLError as error:
+        raise UserError(f"{override}: is not YAML ({' '.join(str(error).split())})") from None
+    if not isinstance(content, dict):
+        raise UserError(f"{override}: holds no keys; write a YAML file of options such as rates, start, outputs")
+    if TARGET in content:
+        raise UserError(f"{override}: has a {TARGET}; the model is chosen by measurement=, so leave it out")
+    group = key.removesuffix(".file").lstrip("+")
+    return [f"++{group}.{k}={_literal(v, override)}" for k, v in content.items()]
+
+
+def _literal(value: Any, where: str) -> str:
+    """A value in the grammar of overrides."""
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{k}:{_literal(v, where)}" for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ",".join(_literal(v, where) for v in value) + "]"
+    if isinstance(value, str):
+        return "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"
+    if value is None or isinstance(value, bool | int | float):
+        return json.dumps(value) if value is None or isinstance(value, bool) else repr(value)
+    raise UserError(f"{where}: {value!r} is neither text nor number")
+
+
+def _in_hydras_words(override: str) -> str:
+    override = re.sub(r"^(\+?)truth_measurement=", r"\1measurement@truth_measurement=", override)
+    override = _FORMULA.sub(lambda found: f"{found[1]}='{found[2]}'", override)
+    return f"++{override}" if _OPEN.match(override) else override
+
+
+def assemble(config: DictConfig, *, estimating: bool = False) -> Job:
+    """The scenario, the estimators and the execution that a composed config describes; UserError by key.
+
+    `estimating`: for real readings, of which the level of the noise need not be known.
+    """
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(plain, dict)
     for key in plain:
@@ -141,14 +195,17 @@ def assemble(config: DictConfig) -> Job:
         if not Path(plain[key]).name:
             raise UserError(f"{key}={plain[key]}: name a folder")
     truth = plain["truth_measurement"]
-    scenario = Scenario(
-        _part(plain, "measurement", Measurement),
-        _part(plain, "noise", Noise),
-        _part(plain, "prior", Prior),
-        plain["error_scale"],
-        plain["seed"],
-        None if truth is None else _part(plain, "truth_measurement", Measurement),
-    )
+    measurement, noise = _part(plain, "measurement", Measurement), _part(plain, "noise", Noise)
+    truth = None if truth is None else _part(plain, "truth_measurement", Measurement)
+    prior = _part(plain, "prior", Prior)
+    if estimating and isinstance(noise, ModelNoise):
+        noise = noise.of(measurement) or Unknown()
+    known = _known(plain["parameters"])
+    if known:
+        measurement = Informed(measurement, known)
+        truth = None if truth is None else Informed(truth, known)
+        prior = _prior(prior, measurement)
+    scenario = Scenario(measurement, noise, prior, plain["error_scale"], plain["seed"], truth)
     execution = _part(plain, "execution", Execution)
     estimators: dict[str, Estimator] = {}
     for label, options in (plain["estimators"] or {}).items():
@@ -171,6 +228,37 @@ class Prior(Protocol):
     def deviation(self, n: int, error_scale: float) -> Any: ...
 
     def draw(self, nominal: Any, error_scale: float, rng: Any) -> Any: ...
+
+
+def _known(given: Any) -> tuple[Known, ...]:
+    """What the key `parameters` says of each."""
+    if given is None:
+        return ()
+    if not isinstance(given, Mapping):
+        raise UserError("parameters: give each what is known of it, such as parameters.NAME.fixed=0.1")
+    found = []
+    for name, options in given.items():
+        where = f"parameters.{name}"
+        if not isinstance(options, Mapping):
+            raise UserError(f"{where}={options}: say what that is, such as {where}.fixed={options}")
+        target = f"{Known.__module__}.{Known.__qualname__}"
+        found.append(construct({TARGET: target, "name": str(name), **options}, where))
+    return tuple(found)
+
+
+def _prior(prior: GaussianPrior, model: Informed) -> GaussianPrior:
+    """The prior with the deviations that are known of single parameters."""
+    if prior.deviations is None:
+        return replace(prior, deviations=model.prior_deviations)
+    names = [p.name for p in model.whole.parameters]
+    if len(prior.deviations) != len(names):
+        raise UserError(
+            f"prior.deviations: has {len(prior.deviations)} numbers; give one for each of {len(names)} parameters"
+        )
+    general = dict(zip(names, prior.deviations, strict=True))
+    own = {one.name for one in model.known if one.deviation is not None}
+    known = zip(model.natural_parameters, model.prior_deviations, strict=True)
+    return replace(prior, deviations=tuple(d if p.name in own else general[p.name] for p, d in known))
 
 
 Part = TypeVar("Part")

@@ -117,11 +117,13 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     status.add_argument("arguments", metavar="DIR", nargs="*", help="folders of results, such as outputs/paper")
     status.add_argument("-v", "--verbose", action="store_true", help="with what is complete, too")
     options = add("list", "what there is to choose from, and where it comes from")
-    options.add_argument("groups", metavar="GROUP", nargs="*", help="solver, baseline, measurement, ... or all")
+    options.add_argument(
+        "names", metavar="GROUP", nargs="*", help="solver, measurement, ... or all; solver/newton: its options"
+    )
     options.add_argument(
         *("-v", "--verbose"),
         action="store_true",
-        help="with each measurement's parameters and the columns of its readings file",
+        help="with each one's options, and the parameters and readings file of measurements",
     )
     new = add("new", "a working plugin to start from, in plugins/NAME")
     new.add_argument("kind", metavar="KIND", help="solver, baseline, measurement, noise or experiment")

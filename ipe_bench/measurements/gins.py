@@ -16,7 +16,7 @@ import numpy as np
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Positive
-from ipe_bench.measurements.base import Parameter
+from ipe_bench.measurements.base import Parameter, UsualNoise
 from ipe_bench.measurements.ode.model import OdeMeasurement
 from ipe_bench.measurements.ode.source import Variation
 from ipe_bench.measurements.ode.trace import tangent
@@ -56,6 +56,7 @@ class Gins(OdeMeasurement):
     step: Positive | None = None
 
     reading_unit = "m/s"
+    usual_noise = UsualNoise(step=0.02286)
     states = 11
     outputs = ("vx", "vy")
 

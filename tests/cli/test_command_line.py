@@ -290,7 +290,7 @@ def test_estimate_leaves_numbers_residuals_and_figures_from_csv_and_parquet_alik
         assert files >= {f"{name}.{kind}" for name in ("residuals", "ellipses") for kind in ("png", "pdf")}
         results.append(json.loads((tmp_path / "outputs" / folder / "estimate.json").read_text()))
         table = pd.read_csv(tmp_path / "outputs" / folder / "residuals.csv")
-        assert len(table) == 2 * 240
+        assert len(table) == 3 * 240
     assert results[0]["estimators"] == results[1]["estimators"]
     found = results[0]["estimators"]["fixed_point"]
     assert found["fits"]
