@@ -75,6 +75,11 @@ class Progressive(Estimator):
     equation = "least_squares"
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
+        best, tally = self.search(problem, z, history=history)
+        return best.estimates(tally, z.shape[1])
+
+    def search(self, problem: Problem, z: Array, *, history: bool = False) -> tuple[Minima, Tally]:
+        """The best minimum of each trial, and what it has cost to find it."""
         kind = Stages if problem.measurement.epochs is None else Windows
         search = kind(self, problem, z, Tally.zeros(len(z)), history)
         best = search.attempt(0, np.arange(len(z)), None)
@@ -89,8 +94,7 @@ class Progressive(Estimator):
             better = _is_better(again, before)
             best = put(best, suspect[better], take(again, better))
         raised = search.tally.failed(np.arange(len(z))) & ~best.converged
-        best = replace(best, status=np.where(raised, Status.ERROR, best.status).astype(np.int8))
-        return best.estimates(search.tally, z.shape[1])
+        return replace(best, status=np.where(raised, Status.ERROR, best.status).astype(np.int8)), search.tally
 
     def _suspect(self, problem: Problem, best: Minima, tally: Tally, z: Array) -> Mask:
         """The trials that another attempt may help: (trials,)."""

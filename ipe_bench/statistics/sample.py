@@ -12,6 +12,7 @@ import numpy as np
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.counted import cost
+from ipe_bench.statistics.calibration import Calibration, calibrations
 from ipe_bench.statistics.collect import Collection, Group
 from ipe_bench.statistics.histories import History, distances_to_limit, trial_label
 from ipe_bench.statistics.intervals import rms_interval
@@ -19,10 +20,12 @@ from ipe_bench.statistics.intervals import rms_interval
 FIT = "fit_p"
 NIS = "extra_nis"
 """Where filters report their normalised innovations squared."""
+AMBIGUOUS = "extra_ambiguous"
+"""Where estimators that look for several minima report 1 if they found some, else 0."""
 SCALARS = ("status", "solved", "success", "iterations", "simulations", "jacobians", "time_s", "nees", "crlb_distance")
 TRUTH = ("contraction_K", "contraction_norm", "contraction_radius", "curvature_M")
 """Scalars of the truth, read where they are stored."""
-OPTIONAL = ("message", FIT, NIS, "root_distance")
+OPTIONAL = ("message", FIT, NIS, AMBIGUOUS, "root_distance")
 """Read where they are stored."""
 
 
@@ -230,6 +233,11 @@ class Sample:
     def _history(self, row: int, iterates: Array) -> History:
         distances = distances_to_limit(iterates, self.crlb[row])
         return History(row, trial_label(*self.ids[row]), iterates, distances, float(self.cost[row]))
+
+    @cached_property
+    def calibrations(self) -> list[Calibration]:
+        """How honest the reported covariance is for each parameter, and for all last; empty where none is reported."""
+        return calibrations(self.error, self.deviation, self.scalars["nees"], self.converged)
 
     @cached_property
     def rmse(self) -> Array:

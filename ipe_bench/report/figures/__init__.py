@@ -13,9 +13,11 @@ FIGURES = (
     "settings",
     "distributions",
     "nees",
+    "calibration",
     "convergence",
     "cost",
     "profile_curves",
+    "data_profile",
     "ranks",
     "correlation",
 )

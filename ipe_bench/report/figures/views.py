@@ -33,7 +33,9 @@ FRAMES = (
     "distributions",
     "correlations",
     "convergence",
+    "calibration",
     "profiles",
+    "attained",
 )
 
 
