@@ -21,6 +21,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from ipe_bench.api import MOST_TRIALS, TRIALS
 from ipe_bench.basics.errors import UserError, describe_exception, unknown
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
@@ -49,7 +50,13 @@ class Schema:
     error_scale: float = 1.0
     """Standard deviation of the true parameters, in multiples of their units."""
     seed: int = 0
-    trials: int = 1000
+    trials: int | None = None
+    """1000 unless given; with a precision, the most there may be."""
+    precision: Any = None
+    """How near to what is found success shares have to be (0.01), or {success: 0.01, rmse: 0.05}: then there are just
+    enough trials."""
+    time_limit: float | None = None
+    """Seconds after which, with a precision, no more blocks are begun."""
     block_size: int = 250
     """Trials per unit of work and of storage; changes no number."""
     readings: Any = None
@@ -79,8 +86,11 @@ class Job:
     estimators: Mapping[str, Estimator]
     execution: Execution
     trials: int
+    """Or the most there may be, where there is a precision."""
     block_size: int
     output: str
+    precision: Any = None
+    time_limit: float | None = None
 
 
 class PluginSearchPath(SearchPathPlugin):
@@ -104,6 +114,7 @@ def prepare() -> None:
 _FORMULA = re.compile(
     r"^(\+*(?:truth_)?measurement\.(?:expression|(?:initial|rates|outputs)\.\w+))=(?!['\"])(.*)$", re.DOTALL
 )
+_UNIT = re.compile(r"^(\+*(?:truth_)?measurement\.(?:time_)?unit)=([^'\",\[\]{}]+)$")
 _FILE = re.compile(r"^\+*(?:truth_)?measurement\.file=")
 _OPEN = re.compile(r"^(?:parameters|(?:truth_)?measurement\.(?:start|columns|initial|rates|outputs))\.")
 """Keys to which users add entries of their own names."""
@@ -174,6 +185,7 @@ def _literal(value: Any, where: str) -> str:
 
 def _in_hydras_words(override: str) -> str:
     override = re.sub(r"^(\+?)truth_measurement=", r"\1measurement@truth_measurement=", override)
+    override = _UNIT.sub(lambda found: f"{found[1]}='{found[2]}'", override)
     override = _FORMULA.sub(lambda found: f"{found[1]}='{found[2]}'", override)
     return f"++{override}" if _OPEN.match(override) else override
 
@@ -218,7 +230,13 @@ def assemble(config: DictConfig, *, estimating: bool = False) -> Job:
             )
         _refuse_false_name(str(label), options[TARGET])
         estimators[str(label)] = _checked(construct(options, f"estimators.{label}"), f"estimators.{label}", Estimator)
-    return Job(scenario, estimators, execution, plain["trials"], plain["block_size"], plain["output"])
+    precision, time_limit = plain["precision"], plain["time_limit"]
+    if time_limit is not None and precision is None:
+        raise UserError(f"time_limit={time_limit}: goes with precision=; give that, or leave it out")
+    unless = TRIALS if precision is None else MOST_TRIALS
+    trials = unless if plain["trials"] is None else plain["trials"]
+    block_size, output = plain["block_size"], plain["output"]
+    return Job(scenario, estimators, execution, trials, block_size, output, precision, time_limit)
 
 
 @runtime_checkable

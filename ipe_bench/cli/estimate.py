@@ -69,7 +69,16 @@ def main(arguments: Sequence[str]) -> int:
     return 0 if answer.passes else 1
 
 
-_WITHOUT_USE = ("trials", "seed", "block_size", "execution", "truth_measurement", "write_readings")
+_WITHOUT_USE = (
+    "trials",
+    "precision",
+    "time_limit",
+    "seed",
+    "block_size",
+    "execution",
+    "truth_measurement",
+    "write_readings",
+)
 
 
 def _refuse_keys_without_use(words: Sequence[str]) -> None:

@@ -197,6 +197,8 @@ def _described(answer: Answer) -> dict[str, Any]:
                 "p": examined.numbers(one.p_value),
                 "fits": one.fits,
                 "passes": one.passes,
+                "with_prior": one.with_prior,
+                "on_bounds": {names[k]: value for k, value in one.held_at.items()},
                 "noise_level_estimated": None if one.level is None else examined.numbers(one.level),
                 "residual_deviation": examined.numbers(one.residual_deviation),
                 "whiteness": {
@@ -237,8 +239,12 @@ def _residual_rows(answer: Answer) -> Iterator[list[Any]]:
         more: tuple[Array, ...] = ()
         if found is not None and one.label == found.label:
             more = (*_influences(found), found.fitted_errors, found.new_errors)
+        # Of the estimator that is examined, the readings that are missing are predicted, too.
+        fitted = z - one.residuals
+        if found is not None and more:
+            fitted = np.where(np.isnan(z), found.fitted, fitted)
         for i, label in enumerate(labels):
-            values = (z[i], z[i] - one.residuals[i], one.residuals[i], one.normalised[i])
+            values = (z[i], fitted[i], one.residuals[i], one.normalised[i])
             further = [_cell(column[i]) for column in more] or [""] * len(influence)
             outlier = "yes" if one.outliers[i] else "no"
             yield [one.label, *label, *map(_cell, values), outlier, *further]
@@ -362,6 +368,8 @@ def _notes(fits: Sequence[Fit], width: int) -> Any:
         " resemble each other." + (" deviation: of the residuals, in the readings' unit." if width >= _NARROW else ""),
         *(f"{one.label}: {one.message}" for one in fits if one.message),
         *_on_levels(fits),
+        *_on_priors(fits),
+        *_on_bounds(fits),
     ]
     failing = [one.label for one in fits if not one.passes]
     if fits[0].model.fixed:
@@ -388,6 +396,26 @@ def _on_levels(fits: Sequence[Fit]) -> Iterator[str]:
             f"{', '.join(suspect)}: successive residuals resemble each other (white p below {FIT_LEVEL:g}); the model"
             " is in doubt, and standard errors are too small."
         )
+
+
+def _on_priors(fits: Sequence[Fit]) -> Iterator[str]:
+    told = [one.label for one in fits if one.with_prior]
+    if told:
+        yield (
+            f"{', '.join(told)}: with a prior. Profiles, bootstrap and influence, where given, are of least squares"
+            " without it."
+        )
+
+
+def _on_bounds(fits: Sequence[Fit]) -> Iterator[str]:
+    for one in fits:
+        if one.held is not None:
+            names = [one.model.natural_parameters[k].name for k in one.held_at]
+            bounds = ", ".join(f"{name} = {value:g}" for name, value in zip(names, one.held_at.values(), strict=True))
+            yield (
+                f"{one.label}: on its bound: {bounds}; the readings want it beyond. It has no error, and those of the"
+                " others are with it held there."
+            )
 
 
 def _outliers(model: Measurement, fits: Sequence[Fit]) -> Iterator[Any]:
@@ -435,7 +463,7 @@ def fragment(answer: Answer) -> str:
     names = ("estimator", "status", "chi-square", "degrees of freedom", "p", "white p", "outliers", "fits")
     head = "".join(f"<th>{name}</th>" for name in names)
     parts.append(f"<h3>Does the model fit?</h3><table><thead><tr>{head}</tr></thead><tbody>{verdicts}</tbody></table>")
-    notes = [*_on_levels(answer.fits)]
+    notes = [*_on_levels(answer.fits), *_on_priors(answer.fits), *_on_bounds(answer.fits)]
     if failing:
         notes.append(f"In brackets, and not an answer: {', '.join(failing)}.")
     found = answer.examination
