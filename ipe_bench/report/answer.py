@@ -35,16 +35,24 @@ _NARROW = 90
 """Columns of a terminal below which the table of verdicts goes without the residual deviation."""
 
 
-def claim(folder: Path, command: Any, *, elsewhere: bool) -> Path:
+def claim(
+    folder: Path,
+    command: Any,
+    *,
+    elsewhere: bool,
+    result: str = RESULT,
+    files: Sequence[str] = (RESIDUALS, *_FIGURES),
+) -> Path:
     """The folder that this command's results go to: it is new, or holds what the same command wrote before.
 
-    Where it holds anything else of ours, `elsewhere` allows folder-2, folder-3 and so on in its place.
+    `result` is the JSON file that says which command it was, `files` are the others. Where the folder holds anything
+    else of ours, `elsewhere` allows folder-2, folder-3 and so on in its place.
 
     Raises:
         UserError: the folder is taken, or cannot be written to.
     """
     number, candidate = 1, folder
-    while not _is_free(candidate, command):
+    while not _is_free(candidate, command, result, files):
         if not elsewhere:
             raise UserError(
                 f"output={candidate}: holds results of another command, which are not overwritten; choose another "
@@ -63,11 +71,11 @@ def claim(folder: Path, command: Any, *, elsewhere: bool) -> Path:
     return candidate
 
 
-def _is_free(folder: Path, command: Any) -> bool:
-    if not (folder / RESULT).exists():
-        return not any((folder / name).exists() for name in (RESIDUALS, *_FIGURES))
+def _is_free(folder: Path, command: Any, result: str, files: Sequence[str]) -> bool:
+    if not (folder / result).exists():
+        return not any((folder / name).exists() for name in files)
     try:
-        return json.loads((folder / RESULT).read_text(encoding="utf-8"))["command"] == command
+        return json.loads((folder / result).read_text(encoding="utf-8"))["command"] == command
     except (OSError, ValueError, KeyError, TypeError):
         return False
 
@@ -116,37 +124,37 @@ def _described(model: Measurement, z: Array, fits: Sequence[Fit]) -> dict[str, A
             one.label: {
                 "status": one.status.label,
                 "message": one.message,
-                "estimates": dict(zip(names, _numbers(one.x), strict=True)),
-                "standard_errors": dict(zip(names, _numbers(one.standard_errors), strict=True)),
-                "correlation": _numbers(one.correlation),
-                "chi_square": _numbers(one.chi_square),
+                "estimates": dict(zip(names, plain_numbers(one.x), strict=True)),
+                "standard_errors": dict(zip(names, plain_numbers(one.standard_errors), strict=True)),
+                "correlation": plain_numbers(one.correlation),
+                "chi_square": plain_numbers(one.chi_square),
                 "degrees_of_freedom": one.degrees_of_freedom,
-                "p": _numbers(one.p_value),
+                "p": plain_numbers(one.p_value),
                 "fits": one.fits,
-                "residual_deviation": _numbers(one.residual_deviation),
+                "residual_deviation": plain_numbers(one.residual_deviation),
                 "whiteness": {
                     "test": "Ljung-Box, p from simulated fits",
-                    "statistic": _numbers(one.whiteness.statistic),
+                    "statistic": plain_numbers(one.whiteness.statistic),
                     "lags": one.whiteness.lags,
-                    "p": _numbers(one.whiteness.p_value),
+                    "p": plain_numbers(one.whiteness.p_value),
                 },
                 "outlier_limit": one.outlier_limit,
                 "outliers": [
-                    {**labels[i], "normalised_residual": _numbers(one.normalised[i])}
+                    {**labels[i], "normalised_residual": plain_numbers(one.normalised[i])}
                     for i in np.flatnonzero(one.outliers)
                 ],
                 "iterations": one.iterations,
-                "simulations": _numbers(one.simulations),
+                "simulations": plain_numbers(one.simulations),
             }
             for one in fits
         },
     }
 
 
-def _numbers(value: Any) -> Any:
+def plain_numbers(value: Any) -> Any:
     """Plain numbers for JSON, which knows no NaN: null in its place."""
     if np.ndim(value):
-        return [_numbers(v) for v in value]
+        return [plain_numbers(v) for v in value]
     number = float(value)
     return number if math.isfinite(number) else None
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from ipe_bench.statistics.records import Kind, Statistic, Where
@@ -24,6 +24,14 @@ def percent(share: float) -> str:
     if 0 < value < 0.1 or 99.9 < value < 100:
         return "<0.1 %" if value < 1 else ">99.9 %"
     return f"{value:.0f} %" if value in (0, 100) else f"{value:.1f} %"
+
+
+def enumerate_few(items: Sequence[str], most: int = 6) -> str:
+    """'a, b and 3 others'."""
+    items = list(items)
+    if len(items) > most:
+        return ", ".join(items[:most]) + f" and {len(items) - most} others"
+    return ", ".join(items)
 
 
 def short(value: float) -> str:
