@@ -25,6 +25,8 @@ RESULT = "design.json"
 READINGS = "readings.csv"
 FILES = (READINGS, "design.png", "design.pdf")
 _MOST_SUSPECTS = 12
+_MUST_BREAK = 1.02
+"""Above this multiple of Van Trees's bound, false roots are felt by any estimator."""
 _UNSEEN = 0.05
 """Noticed in fewer trials than this, an error is one that no test of residuals will see."""
 
@@ -85,6 +87,14 @@ def described(design: Design) -> dict[str, Any]:
             }
             for s in design.suspects
         ],
+        "threshold": design.threshold
+        and {
+            "van_trees": plain_numbers(design.threshold.van_trees * sizes),
+            "weiss_weinstein": plain_numbers(design.threshold.weiss_weinstein * sizes),
+            "false_roots": design.threshold.false_roots,
+            "runs": design.threshold.runs,
+            "nearest": plain_numbers(design.threshold.nearest),
+        },
         "ways": [
             {
                 "by": list(way.units.by),
@@ -194,7 +204,29 @@ def _parameters(name: str, design: Design) -> Iterator[Any]:
         f"Singular values of the whitened Jacobian, per parameter's size: {s[0]:.3g} to {s[-1]:.3g}.",
     )
     verdict = "Least observable direction" if seen.observable else "The readings do not determine"
-    yield Text(f"{verdict}: {seen.words}\n", style="bold")
+    yield Text(f"{verdict}: {seen.words}", style="bold")
+    yield Text(f"{_threshold(design)}\n" if design.threshold else "")
+
+
+def _threshold(design: Design) -> str:
+    """Whether false roots are the estimator's own fault, or anyone's."""
+    limit = design.threshold
+    assert limit is not None
+    if not limit.false_roots:
+        return f"False roots: none in {limit.runs} runs of least squares from other truths."
+    loss = float(np.max(limit.weiss_weinstein / limit.van_trees))
+    blame = (
+        f"so no estimator can do better than {loss:.2f} times Van Trees's bound"
+        if loss > _MUST_BREAK
+        else "so ending there is the estimator's fault and not that of noise"
+        if limit.confusion < _UNSEEN
+        else "which the Weiss-Weinstein bound, averaged over the prior, does not feel"
+    )
+    return (
+        f"False roots: {limit.false_roots} of {limit.runs} runs of least squares from other truths; readings of the"
+        f" nearest are {limit.nearest:.3g} deviations off, and noise makes it fit better in {percent(limit.confusion)},"
+        f" {blame}."
+    )
 
 
 def _suspects(design: Design) -> Iterator[Any]:

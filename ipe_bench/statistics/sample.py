@@ -20,8 +20,13 @@ FIT = "fit_p"
 NIS = "extra_nis"
 """Where filters report their normalised innovations squared."""
 SCALARS = ("status", "solved", "success", "iterations", "simulations", "jacobians", "time_s", "nees", "crlb_distance")
-TRUTH = ("contraction_K", "contraction_norm", "contraction_radius", "curvature_M")
+TRUTH = (
+    *("contraction_K", "contraction_norm", "contraction_radius"),
+    *("curvature_M", "curvature_intrinsic", "curvature_parameter"),
+)
 """Scalars of the truth, read where they are stored."""
+THEORY = ("box_bias", "pseudo_bias", "misspecified")
+"""What theory says of least squares for each parameter, read where it is stored."""
 OPTIONAL = ("message", FIT, NIS, "root_distance")
 """Read where they are stored."""
 
@@ -84,6 +89,8 @@ class Sample:
     """(trials, n), H+ v: what the linear estimate would be off by if h were linear."""
     van_trees: Array
     """(trials, n), deviations of Van Trees's bound, in the first trial of each seed and NaN in the others."""
+    theory: Mapping[str, Array]
+    """(trials, n) by the names in `THEORY`; NaN where it is not stored."""
     truth: Mapping[str, Array]
     """Per trial, by the names in `TRUTH`; NaN where it is not stored."""
     scalars: Mapping[str, Array]
@@ -95,7 +102,7 @@ class Sample:
         names = [p["name"] for p in group.footer["parameters"]]
         vectors = [f"{kind}_{name}" for kind in ("error", "deviation") for name in names]
         bounds = [f"{kind}_{name}" for kind in ("crlb", "bayes") for name in names]
-        linear = [f"{kind}_{name}" for kind in ("linear_error", "van_trees") for name in names]
+        linear = [f"{kind}_{name}" for kind in ("linear_error", "van_trees", *THEORY) for name in names]
         parts: list[dict[str, Array]] = []
         for cell, truth in group.cells:
             rows = collection.load(cell, [*vectors, *SCALARS], OPTIONAL)
@@ -123,6 +130,7 @@ class Sample:
             bayes=matrix("bayes"),
             linear_error=matrix("linear_error"),
             van_trees=matrix("van_trees"),
+            theory={kind: matrix(kind) for kind in THEORY},
             truth=truth,
             scalars=joined,
             shared=shared,

@@ -20,6 +20,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.trials.observability import TRUTHS, Observability, Suspect, suspects, truths_of
 from ipe_bench.trials.scenario import Scenario
+from ipe_bench.trials.weiss_weinstein import Threshold, threshold
 
 Criterion = Literal["A", "D"]
 """A: the mean over parameters and truths of the squared bound. D: the volume of its ellipsoid."""
@@ -124,6 +125,8 @@ class Design:
     candidates: Measurement
     observability: Observability
     suspects: tuple[Suspect, ...]
+    threshold: Threshold | None
+    """What no estimator can beat, false roots counted in; None without a prior."""
     ways: tuple[Way, ...]
     effects: tuple[Effect, ...]
 
@@ -161,6 +164,7 @@ def design(
     model, R, x = scenario.measurement, scenario.problem.R, truths_of(scenario, truths)
     today = Observability.at(model, R, x)
     found = [one for error in errors for one in suspects(model, R, error, x[:SUSPECTED])]
+    limit = threshold(scenario)
     candidates = model.candidates
     columns = _columns(model, by)
     if R.factor.ndim != 1:
@@ -171,7 +175,7 @@ def design(
     slopes = scenario.noise.covariance(candidates.m).whiten_jacobian(candidates.jacobian(x))
     whole = Observability.at(candidates, scenario.noise.covariance(candidates.m), x)
     if not whole.observable:
-        return Design(scenario, criterion, candidates, today, _largest(found), (), ())
+        return Design(scenario, criterion, candidates, today, _largest(found), limit, (), ())
     reference = today if today.observable else whole
     slopes = slopes * np.sqrt(np.diagonal(reference.covariance, axis1=1, axis2=2))[:, None, :]
     most = model.m if readings is None else readings
@@ -180,9 +184,8 @@ def design(
     judge = _Judge.against(_today_information(model, R, x, reference), slopes, criterion)
     ways = [_way(judge, _units(model, candidates, chosen, slopes), model.m, most) for chosen in columns]
     effects = tuple(_effects(judge, model, candidates, slopes)) if today.observable else ()
-    return Design(
-        scenario, criterion, candidates, today, _largest(found), tuple(w for w in ways if w is not None), effects
-    )
+    chosen_ways = tuple(way for way in ways if way is not None)
+    return Design(scenario, criterion, candidates, today, _largest(found), limit, chosen_ways, effects)
 
 
 def _largest(found: Sequence[Suspect]) -> tuple[Suspect, ...]:

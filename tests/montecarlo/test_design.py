@@ -278,6 +278,7 @@ def test_four_cases_of_the_paper_are_as_good_as_any_four():
 def test_candidates_of_gins_begin_with_its_own_cases_and_say_what_they_are():
     model = Gins()
     more = model.candidates
+    assert isinstance(more, Gins)
     np.testing.assert_allclose(more.cases[:4], model.cases)
     assert np.hypot(*more.cases.T).max() == pytest.approx(np.hypot(*model.cases.T).max())
     assert more.levels["case"][1] == "1500, 0 ft/s"
@@ -291,12 +292,14 @@ def test_candidates_of_gins_begin_with_its_own_cases_and_say_what_they_are():
 
 def test_whole_cases_are_options_and_single_readings_a_restriction():
     more = Gins().candidates
+    assert isinstance(more, Gins)
     case = np.array(more.index["case"])
     two = more.taking(np.flatnonzero((case == 2) | (case == 5)).tolist())
     assert isinstance(two, Gins)
     assert two.injected == ((0.0, 1500.0), (1299.038, 750.0))
     few = more.taking([0, 5, 700])
     assert isinstance(few, Restricted)
+    assert isinstance(few.whole, Gins)
     assert len(few.whole.cases) == 2
     x = 10 * np.random.default_rng(2).normal(size=(2, 11))
     np.testing.assert_allclose(few.simulate(x), more.simulate(x)[:, [0, 5, 700]], atol=1e-9)

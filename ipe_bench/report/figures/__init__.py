@@ -18,5 +18,6 @@ FIGURES = (
     "profile_curves",
     "ranks",
     "correlation",
+    "theory",
 )
 """The modules, in the order of the report; a new figure is a module with a FIGURE, and its name here."""
