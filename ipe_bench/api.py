@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from ipe_bench.real.fits import Fit
     from ipe_bench.report import ReportResult
     from ipe_bench.trials.design import Criterion, Design
+    from ipe_bench.trials.posterior import Reference
 
 BLOCK_SIZE = 250
 Directories = Path | str | Sequence[Path | str]
@@ -283,6 +284,34 @@ def design(
     from ipe_bench.trials.design import design as designed
 
     return designed(scenario, by=by, readings=readings, criterion=criterion, errors=errors)
+
+
+def posterior(
+    scenario: Scenario, estimators: Mapping[str, Estimator], trials: int = 3, *, particles: int = 1000
+) -> list[Reference]:
+    """What the readings of a scenario's first trials really say, and how far each estimator's Gaussian is from it.
+
+    The posterior is sampled by sequential Monte Carlo, with nothing linearised, for the normal errors of covariance R
+    that estimators are told. A result has the trial's `truth` (n,), the `posterior` (draws `x` (draws, n) in multiples
+    of the parameters' sizes, `mean`, `covariance`, `modes` with their `shares`, and whether it has `settled`: two
+    populations of particles agree), and for each estimator its `estimates` and a `divergences` entry: `kl` in nats,
+    `shift`, `width` and `energy`.
+
+    >>> import ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
+    >>> (found,) = ib.posterior(bench, {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}, trials=1)
+    >>> found.posterior.settled, len(found.posterior.modes)
+    (True, 1)
+    >>> found.divergences["newton"].kl < 1 < found.divergences["linear"].kl
+    True
+
+    Raises:
+        UserError: the scenario has no prior, an estimator needs what is not there, or there are too few particles.
+    """
+    from ipe_bench.trials.posterior import reference
+
+    validate([scenario], estimators, trials)
+    return [reference(scenario, estimators, trial, particles) for trial in range(trials)]
 
 
 def check(component: Any) -> list[Finding]:

@@ -176,7 +176,7 @@ def _predicted(s: Sample) -> tuple[Array, Array]:
         if not used.any():
             return nothing, nothing
         return wrong[used].mean(axis=0), np.sqrt(np.mean(wrong[used] ** 2 + scatter[used] ** 2, axis=0))
-    known = np.isfinite(box).all(axis=1)
+    known = np.asarray(np.isfinite(box).all(axis=1))
     bias = box[known].mean(axis=0) if known.any() else nothing
     return bias, np.sqrt(_crlb(s) ** 2 + (root_mean(box, known) ** 2 if known.any() else 0.0))
 

@@ -118,6 +118,7 @@ class _Alike:
     @classmethod
     def of(cls, problem: Problem, c: Array, u: Array) -> _Alike:
         model, deviation = problem.measurement, problem.prior_used()
+        assert deviation is not None
         above, below = u + c / 2, u - c / 2
         with np.errstate(all="ignore"):
             apart = problem.R.whiten(model.simulate(above) - model.simulate(below))
