@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test slow campaigns lint bench clean
+.PHONY: run test slow campaigns mutants lint bench docs clean
 
 run: .venv/ready
 	$(BIN)/ipe-bench run +experiment=paper
@@ -18,6 +18,11 @@ slow: .venv/ready
 campaigns: .venv/ready
 	$(BIN)/pytest -n auto -m campaign
 
+# Whether the tests notice changes on purpose, room by room, as a table in outputs/mutants. SAMPLE=40 draws that many.
+mutants: .venv/ready
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[mutants]"
+	$(BIN)/python tests/mutants/score.py $(if $(SAMPLE),--sample $(SAMPLE)) $(ROOMS)
+
 lint: .venv/ready
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
@@ -26,6 +31,11 @@ lint: .venv/ready
 # What everything costs beside its rivals, as a table in outputs/bench.
 bench: .venv/ready
 	IPE_BENCH_THREADS=1 OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/table.py outputs/bench
+
+# The documentation, with every experiment executed, in outputs/docs/html. TRIALS=100 makes the gallery's figures finer.
+docs: .venv/ready
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[docs]"
+	$(BIN)/python -m ipe_bench.report.docs outputs/docs $(if $(TRIALS),--trials $(TRIALS))
 
 .venv/ready: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \

@@ -9,6 +9,7 @@ import functools
 import platform
 import subprocess
 import tempfile
+import time
 import uuid
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,20 +18,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ipe_bench.basics.errors import StorageError, UserError
+from ipe_bench.basics.errors import StorageError, UserError, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import cores, library_versions
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
-from ipe_bench.noise.gaussian import Gaussian
 from ipe_bench.priors.gaussian import GaussianPrior
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.provenance import describe, fingerprint
 from ipe_bench.runs.results import Results, require_results
 from ipe_bench.runs.schedule import RunLog, Watcher, perform, plan, work_through
 from ipe_bench.runs.store import TRUTH, Cell, Store
+from ipe_bench.statistics.sequences import Precision, Reach, next_trials
 from ipe_bench.trials.bounds import linear_bound
 from ipe_bench.trials.scenario import Scenario
 
@@ -38,12 +39,16 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ipe_bench.plugins.conformance import Finding
-    from ipe_bench.real.fits import Fit
     from ipe_bench.report import ReportResult
+    from ipe_bench.report.answer import Answer
     from ipe_bench.trials.design import Criterion, Design
     from ipe_bench.trials.posterior import Reference
 
 BLOCK_SIZE = 250
+TRIALS = 1000
+"""Where neither a number nor a precision is asked for."""
+MOST_TRIALS = 100_000
+"""With a precision, where no number is given."""
 Directories = Path | str | Sequence[Path | str]
 MOST_BLOCKS = 1_000_000
 _FEW = 4
@@ -54,8 +59,10 @@ LARGEST = 1e100
 def run(
     scenarios: Scenario | Sequence[Scenario],
     estimators: Mapping[str, Estimator],
-    trials: int = 1000,
+    trials: int | None = None,
     *,
+    precision: float | Mapping[str, float] | None = None,
+    time_limit: float | None = None,
     output: Path | str | None = None,
     execution: Execution | None = None,
     block_size: int = BLOCK_SIZE,
@@ -68,11 +75,21 @@ def run(
     mean square over parameters of error over bound; `rmse` and its kin are in the parameter's own unit. What could not
     be computed is left out, with a warning that says why.
 
+    There are 1000 `trials` unless another number is given. With `precision` there are just enough, and `trials` is the
+    most there may be (100,000 unless given): blocks are added to what is stored until every success share is known to
+    within that number, or what is named, as in {"success": 0.01, "rmse": 0.05}, to within its own (rmse: relative), or
+    until `time_limit` seconds are over. What is then known to that precision is `success_anytime` and `rmse_anytime`,
+    whose intervals stay valid under such looking. `attrs["stops"]` says how many trials each scenario took, and why no
+    more.
+
     >>> import ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
     >>> table = ib.run(bench, {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}, trials=20)
     >>> table[table["parameter"] == "all"].set_index("estimator")["converged"].to_dict()
     {'newton': 1.0, 'linear': 1.0}
+    >>> table = ib.run(bench, {"newton": ib.solvers.Newton()}, precision=0.05)
+    >>> [(stop["trials"], stop["reason"]) for stop in table.attrs["stops"]]
+    [(250, 'every interval is narrow enough')]
 
     Raises:
         UserError: what was asked for cannot be computed; nothing has been computed then.
@@ -84,9 +101,19 @@ def run(
     with contextlib.ExitStack() as stack:
         folder = output or stack.enter_context(tempfile.TemporaryDirectory(prefix="ipe-bench-"))
         options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
-        for failure in compute(scenarios, estimators, trials, folder, **options):
+        stops: tuple[Stop, ...] = ()
+        if precision is None:
+            _refuse_time_limit(time_limit)
+            failures = compute(scenarios, estimators, TRIALS if trials is None else trials, folder, **options)
+        else:
+            options |= {"precision": precision, "time_limit": time_limit}
+            failures, stops = compute_until(scenarios, estimators, trials, folder, **options)
+        for failure in failures:
             warnings.warn(f"failed: {failure}", stacklevel=2)
-        return summarize([folder])
+        table = summarize([folder])
+        if precision is not None:
+            table.attrs["stops"] = [stop.row for stop in stops]
+        return table
 
 
 def load(directories: Directories) -> pd.DataFrame:
@@ -143,6 +170,74 @@ def report(directories: Directories, output: Path | str | None = None) -> Report
     return write_report(directories, output)
 
 
+def compare(
+    first_directory: Directories,
+    second_directory: Directories | None = None,
+    *,
+    first: str | None = None,
+    second: str | None = None,
+    alpha: float = 0.05,
+    anytime: bool = False,
+    fail_on: Sequence[str] = ("success", "error"),
+    output: Path | str | None = None,
+) -> pd.DataFrame:
+    """Whether a second version, setting or estimator is better or worse than a first, trial by trial.
+
+    Compares every estimator that both directories have, on every scenario that both have, or `first` of the first with
+    `second` of the second; without a second directory both are in the first one. Where no scenario is in both, those
+    are compared that differ in one setting alone. Trials are matched by seed and number; those of other seeds in their
+    order, which is right and gains nothing.
+
+    Returns a row per comparison and quantity: success (share; `change` is a difference), error (mean Mahalanobis error,
+    each trial's at most the radius of the gate; a ratio), cost in simulations (a ratio), and time, which is not tested.
+    `low` and `high` are the ends of the row's own interval, `p` is corrected over all rows (Holm), and `e` is evidence
+    that may be looked at after any number of trials; `finding` says what the second is: better, worse or neither
+    surely, by p below `alpha`, or by e where `anytime`. `attrs["worse"]` has a line for everything in `fail_on` that is
+    worse, `attrs["problems"]` for what is missing, `attrs["stale"]` for what older code computed, `attrs["notes"]` for
+    what is left out. With `output`, comparison.csv and figures are written there.
+
+    >>> import tempfile, ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = ib.run(bench, {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}, 20, output=folder)
+    ...     rows = ib.compare(folder, first="linear", second="newton")
+    >>> rows.set_index("quantity")["finding"].to_dict()
+    {'success': 'better', 'error': 'better', 'cost': 'worse', 'time': ''}
+
+    Raises:
+        UserError: there is nothing to compare.
+    """
+    import pandas as pd
+
+    from ipe_bench.statistics.between import JUDGED, compared, left_out
+    from ipe_bench.statistics.collect import collect
+
+    if not 0 < alpha < 1:
+        raise UserError(f"alpha={alpha}: give a number between 0 and 1")
+    if wrong := [name for name in fail_on if name not in JUDGED]:
+        raise UserError(f"fail_on={wrong[0]}: {unknown(wrong[0], JUDGED, 'quantity')}")
+    paths = [_paths(first_directory), _paths(first_directory if second_directory is None else second_directory)]
+    if second_directory is None and (first is None or second is None):
+        raise UserError("compare: one folder is compared with itself; name another, or first=LABEL and second=LABEL")
+    for part in paths:
+        require_results(part)
+    collections = [collect(part) for part in paths]
+    frame = pd.DataFrame(compared(collections[0], collections[1], (first, second), alpha=alpha, anytime=anytime))
+    worse = frame[(frame["finding"] == "worse") & frame["quantity"].isin(list(fail_on))]
+    frame.attrs["worse"] = [
+        f"{row['second']} in {row['quantity']}, {row['measurement']}, error scale {row['error_scale']}"
+        for row in worse.to_dict("records")
+    ]
+    for name in ("problems", "stale"):
+        frame.attrs[name] = list(dict.fromkeys(line for c in collections for line in getattr(c, name)))
+    frame.attrs["notes"] = left_out(*collections)
+    if output is not None:
+        from ipe_bench.report.comparison import write
+
+        write(frame, Path(output), alpha)
+    return frame
+
+
 def status(directories: Directories) -> pd.DataFrame:
     """How far everything is that runs asked for: a row per scenario and estimator.
 
@@ -178,22 +273,23 @@ def status(directories: Directories) -> pd.DataFrame:
 
 def estimate(
     model: Measurement,
-    readings: Path | str | Array,
+    readings: Path | str | Sequence[Path | str] | Array,
     estimators: Mapping[str, Estimator] | None = None,
     *,
     noise: Noise | None = None,
     prior: GaussianPrior | None = None,
     error_scale: float | None = None,
-) -> list[Fit]:
+) -> Answer:
     """Parameters from real readings, by every estimator: estimates, standard errors, residuals and a test of the fit.
 
-    `readings` is a CSV file (see `ipe_bench.real.readings`) or an array z (m,) in the model's order and unit; NaN is
-    missing. Without `estimators`: `linear_lse`, `fixed_point`, `levenberg_marquardt` and `progressive`. `noise` states
-    R. Without it the readings are taken for independent and equally noisy, and their deviation is estimated from the
-    smallest residuals that an estimator leaves; then nothing is left to test the fit with, and `chi_square` is NaN.
-    Filters and `map_lm` need to know how far from the model's nominal point the parameters may be: `error_scale` is the
-    standard deviation of each in multiples of its size, and `prior` widens or narrows some. `x` and `covariance` of a
-    fit are in the parameters' own units.
+    `readings` is a CSV file (see `ipe_bench.real.readings`), several that share parameters, or an array z (m,) in the
+    model's order and unit; NaN is missing. Without `estimators`: `linear_lse`, `fixed_point`, `levenberg_marquardt` and
+    `progressive`. `noise` states R. Without it R is what the file says in its column sigma, or the model of its own
+    noise; where neither does, the readings are taken for independent and equally noisy, and the level is estimated from
+    the residuals (`Unknown`): then their size cannot test the fit. Filters and `map_lm` need to know how far from the
+    model's nominal point the parameters may be: `error_scale` is the standard deviation of each in multiples of its
+    size, and `prior` widens or narrows some. `x` and `covariance` of a fit are in the parameters' own units. The answer
+    is the sequence of the fits; it shows itself in a notebook, and `table()` is a frame.
 
     >>> import ipe_bench as ib
     >>> model = ib.measurements.Polynomial()
@@ -206,12 +302,15 @@ def estimate(
     progressive converged True
 
     Raises:
-        UserError: the file does not hold this model's readings, the array has another shape, or an estimator needs
+        UserError: a file does not hold this model's readings, the array has another shape, or an estimator needs
             what is not given.
     """
     from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
+    from ipe_bench.noise.own import ModelNoise, Unknown
+    from ipe_bench.real.examination import examine
     from ipe_bench.real.fits import fit
-    from ipe_bench.real.readings import read_readings
+    from ipe_bench.real.sources import Readings, noise_of, open_together
+    from ipe_bench.report.answer import Answer
     from ipe_bench.solvers import FixedPoint, Progressive
 
     if estimators is None:
@@ -221,24 +320,23 @@ def estimate(
             "levenberg_marquardt": LevenbergMarquardt(),
             "progressive": Progressive(),
         }
-    z = read_readings(Path(readings), model) if isinstance(readings, Path | str) else np.array(readings, dtype=float)
-    if z.shape != (model.m,):
-        raise UserError(
-            f"readings: has shape {z.shape}; give the {model.m} readings of {model.name}, NaN where missing"
-        )
-    problem = _real_problem(model, noise or Gaussian(1.0), prior, error_scale)
+    if isinstance(readings, np.ndarray):
+        z = np.array(readings, dtype=float)
+        if z.shape != (model.m,):
+            raise UserError(
+                f"readings: has shape {z.shape}; give the {model.m} readings of {model.name}, NaN where missing"
+            )
+        found = Readings(model, z)
+    else:
+        paths = [readings] if isinstance(readings, str | Path) else readings
+        found = open_together([Path(path) for path in paths], model)
+    known = noise_of(found, noise) or ModelNoise().of(found.model) or Unknown()
+    problem = _real_problem(found.model, known, prior, error_scale)
     if lacking := _needs(problem, estimators):
         remedy = "; give error_scale" if error_scale is None and prior is None else ""
         raise UserError("; ".join(lacking) + remedy)
-    if noise is not None:
-        return fit(problem, z, estimators, noise)
-    # The first round weighs all readings alike, which is all that finding the deviation takes.
-    found = [f.residual_deviation for f in fit(problem, z, estimators)]
-    deviation = np.nanmin(found) if np.isfinite(found).any() else np.nan
-    if not deviation > 0:
-        raise UserError("noise: is not given and cannot be estimated from the residuals; state it, as in Gaussian(0.1)")
-    problem = _real_problem(model, Gaussian(float(deviation)), prior, error_scale)
-    return [dataclasses.replace(f, chi_square=np.nan, p_value=np.nan) for f in fit(problem, z, estimators)]
+    fits = fit(problem, found.z, estimators, known)
+    return Answer(found.model.name, found.model, found.z, fits, examine(problem, found.z, fits))
 
 
 def _real_problem(model: Measurement, noise: Noise, prior: GaussianPrior | None, error_scale: float | None) -> Problem:
@@ -349,8 +447,12 @@ def compute(
     execution: Execution | None = None,
     block_size: int = BLOCK_SIZE,
     watch: Watcher | None = None,
+    record_as: str | None = None,
+    further: Mapping[str, Any] | None = None,
 ) -> tuple[str, ...]:
     """Computes and stores what is missing under `output`; returns the messages of what failed.
+
+    The run is recorded under a new name, or under `record_as`, in place of what is there; with `further` facts.
 
     Raises:
         UserError: what was asked for cannot be computed, or the folder cannot be written to; nothing is computed then.
@@ -369,8 +471,9 @@ def compute(
     aside = results.set_aside()
     tasks = [task for part in cells for task in plan(store.directory, part, results, trials, block_size)]
     execution.warm_up(perform, len(tasks))
-    record = _record(scenarios, estimators, trials)
-    identifier = (None if tasks or aside else store.same_run(record)) or _write_record(store, record)
+    record = _record(scenarios, estimators, trials) | dict(further or {})
+    known = None if tasks or aside else store.same_run(record)
+    identifier = known or _write_record(store, record, record_as or new_name())
     with RunLog(store.directory / "log" / f"{identifier}.log") as log:
         for line in aside:
             log.warning(line)
@@ -381,6 +484,112 @@ def compute(
     return failures
 
 
+@dataclasses.dataclass(frozen=True)
+class Stop:
+    """How many trials a scenario took until its intervals were narrow enough, or why it took no more."""
+
+    scenario: Scenario
+    trials: int
+    reason: str
+    widest: str
+    """The statistic that is farthest from the precision that was asked for, or was nearest to it last."""
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """What it says, by name."""
+        names = {k: v for k, v in Cell(self.scenario).names.items() if k != "estimator"}
+        return names | {"trials": self.trials, "reason": self.reason, "widest": self.widest}
+
+
+def compute_until(
+    scenarios: Sequence[Scenario],
+    estimators: Mapping[str, Estimator],
+    most: int | None,
+    output: Path | str,
+    *,
+    precision: float | Mapping[str, float],
+    time_limit: float | None = None,
+    execution: Execution | None = None,
+    block_size: int = BLOCK_SIZE,
+    watch: Watcher | None = None,
+) -> tuple[tuple[str, ...], tuple[Stop, ...]]:
+    """Adds blocks to what is stored under `output` until every interval is narrow enough, there are `most` trials
+    (`MOST_TRIALS` where None), or `time_limit` seconds are over, which is looked at between rounds of blocks.
+
+    Returns the messages of what failed, and why each scenario stopped.
+
+    Raises:
+        UserError: what was asked for cannot be computed; nothing is computed then.
+        StorageError: nothing can be stored any more.
+    """
+    wanted, budget, began = Precision.of(precision), MOST_TRIALS if most is None else most, time.monotonic()
+    _refuse_time_limit(time_limit, wanted)
+    if any(scenario.noise.real for scenario in scenarios):
+        raise UserError(f"precision={precision}: certified readings are one trial; leave it out")
+    validate(scenarios, estimators, budget, block_size)
+    options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
+    options["further"] = {"precision": dataclasses.asdict(wanted)}
+    at = [_first_trials(s, estimators, Path(output), block_size, budget) for s in scenarios]
+    names, failures = [new_name() for _ in scenarios], []
+    stops: dict[int, Stop] = {}
+    while len(stops) < len(scenarios):
+        for i, scenario in enumerate(scenarios):
+            if i in stops:
+                continue
+            failed = compute([scenario], estimators, at[i], output, record_as=names[i], **options)
+            reached = _reached(scenario, estimators, Path(output), wanted)
+            widest = max(reached, key=lambda r: r.ratio, default=None)
+            late = time_limit is not None and time.monotonic() - began >= time_limit
+            reason = _reason_to_stop(bool(failed) or widest is None, widest, at[i] >= budget, late)
+            if reason:
+                failures += failed
+                stops[i] = Stop(scenario, at[i], reason, str(widest or ""))
+            else:
+                assert widest is not None
+                at[i] = next_trials(at[i], widest.ratio, block_size, budget)
+    return tuple(failures), tuple(stops[i] for i in range(len(scenarios)))
+
+
+def _reason_to_stop(failed: bool, widest: Reach | None, spent: bool, late: bool) -> str:
+    """Empty where there is none."""
+    if failed:
+        return "some blocks failed"
+    if widest is not None and widest.ratio <= 1:
+        return "every interval is narrow enough"
+    if spent:
+        return "there are as many trials as there may be"
+    return "the time is over" if late else ""
+
+
+def _first_trials(
+    scenario: Scenario, estimators: Mapping[str, Estimator], output: Path, block_size: int, most: int
+) -> int:
+    """Where to begin: with what is stored of every estimator, or one block."""
+    cells = cells_of(scenario, estimators)
+    results = Results.read([output] if output.is_dir() else [], keys={cell.key for cell in cells})
+    whole = [results.missing(cell.key, most) for cell in cells]
+    stored = min(gaps[0][0] if gaps else most for gaps in whole)
+    return min(most, max(stored, block_size))
+
+
+def _reached(scenario: Scenario, estimators: Mapping[str, Estimator], output: Path, wanted: Precision) -> list[Reach]:
+    """How near every statistic of every estimator has come."""
+    from ipe_bench.statistics.collect import collect
+    from ipe_bench.statistics.sample import Sample, Shared
+
+    collection = collect([output], {cell.key for cell in cells_of(scenario, estimators)})
+    shared = Shared.among(collection, collection.groups)
+    samples = [Sample.load(collection, group, shared) for group in collection.groups]
+    return [reach for sample in samples if len(sample) for reach in wanted.reached(sample)]
+
+
+def _refuse_time_limit(time_limit: float | None, precision: Precision | None = None) -> None:
+    if time_limit is not None and precision is None:
+        raise UserError(f"time_limit={time_limit}: goes with precision; give that, or leave it out")
+    if time_limit is not None and not time_limit > 0:
+        raise UserError(f"time_limit={time_limit}: give a number of seconds above 0")
+
+
 def validate(
     scenarios: Sequence[Scenario],
     estimators: Mapping[str, Estimator],
@@ -388,10 +597,12 @@ def validate(
     block_size: int = BLOCK_SIZE,
     *,
     untried: Sequence[Scenario] | None = None,
+    estimating: bool = False,
 ) -> None:
-    """Raises one UserError with everything that stands in the way of this run.
+    """Raises one UserError with everything that stands in the way of this run, or of `estimating` from real readings.
 
-    Trials are drawn of the scenarios `untried` (all where it is None), to see whether numbers hold what is asked for.
+    Trials are drawn of the scenarios `untried` (all where it is None), to see whether numbers hold what is asked for;
+    none are where readings are real.
     """
     mistakes = []
     if trials < 1:
@@ -407,9 +618,11 @@ def validate(
     if not estimators:
         mistakes.append("there is no estimator; choose with solver= and baseline=")
     for scenario in scenarios:
+        if scenario.noise.estimated and not estimating:
+            mistakes.append("noise=unknown: has no level to simulate with; choose another noise, or use `estimate`")
         if scenario.noise.real and trials != 1:
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
-        if untried is None or scenario in untried:
+        if not estimating and not scenario.noise.estimated and (untried is None or scenario in untried):
             mistakes += _beyond_numbers(scenario)
         mistakes += _needs(scenario.problem, estimators)
     if mistakes:
@@ -455,10 +668,14 @@ def cells_of(scenario: Scenario, estimators: Mapping[str, Estimator]) -> list[Ce
     return [Cell(scenario), *(Cell(scenario, label, estimator) for label, estimator in estimators.items())]
 
 
-def _write_record(store: Store, record: Mapping[str, Any]) -> str:
+def new_name() -> str:
+    """A name for the record of a run."""
+    return f"{datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}"
+
+
+def _write_record(store: Store, record: Mapping[str, Any], identifier: str) -> str:
     """States what is going to be computed, so that what is missing later is known to be missing; returns its name."""
     now = datetime.datetime.now(datetime.UTC)
-    identifier = f"{now:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}"
     store.write_run(identifier, {"started": now.isoformat(timespec="microseconds"), **record})
     return identifier
 

@@ -22,8 +22,7 @@ class Status(IntEnum):
     NONFINITE = 4, "a reading or an estimate overflowed or was not a number"
     SINGULAR = 5, "a linear system had no unique solution"
     BUDGET = 6, "the budget of simulations was used up"
-    TIMEOUT = 7, "the time limit was reached"
-    ERROR = 8, "the estimator or the model raised an exception"
+    ERROR = 7, "the estimator or the model raised an exception"
 
     def __str__(self) -> str:
         return self.label

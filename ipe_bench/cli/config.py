@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import fnmatch
+import json
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import cloudpickle
+import yaml
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
@@ -19,13 +21,16 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from ipe_bench.api import MOST_TRIALS, TRIALS
 from ipe_bench.basics.errors import UserError, describe_exception, unknown
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
+from ipe_bench.measurements.known import Informed, Known
 from ipe_bench.measurements.nist import datasets
-from ipe_bench.noise.base import Noise
+from ipe_bench.noise import ModelNoise, Noise, Unknown
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
+from ipe_bench.priors.gaussian import GaussianPrior
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.provenance import TARGET, canonical_json, describe
 from ipe_bench.trials.scenario import Scenario
@@ -45,11 +50,17 @@ class Schema:
     error_scale: float = 1.0
     """Standard deviation of the true parameters, in multiples of their units."""
     seed: int = 0
-    trials: int = 1000
+    trials: int | None = None
+    """1000 unless given; with a precision, the most there may be."""
+    precision: Any = None
+    """How near to what is found success shares have to be (0.01), or {success: 0.01, rmse: 0.05}: then there are just
+    enough trials."""
+    time_limit: float | None = None
+    """Seconds after which, with a precision, no more blocks are begun."""
     block_size: int = 250
     """Trials per unit of work and of storage; changes no number."""
-    readings: str | None = None
-    """A file of real readings, for `estimate`."""
+    readings: Any = None
+    """A file of real readings, for `estimate`, or a list of files that are estimated together."""
     write_readings: str | None = None
     """Write the simulated readings of one trial to this file instead of running."""
     write_readings_trial: int = 0
@@ -58,6 +69,8 @@ class Schema:
     """What simulates the readings, where it differs from what the estimators assume."""
     noise: Any = MISSING
     prior: Any = MISSING
+    parameters: Any = None
+    """What is known of the parameters: parameters.NAME.fixed=, .nominal=, .deviation=, .lower=, .upper=, .positive=."""
     execution: Any = MISSING
     estimators: dict[str, Any] = field(default_factory=dict)
 
@@ -73,8 +86,11 @@ class Job:
     estimators: Mapping[str, Estimator]
     execution: Execution
     trials: int
+    """Or the most there may be, where there is a precision."""
     block_size: int
     output: str
+    precision: Any = None
+    time_limit: float | None = None
 
 
 class PluginSearchPath(SearchPathPlugin):
@@ -95,11 +111,21 @@ def prepare() -> None:
         registry.register(PluginSearchPath)
 
 
+_FORMULA = re.compile(
+    r"^(\+*(?:truth_)?measurement\.(?:expression|(?:initial|rates|outputs)\.\w+))=(?!['\"])(.*)$", re.DOTALL
+)
+_UNIT = re.compile(r"^(\+*(?:truth_)?measurement\.(?:time_)?unit)=([^'\",\[\]{}]+)$")
+_FILE = re.compile(r"^\+*(?:truth_)?measurement\.file=")
+_OPEN = re.compile(r"^(?:parameters|(?:truth_)?measurement\.(?:start|columns|initial|rates|outputs))\.")
+"""Keys to which users add entries of their own names."""
+
+
 def rewrite(overrides: Sequence[str]) -> list[str]:
-    """Overrides in Hydra's own words: truth_measurement= chooses from the group measurement, and measurement=nist/NAME
-    is measurement=nist with that data set."""
-    overrides = [re.sub(r"^(\+?)truth_measurement=", r"\1measurement@truth_measurement=", o) for o in overrides]
-    return [part for override in overrides for part in _nist(override)]
+    """Overrides in Hydra's own words: truth_measurement= chooses from the group measurement, measurement=nist/NAME is
+    measurement=nist with that data set, formulas stand in quotes that the shell has taken off, and entries are added
+    where users name them."""
+    expanded = [words for o in overrides for words in (_from_file(o) if _FILE.match(o) else [_in_hydras_words(o)])]
+    return [part for override in expanded for part in _nist(override)]
 
 
 def _nist(override: str) -> list[str]:
@@ -127,8 +153,48 @@ def _nist(override: str) -> list[str]:
     return [f"{key}=nist", f"{key.rpartition('@')[2].lstrip('+')}.dataset={','.join(known[name] for name in names)}"]
 
 
-def assemble(config: DictConfig) -> Job:
-    """The scenario, the estimators and the execution that a composed config describes; UserError by key."""
+def _from_file(override: str) -> list[str]:
+    """A model's options from a YAML file, as if each had been typed there."""
+    key, _, name = override.partition("=")
+    try:
+        content = yaml.safe_load(Path(name).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{override}: cannot be read ({error.__class__.__name__}); name a YAML file") from None
+    except yaml.YAMLError as error:
+        raise UserError(f"{override}: is not YAML ({' '.join(str(error).split())})") from None
+    if not isinstance(content, dict):
+        raise UserError(f"{override}: holds no keys; write a YAML file of options such as rates, start, outputs")
+    if TARGET in content:
+        raise UserError(f"{override}: has a {TARGET}; the model is chosen by measurement=, so leave it out")
+    group = key.removesuffix(".file").lstrip("+")
+    return [f"++{group}.{k}={_literal(v, override)}" for k, v in content.items()]
+
+
+def _literal(value: Any, where: str) -> str:
+    """A value in the grammar of overrides."""
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{k}:{_literal(v, where)}" for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ",".join(_literal(v, where) for v in value) + "]"
+    if isinstance(value, str):
+        return "'" + value.replace("\\", "\\\\").replace("'", "\\'") + "'"
+    if value is None or isinstance(value, bool | int | float):
+        return json.dumps(value) if value is None or isinstance(value, bool) else repr(value)
+    raise UserError(f"{where}: {value!r} is neither text nor number")
+
+
+def _in_hydras_words(override: str) -> str:
+    override = re.sub(r"^(\+?)truth_measurement=", r"\1measurement@truth_measurement=", override)
+    override = _UNIT.sub(lambda found: f"{found[1]}='{found[2]}'", override)
+    override = _FORMULA.sub(lambda found: f"{found[1]}='{found[2]}'", override)
+    return f"++{override}" if _OPEN.match(override) else override
+
+
+def assemble(config: DictConfig, *, estimating: bool = False) -> Job:
+    """The scenario, the estimators and the execution that a composed config describes; UserError by key.
+
+    `estimating`: for real readings, of which the level of the noise need not be known.
+    """
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(plain, dict)
     for key in plain:
@@ -141,14 +207,17 @@ def assemble(config: DictConfig) -> Job:
         if not Path(plain[key]).name:
             raise UserError(f"{key}={plain[key]}: name a folder")
     truth = plain["truth_measurement"]
-    scenario = Scenario(
-        _part(plain, "measurement", Measurement),
-        _part(plain, "noise", Noise),
-        _part(plain, "prior", Prior),
-        plain["error_scale"],
-        plain["seed"],
-        None if truth is None else _part(plain, "truth_measurement", Measurement),
-    )
+    measurement, noise = _part(plain, "measurement", Measurement), _part(plain, "noise", Noise)
+    truth = None if truth is None else _part(plain, "truth_measurement", Measurement)
+    prior = _part(plain, "prior", Prior)
+    if estimating and isinstance(noise, ModelNoise):
+        noise = noise.of(measurement) or Unknown()
+    known = _known(plain["parameters"])
+    if known:
+        measurement = Informed(measurement, known)
+        truth = None if truth is None else Informed(truth, known)
+        prior = _prior(prior, measurement)
+    scenario = Scenario(measurement, noise, prior, plain["error_scale"], plain["seed"], truth)
     execution = _part(plain, "execution", Execution)
     estimators: dict[str, Estimator] = {}
     for label, options in (plain["estimators"] or {}).items():
@@ -161,7 +230,13 @@ def assemble(config: DictConfig) -> Job:
             )
         _refuse_false_name(str(label), options[TARGET])
         estimators[str(label)] = _checked(construct(options, f"estimators.{label}"), f"estimators.{label}", Estimator)
-    return Job(scenario, estimators, execution, plain["trials"], plain["block_size"], plain["output"])
+    precision, time_limit = plain["precision"], plain["time_limit"]
+    if time_limit is not None and precision is None:
+        raise UserError(f"time_limit={time_limit}: goes with precision=; give that, or leave it out")
+    unless = TRIALS if precision is None else MOST_TRIALS
+    trials = unless if plain["trials"] is None else plain["trials"]
+    block_size, output = plain["block_size"], plain["output"]
+    return Job(scenario, estimators, execution, trials, block_size, output, precision, time_limit)
 
 
 @runtime_checkable
@@ -171,6 +246,37 @@ class Prior(Protocol):
     def deviation(self, n: int, error_scale: float) -> Any: ...
 
     def draw(self, nominal: Any, error_scale: float, rng: Any) -> Any: ...
+
+
+def _known(given: Any) -> tuple[Known, ...]:
+    """What the key `parameters` says of each."""
+    if given is None:
+        return ()
+    if not isinstance(given, Mapping):
+        raise UserError("parameters: give each what is known of it, such as parameters.NAME.fixed=0.1")
+    found = []
+    for name, options in given.items():
+        where = f"parameters.{name}"
+        if not isinstance(options, Mapping):
+            raise UserError(f"{where}={options}: say what that is, such as {where}.fixed={options}")
+        target = f"{Known.__module__}.{Known.__qualname__}"
+        found.append(construct({TARGET: target, "name": str(name), **options}, where))
+    return tuple(found)
+
+
+def _prior(prior: GaussianPrior, model: Informed) -> GaussianPrior:
+    """The prior with the deviations that are known of single parameters."""
+    if prior.deviations is None:
+        return replace(prior, deviations=model.prior_deviations)
+    names = [p.name for p in model.whole.parameters]
+    if len(prior.deviations) != len(names):
+        raise UserError(
+            f"prior.deviations: has {len(prior.deviations)} numbers; give one for each of {len(names)} parameters"
+        )
+    general = dict(zip(names, prior.deviations, strict=True))
+    own = {one.name for one in model.known if one.deviation is not None}
+    known = zip(model.natural_parameters, model.prior_deviations, strict=True)
+    return replace(prior, deviations=tuple(d if p.name in own else general[p.name] for p, d in known))
 
 
 Part = TypeVar("Part")

@@ -29,6 +29,8 @@ class DryRun:
     seconds: float = 0.0
     """Of one core."""
     workers: int = 1
+    most: str = ""
+    """Says so where a precision may stop a job earlier."""
     _tried: dict[tuple[str, str, float], float] = field(default_factory=dict)
     """Seconds per trial, by what they depend on most."""
 
@@ -47,9 +49,11 @@ class DryRun:
         stored = job.trials * len(estimates) - missing
         seconds = sum(lacking[c.key] * self._per_trial(c, results) for c in estimates if lacking[c.key])
         self.stored, self.missing, self.seconds = self.stored + stored, self.missing + missing, self.seconds + seconds
+        most = "" if job.precision is None else "at most "
+        self.most = self.most or most
         self.workers = getattr(job.execution, "workers", None) or cores()
         return f"{title}: {stored} of {job.trials * len(estimates)} estimates are stored" + (
-            f", {missing} are missing (on one core {duration(seconds)})" if missing else ""
+            f", {most}{missing} are missing (on one core {duration(seconds)})" if missing else ""
         )
 
     def _per_trial(self, cell: Cell, results: Results) -> float:
@@ -72,7 +76,7 @@ class DryRun:
         if not self.missing:
             return f"all {self.stored} estimates are stored; nothing would be computed"
         return (
-            f"{self.stored} estimates are stored, {self.missing} would be computed, in about "
+            f"{self.stored} estimates are stored, {self.most}{self.missing} would be computed, in about "
             f"{duration(self.seconds / self.workers)} on {self.workers} cores; nothing was computed now"
         )
 

@@ -16,31 +16,34 @@ from ipe_bench.api import validate
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import library_versions
-from ipe_bench.basics.statuses import Status
 from ipe_bench.cli import console
 from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, assemble, explain, prepare, rewrite
 from ipe_bench.cli.overrides import read
 from ipe_bench.measurements import Nist
-from ipe_bench.noise import Certified
+from ipe_bench.noise import Certified, ModelNoise, Noise
 from ipe_bench.plugins import discovery as plugins
+from ipe_bench.real.examination import examine
 from ipe_bench.real.fits import fit
-from ipe_bench.real.readings import read_readings
+from ipe_bench.real.sources import noise_of, open_together
 from ipe_bench.runs.provenance import describe, fingerprint
+
+_STANDARD_ESTIMATORS = ("solver=[fixed_point]", "baseline=[linear_lse,levenberg_marquardt]")
+"""Unless others are chosen: the paper's two, and one that does not depend on the model being nearly linear."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Estimates with every chosen estimator, prints tables and writes files; exit code 1 where none converged."""
+    """Estimates with every chosen estimator, prints tables and writes files; exit code 1 where none is an answer."""
     prepare()
     words = rewrite(arguments)
     _refuse_keys_without_use(words)
     read(words, KEYS)
     try:
         with initialize_config_dir(str(plugins.own_conf()), version_base="1.3"):
-            config = compose("config", words)
+            config = compose("config", [*_STANDARD_ESTIMATORS, *words])
     except Exception as error:  # what Hydra makes of overrides raises nearly anything
         raise explain(error) from error
     try:
-        job = assemble(config)
+        job = assemble(config, estimating=True)
     except CONFIG_ERRORS as error:
         raise explain(error) from error
     named = any(a.lstrip("+").startswith(("name=", "output=")) for a in arguments)
@@ -50,23 +53,32 @@ def main(arguments: Sequence[str]) -> int:
         job = replace(job, output=config.output)
     job, z = _readings(config, job)
     problem = job.scenario.problem
-    validate([job.scenario], job.estimators, trials=1)
+    validate([job.scenario], job.estimators, trials=1, estimating=True)
 
-    from ipe_bench.report.answer import claim, render, write_fits
+    from ipe_bench.report.answer import Answer, claim, render, write_fits
 
     command = _command(config, job)
     folder = claim(Path(job.output), command, elsewhere=not named)
     fits = fit(problem, z, job.estimators, job.scenario.noise)
-    files = write_fits(
-        folder, job.scenario.measurement, z, fits, command, {"measurement": name, **_provenance(config, job)}
-    )
+    answer = Answer(name, job.scenario.measurement, z, fits, examine(problem, z, fits))
+    files = write_fits(folder, answer, command, {"measurement": name, **_provenance(config, job)})
     out = console()
-    out.print(render(name, job.scenario.measurement, fits, out.width))
-    out.print(f"\nIn {folder}: {', '.join(path.name for path in files)}", markup=False, soft_wrap=True)
-    return 0 if any(f.status is Status.CONVERGED for f in fits) else 1
+    out.print(render(answer, out.width))
+    out.print(f"\nIn {folder}:", markup=False, soft_wrap=True)
+    out.print(", ".join(path.name for path in files), markup=False)
+    return 0 if answer.passes else 1
 
 
-_WITHOUT_USE = ("trials", "seed", "block_size", "execution", "truth_measurement", "write_readings")
+_WITHOUT_USE = (
+    "trials",
+    "precision",
+    "time_limit",
+    "seed",
+    "block_size",
+    "execution",
+    "truth_measurement",
+    "write_readings",
+)
 
 
 def _refuse_keys_without_use(words: Sequence[str]) -> None:
@@ -88,17 +100,37 @@ def _measurement_name(arguments: Sequence[str], job: Job) -> str:
 def _readings(config: DictConfig, job: Job) -> tuple[Job, Array]:
     """The readings (m,) of the file, or those that come with the model; with the latter, their own noise."""
     if config.readings is not None:
-        return job, read_readings(Path(config.readings), job.scenario.measurement)
+        found = open_together(_files(config), job.scenario.measurement)
+        noise = noise_of(found, _stated(config, job)) or job.scenario.noise
+        return replace(job, scenario=replace(job.scenario, measurement=found.model, noise=noise)), found.z
     recorded = job.scenario.measurement.recorded
     if recorded is None:
         raise UserError("readings: is not given; write readings=FILE (see `ipe-bench list measurement -v`)")
     return replace(job, scenario=replace(job.scenario, noise=Certified())), recorded.z
 
 
+def _files(config: DictConfig) -> list[Path]:
+    """The files that `readings` names, one or several."""
+    given = config.readings
+    names = list(given) if OmegaConf.is_list(given) else [given]
+    if not names or any(not isinstance(name, str) for name in names):
+        raise UserError(f"readings={given}: name a file, or several as readings=[a.csv,b.csv]")
+    if len(set(names)) < len(names):
+        raise UserError(f"readings={given}: names a file twice, which would count its readings twice")
+    return [Path(name) for name in names]
+
+
+def _stated(config: DictConfig, job: Job) -> Noise | None:
+    """The noise that a user has chosen, not that which stands in for it."""
+    standard = config.noise["_target_"].endswith(ModelNoise.__name__)
+    told = not standard or config.noise.get("deviation") is not None or config.noise.get("step") is not None
+    return job.scenario.noise if told else None
+
+
 def _command(config: DictConfig, job: Job) -> dict[str, Any]:
     """What tells this command from others: what was asked for, whatever the file holds today."""
     return {
-        "readings": None if config.readings is None else str(Path(config.readings).resolve()),
+        "readings": None if config.readings is None else [str(path.resolve()) for path in _files(config)],
         "scenario": describe(job.scenario),
         "estimators": {label: describe(estimator) for label, estimator in job.estimators.items()},
     }
@@ -107,8 +139,9 @@ def _command(config: DictConfig, job: Job) -> dict[str, Any]:
 def _provenance(config: DictConfig, job: Job) -> dict[str, Any]:
     readings = None
     if config.readings is not None:
-        path = Path(config.readings)
-        readings = {"file": str(config.readings), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+        readings = [
+            {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()} for path in _files(config)
+        ]
     return {
         "written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "readings": readings,

@@ -1,4 +1,4 @@
-"""`ipe-bench list [GROUP] [-v]`: what there is to choose from, and where it comes from."""
+"""`ipe-bench list [GROUP | GROUP/NAME] [-v]`: what there is to choose from, and where it comes from."""
 
 from __future__ import annotations
 
@@ -14,41 +14,95 @@ from ipe_bench.cli import console
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
+from ipe_bench.plugins.description import described
 
 
-def main(groups: Sequence[str], verbose: bool) -> int:
-    """One line per option; where verbose, the parameters and the readings file of each measurement."""
+def main(names: Sequence[str], verbose: bool) -> int:
+    """One line per option of each group; of an option itself, GROUP/NAME, what it may be told.
+
+    Where verbose, groups come with all of that.
+    """
     for problem in plugins.take_problems():
         print(f"ipe-bench: {problem}", file=sys.stderr)
     known = plugins.groups()
-    for name in groups:
-        if name not in known:
-            raise UserError(f"{name}: {unknown(name, known, 'group')}")
     out = console()
-    for group in groups or known:
-        table = Table(title=group, title_justify="left", title_style="bold", box=None, pad_edge=False, expand=False)
-        for heading in ("option", "what it is", "from"):
-            table.add_column(heading, overflow="fold", no_wrap=heading == "option")
-        chosen = plugins.options(group)
-        for option in chosen:
-            table.add_row(Text(option.name), Text(option.summary), Text(option.source.origin))
-        out.print(table)
-        out.print()
-        if verbose and group == "measurement":
-            for option in [o for o in chosen if o.fault is None]:
-                _describe_measurement(out, option)
+    for name in names or known:
+        group, slash, _ = name.partition("/")
+        if group not in known:
+            raise UserError(f"{name}: {unknown(group, known, 'group')}")
+        if slash:
+            _describe(out, _find(name))
+        else:
+            _list_group(out, group, verbose)
+    listed = {name.partition("/")[0] for name in names or known}
     for option in plugins.options():
-        if option.fault is not None and option.group in (groups or known):
+        if option.fault is not None and option.group in listed:
             print(f"ipe-bench: {option.group}={option.name}: {option.fault}", file=sys.stderr)
     return 0
 
 
+def _find(name: str) -> plugins.Option:
+    group, _, option = name.partition("/")
+    options = {o.name: o for o in plugins.options(group)}
+    if option not in options:
+        raise UserError(f"{name}: {unknown(option, options, 'option')}")
+    if (fault := options[option].fault) is not None:
+        raise UserError(f"{name}: {fault}")
+    return options[option]
+
+
+def _list_group(out: Console, group: str, verbose: bool) -> None:
+    table = _table(group, "option", "what it is", "from")
+    chosen = plugins.options(group)
+    for option in chosen:
+        table.add_row(Text(option.name), Text(option.summary), Text(option.source.origin))
+    out.print(table)
+    out.print()
+    for option in chosen:
+        if verbose and option.fault is None:
+            _describe(out, option)
+
+
+def _table(title: str, *headings: str) -> Table:
+    """The names of its first column are the last thing to be broken."""
+    table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False, expand=False)
+    for heading in headings:
+        table.add_column(heading, overflow="fold", no_wrap=heading == headings[0])
+    return table
+
+
+def _describe(out: Console, option: plugins.Option) -> None:
+    """Every option of a component with its value, what may be given, and what it means."""
+    key = f"estimators.{option.label}" if option.group in plugins.ESTIMATOR_GROUPS else option.group
+    if option.group == "experiment":
+        key = ""
+    rows = described(option)
+    out.print(Text(f"{option.group}={option.name}  {option.summary}"))
+    if rows:
+        table = _table("", "key", "value", "takes", "meaning")
+        for row in rows:
+            table.add_row(*map(Text, (f"{key}.{row.name}".lstrip("."), row.value, row.kind, row.meaning)))
+        out.print(table)
+    out.print()
+    if option.group == "measurement":
+        _describe_measurement(out, option)
+
+
 def _describe_measurement(out: Console, option: plugins.Option) -> None:
     from omegaconf import OmegaConf
+    from omegaconf.errors import MissingMandatoryValue
 
-    model = construct(OmegaConf.to_container(OmegaConf.load(option.path)), "measurement")
-    assert isinstance(model, Measurement)
     from ipe_bench.real.readings import header
+    from ipe_bench.real.sources import input_rows
+
+    try:
+        model = construct(OmegaConf.to_container(OmegaConf.load(option.path), throw_on_missing=True), "measurement")
+        assert isinstance(model, Measurement)
+        columns = ",".join(header(model))
+    except (MissingMandatoryValue, UserError):
+        out.print(f"measurement={option.name}: what it has depends on its options:", markup=False)
+        out.print(option.path.read_text(encoding="utf-8"), markup=False)
+        return
 
     table = Table(title=f"measurement={option.name}", title_justify="left", box=None, pad_edge=False)
     for heading in ("parameter", "size", "unit"):
@@ -56,6 +110,10 @@ def _describe_measurement(out: Console, option: plugins.Option) -> None:
     for parameter in model.parameters:
         table.add_row(parameter.name, f"{parameter.size:g}", parameter.unit)
     out.print(table)
-    out.print(f"readings={{FILE}}: {model.m} rows, header: {','.join(header(model))}", markup=False)
-    first = ",".join(str(column[0]) for column in model.index.values())
-    out.print(f"first row: {first},<reading>\n", markup=False)
+    out.print(f"readings={{FILE}}: {model.m} rows, header: {columns}", markup=False, soft_wrap=True)
+    first = ",".join(str(column[0]) for column in input_rows(model).values())
+    out.print(f"first row: {first},<reading>", markup=False, soft_wrap=True)
+    if model.inputs:
+        known = ", ".join(i.heading for i in model.inputs)
+        out.print(f"A file's own {known} take the place of these; so it may have any number of rows.", markup=False)
+    out.print("A column sigma, if there is one, holds the standard deviation of each reading.\n", markup=False)

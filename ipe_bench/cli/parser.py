@@ -73,6 +73,20 @@ Nothing is computed again.
 """
 
 
+_COMPARE = """
+Nothing is computed: run both first. The same trials are compared one by one; folders of other seeds, in their order.
+
+  ipe-bench compare outputs/before outputs/after               two versions, or two settings, of the same estimators
+  ipe-bench compare outputs/a outputs/b first=newton second=my_solver
+  ipe-bench compare outputs/a first=fixed_point second=newton  two estimators of one folder
+
+alpha=0.05           the chance that anything is found where there is no difference
+anytime=true         judge by e-values: then it may be looked at as often as one likes, while trials are added
+fail_on=success,error  what the second may not be worse in: success, error, cost
+output=DIR           writes comparison.csv and comparison as PNG and PDF there
+"""
+
+
 INFO_TOPICS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
 
@@ -158,17 +172,26 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         _REPORT,
     )
     report.add_argument("arguments", metavar="DIR", nargs="*", help="folders of results, such as outputs/paper")
+    compare = add(
+        "compare",
+        "whether a second version, setting or estimator is better or worse than a first",
+        "0 not worse; 1 the second is worse, or something that was asked for is missing",
+        _COMPARE,
+    )
+    compare.add_argument("arguments", metavar="DIR", nargs="*", help="one or two folders of results")
     status = add(
         "status", "what is done, missing, failed and stale in folders of results", "0 complete; 1 not complete"
     )
     status.add_argument("arguments", metavar="DIR", nargs="*", help="folders of results, such as outputs/paper")
     status.add_argument("-v", "--verbose", action="store_true", help="with what is complete, too")
     options = add("list", "what there is to choose from, and where it comes from")
-    options.add_argument("groups", metavar="GROUP", nargs="*", help="solver, baseline, measurement, ... or all")
+    options.add_argument(
+        "names", metavar="GROUP", nargs="*", help="solver, measurement, ... or all; solver/newton: its options"
+    )
     options.add_argument(
         *("-v", "--verbose"),
         action="store_true",
-        help="with each measurement's parameters and the columns of its readings file",
+        help="with each one's options, and the parameters and readings file of measurements",
     )
     new = add("new", "a working plugin to start from, in plugins/NAME")
     new.add_argument("kind", metavar="KIND", help="solver, baseline, measurement, noise or experiment")

@@ -18,9 +18,9 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from ipe_bench.api import cells_of, compute
+from ipe_bench.api import cells_of, compute, compute_until
 from ipe_bench.basics.errors import StorageError, UserError, shortened
-from ipe_bench.cli import interrupts
+from ipe_bench.cli import console, interrupts
 from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, assemble, explain, prepare, rewrite
 from ipe_bench.cli.dry_run import DryRun
 from ipe_bench.cli.overrides import default_name, known_options, read
@@ -30,7 +30,8 @@ from ipe_bench.cli.report import main as report
 from ipe_bench.cli.report import show_command
 from ipe_bench.measurements import Nist
 from ipe_bench.plugins import discovery as plugins
-from ipe_bench.runs.execution import Serial
+from ipe_bench.runs.execution import Execution, Serial
+from ipe_bench.runs.schedule import Watcher
 from ipe_bench.runs.store import describe_names, digest
 
 _OWN_LAUNCHER = ".BasicLauncher"
@@ -48,6 +49,8 @@ class Outcome:
         self.outputs: dict[Path, dict[str, str]] = {}
         """The folders that were filled, and by key a line for each cell that was asked for."""
         self.failures: list[str] = []
+        self.stops: list[str] = []
+        """How many trials each job with a precision took, and why no more."""
         self.dry: DryRun | None = None
         """What would be done, where nothing is to be."""
         self.mistakes: dict[str, None] = {}
@@ -145,6 +148,8 @@ def _conclude() -> int:
         if (output / "trials").is_dir():
             # Of jobs in other processes nothing is known but the folder.
             code = max(code, show_command(output, cells) if cells else report([str(output)]))
+    for line in _outcome.stops:
+        console().print(line, markup=False, soft_wrap=True)
     if _outcome.mistakes:
         raise UserError("; ".join(_outcome.mistakes))
     return code
@@ -202,15 +207,7 @@ def task(config: DictConfig) -> None:
             return
         interrupts.begin_work()
         with shown_progress(_title(job)) as watch:
-            failures = compute(
-                [job.scenario],
-                job.estimators,
-                job.trials,
-                job.output,
-                execution=Serial() if _launched_elsewhere() else job.execution,
-                block_size=job.block_size,
-                watch=watch,
-            )
+            failures = _compute(job, Serial() if _launched_elsewhere() else job.execution, watch)
     except (UserError, StorageError, *CONFIG_ERRORS) as error:
         if _launched_elsewhere():
             raise explain(error) if isinstance(error, CONFIG_ERRORS) else error from None
@@ -225,6 +222,20 @@ def task(config: DictConfig) -> None:
         _outcome.failures += failures
         own = _outcome.outputs.setdefault(Path(job.output), {})
         own.update((cell.key, describe_names(cell.names)) for cell in cells_of(job.scenario, job.estimators))
+
+
+def _compute(job: Job, execution: Execution, watch: Watcher) -> tuple[str, ...]:
+    """Computes the trials that are asked for, or just enough; returns the messages of what failed."""
+    options: dict[str, Any] = {"execution": execution, "block_size": job.block_size, "watch": watch}
+    if job.precision is None:
+        return compute([job.scenario], job.estimators, job.trials, job.output, **options)
+    options |= {"precision": job.precision, "time_limit": job.time_limit}
+    failures, (stop,) = compute_until([job.scenario], job.estimators, job.trials, job.output, **options)
+    line = f"{_title(job)}: {stop.trials} trials; {stop.reason} ({stop.widest})"
+    if _launched_elsewhere():
+        print(line)
+    _outcome.stops.append(line)
+    return failures
 
 
 def _refuse_keys_without_use(config: DictConfig) -> None:
@@ -243,7 +254,18 @@ def _launched_elsewhere() -> bool:
 
 
 _IN_EVERY_TITLE = {"measurement", "measurement.dataset", "truth_measurement", "noise", "error_scale", "seed"}
-_NOT_IN_TITLES = {"trials", "block_size", "output", "name", "default_name", "experiment", "solver", "baseline"}
+_NOT_IN_TITLES = {
+    "trials",
+    "precision",
+    "time_limit",
+    "block_size",
+    "output",
+    "name",
+    "default_name",
+    "experiment",
+    "solver",
+    "baseline",
+}
 
 
 def _title(job: Job) -> str:

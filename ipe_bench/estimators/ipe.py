@@ -212,6 +212,7 @@ class IPE(Solver[S], Estimator, Generic[S]):
     """Where the iteration begins: at the linear LSE, eq. (16), at the nominal point, or at that of the two where the
     readings fit better (`best`)."""
     max_iterations: Count = 100
+    """Steps at most, then the trial ends as `max_iterations`."""
     tolerance: Positive = 1e-6
     """Largest abs(F_i) in standard deviations of the linear bound, eq. (5)."""
     budget: Positive | None = None

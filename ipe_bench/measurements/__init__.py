@@ -1,16 +1,18 @@
 """Measurement models: what a parameter vector makes the instruments read. Config group `measurement`."""
 
 from ipe_bench.measurements.accelerometer import Accelerometer
-from ipe_bench.measurements.base import Measurement, Parameter, Restricted
+from ipe_bench.measurements.base import Input, Measurement, Parameter, Restricted, UsualNoise
 from ipe_bench.measurements.bearings import Bearings
 from ipe_bench.measurements.bock import Bock
 from ipe_bench.measurements.falling_body import FallingBody
+from ipe_bench.measurements.formula import Formula
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.gins_richer import RicherGins
 from ipe_bench.measurements.gnss import Gnss
 from ipe_bench.measurements.lotka_volterra import LotkaVolterra
 from ipe_bench.measurements.mgh import Mgh
 from ipe_bench.measurements.nist import Nist
+from ipe_bench.measurements.ode.described import Ode
 from ipe_bench.measurements.ode.model import OdeMeasurement
 from ipe_bench.measurements.polynomial import Polynomial
 from ipe_bench.measurements.ranging import Ranging
@@ -22,12 +24,15 @@ __all__ = [
     "Bearings",
     "Bock",
     "FallingBody",
+    "Formula",
     "Gins",
     "Gnss",
+    "Input",
     "LotkaVolterra",
     "Measurement",
     "Mgh",
     "Nist",
+    "Ode",
     "OdeMeasurement",
     "Parameter",
     "Polynomial",
@@ -36,4 +41,5 @@ __all__ = [
     "RicherGins",
     "Sir",
     "Triad",
+    "UsualNoise",
 ]

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import MinLen
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Positive
-from ipe_bench.measurements.base import Parameter
+from ipe_bench.measurements.base import Input, Measurement, Parameter, UsualNoise
 from ipe_bench.measurements.triad import Magnitudes, attitudes
 
 
@@ -53,6 +53,7 @@ class Accelerometer(Magnitudes):
     """What one unit of error of an angle is, in rad."""
 
     reading_unit = "m/s^2"
+    usual_noise = UsualNoise(5e-3)
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -65,6 +66,18 @@ class Accelerometer(Magnitudes):
     @cached_property
     def nominal(self) -> Array:
         return np.concatenate([self.bias, np.zeros(3), 1e3 * np.array(self.misalignment)]) / self.sizes
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        """What the triad shows in each attitude."""
+        return tuple(Input(f"{axis} [counts]") for axis in "xyz")
+
+    @property
+    def input_columns(self) -> Mapping[str, Sequence[Any]]:
+        return {i.heading: self.measured[:, k].tolist() for k, i in enumerate(self.inputs)}
+
+    def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
+        return replace(self, counts=tuple(zip(*(columns[i.heading] for i in self.inputs), strict=True)))
 
     @cached_property
     def measured(self) -> Array:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -35,6 +35,29 @@ class Parameter:
 
 
 @dataclass(frozen=True)
+class Input:
+    """Something known of each reading besides what it is: a column of the file, such as a satellite's place."""
+
+    heading: str
+    """As in the file, with the unit: `x [m]`."""
+    kind: type = float
+    """float, int or str."""
+    label: bool = False
+    """Whether it is part of what tells readings apart, and stands in every file."""
+    default: Any = None
+    """What is meant where a file lacks the column; None: it must have it, or none of the inputs."""
+
+
+@dataclass(frozen=True)
+class UsualNoise:
+    """The noise that is a model's own: rounding to a step where there is one, else white and Gaussian."""
+
+    deviation: float | None = None
+    """Standard deviation of a reading, in `reading_unit`."""
+    step: float | None = None
+
+
+@dataclass(frozen=True)
 class Recorded:
     """Real readings that come with a model, and what is known of their answer."""
 
@@ -50,12 +73,19 @@ class Measurement(Component, Named, ABC):
     """A model z = h(x) + v, without the noise v.
 
     x is (trials, n) in multiples of the parameters' sizes, h(x) is (trials, m) in `reading_unit`, and a trial's
-    readings depend on that trial's x alone, bit for bit. n parameters, m readings, m > n.
+    readings depend on that trial's x alone, bit for bit. n parameters, m readings, m >= n; where
+    m = n the readings can be met exactly, and no fit can be tested.
     """
 
     analytic: ClassVar[bool] = False
     """True where `simulate` accepts complex x and is analytic in it: the Jacobian is then a complex step."""
     reading_unit: str = ""
+    reading_name: str = "reading"
+    """What the column of the readings is called in a file; `reading` is understood too."""
+    usual_noise: UsualNoise | None = None
+    """The noise of the readings unless told otherwise; None: the model does not know any."""
+    own_parameters: Sequence[str] = ()
+    """Names of parameters of which every file of readings has its own, where several are estimated together."""
 
     @property
     @abstractmethod
@@ -125,6 +155,31 @@ class Measurement(Component, Named, ABC):
         return False
 
     @property
+    def inputs(self) -> tuple[Input, ...]:
+        """What the model takes from the columns of a readings file, where the file has them."""
+        return ()
+
+    @property
+    def input_columns(self) -> Mapping[str, Sequence[Any]]:
+        """The values of those columns, m each, by heading, of this model as it stands."""
+        return {}
+
+    @property
+    def input_columns_known(self) -> bool:
+        """Whether there are readings without a file, whose inputs stand in the config or are the model's own."""
+        return True
+
+    def absent_input(self, heading: str, columns: Sequence[str]) -> str:
+        """What to do where a file lacks that column, having others of the inputs."""
+        del heading, columns
+        return f"give all of {', '.join(i.heading for i in self.inputs)}, or none"
+
+    def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
+        """This model with the inputs of a file: `columns` by heading, one entry for each of its readings, in the
+        order of the file, which is that of z from then on."""
+        raise NotImplementedError(f"{self.name} takes nothing from a file but readings")
+
+    @property
     def n(self) -> int:
         return len(self.parameters)
 
@@ -137,12 +192,43 @@ class Measurement(Component, Named, ABC):
         """The physical size (n,) of one unit of x, in each parameter's own unit."""
         return np.array([p.size for p in self.parameters])
 
+    @property
+    def natural_parameters(self) -> tuple[Parameter, ...]:
+        """The n unknowns as users know them, where those of x are their logarithms, say."""
+        return self.parameters
+
+    def natural(self, x: Array) -> Array:
+        """Their values (trials, n), each in its own unit."""
+        return x * self.sizes
+
+    def natural_slope(self, x: Array) -> Array:
+        """The derivative of each value by its own entry of x (trials, n)."""
+        return np.broadcast_to(self.sizes, x.shape)
+
+    @property
+    def fixed(self) -> Mapping[str, float]:
+        """Values of parameters that are known and not estimated, by name."""
+        return {}
+
+    def near_bounds(self, x: Array) -> Mapping[int, float]:
+        """Which of the n parameters are next to a bound at x (n,), and that bound in their own unit."""
+        del x
+        return {}
+
+    def holding(self, values: Mapping[int, float]) -> Measurement:
+        """This model with some of the n parameters fixed at values in their own units."""
+        raise NotImplementedError(f"{self.name} holds no parameter")
+
+    def released(self, values: Mapping[int, float]) -> Measurement:
+        """This model with some of the n parameters free of bounds, starting at values in their own units."""
+        raise NotImplementedError(f"{self.name} holds no parameter")
+
     def jacobian(self, x: Array) -> Array:
         """dh/dx at each trial: (trials, n) -> (trials, m, n); complex step where analytic, else central differences."""
         return differentiate(self.simulate, x, analytic=self.analytic)
 
     def coarse_jacobian(self, x: Array) -> Array:
-        """dh/dx near enough for the steps of an iteration, |I - J~+ J| below 0.01, where that is cheaper; else exact.
+        """dh/dx near enough for the steps of an iteration, `|I - J~+ J|` below 0.01, where that is cheaper; else exact.
         A trial's bits depend on that trial's x alone. Covariances and tests of convergence want `jacobian`."""
         return self.jacobian(x)
 
@@ -204,6 +290,37 @@ class Restricted(Measurement):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         return self.whole.parameters
+
+    @property
+    def natural_parameters(self) -> tuple[Parameter, ...]:
+        return self.whole.natural_parameters
+
+    def natural(self, x: Array) -> Array:
+        return self.whole.natural(x)
+
+    def natural_slope(self, x: Array) -> Array:
+        return self.whole.natural_slope(x)
+
+    @property
+    def fixed(self) -> Mapping[str, float]:
+        return self.whole.fixed
+
+    def near_bounds(self, x: Array) -> Mapping[int, float]:
+        return self.whole.near_bounds(x)
+
+    def holding(self, values: Mapping[int, float]) -> Measurement:
+        return replace(self, whole=self.whole.holding(values))
+
+    def released(self, values: Mapping[int, float]) -> Measurement:
+        return replace(self, whole=self.whole.released(values))
+
+    @property
+    def reading_unit(self) -> str:  # type: ignore[override]
+        return self.whole.reading_unit
+
+    @property
+    def own_parameters(self) -> Sequence[str]:
+        return self.whole.own_parameters
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:

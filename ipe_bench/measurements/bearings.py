@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Positive
-from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,7 @@ class Bearings(Measurement):
     """What one unit of error of a velocity is, in m/s."""
 
     reading_unit = "deg"
+    usual_noise = UsualNoise(0.5)
     analytic = True
 
     @cached_property

@@ -11,7 +11,7 @@ from annotated_types import Ge
 
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.options import Positive
-from ipe_bench.measurements.base import Parameter, Recorded
+from ipe_bench.measurements.base import Parameter, Recorded, UsualNoise
 from ipe_bench.measurements.ode.model import OdeMeasurement
 
 
@@ -49,6 +49,10 @@ class Bock(OdeMeasurement):
     step: Positive | None = 0.0025
 
     states, outputs = 2, ("x1", "x2")
+
+    @property
+    def usual_noise(self) -> UsualNoise:  # type: ignore[override]
+        return UsualNoise(self.deviation)
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -11,7 +11,7 @@ from annotated_types import Ge
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Positive
-from ipe_bench.measurements.base import Parameter
+from ipe_bench.measurements.base import Parameter, UsualNoise
 from ipe_bench.measurements.ode.model import OdeMeasurement
 
 _FOOT = 0.3048
@@ -58,8 +58,11 @@ class FallingBody(OdeMeasurement):
     ballistic_size: Positive = float(np.log(1e-3 / 3e-5))
     """What one unit of error of the logarithm of the ballistic coefficient is."""
     step: Positive | None = 0.5
+    sampled: tuple[float, ...] | None = None
+    """Times of the ranges in s, in place of equal intervals."""
 
     states, outputs, reading_unit = 2, ("range",), "m"
+    usual_noise = UsualNoise(100 * _FOOT)
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -75,7 +78,7 @@ class FallingBody(OdeMeasurement):
 
     @cached_property
     def times(self) -> Array:
-        return self.interval * np.arange(1.0, self.readings + 1)
+        return self.interval * np.arange(1.0, self.readings + 1) if self.sampled is None else np.array(self.sampled)
 
     def start(self, p, c):
         return p[0], p[1]

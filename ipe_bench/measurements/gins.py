@@ -17,7 +17,7 @@ import numpy as np
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite, Positive
-from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise
 from ipe_bench.measurements.ode.model import OdeMeasurement
 from ipe_bench.measurements.ode.source import Variation
 from ipe_bench.measurements.ode.trace import tangent
@@ -61,6 +61,7 @@ class Gins(OdeMeasurement):
     """Velocities (x, y) in ft/s to inject, a case each; None: the paper's four cases of `injected_ft_per_s`."""
 
     reading_unit = "m/s"
+    usual_noise = UsualNoise(step=0.02286)
     states = 11
     outputs = ("vx", "vy")
 

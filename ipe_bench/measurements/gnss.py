@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Positive
-from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.measurements.base import Input, Measurement, Parameter, UsualNoise
 
 LIGHT = 299792458.0
 """Speed of light in m/s."""
@@ -94,6 +94,7 @@ class Gnss(Measurement):
     """In rad/s; 0 for beacons and readings whose rotation is taken off already."""
 
     reading_unit = "m"
+    usual_noise = UsualNoise(1.0)
     analytic = True
 
     def __post_init__(self) -> None:
@@ -109,7 +110,7 @@ class Gnss(Measurement):
                     raise UserError(f"{name}: {len(column)} entries for {len(self.satellites)} satellites")
         if self.frame == "enu" and math.hypot(*self.position) < _LEAST_RADIUS:
             raise UserError("position: there is no up near the centre of the Earth; set frame=ecef")
-        if self.m <= self.n:
+        if self.m < self.n:
             raise UserError(f"satellites: {self.m} readings are too few for {self.n} parameters")
 
     @cached_property
@@ -173,6 +174,28 @@ class Gnss(Measurement):
             seen[key] = seen.get(key, 0) + 1
             numbers.append(seen[key])
         return {"epoch": list(times), "constellation": list(systems), "satellite": numbers}
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        """Epoch, constellation and the satellite's place at transmission, for each pseudo-range."""
+        names = Input("epoch", int, label=True, default=1), Input("constellation", str, label=True, default="gps")
+        return (*names, *(Input(f"{axis} [m]") for axis in "xyz"))
+
+    @property
+    def input_columns(self) -> Mapping[str, Sequence[Any]]:
+        places, systems, times = self._columns
+        axes = {f"{axis} [m]": places[:, i].tolist() for i, axis in enumerate("xyz")}
+        return {"epoch": list(times), "constellation": list(systems), **axes}
+
+    def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
+        places = tuple(zip(*(columns[f"{axis} [m]"] for axis in "xyz"), strict=True))
+        given = {"constellations": tuple(columns["constellation"]), "times": tuple(columns["epoch"])}
+        return replace(self, satellites=places, **given)
+
+    @property
+    def own_parameters(self) -> tuple[str, ...]:
+        """Every file has clocks of its own, as every epoch has."""
+        return tuple(p.name for p in self.parameters if p.group == "clock")
 
     @cached_property
     def epochs(self) -> tuple[NDArray[np.intp], ...]:

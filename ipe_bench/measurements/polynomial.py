@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite
-from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,7 @@ class Polynomial(Measurement):
     """s, by how much the readings bend per unit of x."""
 
     analytic = True
+    usual_noise = UsualNoise(0.01)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Positive
-from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise
 
 _BEACONS = (
     (1000.0, 0.0, 300.0),
@@ -49,6 +49,7 @@ class Ranging(Measurement):
     """What one unit of error of the clock bias is, in m."""
 
     reading_unit = "m"
+    usual_noise = UsualNoise(0.1)
     analytic = True
 
     def __post_init__(self) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Positive
-from ipe_bench.measurements.base import Parameter
+from ipe_bench.measurements.base import Parameter, UsualNoise
 from ipe_bench.measurements.ode.model import OdeMeasurement
 
 State = Literal["susceptible", "infected", "removed"]
@@ -51,8 +51,11 @@ class Sir(OdeMeasurement):
     infected_size: Positive = 0.3
     """What one unit of error of the logarithm of the odds I(0) / S(0) is."""
     step: Positive | None = 0.125
+    sampled: tuple[float, ...] | None = None
+    """Times of the readings in days, in place of one at the end of each day."""
 
     states, time_unit, reading_unit = 2, "day", "people"
+    usual_noise = UsualNoise(20.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -74,7 +77,7 @@ class Sir(OdeMeasurement):
 
     @cached_property
     def times(self) -> Array:
-        return np.arange(1.0, self.days + 1)
+        return np.arange(1.0, self.days + 1) if self.sampled is None else np.array(self.sampled)
 
     def start(self, p, c):
         odds = self.infected / (self.population - self.infected) * np.exp(p[2])

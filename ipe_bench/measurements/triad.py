@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from typing import Annotated, Any
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Positive
-from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.measurements.base import Input, Measurement, Parameter, UsualNoise
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 
@@ -97,6 +97,10 @@ class Triad(Magnitudes):
     def reading_unit(self) -> str:
         return self.unit
 
+    @property
+    def usual_noise(self) -> UsualNoise:
+        return UsualNoise(1e-5 * self.field)
+
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         return (
@@ -113,6 +117,18 @@ class Triad(Magnitudes):
     @cached_property
     def nominal(self) -> Array:
         return np.concatenate([self.bias, self.scale, self.misalignment]) / self._plain_sizes
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        """What the triad shows in each attitude."""
+        return tuple(Input(f"{axis} [{self.unit}]") for axis in "xyz")
+
+    @property
+    def input_columns(self) -> Mapping[str, Sequence[Any]]:
+        return {i.heading: self.measured[:, k].tolist() for k, i in enumerate(self.inputs)}
+
+    def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
+        return replace(self, outputs=tuple(zip(*(columns[i.heading] for i in self.inputs), strict=True)))
 
     @cached_property
     def measured(self) -> Array:

@@ -22,6 +22,8 @@ class Noise(Component, Named, ABC):
 
     real: ClassVar[bool] = False
     """True where readings are not simulated at all, but are those that come with the model."""
+    estimated: ClassVar[bool] = False
+    """True where the level of the errors is estimated from the residuals, R being known up to a factor."""
 
     @property
     def true_covariance(self) -> bool:

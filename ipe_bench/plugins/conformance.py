@@ -26,6 +26,7 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.measurements.sir import Sir
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.gaussian import Gaussian
+from ipe_bench.noise.own import ModelNoise
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.discovery import Option, blame
 from ipe_bench.priors.gaussian import GaussianPrior
@@ -282,8 +283,8 @@ def _points(model: Measurement, trials: int = 4) -> Array:
 
 
 def names_its_readings(model: Measurement) -> None:
-    """Has more readings than parameters, each with its own label, and units."""
-    assert model.m > model.n, f"{model.m} readings are too few for {model.n} parameters"
+    """Has at least as many readings as parameters, each with its own label, and units."""
+    assert model.m >= model.n, f"{model.m} readings are too few for {model.n} parameters"
     lengths = {name: len(column) for name, column in model.index.items()}
     assert set(lengths.values()) == {model.m}, f"the columns of index have lengths {lengths}, and not {model.m}"
     labels = list(zip(*model.index.values(), strict=True))
@@ -358,17 +359,22 @@ def orders_its_epochs(model: Measurement) -> None:
 
 def states_its_covariance(noise: Noise) -> None:
     """States a covariance R that whitens as many readings as there are."""
-    if noise.real:
-        return  # R comes with the readings.
+    if noise.real or isinstance(noise, ModelNoise):
+        return  # R comes with the readings, or with the model.
     R = noise.covariance(6)
     assert R.m == 6, f"covariance(6) is for {R.m} readings"
     assert (R.deviations > 0).all(), "a standard deviation is not above 0"
 
 
+def _draws_nothing(noise: Noise) -> bool:
+    """Whether readings are real, their level is estimated, or the noise only stands for that of a model."""
+    return noise.real or noise.estimated or isinstance(noise, ModelNoise)
+
+
 def corrupts_reproducibly(noise: Noise) -> None:
     """Gives the same readings from the same random stream, and leaves h alone."""
-    if noise.real:
-        return  # Nothing is corrupted.
+    if _draws_nothing(noise):
+        return
     h, offset = np.linspace(-1.0, 1.0, 6), np.zeros(6)
     copy = h.copy()
     first, second = (noise.corrupt(h, offset, np.random.default_rng(3)) for _ in range(2))
@@ -379,7 +385,7 @@ def corrupts_reproducibly(noise: Noise) -> None:
 
 def draws_what_it_states(noise: Noise) -> None:
     """Draws errors of mean zero whose variances and correlations are those of R."""
-    if noise.real or not noise.true_covariance:
+    if _draws_nothing(noise) or not noise.true_covariance:
         return
     m = 6
     R, rng = noise.covariance(m), np.random.default_rng(7)
@@ -407,6 +413,28 @@ def draws_what_it_states(noise: Noise) -> None:
         )
 
 
+def states_its_law(noise: Noise) -> None:
+    """Says by `whitened` how its errors are distributed, where they are not normal: the test of fit takes that law."""
+    from scipy.stats import ks_2samp
+
+    if _draws_nothing(noise) or not noise.true_covariance:
+        return
+    m, draws = 6, DRAWS // 5
+    rng = np.random.default_rng(9)
+    R = noise.covariance(m)
+    h = rng.uniform(-1000.0, 1000.0, (draws, m)) * R.deviations
+    w = R.whiten(np.array([noise.corrupt(row.copy(), np.zeros(m), rng) - row for row in h]))
+    stated = noise.whitened((draws, m), rng)
+    law = rng.standard_normal((draws, m)) if stated is None else stated
+    # Of each trial its chi-square, which is what the test of fit looks at, and one reading: trials are independent.
+    for what, found, said in (("reading", w[:, 0], law[:, 0]), ("chi-square", (w**2).sum(1), (law**2).sum(1))):
+        p = ks_2samp(found, said).pvalue
+        words = "normal, since there is no `whitened`" if stated is None else "what `whitened` draws"
+        assert p > 1e-6, (
+            f"the {what} of whitened errors is not distributed as {words} (Kolmogorov-Smirnov, p = {p:.1g})"
+        )
+
+
 Check = Callable[[Any], None]
 
 _CHECKS: dict[type, tuple[Check, ...]] = {
@@ -422,6 +450,6 @@ _CHECKS: dict[type, tuple[Check, ...]] = {
         keeps_a_history_if_asked,
     ),
     Measurement: (names_its_readings, simulates_batches, differentiates, orders_its_epochs),
-    Noise: (states_its_covariance, corrupts_reproducibly, draws_what_it_states),
+    Noise: (states_its_covariance, corrupts_reproducibly, draws_what_it_states, states_its_law),
     GaussianPrior: (),
 }

@@ -35,7 +35,7 @@ def construct(config: Any, where: str) -> Any:
     if isinstance(config, Mapping):
         if TARGET not in config:
             return {str(k): construct(v, f"{where}.{k}") for k, v in config.items()}
-        cls = _find_class(config[TARGET], where)
+        cls = find_class(config[TARGET], where)
         options = {str(k): construct(v, f"{where}.{k}") for k, v in config.items() if k != TARGET}
         return _instantiate(cls, options, where)
     if isinstance(config, list | tuple):
@@ -43,7 +43,12 @@ def construct(config: Any, where: str) -> Any:
     return config
 
 
-def _find_class(target: Any, where: str) -> type:
+def find_class(target: Any, where: str) -> type:
+    """The component class of that dotted name.
+
+    Raises:
+        UserError: it is not there, not a component, abstract, or of a package that is not registered.
+    """
     where = f"{where}.{TARGET}={target}"
     module_name, _, class_name = str(target).rpartition(".")
     if module_name.split(".")[0] not in _registered_packages:

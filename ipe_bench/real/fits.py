@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2, norm
+from scipy.stats import f as fisher
+from scipy.stats import t as student
 
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimator, estimate_safely
 from ipe_bench.measurements.base import Measurement, Restricted
@@ -22,6 +27,13 @@ from ipe_bench.trials.thresholds import FIT_LEVEL
 
 _NORMAL = Gaussian(1.0)
 """Its whitened errors are those of any normal noise."""
+_MOST_LEVELS = 6
+"""Fits in search of the level of the noise,"""
+_SAME_LEVEL = 1e-3
+"""which is found where it changes by less than this share."""
+_SMALLEST_LEVEL = 1e-8
+"""As a share of the readings, the level that estimators are told at least."""
+_FARTHEST = 40.0
 
 
 @dataclass(frozen=True)
@@ -47,9 +59,35 @@ class Fit:
     iterations: int
     p_value: float
     """Chance of a chi-square at least this large if the model and R are right: tiny means that they are not. Its law is
-    that of the noise and of what the estimator leaves; see `ipe_bench.trials.fit_test`."""
+    that of the noise and of what the estimator leaves; see `ipe_bench.trials.fit_test`. NaN where that cannot be tested
+    (`testable`)."""
     simulations: float
     """Evaluations of the model, a Jacobian counting n."""
+    model: Measurement
+    """What was fitted, without the readings that are missing."""
+    inner: Array
+    """The estimates (n,) as the estimator knows them: in multiples of sizes, of logarithms where parameters have
+    bounds."""
+    inner_covariance: Array
+    """Of those (n, n)."""
+    level: float | None = None
+    """The factor by which the readings are noisier than R says, where it is estimated from the residuals; R and all
+    that rests on it, the covariance included, have been multiplied by it already. None: R is known."""
+    held: Fit | None = None
+    """Where parameters are on their bounds: the fit of the model in which they are held there. Errors of the others are
+    from it; those on a bound have none."""
+    with_prior: bool = False
+    """Whether the estimator was told a prior, so that x is not the least-squares estimate."""
+    beaten: bool = False
+    """Whether another estimator's sum of squares is so much smaller that chance does not explain it: tested where the
+    level is estimated, because there nothing else tells a wrong answer."""
+
+    @property
+    def held_at(self) -> dict[int, float]:
+        """Which parameters are on a bound, because the readings want them beyond it, and the bound in their own
+        unit."""
+        on_bound = [] if self.held is None else np.flatnonzero(np.isnan(self.inner)).tolist()
+        return {k: float(self.x[k]) for k in on_bound}
 
     @property
     def standard_errors(self) -> Array:
@@ -70,12 +108,45 @@ class Fit:
     def residual_deviation(self) -> float:
         """Root of the residual sum of squares over the degrees of freedom, in the unit of the readings."""
         # A sum that skips NaN would be zero, and a perfect fit, where no residual is known.
-        known = np.isfinite(self.residuals).any()
+        known = np.isfinite(self.residuals).any() and self.degrees_of_freedom > 0
         return float(np.sqrt(np.nansum(self.residuals**2) / self.degrees_of_freedom)) if known else np.nan
 
     @property
-    def fits(self) -> bool:
-        return self.p_value >= FIT_LEVEL
+    def testable(self) -> bool:
+        """Whether the size of the residuals says anything of the model: not where it made R, nor without any left."""
+        return self.level is None and self.degrees_of_freedom > 0
+
+    @property
+    def fits(self) -> bool | None:
+        """Whether the residuals are as small as R says, or as small as they can be; None where neither can be told."""
+        if self.beaten:
+            return False
+        return self.p_value >= FIT_LEVEL if self.testable else None
+
+    @property
+    def passes(self) -> bool:
+        """Whether this is an answer: the estimator converged, and nothing says that the model does not fit."""
+        return self.status is Status.CONVERGED and self.fits is not False
+
+    def half_width(self, confidence: float = 0.95) -> float:
+        """Half the width of a confidence interval in standard errors: of the normal distribution, or of Student's t
+        where the level of the noise is estimated."""
+        tail = (1.0 - confidence) / 2.0
+        return float(norm.isf(tail) if self.level is None else student.isf(tail, self.degrees_of_freedom))
+
+    def interval(self, confidence: float = 0.95) -> tuple[Array, Array]:
+        """Confidence intervals (n,), (n,) from the standard errors; inside of its bounds where a parameter has some."""
+        with np.errstate(invalid="ignore"):
+            half = self.half_width(confidence) * np.sqrt(np.diagonal(self.inner_covariance))
+        ends = self.model.natural(np.stack([self.inner - half, self.inner + half]))
+        return ends.min(axis=0), ends.max(axis=0)
+
+    def region(self, parameters: int, confidence: float = 0.95) -> float:
+        """The squared distance, in standard errors, to the edge of a joint region of so many parameters: chi-square, or
+        F where the level of the noise is estimated."""
+        if self.level is None:
+            return float(chi2.ppf(confidence, parameters))
+        return float(parameters * fisher.ppf(confidence, parameters, self.degrees_of_freedom))
 
     @property
     def outlier_limit(self) -> float:
@@ -88,16 +159,104 @@ class Fit:
             return np.abs(self.normalised) > self.outlier_limit
 
 
-def fit(problem: Problem, z: Array, estimators: Mapping[str, Estimator], noise: Noise = _NORMAL) -> list[Fit]:
+def fit(
+    problem: Problem,
+    z: Array,
+    estimators: Mapping[str, Estimator],
+    noise: Noise = _NORMAL,
+    *,
+    level_unknown: bool | None = None,
+) -> list[Fit]:
     """Lets every estimator loose on the readings z (m,), of which those that are NaN are missing; `noise` states the
-    law of their whitened errors."""
+    law of their whitened errors.
+
+    `level_unknown`: R is known up to a factor, which is estimated from the residuals of each fit; None: as the noise
+    says.
+    """
     present = np.flatnonzero(~np.isnan(z))
     given = problem if len(present) == len(z) else _restricted(problem, present)
-    order = _succession(problem.measurement, present)
-    return [
-        _fit_one(label, estimator, given, z[present], present, len(z), order, noise)
-        for label, estimator in estimators.items()
-    ]
+    where = present, len(z), _succession(problem.measurement, present)
+    if noise.estimated if level_unknown is None else level_unknown:
+        found = [_fit_with_level(label, one, given, z[present], *where) for label, one in estimators.items()]
+    else:
+        found = [_fit_one(label, one, given, z[present], *where, noise) for label, one in estimators.items()]
+    return _compared(found)
+
+
+def _compared(fits: list[Fit]) -> list[Fit]:
+    """The fits; where the size of residuals tests nothing, those are marked that lie outside of the joint confidence
+    region of the best (Bates and Watts, Nonlinear Regression Analysis and Its Applications, 1988, section 6.1)."""
+    if not fits or fits[0].testable:
+        return fits
+    sums = [one.chi_square * (1.0 if one.level is None else one.level**2) for one in fits]
+    n, free = len(fits[0].x), fits[0].degrees_of_freedom
+    least = min((value for value in sums if np.isfinite(value)), default=np.nan)
+    if fits[0].level is None:
+        limit = least + float(chi2.isf(FIT_LEVEL, n))
+    else:
+        limit = least * (1 + n / free * float(fisher.isf(FIT_LEVEL, n, free))) if free > 0 else np.inf
+    return [replace(one, beaten=not value <= limit) for one, value in zip(fits, sums, strict=True)]
+
+
+def _fit_with_level(label: str, estimator: Estimator, problem: Problem, z: Array, *where: Any) -> Fit:
+    """Fits until the level that R assumes is that of the residuals, since estimators measure their steps by it."""
+    spread = float(np.sqrt(np.mean(problem.R.whiten(z) ** 2)))
+    level, found = spread or 1.0, None
+    for _ in range(_MOST_LEVELS):
+        assumed = level
+        again = _fit_one(label, estimator, _scaled(problem, assumed), z, *where, noise=None)
+        if found is not None and again.status is not Status.CONVERGED and found.status is Status.CONVERGED:
+            break
+        found = again
+        free = found.degrees_of_freedom
+        level = assumed * float(np.sqrt(found.chi_square / free)) if free > 0 else np.nan
+        if level == 0.0:
+            raise UserError(
+                "noise: is not given and cannot be estimated from the residuals, which are zero; state it, as in"
+                " noise.deviation=0.1"
+            )
+        found = _with_level(found, level / assumed, level)
+        # Residuals of round-off would make steps of round-off count.
+        level = max(level, _SMALLEST_LEVEL * spread)
+        if not np.isfinite(level) or abs(level / assumed - 1.0) < _SAME_LEVEL:
+            break
+    assert found is not None
+    return found
+
+
+def _scaled(problem: Problem, level: float) -> Problem:
+    return replace(problem, R=Covariance(problem.R.factor * level))
+
+
+def _with_level(found: Fit, factor: float, level: float) -> Fit:
+    """The fit as it is with R multiplied by factor^2; residuals in their own deviations, which are then estimated.
+
+    An internally studentised residual r becomes t = r sqrt((f - 1) / (f - r^2)), Student's t with f - 1 degrees of
+    freedom (Cook and Weisberg, Residuals and Influence in Regression, 1982, eq. 2.2.8), and that the normal deviate
+    that is as probable.
+    """
+    free = found.degrees_of_freedom
+    with np.errstate(all="ignore"):
+        r = found.normalised / factor
+        t = r * np.sqrt((free - 1) / np.maximum(free - r**2, 0.0))
+        deviates = np.sign(r) * norm.isf(student.sf(np.abs(t), free - 1)) if free > 1 else np.full(len(r), np.nan)
+        # So improbable that it underflows: a deviate beyond every limit.
+        deviates = np.where(np.isinf(deviates), np.sign(r) * _FARTHEST, deviates)
+        return replace(
+            found,
+            covariance=found.covariance * factor**2,
+            inner_covariance=found.inner_covariance * factor**2,
+            chi_square=found.chi_square / factor**2,
+            normalised=deviates,
+            level=level,
+            held=None if found.held is None else _with_level(found.held, factor, level),
+        )
+
+
+def present_part(problem: Problem, rows: NDArray[np.intp], level: float | None = None) -> Problem:
+    """The problem of the readings that are there, R multiplied by an estimated level."""
+    part = problem if len(rows) == problem.R.m else _restricted(problem, rows)
+    return part if level is None else _scaled(part, level)
 
 
 def _restricted(problem: Problem, rows: Array) -> Problem:
@@ -127,7 +286,60 @@ def _fit_one(
     rows: NDArray[np.intp],
     m: int,
     order: NDArray[np.intp],
-    noise: Noise,
+    noise: Noise | None,
+) -> Fit:
+    """`noise` None: its level is not known, and the size of the residuals cannot be tested."""
+    found = _fit_inside(label, estimator, problem, z, rows, m, order, noise)
+    near = {} if found.with_prior else problem.measurement.near_bounds(found.inner)
+    if not 0 < len(near) < len(found.x):
+        return found
+    held = _fit_inside(label, estimator, holding(problem, near), z, rows, m, order, noise)
+    return _on_bounds(found, held, near) if _is_minimum(problem, held, near, z) else found
+
+
+def holding(problem: Problem, values: Mapping[int, float]) -> Problem:
+    """The problem with some parameters fixed at values in their own units."""
+    deviation = problem.prior_deviation
+    if deviation is not None:
+        deviation = np.delete(deviation, list(values))
+    return Problem(problem.measurement.holding(values), problem.R, deviation)
+
+
+def _is_minimum(problem: Problem, held: Fit, near: Mapping[int, float], z: Array) -> bool:
+    """Whether the sum of squares falls on beyond every bound, so that its minimum within them is on them (Nocedal and
+    Wright, Numerical Optimization, 2nd ed., 2006, theorem 12.1)."""
+    if held.status is not Status.CONVERGED:
+        return False
+    model, places = problem.measurement.released(near), list(near)
+    x = np.array(model.nominal, dtype=float)
+    x[[k for k in range(model.n) if k not in near]] = held.inner
+    with np.errstate(all="ignore"):
+        r = problem.R.whiten(z - model.simulate(x[None])[0])
+        downhill = problem.R.whiten_jacobian(model.jacobian(x[None]))[0][:, places].T @ r
+    start = problem.measurement.natural(problem.measurement.nominal[None])[0]
+    outward = np.sign(np.array(list(near.values())) - start[places])
+    return bool((downhill * outward > 0).all())
+
+
+def _on_bounds(found: Fit, held: Fit, near: Mapping[int, float]) -> Fit:
+    """The fit with some parameters on their bounds, those having no errors."""
+    n = len(found.x)
+    free = np.array([k for k in range(n) if k not in near])
+    x, inner, P, inner_P = np.empty(n), np.full(n, np.nan), np.full((n, n), np.nan), np.full((n, n), np.nan)
+    x[list(near)], x[free], inner[free] = list(near.values()), held.x, held.inner
+    P[np.ix_(free, free)], inner_P[np.ix_(free, free)] = held.covariance, held.inner_covariance
+    return replace(held, x=x, inner=inner, covariance=P, inner_covariance=inner_P, model=found.model, held=held)
+
+
+def _fit_inside(
+    label: str,
+    estimator: Estimator,
+    problem: Problem,
+    z: Array,
+    rows: NDArray[np.intp],
+    m: int,
+    order: NDArray[np.intp],
+    noise: Noise | None,
 ) -> Fit:
     model, n = problem.measurement, problem.measurement.n
     estimates = estimate_safely(estimator, problem, z[None])
@@ -148,15 +360,18 @@ def _fit_one(
     else:
         scaled, white = np.full(len(z), np.nan), Whiteness(np.nan, 0, np.nan)
     chi_square = float(np.sum(w**2))
-    spread = spread_of(estimator, problem, J[None])
-    p = fit_probability(np.array([chi_square]), spread, noise, problem.H, problem.R)[0]
+    p = np.nan
+    if noise is not None:
+        spread = spread_of(estimator, problem, J[None])
+        p = fit_probability(np.array([chi_square]), spread, noise, problem.H, problem.R)[0]
     P = np.full((n, n), np.nan) if estimates.covariance is None else estimates.covariance[0]
+    slope = model.natural_slope(estimates.x)[0]
     return Fit(
         label,
         Status(int(estimates.status[0])),
         message,
-        estimates.x[0] * model.sizes,
-        P * np.outer(model.sizes, model.sizes),
+        model.natural(estimates.x)[0],
+        P * np.outer(slope, slope),
         _at(rows, r, m),
         _at(rows, scaled, m),
         chi_square,
@@ -165,6 +380,10 @@ def _fit_one(
         int(estimates.iterations[0]),
         float(p),
         float(cost(estimates.simulations, estimates.jacobians, n)[0]),
+        model,
+        estimates.x[0],
+        P,
+        with_prior="prior" in estimator.needs,
     )
 
 

@@ -3,34 +3,42 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.files import write_atomically
+from ipe_bench.basics.files import write_atomically, write_text
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement
+from ipe_bench.real.examination import Examination
 from ipe_bench.real.fits import Fit
 from ipe_bench.real.residuals import LEAST_P
+from ipe_bench.report import examined
 from ipe_bench.report.words import p_value
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
 if TYPE_CHECKING:
+    import pandas as pd
     from rich.console import Group
 
-SCHEMA = 1
+SCHEMA = 2
 RESULT = "estimate.json"
 RESIDUALS = "residuals.csv"
-_FIGURES = tuple(f"{name}{suffix}" for name in ("residuals", "ellipses") for suffix in (".png", ".pdf"))
+PAGE = "estimate.html"
+_FIGURES = tuple(f"{name}{suffix}" for name in ("residuals", "ellipses", "likelihood") for suffix in (".png", ".pdf"))
 _MOST_OUTLIERS = 8
 _FEW = 0.05
 """Above this share of outliers it is the model that is wrong, and a list of readings says nothing."""
 _ALIKE = 0.02
+_FITS = {True: "yes", False: "NO", None: "not tested"}
 _NARROW = 90
 """Columns of a terminal below which the table of verdicts goes without the residual deviation."""
 
@@ -80,30 +88,90 @@ def _is_free(folder: Path, command: Any, result: str, files: Sequence[str]) -> b
         return False
 
 
-def write_fits(
-    folder: Path, model: Measurement, z: Array, fits: Sequence[Fit], command: Any, provenance: Mapping[str, Any]
-) -> list[Path]:
-    """Writes the results of fits of the readings z (m,); each file appears whole or not at all. Returns the files.
+@dataclass(frozen=True)
+class Answer:
+    """What estimators make of real readings, and what can be signed of it."""
+
+    name: str
+    """What the model is called in titles."""
+    model: Measurement
+    z: Array
+    """The readings (m,); NaN where one is missing."""
+    fits: list[Fit]
+    """One for each estimator, in the order in which they were given."""
+    examination: Examination | None
+    """Of the least minimum that was found; None where no estimator found any."""
+
+    @property
+    def passes(self) -> bool:
+        """Whether any estimator has an answer that nothing speaks against."""
+        least = self.examination is None or self.examination.least
+        return least and any(one.passes for one in self.fits)
+
+    def __iter__(self) -> Iterator[Fit]:
+        return iter(self.fits)
+
+    def __len__(self) -> int:
+        return len(self.fits)
+
+    def __getitem__(self, which: str | int) -> Fit:
+        """By label or place."""
+        return self.fits[which] if isinstance(which, int) else next(f for f in self.fits if f.label == which)
+
+    def table(self) -> pd.DataFrame:
+        """A row per estimator and parameter: estimate, standard error, 95 % interval, and whether the fit passes."""
+        import pandas as pd
+
+        found = []
+        for one in self.fits:
+            columns = zip(one.model.natural_parameters, one.x, one.standard_errors, *one.interval(), strict=True)
+            for p, x, error, low, high in columns:
+                values = {"estimate": x, "standard_error": error, "low95": low, "high95": high}
+                found.append(
+                    {"estimator": one.label, "parameter": p.name, "unit": p.unit, **values, "passes": one.passes}
+                )
+        return pd.DataFrame(found)
+
+    def __str__(self) -> str:
+        from rich.console import Console
+
+        console = Console(width=120, file=io.StringIO())
+        console.print(render(self, 120))
+        return console.file.getvalue()  # type: ignore[attr-defined]
+
+    def _repr_html_(self) -> str:
+        return fragment(self)
+
+
+def write_fits(folder: Path, answer: Answer, command: Any, provenance: Mapping[str, Any]) -> list[Path]:
+    """Writes an answer; each file appears whole or not at all. Returns the files.
 
     `command` tells one command from another (see `claim`); `provenance` is added to the JSON file and overrides what
     stands there of the same name.
     """
+    from ipe_bench.report.figures import likelihood
     from ipe_bench.report.figures.residual_plots import draw_fits
 
+    model, fits, found = answer.model, answer.fits, answer.examination
     result = folder / RESULT
     # First, since it says whose folder this is.
-    text = json.dumps({"schema": SCHEMA, "command": command, **_described(model, z, fits), **provenance}, indent=1)
+    text = json.dumps({"schema": SCHEMA, "command": command, **_described(answer), **provenance}, indent=1)
     write_atomically(result, lambda path: path.write_text(text + "\n", encoding="utf-8"))
     table = folder / RESIDUALS
 
     def write_table(path: Path) -> None:
         with path.open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows(_residual_rows(model, z, fits))
+            csv.writer(file).writerows(_residual_rows(answer))
 
     write_atomically(table, write_table)
-    files = [result, table]
-    for drawing in draw_fits(model, fits):
-        files += drawing.save(folder)
+    files, figures = [result, table], []
+    for drawing in (*draw_fits(model, fits), *(likelihood.draw(found) if found is not None else ())):
+        written = drawing.save(folder)
+        files += written
+        figures.append((drawing.title, drawing.caption, written[0].read_bytes()))
+    page = folder / PAGE
+    write_text(page, whole_page(answer, figures, str(provenance.get("written", ""))))
+    files.append(page)
     for name in _FIGURES:
         # The same command may draw less than before: with other readings nothing may converge any more.
         if folder / name not in files:
@@ -111,52 +179,53 @@ def write_fits(
     return files
 
 
-def _described(model: Measurement, z: Array, fits: Sequence[Fit]) -> dict[str, Any]:
-    names = [p.name for p in model.parameters]
+def _described(answer: Answer) -> dict[str, Any]:
+    model, z, fits = answer.model, answer.z, answer.fits
+    names = [p.name for p in model.natural_parameters]
     labels = _reading_labels(model)
     return {
         "measurement": model.name,
         "reading_unit": model.reading_unit,
         "readings_present": int(np.isfinite(z).sum()),
         "readings_missing": int(np.isnan(z).sum()),
-        "parameters": [{"name": p.name, "unit": p.unit} for p in model.parameters],
+        "fixed": dict(model.fixed),
+        "passes": answer.passes,
+        "examination": None if answer.examination is None else examined.described(answer.examination, labels),
+        "parameters": [{"name": p.name, "unit": p.unit} for p in model.natural_parameters],
         "estimators": {
             one.label: {
                 "status": one.status.label,
                 "message": one.message,
-                "estimates": dict(zip(names, plain_numbers(one.x), strict=True)),
-                "standard_errors": dict(zip(names, plain_numbers(one.standard_errors), strict=True)),
-                "correlation": plain_numbers(one.correlation),
-                "chi_square": plain_numbers(one.chi_square),
+                "estimates": dict(zip(names, examined.numbers(one.x), strict=True)),
+                "standard_errors": dict(zip(names, examined.numbers(one.standard_errors), strict=True)),
+                "intervals95": dict(zip(names, examined.numbers(np.transpose(one.interval())), strict=True)),
+                "correlation": examined.numbers(one.correlation),
+                "chi_square": examined.numbers(one.chi_square),
                 "degrees_of_freedom": one.degrees_of_freedom,
-                "p": plain_numbers(one.p_value),
+                "p": examined.numbers(one.p_value),
                 "fits": one.fits,
-                "residual_deviation": plain_numbers(one.residual_deviation),
+                "passes": one.passes,
+                "with_prior": one.with_prior,
+                "on_bounds": {names[k]: value for k, value in one.held_at.items()},
+                "noise_level_estimated": None if one.level is None else examined.numbers(one.level),
+                "residual_deviation": examined.numbers(one.residual_deviation),
                 "whiteness": {
                     "test": "Ljung-Box, p from simulated fits",
-                    "statistic": plain_numbers(one.whiteness.statistic),
+                    "statistic": examined.numbers(one.whiteness.statistic),
                     "lags": one.whiteness.lags,
-                    "p": plain_numbers(one.whiteness.p_value),
+                    "p": examined.numbers(one.whiteness.p_value),
                 },
                 "outlier_limit": one.outlier_limit,
                 "outliers": [
-                    {**labels[i], "normalised_residual": plain_numbers(one.normalised[i])}
+                    {**labels[i], "normalised_residual": examined.numbers(one.normalised[i])}
                     for i in np.flatnonzero(one.outliers)
                 ],
                 "iterations": one.iterations,
-                "simulations": plain_numbers(one.simulations),
+                "simulations": examined.numbers(one.simulations),
             }
             for one in fits
         },
     }
-
-
-def plain_numbers(value: Any) -> Any:
-    """Plain numbers for JSON, which knows no NaN: null in its place."""
-    if np.ndim(value):
-        return [plain_numbers(v) for v in value]
-    number = float(value)
-    return number if math.isfinite(number) else None
 
 
 def _reading_labels(model: Measurement) -> list[dict[str, Any]]:
@@ -167,16 +236,34 @@ def _reading_labels(model: Measurement) -> list[dict[str, Any]]:
     ]
 
 
-def _residual_rows(model: Measurement, z: Array, fits: Sequence[Fit]) -> Iterator[list[Any]]:
+def _residual_rows(answer: Answer) -> Iterator[list[Any]]:
+    model, z, found = answer.model, answer.z, answer.examination
     unit = f" [{model.reading_unit}]" if model.reading_unit else ""
     quantities = [f"{name}{unit}" for name in ("reading", "fitted", "residual")]
-    yield ["estimator", *model.index, *quantities, "normalised_residual", "outlier"]
+    influence = ["leverage", "cook", "shift", f"fitted_error{unit}", f"prediction_error{unit}"]
+    yield ["estimator", *model.index, *quantities, "normalised_residual", "outlier", *influence]
     labels = list(zip(*model.index.values(), strict=True))
-    for one in fits:
+    for one in answer.fits:
+        more: tuple[Array, ...] = ()
+        if found is not None and one.label == found.label:
+            more = (*_influences(found), found.fitted_errors, found.new_errors)
+        # Of the estimator that is examined, the readings that are missing are predicted, too.
+        fitted = z - one.residuals
+        if found is not None and more:
+            fitted = np.where(np.isnan(z), found.fitted, fitted)
         for i, label in enumerate(labels):
-            values = (z[i], z[i] - one.residuals[i], one.residuals[i], one.normalised[i])
-            cells = ["" if math.isnan(v) else repr(float(v)) for v in values]
-            yield [one.label, *label, *cells, "yes" if one.outliers[i] else "no"]
+            values = (z[i], fitted[i], one.residuals[i], one.normalised[i])
+            further = [_cell(column[i]) for column in more] or [""] * len(influence)
+            outlier = "yes" if one.outliers[i] else "no"
+            yield [one.label, *label, *map(_cell, values), outlier, *further]
+
+
+def _influences(found: Examination) -> tuple[Array, Array, Array]:
+    return found.influence.leverage, found.influence.cook, found.influence.shift
+
+
+def _cell(value: float) -> str:
+    return "" if math.isnan(value) else repr(float(value))
 
 
 def with_error(value: float, error: float) -> str:
@@ -195,26 +282,36 @@ def with_error(value: float, error: float) -> str:
     return f"{value:.{figures}e} ± {error:.1e}"
 
 
-def render(name: str, model: Measurement, fits: Sequence[Fit], width: int) -> Group:
-    """The tables for a terminal of that width: as many estimators side by side as there is room for.
-
-    `name` is what the model is called in the title.
-    """
+def render(answer: Answer, width: int) -> Group:
+    """The tables for a terminal of that width: as many estimators side by side as there is room for."""
     from rich.console import Group
 
-    parts = [*_estimates(name, model, fits, width), _verdicts(fits, width), _notes(fits, width)]
+    model, fits, found = answer.model, answer.fits, answer.examination
+    parts = [*_estimates(answer.name, model, fits, width), _verdicts(fits, width), _notes(fits, width)]
     parts += _outliers(model, fits)
+    if found is not None and answer[found.label].passes:
+        parts += ["", examined.table(found), *_remarks(answer)]
+    elif found is not None and not found.least:
+        parts += ["", *_remarks(answer)]
     return Group(*parts)
+
+
+def _remarks(answer: Answer) -> Iterator[Any]:
+    from rich.text import Text
+
+    assert answer.examination is not None
+    for remark in examined.remarks(answer.examination, _reading_labels(answer.model)):
+        yield Text(remark, style="bold" if remark.isupper() or remark.split(":")[0].isupper() else "dim")
 
 
 def _estimates(name: str, model: Measurement, fits: Sequence[Fit], width: int) -> Iterator[Any]:
     from rich.markup import escape
     from rich.table import Table
 
-    columns = [(f.label, [with_error(*pair) for pair in zip(f.x, f.standard_errors, strict=True)]) for f in fits]
+    columns = [(_heading(f), _cells(f)) for f in fits]
     widths = [max(map(len, (label, *cells))) + 2 for label, cells in columns]
-    fixed = max(len("parameter"), *(len(p.name) for p in model.parameters))
-    fixed += 2 + max(len("unit"), *(len(p.unit) for p in model.parameters))
+    fixed = max(len("parameter"), *(len(p.name) for p in model.natural_parameters))
+    fixed += 2 + max(len("unit"), *(len(p.unit) for p in model.natural_parameters))
     start = 0
     while start < len(columns):
         stop, room = start + 1, width - fixed - widths[start]
@@ -227,12 +324,28 @@ def _estimates(name: str, model: Measurement, fits: Sequence[Fit], width: int) -
         table.add_column("unit", no_wrap=True)
         for label, _ in columns[start:stop]:
             table.add_column(escape(label), justify="right", overflow="fold")
-        for i, parameter in enumerate(model.parameters):
+        for i, parameter in enumerate(model.natural_parameters):
             cells = [cells[i] for _, cells in columns[start:stop]]
             table.add_row(escape(parameter.name), escape(parameter.unit), *cells)
         yield table
         yield ""
         start = stop
+
+
+def _heading(one: Fit) -> str:
+    return one.label if one.passes else f"{one.label}: {_failing(one)}"
+
+
+def _failing(one: Fit) -> str:
+    """Why a fit is not an answer."""
+    return "MISFIT" if one.status is Status.CONVERGED else one.status.label.replace("_", " ").upper()
+
+
+def _cells(one: Fit) -> list[str]:
+    """Estimates with their errors; what is not an answer stands in brackets, without errors that would be wrong."""
+    if one.passes:
+        return [with_error(*pair) for pair in zip(one.x, one.standard_errors, strict=True)]
+    return [f"({value:.4g})" if math.isfinite(value) else "-" for value in one.x]
 
 
 def _verdicts(fits: Sequence[Fit], width: int) -> Any:
@@ -251,7 +364,7 @@ def _verdicts(fits: Sequence[Fit], width: int) -> Any:
         numbers = [f"{one.residual_deviation:.4g}", f"{one.chi_square:.4g}", str(one.degrees_of_freedom)]
         numbers += [p_value(one.p_value), p_value(one.whiteness.p_value, LEAST_P), str(int(one.outliers.sum()))]
         status = one.status.label.replace("_", " ")
-        table.add_row(escape(one.label), status, *numbers[width < _NARROW :], "yes" if one.fits else "NO")
+        table.add_row(escape(one.label), status, *numbers[width < _NARROW :], _FITS[one.fits])
     return table
 
 
@@ -262,8 +375,55 @@ def _notes(fits: Sequence[Fit], width: int) -> Any:
         f"fits: p of chi-square is at least {FIT_LEVEL:g}. white p: Ljung-Box; small where successive residuals"
         " resemble each other." + (" deviation: of the residuals, in the readings' unit." if width >= _NARROW else ""),
         *(f"{one.label}: {one.message}" for one in fits if one.message),
+        *_on_levels(fits),
+        *_on_priors(fits),
+        *_on_bounds(fits),
     ]
+    failing = [one.label for one in fits if not one.passes]
+    if fits[0].model.fixed:
+        lines.append("Fixed: " + ", ".join(f"{name} = {value:g}" for name, value in fits[0].model.fixed.items()))
+    if failing:
+        lines.append(
+            f"In brackets: {', '.join(failing)}. Not an answer: errors are not given, for they would be wrong."
+        )
     return Text("\n".join(lines), style="dim")
+
+
+def _on_levels(fits: Sequence[Fit]) -> Iterator[str]:
+    """What is to be said where the level of the noise is estimated."""
+    unknown = [one for one in fits if one.level is not None]
+    if not unknown:
+        return
+    yield (
+        "The level of the noise is estimated from the residuals: standard errors are scaled by it, intervals are those"
+        " of Student's t, and the size of the residuals cannot test the model."
+    )
+    suspect = [one.label for one in unknown if one.whiteness.p_value < FIT_LEVEL]
+    if suspect:
+        yield (
+            f"{', '.join(suspect)}: successive residuals resemble each other (white p below {FIT_LEVEL:g}); the model"
+            " is in doubt, and standard errors are too small."
+        )
+
+
+def _on_priors(fits: Sequence[Fit]) -> Iterator[str]:
+    told = [one.label for one in fits if one.with_prior]
+    if told:
+        yield (
+            f"{', '.join(told)}: with a prior. Profiles, bootstrap and influence, where given, are of least squares"
+            " without it."
+        )
+
+
+def _on_bounds(fits: Sequence[Fit]) -> Iterator[str]:
+    for one in fits:
+        if one.held is not None:
+            names = [one.model.natural_parameters[k].name for k in one.held_at]
+            bounds = ", ".join(f"{name} = {value:g}" for name, value in zip(names, one.held_at.values(), strict=True))
+            yield (
+                f"{one.label}: on its bound: {bounds}; the readings want it beyond. It has no error, and those of the"
+                " others are with it held there."
+            )
 
 
 def _outliers(model: Measurement, fits: Sequence[Fit]) -> Iterator[Any]:
@@ -287,3 +447,74 @@ def _outliers(model: Measurement, fits: Sequence[Fit]) -> Iterator[Any]:
             yield Text(f"  {where}: {', '.join(f'{label} {value:.1f}' for label, value in values.items())}")
     if len(rows) > _MOST_OUTLIERS:
         yield Text(f"  and {len(rows) - _MOST_OUTLIERS} others: see {RESIDUALS}")
+
+
+def fragment(answer: Answer) -> str:
+    """The tables as a piece of HTML, for a notebook."""
+    from html import escape
+
+    failing = [f"{one.label}: {_failing(one)}" for one in answer.fits if not one.passes]
+    header = "".join(f"<th>{escape(_heading(one))}</th>" for one in answer.fits)
+    cells = [_cells(one) for one in answer.fits]
+    body = "".join(
+        f"<tr><td>{escape(p.name)}</td><td>{escape(p.unit)}</td>{''.join(f'<td>{c[i]}</td>' for c in cells)}</tr>"
+        for i, p in enumerate(answer.model.natural_parameters)
+    )
+    parts = [f"<h3>{escape(answer.name)}: estimate ± standard error</h3>"]
+    parts.append(f"<table><thead><tr><th>parameter</th><th>unit</th>{header}</tr></thead><tbody>{body}</tbody></table>")
+    verdicts = "".join(
+        f"<tr><td>{escape(one.label)}</td><td>{one.status.label}</td><td>{one.chi_square:.4g}</td>"
+        f"<td>{one.degrees_of_freedom}</td><td>{p_value(one.p_value)}</td><td>{p_value(one.whiteness.p_value)}</td>"
+        f"<td>{int(one.outliers.sum())}</td><td>{_FITS[one.fits]}</td></tr>"
+        for one in answer.fits
+    )
+    names = ("estimator", "status", "chi-square", "degrees of freedom", "p", "white p", "outliers", "fits")
+    head = "".join(f"<th>{name}</th>" for name in names)
+    parts.append(f"<h3>Does the model fit?</h3><table><thead><tr>{head}</tr></thead><tbody>{verdicts}</tbody></table>")
+    notes = [*_on_levels(answer.fits), *_on_priors(answer.fits), *_on_bounds(answer.fits)]
+    if failing:
+        notes.append(f"In brackets, and not an answer: {', '.join(failing)}.")
+    found = answer.examination
+    if found is not None and answer[found.label].passes:
+        head = "".join(f"<th>{name}</th>" for name in examined.HEADINGS)
+        lines = "".join(
+            f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in examined.rows(found)
+        )
+        parts.append(
+            f"<h3>95 % intervals of {escape(found.label)}</h3><table><thead><tr>{head}</tr></thead>"
+            f"<tbody>{lines}</tbody></table>"
+        )
+    if found is not None:
+        notes += examined.remarks(found, _reading_labels(answer.model))
+    return "".join([*parts, *(f"<p>{escape(note)}</p>" for note in notes)])
+
+
+_STYLE = """
+:root { color-scheme: light dark; font: 16px/1.5 system-ui, sans-serif; }
+body { max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
+table { border-collapse: collapse; display: block; overflow-x: auto; font-variant-numeric: tabular-nums; }
+th, td { padding: .2rem .7rem; text-align: right; border-bottom: 1px solid #8884; }
+th:first-child, td:first-child { text-align: left; }
+img { max-width: 100%; background: white; }
+figcaption { font-size: .9rem; opacity: .8; }
+"""
+
+
+def whole_page(answer: Answer, figures: Sequence[tuple[str, str, bytes]], written: str) -> str:
+    """estimate.html: one file with everything in it; `figures` are titles, captions and PNGs."""
+    import base64
+    from html import escape
+
+    verdict = "an answer that passes" if answer.passes else "NO ANSWER THAT PASSES"
+    shown = "".join(
+        f'<figure><img alt="{escape(title)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
+        f"<figcaption>{escape(caption)}</figcaption></figure>"
+        for title, caption, png in figures
+    )
+    title = f"{answer.name}: estimates"
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
+        f'<meta name="viewport" content="width=device-width"><style>{_STYLE}</style></head><body>'
+        f"<h1>{escape(title)}</h1><p>{int(np.isfinite(answer.z).sum())} readings; {verdict}. {escape(written)}</p>"
+        f"{fragment(answer)}{shown}</body></html>\n"
+    )

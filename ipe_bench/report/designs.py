@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ipe_bench.basics.files import write_atomically
-from ipe_bench.report.answer import plain_numbers
+from ipe_bench.report.examined import numbers
 from ipe_bench.report.words import enumerate_few, percent
 from ipe_bench.runs.provenance import describe
 from ipe_bench.trials.design import Choice, Design, Effect, Way, levels_of
@@ -67,33 +67,33 @@ def described(design: Design) -> dict[str, Any]:
         "candidates": design.candidates.m,
         "observable": seen.observable,
         "least_observable_direction": seen.words,
-        "singular_values": plain_numbers(np.median(seen.singular_values, axis=0)),
+        "singular_values": numbers(np.median(seen.singular_values, axis=0)),
         "parameters": [
-            {"name": p.name, "unit": p.unit, "bound": plain_numbers(b), "multiple_correlation": plain_numbers(r)}
+            {"name": p.name, "unit": p.unit, "bound": numbers(b), "multiple_correlation": numbers(r)}
             for p, b, r in zip(seen.parameters, seen.bound * sizes, seen.multiple_correlation, strict=True)
         ],
-        "correlation": plain_numbers(seen.correlation),
+        "correlation": numbers(seen.correlation),
         "suspects": [
             {
                 "name": s.name,
                 "deviation": s.deviation,
                 "unit": s.unit,
-                "shift": plain_numbers(s.shift * sizes),
-                "shift_in_bounds": plain_numbers(s.bounds),
+                "shift": numbers(s.shift * sizes),
+                "shift_in_bounds": numbers(s.bounds),
                 "parameter": s.parameter,
-                "visible": plain_numbers(s.visible),
-                "noticed": plain_numbers(s.noticed),
+                "visible": numbers(s.visible),
+                "noticed": numbers(s.noticed),
                 "direction": s.words,
             }
             for s in design.suspects
         ],
         "threshold": design.threshold
         and {
-            "van_trees": plain_numbers(design.threshold.van_trees * sizes),
-            "weiss_weinstein": plain_numbers(design.threshold.weiss_weinstein * sizes),
+            "van_trees": numbers(design.threshold.van_trees * sizes),
+            "weiss_weinstein": numbers(design.threshold.weiss_weinstein * sizes),
             "false_roots": design.threshold.false_roots,
             "runs": design.threshold.runs,
-            "nearest": plain_numbers(design.threshold.nearest),
+            "nearest": numbers(design.threshold.nearest),
         },
         "ways": [
             {
@@ -110,7 +110,7 @@ def described(design: Design) -> dict[str, Any]:
                 "entry": _plain(e.entry),
                 "action": e.action,
                 "readings": e.readings,
-                "mean_bound": plain_numbers(e.mean_bound),
+                "mean_bound": numbers(e.mean_bound),
             }
             for e in design.effects
         ],

@@ -12,7 +12,7 @@ import numpy as np
 from ipe_bench.basics.files import write_atomically
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.report.answer import plain_numbers
+from ipe_bench.report.examined import numbers
 from ipe_bench.report.words import compact, percent
 from ipe_bench.trials.posterior import Divergence, Posterior, Reference
 
@@ -50,28 +50,28 @@ def _described(model: Measurement, one: Reference) -> dict[str, Any]:
     return {
         "trial": one.trial,
         "parameters": [{"name": p.name, "unit": p.unit} for p in model.parameters],
-        "truth": dict(zip(names, plain_numbers(one.truth * sizes), strict=True)),
-        "mean": dict(zip(names, plain_numbers(sampled.mean * sizes), strict=True)),
-        "deviation": dict(zip(names, plain_numbers(sampled.deviation * sizes), strict=True)),
-        "covariance": plain_numbers(sampled.covariance * np.outer(sizes, sizes)),
+        "truth": dict(zip(names, numbers(one.truth * sizes), strict=True)),
+        "mean": dict(zip(names, numbers(sampled.mean * sizes), strict=True)),
+        "deviation": dict(zip(names, numbers(sampled.deviation * sizes), strict=True)),
+        "covariance": numbers(sampled.covariance * np.outer(sizes, sizes)),
         "modes": [
-            {"share": plain_numbers(share), "x": plain_numbers(mode * sizes)}
+            {"share": numbers(share), "x": numbers(mode * sizes)}
             for mode, share in zip(sampled.modes, sampled.shares, strict=True)
         ],
         "settled": sampled.settled,
-        "populations_apart": plain_numbers(sampled.apart),
-        "noise": plain_numbers(sampled.noise),
-        "evidence": plain_numbers(sampled.evidence),
+        "populations_apart": numbers(sampled.apart),
+        "noise": numbers(sampled.noise),
+        "evidence": numbers(sampled.evidence),
         "draws": len(sampled.x),
         "stages": sampled.stages,
         "simulations": sampled.simulations,
         "estimators": {
             label: {
                 "status": Status(int(one.estimates[label].status[0])).label,
-                "kl": plain_numbers(d.kl),
-                "shift": plain_numbers(d.shift),
-                "width": plain_numbers(d.width),
-                "energy": plain_numbers(d.energy),
+                "kl": numbers(d.kl),
+                "shift": numbers(d.shift),
+                "width": numbers(d.width),
+                "energy": numbers(d.energy),
             }
             for label, d in one.divergences.items()
         },
@@ -104,8 +104,8 @@ def render(name: str, found: Sequence[Reference]) -> Group:
             sampled = one.posterior
             head = [str(one.trial), str(len(sampled.modes)), compact(sampled.noise)] if i == 0 else ["", "", ""]
             status = Status(int(one.estimates[label].status[0])).label
-            numbers = [compact(value) for value in (d.kl, d.shift, d.width, d.energy)]
-            table.add_row(*head, *(Text(cell) for cell in (label, status, *numbers, honesty(d, sampled))))
+            figures = [compact(value) for value in (d.kl, d.shift, d.width, d.energy)]
+            table.add_row(*head, *(Text(cell) for cell in (label, status, *figures, honesty(d, sampled))))
     lines = [
         "divergence: of the estimator's Gaussian from the posterior's moments, in nats; noise: the same of two"
         " populations of particles, so what is not above it is chance. shift: of the mean, in the posterior's"

@@ -85,7 +85,7 @@ def all_tables(analysis: Analysis) -> list[Table]:
     if analysis.summary.empty:
         return []
     tables = [overview(analysis), costs(analysis), comparisons(analysis), ranks(analysis)]
-    tables += [parameters(analysis), endings(analysis)]
+    tables += [parameters(analysis), calibration(analysis), endings(analysis)]
     tables += [contraction(analysis), covariances(analysis), theory(analysis), iterations(analysis)]
     return [t for t in tables if t is not None]
 
@@ -289,6 +289,25 @@ def parameters(analysis: Analysis) -> Table:
         " absolute error, and coverage, over all trials."
     )
     return Table("parameters", "Parameters", caption, columns, rows)
+
+
+def calibration(analysis: Analysis) -> Table | None:
+    """How each reported covariance lies, in words."""
+    summary = analysis.summary[analysis.summary["claims"] > 0]
+    rows = summary[summary["parameter"] == ALL]
+    if rows.empty:
+        return None
+    columns = [*_head(analysis, rows), words("estimator", rows["estimator"])]
+    columns += statistics("calibration", STATISTICS, rows)
+    caption = (
+        "Whether the truth lies under the Gaussian that an estimator reports as that Gaussian says: over converged"
+        " trials with a covariance, for NEES and every parameter together, at 5 % for each row. p: that chance alone"
+        " takes any of these distributions so far. Excursion: how far the one of NEES is from its own at most. What"
+        " each parameter came to is in the table of parameters."
+    )
+    names = [*analysis.setting_columns, "error_scale", "estimator", "parameter"]
+    data = summary[[*names, *_stored("calibration", STATISTICS)]]
+    return Table("calibration", "Calibration of the reported covariance", caption, columns, data)
 
 
 def endings(analysis: Analysis) -> Table | None:

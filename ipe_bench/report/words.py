@@ -98,6 +98,7 @@ def shower(kind: Kind, where: Where) -> Callable[[Any], str]:
         "number": short,
         "physical": precise if where == "parameters" else short,
         "seconds": (lambda v: duration(v, 2)) if where == "terminal" else duration,
+        "probability": p_value,
         "word": str,
     }[kind]
 

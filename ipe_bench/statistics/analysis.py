@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +12,7 @@ import numpy as np
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
+from ipe_bench.statistics.calibration import POINTS, shared_level
 from ipe_bench.statistics.collect import Collection, Group, collect
 from ipe_bench.statistics.comparisons import (
     Outcomes,
@@ -27,7 +28,7 @@ from ipe_bench.statistics.intervals import quantile, quantiles, rms_interval
 from ipe_bench.statistics.profiles import Profiles
 from ipe_bench.statistics.records import SCORES, capped_error, gate_radius, rows_of
 from ipe_bench.statistics.sample import Sample, Shared
-from ipe_bench.statistics.summary import summary_rows, to_frame
+from ipe_bench.statistics.summary import ALL, summary_rows, to_frame
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -62,6 +63,10 @@ class Analysis:
     """Of each converged trial with a stored history: trial, iteration, and the iterate's distance from the last one
     in deviations of the bound; none of filters, whose epochs are not iterations. The last
     distance is zero by definition, which says nothing of convergence."""
+    calibration: pd.DataFrame
+    """Of each parameter, and of NEES under the parameter `all`: `at`, the `difference` of the empirical distribution
+    function from the uniform one there, the ends `low` and `high` of the band that all of an honest estimator's keep
+    within in 95 % of cases, and whether this one is `outside` (by either of its curves)."""
     contraction: pd.DataFrame
     """Per scenario, how much the fixed-point iteration contracts at the truth; empty where no file says so."""
 
@@ -142,6 +147,7 @@ def _analysis(collection: Collection, rows: _Rows, everywhere: set[str]) -> Anal
         distributions=_joined(rows.distributions, ("probability", "distance")),
         correlations=_joined(rows.correlations, ("row", "column", "value")),
         convergence=_joined(rows.convergence, ("trial", "iteration", "distance")),
+        calibration=_joined(rows.calibration, ("parameter", "at", "difference", "low", "high", "outside")),
         contraction=pd.DataFrame(rows.contraction),
     )
 
@@ -159,6 +165,7 @@ class _Rows:
     distributions: list[dict[str, Any]] = field(default_factory=list)
     correlations: list[dict[str, Any]] = field(default_factory=list)
     convergence: list[dict[str, Any]] = field(default_factory=list)
+    calibration: list[dict[str, Any]] = field(default_factory=list)
     replicates: list[tuple[int, int, str, float]] = field(default_factory=list)
     """Scenario, seed, estimator and capped error."""
     profiles: Profiles = field(default_factory=Profiles)
@@ -198,6 +205,7 @@ def _add_scenario(rows: _Rows, collection: Collection, number: int, groups: Sequ
         ]
         rows.distributions.append(_distribution(where, outcome))
         rows.correlations.append(_correlation_rows(where, sample))
+        rows.calibration += _calibration_rows(where, sample)
         rows.convergence += [_convergence_rows(where, history) for history in sample.histories]
     rows.scores += scores
     return dict(groups[0].columns) | {"scenario": number}, outcomes
@@ -327,6 +335,17 @@ def _reason(status: str) -> str:
 
 def _distribution(where: dict[str, Any], outcome: Outcomes) -> dict[str, Any]:
     return where | {"probability": PROBABILITIES, "distance": quantiles(outcome.distance, PROBABILITIES)}
+
+
+def _calibration_rows(where: dict[str, Any], sample: Sample) -> Iterator[dict[str, Any]]:
+    parts = sample.calibrations
+    if not parts:
+        return
+    level = shared_level(parts)
+    for name, part in zip([*(str(p["name"]) for p in sample.parameters), ALL], parts, strict=True):
+        low, high = part.band(level)
+        curve = {"parameter": name, "at": POINTS, "difference": part.shown.difference, "low": low, "high": high}
+        yield where | curve | {"outside": part.p < 1 - level}
 
 
 def _correlation_rows(where: dict[str, Any], sample: Sample) -> dict[str, Any]:

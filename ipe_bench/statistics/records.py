@@ -14,15 +14,17 @@ import numpy as np
 from scipy.special import chdtri, gammaincinv, ndtri
 
 from ipe_bench.basics.linalg import Array
+from ipe_bench.statistics.calibration import overall_p, overall_words, shared_level
 from ipe_bench.statistics.consistency import clopper_pearson, mean_limits, verdict
 from ipe_bench.statistics.histories import CLOSE, FixedPointBound, fixed_point_bound, observed_constant, orders_of
 from ipe_bench.statistics.intervals import LARGEST_SAMPLE, RESAMPLES, quantile, quantiles
 from ipe_bench.statistics.sample import FIT, NIS, Sample, root_mean
+from ipe_bench.statistics.sequences import rms_sequence, share_sequence
 from ipe_bench.trials.thresholds import EXPECTED, FEW, FIT_LEVEL, GATE, SAME_ROOT
 
-Kind = Literal["count", "share", "number", "physical", "seconds", "word"]
+Kind = Literal["count", "share", "number", "physical", "seconds", "probability", "word"]
 """How a value is written; `report.words` knows each."""
-Where = Literal["overview", "costs", "parameters", "terminal", "covariances", "iterations", "theory"]
+Where = Literal["overview", "costs", "parameters", "terminal", "covariances", "iterations", "theory", "calibration"]
 """A table; its columns are in the order of the records."""
 Limits = tuple[Any, Any]
 
@@ -105,6 +107,21 @@ def _share(mask: Array) -> float:
 
 def _success_limits(s: Sample) -> Limits:
     return clopper_pearson(int(s.scalars["success"].sum()), len(s))
+
+
+def _success_sequence(s: Sample) -> Limits:
+    return share_sequence(int(s.scalars["success"].sum()), len(s))
+
+
+def _rmse_sequence(s: Sample) -> Limits:
+    together = np.mean(s.normalised[s.solved] ** 2, axis=1)
+    low, high = rms_sequence(together[:, None])
+    return float(low[0]), float(high[0])
+
+
+def _rmse_sequence_each(s: Sample) -> Limits:
+    low, high = rms_sequence(s.error[s.solved] ** 2)
+    return low * s.sizes, high * s.sizes
 
 
 def _misfit(s: Sample) -> float:
@@ -291,6 +308,31 @@ def _coverage_each(s: Sample) -> Array:
     return (_errors_over_reported(s) <= -ndtri(0.025)).mean(axis=0)
 
 
+def _claims(s: Sample) -> int:
+    return int((s.converged & ~np.isnan(s.scalars["nees"])).sum())
+
+
+def _calibration_p_each(s: Sample) -> Array:
+    return np.array([part.p for part in s.calibrations[:-1]] or [np.nan] * s.n)
+
+
+def _excursion(s: Sample) -> float:
+    return s.calibrations[-1].excursion if s.calibrations else np.nan
+
+
+def _excursion_each(s: Sample) -> Array:
+    return np.array([part.excursion for part in s.calibrations[:-1]] or [np.nan] * s.n)
+
+
+def _calibration(s: Sample) -> str:
+    return overall_words(s.calibrations, [str(p["name"]) for p in s.parameters])
+
+
+def _calibration_each(s: Sample) -> Array:
+    level = shared_level(s.calibrations)
+    return np.array([part.words(level) for part in s.calibrations[:-1]] or ["-"] * s.n, dtype=object)
+
+
 def _false_root_distance(s: Sample) -> float:
     wrong = s.converged & ~s.solved
     known = "root_distance" in s.scalars and wrong.any()
@@ -375,6 +417,17 @@ STATISTICS: tuple[Statistic, ...] = (
         limits_titles={"overview": "95 % of success"},
     ),
     Statistic(
+        "success_anytime",
+        "success, any time",
+        "all trials",
+        "The same share, with an interval of 95 % that stays valid however often one looks and whenever one stops: the"
+        " one for runs with `precision` (beta-binomial confidence sequence: Robbins, Ann. Math. Statist. 41, 1970;"
+        " Howard et al., Ann. Statist. 49, 2021).",
+        lambda s: int(s.scalars["success"].sum()) / len(s),
+        limits=_success_sequence,
+        kind="share",
+    ),
+    Statistic(
         "solved_trials",
         "solved trials",
         "all trials",
@@ -455,6 +508,19 @@ STATISTICS: tuple[Statistic, ...] = (
         kind="physical",
         where=("parameters", "covariances", "theory"),
         limits_titles={"parameters": "95 % of rmse", "theory": "95 % of rmse"},
+    ),
+    Statistic(
+        "rmse_anytime",
+        "rmse, any time",
+        "solved trials",
+        "The same root mean square error, with an asymptotic interval of 95 % that stays valid however often one looks"
+        " and whenever one stops (Waudby-Smith et al., Ann. Statist. 52, 2024).",
+        _over_linear_bound(_rmse),
+        _in_units(_rmse),
+        limits=_rmse_sequence,
+        each_limits=_rmse_sequence_each,
+        given="solved",
+        kind="physical",
     ),
     Statistic(
         "rmse_common",
@@ -681,6 +747,50 @@ STATISTICS: tuple[Statistic, ...] = (
         lambda s: verdict(s.scalars["nees"][s.converged], s.n),
         kind="word",
         where=("overview",),
+    ),
+    Statistic(
+        "claims",
+        "claims",
+        "all trials",
+        "Number that converged and report a covariance: what calibration is over.",
+        _claims,
+        kind="count",
+        where=("calibration",),
+    ),
+    Statistic(
+        "calibration_p",
+        "p of calibration",
+        "converged trials with a reported covariance",
+        "Of a parameter, the probability that the distribution of the truth under the reported Gaussian, or of the"
+        " squared error under chi-square, is so far from uniform by chance: both are held against bands that an honest"
+        " one leaves anywhere with a stated probability (Säilynoja, Bürkner and Vehtari, Stat. Comput. 32, 2022), and"
+        " the smaller p is doubled. Of all, the smallest p of the n parameters and of NEES times n + 1 (Bonferroni).",
+        lambda s: overall_p(s.calibrations),
+        _calibration_p_each,
+        kind="probability",
+        where=("calibration",),
+    ),
+    Statistic(
+        "calibration_excursion",
+        "excursion",
+        "the same trials",
+        "The largest difference between these distribution functions and the uniform one; of all, that of NEES.",
+        _excursion,
+        _excursion_each,
+        where=("calibration",),
+    ),
+    Statistic(
+        "calibration",
+        "calibration",
+        "the same trials",
+        "How the reported covariance lies, where it surely does, at 5 % for an estimator and all its parameters"
+        " together: shifted is the median of error over reported deviation (estimate less truth); deviations too small"
+        " or too large, the median of its size over that of an honest one; far outside, the share beyond the quantile"
+        f" that {GATE:g} should lie beyond, after that factor.",
+        _calibration,
+        _calibration_each,
+        kind="word",
+        where=("calibration", "parameters"),
     ),
     Statistic(
         "misfit",

@@ -12,6 +12,7 @@ import numpy as np
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.counted import cost
+from ipe_bench.statistics.calibration import Calibration, calibrations
 from ipe_bench.statistics.collect import Collection, Group
 from ipe_bench.statistics.histories import History, distances_to_limit, trial_label
 from ipe_bench.statistics.intervals import rms_interval
@@ -238,6 +239,11 @@ class Sample:
     def _history(self, row: int, iterates: Array) -> History:
         distances = distances_to_limit(iterates, self.crlb[row])
         return History(row, trial_label(*self.ids[row]), iterates, distances, float(self.cost[row]))
+
+    @cached_property
+    def calibrations(self) -> list[Calibration]:
+        """How honest the reported covariance is for each parameter, and for all last; empty where none is reported."""
+        return calibrations(self.error, self.deviation, self.scalars["nees"], self.converged)
 
     @cached_property
     def rmse(self) -> Array:

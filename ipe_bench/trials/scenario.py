@@ -12,6 +12,7 @@ from ipe_bench.basics.linalg import Array, read_only
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem, recorded_problem
 from ipe_bench.noise.base import Noise
+from ipe_bench.noise.own import ModelNoise, resolved
 from ipe_bench.priors.gaussian import GaussianPrior
 
 _SEEDS = 1 << 23
@@ -42,7 +43,8 @@ class Scenario:
     """
 
     measurement: Measurement
-    noise: Noise
+    noise: Noise = field(default_factory=ModelNoise)
+    """The model's own unless another is given."""
     prior: GaussianPrior = field(default_factory=GaussianPrior)
     error_scale: float = 1.0
     """Times the prior's deviations."""
@@ -50,6 +52,7 @@ class Scenario:
     truth: Measurement | None = None
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "noise", resolved(self.noise, self.measurement))
         if not (np.isfinite(self.error_scale) and self.error_scale > 0):
             raise UserError(f"error_scale={self.error_scale}: give a finite number above 0")
         if not 0 <= self.seed < _SEEDS:

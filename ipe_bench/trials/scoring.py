@@ -211,7 +211,7 @@ class Block:
         status = np.where((estimates.status == Status.CONVERGED) & ~usable, Status.NONFINITE, estimates.status)
         converged = status == Status.CONVERGED
         bound = self.bayes_information if "prior" in estimator.needs else self.crlb_information
-        distance = quadratic_form(bound, error)
+        distance = np.maximum(quadratic_form(bound, error), 0.0)  # round-off where J lacks rank
         solved = converged
         apart = np.full(len(error), np.nan)
         if estimator.equation is not None:
@@ -232,7 +232,7 @@ class Block:
             "simulations": estimates.simulations,
             "jacobians": estimates.jacobians,
             "time_s": estimates.seconds,
-            "crlb_distance": quadratic_form(self.crlb_information, error),
+            "crlb_distance": np.maximum(quadratic_form(self.crlb_information, error), 0.0),
             "nees": squared,
             "fit_p": self._fit_probability(estimator, estimates.x),
             "root_distance": apart,

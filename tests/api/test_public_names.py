@@ -16,7 +16,7 @@ import ipe_bench as ib
 from ipe_bench import api
 
 HEAVY = ("pandas", "matplotlib", "seaborn", "hydra", "omegaconf", "filterpy", "numba", "rich")
-FUNCTIONS = ("check", "design", "estimate", "load", "posterior", "report", "run", "status")
+FUNCTIONS = ("check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status")
 
 
 @pytest.mark.parametrize("use", ["pass", "ib.Scenario, ib.Status, ib.UserError, ib.Estimator", "ib.noise.Gaussian"])
@@ -106,11 +106,12 @@ def test_noise_that_nobody_states_is_estimated_from_the_residuals(polynomial):
     from scipy.optimize import curve_fit
 
     model, z = polynomial.measurement, polynomial.draw(0, 1).z[0]
-    (found,) = ib.estimate(model, z, {"lm": ib.baselines.LevenbergMarquardt(tolerance=1e-9)})
+    (found,) = ib.estimate(model, z, {"lm": ib.baselines.LevenbergMarquardt(tolerance=1e-9)}, noise=ib.noise.Unknown())
     x, P = curve_fit(lambda _, *x: model.simulate(np.array([x]))[0], np.zeros(model.m), z, np.zeros(model.n))
     np.testing.assert_allclose(found.x, x * model.sizes, rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(found.covariance, P * np.outer(model.sizes, model.sizes), rtol=1e-3, atol=1e-12)
-    assert np.isnan(found.chi_square)
+    assert found.fits is None
+    assert np.isnan(found.p_value)
 
 
 @pytest.mark.parametrize(
@@ -119,7 +120,7 @@ def test_noise_that_nobody_states_is_estimated_from_the_residuals(polynomial):
         ((np.zeros(3),), {}, "give the 40 readings"),
         (("nowhere.csv",), {}, "no such file"),
         ((np.zeros(40), {"map": ib.baselines.MapLM()}), {}, "needs prior"),
-        ((np.zeros(40),), {}, "noise: is not given and cannot be estimated"),
+        ((np.zeros(40),), {"noise": ib.noise.Unknown()}, "noise: is not given and cannot be estimated"),
     ],
 )
 def test_mistakes_in_an_estimate_are_one_line(polynomial, arguments, options, words):

@@ -119,6 +119,32 @@ def test_no_noise_adds_nothing_while_r_stays_nominal():
 
 
 @pytest.mark.parametrize(
+    "noise",
+    [
+        Gaussian(0.3),
+        StudentT(0.3, 5.0),
+        Quantization(0.3, dither=True),
+        Outliers(0.3, share=0.1, factor=5.0, assumed="total"),
+        Colored(0.3, 0.8, channels=2, length=10, assumed="full"),
+    ],
+    ids=lambda noise: type(noise).__name__,
+)
+def test_the_stated_law_is_that_of_whitened_errors(noise):
+    """Mean, variance and kurtosis, the last from many draws of what it should be."""
+    w = noise.covariance(40).whiten(errors(noise, h=np.linspace(0.0, 7.0, 40)))
+    stated = noise.whitened(w.shape, np.random.default_rng(5))
+    law = np.random.default_rng(6).standard_normal(w.shape) if stated is None else stated
+    assert law.mean() == pytest.approx(0.0, abs=0.01)
+    assert law.var() == pytest.approx(1.0, rel=0.03)
+    tails = [np.mean(np.abs(values) > limit) for values in (w, law) for limit in (0.5, 1.5, 3.0)]
+    np.testing.assert_allclose(tails[:3], tails[3:], rtol=0.05, atol=0.0005)
+
+
+def test_outliers_that_estimators_are_not_told_of_leave_the_law_normal():
+    assert Outliers(0.3).whitened((4, 4), np.random.default_rng(0)) is None
+
+
+@pytest.mark.parametrize(
     ("make", "key"),
     [
         (lambda: StudentT(1.0, 2.0), "degrees_of_freedom=2.0"),

@@ -193,7 +193,7 @@ PRESETS = {
 
 @pytest.mark.parametrize(
     "option",
-    [o for o in discovery.options() if o.group != "experiment"],
+    [o for o in discovery.options() if o.group != "experiment" and "???" not in o.path.read_text(encoding="utf-8")],
     ids=lambda o: f"{o.group}={o.name}",
 )
 def test_conf_says_what_the_class_says(option):

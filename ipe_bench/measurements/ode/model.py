@@ -6,6 +6,7 @@ come from it. Recording and compilation are in `trace`, `source` and `kernel`, t
 
 from __future__ import annotations
 
+import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -16,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.base import Measurement
+from ipe_bench.measurements.base import Input, Measurement
+from ipe_bench.measurements.ode import sampling
 from ipe_bench.measurements.ode.coarse import CONTRACTION, MOST_RK4, Coarseness, contraction
 from ipe_bench.measurements.ode.kernel import Kernel, load
 from ipe_bench.measurements.ode.levels import Found, Indices, Remembered, Search, grouped, ladder
@@ -43,6 +45,9 @@ class OdeMeasurement(Measurement):
     """The names of what is read at each time."""
     time_unit: ClassVar[str] = "s"
     """The unit of `times`, `step` and t."""
+    sampled: tuple[float, ...] | None = None
+    """Times of the readings in place of the usual ones, where a subclass has a field of that name: a readings file may
+    bring its own."""
     tolerance: float | Sequence[float] | None = None
     """The error that the integration may leave in a reading, in `reading_unit`; or one such error for each output.
     Each trial's step follows from it and from the trial's parameters."""
@@ -101,9 +106,21 @@ class OdeMeasurement(Measurement):
         )
         return {
             "case": cases.ravel().tolist(),
-            f"time [{self.time_unit}]": times.ravel().tolist(),
+            sampling.time_heading(self.time_unit): times.ravel().tolist(),
             "output": [self.outputs[i] for i in outputs.ravel()],
         }
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        if "sampled" not in getattr(self, "__dataclass_fields__", {}):
+            return ()
+        return sampling.inputs(self.time_unit, self.outputs, len(self.cases))
+
+    def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
+        def at(times: tuple[float, ...]) -> Measurement:
+            return self if np.array_equal(times, self.times) else dataclasses.replace(self, sampled=times)  # type: ignore[type-var]
+
+        return sampling.sampled(columns, self.outputs, len(self.cases), at)
 
     @cached_property
     def epochs(self) -> tuple[NDArray[np.intp], ...]:

@@ -13,6 +13,7 @@ FIGURES = (
     "settings",
     "distributions",
     "nees",
+    "calibration",
     "convergence",
     "cost",
     "profile_curves",

@@ -23,6 +23,8 @@ MOST_ESTIMATORS = 12
 """Estimators with a panel of residuals; `residuals.csv` has all."""
 MOST_PAIRS = 9
 LEVEL = 0.95
+_MANY = 5000
+"""Points from which on they are pixels in the PDF, too."""
 _BENT = 30.0
 """Normalised residuals beyond this are drawn on a logarithmic axis: a model that does not fit at all."""
 _NEAR = 10.0
@@ -68,7 +70,17 @@ def _residual_panel(ax: Any, x: Array, one: Fit, color: str) -> None:
     common.bound_line(ax, limit, "limit for outliers")
     common.bound_line(ax, -limit, "")
     good = known & ~out
-    sns.scatterplot(x=x[good], y=one.normalised[good], s=9, alpha=0.75, linewidth=0, color=color, legend=False, ax=ax)
+    sns.scatterplot(
+        x=x[good],
+        y=one.normalised[good],
+        s=9,
+        alpha=0.75,
+        linewidth=0,
+        color=color,
+        legend=False,
+        ax=ax,
+        rasterized=len(x) > _MANY,
+    )
     if out.any():
         sns.scatterplot(
             x=x[out], y=one.normalised[out], s=25, marker="x", linewidth=1.2, color=color, legend=False, ax=ax
@@ -97,7 +109,7 @@ def _abscissa(model: Measurement) -> tuple[Array, str]:
             continue
         values = np.array(column, dtype=float)
         alike = all(np.ptp(values[rows]) == 0 for rows in model.epochs)
-        if alike and np.corrcoef(values, epoch)[0, 1] > 0.99:
+        if alike and np.ptp(values) > 0 and np.ptp(epoch) > 0 and np.corrcoef(values, epoch)[0, 1] > 0.99:
             return values, name
     return epoch, "epoch"
 
@@ -109,14 +121,14 @@ def most_correlated(correlation: Array, most: int = MOST_PAIRS) -> list[tuple[in
     return pairs[:most]
 
 
-def ellipse(P: Array, level: float = LEVEL, points: int = 181) -> Array:
+def ellipse(P: Array, level: float = LEVEL, points: int = 181, edge: float | None = None) -> Array:
     """The boundary (points, 2) of the region about zero in which an error of covariance P (2, 2) lies with that
-    probability."""
+    probability; or, where P is itself estimated, at the squared distance `edge` in deviations."""
     # Scaled first: the parameters' units must not decide what is singular.
     d = np.sqrt(np.diagonal(P))
     values, vectors = np.linalg.eigh(P / np.outer(d, d))
     turn = np.linspace(0.0, 2 * np.pi, points)
-    circle = np.sqrt(chi2.ppf(level, 2)) * np.column_stack([np.cos(turn), np.sin(turn)])
+    circle = np.sqrt(chi2.ppf(level, 2) if edge is None else edge) * np.column_stack([np.cos(turn), np.sin(turn)])
     return (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T * d
 
 
@@ -135,7 +147,7 @@ def _ellipses(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look])
         seen |= near
         away |= {f.label for f in converged} - near
         for set_label, k in zip((ax.set_xlabel, ax.set_ylabel), pair, strict=True):
-            parameter = model.parameters[k]
+            parameter = model.natural_parameters[k]
             unit = f" [{parameter.unit}]" if parameter.unit else ""
             sign = "+" if best.x[k] < 0 else "−"
             set_label(common.text(f"{parameter.name} {sign} {abs(best.x[k]):.5g}{unit}"))
@@ -160,7 +172,7 @@ def _ellipse_panel(ax: Any, pair: list[int], best: Fit, fits: Sequence[Fit], loo
     near = [f for f in fits if (np.abs(offsets[f.label]) <= _NEAR * best.standard_errors[pair]).all()]
     outlines = []
     for one, linewidth in zip(near, np.linspace(4.0 if len(near) > 1 else 1.6, 1.0, len(near)), strict=True):
-        outlines.append(offsets[one.label] + ellipse(one.covariance[np.ix_(pair, pair)]))
+        outlines.append(offsets[one.label] + ellipse(one.covariance[np.ix_(pair, pair)], edge=one.region(2, LEVEL)))
         style = look[one.label]
         ax.plot(*outlines[-1].T, color=style.color, linestyle=style.linestyle, linewidth=linewidth)
         ax.plot(*offsets[one.label], color=style.color, marker=style.marker, markersize=5, markeredgecolor="white")

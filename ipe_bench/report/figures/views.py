@@ -33,6 +33,7 @@ FRAMES = (
     "distributions",
     "correlations",
     "convergence",
+    "calibration",
     "profiles",
 )
 

@@ -1,0 +1,64 @@
+"""`ipe-bench compare A [B]`: whether the second is better or worse than the first, trial by trial."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.cli import console
+
+KEYS = ("first", "second", "alpha", "anytime", "fail_on", "output")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Prints the table; exit code 1 where the second is worse, or lacks what was asked for."""
+    folders = [a for a in arguments if "=" not in a or Path(a).is_dir()]
+    keys = _keys([a for a in arguments if a not in folders])
+    if not 1 <= len(folders) <= 2:
+        raise UserError("compare: name one or two folders of results, such as outputs/before outputs/after")
+    from ipe_bench.api import compare
+    from ipe_bench.report.comparison import render
+
+    frame = compare(*folders, **keys)
+    out = console()
+    out.print(render(frame, keys.get("alpha", 0.05)))
+    sys.stdout.flush()
+    for line in (*frame.attrs["problems"], *frame.attrs["stale"], *frame.attrs["notes"]):
+        print(f"ipe-bench: {line}", file=sys.stderr)
+    if "output" in keys:
+        out.print(f"\nTable   {Path(keys['output']) / 'comparison.csv'}", markup=False, soft_wrap=True)
+        out.print(f"Figure  {Path(keys['output']) / 'comparison.png'}", markup=False, soft_wrap=True)
+    for line in frame.attrs["worse"]:
+        out.print(f"worse: {line}", markup=False, soft_wrap=True)
+    return 1 if frame.attrs["worse"] or frame.attrs["problems"] else 0
+
+
+def _keys(words: Sequence[str]) -> dict[str, Any]:
+    """The keys as `compare` takes them."""
+    found: dict[str, Any] = {}
+    for word in words:
+        key, _, value = word.partition("=")
+        if key not in KEYS:
+            raise UserError(f"compare: {word}: {unknown(key, KEYS, 'key')}")
+        if key in found:
+            raise UserError(f"compare: {word}: {key} stands there twice; give it once")
+        if not value:
+            raise UserError(f"compare: {word}: give it a value")
+        found[key] = _value(key, value)
+    return found
+
+
+def _value(key: str, value: str) -> Any:
+    if key == "alpha":
+        try:
+            return float(value)
+        except ValueError:
+            raise UserError(f"alpha={value}: give a number between 0 and 1") from None
+    if key == "anytime":
+        if value not in ("true", "false"):
+            raise UserError(f"anytime={value}: give true or false")
+        return value == "true"
+    return tuple(value.strip("[]").split(",")) if key == "fail_on" else value

@@ -1,0 +1,222 @@
+"""A measurement model that is one formula: no plugin, no Python, only its text and the columns of a file.
+
+The text is read by `arithmetic` and recorded by `ode.trace`, which differentiates it exactly; here the recording is
+carried out on arrays.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
+from ipe_bench.measurements.arithmetic import Arithmetic, read
+from ipe_bench.measurements.base import Input, Measurement, Parameter
+from ipe_bench.measurements.ode.trace import Expression, Graph, tangent
+
+_UFUNCS: dict[str, Any] = {"add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide}
+_UFUNCS |= {"pow": np.power, "neg": np.negative}
+
+
+@dataclass(frozen=True)
+class Formula(Measurement):
+    """z = expression, in which every name with a start is a parameter and every other one a column of the readings.
+
+        ipe-bench estimate measurement=formula "measurement.expression=b1*(1-exp(-b2*t))" \\
+            measurement.start.b1=500 measurement.start.b2=1e-4 readings=my.csv
+
+    The language is that of `ipe_bench.measurements.arithmetic`: + - * / ** and elementary functions, angles in rad.
+    Parameters stand in the order of their appearance, each in multiples of the magnitude of its start; they have no
+    units but those that the formula gives them. Readings have the order of the file, and no epochs.
+    """
+
+    expression: str
+    start: Mapping[str, float] = field(default_factory=dict)
+    """Where estimation begins, for each parameter: the nominal point."""
+    columns: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    """What is known of each reading: the same columns as in a file, for `run`, which has no file."""
+    readings: int | None = None
+    """Number of readings; None: the length of the columns."""
+    reading: str = "y"
+    """What the column of the readings is called in a file (or `reading`),"""
+    unit: str = ""
+    """and its unit."""
+    own: tuple[str, ...] = ()
+    """Parameters of which every file of readings has its own, where there are several."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, value in self.start.items():
+            if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+                raise UserError(f"start.{name}={value}: give a finite number")
+            if name not in self._arithmetic.names:
+                wanted = ", ".join(self._arithmetic.names)
+                raise UserError(f"start.{name}: does not appear in the expression, whose names are {wanted}")
+        if not self.start:
+            name = next(iter(self._arithmetic.names), "NAME")
+            raise UserError(
+                f"start: is empty, so nothing is to be estimated; give each parameter a start: start.{name}=1"
+            )
+        if self.reading in self._arithmetic.names:
+            raise UserError(f"reading={self.reading}: stands in the expression too; what is measured cannot explain it")
+        lengths = {name: len(column) for name, column in self.columns.items()}
+        if len(set(lengths.values())) > 1:
+            raise UserError(f"columns: have different lengths: {lengths}")
+        for name in self.own:
+            if name not in self.start:
+                raise UserError(f"own: {name} is not a parameter; these are {', '.join(self.start)}")
+
+    @cached_property
+    def _arithmetic(self) -> Arithmetic:
+        return read(self.expression, "expression")
+
+    @cached_property
+    def _names(self) -> tuple[str, ...]:
+        """The parameters, in order of appearance."""
+        return tuple(name for name in self._arithmetic.names if name in self.start)
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return tuple(Parameter(name, size=abs(float(self.start[name])) or 1.0) for name in self._names)
+
+    @cached_property
+    def nominal(self) -> Array:
+        return np.sign([float(self.start[name]) for name in self._names])
+
+    @property
+    def reading_unit(self) -> str:  # type: ignore[override]
+        return self.unit
+
+    @property
+    def reading_name(self) -> str:
+        return self.reading
+
+    @property
+    def own_parameters(self) -> tuple[str, ...]:
+        return self.own
+
+    @cached_property
+    def inputs(self) -> tuple[Input, ...]:
+        return tuple(Input(name) for name in self._arithmetic.names if name not in self.start)
+
+    @property
+    def input_columns(self) -> Mapping[str, Sequence[Any]]:
+        return {i.heading: self._column(i.heading).tolist() for i in self.inputs}
+
+    @property
+    def input_columns_known(self) -> bool:
+        return bool(self.columns) or self.readings is not None
+
+    def absent_input(self, heading: str, columns: Sequence[str]) -> str:
+        return (
+            f"there are {', '.join(columns)}. If {heading} is a parameter, give it a start: "
+            f"measurement.start.{heading}=VALUE"
+        )
+
+    def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Formula:
+        return replace(self, columns=dict(columns), readings=readings)
+
+    def _column(self, name: str) -> Array:
+        if name not in self.columns:
+            raise UserError(
+                f"measurement.expression: {name} is neither a column nor a parameter; give a parameter its start, "
+                f"measurement.start.{name}=VALUE, or the column, by readings=FILE or measurement.columns.{name}=[...]"
+            )
+        return np.asarray(self.columns[name], dtype=float)
+
+    @cached_property
+    def m(self) -> int:
+        if self.readings is not None:
+            return self.readings
+        return len(self._column(self.inputs[0].heading)) if self.inputs else 0
+
+    @property
+    def index(self) -> Mapping[str, Sequence[Any]]:
+        return {"row": list(range(1, self.m + 1)), **self.input_columns}
+
+    @cached_property
+    def _recorded(self) -> tuple[Expression, tuple[Expression, ...]]:
+        """The formula and its derivative by each parameter, as recorded expressions."""
+        graph = Graph()
+        known = {name: graph.input(name) for name in self._arithmetic.names}
+        try:
+            with np.errstate(all="raise", under="ignore"):
+                value, one = graph.apply("add", self._arithmetic(known), 0.0), graph.constant(1.0)
+                return value, tuple(tangent([value], {known[name]: one})[0] for name in self._names)
+        except (ArithmeticError, ValueError, TypeError) as error:
+            raise UserError(
+                f"measurement.expression: a part that is made of numbers alone has no real value ({error})"
+            ) from None
+
+    def _values(self, x: Array) -> dict[str, Array]:
+        p = (x * self.sizes)[:, :, None]
+        return {name: p[:, i] for i, name in enumerate(self._names)} | {
+            i.heading: self._column(i.heading)[None] for i in self.inputs
+        }
+
+    def simulate(self, x: Array) -> Array:
+        value, _ = self._recorded
+        with np.errstate(all="ignore"):
+            z = carry_out([value], self._values(x))[0]
+        return np.array(np.broadcast_to(z, (len(x), self.m)))
+
+    def jacobian(self, x: Array) -> Array:
+        _, slopes = self._recorded
+        with np.errstate(all="ignore"):
+            columns = carry_out(slopes, self._values(x))
+        J = np.empty((len(x), self.m, self.n))
+        for i, column in enumerate(columns):
+            J[:, :, i] = column * self.sizes[i]
+        return J
+
+
+def carry_out(outputs: Sequence[Expression], values: Mapping[str, Array]) -> list[Array]:
+    """The values of recorded expressions, entry by entry, where `values` gives the arrays of their inputs.
+
+    What no later operation needs is let go of: a formula on a million rows keeps few arrays.
+    """
+    order = _in_order(outputs)
+    users = Counter(a.order for e in order for a in e.operands if isinstance(a, Expression))
+    users.update(e.order for e in outputs)
+    found: dict[int, Any] = {}
+    for e in order:
+        operands = [a for a in e.operands if isinstance(a, Expression)]
+        found[e.order] = _operation(e, operands, [found[a.order] for a in operands], values)
+        for a in operands:
+            users[a.order] -= 1
+            if not users[a.order]:
+                del found[a.order]
+    return [found[e.order] for e in outputs]
+
+
+def _operation(
+    e: Expression, operands: Sequence[Expression], arrays: Sequence[Any], values: Mapping[str, Array]
+) -> Any:
+    if e.operation == "input":
+        return values[e.operands[0]]
+    if e.operation == "constant":
+        return e.value
+    if e.operation == "mul" and operands[1].operation == "log" and operands[0].operation == "pow":
+        power, logarithm = operands
+        if power.operands[0] is logarithm.operands[0]:
+            # d(a^b)/db = a^b log(a), which is 0 where a = 0 and b > 0, and not 0 times infinity.
+            return np.where(arrays[0] == 0.0, 0.0, arrays[0] * arrays[1])
+    return (_UFUNCS.get(e.operation) or getattr(np, e.operation))(*arrays)
+
+
+def _in_order(outputs: Sequence[Expression]) -> list[Expression]:
+    """Every expression that the outputs need, operands before their users."""
+    needed: dict[int, Expression] = {}
+    waiting = list(outputs)
+    while waiting:
+        e = waiting.pop()
+        if e.order not in needed:
+            needed[e.order] = e
+            waiting += [a for a in e.operands if isinstance(a, Expression)]
+    return [needed[order] for order in sorted(needed)]

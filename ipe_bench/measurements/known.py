@@ -1,0 +1,340 @@
+"""What is known of parameters before anything is measured: values, starts, bounds, and how far off they may be.
+
+A model in which that is so is the model in other coordinates: fixed parameters are gone, and bounded ones run over all
+numbers, so that no estimator and no draw can leave the bounds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.linalg import Array
+from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, UsualNoise
+
+_NEAR = 1e-2
+"""An estimate nearer to a bound than this share of the start's distance may be on its way there."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of one parameter; all in its own unit."""
+
+    name: str
+    fixed: float | None = None
+    """Its value, where it is not to be estimated."""
+    nominal: float | None = None
+    """Where estimation starts and the prior is centred, in place of the model's own value."""
+    deviation: float | None = None
+    """Standard deviation of the prior at error scale 1, in place of the parameter's size."""
+    lower: float | None = None
+    upper: float | None = None
+    positive: bool = False
+    """The same as lower=0: the prior is then log-normal."""
+
+    def __post_init__(self) -> None:
+        for key in ("fixed", "nominal", "deviation", "lower", "upper"):
+            value = getattr(self, key)
+            if value is not None and not np.isfinite(value):
+                raise UserError(f"{key}={value}: give a finite number, or leave it out")
+        if self.deviation is not None and self.deviation <= 0:
+            raise UserError(f"deviation={self.deviation}: give a number above 0; fixed=VALUE fixes a parameter")
+        if self.positive and self.lower is not None:
+            raise UserError(f"lower={self.lower}: is given with positive=true, which is lower=0; leave one of them out")
+        bounds = self.bounds
+        if not bounds[0] < bounds[1]:
+            raise UserError(f"upper={self.upper}: give a number above lower={bounds[0]:g}")
+        others = [k for k in ("nominal", "deviation", "lower", "upper") if getattr(self, k) is not None]
+        if self.fixed is not None and (others or self.positive):
+            raise UserError(f"fixed={self.fixed}: a fixed parameter has no {(others or ['bounds'])[0]}; leave one out")
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        lower = 0.0 if self.positive else -np.inf if self.lower is None else self.lower
+        return lower, np.inf if self.upper is None else self.upper
+
+
+def informed(model: Measurement, known: Sequence[Known]) -> Measurement:
+    """The model in which so much is known of its parameters.
+
+    Raises:
+        UserError: of a parameter that the model does not have, or a start outside of its bounds.
+    """
+    return Informed(model, tuple(known)) if known else model
+
+
+@dataclass(frozen=True)
+class Informed(Measurement):
+    """A model of which some parameters are fixed, bounded or start elsewhere.
+
+    x counts the parameters that are left. A bounded one is ln((v - lower) / (v0 - lower)), or
+    ln((upper - v0) / (upper - v)), or the difference of the logits of v and its start v0, and is named accordingly; its
+    size is such that one unit of x moves v by as much at v0 as before.
+    """
+
+    whole: Measurement
+    known: tuple[Known, ...]
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return self.whole.name
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        names = [p.name for p in self.whole.parameters]
+        for one in self.known:
+            if one.name not in names:
+                raise UserError(f"parameters.{one.name}: {unknown(one.name, names, 'parameter')}")
+        for name, v0, (lower, upper) in zip(names, self._v0, self._bounds, strict=True):
+            if not lower < v0 < upper:
+                raise UserError(
+                    f"parameters.{name}: its start, {v0:g}, is not inside of its bounds; give parameters.{name}.nominal"
+                )
+        if not len(self._free):
+            raise UserError("parameters: all are fixed; leave at least one to be estimated")
+
+    @cached_property
+    def _known(self) -> tuple[Known, ...]:
+        """One for each of the whole model's parameters."""
+        given = {one.name: one for one in self.known}
+        return tuple(given.get(p.name, Known(p.name)) for p in self.whole.parameters)
+
+    @cached_property
+    def _free(self) -> NDArray[np.intp]:
+        return np.flatnonzero([one.fixed is None for one in self._known])
+
+    @cached_property
+    def _bounds(self) -> tuple[tuple[float, float], ...]:
+        return tuple(one.bounds for one in self._known)
+
+    @cached_property
+    def _v0(self) -> Array:
+        """Starts and fixed values of all parameters, in their units."""
+        starts = self.whole.nominal * self.whole.sizes
+        given = [one.fixed if one.fixed is not None else one.nominal for one in self._known]
+        return np.array([s if g is None else g for s, g in zip(starts, given, strict=True)], dtype=float)
+
+    @cached_property
+    def _transformed(self) -> tuple[_Transformation, ...]:
+        """Of the parameters that are left."""
+        whole = zip(self._v0, self._bounds, self.whole.sizes, strict=True)
+        each = [_Transformation(float(v0), *bounds, float(size)) for v0, bounds, size in whole]
+        return tuple(each[i] for i in self._free)
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return tuple(
+            p if t.plain else Parameter(f"{t.prefix}_{p.name}", size=t.inner_size, group=p.group or p.name)
+            for p, t in zip(self.natural_parameters, self._transformed, strict=True)
+        )
+
+    @cached_property
+    def natural_parameters(self) -> tuple[Parameter, ...]:
+        return tuple(self.whole.parameters[i] for i in self._free)
+
+    @cached_property
+    def prior_deviations(self) -> tuple[float, ...]:
+        """Standard deviations (n,) of x at error scale 1, as far as is known; 1 where nothing is."""
+        given = [self._known[i].deviation for i in self._free]
+        sizes = self.whole.sizes[self._free]
+        return tuple(1.0 if d is None else float(d / size) for d, size in zip(given, sizes, strict=True))
+
+    @property
+    def fixed(self) -> dict[str, float]:
+        return {one.name: one.fixed for one in self._known if one.fixed is not None}
+
+    @cached_property
+    def nominal(self) -> Array:
+        return np.array([t.inner(t.v0) for t in self._transformed])
+
+    def natural(self, x: Array) -> Array:
+        return np.stack([t.value(x[:, k]) for k, t in enumerate(self._transformed)], axis=1)
+
+    def natural_slope(self, x: Array) -> Array:
+        return np.stack([t.slope(x[:, k]) for k, t in enumerate(self._transformed)], axis=1)
+
+    def near_bounds(self, x: Array) -> dict[int, float]:
+        found = {}
+        for k, (t, v) in enumerate(zip(self._transformed, self.natural(x[None])[0], strict=True)):
+            for bound in (t.lower, t.upper):
+                if abs(v - bound) <= _NEAR * abs(t.v0 - bound) < np.inf:
+                    found[k] = bound
+        return found
+
+    def holding(self, values: Mapping[int, float]) -> Measurement:
+        return self._with(Known(self.natural_parameters[k].name, fixed=value) for k, value in values.items())
+
+    def released(self, values: Mapping[int, float]) -> Measurement:
+        return self._with(Known(self.natural_parameters[k].name, nominal=value) for k, value in values.items())
+
+    def _with(self, known: Iterable[Known]) -> Informed:
+        """The model in which that is known, in place of what was known of the same parameters."""
+        given = {one.name: one for one in (*self.known, *known)}
+        return replace(self, known=tuple(given.values()))
+
+    def inner(self, values: Array) -> Array:
+        """x (trials, n) of values (trials, n) in the parameters' own units."""
+        return np.stack([t.inner(values[:, k]) for k, t in enumerate(self._transformed)], axis=1)
+
+    def _whole_x(self, x: Array) -> Array:
+        """x of the whole model; what comes behind the parameters, a truth's nuisances, stays there."""
+        n, sizes = self.n, self.whole.sizes
+        whole = np.repeat((self._v0 / sizes)[None], len(x), axis=0).astype(x.dtype)
+        for k, (i, t) in enumerate(zip(self._free, self._transformed, strict=True)):
+            whole[:, i] = x[:, k] if t.plain else t.value(x[:, k]) / sizes[i]
+        return whole if x.shape[1] == n else np.concatenate([whole, x[:, n:]], axis=1)
+
+    def _slopes(self, x: Array) -> Array:
+        """The derivative (trials, 1, n) of the whole model's x by x."""
+        slopes = [
+            np.ones(len(x)) if t.plain else t.slope(x[:, k]) / self.whole.sizes[i]
+            for k, (i, t) in enumerate(zip(self._free, self._transformed, strict=True))
+        ]
+        return np.stack(slopes, axis=1)[:, None]
+
+    def simulate(self, x: Array) -> Array:
+        return self.whole.simulate(self._whole_x(x))
+
+    def jacobian(self, x: Array) -> Array:
+        return self.whole.jacobian(self._whole_x(x))[:, :, self._free] * self._slopes(x)
+
+    def simulate_until(self, x: Array, stop: int) -> Array:
+        return self.whole.simulate_until(self._whole_x(x), stop)
+
+    def jacobian_until(self, x: Array, stop: int) -> Array:
+        return self.whole.jacobian_until(self._whole_x(x), stop)[:, :, self._free] * self._slopes(x)
+
+    def linearization(self) -> Array:
+        if np.array_equal(self._v0, self.whole.nominal * self.whole.sizes):
+            return self.whole.linearization()[:, self._free] * self._slopes(self.nominal[None])[0]
+        return self.jacobian(self.nominal[None])[0]
+
+    @property
+    def index(self) -> Mapping[str, Sequence[Any]]:
+        return self.whole.index
+
+    @property
+    def epochs(self) -> tuple[NDArray[np.intp], ...] | None:
+        return self.whole.epochs
+
+    @property
+    def offset(self) -> Array:
+        return self.whole.offset
+
+    @cached_property
+    def m(self) -> int:
+        return self.whole.m
+
+    @property
+    def reading_unit(self) -> str:  # type: ignore[override]
+        return self.whole.reading_unit
+
+    @property
+    def reading_name(self) -> str:
+        return self.whole.reading_name
+
+    @property
+    def usual_noise(self) -> UsualNoise | None:
+        return self.whole.usual_noise
+
+    @property
+    def nuisance_deviation(self) -> Array:
+        return self.whole.nuisance_deviation
+
+    @property
+    def own_parameters(self) -> Sequence[str]:
+        return self.whole.own_parameters
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        return self.whole.inputs
+
+    @property
+    def input_columns(self) -> Mapping[str, Sequence[Any]]:
+        return self.whole.input_columns
+
+    @property
+    def input_columns_known(self) -> bool:
+        return self.whole.input_columns_known
+
+    def absent_input(self, heading: str, columns: Sequence[str]) -> str:
+        return self.whole.absent_input(heading, columns)
+
+    def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
+        return replace(self, whole=self.whole.with_inputs(columns, readings))
+
+    @property
+    def recorded(self) -> Recorded | None:
+        """The whole model's readings; its answer only where nothing of it is fixed otherwise."""
+        found = self.whole.recorded
+        if found is None:
+            return None
+        with np.errstate(all="ignore"):
+            x = self.inner((found.x * self.whole.sizes)[None, self._free])[0]
+        return Recorded(found.z, found.R, x)
+
+
+@dataclass(frozen=True)
+class _Transformation:
+    """From a multiple x of `inner_size` to a value inside of its bounds."""
+
+    v0: float
+    lower: float
+    upper: float
+    size: float
+
+    @property
+    def plain(self) -> bool:
+        return self.lower == -np.inf and self.upper == np.inf
+
+    @property
+    def prefix(self) -> str:
+        return "logit" if self.lower > -np.inf and self.upper < np.inf else "ln"
+
+    @property
+    def inner_size(self) -> float:
+        """What one unit of x is, of the logarithm or logit."""
+        return self.size / self._slope_at(self.v0)
+
+    def _slope_at(self, v: Any) -> Any:
+        """The derivative of the value by its logarithm or logit."""
+        if self.upper == np.inf:
+            return v - self.lower
+        if self.lower == -np.inf:
+            return self.upper - v
+        return (v - self.lower) * (self.upper - v) / (self.upper - self.lower)
+
+    def _coordinate(self, v: Any) -> Any:
+        if self.upper == np.inf:
+            return np.log(v - self.lower)
+        if self.lower == -np.inf:
+            return -np.log(self.upper - v)
+        return np.log((v - self.lower) / (self.upper - v))
+
+    def value(self, x: Any) -> Any:
+        if self.plain:
+            return x * self.size
+        u = self._coordinate(self.v0) + x * self.inner_size
+        with np.errstate(over="ignore"):
+            if self.upper == np.inf:
+                return self.lower + np.exp(u)
+            if self.lower == -np.inf:
+                return self.upper - np.exp(-u)
+            return self.lower + (self.upper - self.lower) / (1.0 + np.exp(-u))
+
+    def slope(self, x: Any) -> Any:
+        """dv/dx."""
+        if self.plain:
+            return np.full(np.shape(x), self.size)
+        return self._slope_at(self.value(x)) * self.inner_size
+
+    def inner(self, v: Any) -> Any:
+        if self.plain:
+            return v / self.size
+        return (self._coordinate(v) - self._coordinate(self.v0)) / self.inner_size

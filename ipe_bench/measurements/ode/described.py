@@ -1,0 +1,223 @@
+"""Differential equations that are described in a config, in the language of formulas: no plugin and no Python."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Positive
+from ipe_bench.measurements.arithmetic import Arithmetic, read
+from ipe_bench.measurements.base import Input, Measurement, Parameter
+from ipe_bench.measurements.ode import sampling
+from ipe_bench.measurements.ode.model import OdeMeasurement
+
+_SHARE = 1e-8
+"""Of the largest reading, what the integration may leave unless told otherwise."""
+_TRIAL_STEPS = 16
+"""Steps within the shortest interval that tell how large readings are."""
+
+
+@dataclass(frozen=True)
+class Ode(Measurement):
+    """Readings of the solution of differential equations, each a formula of the states, the parameters and t.
+
+        states prey and predators with
+        rates    prey: a*prey - b*prey*predators     predators: d*prey*predators - c*predators
+        initial  prey: 34     predators: y0
+        outputs  prey: prey
+        start    a: 0.5  b: 0.03  c: 0.8  d: 0.02  y0: 6
+
+    A parameter is a name with a start; it has no unit but that which the formulas give it, and its size is the
+    magnitude of its start. `initial` may hold parameters, but neither states nor t; a state that is absent there starts
+    at 0.
+    A readings file has the columns time, reading, and with several outputs `output`.
+    """
+
+    rates: Mapping[str, str]
+    """The time derivative of every state."""
+    start: Mapping[str, float] = field(default_factory=dict)
+    """Where estimation begins, for each parameter: the nominal point."""
+    initial: Mapping[str, str | float] = field(default_factory=dict)
+    """The states at t = 0."""
+    outputs: Mapping[str, str] = field(default_factory=dict)
+    """What is read at each time; none: every state."""
+    times: tuple[float, ...] = ()
+    """When it is read; a readings file brings its own."""
+    tolerance: Positive | None = None
+    """The error that the integration may leave in a reading; None: 1e-8 of the largest reading at the start."""
+    step: Positive | None = None
+    """A longest integration step for all, in place of the tolerance."""
+    unit: str = ""
+    """Of the readings."""
+    time_unit: str = ""
+    own: tuple[str, ...] = ()
+    """Parameters of which every file of readings has its own, where there are several."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.rates:
+            raise UserError("rates: is empty; give each state its rate, such as rates.y=-k*y")
+        for name in self.initial:
+            if name not in self.rates:
+                raise UserError(f"initial.{name}: there is no such state; these have rates: {', '.join(self.rates)}")
+        for name, value in self.start.items():
+            if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+                raise UserError(f"start.{name}={value}: give a finite number")
+            if name in self.rates or name == "t":
+                raise UserError(f"start.{name}: is a state or the time, and not a parameter; rename one of them")
+        known = {**dict.fromkeys(self.start), **dict.fromkeys(self.rates), "t": None}
+        for part, formulas, allowed in (
+            ("rates", self._rates, known),
+            ("initial", self._initial, dict.fromkeys(self.start)),
+            ("outputs", self._outputs, known),
+        ):
+            for name, formula in formulas.items():
+                for used in formula.names:
+                    if used not in allowed:
+                        remedy = f"if it is a parameter, give it a start: start.{used}=1"
+                        raise UserError(f"{part}.{name}: {used} is not known there; {remedy}")
+        used = {name for part in (self._rates, self._initial, self._outputs) for f in part.values() for name in f.names}
+        for name in self.start:
+            if name not in used:
+                raise UserError(f"start.{name}: appears in no formula")
+        if not self.start:
+            raise UserError("start: is empty, so nothing is to be estimated; give each parameter a start")
+        if any(time < 0 for time in self.times) or any(b <= a for a, b in itertools.pairwise(self.times)):
+            raise UserError(f"times={list(self.times)}: give ascending numbers from 0 on")
+        for name in self.own:
+            if name not in self.start:
+                raise UserError(f"own: {name} is not a parameter; these are {', '.join(self.start)}")
+
+    @cached_property
+    def _rates(self) -> dict[str, Arithmetic]:
+        return {name: read(str(text), f"rates.{name}") for name, text in self.rates.items()}
+
+    @cached_property
+    def _initial(self) -> dict[str, Arithmetic]:
+        return {name: read(str(self.initial.get(name, 0.0)), f"initial.{name}") for name in self.rates}
+
+    @cached_property
+    def _outputs(self) -> dict[str, Arithmetic]:
+        shown = self.outputs or {name: name for name in self.rates}
+        return {name: read(str(text), f"outputs.{name}") for name, text in shown.items()}
+
+    @cached_property
+    def engine(self) -> OdeMeasurement:
+        """The equations as the integrator takes them."""
+        if not self.times:
+            raise UserError("measurement.times: is empty; give the times of the readings, or readings=FILE")
+        return _Engine(self)
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return tuple(Parameter(name, size=abs(float(value)) or 1.0) for name, value in self.start.items())
+
+    @cached_property
+    def nominal(self) -> Array:
+        return np.sign([float(value) for value in self.start.values()])
+
+    @property
+    def reading_unit(self) -> str:  # type: ignore[override]
+        return self.unit
+
+    @property
+    def own_parameters(self) -> tuple[str, ...]:
+        return self.own
+
+    @property
+    def index(self) -> Mapping[str, Sequence[Any]]:
+        return self.engine.index
+
+    @property
+    def epochs(self) -> tuple[NDArray[np.intp], ...] | None:
+        return self.engine.epochs
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        return sampling.inputs(self.time_unit, tuple(self._outputs), 1)
+
+    @property
+    def input_columns_known(self) -> bool:
+        return bool(self.times)
+
+    def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
+        del readings
+        return sampling.sampled(columns, tuple(self._outputs), 1, lambda times: replace(self, times=times))
+
+    def simulate(self, x: Array) -> Array:
+        return self.engine.simulate(x)
+
+    def jacobian(self, x: Array) -> Array:
+        return self.engine.jacobian(x)
+
+    def simulate_until(self, x: Array, stop: int) -> Array:
+        return self.engine.simulate_until(x, stop)
+
+    def jacobian_until(self, x: Array, stop: int) -> Array:
+        return self.engine.jacobian_until(x, stop)
+
+
+@dataclass(frozen=True)
+class _Engine(OdeMeasurement):
+    """The model that `Ode` describes, for the integrator."""
+
+    described: Ode
+
+    @property
+    def states(self) -> int:  # type: ignore[override]
+        return len(self.described.rates)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:  # type: ignore[override]
+        return tuple(self.described._outputs)
+
+    @property
+    def time_unit(self) -> str:  # type: ignore[override]
+        return self.described.time_unit
+
+    @property
+    def step(self) -> float | None:  # type: ignore[override]
+        return self.described.step
+
+    @cached_property
+    def tolerance(self) -> float:  # type: ignore[override]
+        if self.described.tolerance is not None:
+            return self.described.tolerance
+        intervals = np.diff(self.times, prepend=0.0)
+        trial = replace(self.described, step=float(intervals[intervals > 0].min()) / _TRIAL_STEPS)
+        largest = float(np.abs(trial.engine.simulate(self.nominal[None])).max())
+        return _SHARE * largest if 0 < largest < np.inf else _SHARE
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return self.described.parameters
+
+    @property
+    def nominal(self) -> Array:
+        return self.described.nominal
+
+    @cached_property
+    def times(self) -> Array:
+        return np.asarray(self.described.times)
+
+    def _known(self, p: Sequence[Any]) -> dict[str, Any]:
+        return dict(zip(self.described.start, p, strict=True))
+
+    def start(self, p, c):
+        return [formula(self._known(p)) for formula in self.described._initial.values()]
+
+    def rhs(self, t, y, p, c):
+        values = {**self._known(p), **dict(zip(self.described.rates, y, strict=True)), "t": t}
+        return [formula(values) for formula in self.described._rates.values()]
+
+    def read(self, t, y, p, c):
+        values = {**self._known(p), **dict(zip(self.described.rates, y, strict=True)), "t": t}
+        return [formula(values) for formula in self.described._outputs.values()]

@@ -1,0 +1,83 @@
+"""The noise that a measurement model names as its own, and noise of which nobody knows the level."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.options import Positive
+from ipe_bench.measurements.base import Measurement
+from ipe_bench.noise.base import Noise
+from ipe_bench.noise.gaussian import Gaussian
+from ipe_bench.noise.quantization import Quantization
+
+
+@dataclass(frozen=True)
+class Unknown(Noise):
+    """Independent errors whose level is estimated from the residuals, so for `estimate` alone.
+
+    Estimates do not depend on the level; standard errors are scaled by it, and tests of the level itself are not
+    possible. `weights` are standard deviations of the readings up to a common factor; None: they are equal.
+    """
+
+    weights: tuple[Positive, ...] | None = None
+
+    estimated = True
+
+    def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
+        raise UserError("noise=unknown: has no level to simulate with; choose another noise, or use `estimate`")
+
+    def covariance(self, m: int) -> Covariance:
+        if self.weights is None:
+            return Covariance(np.ones(m))
+        return Gaussian(self.weights).covariance(m)
+
+
+@dataclass(frozen=True)
+class ModelNoise(Noise):
+    """Stands for the noise that the measurement model names, with its deviation or step replaced where given.
+
+    A scenario never holds it: it holds what `of` makes of it.
+    """
+
+    deviation: Positive | tuple[Positive, ...] | None = None
+    """Standard deviation of the readings in their unit, or one for each."""
+    step: Positive | None = None
+    """The step of a read-out that is rounded."""
+
+    def of(self, model: Measurement) -> Noise | None:
+        """The noise meant for this model; None where neither the model nor an option says what it is."""
+        usual = model.usual_noise
+        step = self.step if self.step is not None else usual.step if usual is not None else None
+        if isinstance(self.deviation, tuple):
+            return Gaussian(self.deviation)
+        if step is not None:
+            return Quantization(step, self.deviation)
+        deviation = self.deviation if self.deviation is not None else usual.deviation if usual is not None else None
+        return None if deviation is None else Gaussian(deviation)
+
+    def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
+        raise TypeError("ModelNoise stands for another noise: see `of`")
+
+    def covariance(self, m: int) -> Covariance:
+        raise TypeError("ModelNoise stands for another noise: see `of`")
+
+
+def resolved(noise: Noise, model: Measurement) -> Noise:
+    """The noise itself, or what it stands for with this model.
+
+    Raises:
+        UserError: the model names no noise and none is given.
+    """
+    if not isinstance(noise, ModelNoise):
+        return noise
+    own = noise.of(model)
+    if own is None:
+        raise UserError(
+            f"noise: is not given, and measurement={model.name} names no noise of its own; set noise.deviation=X, the "
+            "standard deviation of a reading, or choose a noise"
+        )
+    return own

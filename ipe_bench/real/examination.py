@@ -1,0 +1,304 @@
+"""What can be signed of an answer beyond its standard errors: intervals that follow the bends of the model, what the
+readings say least of, which of them carry the answer, and whether another answer fits as well.
+
+One least-squares minimum is examined, whichever estimator found it. Profiles have a page of their own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.stats import chi2
+from scipy.stats import f as fisher
+
+from ipe_bench.basics.linalg import Array, Covariance, deviations
+from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.least_squares import Minima, Objective, minimize
+from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
+from ipe_bench.measurements.base import Measurement
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.real.fits import Fit, holding, present_part
+from ipe_bench.real.profiles import Profile, half_width, profiles
+
+CONFIDENCE = 0.95
+BOOTSTRAPS = 500
+STARTS = 64
+"""Points that the search for other minima begins from,"""
+_SPREADS = (1.0, 3.0)
+"""drawn from the prior, half of them at so many times its deviations."""
+_WORK = 20_000_000
+"""Entries of Jacobians that one iteration of all draws or starts may come to: of very many readings there are fewer,"""
+_FEWEST = 4
+"""but so many at least."""
+_ENTRIES = 4_000_000
+"""of which so many are in memory at a time."""
+_TOLERANCE = 1e-8
+_MOST_STEPS = 200
+_SAME = 1e-2
+"""Minima closer than this, in standard errors of either, are one."""
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """A minimum of the sum of squares."""
+
+    x: Array
+    """(n,) in the parameters' own units."""
+    chi_square: float
+    found: int
+    """From how many of the starts."""
+    as_good: bool
+    """Whether the readings do not tell it from the least one: their joint confidence region holds it."""
+
+
+@dataclass(frozen=True)
+class Direction:
+    """The combination of parameters that the readings say least of."""
+
+    weights: Array
+    """(n,): by how many of its own units each parameter changes along it; the readings hardly change."""
+    collinearity: float
+    """How many times larger the errors are than if the parameters acted on the readings each in its own way: the
+    collinearity index of Brun, Reichert and Künsch, Water Resources Research 37, 2001; above 10 to 15 the readings do
+    not tell the parameters apart."""
+
+
+@dataclass(frozen=True)
+class Influence:
+    """What single readings do to the answer; all (m,), NaN where a reading is missing."""
+
+    leverage: Array
+    """The share of a reading's error that the fit follows, from 0 to 1."""
+    cook: Array
+    """Cook's distance (Technometrics 19, 1977): how far the answer moves without the reading, in its own region."""
+    shift: Array
+    """By how many standard errors the parameter that moves most moves without the reading."""
+
+
+@dataclass(frozen=True)
+class Bootstrap:
+    """Answers to simulated readings of the model as estimated."""
+
+    low: Array
+    high: Array
+    """Percentile intervals (n,) in the parameters' own units."""
+    bias: Array
+    """Mean of the answers less the estimate (n,)."""
+    converged: int
+    drawn: int
+
+
+@dataclass(frozen=True)
+class Examination:
+    """An answer with all that is known of it."""
+
+    label: str
+    """The estimator whose answer it is."""
+    model: Measurement
+    x: Array
+    """The least-squares estimate (n,) in the parameters' own units,"""
+    standard_errors: Array
+    wald: tuple[Array, Array]
+    """intervals from them,"""
+    profiles: list[Profile]
+    """and those of the profiles."""
+    bootstrap: Bootstrap
+    direction: Direction
+    influence: Influence
+    fitted: Array
+    """h (m,) at the estimate, where readings are missing too,"""
+    fitted_errors: Array
+    """and its standard errors: the band of the prediction is `half_width` times this;"""
+    new_errors: Array
+    """that of a further reading, with its noise; NaN where that is not known."""
+    half_width: float
+    minima: list[Minimum]
+    """All that were found, the least first."""
+    least: bool
+    """Whether the estimate is the least minimum that was found."""
+
+    @property
+    def ambiguous(self) -> list[Minimum]:
+        """Other minima that fit as well."""
+        apart = _SAME * self.standard_errors
+        return [one for one in self.minima if one.as_good and (np.abs(one.x - self.x) > apart).any()]
+
+
+def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BOOTSTRAPS) -> Examination | None:
+    """Examines the least of the minima that the estimators found; None where none of them is one, as with a prior."""
+    found = [one for one in fits if one.status is Status.CONVERGED and np.isfinite(one.chi_square)]
+    told = [one for one in found if not one.with_prior]
+    if not told:
+        return None
+    best = min(told, key=_sum_of_squares)
+    rows = np.flatnonzero(np.isfinite(z))
+    if best.held is not None:
+        # What is on its bound has no error; the others are examined with it held there.
+        problem, best = holding(problem, best.held_at), best.held
+    least = _Least.near(present_part(problem, rows, best.level), z[rows], best)
+    return None if least is None else least.examined(best.label, problem, rows, bootstraps)
+
+
+def _sum_of_squares(one: Fit) -> float:
+    return one.chi_square * (1.0 if one.level is None else one.level**2)
+
+
+@dataclass(frozen=True)
+class _Least:
+    """A least-squares minimum x (n,) of present readings z (m,), R being known or as estimated."""
+
+    problem: Problem
+    z: Array
+    x: Array
+    P: Array
+    chi_square: float
+    freedom: int | None
+    """Degrees of freedom that the level of the noise is estimated from; None where it is known."""
+
+    @classmethod
+    def near(cls, problem: Problem, z: Array, best: Fit) -> _Least | None:
+        minima = _minimise(problem, z[None], best.inner[None])
+        if not minima.converged[0] or not (np.diag(minima.covariance[0]) > 0).all():
+            return None
+        free = len(z) - problem.measurement.n
+        if best.level is not None:
+            # The minimum's own level, where the estimator's was a little higher.
+            factor = float(np.sqrt(minima.chi_square[0] / free))
+            problem = replace(problem, R=Covariance(problem.R.factor * factor))
+            minima = replace(minima, covariance=minima.covariance * factor**2, chi_square=minima.chi_square / factor**2)
+        level = None if best.level is None else free
+        return cls(problem, z, minima.x[0], minima.covariance[0], float(minima.chi_square[0]), level)
+
+    @property
+    def model(self) -> Measurement:
+        return self.problem.measurement
+
+    @cached_property
+    def J(self) -> Array:
+        """The whitened Jacobian (m, n)."""
+        return self.problem.R.whiten_jacobian(self.model.jacobian(self.x[None]))[0]
+
+    def examined(self, label: str, whole: Problem, rows: Array, bootstraps: int) -> Examination:
+        """`whole`: the problem with the readings that are missing, of which the present ones are `rows`."""
+        model, x, m = self.model, self.x[None], whole.R.m
+        q = half_width(CONFIDENCE, self.freedom)
+        deviation = np.sqrt(np.diag(self.P))
+        ends = np.sort(model.natural(np.stack([self.x - q * deviation, self.x + q * deviation])), axis=0)
+        h, raw = whole.measurement.simulate(x)[0], whole.measurement.jacobian(x)[0]
+        errors = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", raw, self.P, raw), 0.0))
+        deviations = _at(rows, self.problem.R.deviations, m)
+        if np.ptp(self.problem.R.deviations) == 0:
+            # Where all readings are as good, so is one that is missing; else nobody knows.
+            deviations[:] = self.problem.R.deviations[0]
+        minima = self.minima()
+        return Examination(
+            label,
+            model,
+            model.natural(x)[0],
+            deviation * np.abs(model.natural_slope(x)[0]),
+            (ends[0], ends[1]),
+            profiles(self.problem, self.z, self.x, self.P, confidence=CONFIDENCE, freedom=self.freedom),
+            self.bootstrap(bootstraps),
+            self.direction(),
+            self.influence(rows, m),
+            h,
+            errors,
+            np.hypot(errors, deviations),
+            q,
+            minima,
+            self.chi_square <= minima[0].chi_square + 1e-6 * max(1.0, self.chi_square),
+        )
+
+    def direction(self) -> Direction:
+        size = np.linalg.norm(self.J, axis=0)
+        _, s, V = np.linalg.svd(self.J / size, full_matrices=False)
+        weights = V[-1] / size * self.model.natural_slope(self.x[None])[0]
+        leading = np.argmax(np.abs(V[-1]))
+        return Direction(weights * np.sign(weights[leading]), float(1.0 / s[-1]))
+
+    def influence(self, rows: Array, m: int) -> Influence:
+        """By the linear model about the estimate (Cook and Weisberg, Residuals and Influence in Regression, 1982)."""
+        n = len(self.x)
+        Q, _ = np.linalg.qr(self.J)
+        w = self.problem.R.whiten(self.z - self.model.simulate(self.x[None])[0])
+        leverage = np.sum(Q**2, axis=1)
+        with np.errstate(all="ignore"):
+            left = np.where(leverage < 1 - 1e-9, 1 - leverage, np.nan)
+            cook = w**2 * leverage / (n * left**2)
+            moved = self.P @ self.J.T * (w / left)
+        shift = np.abs(moved / np.sqrt(np.diag(self.P))[:, None]).max(axis=0)
+        return Influence(*(_at(rows, values, m) for values in (leverage, cook, shift)))
+
+    def bootstrap(self, draws: int) -> Bootstrap:
+        """Estimates from readings simulated at the estimate, started there, with noise of R; the draws are always the
+        same ones (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 6.5)."""
+        rng = np.random.Generator(np.random.Philox(0))
+        draws = _affordable(draws, self.J.size)
+        factor = self.problem.R.factor
+        e = rng.standard_normal((draws, len(self.z)))
+        h = self.model.simulate(self.x[None])[0]
+        z = h + (e * factor if factor.ndim == 1 else e @ factor.T)
+        minima = _minimise(self.problem, z, np.repeat(self.x[None], draws, axis=0))
+        values = self.model.natural(minima.x[minima.converged])
+        tail = (1 - CONFIDENCE) / 2
+        n, estimate = len(self.x), self.model.natural(self.x[None])[0]
+        if len(values) < draws / 2:
+            unknown = np.full(n, np.nan)
+            return Bootstrap(unknown, unknown, unknown, len(values), draws)
+        low, high = np.quantile(values, [tail, 1 - tail], axis=0)
+        return Bootstrap(low, high, values.mean(axis=0) - estimate, len(values), draws)
+
+    def minima(self) -> list[Minimum]:
+        """Minima reached from starts that the prior draws about the nominal point, and the estimate."""
+        n, problem = len(self.x), self.problem
+        rng = np.random.Generator(np.random.Philox(1))
+        spread = np.ones(n) if problem.prior_deviation is None else problem.prior_deviation
+        reach = np.repeat(_SPREADS, _affordable(STARTS, self.J.size) // len(_SPREADS))[:, None]
+        starts = np.concatenate([self.x[None], problem.x0 + reach * spread * rng.standard_normal((len(reach), n))])
+        minima = _minimise(problem, np.repeat(self.z[None], len(starts), axis=0), starts)
+        return self._told_apart(minima)
+
+    def _told_apart(self, minima: Minima) -> list[Minimum]:
+        limit = float(chi2.ppf(CONFIDENCE, len(self.x)))
+        if self.freedom is not None:
+            limit = float(len(self.x) * fisher.ppf(CONFIDENCE, len(self.x), self.freedom))
+        usable = minima.converged & np.isfinite(minima.chi_square) & np.isfinite(minima.covariance).all(axis=(1, 2))
+        order = np.flatnonzero(usable)[np.argsort(minima.chi_square[usable], kind="stable")]
+        found: list[Minimum] = []
+        places: list[tuple[Array, Array]] = []
+        for i in order:
+            x, deviation = minima.x[i], deviations(minima.covariance[i])
+            near = [k for k, (y, d) in enumerate(places) if (np.abs(x - y) <= _SAME * np.maximum(d, deviation)).all()]
+            if near:
+                found[near[0]] = replace(found[near[0]], found=found[near[0]].found + 1)
+                continue
+            chi_square = float(minima.chi_square[i])
+            least = found[0].chi_square if found else chi_square
+            places.append((x, deviation))
+            found.append(Minimum(self.model.natural(x[None])[0], chi_square, 1, chi_square - least <= limit))
+        return found or [Minimum(self.model.natural(self.x[None])[0], self.chi_square, 1, True)]
+
+
+def _affordable(wanted: int, entries: int) -> int:
+    """How many minimisations to make of a Jacobian with so many entries."""
+    return min(wanted, max(_FEWEST, _WORK // entries))
+
+
+def _minimise(problem: Problem, z: Array, x: Array) -> Minima:
+    at_once = max(1, _ENTRIES // (z.shape[1] * x.shape[1]))
+    if len(x) > at_once:
+        parts = [_minimise(problem, z[k : k + at_once], x[k : k + at_once]) for k in range(0, len(x), at_once)]
+        names = [f.name for f in fields(Minima) if f.name != "history"]
+        joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        return Minima(**joined, history=None)
+    with np.errstate(all="ignore"):
+        objective = Objective.of(problem, z, prior=False)
+        return minimize(objective, LevenbergMarquardtMethod(1e-3), x, tolerance=_TOLERANCE, max_iterations=_MOST_STEPS)
+
+
+def _at(rows: Array, values: Array, m: int) -> Array:
+    whole = np.full(m, np.nan)
+    whole[rows] = values
+    return whole

@@ -1,0 +1,181 @@
+"""What `compare` found: a table for the terminal, a CSV file, and a figure of all changes with their intervals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ipe_bench.basics.files import make_folder, write_text
+from ipe_bench.report.figures import common
+from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.style import BOUND_COLOR, house_style
+from ipe_bench.report.words import compact, duration, p_value, percent, plain
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from rich.console import Group
+
+_HEADINGS = ("", "first", "second", "change", "95 %", "p", "e", "second is")
+_NAMES = {"success": "success", "error": "error", "cost": "cost", "time": "time"}
+_NOT_SETTINGS = (
+    *("first", "second", "trials", "matched_by", "quantity", "first_value", "second_value"),
+    *("change", "low", "high", "p", "e", "finding"),
+)
+_COLORS = {"better": "#009E73", "worse": "#D55E00", "": BOUND_COLOR}
+MOST_ROWS = 40
+"""Comparisons that the figure shows; the CSV file has all."""
+_PANELS = (
+    ("success", "success: share gained"),
+    ("error", "capped error: ratio"),
+    ("cost", "cost in simulations: ratio"),
+)
+
+
+def render(frame: pd.DataFrame, alpha: float) -> Group:
+    """One table per comparison, within 80 columns."""
+    from rich import box
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
+    parts: list[Any] = []
+    for title, rows in _comparisons(frame):
+        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for heading in _HEADINGS:
+            shown = heading if heading != "95 %" else _level(alpha)
+            table.add_column(shown, justify="left" if heading in ("", "second is") else "right", no_wrap=True)
+        for row in rows:
+            table.add_row(*map(Text, _cells(row)))
+        parts += [Text(title, style="bold"), table]
+    return Group(*parts, Text(_note(frame), style="dim"))
+
+
+def _level(alpha: float) -> str:
+    return f"{100 * (1 - alpha):g} %"
+
+
+def _comparisons(frame: pd.DataFrame) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """Each comparison with its title, in order."""
+    settings = [c for c in frame.columns if c not in _NOT_SETTINGS]
+    listed: list[Any] = frame.to_dict("records")
+    for _, part in groupby(listed, key=lambda row: tuple(plain(row[c]) for c in (*settings, "first", "second"))):
+        rows = list(part)
+        first = rows[0]
+        named = [
+            str(first[c]) if c in ("measurement", "noise") else f"{c.replace('_', ' ')} {plain(first[c])}"
+            for c in settings
+            if first[c] is not None and first[c] == first[c]
+        ]
+        who = first["first"] if first["first"] == first["second"] else f"{first['first']}, then {first['second']}"
+        how = "trials" if first["matched_by"] == "trial" else "trials of other seeds, matched in their order"
+        yield f"{', '.join(named)}: {who}; {first['trials']} {how}", rows
+
+
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    quantity = row["quantity"]
+    show = {"success": percent, "time": lambda v: duration(v, 2)}.get(quantity, compact)
+    values = show(row["first_value"]), show(row["second_value"])
+    finding = row["finding"] or ("-" if quantity != "time" else "")
+    if quantity == "success":
+        change, ends = f"{100 * row['change']:+.1f} %", f"{100 * row['low']:+.1f} to {100 * row['high']:+.1f}"
+    else:
+        change, ends = _ratio(row["change"]), f"{_ratio(row['low'])} to {_ratio(row['high'])}"
+    if not math.isfinite(row["low"]):
+        ends = "-"
+    p = p_value(row["p"]) if math.isfinite(row["p"]) else ""
+    return _NAMES[quantity], *values, change, ends, p, _evidence(row["e"]), finding
+
+
+def _ratio(value: float) -> str:
+    return f"{value:.3f}" if 0.1 <= value < 9.9995 else compact(value)
+
+
+def _evidence(e: float) -> str:
+    return "" if not math.isfinite(e) else f"{e:.2g}" if e < 1e4 else f"{e:.0e}".replace("e+0", "e").replace("e+", "e")
+
+
+def _note(frame: pd.DataFrame) -> str:
+    unmatched = (frame["matched_by"] == "order").any()
+    return (
+        "error: mean Mahalanobis error, each trial's at most the radius of the gate of success. cost: simulations."
+        " p: McNemar's exact test, random signs for ratios; Holm over all rows. e: evidence that may be looked at as"
+        " often as one likes, 20 being as rare as p = 0.05. Intervals are each row's own. time: not tested."
+        + (" Without common trials nothing is gained from pairing: the intervals are wider." if unmatched else "")
+    )
+
+
+def write(frame: pd.DataFrame, output: Path, alpha: float) -> tuple[Path, ...]:
+    """Writes comparison.csv, and comparison as PNG and PDF."""
+    make_folder(output)
+    table = output / "comparison.csv"
+    write_text(table, frame.to_csv(index=False))
+    with house_style():
+        return (table, *draw(frame, alpha).save(output))
+
+
+def draw(frame: pd.DataFrame, alpha: float) -> Drawing:
+    """A line per comparison, a panel per quantity: the change and its interval, coloured where it is sure."""
+    from matplotlib.lines import Line2D
+
+    found = list(_comparisons(frame))[:MOST_ROWS]
+    labels = [_row_label(rows[0], frame) for _, rows in found]
+    longest = max(len(label) for label in labels)
+    fig = common.figure(7.4 + min(0.065 * longest, 3.2), 1.3 + 0.28 * len(found))
+    axes = list(fig.subplots(1, len(_PANELS), sharey=True))
+    for (quantity, title), ax in zip(_PANELS, axes, strict=True):
+        rows = [next(row for row in part if row["quantity"] == quantity) for _, part in found]
+        _panel(ax, rows, quantity)
+        ax.set_title(title)
+    axes[0].set_yticks(range(len(labels)), [common.text(label) for label in labels])
+    axes[0].set_ylim(len(labels) - 0.4, -0.6)
+    handles = [
+        Line2D([], [], color=color, marker="o", markersize=5, label=f"second is {name}" if name else "not sure")
+        for name, color in _COLORS.items()
+    ]
+    fig.legend(handles=handles, loc="outside lower center", ncols=3)
+    caption = f"The second less, or over, the first, with intervals of {_level(alpha)}; coloured where sure."
+    return Drawing("comparison", "Comparison", caption, fig)
+
+
+def _panel(ax: Any, rows: Sequence[dict[str, Any]], quantity: str) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    none = 0.0 if quantity == "success" else 1.0
+    for i, row in enumerate(rows):
+        color = _COLORS[row["finding"]]
+        if math.isfinite(row["low"]):
+            ax.plot([row["low"], row["high"]], [i, i], color=color, linewidth=1.6, solid_capstyle="butt")
+        if math.isfinite(row["change"]):
+            ax.plot([row["change"]], [i], color=color, marker="o", markersize=5, linestyle="")
+    ax.axvline(none, color=BOUND_COLOR, linewidth=0.8, zorder=0)
+    ends = np.array([[row["low"], row["high"], row["change"], none] for row in rows], dtype=float)
+    ends = ends[np.isfinite(ends)]
+    if quantity == "success":
+        reach = max(0.01, 1.1 * float(np.abs(ends).max()))
+        ax.set_xlim(-reach, reach)
+        ax.xaxis.set_major_locator(MaxNLocator(5, symmetric=True))
+        ax.xaxis.set_major_formatter(lambda v, _: f"{100 * v:+.3g} %".replace("-", "\N{MINUS SIGN}") if v else "0")
+        return
+    reach = max(1.05, float(np.maximum(ends[ends > 0], 1 / ends[ends > 0]).max()) ** 1.1)
+    ax.set_xscale("log")
+    ax.set_xlim(1 / reach, reach)
+    if reach >= 2:
+        common.log_ticks(ax.xaxis, 1 / reach, reach)
+    else:
+        step = float(f"{(reach - 1) / 1.5:.0e}")
+        ax.set_xticks([1 - step, 1, 1 + step], [f"{1 - step:g}", "1", f"{1 + step:g}"])
+        ax.set_xticks([], minor=True)
+
+
+def _row_label(row: dict[str, Any], frame: pd.DataFrame) -> str:
+    """What tells this comparison from the others."""
+    settings = [c for c in frame.columns if c not in _NOT_SETTINGS]
+    varying = [c for c in settings if len(set(frame[c].astype(str))) > 1] or ["error_scale"]
+    who = row["first"] if row["first"] == row["second"] else f"{row['first']}, {row['second']}"
+    named = [f"{c.replace('_', ' ')} {plain(row[c])}" for c in varying if c in row]
+    return ", ".join([who, *named])

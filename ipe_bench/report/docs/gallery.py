@@ -1,0 +1,74 @@
+"""The gallery: every experiment as it was executed for this page: command, table, pictures, config."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.files import write_text
+from ipe_bench.plugins import discovery
+from ipe_bench.report.figures.gallery import INDEX
+
+FIGURES = 3
+"""Pictures of an experiment that its page shows."""
+_STYLE = re.compile(r"\x1b\[[0-9;]*m")
+
+
+def write_gallery(folder: Path, results: Path, trials: int, names: Sequence[str] | None) -> None:
+    """A page for each experiment, and one that lists them."""
+    options = [o for o in discovery.options("experiment") if o.source.name == "ipe-bench"]
+    chosen = [o for o in options if names is None or o.name in names]
+    for option in chosen:
+        write_text(folder / f"{option.name}.md", _page(option, folder, results / option.name, trials))
+    lines = ["# Gallery", "", f"Every experiment, with {trials} trials where it does not fix their number.", ""]
+    for option in chosen:
+        lines += [f"- [{option.name}]({option.name}.md): {option.summary}"]
+    lines += ["", "```{toctree}", ":hidden:", *(option.name for option in chosen), "```"]
+    write_text(folder / "index.md", "\n".join(lines))
+
+
+def _page(option: discovery.Option, folder: Path, results: Path, trials: int) -> str:
+    number = [] if (option.config or {}).get("trials") == 1 else [f"trials={trials}"]
+    command = ["run", f"+experiment={option.name}", *number]
+    printed = _executed([*command, f"output={results.resolve()}"], option.name)
+    lines = [f"# {option.name}", "", option.summary, "", "```console", f"$ ipe-bench {shlex.join(command)}", "```", ""]
+    lines += ["```text", printed, "```", ""]
+    for picture, caption in _pictures(results / "figures"):
+        shutil.copyfile(picture, _made(folder / "pictures") / f"{option.name}_{picture.name}")
+        lines += [f"![{picture.stem.replace('_', ' ')}](pictures/{option.name}_{picture.name})", "", f"*{caption}*", ""]
+    return "\n".join([*lines, "## Its config", "", "```yaml", option.text.rstrip(), "```", ""])
+
+
+def _executed(command: Sequence[str], name: str) -> str:
+    """What a command printed, without the paths at its end.
+
+    Raises:
+        UserError: it failed.
+    """
+    program = [sys.executable, "-m", "ipe_bench", *command]
+    environment = os.environ | {"COLUMNS": "80", "NO_COLOR": "1"}
+    done = subprocess.run(program, capture_output=True, text=True, env=environment, check=False)
+    if done.returncode != 0:
+        raise UserError(f"experiment={name}: ended with exit code {done.returncode}: {done.stderr[-2000:]}")
+    text = _STYLE.sub("", done.stdout)
+    return "\n".join(line.rstrip() for line in text.partition("\nSummary ")[0].strip().splitlines())
+
+
+def _pictures(folder: Path) -> list[tuple[Path, str]]:
+    """The first pictures of a report, each with what it shows."""
+    index = json.loads((folder / INDEX).read_text(encoding="utf-8"))
+    drawn = [entry for entries in index["drawn"].values() for entry in entries]
+    return [(folder / f"{entry['name']}.png", entry["caption"]) for entry in drawn[:FIGURES]]
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder

@@ -1,0 +1,157 @@
+"""Two columns of numbers of the same trials: ratios of means with intervals, and evidence that may be looked at daily.
+
+Numbers in, numbers out: what they are numbers of, and which trials belong together, is left to `statistics.between`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.special import betaln, ndtri
+
+from ipe_bench.basics.linalg import Array
+from ipe_bench.statistics.comparisons import ALPHA, mcnemar
+
+FLIPS = 4999
+"""Random assignments of signs."""
+LARGEST_SAMPLE = 1000
+"""Of more trials, groups of consecutive ones share a sign: as good, since trials are independent."""
+_STEPS = 50
+_BETS = np.concatenate([-(2.0 ** -np.arange(9)), 2.0 ** -np.arange(9)]) * 0.99
+"""Shares of the stake, on either side."""
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What the second has over the first, with its interval, the p of no effect, and the evidence against none."""
+
+    first: float
+    second: float
+    change: float
+    """A ratio or a difference, as the function that made it says."""
+    low: float
+    high: float
+    p: float
+    e: float
+    """An e-value: by chance it exceeds 1/alpha, at whatever number of trials one looks, in a share alpha of cases."""
+
+
+def success_effect(first: Array, second: Array, alpha: float = ALPHA) -> Effect:
+    """Difference of two shares of the same trials (trials,), second less first.
+
+    The p is McNemar's exact one: given their number, the trials in which one alone succeeds are fair coin tosses. The
+    interval is Tango's (Stat. Med. 17, 1998), of the score; it is widened to hold 0 where the exact test does not
+    reject.
+    """
+    only_first, only_second = int((first & ~second).sum()), int((second & ~first).sum())
+    trials, p = len(first), mcnemar(only_first, only_second)
+    low, high = _tango(only_first, only_second, trials, alpha), -_tango(only_second, only_first, trials, alpha)
+    if p >= alpha:
+        low, high = min(low, 0.0), max(high, 0.0)
+    change = (only_second - only_first) / trials
+    evidence = fair_coin(only_first, only_second)
+    return Effect(float(first.mean()), float(second.mean()), change, low, high, p, evidence)
+
+
+def _tango(losses: int, gains: int, trials: int, alpha: float) -> float:
+    """The least difference of shares at which the score, with the likeliest shares of that difference, is not beyond
+    the normal quantile; by bisection."""
+    quantile = -float(ndtri(alpha / 2))
+
+    def beyond(difference: float) -> bool:
+        b = losses + gains + difference * (gains - losses - 2 * trials)
+        root = max(b * b + 8 * trials * losses * difference * (1 - difference), 0.0)
+        lost = (b + np.sqrt(root)) / (4 * trials)
+        variance = trials * max(2 * lost + difference * (1 - difference), 0.0)
+        return gains - losses - trials * difference > quantile * np.sqrt(variance)
+
+    low, high = -1.0, (gains - losses) / trials
+    for _ in range(_STEPS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if beyond(middle) else (low, middle)
+    return high
+
+
+def ratio_effect(first: Array, second: Array, alpha: float = ALPHA, evidence: float = np.nan) -> Effect:
+    """Ratio of the means of two columns (trials,) of finite numbers that are not negative, second over first.
+
+    Where neither is larger by nature, each trial's difference is as likely to have the other sign: the p is the share
+    of random signs whose sum is as far from 0 (Fisher, The Design of Experiments, 1935, sec. 21), the interval holds
+    the ratios r that the same test does not reject for second less r times first.
+    """
+    a, b = _grouped(first), _grouped(second)
+    signs = _signs(len(a))
+    flipped_a, flipped_b = signs @ a, signs @ b
+    total_a, total_b = float(a.sum()), float(b.sum())
+    value = total_b / total_a if total_a > 0 else np.nan
+
+    def p(ratio: float) -> float:
+        return _extreme(b - ratio * a, flipped_b - ratio * flipped_a, total_b + ratio * total_a)
+
+    def p_inverse(ratio: float) -> float:
+        return _extreme(a - ratio * b, flipped_a - ratio * flipped_b, total_a + ratio * total_b)
+
+    if not total_a > 0 or not total_b > 0:
+        low = high = np.nan
+    else:
+        low, high = _end(p, value, alpha), 1 / _end(p_inverse, 1 / value, alpha)
+    return Effect(float(first.mean()), float(second.mean()), value, low, high, p(1.0), evidence)
+
+
+def _grouped(values: Array) -> Array:
+    if len(values) <= LARGEST_SAMPLE:
+        return values.astype(float)
+    return np.add.reduceat(
+        values.astype(float), np.linspace(0, len(values), LARGEST_SAMPLE, endpoint=False).astype(int)
+    )
+
+
+@lru_cache(maxsize=2)
+def _signs(size: int) -> Array:
+    """(FLIPS, size) of 1 and -1, the same whoever asks."""
+    rng = np.random.Generator(np.random.Philox(size))
+    return rng.integers(0, 2, (FLIPS, size)) * 2.0 - 1
+
+
+def _extreme(d: Array, flipped: Array, size: float) -> float:
+    """The share of sums with random signs at least as far from 0 as the sum of d, that one among them; where it is
+    alone, Hoeffding's bound of the same share (J. Amer. Statist. Assoc. 58, 1963). `size` is what round-off is of."""
+    total = abs(float(d.sum()))
+    count = int((np.abs(flipped) >= total - 1e-12 * size).sum())
+    least = 1 / (FLIPS + 1)
+    return (1 + count) * least if count else min(least, 2 * float(np.exp(-(total**2) / (2 * float(d @ d)))))
+
+
+def _end(p: Callable[[float], float], value: float, alpha: float) -> float:
+    """The least ratio below the value that is not rejected, by bisection."""
+    if p(0.0) >= alpha:
+        return 0.0
+    low, high = 0.0, value
+    for _ in range(_STEPS):
+        middle = (low + high) / 2
+        low, high = (low, middle) if p(middle) >= alpha else (middle, high)
+    return high
+
+
+def fair_coin(heads: int, tails: int) -> float:
+    """Evidence against a fair coin: the likelihood under a coin drawn from Beta(1/2, 1/2) over that of a fair one.
+
+    A martingale in the tosses, so it may be looked at after each of them (Robbins, Ann. Math. Statist. 41, 1970).
+    """
+    return _exp(betaln(heads + 0.5, tails + 0.5) - betaln(0.5, 0.5) + (heads + tails) * np.log(2))
+
+
+def no_drift(differences: Array, largest: float) -> float:
+    """Evidence against a mean of 0 of differences (trials,) that are never beyond `largest`: the mean fortune of those
+    who bet a fixed share on either sign (Waudby-Smith and Ramdas, J. R. Stat. Soc. B 86, 2024)."""
+    fortunes = np.log1p(_BETS[:, None] * (differences / largest)[None, :]).sum(axis=1)
+    top = float(fortunes.max())
+    return _exp(top + float(np.log(np.mean(np.exp(fortunes - top)))))
+
+
+def _exp(value: float) -> float:
+    """Never beyond what a number holds: evidence that large is written as the largest."""
+    return float(np.exp(min(value, 690.0)))

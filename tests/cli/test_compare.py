@@ -1,0 +1,222 @@
+"""`compare` finds what is there, nothing where there is nothing, and says which trials it compared."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from synthetic_store import Pretender, Synthetic
+
+import ipe_bench as ib
+from ipe_bench.cli.main import main
+from ipe_bench.report.comparison import draw
+
+ERROR = 0.1
+"""The bound's deviation in the synthetic stores."""
+
+
+def store(folder, *, seed=0, factor=1.0, trials=200, label="it", draws=0, estimator=None, fails=0, **scenario):
+    """A folder in which one estimator errs by `factor` times the bound, and fails in the first `fails` trials."""
+    filled = Synthetic(folder)
+    error = factor * ERROR * np.random.default_rng(draws).standard_normal((trials, 3))
+    error[:fails] = 1e3
+    given = {"success": np.arange(trials) >= fails} if fails else {}
+    filled.add(filled.scenario(seed=seed, **scenario), label, error, estimator=estimator, **given)
+    filled.record(trials)
+    return folder
+
+
+def findings(frame: pd.DataFrame) -> dict[str, str]:
+    return frame.set_index("quantity")["finding"].to_dict()
+
+
+def test_the_same_trials_are_compared_one_by_one(tmp_path):
+    """Errors half as large in every trial: a ratio of exactly 2, however much the trials differ among themselves."""
+    a, b = store(tmp_path / "a", factor=0.5), store(tmp_path / "b", factor=1.0)
+    rows = ib.compare(a, b).set_index("quantity")
+    assert rows.loc["error", "change"] == pytest.approx(2.0)
+    assert rows.loc["error", "low"] == pytest.approx(2.0, abs=1e-6)
+    assert rows.loc["error", "high"] == pytest.approx(2.0, abs=1e-6)
+    assert (rows["matched_by"] == "trial").all()
+    assert findings(ib.compare(a, b)) == {"success": "", "error": "worse", "cost": "", "time": ""}
+    assert findings(ib.compare(b, a))["error"] == "better"
+
+
+def test_trials_are_matched_by_their_numbers(tmp_path):
+    """The second folder lacks the first hundred trials: the others are compared with their own."""
+    a = store(tmp_path / "a", trials=300)
+    filled = Synthetic(tmp_path / "b")
+    error = ERROR * np.random.default_rng(0).standard_normal((300, 3))
+    filled.add(filled.scenario(), "it", 1.2 * error[100:], start=100)
+    row = ib.compare(a, tmp_path / "b").set_index("quantity").loc["error"]
+    assert row["trials"] == 200
+    assert row["high"] == pytest.approx(1.2, abs=1e-6)
+
+
+def test_other_seeds_are_matched_in_their_order_and_it_is_said(tmp_path, capsys):
+    a, b = store(tmp_path / "a"), store(tmp_path / "b", seed=1, draws=1, trials=150)
+    frame = ib.compare(a, b)
+    assert (frame["matched_by"] == "order").all()
+    assert (frame["trials"] == 150).all()
+    assert main(["compare", str(a), str(b)]) == 0
+    assert "150 trials of other seeds, matched in their order" in " ".join(capsys.readouterr().out.split())
+
+
+def test_failures_are_found_worse_and_the_exit_code_says_so(tmp_path, capsys):
+    a, b = store(tmp_path / "a"), store(tmp_path / "b", fails=15)
+    assert main(["compare", str(a), str(b)]) == 1
+    out = capsys.readouterr().out
+    assert "worse: it in success" in out
+    assert max(len(line) for line in out.splitlines() if "│" in line or "%" in line) <= 120
+    assert main(["compare", str(b), str(a)]) == 0
+    row = ib.compare(a, b).set_index("quantity").loc["success"]
+    assert row["change"] == pytest.approx(-15 / 200)
+    assert row["p"] == pytest.approx(3 * 2 * 0.5**15)  # McNemar's p, corrected for three questions
+
+
+def test_what_may_be_worse_is_for_the_user_to_say(tmp_path):
+    a = store(tmp_path / "a")
+    filled = Synthetic(tmp_path / "b")
+    error = ERROR * np.random.default_rng(0).standard_normal((200, 3))
+    filled.add(filled.scenario(), "it", error, simulations=9.0)
+    assert main(["compare", str(a), str(tmp_path / "b")]) == 0
+    assert main(["compare", str(a), str(tmp_path / "b"), "fail_on=success,error,cost"]) == 1
+
+
+def test_what_is_missing_in_the_second_is_not_passed_over(tmp_path, capsys):
+    a, b = store(tmp_path / "a"), store(tmp_path / "b")
+    Synthetic(b)
+    filled = Synthetic(b)
+    filled.add(filled.scenario(), "it", np.zeros((1, 3)), start=900)
+    filled.record(1000, "later")
+    assert main(["compare", str(a), str(b)]) == 1
+    assert "missing" in capsys.readouterr().err
+
+
+def test_two_estimators_of_one_folder(tmp_path):
+    folder = store(tmp_path / "a", label="good", factor=0.5)
+    store(folder, label="bad", factor=0.6)
+    assert findings(ib.compare(folder, first="good", second="bad"))["error"] == "worse"
+    assert findings(ib.compare(folder, first="bad", second="good"))["error"] == "better"
+
+
+def test_scenarios_that_differ_in_one_setting_are_compared_and_it_is_said(tmp_path):
+    a, b = store(tmp_path / "a", sigma=0.2), store(tmp_path / "b", sigma=0.4, factor=2.0)
+    frame = ib.compare(a, b)
+    assert frame["noise.deviation"].iloc[0] == "0.2 | 0.4"
+    # The errors double and so does the bound that they are measured by; only the synthetic rows know another one.
+    assert frame.set_index("quantity").loc["error", "change"] == pytest.approx(1.0, rel=1e-6)
+
+
+def test_scenarios_of_one_folder_alone_are_left_out_and_it_is_said(tmp_path):
+    a, b = store(tmp_path / "a"), store(tmp_path / "b")
+    store(a, error_scale=7.0)
+    frame = ib.compare(a, b)
+    assert frame["error_scale"].tolist() == [1.0] * 4
+    assert "1 scenarios that the other lacks are left out" in frame.attrs["notes"][0]
+
+
+def test_two_versions_of_the_source_are_compared(tmp_path):
+    """The same estimator with another option under the same label: what a changed solver looks like."""
+    a = store(tmp_path / "a", factor=0.5, estimator=Pretender(1))
+    b = store(tmp_path / "b", factor=0.6, estimator=Pretender(2))
+    assert findings(ib.compare(a, b))["error"] == "worse"
+
+
+def test_judging_by_evidence(tmp_path):
+    """Three questions at 5 %: evidence of 60 is needed."""
+    a, b = store(tmp_path / "a"), store(tmp_path / "b", fails=9)
+    row = ib.compare(a, b, anytime=True).set_index("quantity").loc["success"]
+    assert 9 < row["e"] < 120
+    assert row["finding"] == ("worse" if row["e"] >= 60 else "")
+    sure = ib.compare(a, store(tmp_path / "c", fails=20), anytime=True).set_index("quantity").loc["success"]
+    assert sure["e"] >= 60
+    assert sure["finding"] == "worse"
+
+
+@pytest.mark.parametrize(
+    ("words", "remedy"),
+    [
+        ([], "name one or two folders"),
+        (["{a}", "{b}", "{a}"], "name one or two folders"),
+        (["{a}"], "name another"),
+        (["{a}", "nowhere"], "holds no results"),
+        (["{a}", "{b}", "alpha=2"], "between 0 and 1"),
+        (["{a}", "{b}", "alpha=x"], "between 0 and 1"),
+        (["{a}", "{b}", "alfa=0.1"], "did you mean alpha"),
+        (["{a}", "{b}", "alpha="], "give it a value"),
+        (["{a}", "{b}", "first=it", "first=it"], "stands there twice"),
+        (["{a}", "{b}", "anytime=1"], "true or false"),
+        (["{a}", "{b}", "fail_on=time"], "there is no such quantity"),
+        (["{a}", "{b}", "first=nobody"], "there is no such estimator"),
+        (["{a}", "{other}"], "no estimator is in both"),
+        (["{a}", "{model}"], "no scenario in common"),
+        (["{a}", "{empty}"], "holds no trials"),
+        (["{a}", "{b}", "--force"], "there is no such flag"),
+    ],
+)
+def test_mistakes_are_one_line_and_exit_code_2(tmp_path, capsys, words, remedy):
+    places = {"a": store(tmp_path / "a"), "b": store(tmp_path / "b")}
+    places["other"] = store(tmp_path / "other", label="them")
+    places["model"] = store(tmp_path / "model", repeats=9, error_scale=3.0)
+    store(places["model"], repeats=9, error_scale=4.0)
+    store(places["a"], error_scale=2.0)
+    places["empty"] = tmp_path / "empty"
+    (places["empty"] / "trials").mkdir(parents=True)
+    assert main(["compare", *(word.format(**places) for word in words)]) == 2
+    error = capsys.readouterr().err
+    assert remedy in error
+    assert len(error.strip().splitlines()) == 1
+
+
+def test_the_table_fits_80_columns_and_files_are_written(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    a, b = store(tmp_path / "a"), store(tmp_path / "b", fails=15, factor=1.7)
+    assert main(["compare", str(a), str(b), f"output={tmp_path / 'out'}"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    table = lines[next(i for i, line in enumerate(lines) if "second is" in line) :][:6]
+    assert max(len(line.rstrip()) for line in table) <= 80
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"comparison.csv", "comparison.png", "comparison.pdf"}
+    written = pd.read_csv(tmp_path / "out" / "comparison.csv")
+    assert written["quantity"].tolist() == ["success", "error", "cost", "time"]
+
+
+def test_the_figure_shows_each_interval_at_its_place(tmp_path):
+    frame = ib.compare(store(tmp_path / "a"), store(tmp_path / "b", fails=15))
+    axes = draw(frame, 0.05).figure.axes
+    for quantity, ax in zip(("success", "error"), axes, strict=False):
+        row = frame.set_index("quantity").loc[quantity]
+        assert list(np.asarray(ax.lines[0].get_xdata())) == pytest.approx([row["low"], row["high"]])
+
+
+@pytest.mark.slow
+def test_newton_is_better_than_fixed_point_at_scale_100_and_costs_more(tmp_path):
+    bench = ib.Scenario(ib.measurements.Gins(), ib.noise.Quantization(), error_scale=100.0)
+    ib.run(bench, {"fixed_point": ib.solvers.FixedPoint(), "newton": ib.solvers.Newton()}, 600, output=tmp_path)
+    frame = ib.compare(tmp_path, first="fixed_point", second="newton")
+    assert findings(frame) == {"success": "better", "error": "better", "cost": "worse", "time": ""}
+    assert not frame.attrs["worse"]
+    assert ib.compare(tmp_path, first="newton", second="fixed_point").attrs["worse"]
+
+
+@pytest.mark.campaign
+def test_equal_folders_of_other_seeds_are_found_different_as_rarely_as_stated(tmp_path):
+    """500 pairs of folders with shares of failure of 1 in 10 and random costs: at most 5 % findings, up to 3
+    deviations, of any quantity; by evidence fewer."""
+    rng = np.random.default_rng(0)
+    alarms = {False: 0, True: 0}
+    for number in range(500):
+        folders = []
+        for seed in (0, 1):
+            filled = Synthetic(tmp_path / f"{number}-{seed}")
+            error = ERROR * rng.standard_normal((100, 3))
+            failed = rng.uniform(size=100) < 0.1
+            error[failed] = 1e3
+            filled.add(filled.scenario(seed=seed), "it", error, simulations=rng.integers(4, 9, 100).astype(float))
+            folders.append(filled.directory)
+        for anytime in alarms:
+            alarms[anytime] += any(findings(ib.compare(*folders, anytime=anytime)).values())
+    print(f"false alarms in 500: {alarms[False]} by p, {alarms[True]} by e")
+    assert alarms[False] / 500 < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 500)
+    assert alarms[False] / 500 > 0.01
+    assert alarms[True] <= alarms[False]

@@ -1,0 +1,165 @@
+"""A formula without a plugin: its language, its derivatives, and NIST's problems as a user types them."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ipe_bench.baselines import LeastSquares
+from ipe_bench.basics.errors import UserError
+from ipe_bench.measurements import Formula, Nist
+from ipe_bench.measurements.arithmetic import read
+from ipe_bench.measurements.base import differentiate
+from ipe_bench.measurements.nist import datasets, digits
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.noise import Unknown
+from ipe_bench.real.fits import fit
+from ipe_bench.real.sources import open_readings
+
+_POLYNOMIALS = "(b1+b2*x+b3*x**2+b4*x**3)/(1+b5*x+b6*x**2+b7*x**3)"
+_GAUSS = "b1*exp(-b2*x) + b3*exp(-(x-b4)**2/b5**2) + b6*exp(-(x-b7)**2/b8**2)"
+_LANCZOS = "b1*exp(-b2*x) + b3*exp(-b4*x) + b5*exp(-b6*x)"
+_CHWIRUT = "exp(-b1*x)/(b2+b3*x)"
+_ENSO = (
+    "b1 + b2*cos(2*pi*x/12) + b3*sin(2*pi*x/12) + b5*cos(2*pi*x/b4) + b6*sin(2*pi*x/b4) + b8*cos(2*pi*x/b7)"
+    " + b9*sin(2*pi*x/b7)"
+)
+NIST = {
+    "Misra1a": "b1*(1-exp(-b2*x))",
+    "Chwirut2": _CHWIRUT,
+    "Chwirut1": _CHWIRUT,
+    "Lanczos3": _LANCZOS,
+    "Gauss1": _GAUSS,
+    "Gauss2": _GAUSS,
+    "DanWood": "b1*x**b2",
+    "Misra1b": "b1*(1-(1+b2*x/2)**(-2))",
+    "Kirby2": "(b1 + b2*x + b3*x**2)/(1 + b4*x + b5*x**2)",
+    "Hahn1": _POLYNOMIALS,
+    "Nelson": "b1 - b2*time*exp(-b3*temperature)",
+    "MGH17": "b1 + b2*exp(-x*b4) + b3*exp(-x*b5)",
+    "Lanczos1": _LANCZOS,
+    "Lanczos2": _LANCZOS,
+    "Gauss3": _GAUSS,
+    "Misra1c": "b1*(1-(1+2*b2*x)**(-.5))",
+    "Misra1d": "b1*b2*x*((1+b2*x)**(-1))",
+    "Roszman1": "b1 - b2*x - arctan(b3/(x-b4))/pi",
+    "ENSO": _ENSO,
+    "MGH09": "b1*(x**2+x*b2)/(x**2+x*b3+b4)",
+    "Thurber": _POLYNOMIALS,
+    "BoxBOD": "b1*(1-exp(-b2*x))",
+    "Rat42": "b1/(1+exp(b2-b3*x))",
+    "MGH10": "b1*exp(b2/(x+b3))",
+    "Eckerle4": "(b1/b2)*exp(-0.5*((x-b3)/b2)**2)",
+    "Rat43": "b1/((1+exp(b2-b3*x))**(1/b4))",
+    "Bennett5": "b1*(b2+x)**(-1/b3)",
+}
+"""NIST's functions, as its files print them but for the names of functions."""
+
+
+def test_every_nist_function_is_written_out():
+    assert tuple(NIST) == datasets()
+
+
+@pytest.mark.parametrize("dataset", NIST)
+def test_nist_answers_come_from_the_formula_with_an_unknown_noise(dataset, tmp_path):
+    """Certified parameters and standard deviations to 6 digits, from a file with columns and the text of the formula,
+    from NIST's second start."""
+    nist = Nist(dataset, start=2)
+    names = ("time", "temperature") if dataset == "Nelson" else ("x",)
+    path = tmp_path / "readings.csv"
+    with path.open("w", newline="") as file:
+        rows = zip(*(c.tolist() for c in nist.predictors), nist.readings.tolist(), strict=True)
+        csv.writer(file).writerows([[*names, "y"], *rows])
+    start = {f"b{i + 1}": float(b) for i, b in enumerate(nist.start_values)}
+    found = open_readings(path, Formula(NIST[dataset], start))
+    order = [[p.name for p in found.model.parameters].index(name) for name in start]
+    estimators = {"lm": LeastSquares(method="lm", start="nominal", ftol=1e-15, xtol=1e-15, gtol=1e-15, max_nfev=5000)}
+    result = fit(Problem(found.model, Unknown().covariance(len(found.z))), found.z, estimators, level_unknown=True)[0]
+    assert digits(result.x[order], nist.certified.parameters) >= 6
+    if dataset == "Lanczos1":
+        # Generated without noise to 14 digits: the certified sum of squares, 1.4e-25, is of their rounding.
+        assert digits(result.standard_errors[order], nist.certified.deviations) >= 2
+        return
+    assert digits(result.standard_errors[order], nist.certified.deviations) >= 6
+    assert result.level == pytest.approx(nist.certified.residual_deviation, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("-2**2", -4.0),
+        ("2**-1", 0.5),
+        ("2**3**2", 512.0),
+        ("2^3", 8.0),
+        ("-a/b*c", -3.0),
+        ("a-b-c", -1.0),
+        ("--a", 2.0),
+        ("1.5e-3*2", 0.003),
+        (".5+5.", 5.5),
+        ("log10(1000)+ln(1)", 3.0),
+        ("4*atan(1)-pi", 0.0),
+        ("sqrt(a*b*4)-tanh(0)", 4.0),
+    ],
+)
+def test_the_language_is_that_of_algebra(text, value):
+    values = {"a": 2.0, "b": 2.0, "c": 3.0} if "a-b-c" not in text else {"a": 2.0, "b": 2.0, "c": 1.0}
+    assert float(read(text, "expression")(values)) == pytest.approx(value, abs=1e-12)
+
+
+REFUSED = [
+    "__import__('os')", "b1.real", "b1[0]", "b1 if t else 2", "lambda: 1", "b1; b2", "b1=2", "open(b1)", "eval(b1)",
+    "b1*(t",
+    "b1*t)", "2t", "b1 b2", "", "()", "b1**", "*b1", "1,5*t", "b1 and t", "'b1'", "b1@t", "b1//t*", "exp", "exp()",
+    "exp(b1,t)",
+    "b1%t", "{b1}", "b1\\n", "0x10", "1e", "1_000*b1", "b1!", "é*t", "sin t", "(" * 60 + "b1" + ")" * 60,
+    "-" * 60 + "b1",
+    "b1*" * 4000 + "t", "9**9**9*b1", "b1*log(0)", "b1/(1-1)", "b1*sqrt(-1)",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", REFUSED)
+def test_what_is_not_arithmetic_is_refused(text):
+    with pytest.raises(UserError):
+        Formula(text, {"b1": 1.0}, {"t": (1.0, 2.0)}).simulate(np.ones((1, 1)))
+
+
+def test_nothing_that_looks_like_a_formula_reaches_the_interpreter():
+    """Text of any kind is a formula or a user's mistake, and never any other exception."""
+
+    @settings(max_examples=1500, deadline=None)
+    @given(st.text(alphabet="abt12.e+-*/^() ,_'\"[]{}:=<>!%\\\nsincoexplg", max_size=40))
+    def check(text):
+        with contextlib.suppress(UserError):
+            read(text, "expression")
+
+    check()
+
+
+_EVERYTHING = (
+    "b1*sin(t*b2)+b2*cos(t)-tan(b1*t/9)+arctan(b2*t)+exp(-b1*t)/b2+log(b1+t)*sqrt(b2*t)+sinh(b1/t)-cosh(b2)*tanh(t*b1)"
+    "+t**b1+b2**t-(b1-5)**2+(-t)**3*b1"
+)
+
+
+def test_derivatives_are_exact_and_those_of_a_power_of_zero_are_zero():
+    model = Formula(_EVERYTHING, {"b1": 0.7, "b2": 1.3}, {"t": (0.3, 1.1, 2.4)})
+    x = np.array([[1.0, 1.0], [1.2, 0.7]])
+    differences = differentiate(model.simulate, x, analytic=False)
+    assert model.jacobian(x) == pytest.approx(differences, rel=1e-7, abs=1e-8)
+    power = Formula("a*t**b", {"a": 2.0, "b": 1.5}, {"t": (0.0, 4.0)})
+    assert power.jacobian(np.ones((1, 2)))[0, 0].tolist() == [0.0, 0.0]
+    assert power.jacobian(np.ones((1, 2)))[0, 1, 1] == pytest.approx(2.0 * 8.0 * math.log(4.0) * 1.5)
+
+
+def test_a_misspelt_column_is_named(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("t [s],y\n0,1\n1,2\n2,4\n")
+    with pytest.raises(UserError, match=r"column b2 is missing.*If b2 is a parameter.*measurement.start.b2=VALUE"):
+        open_readings(path, Formula("b1*exp(b2*t)", {"b1": 1.0}))
+    assert open_readings(path, Formula("b1*t", {"b1": 1.0})).z.tolist() == [1.0, 2.0, 4.0]

@@ -1,0 +1,285 @@
+"""Estimates from files as instruments give them, against SciPy's solution of the same problem."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from ipe_bench.baselines import GaussNewton, LevenbergMarquardt
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.statuses import Status
+from ipe_bench.measurements import Formula, Gins, Gnss, LotkaVolterra, Sir
+from ipe_bench.measurements.known import Informed, Known
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.noise import Gaussian, ModelNoise, Quantization, Unknown
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.real.fits import Fit, fit
+from ipe_bench.real.readings import write_readings
+from ipe_bench.real.sources import open_readings, open_together
+from ipe_bench.trials.scenario import Scenario
+
+SATURATION = "b1*(1-exp(-b2*t))"
+START = {"b1": 250.0, "b2": 5e-4}
+ESTIMATORS = {"lm": LevenbergMarquardt(tolerance=1e-10, max_iterations=300)}
+
+
+def write(path: Path, **columns: list[float]) -> Path:
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([list(columns), *zip(*columns.values(), strict=True)])
+    return path
+
+
+def simulated(path: Path, b1: float, seed: int, readings: int = 16) -> tuple[Path, np.ndarray]:
+    """A file t, y, sigma of unequal weights, and its columns (readings, 3)."""
+    rng = np.random.default_rng(seed)
+    t, sigma = np.linspace(50, 700, readings), 0.1 * (1 + 4 * rng.random(readings))
+    y = b1 * -np.expm1(-5.6e-4 * t) + sigma * rng.standard_normal(readings)
+    return write(path, t=t.tolist(), y=y.tolist(), sigma=sigma.tolist()), np.column_stack([t, y, sigma])
+
+
+def solution(residuals, start, jacobian=None, **options) -> tuple[np.ndarray, np.ndarray]:
+    """SciPy's minimum, polished by Gauss-Newton steps with complex-step slopes, and the deviations there."""
+    found = least_squares(residuals, start, x_scale=np.abs(start), ftol=1e-15, xtol=1e-15, gtol=1e-15, **options).x
+    for _ in range(4):
+        steps = np.eye(len(found)) * 1e-100j
+        J = np.column_stack([np.imag(residuals(found + step)) * 1e100 for step in steps])
+        found = found - np.linalg.lstsq(J, np.real(residuals(found)), rcond=None)[0]
+    scale = np.linalg.norm(J, axis=0)
+    return found, np.sqrt(np.diag(np.linalg.inv((J / scale).T @ (J / scale)))) / scale
+
+
+def estimate(found, **options) -> Fit:
+    R = Gaussian(tuple(found.deviations)).covariance(len(found.z))
+    return fit(Problem(found.model, R), found.z, ESTIMATORS, **options)[0]
+
+
+def test_weights_of_the_file_are_those_of_the_fit(tmp_path):
+    path, (t, y, sigma) = (lambda p, c: (p, c.T))(*simulated(tmp_path / "a.csv", 240.0, 1))
+    result = estimate(open_readings(path, Formula(SATURATION, START)))
+    x, deviations = solution(lambda p: (p[0] * (1 - np.exp(-p[1] * t)) - y) / sigma, [250, 5e-4])
+    assert result.x == pytest.approx(x, rel=1e-8)
+    assert result.standard_errors == pytest.approx(deviations, rel=1e-8)
+    unweighted, _ = solution(lambda p: p[0] * (1 - np.exp(-p[1] * t)) - y, [250, 5e-4])
+    assert abs(unweighted[0] - x[0]) > 1e-3 * x[0]
+
+
+def test_a_fixed_parameter_is_not_estimated_and_costs_no_degree_of_freedom(tmp_path):
+    path, columns = simulated(tmp_path / "a.csv", 240.0, 2)
+    t, y, sigma = columns.T
+    found = open_readings(path, Informed(Formula(SATURATION, START), (Known("b2", fixed=5.7e-4),)))
+    result = estimate(found)
+    x, deviations = solution(lambda p: (p[0] * (1 - np.exp(-5.7e-4 * t)) - y) / sigma, [250])
+    assert result.x == pytest.approx(x, rel=1e-8)
+    assert result.standard_errors == pytest.approx(deviations, rel=1e-8)
+    assert result.degrees_of_freedom == len(t) - 1
+    assert result.model.fixed == {"b2": 5.7e-4}
+
+
+@pytest.mark.parametrize(
+    "known",
+    [
+        (Known("b1", lower=100.0, upper=300.0), Known("b2", positive=True)),
+        (Known("b1", upper=260.0), Known("b2", lower=1e-5)),
+        (Known("b1", nominal=200.0), Known("b2", nominal=8e-4, lower=0.0, upper=1e-3)),
+    ],
+)
+def test_bounds_move_neither_a_minimum_inside_of_them_nor_its_standard_errors(tmp_path, known):
+    path, columns = simulated(tmp_path / "a.csv", 240.0, 3)
+    t, y, sigma = columns.T
+    result = estimate(open_readings(path, Informed(Formula(SATURATION, START), known)))
+    x, deviations = solution(lambda p: (p[0] * (1 - np.exp(-p[1] * t)) - y) / sigma, [250, 5e-4])
+    assert result.status is Status.CONVERGED
+    assert result.x == pytest.approx(x, rel=1e-8)
+    assert result.standard_errors == pytest.approx(deviations, rel=1e-8)
+    for one, low, high in zip(known, *result.interval(0.999999), strict=True):
+        assert one.bounds[0] < low < high < one.bounds[1]
+
+
+@pytest.mark.parametrize("unknown", [False, True])
+@pytest.mark.parametrize("upper", [220.0, 231.0])
+def test_an_estimate_on_its_bound_is_the_minimum_within_the_bounds(tmp_path, upper, unknown):
+    """Against SciPy's bounded solution; what is on the bound has no error, and the others' are with it held there."""
+    path, columns = simulated(tmp_path / "a.csv", 240.0, 3)
+    t, y, sigma = columns.T
+    known = (Known("b1", nominal=200.0, lower=100.0, upper=upper), Known("b2", positive=True))
+    result = estimate(open_readings(path, Informed(Formula(SATURATION, START), known)), level_unknown=unknown)
+    bounded = least_squares(
+        lambda p: (p[0] * 100 * (1 - np.exp(-p[1] * 1e-4 * t)) - y) / sigma,
+        [2.0, 5.0],
+        bounds=([1, 0], [upper / 100, np.inf]),
+        ftol=1e-15,
+        xtol=1e-15,
+        gtol=1e-15,
+    )
+    assert result.status is Status.CONVERGED
+    assert result.held_at == {0: upper}
+    assert result.x == pytest.approx(bounded.x * [100, 1e-4], rel=1e-5)
+    x, deviations = solution(lambda p: (upper * (1 - np.exp(-p[0] * t)) - y) / sigma, [5e-4])
+    assert result.x[1] == pytest.approx(x[0], rel=1e-8)
+    assert result.degrees_of_freedom == len(t) - 1
+    level = np.sqrt(np.sum(((upper * (1 - np.exp(-x[0] * t)) - y) / sigma) ** 2) / (len(t) - 1)) if unknown else 1.0
+    assert np.isnan(result.standard_errors[0])
+    assert result.standard_errors[1] == pytest.approx(level * deviations[0], rel=1e-6)
+
+
+def test_a_minimum_near_a_bound_but_inside_is_not_on_it(tmp_path):
+    path, columns = simulated(tmp_path / "a.csv", 240.0, 3)
+    t, y, sigma = columns.T
+    x, deviations = solution(lambda p: (p[0] * (1 - np.exp(-p[1] * t)) - y) / sigma, [250, 5e-4])
+    known = (Known("b1", nominal=200.0, upper=x[0] * 1.0005),)
+    result = estimate(open_readings(path, Informed(Formula(SATURATION, START), known)))
+    assert result.held_at == {}
+    assert result.x == pytest.approx(x, rel=1e-8)
+    assert result.standard_errors == pytest.approx(deviations, rel=1e-8)
+
+
+def test_files_share_the_parameters_that_are_not_their_own(tmp_path):
+    paths, data = zip(
+        *(simulated(tmp_path / f"{b1}.csv", b1, k, 12 + k) for k, b1 in enumerate((240.0, 180.0))), strict=True
+    )
+    result = estimate(open_together(list(paths), Formula(SATURATION, START, own=("b1",))))
+
+    def residuals(p):
+        parts = [(p[k] * (1 - np.exp(-p[2] * t)) - y) / sigma for k, (t, y, sigma) in enumerate(c.T for c in data)]
+        return np.concatenate(parts)
+
+    x, deviations = solution(residuals, [250, 250, 5e-4])
+    names = [p.name for p in result.model.natural_parameters]
+    assert names == ["b1_1", "b2", "b1_2"]
+    order = [names.index(name) for name in ("b1_1", "b1_2", "b2")]
+    assert result.x[order] == pytest.approx(x, rel=1e-8)
+    assert result.standard_errors[order] == pytest.approx(deviations, rel=1e-8)
+
+
+def test_several_files_of_a_bounded_model_are_estimated_together_too(tmp_path):
+    paths, data = zip(*(simulated(tmp_path / f"{k}.csv", 240.0, k, 12) for k in range(2)), strict=True)
+    model = Informed(Formula(SATURATION, START), (Known("b1", lower=100.0, upper=300.0), Known("b2", positive=True)))
+    t, y, sigma = np.concatenate(data).T
+    x, deviations = solution(lambda p: (p[0] * (1 - np.exp(-p[1] * t)) - y) / sigma, [250, 5e-4])
+    result = estimate(open_together(list(paths), model))
+    assert result.x == pytest.approx(x, rel=1e-8)
+    assert result.standard_errors == pytest.approx(deviations, rel=1e-8)
+
+
+def test_draws_of_a_positive_parameter_are_log_normal_and_of_a_bounded_one_inside():
+    model = Informed(
+        LotkaVolterra(), (Known("birth", positive=True, deviation=0.3), Known("death", lower=0.5, upper=1.0))
+    )
+    scenario = Scenario(model, Gaussian(0.5), GaussianPrior(model.prior_deviations), 1.0)
+    values = model.natural(
+        np.stack([scenario.prior.draw(model.nominal, 1.0, rng) for rng in map(np.random.default_rng, range(2000))])
+    )
+    birth, death = values[:, 0], values[:, 2]
+    assert (birth > 0).all()
+    assert np.log(birth).std() == pytest.approx(0.3 / 0.55, rel=0.06)
+    assert np.median(birth) == pytest.approx(0.55, rel=0.05)
+    assert ((death > 0.5) & (death < 1.0)).all()
+
+
+def test_every_coordinate_of_a_known_parameter_leads_back_to_its_value():
+    known = (Known("b1", lower=-3.0, upper=300.0), Known("b2", upper=2e-3))
+    model = Informed(Formula(SATURATION, START, {"t": (1.0, 2.0, 3.0)}), known)
+    x = np.random.default_rng(0).normal(size=(50, 2))
+    assert model.inner(model.natural(x)) == pytest.approx(x, abs=1e-9)
+    h = 1e-6
+    for k in range(2):
+        step = h * np.eye(2)[k]
+        difference = (model.natural(x + step) - model.natural(x - step))[:, k] / (2 * h)
+        assert model.natural_slope(x)[:, k] == pytest.approx(difference, rel=1e-6, abs=1e-6)
+
+
+def test_a_satellite_file_brings_its_own_sky(tmp_path):
+    """Position and clock of a file with a sky, an order and an epoch of its own, within their intervals, at the answer
+    of an independent solution."""
+    rng = np.random.default_rng(5)
+    sky = tuple(tuple(v) for v in Gnss(rounds=1)._columns[0][[3, 0, 5, 1, 2, 4]] + rng.normal(0, 3e5, (6, 3)))
+    truth = Gnss(sky, earth_rate=0.0)
+    p = np.array([120.0, -40.0, 30.0, 2500.0])
+    z = truth.simulate((p / truth.sizes)[None])[0] + rng.normal(size=6)
+    write_readings(tmp_path / "g.csv", truth, z)
+    found = open_readings(tmp_path / "g.csv", Gnss(earth_rate=0.0))
+    assert found.model.m == 6
+    result = fit(Problem(found.model, ModelNoise().of(found.model).covariance(6)), found.z, {"gn": GaussNewton()})[0]
+    low, high = result.interval(0.9999)
+    assert ((low < p) & (p < high)).all()
+    from ipe_bench.measurements.gnss import east_north_up
+
+    here = np.asarray(truth.position)
+    axes = east_north_up(here)
+
+    def residuals(q):
+        place = here + axes.T @ q[:3]
+        ranges = np.array([np.sqrt(np.sum((np.array(s) - place) ** 2)) for s in sky])
+        return ranges + q[3] - z
+
+    expected, deviations = solution(residuals, [1.0, 1.0, 1.0, 1000.0])
+    assert result.x == pytest.approx(expected, abs=1e-5)
+    assert result.standard_errors == pytest.approx(deviations, rel=1e-6)
+
+
+def test_an_epidemic_is_read_when_its_file_says(tmp_path):
+    times = (0.7, 2.25, 3.0, 5.5, 9.0, 12.125)
+    truth = Sir(sampled=times)
+    x = np.array([[0.5, -0.3, 0.2]])
+    write_readings(tmp_path / "s.csv", truth, truth.simulate(x)[0])
+    lines = (tmp_path / "s.csv").read_text().splitlines()
+    (tmp_path / "s.csv").write_text("\n".join([lines[0], *reversed(lines[1:])]))
+    found = open_readings(tmp_path / "s.csv", Sir())
+    assert found.model.simulate(x)[0] == pytest.approx(found.z, abs=1e-9)
+    assert found.model.index["time [day]"] == list(reversed(times))
+    result = fit(Problem(found.model, Gaussian(20.0).covariance(6)), found.z, {"gn": GaussNewton(max_iterations=50)})[0]
+    assert result.inner == pytest.approx(x[0], abs=1e-6)
+
+
+def test_every_model_with_a_noise_of_its_own_is_simulated_with_it():
+    assert Scenario(Gins()).noise == Quantization(step=0.02286)
+    assert Scenario(Sir()).noise == Gaussian(20.0)
+    with pytest.raises(UserError, match=r"measurement=formula names no noise of its own; set noise.deviation"):
+        Scenario(Formula("a*t", {"a": 1.0}, {"t": (1.0, 2.0)}))
+
+
+def test_an_unknown_level_is_estimated_and_student_t_takes_the_place_of_the_normal(tmp_path):
+    """With the level estimated, 95 % intervals of few readings hold the truth in 95 % of cases, and those of the normal
+    distribution would not."""
+    model = Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(range(5))})
+    rng, inside, too_short, trials = np.random.default_rng(8), 0, 0, 600
+    problem = Problem(model, Unknown().covariance(5))
+    for _ in range(trials):
+        z = 1.0 + np.arange(5) + 3.0 * rng.standard_normal(5)
+        result = fit(problem, z, {"gn": GaussNewton()}, level_unknown=True)[0]
+        low, high = result.interval()
+        inside += low[1] <= 1.0 <= high[1]
+        too_short += abs(result.x[1] - 1.0) <= 1.96 * result.standard_errors[1]
+    assert abs(inside / trials - 0.95) < 3 * np.sqrt(0.95 * 0.05 / trials)
+    assert too_short / trials < 0.90
+
+
+REFUSED = {
+    "negative sigma": ("t,y,sigma\n1,2,1\n2,3,-1\n3,4,1\n", r"row 3, column sigma: '-1' is not a standard deviation"),
+    "zero sigma": ("t,y,sigma\n1,2,0\n2,3,1\n3,4,1\n", r"row 2, column sigma: '0' is not"),
+    "absent sigma": ("t,y,sigma\n1,2,1\n2,3,\n3,4,1\n", r"row 3, column sigma: '' is not"),
+    "empty input": ("t,y\n1,2\n,3\n3,4\n", r"row 3, column t: is empty"),
+    "text for an input": ("t,y\n1,2\nx,3\n3,4\n", r"row 3, column t: 'x' is no"),
+    "no readings": ("t,y\n", r"has a header and no rows"),
+    "too few readings": ("t,y\n1,2\n2,\n", r"1 readings are too few for 2 parameters"),
+    "no column y": ("t,z\n1,2\n", r"column y is missing"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_wrong_file_is_refused_with_its_row(tmp_path, case):
+    text, expected = REFUSED[case]
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(UserError, match=expected):
+        open_readings(tmp_path / "a.csv", Formula("a+b*t", {"a": 1.0, "b": 1.0}))
+
+
+def test_a_missing_reading_keeps_its_row(tmp_path):
+    (tmp_path / "a.csv").write_text("t,y,sigma\n1,2,1\n2,,\n3,4,1\n4,5.5,1\n")
+    found = open_readings(tmp_path / "a.csv", Formula("a+b*t", {"a": 1.0, "b": 1.0}))
+    assert np.isnan(found.z).tolist() == [False, True, False, False]
+    assert np.isnan(found.deviations).tolist() == [False, True, False, False]

@@ -1,0 +1,386 @@
+"""More than 200 files as instruments, spreadsheets and people write them: each is read as it was meant, or refused with
+the row and the column, and none is read as something else."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import itertools
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.measurements import Accelerometer, Formula, Gnss, Measurement, Ranging, Sir
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.noise import Gaussian
+from ipe_bench.real.fits import fit
+from ipe_bench.real.readings import write_readings
+from ipe_bench.real.sources import open_readings, open_together
+
+LINE = Formula("a+b*t", {"a": 1.0, "b": 1.0})
+T = [0.5, 1.25, 2.0, 3.5, 5.0, 8.0]
+Y = [-1.25, 2.5, 1017.0, 0.001, 4e-7, 12345.678]
+SIGMA = [0.1, 0.25, 1.0, 2.0, 0.5, 3.0]
+COLUMNS = {"t": T, "y": Y, "sigma": SIGMA}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A file, and what is to come of it: refusal by these words, or the columns above."""
+
+    name: str
+    content: bytes
+    refusal: str = ""
+    suffix: str = ".csv"
+    model: Measurement = LINE
+    missing: tuple[int, ...] = ()
+    """Rows without a reading."""
+
+
+def lines(columns=COLUMNS, *, separator=",", cell=repr) -> list[str]:
+    rows = zip(*columns.values(), strict=True)
+    return [separator.join(columns), *(separator.join(cell(v) for v in row) for row in rows)]
+
+
+def ways_of_writing() -> Iterator[Case]:
+    separators = {"commas": (",", "."), "semicolons": (";", "."), "decimal commas": (";", ",")}
+    ends = {"unix": "\n", "windows": "\r\n", "old mac": "\r"}
+    for order, (how, (separator, point)), (end, newline), marked in itertools.product(
+        itertools.permutations(COLUMNS), separators.items(), ends.items(), (False, True)
+    ):
+        text = lines(
+            {k: COLUMNS[k] for k in order}, separator=separator, cell=lambda v, p=point: repr(v).replace(".", p)
+        )
+        content = newline.join(text).encode("utf-8-sig" if marked else "utf-8")
+        yield Case(f"{'-'.join(order)} {how} {end}{' marked' * marked}", content)
+
+
+def with_cell(column: str, text: str) -> bytes:
+    """The file with that text in the third row of data, the fourth of the file."""
+    rows = [line.split(",") for line in lines()]
+    rows[3][list(COLUMNS).index(column)] = text
+    return "\n".join(",".join(row) for row in rows).encode()
+
+
+NO_NUMBERS = {
+    "word": "high", "not available": "N/A", "na": "NA", "null": "null", "dash": "-", "question": "?", "true": "True",
+    "underscore": "1_0", "hexadecimal": "0x1F", "no exponent": "1e", "two points": "1.2.3", "two signs": "--1",
+    "unit": "1 V", "per cent": "5%", "money": "$1", "date": "2024-01-31", "clock": "00:01:00", "fraction": "1/2",
+    "gap between thousands": "1 017", "minus sign of a typesetter": "−1", "full-width digits": "１２",
+    "arabic digits": "٣", "quoted comma": '"1,5"', "less than": "<0.1", "formula": "=A1+1", "complex": "1j",
+    "zero byte": "1\0", "D exponent": "1D3", "infinite": "inf", "not a number": "nan", "beyond numbers": "1e999",
+}  # fmt: skip
+
+
+def wrong_cells() -> Iterator[Case]:
+    for column, (name, text) in itertools.product(COLUMNS, NO_NUMBERS.items()):
+        yield Case(f"{name} in {column}", with_cell(column, text), rf"row 4, column {column}: .*; (correct it|leave)")
+
+
+def text(*rows: str) -> bytes:
+    return "\n".join(rows).encode()
+
+
+def odd_cells() -> Iterator[Case]:
+    yield Case(
+        "signs and exponents", text("t,y,sigma", *(f"+{t},{y:.17e},{s:E}" for t, y, s in zip(T, Y, SIGMA, strict=True)))
+    )
+    yield Case(
+        "blanks about numbers",
+        text("t , y, sigma", *(f" {t} ,\t{y} ,{s} " for t, y, s in zip(T, Y, SIGMA, strict=True))),
+    )
+    yield Case("everything quoted", text(*('"' + line.replace(",", '","') + '"' for line in lines())))
+    yield Case("blank lines", text("", *itertools.chain.from_iterable((line, " ", ",,") for line in lines()), ""))
+    yield Case(
+        "points without zeros",
+        text(
+            "t,y,sigma",
+            *(f"{t},{y},{s}".replace("0.", ".").replace(".0,", ".,") for t, y, s in zip(T, Y, SIGMA, strict=True)),
+        ),
+    )
+    yield Case("rows numbered", text("row,t,y,sigma", *(f"{i},{line}" for i, line in enumerate(lines()[1:], 1))))
+    yield Case("units", text("t [s],y [V],sigma [V]", *lines()[1:]))
+    yield Case("no unit of sigma", text("t [s],y [V],sigma", *lines()[1:]))
+    yield Case("called reading", text("t,reading,sigma", *lines()[1:]))
+    yield Case("a reading missing", with_cell("y", ""), missing=(2,))
+    yield Case(
+        "a reading and its deviation missing",
+        text(*(line if i != 3 else "2.0,," for i, line in enumerate(lines()))),
+        missing=(2,),
+    )
+    yield Case("a reading of blanks", with_cell("y", "  "), missing=(2,))
+    yield Case("weight missing", with_cell("sigma", ""), r"row 4, column sigma: '' is not a standard deviation")
+    yield Case("weight zero", with_cell("sigma", "0"), r"row 4, column sigma: '0' is not a standard deviation")
+    yield Case("weight negative", with_cell("sigma", "-0.1"), r"row 4, column sigma: '-0.1' is not a standard")
+    yield Case("weight so small that it is zero", with_cell("sigma", "1e-400"), r"row 4, column sigma: '1e-400' is not")
+    yield Case("time missing", with_cell("t", ""), r"row 4, column t: is empty")
+    yield Case(
+        "rows numbered otherwise",
+        text("row,t,y,sigma", *(f"{i},{line}" for i, line in enumerate(lines()[1:]))),
+        r"row 2, column row: '0' stands where the order of the rows says 1",
+    )
+
+
+def odd_tables() -> Iterator[Case]:
+    good = lines()
+    as_text = "\n".join(good)
+    yield Case("empty", b"", "is empty")
+    yield Case("a mark and nothing else", "\ufeff".encode(), "is empty")
+    yield Case("blanks alone", b"\n  \n,,\n", "is empty")
+    yield Case("a header alone", text(good[0]), "has a header and no rows")
+    yield Case("no header", text(*good[1:]), "column t is missing")
+    yield Case("two readings", text(*good[:2]), "1 readings are too few for 2 parameters")
+    yield Case("tabs", as_text.replace(",", "\t").encode())
+    yield Case(
+        "tabs and decimal commas",
+        as_text.replace(",", "\t").replace(".", ",").encode(),
+        "row 2, column y: '-1,25' is not a number",
+    )
+    yield Case("bars", as_text.replace(",", "|").encode(), "column t is missing")
+    yield Case("blanks between", as_text.replace(",", "  ").encode(), "column t is missing")
+    yield Case(
+        "a separator declared", text("sep=,", *good), "row 2: looks like the header, which must be the first row"
+    )
+    yield Case("a remark first", text("# voltmeter 3", *good), "row 2: looks like the header, which")
+    yield Case("a remark within", text(*good[:3], "# pause", *good[3:]), "row 4: has 1 cells and the header 3")
+    yield Case("two headers", text(*good[:4], *good), r"row 5, column .: '.' is not a number")
+    yield Case("units in a row", text(good[0], "s,V,V", *good[1:]), r"row 2, column .: '.' is not a number")
+    yield Case("a sum below", text(*good, ",999,"), r"row 8, column t: is empty")
+    yield Case(
+        "decimal commas between commas",
+        text(good[0], *(line.replace(".", ",") for line in good[1:])),
+        "row 2: has 6 cells and the header 3; with decimal commas, separate the cells by semicolons",
+    )
+    yield Case("thousands", text(good[0], '1,"1,017.5",1', *good[1:]), r"row 2, column y: '1,017.5' is not a number")
+    yield Case(
+        "thousands of Germany", text("t;y;sigma", "1,5;1.017,5;1", "2;3;1", "3;4;1"), r"row 2, column y: '1.017,5'"
+    )
+    yield Case(
+        "points and commas", text("t;y;sigma", "1,5;2;1", "2;3.5;1", "3;4;1"), r"row 3, column y: '3.5' is not a"
+    )
+    yield Case("a cell too few", text(*good[:2], "1.25,2.5", *good[3:]), "row 3: has 2 cells and the header 3")
+    yield Case("a cell too many", text(*good[:2], good[2] + ",7", *good[3:]), "row 3: has 4 cells and the header 3")
+    yield Case("a comma behind each row", text(*(line + "," for line in good)), "column 4, which has no name, is not")
+    yield Case("two columns of one name", text("t,y,y", *good[1:]), "column y stands there twice")
+    yield Case(
+        "two columns without a name", text("t,y,sigma,,", *(line + ",," for line in good[1:])), "without a name stand"
+    )
+    yield Case("Sigma", text("t,y,Sigma", *good[1:]), "column Sigma is not understood; remove it")
+    yield Case("deviation", text("t,y,deviation", *good[1:]), "column deviation is not understood; remove it")
+    yield Case("weight", text("t,y,weight", *good[1:]), "column weight is not understood; remove it")
+    yield Case(
+        "a note",
+        text("t,y,note", *(",".join(line.split(",")[:2]) + ",fine" for line in good[1:])),
+        "column note is not",
+    )
+    yield Case("Y", text("t,Y,sigma", *good[1:]), "column y is missing, which holds the readings")
+    yield Case("x", text("x,y,sigma", *good[1:]), "column t is missing.*If t is a parameter")
+    yield Case("readings in two columns", text("t,y,reading", *good[1:]), "column reading is not understood")
+    yield Case(
+        "another unit of sigma",
+        text("t,y [V],sigma [mV]", *good[1:]),
+        r"column sigma \[mV\]: the unit must be that of y",
+    )
+    yield Case(
+        "a unit of sigma alone", text("t,y,sigma [mV]", *good[1:]), r"column sigma \[mV\]: the unit must be that of y"
+    )
+    yield Case("a quote left open", text(*good[:4], '3.5,"0.001,2.0', *good[5:]), r"row \d: is not a readable CSV file")
+    yield Case("a quote within", text(*good[:4], '3.5,"0."001,2.0', *good[5:]), r"row 5: is not a readable CSV file")
+    yield Case("latin-1", text("t,y [µV],sigma", *good[1:]).decode().encode("latin-1"), "row 1: is not a readable CSV")
+    yield Case("latin-1 below", (as_text + "\n9,1°,1").encode("latin-1"), "row 8: is not a readable CSV file")
+    yield Case("UTF-16", as_text.encode("utf-16"), "row 1: is not a readable CSV file")
+    yield Case("UTF-16 without a mark", as_text.encode("utf-16-le"), "column t is missing|is not a readable")
+    yield Case("UTF-32", as_text.encode("utf-32"), "is not a readable CSV file")
+    yield Case("compressed", gzip.compress(as_text.encode(), mtime=0), "is not a readable CSV file")
+    yield Case("a workbook", b"PK\x03\x04\x14\x00\x06\x00\x08\x00\x00\x00!\x00\x9c\xff", "is not a readable CSV file")
+    yield Case("a page", b"<html><body>404 not found</body></html>", "column t is missing")
+    yield Case("JSON", b'{"t": [1, 2], "y": [1, 2]}', "is not a readable CSV|column t is missing")
+    yield Case("no table at all", np.random.default_rng(0).bytes(500), "is not a readable CSV file")
+    yield Case("text called Parquet", as_text.encode(), "is not a readable Parquet file", ".parquet")
+    yield Case("Parquet called text", parquet(COLUMNS), "is not a readable CSV file")
+
+
+def parquet(columns) -> bytes:
+    import pandas as pd
+
+    stream = io.BytesIO()
+    pd.DataFrame(columns).to_parquet(stream)
+    return stream.getvalue()
+
+
+def tables_of_programs() -> Iterator[Case]:
+    yield Case("Parquet", parquet(COLUMNS), suffix=".parquet")
+    yield Case("Parquet of texts", parquet({k: [repr(v) for v in c] for k, c in COLUMNS.items()}), suffix=".parquet")
+    yield Case("Parquet in another order", parquet(dict(reversed(COLUMNS.items()))), suffix=".parquet")
+    holes = {"t": T, "y": [*Y[:2], None, *Y[3:]], "sigma": SIGMA}
+    yield Case("Parquet with a hole", parquet(holes), suffix=".parquet", missing=(2,))
+    yield Case(
+        "Parquet with words", parquet({**COLUMNS, "y": list("abcdef")}), "row 1, column y: 'a' is not", ".parquet"
+    )
+    yield Case(
+        "Parquet with dates",
+        parquet({**COLUMNS, "t": np.arange(6).astype("M8[s]")}),
+        "row 1, column t: '1970.*' is not",
+        ".parquet",
+    )
+    yield Case("Parquet of truths", parquet({**COLUMNS, "t": [True] * 6}), "row 1, column t: 'True' is not", ".parquet")
+    yield Case("Parquet without rows", parquet({k: [] for k in COLUMNS}), "has a header and no rows", ".parquet")
+
+
+def written(model: Measurement, change=lambda rows: rows) -> bytes:
+    """The file that a model writes of its own readings, changed."""
+    import tempfile
+    from pathlib import Path
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.csv"
+        write_readings(path, model, model.simulate(model.nominal[None])[0])
+        return text(*change(path.read_text().splitlines()))
+
+
+def replaced(row: int, old: str, new: str):
+    def change(rows: list[str]) -> list[str]:
+        assert old in rows[row - 1], rows[row - 1]
+        return [*rows[: row - 1], rows[row - 1].replace(old, new, 1), *rows[row:]]
+
+    return change
+
+
+def files_of_models() -> Iterator[Case]:
+    for model in (Ranging(), Sir(), Gnss(), Accelerometer()):
+        yield Case(f"{model.name} as written", written(model), model=model)
+        swapped = {"ranging": True, "sir": True}.get(model.name, False)
+        if swapped:
+            yield Case(f"{model.name} in reverse", written(model, lambda r: [r[0], *reversed(r[1:])]), model=model)
+        another_unit = written(
+            model, replaced(1, "[day]", "[week]") if model.name == "sir" else replaced(1, "[m", "[km")
+        )
+        yield Case(f"{model.name} in another unit", another_unit, r"unit must be|is missing", model=model)
+        yield Case(f"{model.name} with its first reading gone", written(model, emptied), model=model, missing=(0,))
+    yield Case(
+        "a beacon twice",
+        written(Ranging(), lambda r: [*r, r[1]]),
+        r"row \d+: round=1, beacon=1 stands in row 2 already",
+        model=Ranging(),
+    )
+    yield Case(
+        "a beacon too few", written(Ranging(), lambda r: r[:-1]), r"rows; the first absent one is", model=Ranging()
+    )
+    yield Case(
+        "an unknown beacon",
+        written(Ranging(), replaced(2, "1,1,", "1,99,")),
+        "row 2: ranging has no reading round=1, beacon=99",
+        model=Ranging(),
+    )
+    yield Case("a beacon as 1.0", written(Ranging(), replaced(2, "1,1,", "1.0,1e0,")), model=Ranging())
+    yield Case("a beacon with weights", written(Ranging(), with_weights), model=Ranging())
+    yield Case(
+        "weights in km",
+        written(Ranging(), lambda r: with_weights(r, "sigma [km]")),
+        r"column sigma \[km\]: the unit must be that of reading \[m\]",
+        model=Ranging(),
+    )
+    yield Case("a day twice", written(Sir(), lambda r: [*r, r[1]]), "stands there twice", model=Sir())
+    yield Case(
+        "a day before the start",
+        written(Sir(), replaced(2, "1,1.0,", "1,-1.0,")),
+        "comes before the start",
+        model=Sir(),
+    )
+    yield Case("an unknown output", written(Sir(), replaced(3, "infected", "healed")), "output=healed", model=Sir())
+    yield Case("a second epidemic", written(Sir(), replaced(3, "1,", "2,")), "case=2: there are 1 cases", model=Sir())
+    yield Case(
+        "half an epoch",
+        written(Gnss(), replaced(2, "1,", "1.5,")),
+        "row 2, column epoch: '1.5' is not a whole",
+        model=Gnss(),
+    )
+    yield Case(
+        "an attitude out of order",
+        written(Accelerometer(), lambda r: [r[0], r[2], r[1], *r[3:]]),
+        "row 2, column attitude: '2' stands where the order of the rows says 1",
+        model=Accelerometer(),
+    )
+
+
+def emptied(rows: list[str]) -> list[str]:
+    return [rows[0], rows[1].rpartition(",")[0] + ",", *rows[2:]]
+
+
+def with_weights(rows: list[str], heading: str = "sigma") -> list[str]:
+    return [f"{rows[0]},{heading}", *(f"{row},{0.5 + i}" for i, row in enumerate(rows[1:]))]
+
+
+CASES = [
+    *ways_of_writing(), *wrong_cells(), *odd_cells(), *odd_tables(), *tables_of_programs(), *files_of_models()
+]  # fmt: skip
+
+
+def test_there_are_more_than_two_hundred_and_no_two_are_alike():
+    assert len({case.name for case in CASES}) == len(CASES)
+    assert len({(case.content, case.suffix, case.model.name) for case in CASES}) == len(CASES)
+    assert len(CASES) > 200
+    assert sum(bool(case.refusal) for case in CASES) > 100
+
+
+@pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
+def test_a_file_is_read_as_meant_or_refused_with_its_row(case, tmp_path):
+    path = tmp_path / f"file{case.suffix}"
+    path.write_bytes(case.content)
+    if case.refusal:
+        with pytest.raises(UserError) as refused:
+            open_readings(path, case.model)
+        told = str(refused.value)
+        assert told.startswith(f"readings={path}: ")
+        assert "\n" not in told
+        assert re.search(case.refusal, told), told
+        return
+    found = open_readings(path, case.model)
+    if case.model is LINE:
+        z, known = np.array(Y), found.model.columns["t"]
+        assert list(known) == T
+        expected = np.where(np.isin(np.arange(6), case.missing) & np.isnan(found.deviations), np.nan, SIGMA)
+        np.testing.assert_array_equal(found.deviations, expected)
+    else:
+        # In whatever order the rows stand, each reading is that of the model which the file describes.
+        z = found.model.simulate(case.model.nominal[None])[0]
+        assert (found.deviations is None) == (b"sigma" not in case.content)
+    z[list(case.missing)] = np.nan
+    np.testing.assert_allclose(found.z, z, rtol=1e-15 if case.model is LINE else 1e-12, atol=0)
+
+
+def test_files_in_different_units_are_not_estimated_together(tmp_path):
+    (tmp_path / "a.csv").write_text("t [s],y\n1,2\n2,3\n3,4\n")
+    (tmp_path / "b.csv").write_text("t [min],y\n1,2\n2,3\n3,4\n")
+    with pytest.raises(UserError, match=r"b.csv: column t \[min\]: .*a.csv has it in s; convert the values"):
+        open_together([tmp_path / "a.csv", tmp_path / "b.csv"], LINE)
+
+
+@pytest.mark.slow
+def test_a_million_rows_are_read_and_estimated_as_a_small_file_is(tmp_path):
+    rng = np.random.default_rng(4)
+    t = rng.uniform(0, 10, 1_000_000)
+    sigma = rng.uniform(0.5, 2.0, t.size)
+    y = 3.0 - 0.25 * t + sigma * rng.standard_normal(t.size)
+    path = tmp_path / "million.csv"
+    np.savetxt(path, np.column_stack([t, y, sigma]), "%.17g", ",", header="t,y,sigma", comments="")
+    from ipe_bench.baselines import GaussNewton
+
+    found = open_readings(path, LINE)
+    np.testing.assert_array_equal(found.z, y)
+    np.testing.assert_array_equal(found.deviations, sigma)
+    problem = Problem(found.model, Gaussian(tuple(found.deviations)).covariance(t.size))
+    result = fit(problem, found.z, {"gn": GaussNewton()})[0]
+    A = np.column_stack([np.ones_like(t), t]) / sigma[:, None]
+    np.testing.assert_allclose(result.x, np.linalg.lstsq(A, y / sigma)[0], rtol=1e-9)
+    np.testing.assert_allclose(result.covariance, np.linalg.inv(A.T @ A), rtol=1e-9)
+    assert result.fits
+    # One cell among a million that is not a number is named by its row.
+    with path.open("a") as file:
+        file.write("1,2.O,1\n")
+    with pytest.raises(UserError, match=r"row 1000002, column y: '2.O' is not a number"):
+        open_readings(path, LINE)

@@ -1,0 +1,79 @@
+"""The documentation: what its pages tell readers to type works, links lead somewhere, and nothing is fetched."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from ipe_bench.plugins import discovery
+from ipe_bench.plugins.description import described
+from ipe_bench.report.docs.build import build
+from ipe_bench.report.docs.gallery import write_gallery
+from ipe_bench.report.docs.reference import write_reference
+
+PAGES = Path(str(files("ipe_bench.report.docs"))) / "pages"
+WRITTEN = sorted(PAGES.rglob("*.md"))
+
+
+def ids(path: Path) -> str:
+    return str(path.relative_to(PAGES))
+
+
+@pytest.mark.parametrize("page", WRITTEN, ids=ids)
+def test_links_lead_to_pages(page, tmp_path):
+    write_reference(tmp_path / "reference")
+    write_gallery(tmp_path / "gallery", tmp_path, 1, [])
+    for link in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
+        target = (page.parent / link).resolve()
+        made = tmp_path / target.relative_to(PAGES.resolve())
+        assert target.exists() or made.exists(), link
+
+
+def test_options_are_described_from_class_and_config():
+    rows = {row.name: row for option in discovery.options("solver") for row in described(option)}
+    assert rows["growth"].value == "2"
+    assert rows["tolerance"].kind == "a number above 0"
+    assert rows["budget"].value == "null"
+    assert rows["depth"].meaning == "past steps that each new one draws on"
+
+
+@pytest.mark.parametrize("group", ["solver", "baseline", "noise", "measurement"])
+def test_every_option_of_ours_says_what_it_means(group):
+    ours = [option for option in discovery.options(group) if option.source.name == "ipe-bench"]
+    silent = [f"{option.name}.{row.name}" for option in ours for row in described(option) if not row.meaning]
+    assert silent == []
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [p for p in WRITTEN if blocks(p, "console") or blocks(p, "python")], ids=ids)
+def test_what_a_page_says_to_type_works(page, tmp_path):
+    environment = os.environ | {"NO_COLOR": "1"}
+    for line in "".join(blocks(page, "console")).splitlines():
+        program = [sys.executable, "-m", "ipe_bench", *shlex.split(line.removeprefix("$ ipe-bench "))]
+        done = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, env=environment, check=False)
+        assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
+    for code in blocks(page, "python"):
+        program = [sys.executable, "-c", code]
+        done = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, env=environment, check=False)
+        assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning_and_fetches_nothing(tmp_path):
+    pytest.importorskip("pydata_sphinx_theme")
+    assert build(tmp_path, 3, ["polynomial"]) == 0
+    pages = list((tmp_path / "html").rglob("*.html"))
+    assert tmp_path / "html" / "gallery" / "polynomial.html" in pages
+    fetched = r"""<(?:script|img|iframe|link(?=[^>]*stylesheet))[^>]*(?:src|href)=["']?(?:https?:)?//"""
+    assert [page for page in pages if re.search(fetched, page.read_text(encoding="utf-8"))] == []

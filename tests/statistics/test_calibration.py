@@ -1,0 +1,259 @@
+"""Calibration: exact bands against simulation and closed forms, false alarms at their level, faults found and named."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+from synthetic_store import Seeker
+
+import ipe_bench as ib
+from ipe_bench.report.figures import calibration as figure
+from ipe_bench.report.figures.views import views
+from ipe_bench.report.style import house_style
+from ipe_bench.report.tables import calibration as table
+from ipe_bench.statistics import analyse
+from ipe_bench.statistics.calibration import (
+    INSIDE,
+    POINTS,
+    band,
+    calibrations,
+    covered,
+    curves,
+    median_limits,
+    overall_p,
+    overall_words,
+    shared_level,
+)
+
+
+def claims(trials: int, ratio: float = 1.0, shift: float = 0.0, n: int = 1, seed: int = 0):
+    """Calibrations of n independent errors that are `ratio` times what is reported, shifted by `shift`."""
+    rng = np.random.default_rng(seed)
+    error = ratio * rng.standard_normal((trials, n)) + shift
+    every = np.ones(trials, dtype=bool)
+    return calibrations(error, np.ones((trials, n)), (error**2).sum(axis=1), every)
+
+
+# The bands -----------------------------------------------------------------------------------------------------------
+
+
+def test_one_trial_in_closed_form():
+    """One draw u leaves 'tails above t' where a point p <= 1/2 has u < p <= t, or symmetrically: 2 floor(100 t) / 100
+    of the unit interval, for a tail that is no multiple of 0.01."""
+    tails = np.array([0.005, 0.015, 0.034, 0.105])
+    assert covered(1, tails) == pytest.approx(1 - 2 * np.floor(100 * tails) / 100, abs=1e-12)
+
+
+@pytest.mark.parametrize("trials", [7, 150, 2500])
+def test_the_coverage_is_that_of_simulated_draws(trials):
+    """20,000 simulated sets of counts keep both tails as often as computed, within 4 deviations."""
+    rng = np.random.default_rng(trials)
+    counts = np.cumsum(rng.multinomial(trials, np.full(100, 0.01), size=20_000), axis=1)[:, :-1]
+    low, high = binom.cdf(counts, trials, POINTS), binom.sf(counts - 1, trials, POINTS)
+    least = np.minimum(low, high).min(axis=1)
+    tails = np.array([0.02, 0.003, 0.0005])
+    shares = (least[:, None] > tails).mean(axis=0)
+    expected = covered(trials, tails)
+    assert np.all(np.abs(shares - expected) < 4 * np.sqrt(expected * (1 - expected) / 20_000) + 1e-9)
+
+
+def test_the_coverage_of_a_band_does_not_depend_on_the_others():
+    tails = np.array([0.01, 1e-12, 0.002])
+    assert covered(300, tails) == pytest.approx([covered(300, tails[i : i + 1])[0] for i in range(3)], abs=1e-12)
+
+
+@pytest.mark.parametrize("trials", [5, 200, 100_000])
+def test_a_band_has_its_level_and_a_curve_its_p(trials):
+    """The largest band of at least 95 %: coarse where few trials make few different bands."""
+    low, high = band(trials)
+    assert np.all(low < 0)
+    assert np.all(high > 0)
+    assert high == pytest.approx(-low[::-1])
+    edge = np.where(np.arange(99) == 49, high, 0)
+    (curve,) = curves(np.sort(np.random.default_rng(0).random((1, trials))))
+    assert 0 < curve.p <= 1
+    assert abs(edge).max() < 1.0
+    if trials == 100_000:
+        # Kolmogorov's bands (1933) are 1.358 / sqrt(trials) wide everywhere; these are wider in the middle only.
+        assert 1.358 < high[49] * np.sqrt(trials) < 1.7
+        assert high[4] * np.sqrt(trials) < 1.0
+
+
+def test_p_values_are_uniform():
+    """4 deviations of the binomial, over 3,000 honest curves."""
+    u = np.random.default_rng(3).random((3000, 400))
+    p = np.array([c.p for c in curves(u)])
+    for level in (0.01, 0.05, 0.3):
+        assert abs((p <= level).mean() - level) < 4 * np.sqrt(level / 3000)
+
+
+def test_a_curve_inside_its_band_has_a_p_above_the_level_and_one_outside_below():
+    low, high = band(400)
+    for curve in curves(np.random.default_rng(4).random((400, 400))):
+        inside = bool(np.all((curve.difference >= low - 1e-9) & (curve.difference <= high + 1e-9)))
+        # The band is the one of a tail found to seven figures: a curve that touches it may fall on either side.
+        assert inside == (curve.p >= 0.05) or abs(curve.p - 0.05) < 2e-3
+
+
+def test_the_interval_of_the_median_covers_it():
+    """At least 95 % of 2,000 samples of 41 skewed numbers, less 4 deviations, and not nearly all."""
+    samples = np.random.default_rng(5).exponential(size=(2000, 41))
+    ends = np.array([median_limits(row) for row in samples])
+    share = ((ends[:, 0] <= np.log(2)) & (np.log(2) <= ends[:, 1])).mean()
+    assert 0.95 - 4 * np.sqrt(0.05 * 0.95 / 2000) < share < 0.99
+
+
+# Verdicts ------------------------------------------------------------------------------------------------------------
+
+
+def test_false_alarms_keep_to_their_level():
+    """Of 400 honest estimators of five parameters at most 5 % are called anything, up to 3 deviations; NEES alone
+    exactly 5 %."""
+    verdicts = [claims(200, n=5, seed=s) for s in range(400)]
+    alarms = np.mean([overall_words(parts, list("abcde")) != INSIDE for parts in verdicts])
+    assert alarms < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 400)
+    alone = np.mean([parts[-1].p < 0.05 for parts in verdicts])
+    assert abs(alone - 0.05) < 4 * np.sqrt(0.05 * 0.95 / 400)
+
+
+def test_a_deviation_ten_per_cent_too_small_is_found_with_2000_trials():
+    """Of one parameter among eleven, judged together with all others."""
+    found = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        error, deviation = rng.standard_normal((2000, 11)), np.ones(11)
+        deviation[3] = 0.9
+        nees = ((error / deviation) ** 2).sum(axis=1)
+        parts = calibrations(error, np.broadcast_to(deviation, error.shape), nees, np.ones(2000, dtype=bool))
+        found.append(parts[3].words(shared_level(parts)))
+    assert sum("times too small" in words for words in found) >= 38
+    assert all(words != INSIDE for words in found)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "shift", "words"),
+    [
+        (1.8, 0.0, "deviations 1.8 times too small"),
+        (0.5, 0.0, "deviations 2.0 times too large"),
+        (1.0, 3.0, "shifted by +3 deviations"),
+        (1.0, -3.0, "shifted by \N{MINUS SIGN}3 deviations"),
+        (1.0, 0.0, INSIDE),
+    ],
+)
+def test_faults_are_named(ratio, shift, words):
+    parts = claims(20_000, ratio, shift)
+    assert parts[0].words(0.95) == words
+
+
+def test_a_shift_and_a_scale_are_told_apart():
+    assert claims(20_000, 3.0, 6.0)[0].words(0.95) == "shifted by +6 deviations; deviations 3.0 times too small"
+
+
+def test_few_far_outside_an_honest_bulk_are_named_as_such():
+    rng = np.random.default_rng(0)
+    error = rng.standard_normal((2000, 1))
+    error[:100] *= 1e6
+    parts = calibrations(error, np.ones_like(error), error[:, 0] ** 2, np.ones(2000, dtype=bool))
+    assert "far outside" in parts[0].words(0.95)
+    assert "5 %" in parts[0].words(0.95)
+
+
+def test_another_shape_is_neither_shift_nor_scale():
+    """Errors of either sign, all about as large as the median of normal ones."""
+    rng = np.random.default_rng(0)
+    error = rng.choice([-1.0, 1.0], size=(20_000, 1)) * 0.674489750196 * (1 + 1e-3 * rng.standard_normal((20_000, 1)))
+    parts = calibrations(error, np.ones_like(error), error[:, 0] ** 2, np.ones(20_000, dtype=bool))
+    assert parts[0].words(0.95) == "of another shape"
+
+
+def test_what_makes_no_claim_and_what_is_no_covariance():
+    error = np.random.default_rng(0).standard_normal((300, 2))
+    deviation, nees = np.ones_like(error), (error**2).sum(axis=1)
+    assert calibrations(error, deviation, nees, np.zeros(300, dtype=bool)) == []
+    assert calibrations(error, np.full_like(error, np.nan), np.full(300, np.nan), np.ones(300, dtype=bool)) == []
+    assert overall_words([], []) == "-"
+    assert np.isnan(overall_p([]))
+    void = calibrations(error, np.full_like(error, np.nan), np.full(300, np.inf), np.ones(300, dtype=bool))
+    assert overall_words(void, ["a", "b"]).startswith("most reported covariances are void")
+
+
+def test_the_parameter_that_is_off_is_named_among_honest_ones():
+    rng = np.random.default_rng(0)
+    error, deviation = rng.standard_normal((1000, 3)), np.array([1.0, 0.25, 1.0])
+    nees = ((error / deviation) ** 2).sum(axis=1)
+    parts = calibrations(error, np.broadcast_to(deviation, error.shape), nees, np.ones(1000, dtype=bool))
+    assert "; b: deviations 3." in overall_words(parts, ["a", "b", "c"])
+    assert [part.words(shared_level(parts)) for part in (parts[0], parts[2])] == [INSIDE] * 2
+
+
+# In the report -------------------------------------------------------------------------------------------------------
+
+
+def test_summary_table_and_figures_say_so(synthetic):
+    rng = np.random.default_rng(1)
+    for scale in (1.0, 10.0):
+        scenario = synthetic.scenario(error_scale=scale)
+        error = 0.1 * rng.standard_normal((400, 3))
+        synthetic.add(scenario, "honest", error, estimator=Seeker())
+        synthetic.add(scenario, "boaster", error, deviation=np.full(3, 0.05), estimator=Seeker())
+        synthetic.add(scenario, "silent", error, deviation=np.full(3, np.nan), nees=np.nan, estimator=Seeker())
+    analysis = analyse([synthetic.directory])
+    summary = analysis.summary[analysis.summary["error_scale"] == 10].set_index(["estimator", "parameter"])
+    assert summary.loc[("honest", "all"), "calibration"] == INSIDE
+    assert "deviations 2.0 times too small" in summary.loc[("boaster", "all"), "calibration"]
+    assert "deviations" in summary.loc[("boaster", "b"), "calibration"]
+    assert (summary.loc["silent", "calibration"] == "-").all()
+    assert (summary.loc["silent", "claims"] == 0).all()
+    shown = table(analysis)
+    assert shown is not None
+    assert [cell.text for cell in shown.columns[1].cells] == ["boaster", "honest"] * 2
+    (view,), _ = views(analysis)
+    with house_style():
+        drawings = {d.name: d for d in figure.draw(view)}
+    assert set(drawings) == {"calibration", "calibration_parameters"}
+    assert "boaster: deviations 2.0 times too small" in drawings["calibration"].caption
+    lines = {line.get_label() for ax in drawings["calibration_parameters"].figure.axes for line in ax.lines}
+    assert {"a", "b", "c", INSIDE} <= lines
+
+
+def test_the_figure_of_nees_is_the_empirical_distribution_function(synthetic):
+    """Where every NEES is the quantile of 0.5036, the share seen below jumps there from none to all."""
+    error = np.full((100, 3), 0.1 * np.sqrt(2.385 / 3))
+    synthetic.add(synthetic.scenario(), "one", error, estimator=Seeker())
+    rows = analyse([synthetic.directory]).calibration
+    rows = rows[rows["parameter"] == "all"]
+    assert rows["difference"].to_numpy() == pytest.approx(np.where(POINTS > 0.505, 1 - POINTS, -POINTS))
+    assert rows["outside"].all()
+
+
+def _verdicts(scenario, estimators, trials):
+    summary = ib.run(scenario, estimators, trials)
+    return summary[summary["parameter"] == "all"].set_index("estimator")
+
+
+@pytest.mark.slow
+def test_an_ekf_at_scale_300_is_outside_and_gauss_newton_on_the_same_trials_is_not():
+    bench = ib.Scenario(ib.measurements.Gins(), ib.noise.Quantization(), error_scale=300.0)
+    rows = _verdicts(bench, {"ekf": ib.baselines.EKF(), "gauss_newton": ib.baselines.GaussNewton()}, 100)
+    assert rows.loc["ekf", "calibration_p"] < 1e-6
+    assert "too small" in rows.loc["ekf", "calibration"]
+    assert rows.loc["gauss_newton", "calibration"] == INSIDE
+
+
+@pytest.mark.campaign
+def test_gauss_newton_at_scale_33_is_inside_in_95_of_100_repeats():
+    """False alarms of the whole verdict at most 5 %, up to 3 deviations; of each of the 12 rows by itself 5 % on
+    average, whose deviation over 100 seeds is at most that of one row."""
+    scenarios = [
+        ib.Scenario(ib.measurements.Gins(), ib.noise.Quantization(), error_scale=33.0, seed=seed) for seed in range(100)
+    ]
+    inside, rows = 0, []
+    for scenario in scenarios:
+        summary = ib.run(scenario, {"gauss_newton": ib.baselines.GaussNewton()}, 250)
+        whole = summary[summary["parameter"] == "all"].iloc[0]
+        inside += whole["calibration"] == INSIDE
+        rows.append((summary.loc[summary["parameter"] != "all", "calibration_p"] < 0.05).mean())
+    print(f"inside: {inside} of 100; a parameter alone outside at 5 %: {np.mean(rows):.3f}")
+    assert inside >= 89
+    assert np.mean(rows) == pytest.approx(0.05, abs=3 * np.sqrt(0.05 * 0.95 / 100))

@@ -1,0 +1,141 @@
+"""Paired effects against exhaustive enumeration and maximised likelihoods; evidence that keeps its promise."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+from scipy.stats import norm
+
+from ipe_bench.statistics.paired import fair_coin, no_drift, ratio_effect, success_effect
+
+
+def successes(both: int, only_first: int, only_second: int, neither: int):
+    pairs = [(1, 1)] * both + [(1, 0)] * only_first + [(0, 1)] * only_second + [(0, 0)] * neither
+    return np.array(pairs, dtype=bool).T
+
+
+def test_the_p_of_a_ratio_is_the_share_of_all_signs():
+    """All 4,096 assignments of signs to twelve differences, within 4 deviations of the 4,999 that are drawn."""
+    rng = np.random.default_rng(0)
+    a, b = rng.gamma(3, size=12), rng.gamma(4.5, size=12)
+    signs = np.array(list(itertools.product([-1.0, 1.0], repeat=12)))
+    exact = (np.abs(signs @ (b - a)) >= abs((b - a).sum()) - 1e-12).mean()
+    assert 0.01 < exact < 0.5
+    assert abs(ratio_effect(a, b).p - exact) < 4 * np.sqrt(exact / 4999)
+
+
+def test_an_interval_of_a_ratio_holds_1_where_the_test_does_not_reject():
+    rng = np.random.default_rng(1)
+    verdicts = []
+    for _ in range(60):
+        a = rng.gamma(3, size=40)
+        effect = ratio_effect(a, 0.5 * a + 0.58 * rng.gamma(3, size=40))
+        verdicts.append(effect.p < 0.05)
+        assert (effect.p < 0.05) != (effect.low <= 1 <= effect.high)
+    assert 5 < sum(verdicts) < 55
+
+
+def test_an_interval_of_a_ratio_covers_it():
+    rng = np.random.default_rng(2)
+    held = 0
+    for _ in range(400):
+        a = rng.gamma(3, size=80)
+        effect = ratio_effect(a, 2 * (0.5 * a + 0.5 * rng.gamma(3, size=80)))
+        held += effect.low <= 2 <= effect.high
+    assert abs(held / 400 - 0.95) < 4 * np.sqrt(0.05 * 0.95 / 400)
+
+
+def test_a_ratio_is_that_of_the_means_and_turns_with_the_order():
+    a, b = np.array([1.0, 2.0, 3.0, 5.0] * 10), np.array([2.0, 2.5, 3.0, 6.0] * 10)
+    forth, back = ratio_effect(a, b), ratio_effect(b, a)
+    assert forth.change == pytest.approx(b.mean() / a.mean())
+    assert back.low == pytest.approx(1 / forth.high)
+    assert back.high == pytest.approx(1 / forth.low)
+    assert ratio_effect(a, a).p == 1.0
+
+
+def test_a_few_trials_that_differ_are_no_finding_however_far():
+    """Three differences of one side have a p of 1/4 by signs; a normal approximation would call them sure."""
+    a = np.ones(1000)
+    b = a.copy()
+    b[:3] = 7.0
+    assert ratio_effect(a, b).p == pytest.approx(0.25, abs=0.03)
+    assert ratio_effect(a, b).low <= 1.0
+
+
+def test_sure_differences_have_a_p_beyond_the_number_of_signs():
+    """Hoeffding's bound: 2 exp(-n / 2) for n equal differences."""
+    assert ratio_effect(np.full(200, 3.0), np.full(200, 4.0)).p == pytest.approx(2 * np.exp(-100.0))
+
+
+def test_success_is_mcnemar_s_test():
+    """12 against 3 discordant trials: 2 (C(15,0) + ... + C(15,3)) / 2^15."""
+    effect = success_effect(*successes(50, 3, 12, 5))
+    assert effect.p == pytest.approx(2 * (1 + 15 + 105 + 455) / 2**15)
+    assert effect.change == pytest.approx(9 / 70)
+
+
+@pytest.mark.parametrize("counts", [(50, 3, 12, 5), (20, 8, 1, 3), (10, 0, 4, 30), (5, 30, 40, 5)])
+def test_the_ends_of_an_interval_of_success_have_the_score_of_the_quantile(counts):
+    """At each end, the shares that are likeliest at that difference give a score of +-1.96: by maximising the
+    likelihood numerically, which the closed form does not."""
+    _, losses, gains, _ = counts
+    effect, trials = success_effect(*successes(*counts)), sum(counts)
+
+    def score(difference: float) -> float:
+        def unlikely(lost: float) -> float:
+            shares = np.array([lost, lost + difference, 1 - 2 * lost - difference])
+            return -float(np.array([losses, gains, trials - losses - gains]) @ np.log(shares))
+
+        bounds = (max(0.0, -difference) + 1e-12, (1 - difference) / 2 - 1e-12)
+        lost = minimize_scalar(unlikely, bounds=bounds, method="bounded", options={"xatol": 1e-12}).x
+        return (gains - losses - trials * difference) / np.sqrt(trials * (2 * lost + difference - difference**2))
+
+    for end, side in ((effect.low, 1), (effect.high, -1)):
+        if end != 0:
+            assert score(end) == pytest.approx(side * norm.isf(0.025), rel=1e-3)
+
+
+def test_no_trial_that_differs_is_no_evidence_and_a_p_of_1():
+    effect = success_effect(*successes(40, 0, 0, 10))
+    assert (effect.p, effect.e, effect.change) == (1.0, 1.0, 0.0)
+    assert effect.low < 0 < effect.high
+
+
+def test_evidence_against_a_fair_coin_in_closed_form():
+    """After one toss 1, whatever it showed; after two equal ones 2 B(2.5, 0.5) / B(0.5, 0.5) 2 = 3/2."""
+    assert fair_coin(1, 0) == pytest.approx(1.0)
+    assert fair_coin(2, 0) == pytest.approx(1.5)
+    assert fair_coin(1, 1) == pytest.approx(0.5)
+    assert fair_coin(10**6, 0) < np.inf
+
+
+def test_evidence_is_1_on_average_where_there_is_nothing():
+    """An exact sum over all numbers of heads, and over all signs of given differences."""
+    heads = np.arange(13)
+    weights = np.array([len(list(itertools.combinations(range(12), k))) for k in heads]) / 2**12
+    assert weights @ np.array([fair_coin(k, 12 - k) for k in heads]) == pytest.approx(1.0)
+    sizes = np.array([0.1, 0.7, 1.0, 2.0, 0.4, 3.0])
+    signs = np.array(list(itertools.product([-1.0, 1.0], repeat=6)))
+    assert np.mean([no_drift(s * sizes, 3.0) for s in signs]) == pytest.approx(1.0)
+
+
+def test_who_looks_after_every_trial_is_misled_no_more_often_than_promised():
+    """1 / alpha is exceeded anywhere among 400 tosses in at most alpha of 300 sequences, up to 3 deviations."""
+    tosses = np.random.default_rng(0).integers(0, 2, (300, 400))
+    heads = np.cumsum(tosses, axis=1)
+    ever = [max(fair_coin(h, i + 1 - h) for i, h in enumerate(row)) >= 10 for row in heads.tolist()]
+    assert np.mean(ever) < 0.1 + 3 * np.sqrt(0.1 * 0.9 / 300)
+    steps = (2 * tosses - 1) * np.random.default_rng(1).uniform(size=(300, 400))
+    drift = [max(no_drift(row[:k], 1.0) for k in range(10, 401, 10)) >= 10 for row in steps]
+    assert np.mean(drift) < 0.1 + 3 * np.sqrt(0.1 * 0.9 / 300)
+
+
+def test_evidence_grows_where_there_is_something():
+    rng = np.random.default_rng(2)
+    assert no_drift(rng.normal(0.2, 0.5, 500).clip(-3, 3), 3.0) > 1e4
+    assert no_drift(-rng.normal(0.2, 0.5, 500).clip(-3, 3), 3.0) > 1e4
+    assert fair_coin(5, 40) > 1e4

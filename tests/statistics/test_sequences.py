@@ -1,0 +1,153 @@
+"""Intervals that stay valid however often one looks: exact probabilities, simulated studies, and trials saved."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.statistics.consistency import clopper_pearson
+from ipe_bench.statistics.sequences import Precision, next_trials, rms_sequence, share_sequence
+
+
+def ever_missed(p: float, step: int, looks: int) -> float:
+    """The exact probability that any of the intervals after `step`, 2 `step`, ... trials misses p: counts are carried
+    from look to look, and those that missed are taken out."""
+    alive = np.ones(1)
+    steps = binom.pmf(np.arange(step + 1), step, p)
+    for look in range(1, looks + 1):
+        alive = np.convolve(alive, steps)
+        for count in np.flatnonzero(alive > 1e-12):
+            low, high = share_sequence(int(count), look * step)
+            if not low <= p <= high:
+                alive[count] = 0.0
+    return 1 - float(alive.sum())
+
+
+@pytest.mark.parametrize("p", [0.5, 0.05])
+def test_an_interval_after_every_ten_trials_holds_the_share_at_all_times(p):
+    missed = ever_missed(p, 10, 25)
+    assert 0 <= missed <= 0.05
+    # What looks as often at intervals of a fixed number misses far more often.
+    assert missed > 0 or p != 0.5
+
+
+def test_intervals_of_a_fixed_number_would_not():
+    """The reason for all this: Clopper and Pearson's after every ten of 250 trials miss one half in more than 10 %."""
+    rng = np.random.default_rng(0)
+    counts = np.cumsum(rng.binomial(10, 0.5, (400, 25)), axis=1)
+    ends = {(k, n): clopper_pearson(k, n) for n in range(10, 251, 10) for k in range(n + 1)}
+    missed = [
+        any(not ends[k, 10 * i][0] <= 0.5 <= ends[k, 10 * i][1] for i, k in enumerate(r, 1)) for r in counts.tolist()
+    ]
+    assert np.mean(missed) > 0.1
+
+
+@pytest.mark.parametrize(("count", "trials"), [(0, 1), (1, 1), (0, 250), (249, 250), (500, 1000), (7, 9000)])
+def test_an_interval_of_a_share_holds_what_was_seen_and_that_of_a_fixed_number(count, trials):
+    low, high = share_sequence(count, trials)
+    fixed = clopper_pearson(count, trials)
+    assert 0 <= low <= fixed[0]
+    assert fixed[1] <= high <= 1
+    mirrored = share_sequence(trials - count, trials)
+    assert (low, high) == (pytest.approx(1 - mirrored[1], abs=1e-9), pytest.approx(1 - mirrored[0], abs=1e-9))
+
+
+def test_looking_costs_half_as_much_again_at_a_thousand_trials():
+    """Robbins's normal mixture, tightest there, is 3.04 deviations wide where a fixed number has 1.96."""
+    low, high = share_sequence(500, 1000)
+    assert (high - low) / 2 == pytest.approx(3.04 * np.sqrt(0.25 / 1000), rel=0.02)
+
+
+def test_a_root_mean_square_scales_with_its_errors_and_narrows_with_trials():
+    squares = np.random.default_rng(0).chisquare(11, (4000, 2)) / 11
+    low, high = rms_sequence(squares)
+    assert np.all((low < 1) & (high > 1))
+    assert rms_sequence(squares * 1e12)[0] == pytest.approx(1e6 * low)
+    few = rms_sequence(squares[:250])
+    assert np.all(high - low < few[1] - few[0])
+    assert np.isnan(rms_sequence(squares[:19])[0]).all()
+    assert rms_sequence(np.zeros((50, 1)))[1] == 0
+
+
+def test_the_next_number_of_trials():
+    """Half as wide takes four times as many, but at most twice as many are taken at once."""
+    assert next_trials(1000, 1.3, 250, 10**6) == 1750
+    assert next_trials(1000, 2.0, 250, 10**6) == 2000
+    assert next_trials(1000, 1.0001, 250, 10**6) == 1250
+    assert next_trials(1100, 1.0001, 250, 10**6) == 1250
+    assert next_trials(250, np.inf, 250, 10**6) == 500
+    assert next_trials(1000, 1.3, 250, 1600) == 1600
+
+
+@pytest.mark.parametrize("given", [0, 1, -0.1, 2, True, "x", float("nan"), {}, {"nees": 0.1}, {"rmse": 0}, None])
+def test_what_is_no_precision_is_refused(given):
+    with pytest.raises(UserError, match="precision"):
+        Precision.of(given)
+
+
+def test_a_precision_is_a_number_or_numbers_by_name():
+    assert Precision.of(0.02) == Precision(success=0.02)
+    assert Precision.of({"rmse": 0.05, "success": 0.01}) == Precision(0.01, 0.05)
+
+
+def trials_taken(p: float, wanted: float, rng: np.random.Generator, block: int = 50) -> tuple[int, bool]:
+    """How many trials a study takes, and whether the interval that it ends with holds the share."""
+    seen, trials = rng.uniform(size=100_000) < p, block
+    while True:
+        count = int(seen[:trials].sum())
+        low, high = share_sequence(count, trials)
+        width = max(high - count / trials, count / trials - low)
+        if width <= wanted or trials == len(seen):
+            return trials, low <= p <= high
+        trials = next_trials(trials, width / wanted, block, len(seen))
+
+
+def test_shares_near_0_and_1_take_fewer_trials_than_a_fixed_thousand_and_one_half_more():
+    """To within the 3.1 % that a thousand trials give in the worst case, p = 0.5."""
+    rng = np.random.default_rng(0)
+    taken = {p: np.mean([trials_taken(p, 0.0316, rng)[0] for _ in range(20)]) for p in (0.0, 0.01, 0.99, 1.0, 0.5)}
+    assert max(taken[0.0], taken[1.0]) <= 250
+    assert max(taken[0.01], taken[0.99]) < 500
+    assert 2000 < taken[0.5] < 3000
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("p", [0.5, 0.9, 0.99, 0.999])
+def test_2000_studies_that_look_after_every_block_are_covered(p):
+    """100 looks at blocks of 50: missed anywhere in at most 5 % of studies; so are those that stop when it suits."""
+    rng = np.random.default_rng(1)
+    ends: dict[tuple[int, int], bool] = {}
+    missed = 0
+    for row in np.cumsum(rng.binomial(50, p, (2000, 100)), axis=1).tolist():
+        for look, count in enumerate(row, 1):
+            key = count, 50 * look
+            if key not in ends:
+                low, high = share_sequence(*key)
+                ends[key] = low <= p <= high
+            if not ends[key]:
+                missed += 1
+                break
+    stopped = [trials_taken(p, 0.05, rng)[1] for _ in range(300)]
+    print(f"p = {p}: covered at all times {1 - missed / 2000:.4f}, on stopping {np.mean(stopped):.3f}")
+    assert missed / 2000 <= 0.05
+    assert np.mean(stopped) >= 0.95
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("law", ["normal, 11 parameters", "normal, 1 parameter", "Student 5, 3 parameters"])
+def test_2000_studies_of_a_root_mean_square_are_covered(law):
+    """20 looks at blocks of 250, from the first on: an asymptotic promise, so up to 3 deviations below 95 %."""
+    rng = np.random.default_rng(2)
+    missed = 0
+    for _ in range(2000):
+        if law.startswith("Student"):
+            squares, true = np.mean(rng.standard_t(5, (5000, 3)) ** 2, axis=1), np.sqrt(5 / 3)
+        else:
+            n = 11 if "11" in law else 1
+            squares, true = rng.chisquare(n, 5000) / n, 1.0
+        ends = (rms_sequence(squares[:stop, None]) for stop in range(250, 5001, 250))
+        missed += any(not low[0] <= true <= high[0] for low, high in ends)
+    print(f"{law}: covered at all times {1 - missed / 2000:.4f}")
+    assert 1 - missed / 2000 > 0.95 - 3 * np.sqrt(0.05 * 0.95 / 2000)
