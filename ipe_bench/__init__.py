@@ -16,7 +16,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from ipe_bench import baselines, measurements, noise, priors, solvers
-    from ipe_bench.api import check, compare, estimate, load, report, run, status
+    from ipe_bench.api import check, compare, design, estimate, load, posterior, report, run, status
     from ipe_bench.basics.errors import UserError
     from ipe_bench.basics.statuses import Status
     from ipe_bench.estimators.base import Estimates, Estimator
@@ -37,7 +37,7 @@ _HOMES = {
     "Scenario": "trials.scenario",
     "Status": "basics.statuses",
     "UserError": "basics.errors",
-    **dict.fromkeys(("check", "compare", "estimate", "load", "report", "run", "status"), "api"),
+    **dict.fromkeys(("check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status"), "api"),
 }
 _ROOMS = ("baselines", "measurements", "noise", "priors", "solvers")
 
@@ -56,10 +56,12 @@ __all__ = [
     "baselines",
     "check",
     "compare",
+    "design",
     "estimate",
     "load",
     "measurements",
     "noise",
+    "posterior",
     "priors",
     "report",
     "run",

@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from ipe_bench.plugins.conformance import Finding
     from ipe_bench.report import ReportResult
     from ipe_bench.report.answer import Answer
+    from ipe_bench.trials.design import Criterion, Design
+    from ipe_bench.trials.posterior import Reference
 
 BLOCK_SIZE = 250
 TRIALS = 1000
@@ -343,6 +345,71 @@ def _real_problem(model: Measurement, noise: Noise, prior: GaussianPrior | None,
     scale = 1.0 if error_scale is None else error_scale
     problem = Scenario(model, noise, prior or GaussianPrior(), scale).problem
     return problem if known else dataclasses.replace(problem, prior_deviation=None)
+
+
+def design(
+    scenario: Scenario,
+    *,
+    by: Sequence[str] | None = None,
+    readings: int | None = None,
+    criterion: Criterion = "A",
+    errors: Sequence[Measurement] = (),
+) -> Design:
+    """What a scenario's readings say about each parameter, and which readings would say more; nothing is simulated.
+
+    The result has `observability` (singular values, bounds, correlations, the least observable direction),
+    `suspects` (what each error of the richer models `errors` does to the estimates, and whether a test of residuals
+    will notice), `ways` and `effects`. A way chooses by one column of the model's index, all else as today, or
+    reading by reading; `by` names the columns of one way instead. Its `saving` is the choice of fewest readings whose
+    mean bound is not above today's, its `sharpest` the smallest mean bound with `readings` readings (today's number
+    where it is None); both say below which bound no choice can go. `measurement(choice)` is the model with those
+    readings.
+    Bounds are averaged over truths from the prior: as squares over parameters in units of today's bound
+    (`criterion` A), or as the volume of the ellipsoid (D).
+
+    >>> import ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
+    >>> found = ib.design(bench, readings=20)
+    >>> half = found.best.sharpest
+    >>> half.readings, bench.measurement.m, half.mean_bound < 2**0.5
+    (20, 40, True)
+    >>> ib.Scenario(found.measurement(half), bench.noise, error_scale=3.0).draw(0, 5).z.shape
+    (5, 20)
+
+    Raises:
+        UserError: the errors of readings are correlated, a column is unknown, or there are too few readings.
+    """
+    from ipe_bench.trials.design import design as designed
+
+    return designed(scenario, by=by, readings=readings, criterion=criterion, errors=errors)
+
+
+def posterior(
+    scenario: Scenario, estimators: Mapping[str, Estimator], trials: int = 3, *, particles: int = 1000
+) -> list[Reference]:
+    """What the readings of a scenario's first trials really say, and how far each estimator's Gaussian is from it.
+
+    The posterior is sampled by sequential Monte Carlo, with nothing linearised, for the normal errors of covariance R
+    that estimators are told. A result has the trial's `truth` (n,), the `posterior` (draws `x` (draws, n) in multiples
+    of the parameters' sizes, `mean`, `covariance`, `modes` with their `shares`, and whether it has `settled`: two
+    populations of particles agree), and for each estimator its `estimates` and a `divergences` entry: `kl` in nats,
+    `shift`, `width` and `energy`.
+
+    >>> import ipe_bench as ib
+    >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
+    >>> (found,) = ib.posterior(bench, {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}, trials=1)
+    >>> found.posterior.settled, len(found.posterior.modes)
+    (True, 1)
+    >>> found.divergences["newton"].kl < 1 < found.divergences["linear"].kl
+    True
+
+    Raises:
+        UserError: the scenario has no prior, an estimator needs what is not there, or there are too few particles.
+    """
+    from ipe_bench.trials.posterior import reference
+
+    validate([scenario], estimators, trials)
+    return [reference(scenario, estimators, trial, particles) for trial in range(trials)]
 
 
 def check(component: Any) -> list[Finding]:

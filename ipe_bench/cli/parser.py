@@ -15,6 +15,8 @@ ipe-bench: which estimator to trust with nonlinear measurements
   ipe-bench run error_scale=33 "solver=[fixed_point,newton]" "baseline=[linear_lse]"
   ipe-bench run -m error_scale=1,10,100 seed=1,2  sweeps; any Hydra flag works after run (--cfg job, --info, ...)
   ipe-bench estimate readings=FILE.csv            parameters from real readings
+  ipe-bench design measurement=gins               what the readings will say, and which to take instead
+  ipe-bench posterior error_scale=300             what a few trials' readings really say, beside the estimators
 """
 _CODES = """\
 `ipe-bench COMMAND --help` says more of one command.
@@ -35,6 +37,31 @@ output=DIR          where the files go: outputs/estimate-MODEL unless given, or 
 
 Files: estimate.json (estimates, standard errors, correlations, tests, versions), residuals.csv, and as PNG and PDF
 residuals (normalised, by time) and ellipses (95 % regions of the most correlated pairs of parameters).
+"""
+_DESIGN = """
+  ipe-bench design                                              the default model, gins
+  ipe-bench design measurement=ranging error_scale=10
+  ipe-bench design measurement=gins --by time                   the same cases and axes, at other times
+  ipe-bench design measurement=gins truth_measurement=gins_tilted
+
+Nothing is simulated with noise and nothing estimated: all follows from the model's slopes at truths drawn from the
+prior. Errors that the model leaves out are those of truth_measurement=, or of every option of measurement= that is the
+same model with more errors.
+
+Files: design.json, readings.csv (the readings that each choice takes), and as PNG and PDF the bound against the number
+of readings. They go to output=DIR, or to outputs/design-MODEL unless another command has written there.
+"""
+
+_POSTERIOR = """
+  ipe-bench posterior error_scale=300 "solver=[newton]" "baseline=[gauss_newton,ekf]"
+  ipe-bench posterior measurement=triad noise=gaussian noise.deviation=0.01 trials=1
+
+For the first trials of a scenario (trials=3 unless given), the posterior itself is sampled, with nothing linearised,
+by sequential Monte Carlo: particles go from the prior to the posterior as the likelihood is let in. Each estimator's
+estimate and covariance are then held against it. It takes seconds to a minute a trial.
+
+Files: posterior.json, and as PNG and PDF a corner picture of each trial (corner_0, corner_1, ...). They go to
+output=DIR, or to outputs/posterior-MODEL unless another command has written there.
 """
 
 
@@ -118,6 +145,26 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         _ESTIMATE,
     )
     estimate.add_argument("arguments", metavar="KEY=VALUE", nargs="*", help="whatever `ipe-bench run` takes")
+    design = add(
+        "design",
+        "what the readings will say of each parameter, and which to take instead",
+        "0 the readings determine every parameter; 1 they do not",
+        _DESIGN,
+    )
+    design.add_argument("arguments", metavar="KEY=VALUE", nargs="*", help="the scenario, as for `ipe-bench run`")
+    design.add_argument("--by", metavar="COLUMN", action="append", help="choose by this column of the readings alone")
+    design.add_argument("--readings", metavar="NUMBER", type=int, help="how many there may be; as many as now")
+    design.add_argument(
+        "--criterion", choices=("A", "D"), default="A", help="mean squared bound (A) or volume of the ellipsoid (D)"
+    )
+    posterior = add(
+        "posterior",
+        "what the readings of a few trials really say, and how far estimators are from it",
+        "0 the populations of particles agree; 1 in some trial they do not",
+        _POSTERIOR,
+    )
+    posterior.add_argument("arguments", metavar="KEY=VALUE", nargs="*", help="whatever `ipe-bench run` takes")
+    posterior.add_argument("--particles", metavar="NUMBER", type=int, default=1000, help="1000 unless given")
     report = add(
         "report",
         "tables, figures and report of what is stored",

@@ -117,6 +117,29 @@ class Measurement(Component, Named, ABC):
         return np.zeros(0)
 
     @property
+    def nuisances(self) -> tuple[Parameter, ...]:
+        """What the k numbers of `nuisance_deviation` are, in their order: each a multiple of `size` `unit`s. Those of
+        one group are told of together."""
+        return tuple(Parameter(f"nuisance_{i + 1}", group="nuisances") for i in range(len(self.nuisance_deviation)))
+
+    @property
+    def candidates(self) -> Measurement:
+        """The model with every reading that could be taken, for a design to choose among: by default those it has.
+
+        Its columns of `index` are this model's, and equal entries mean the same reading.
+        """
+        return self
+
+    @property
+    def levels(self) -> Mapping[str, Mapping[Any, str]]:
+        """Words for entries of `index` that do not speak for themselves, by column: the numbers of cases, say."""
+        return {}
+
+    def taking(self, rows: Sequence[int]) -> Measurement:
+        """The model with these of its readings (rows of z, ascending) and no others."""
+        return Restricted(self, tuple(int(row) for row in rows))
+
+    @property
     def epochs(self) -> tuple[NDArray[np.intp], ...] | None:
         """The rows of z that arrive at each epoch, in order of arrival; None where readings have no order."""
         return None

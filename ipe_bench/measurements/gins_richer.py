@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import NonNegative
+from ipe_bench.measurements.base import Parameter
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.ode.kernel import Kernel
 from ipe_bench.measurements.ode.source import Equations, simulation_source
@@ -57,11 +58,29 @@ class RicherGins(Gins):
         angles = np.repeat([self.accelerometer_misalignment * _ARCSEC, self.platform_misalignment * _ARCSEC], [2, 3])
         return np.concatenate([[quadratic, quadratic], angles, walk])
 
+    @property
+    def nuisances(self) -> tuple[Parameter, ...]:
+        """In the units of the options that set their deviations; the walk's increments in deg/h."""
+        quadratic, across, tilt = "accelerometer quadratic", "accelerometer misalignment", "platform tilt"
+        drift = self.parameters[4].size / self.si_sizes[4]
+        return (
+            *(Parameter(f"quadratic {axis}", "micro-g/g^2", self.gravity / 1e-6, quadratic) for axis in "xy"),
+            *(Parameter(f"misalignment {axes}", "arcsec", 1 / _ARCSEC, across) for axes in ("xy", "yx")),
+            *(Parameter(f"tilt {axis}", "arcsec", 1 / _ARCSEC, tilt) for axis in "xyz"),
+            *(
+                Parameter(f"walk d{axis} {case}.{k}", "deg/h", drift, "gyro random walk")
+                for case in range(1, len(self.cases) + 1)
+                for k in range(1, self.readings_per_case + 1)
+                for axis in "xyz"
+            ),
+        )
+
     def _simulate(self, x: Array, rows: NDArray[np.intp], steps: NDArray[np.int64], offset: Array, z: Array) -> None:
         if x.shape[1] == self.n:
             super()._simulate(x, rows, steps, offset, z)
         else:
-            z[rows] = self._walked(x[rows], steps, z.shape[1] // 8) - offset[self.rows(z.shape[1] // 8)]
+            stop = z.shape[1] // (2 * len(self.cases))
+            z[rows] = self._walked(x[rows], steps, stop) - offset[self.rows(stop)]
 
     def _rates(self, x: Array) -> tuple[Array, float]:
         """With the farthest that the drifts walk; such a trial is tested however slowly it turns."""

@@ -46,16 +46,24 @@ _NARROW = 90
 """Columns of a terminal below which the table of verdicts goes without the residual deviation."""
 
 
-def claim(folder: Path, command: Any, *, elsewhere: bool) -> Path:
+def claim(
+    folder: Path,
+    command: Any,
+    *,
+    elsewhere: bool,
+    result: str = RESULT,
+    files: Sequence[str] = (RESIDUALS, *_FIGURES),
+) -> Path:
     """The folder that this command's results go to: it is new, or holds what the same command wrote before.
 
-    Where it holds anything else of ours, `elsewhere` allows folder-2, folder-3 and so on in its place.
+    `result` is the JSON file that says which command it was, `files` are the others. Where the folder holds anything
+    else of ours, `elsewhere` allows folder-2, folder-3 and so on in its place.
 
     Raises:
         UserError: the folder is taken, or cannot be written to.
     """
     number, candidate = 1, folder
-    while not _is_free(candidate, command):
+    while not _is_free(candidate, command, result, files):
         if not elsewhere:
             raise UserError(
                 f"output={candidate}: holds results of another command, which are not overwritten; choose another "
@@ -74,11 +82,11 @@ def claim(folder: Path, command: Any, *, elsewhere: bool) -> Path:
     return candidate
 
 
-def _is_free(folder: Path, command: Any) -> bool:
-    if not (folder / RESULT).exists():
-        return not any((folder / name).exists() for name in (RESIDUALS, *_FIGURES))
+def _is_free(folder: Path, command: Any, result: str, files: Sequence[str]) -> bool:
+    if not (folder / result).exists():
+        return not any((folder / name).exists() for name in files)
     try:
-        return json.loads((folder / RESULT).read_text(encoding="utf-8"))["command"] == command
+        return json.loads((folder / result).read_text(encoding="utf-8"))["command"] == command
     except (OSError, ValueError, KeyError, TypeError):
         return False
 

@@ -86,7 +86,7 @@ def all_tables(analysis: Analysis) -> list[Table]:
         return []
     tables = [overview(analysis), costs(analysis), portfolio(analysis), comparisons(analysis), ranks(analysis)]
     tables += [parameters(analysis), calibration(analysis), endings(analysis)]
-    tables += [contraction(analysis), covariances(analysis), iterations(analysis)]
+    tables += [contraction(analysis), covariances(analysis), theory(analysis), iterations(analysis)]
     return [t for t in tables if t is not None]
 
 
@@ -170,6 +170,24 @@ def covariances(analysis: Analysis) -> Table | None:
     )
     data = rows[[*analysis.setting_columns, "error_scale", "estimator", *_stored("covariances", STATISTICS)]]
     return Table("covariances", "Covariance of the frozen root", caption, columns, data, appendix=True)
+
+
+def theory(analysis: Analysis) -> Table | None:
+    """What theory expects of least squares, parameter by parameter, beside what happened."""
+    rows = analysis.summary[analysis.summary["predicted_rmse"].notna()]
+    if rows.empty:
+        return None
+    columns = [*_head(analysis, rows), words("estimator", rows["estimator"]), words("parameter", rows["parameter"])]
+    columns += statistics("theory", STATISTICS, rows)
+    caption = (
+        "Estimators that minimise the sum of squares, over solved trials, in the parameters' own units; all: over the"
+        " linear bound, root mean square over parameters. By theory: without any noise drawn, from the slopes of the"
+        " models alone; where readings come from another model than is assumed, from those of both. Relative curvatures"
+        " say how far linear theory reaches: they are small below 0.3."
+    )
+    names = ["error_scale", "estimator", "parameter", "unit"]
+    data = rows[[*analysis.setting_columns, *names, *_stored("theory", STATISTICS)]]
+    return Table("theory", "Theory beside experiment", caption, columns, data, appendix=True)
 
 
 def iterations(analysis: Analysis) -> Table | None:

@@ -26,6 +26,14 @@ def percent(share: float) -> str:
     return f"{value:.0f} %" if value in (0, 100) else f"{value:.1f} %"
 
 
+def enumerate_few(items: Sequence[str], most: int = 6) -> str:
+    """'a, b and 3 others'."""
+    items = list(items)
+    if len(items) > most:
+        return ", ".join(items[:most]) + f" and {len(items) - most} others"
+    return ", ".join(items)
+
+
 def short(value: float) -> str:
     """About four figures."""
     if not math.isfinite(value):

@@ -24,7 +24,7 @@ from ipe_bench.trials.thresholds import EXPECTED, FEW, FIT_LEVEL, GATE, SAME_ROO
 
 Kind = Literal["count", "share", "number", "physical", "seconds", "probability", "word"]
 """How a value is written; `report.words` knows each."""
-Where = Literal["overview", "costs", "parameters", "terminal", "covariances", "iterations", "calibration"]
+Where = Literal["overview", "costs", "parameters", "terminal", "covariances", "iterations", "theory", "calibration"]
 """A table; its columns are in the order of the records."""
 Limits = tuple[Any, Any]
 
@@ -181,8 +181,40 @@ def _eq_14(s: Sample) -> Array:
     return np.sqrt(s.linear_bound**2 + compensation**2)
 
 
+def _known(values: Array) -> Array:
+    return values[np.isfinite(values)]
+
+
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
+
+
+def _predicted(s: Sample) -> tuple[Array, Array]:
+    """Bias (n,) and root mean square error (n,) that theory expects of least squares; NaN of other estimators.
+
+    Where readings come from another model, from each trial's pseudo-true parameters and the scatter about them; where
+    they do not, from the Cramér-Rao bound and Box's bias.
+    """
+    nothing = np.full(s.n, np.nan)
+    if s.group.footer.get("equation") != "least_squares":
+        return nothing, nothing
+    wrong, scatter, box = (s.theory[kind] for kind in ("pseudo_bias", "misspecified", "box_bias"))
+    used = s.solved & np.isfinite(wrong).all(axis=1) & np.isfinite(scatter).all(axis=1)
+    if s.group.footer["identity"]["scenario"].get("truth") is not None:
+        if not used.any():
+            return nothing, nothing
+        return wrong[used].mean(axis=0), np.sqrt(np.mean(wrong[used] ** 2 + scatter[used] ** 2, axis=0))
+    known = np.asarray(np.isfinite(box).all(axis=1))
+    bias = box[known].mean(axis=0) if known.any() else nothing
+    return bias, np.sqrt(_crlb(s) ** 2 + (root_mean(box, known) ** 2 if known.any() else 0.0))
+
+
+def _predicted_bias(s: Sample) -> Array:
+    return _predicted(s)[0]
+
+
+def _predicted_rmse(s: Sample) -> Array:
+    return _predicted(s)[1]
 
 
 def _over_linear_bound(values: Callable[[Sample], Array]) -> Callable[[Sample], float]:
@@ -458,7 +490,7 @@ STATISTICS: tuple[Statistic, ...] = (
         _in_units(_bias),
         given="solved",
         kind="physical",
-        where=("parameters",),
+        where=("parameters", "theory"),
     ),
     Statistic(
         "std",
@@ -485,8 +517,8 @@ STATISTICS: tuple[Statistic, ...] = (
         each_limits=_rmse_limits_each,
         given="solved",
         kind="physical",
-        where=("parameters", "covariances"),
-        limits_titles={"parameters": "95 % of rmse"},
+        where=("parameters", "covariances", "theory"),
+        limits_titles={"parameters": "95 % of rmse", "theory": "95 % of rmse"},
     ),
     Statistic(
         "rmse_anytime",
@@ -530,7 +562,7 @@ STATISTICS: tuple[Statistic, ...] = (
         _in_units(_crlb),
         given="solved",
         kind="physical",
-        where=("parameters", "covariances"),
+        where=("parameters", "covariances", "theory"),
     ),
     Statistic(
         "bayes_bound",
@@ -555,6 +587,49 @@ STATISTICS: tuple[Statistic, ...] = (
         _in_units(_van_trees),
         kind="physical",
         where=("parameters",),
+    ),
+    Statistic(
+        "predicted_bias",
+        "bias by theory",
+        "solved trials under a wrong model, else the first trials",
+        "Mean error that theory expects of least squares: under a wrong model, the distance to the parameters that come"
+        " closest to the error-free readings (Vuong, Caltech working paper 652, 1986); under the right one, the bias of"
+        " second order (Box, J. R. Stat. Soc. B 33, 1971).",
+        _over_linear_bound(_predicted_bias),
+        _in_units(_predicted_bias),
+        given="solved",
+        kind="physical",
+        where=("theory",),
+    ),
+    Statistic(
+        "predicted_rmse",
+        "rmse by theory",
+        "solved trials",
+        "Root mean square error that theory expects of least squares, without any noise drawn: under a wrong model, of"
+        " that distance and the misspecified Cramér-Rao bound A⁻¹ B A⁻¹ about it (Richmond and Horowitz, IEEE Trans."
+        " Signal Processing 63, 2015); under the right one, of the Cramér-Rao bound and the bias of second order.",
+        _over_linear_bound(_predicted_rmse),
+        _in_units(_predicted_rmse),
+        given="solved",
+        kind="physical",
+        where=("theory",),
+    ),
+    Statistic(
+        "curvature_intrinsic",
+        "intrinsic curvature",
+        "the first trials",
+        "Median relative curvature of the surface of readings at the truth, within the 95 % region of the bound (Bates"
+        " and Watts, J. R. Stat. Soc. B 42, 1980): linear theory holds well below 0.3.",
+        lambda s: quantile(_known(s.truth["curvature_intrinsic"]), 0.5),
+        where=("theory",),
+    ),
+    Statistic(
+        "curvature_parameter",
+        "parameter curvature",
+        "the first trials",
+        "The same of the parameters' lines on that surface: how uneven they are.",
+        lambda s: quantile(_known(s.truth["curvature_parameter"]), 0.5),
+        where=("theory",),
     ),
     Statistic(
         "reported",

@@ -23,8 +23,13 @@ NIS = "extra_nis"
 AMBIGUOUS = "extra_ambiguous"
 """Where estimators that look for several minima report 1 if they found some, else 0."""
 SCALARS = ("status", "solved", "success", "iterations", "simulations", "jacobians", "time_s", "nees", "crlb_distance")
-TRUTH = ("contraction_K", "contraction_norm", "contraction_radius", "curvature_M")
+TRUTH = (
+    *("contraction_K", "contraction_norm", "contraction_radius"),
+    *("curvature_M", "curvature_intrinsic", "curvature_parameter"),
+)
 """Scalars of the truth, read where they are stored."""
+THEORY = ("box_bias", "pseudo_bias", "misspecified")
+"""What theory says of least squares for each parameter, read where it is stored."""
 OPTIONAL = ("message", FIT, NIS, AMBIGUOUS, "root_distance")
 """Read where they are stored."""
 
@@ -87,6 +92,8 @@ class Sample:
     """(trials, n), H+ v: what the linear estimate would be off by if h were linear."""
     van_trees: Array
     """(trials, n), deviations of Van Trees's bound, in the first trial of each seed and NaN in the others."""
+    theory: Mapping[str, Array]
+    """(trials, n) by the names in `THEORY`; NaN where it is not stored."""
     truth: Mapping[str, Array]
     """Per trial, by the names in `TRUTH`; NaN where it is not stored."""
     scalars: Mapping[str, Array]
@@ -98,7 +105,7 @@ class Sample:
         names = [p["name"] for p in group.footer["parameters"]]
         vectors = [f"{kind}_{name}" for kind in ("error", "deviation") for name in names]
         bounds = [f"{kind}_{name}" for kind in ("crlb", "bayes") for name in names]
-        linear = [f"{kind}_{name}" for kind in ("linear_error", "van_trees") for name in names]
+        linear = [f"{kind}_{name}" for kind in ("linear_error", "van_trees", *THEORY) for name in names]
         parts: list[dict[str, Array]] = []
         for cell, truth in group.cells:
             rows = collection.load(cell, [*vectors, *SCALARS], OPTIONAL)
@@ -126,6 +133,7 @@ class Sample:
             bayes=matrix("bayes"),
             linear_error=matrix("linear_error"),
             van_trees=matrix("van_trees"),
+            theory={kind: matrix(kind) for kind in THEORY},
             truth=truth,
             scalars=joined,
             shared=shared,

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ipe_bench.basics.linalg import Array, finite, solve
-from ipe_bench.measurements.base import Measurement
 
 
 @dataclass(frozen=True)
@@ -39,20 +38,12 @@ def contraction_of(J_F: Array) -> Contraction:
     )
 
 
-def curvature(model: Measurement, H_plus: Array, x: Array) -> Array:
-    """M of eq. (23) at x (trials, n): the largest abs(d2 g_i / dx_j dx_k) of Newton's g, where at a root
-    d2g = J_F^-1 d2F, by central differences of J_F = H+ dh/dx, for H+ (1, n, m). (trials,), NaN where J_F is singular.
+def curvature(J: Array, second: Array, H_plus: Array) -> Array:
+    """M of eq. (23): the largest abs(d2 g_i / dx_j dx_k) of Newton's g, where at a root d2g = J_F^-1 d2F, from the
+    slopes J (trials, m, n) and second derivatives (trials, m, n, n) of the readings, for H+ (1, n, m). (trials,), NaN
+    where J_F is singular.
     """
-    trials, n = x.shape
-    J_F = np.matmul(H_plus, model.jacobian(x))
-    step = 1e-4 * np.maximum(1.0, np.abs(x))
-    largest = np.zeros(trials)
-    for k in range(n):
-        shift = np.zeros((trials, n))
-        shift[:, k] = step[:, k]
-        rise = np.matmul(H_plus, model.jacobian(x + shift) - model.jacobian(x - shift))
-        second = rise / (2 * step[:, k])[:, None, None]  # d2F_i / dx_j dx_k
-        for j in range(n):
-            bent, _ = solve(J_F, second[:, :, j])
-            largest = np.maximum(largest, np.abs(bent).max(axis=1))
-    return largest
+    trials, m, n = J.shape
+    d2F = np.matmul(H_plus, second.reshape(trials, m, n * n))
+    bent, _ = solve(np.matmul(H_plus, J), d2F)
+    return np.asarray(np.abs(bent).max(axis=(1, 2)))

@@ -97,17 +97,25 @@ class Scenario:
             return _recorded_trial(self.measurement, start, stop)
         model = self.simulator
         streams = [_streams(self.seed, trial) for trial in range(start, stop)]
-        x = np.stack([self.prior.draw(read_only(model.nominal), self.error_scale, rng) for rng, _ in streams])
-        deviation = model.nuisance_deviation
-        if len(deviation):
-            # After the parameters, from the same stream: a richer truth keeps the parameters of the trial.
-            h = model.simulate(
-                np.column_stack([x, [deviation * rng.standard_normal(len(deviation)) for rng, _ in streams]])
-            )
-        else:
-            h = model.simulate(read_only(x))
+        x, h = self._without_noise([rng for rng, _ in streams])
         z = np.stack([self.noise.corrupt(h[i], model.offset, rng) for i, (_, rng) in enumerate(streams)])
         return Trials(start, x, z)
+
+    def error_free(self, start: int, stop: int) -> Array:
+        """The readings (trials, m) of trials start to stop before noise is added; those of a richer truth with what
+        else acts on them."""
+        return self._without_noise([_streams(self.seed, trial)[0] for trial in range(start, stop)])[1]
+
+    def _without_noise(self, streams: list[np.random.Generator]) -> tuple[Array, Array]:
+        """x (trials, n) and h (trials, m), drawn from each trial's stream of parameters."""
+        model = self.simulator
+        x = np.stack([self.prior.draw(read_only(model.nominal), self.error_scale, rng) for rng in streams])
+        deviation = model.nuisance_deviation
+        if not len(deviation):
+            return x, model.simulate(read_only(x))
+        # After the parameters, from the same stream: a richer truth keeps the parameters of the trial.
+        drawn = [deviation * rng.standard_normal(len(deviation)) for rng in streams]
+        return x, model.simulate(np.column_stack([x, drawn]))
 
 
 def _recorded_trial(measurement: Measurement, start: int, stop: int) -> Trials:

@@ -17,6 +17,7 @@ from ipe_bench.basics.linalg import (
     Array,
     Mask,
     deviations,
+    finite,
     information,
     inverse,
     multiply,
@@ -31,15 +32,17 @@ from ipe_bench.measurements.counted import Counted
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.trials.contraction import contraction_of, curvature
 from ipe_bench.trials.fit_test import Spread, fit_probability, inflation_of, spread_of
+from ipe_bench.trials.misspecified import misspecified
 from ipe_bench.trials.roots import frozen_root, least_squares_root
 from ipe_bench.trials.scenario import Scenario, Trials
+from ipe_bench.trials.second_order import box_bias, relative_curvatures, second_derivatives
 from ipe_bench.trials.thresholds import EXPECTED, GATE, SAME_ROOT
 
 HISTORIES = 20
 """Trials whose iterates are kept: the first ones of a scenario."""
 
-CURVED = 5
-"""Trials in which M of eq. (23) is computed, which takes 2 n Jacobians each: the first ones of a scenario."""
+CURVED = 20
+"""Trials in which second derivatives are taken, which takes 2 n Jacobians each: the first ones of a scenario."""
 
 Columns = dict[str, Array]
 
@@ -100,7 +103,8 @@ class Block:
             "contraction_K": contracts.K,
             "contraction_norm": contracts.infinity_norm,
             "contraction_radius": contracts.spectral_radius,
-            "curvature_M": self._curvature(H_plus),
+            **self._bent(names, H_plus),
+            **self._wrong_model(names),
         }
 
     def _van_trees(self) -> Array:
@@ -120,14 +124,41 @@ class Block:
         """h(x) (trials, m) for x (trials, n); NaN where the model fails."""
         return Counted.uncounted(self.problem.measurement, len(x)).simulate(read_only(x), np.arange(len(x)))
 
-    def _curvature(self, H_plus: Array) -> Array:
-        """M of eq. (23) at the truth, for the first trials and NaN for the others."""
+    def _bent(self, names: list[str], H_plus: Array) -> Columns:
+        """What second derivatives at the truth say, for the first trials and NaN for the others: M of eq. (23), the
+        relative curvatures, and the bias of least squares."""
         kept = max(0, min(CURVED, self.trials.stop) - self.trials.start)
-        M = np.full(len(self.trials.x), np.nan)
-        if kept and np.isfinite(H_plus).all():
+        M, intrinsic, parametric = np.full((3, len(self.trials.x)), np.nan)
+        bias = np.full(self.trials.x.shape, np.nan)
+        if kept:
+            J, R = self.jacobian[:kept], self.problem.R
             with np.errstate(all="ignore"):
-                M[:kept] = curvature(self.problem.measurement, H_plus, self.trials.x[:kept])
-        return M
+                second = second_derivatives(self.problem.measurement, self.trials.x[:kept])
+                usable = finite(J) & finite(second)
+                J, second = (np.where(usable.reshape(-1, *[1] * (a.ndim - 1)), a, np.nan) for a in (J, second))
+                bias[:kept] = box_bias(J, second, R)
+                intrinsic[:kept], parametric[:kept] = relative_curvatures(J, second, R)
+                if np.isfinite(H_plus).all():
+                    M[:kept] = curvature(J, second, H_plus)
+        return {
+            "curvature_M": M,
+            "curvature_intrinsic": intrinsic,
+            "curvature_parameter": parametric,
+            **_by_parameter("box_bias", names, bias),
+        }
+
+    def _wrong_model(self, names: list[str]) -> Columns:
+        """Where least squares goes, and how it scatters there, when readings come from another model; nothing where
+        they do not, and where estimators are told another R than that of the noise."""
+        if self.scenario.truth is None or not self.scenario.noise.true_covariance:
+            return {}
+        h = self.scenario.error_free(self.trials.start, self.trials.stop)
+        with np.errstate(all="ignore"):
+            found = misspecified(self.problem, h, self.trials.x, self.jacobian)
+        return {
+            **_by_parameter("pseudo_bias", names, found.bias),
+            **_by_parameter("misspecified", names, found.deviation),
+        }
 
     @cached_property
     def _roots(self) -> dict[tuple[Equation, float], Array]:
@@ -176,8 +207,8 @@ class Block:
         names = [p.name for p in model.parameters]
         error = estimates.x - self.trials.x
         # Whatever the estimator says: what is not finite has not converged.
-        finite = np.isfinite(error).all(axis=1)
-        status = np.where((estimates.status == Status.CONVERGED) & ~finite, Status.NONFINITE, estimates.status)
+        usable = np.isfinite(error).all(axis=1)
+        status = np.where((estimates.status == Status.CONVERGED) & ~usable, Status.NONFINITE, estimates.status)
         converged = status == Status.CONVERGED
         bound = self.bayes_information if "prior" in estimator.needs else self.crlb_information
         distance = np.maximum(quadratic_form(bound, error), 0.0)  # round-off where J lacks rank

@@ -16,7 +16,7 @@ import ipe_bench as ib
 from ipe_bench import api
 
 HEAVY = ("pandas", "matplotlib", "seaborn", "hydra", "omegaconf", "filterpy", "numba", "rich")
-FUNCTIONS = ("check", "compare", "estimate", "load", "report", "run", "status")
+FUNCTIONS = ("check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status")
 
 
 @pytest.mark.parametrize("use", ["pass", "ib.Scenario, ib.Status, ib.UserError, ib.Estimator", "ib.noise.Gaussian"])

@@ -328,7 +328,9 @@ def test_a_spoiled_parquet_file_is_named_by_row_and_column(readings, tmp_path, i
     assert len(error.strip().splitlines()) == 1
 
 
-@pytest.mark.parametrize("command", ["estimate", "report", "status", "list", "new", "check", "compare"])
+@pytest.mark.parametrize(
+    "command", ["estimate", "design", "posterior", "report", "status", "list", "new", "check", "compare"]
+)
 def test_every_command_has_help(tmp_path, monkeypatch, capsys, command):
     monkeypatch.chdir(tmp_path)
     assert main([command, "--help"]) == 0
@@ -339,7 +341,7 @@ def test_every_command_has_help(tmp_path, monkeypatch, capsys, command):
 def test_the_bare_program_says_what_there_is(capsys, words):
     assert main(words) == 0
     text = capsys.readouterr().out
-    for command in ("run", "estimate", "report", "status", "list", "new", "check", "compare"):
+    for command in ("run", "estimate", "design", "posterior", "report", "status", "list", "new", "check", "compare"):
         assert f"\n    {command} " in text
 
 

@@ -23,6 +23,7 @@ from ipe_bench.trials.contraction import contraction_of, curvature
 from ipe_bench.trials.roots import frozen_root
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import CURVED, SAME_ROOT, Block
+from ipe_bench.trials.second_order import second_derivatives
 
 
 def contraction(problem, x):
@@ -101,7 +102,8 @@ def test_the_constant_of_eq_23_is_that_of_a_quadratic():
     root = frozen_root(problem, trials.z, trials.x)
     iterates = Newton(start="nominal").estimate(problem, trials.z, history=True).history[0]
     H_plus, _ = pseudo_inverse(problem.H[None], problem.R)
-    M = curvature(problem.measurement, H_plus, root)[0]
+    model = problem.measurement
+    M = curvature(model.jacobian(root), second_derivatives(model, root), H_plus)[0]
     u, s = root[0, 0], 0.1
     np.testing.assert_allclose(M, (s + s**2 * u) / (1 + s * u + s**2 * u**2 / 2), rtol=1e-5)
     assert 0.5 * M < observed_constant(iterates, root[0]) < 2 * M
@@ -116,7 +118,8 @@ def test_eq_23_takes_the_largest_second_derivative_over_all_pairs():
             rows = [[ones + x[:, 1], x[:, 0]], [zeros, ones + 6 * x[:, 1]]]
             return np.array(rows).transpose(2, 0, 1)
 
-    found = curvature(Square(), np.eye(2)[None], np.zeros((2, 2)))
+    x = np.zeros((2, 2))
+    found = curvature(Square().jacobian(x), second_derivatives(Square(), x), np.eye(2)[None])
     np.testing.assert_allclose(found, 6.0, rtol=1e-9)
 
 

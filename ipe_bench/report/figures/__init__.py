@@ -20,5 +20,6 @@ FIGURES = (
     "data_profile",
     "ranks",
     "correlation",
+    "theory",
 )
 """The modules, in the order of the report; a new figure is a module with a FIGURE, and its name here."""

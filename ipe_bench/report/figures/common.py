@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, Look
+from ipe_bench.report.words import enumerate_few as enumerate_few
 from ipe_bench.report.words import plain
 from ipe_bench.trials.thresholds import FEW
 
@@ -241,14 +242,6 @@ def legend_below(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | N
     longest = max(len(label) for label in handles)
     columns = max(1, min(len(handles), int(fig.get_figwidth() / (0.55 + 0.075 * longest))))
     fig.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=columns)
-
-
-def enumerate_few(items: Sequence[str], most: int = 6) -> str:
-    """'a, b and 3 others'."""
-    items = list(items)
-    if len(items) > most:
-        return ", ".join(items[:most]) + f" and {len(items) - most} others"
-    return ", ".join(items)
 
 
 def values_of(rows: pd.DataFrame, column: str, *, most: int = 20) -> str:

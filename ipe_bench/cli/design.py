@@ -1,0 +1,105 @@
+"""`ipe-bench design`: what readings will say before they are taken, and which to take instead."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.cli import console
+from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, assemble, explain, prepare, rewrite
+from ipe_bench.cli.overrides import read
+from ipe_bench.measurements.base import Measurement
+from ipe_bench.plugins import discovery as plugins
+from ipe_bench.plugins.construct import construct
+from ipe_bench.runs.provenance import describe
+from ipe_bench.trials.design import Criterion, design
+
+_WITHOUT_USE = ("trials", "block_size", "execution", "readings", "write_readings", "solver", "baseline", "estimators")
+
+
+def main(
+    arguments: Sequence[str],
+    by: Sequence[str] | None = None,
+    readings: int | None = None,
+    criterion: Criterion = "A",
+) -> int:
+    """Prints tables and writes files; exit code 1 where the readings do not determine every parameter."""
+    prepare()
+    words = rewrite(arguments)
+    _refuse_keys_without_use(words)
+    read(words, KEYS)
+    try:
+        with initialize_config_dir(str(plugins.own_conf()), version_base="1.3"):
+            config = compose("config", words)
+    except Exception as error:  # what Hydra makes of overrides raises nearly anything
+        raise explain(error) from error
+    named = any(a.lstrip("+").startswith(("name=", "output=")) for a in arguments)
+    chosen = [a.partition("=")[2] for a in arguments if a.startswith("measurement=")]
+    try:
+        job = assemble(config)
+        name = chosen[-1] if chosen else job.scenario.measurement.name
+        if not named:
+            config.name = f"design-{name.replace('/', '-')}"
+    except CONFIG_ERRORS as error:
+        raise explain(error) from error
+    scenario = dataclasses.replace(job.scenario, truth=None)
+    if scenario.noise.real:
+        raise UserError("noise=certified: a design is of readings that are still to be taken; choose another noise")
+    errors = _errors(job)
+    found = design(scenario, by=by, readings=readings, criterion=criterion, errors=errors)
+
+    from ipe_bench.report.answer import claim
+    from ipe_bench.report.designs import FILES, RESULT, render, write_design
+
+    asked = {
+        "scenario": describe(scenario),
+        "errors": [describe(error) for error in errors],
+        "by": None if by is None else list(by),
+        "readings": readings,
+        "criterion": criterion,
+    }
+    folder = claim(Path(config.output), asked, elsewhere=not named, result=RESULT, files=FILES)
+    files = write_design(folder, found, asked, {"measurement": name})
+    out = console()
+    out.print(render(name, found))
+    out.print(f"In {folder}: {', '.join(path.name for path in files)}", markup=False, soft_wrap=True)
+    return 0 if found.observability.observable else 1
+
+
+def _refuse_keys_without_use(words: Sequence[str]) -> None:
+    for word in words:
+        key = word.lstrip("+~").partition("=")[0]
+        if key.split(".")[0].split("@")[0] in _WITHOUT_USE:
+            remedy = "; the number to choose is --readings NUMBER" if key == "readings" else ""
+            raise UserError(f"{key}: is for `ipe-bench run`, and nothing in a design; leave it out{remedy}")
+
+
+def _errors(job: Job) -> list[Measurement]:
+    """The truth that was asked for; else every richer version of the model that there is an option of."""
+    if job.scenario.truth is not None:
+        if not job.scenario.truth.nuisance_deviation.any():
+            raise UserError(
+                f"truth_measurement={job.scenario.truth.name}: has no errors besides the parameters; leave it out, or "
+                "choose a richer one"
+            )
+        return [job.scenario.truth]
+    return list(_richer(job.scenario.measurement))
+
+
+def _richer(model: Measurement) -> Iterator[Measurement]:
+    """Options whose class derives from the model's and which have more errors, with the model's own options."""
+    options: dict[str, Any] = {f.name: getattr(model, f.name) for f in dataclasses.fields(model) if f.init}  # type: ignore[arg-type]
+    for option in plugins.options("measurement"):
+        if option.fault is not None:
+            continue
+        try:
+            other = construct(option.config, f"measurement={option.name}")
+        except UserError:
+            continue  # `ipe-bench list` tells of options that cannot be made
+        if isinstance(other, type(model)) and type(other) is not type(model) and other.nuisance_deviation.any():
+            yield dataclasses.replace(other, **options)  # type: ignore[type-var]

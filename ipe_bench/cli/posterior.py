@@ -1,0 +1,71 @@
+"""`ipe-bench posterior`: what the readings of a few trials really say, beside what estimators make of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+
+from ipe_bench.api import validate
+from ipe_bench.basics.errors import UserError
+from ipe_bench.cli import console
+from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, assemble, explain, prepare, rewrite
+from ipe_bench.cli.overrides import read
+from ipe_bench.plugins import discovery as plugins
+from ipe_bench.runs.provenance import describe
+from ipe_bench.trials.posterior import reference
+
+_WITHOUT_USE = ("block_size", "execution", "readings", "write_readings", "write_readings_trial")
+_TRIALS = 3
+_MOST_TRIALS = 100
+
+
+def main(arguments: Sequence[str], particles: int) -> int:
+    """Samples, prints a table and writes files; exit code 1 where the populations of a trial do not agree."""
+    prepare()
+    words = rewrite(arguments)
+    for word in words:
+        key = word.lstrip("+~").partition("=")[0]
+        if key.split(".")[0] in _WITHOUT_USE:
+            raise UserError(f"{key}: is for other commands, and nothing in a posterior; leave it out")
+    read(words, KEYS)
+    try:
+        with initialize_config_dir(str(plugins.own_conf()), version_base="1.3"):
+            config = compose("config", words)
+    except Exception as error:  # what Hydra makes of overrides raises nearly anything
+        raise explain(error) from error
+    named = any(a.lstrip("+").startswith(("name=", "output=")) for a in arguments)
+    chosen = [a.partition("=")[2] for a in arguments if a.startswith("measurement=")]
+    try:
+        job = assemble(config)
+        name = chosen[-1] if chosen else job.scenario.measurement.name
+        if not named:
+            config.name = f"posterior-{name.replace('/', '-')}"
+    except CONFIG_ERRORS as error:
+        raise explain(error) from error
+    trials = job.trials if any(w.lstrip("+").startswith("trials=") for w in words) else _TRIALS
+    if trials > _MOST_TRIALS:
+        raise UserError(f"trials={trials}: each takes up to a minute; give at most {_MOST_TRIALS}")
+    if job.scenario.noise.real:
+        raise UserError("noise=certified: has no prior to begin with; choose another noise and an error_scale")
+    validate([job.scenario], job.estimators, trials)
+
+    from ipe_bench.report.answer import claim
+    from ipe_bench.report.posteriors import RESULT, render, write_posteriors
+
+    command = {
+        "scenario": describe(job.scenario),
+        "estimators": {label: describe(estimator) for label, estimator in job.estimators.items()},
+        "trials": trials,
+        "particles": particles,
+    }
+    files_ours = [f"corner_{trial}.{kind}" for trial in range(trials) for kind in ("png", "pdf")]
+    folder = claim(Path(config.output), command, elsewhere=not named, result=RESULT, files=files_ours)
+    found = [reference(job.scenario, job.estimators, trial, particles) for trial in range(trials)]
+    files = write_posteriors(folder, job.scenario.measurement, found, command, {"measurement": name})
+    scenario = f"{name}, {job.scenario.noise.name}, error scale {job.scenario.error_scale:g}"
+    out = console()
+    out.print(render(scenario, found))
+    out.print(f"\nIn {folder}: {', '.join(path.name for path in files)}", markup=False, soft_wrap=True)
+    return 0 if all(one.posterior.settled for one in found) else 1

@@ -1,0 +1,226 @@
+"""What readings say about each parameter before any are taken: singular values, the least observable direction, bounds
+and correlations, and which errors that the model leaves out look like its parameters.
+
+All of it follows from Jacobians at truths drawn from the prior. Which readings to take is left to `design`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri, chndtr
+
+from ipe_bench.basics.linalg import Array, Covariance, multiply
+from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.trials.scenario import Scenario
+from ipe_bench.trials.thresholds import FIT_LEVEL
+
+TRUTHS = 30
+"""Truths from the prior over which bounds and designs are averaged."""
+_STEP = 0.1
+"""Of a nuisance's deviation, for central differences: far above round-off, far below where it bends."""
+_SINGLE = 4
+"""Nuisances of a group up to which each is told of by itself."""
+_DRAWS = 200
+_WORTH_SAYING = 0.1
+"""Coefficients of a direction below this share of the largest are left out of its words."""
+
+
+@dataclass(frozen=True)
+class Observability:
+    """What a model's readings say about its parameters; lengths in multiples of the parameters' sizes."""
+
+    parameters: tuple[Parameter, ...]
+    singular_values: Array
+    """Of the whitened Jacobian R^-1/2 J (truths, n), descending."""
+    right: Array
+    """Its right singular vectors (truths, n, n), a row each."""
+
+    @classmethod
+    def at(cls, model: Measurement, R: Covariance, x: Array) -> Observability:
+        """At the truths x (truths, n)."""
+        _, s, right = np.linalg.svd(R.whiten_jacobian(model.jacobian(x)), full_matrices=False)
+        return cls(model.parameters, s, right)
+
+    @cached_property
+    def observable(self) -> bool:
+        """Whether the readings determine every parameter at every truth, to working precision."""
+        s, n = self.singular_values, len(self.parameters)
+        return s.shape[1] == n and bool((s[:, -1] > np.finfo(float).eps * 1e3 * s[:, 0]).all())
+
+    @cached_property
+    def covariance(self) -> Array:
+        """The Cramér-Rao bound (truths, n, n); where the readings leave a direction open it is very large there."""
+        s = np.maximum(self.singular_values, np.finfo(float).eps * self.singular_values[:, :1])
+        scaled = self.right / s[:, :, None]
+        return np.matmul(scaled.swapaxes(1, 2), scaled)
+
+    @cached_property
+    def bound(self) -> Array:
+        """Root mean square over the truths (n,) of each parameter's bound; infinite where readings leave it open."""
+        P = self.covariance.mean(axis=0)
+        return np.where(self._open, np.inf, np.sqrt(np.diag(P)))
+
+    @property
+    def _open(self) -> NDArray[np.bool_]:
+        """Parameters (n,) with a part in a direction that the readings do not determine at some truth."""
+        s = self.singular_values
+        lost = s <= np.finfo(float).eps * 1e3 * s[:, :1]
+        return np.asarray((np.abs(self.right) > 1e-6)[lost].any(axis=0))
+
+    @cached_property
+    def correlation(self) -> Array:
+        """Of the errors of efficient estimates (n, n), over the truths."""
+        P = self.covariance.mean(axis=0)
+        d = np.sqrt(np.diag(P))
+        return P / np.outer(d, d)
+
+    @cached_property
+    def multiple_correlation(self) -> Array:
+        """Of each parameter's error with those of all others (n,): sqrt(1 - 1 / (P_ii (P^-1)_ii)), the median over the
+        truths. The bound is 1 / sqrt(1 - square) of what it were if all others were known."""
+        information = np.sum((self.right * self.singular_values[:, :, None]) ** 2, axis=1)
+        inflation = np.diagonal(self.covariance, axis1=1, axis2=2) * information
+        return np.sqrt(np.maximum(1 - 1 / np.maximum(np.median(inflation, axis=0), 1.0), 0.0))
+
+    @cached_property
+    def least_observable(self) -> Array:
+        """The unit vector (n,) along which an efficient estimate scatters most: the first axis of the mean bound."""
+        return _signed(np.linalg.eigh(self.covariance.mean(axis=0))[1][:, -1])
+
+    @property
+    def words(self) -> str:
+        """`least_observable` in words, such as 'ky - 0.85 kx'."""
+        return in_words([p.name for p in self.parameters], self.least_observable)
+
+
+def in_words(names: Sequence[str], direction: Array) -> str:
+    """A direction (n,) as a sum over its largest coefficient, without what is below a tenth of it."""
+    # What is equal but for round-off stays in the order of the names.
+    order = np.argsort(-np.round(np.abs(direction) / np.abs(direction).max(), 6), kind="stable")
+    coefficients = direction / direction[order[0]]
+    text = str(names[order[0]])
+    for i in order[1:]:
+        if abs(coefficients[i]) < _WORTH_SAYING:
+            break
+        size = f"{abs(coefficients[i]):.2f}"
+        text += f" {'+' if coefficients[i] > 0 else '-'} {'' if size == '1.00' else size + ' '}{names[i]}"
+    return text
+
+
+def _signed(v: Array) -> Array:
+    return v * np.sign(v[np.argmax(np.abs(v))])
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """An error that the model leaves out, of its usual size, and what least squares makes of it to first order."""
+
+    name: str
+    unit: str
+    deviation: float
+    """Its standard deviation, in `unit`."""
+    shift: Array
+    """By how much it moves each parameter's estimate (n,): root mean square, in multiples of the parameters' sizes;
+    with its sign where it is a single number."""
+    bounds: float
+    """The largest shift of a parameter, in standard deviations of its bound."""
+    parameter: str
+    """The parameter that it moves most."""
+    visible: float
+    """The share of its whitened squares that the residuals keep; the parameters imitate the rest."""
+    noticed: float
+    """The chance that the test of fit at its level notices it, by the noncentral chi-square law."""
+    words: str
+    """Where it is a single number: the direction, in multiples of its deviation and of the parameters' sizes, in which
+    parameters undo what it does to the readings."""
+
+    @property
+    def hidden(self) -> bool:
+        """Whether it makes the answer wrong and the test of fit will mostly not say so."""
+        return self.bounds > 1 and self.noticed < 0.5
+
+
+def suspects(model: Measurement, R: Covariance, truth: Measurement, x: Array) -> tuple[Suspect, ...]:
+    """The errors that `truth` has and `model` has not, at the truths x (truths, n), the largest shift first.
+
+    Each is a nuisance of `truth`; those of a group of many are taken together.
+    """
+    J = R.whiten_jacobian(model.jacobian(x))
+    Q, s, right = np.linalg.svd(J, full_matrices=False)
+    bound = np.sqrt(np.sum((right / s[:, :, None]) ** 2, axis=1))
+    G = R.whiten_jacobian(nuisance_slopes(truth, x))
+    inside = np.matmul(Q.swapaxes(1, 2), G)
+    # To first order least squares moves by J+ g, and leaves g - J J+ g in the residuals.
+    shift = np.matmul(right.swapaxes(1, 2), inside / s[:, :, None])
+    left = G - np.matmul(Q, inside)
+    found, names = [], [p.name for p in model.parameters]
+    for name, unit, deviation, columns in _told(truth):
+        moved, kept, whole = shift[:, :, columns], left[:, :, columns], G[:, :, columns]
+        rms = np.sqrt(np.mean(np.sum(moved**2, axis=2), axis=0))
+        relative = np.sqrt(np.mean(np.sum((moved / bound[:, :, None]) ** 2, axis=2), axis=0))
+        worst = int(np.argmax(relative))
+        single = len(columns) == 1
+        sign = np.sign(moved[:, :, 0].mean(axis=0)) if single else 1.0
+        found.append(
+            Suspect(
+                name=name,
+                unit=unit,
+                deviation=deviation,
+                shift=rms * sign,
+                bounds=float(relative[worst]),
+                parameter=names[worst],
+                visible=float(np.sum(kept**2) / np.sum(whole**2)) if np.any(whole) else 0.0,
+                noticed=_noticed(kept, model.m - model.n),
+                words=in_words([name, *names], np.concatenate([[1.0], -rms * sign])) if single else "",
+            )
+        )
+    return tuple(sorted(found, key=lambda suspect: -suspect.bounds))
+
+
+def nuisance_slopes(truth: Measurement, x: Array) -> Array:
+    """The readings' slopes (truths, m, k) along the k nuisances that have a deviation, per deviation, at 0."""
+    deviation = truth.nuisance_deviation
+    active = np.flatnonzero(deviation)
+    steps = np.zeros((len(active), len(deviation)))
+    steps[np.arange(len(active)), active] = _STEP * deviation[active]
+    slopes = []
+    for one in x:  # a truth at a time: there may be hundreds of nuisances
+        fixed = np.broadcast_to(one, (len(active), len(one)))
+        above, below = (truth.simulate(np.concatenate([fixed, sign * steps], axis=1)) for sign in (1.0, -1.0))
+        slopes.append((above - below).T / (2 * _STEP))
+    return np.stack(slopes)
+
+
+def _told(truth: Measurement) -> Iterator[tuple[str, str, float, list[int]]]:
+    """Name, unit, deviation and columns, among the active nuisances, of each suspect."""
+    deviation = truth.nuisance_deviation
+    active = [(p, d) for p, d in zip(truth.nuisances, deviation, strict=True) if d != 0]
+    groups: dict[str, list[int]] = {}
+    for i, (parameter, _) in enumerate(active):
+        groups.setdefault(parameter.group or parameter.name, []).append(i)
+    for group, columns in groups.items():
+        if len(columns) <= _SINGLE:
+            for i in columns:
+                yield active[i][0].name, active[i][0].unit, float(active[i][1] * active[i][0].size), [i]
+        else:
+            first, size = active[columns[0]]
+            yield group, first.unit, float(size * first.size), columns
+
+
+def _noticed(left: Array, degrees: int) -> float:
+    """The mean chance of a misfit, over truths and draws of the nuisances, for what they leave (truths, m, k)."""
+    rng = np.random.Generator(np.random.Philox(0))
+    drawn = rng.standard_normal((_DRAWS, left.shape[2]))
+    inner = np.matmul(left.swapaxes(1, 2), left)
+    squares = np.stack([np.einsum("dk,dk->d", drawn, multiply(one, drawn)) for one in inner])
+    return float(np.mean(1 - chndtr(chdtri(degrees, FIT_LEVEL), degrees, squares)))
+
+
+def truths_of(scenario: Scenario, count: int = TRUTHS) -> Array:
+    """The truths (count, n) that the averages are over: those of the scenario's first trials."""
+    return scenario.truths(0, count)

@@ -1,0 +1,82 @@
+"""`ipe-bench design`: tables, files, and mistakes in one line."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import pytest
+
+from ipe_bench.cli.main import main
+
+SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01")
+
+
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    """Runs the command in this process: its exit code and what it wrote on stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words: str) -> tuple[int, str, str]:
+        code = main(["design", *words])
+        written = capsys.readouterr()
+        return code, written.out, written.err
+
+    return run
+
+
+def test_tables_and_files_say_the_same(command, tmp_path):
+    code, out, _ = command(*SMALL, "--readings", "20")
+    assert code == 0
+    assert "what 40 readings say" in out
+    folder = tmp_path / "outputs" / "design-polynomial"
+    found = json.loads((folder / "design.json").read_text())
+    (way,) = found["ways"]
+    assert f"Least observable direction: {found['least_observable_direction']}" in out
+    assert f"{way['sharpest']['mean_bound']:.3f}" in out
+    with (folder / "readings.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["choice"] == "sharpest"]
+    assert [float(row["time"]) for row in rows] == [pytest.approx(unit[0]) for unit in way["sharpest"]["units"]]
+    assert len(rows) == way["sharpest"]["readings"] == 20
+    assert all((folder / name).stat().st_size > 5000 for name in ("design.png", "design.pdf"))
+    # The same command writes there again, another one elsewhere.
+    assert command(*SMALL, "--readings", "20")[0] == 0
+    assert not (tmp_path / "outputs" / "design-polynomial-2").exists()
+    assert command(*SMALL, "--readings", "25")[0] == 0
+    assert (tmp_path / "outputs" / "design-polynomial-2" / "design.json").exists()
+
+
+def test_every_richer_version_of_the_model_is_suspected(command):
+    code, out, _ = command("measurement=gins", "error_scale=33", "--by", "axis", "output=here")
+    assert code == 0
+    rows = {line.split("  ")[0]: line for line in out.splitlines()}
+    for name in ("tilt x", "tilt y", "gyro random walk", "misalignment xy", "quadratic x"):
+        assert name in rows
+    assert "yes" in rows["tilt y"]
+    assert "tilt y + 0.97 bx" in rows["tilt y"]
+    assert "No test of residuals will see tilt y, tilt x, tilt z" in out
+
+
+def test_the_truth_that_is_asked_for_is_the_only_suspect(command):
+    _, out, _ = command("measurement=gins", "truth_measurement=gins_tilted", "--by", "axis", "output=here")
+    assert "5 arcsec" in out
+    assert "misalignment" not in out
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["trials=5"], "trials: is for `ipe-bench run`"),
+        (["solver=[newton]"], "solver: is for `ipe-bench run`"),
+        (["readings=a.csv"], "--readings NUMBER"),
+        (["--by", "colour"], "by=colour: there is no such column"),
+        (["--criterion", "E"], "--criterion: invalid choice"),
+        (["--readings", "3"], "readings=3: 4 parameters want"),
+        (["truth_measurement=polynomial"], "has no errors besides the parameters"),
+    ],
+)
+def test_mistakes_are_one_line(command, words, expected):
+    code, _, error = command(*SMALL, *words)
+    assert code == 2
+    assert expected in error
+    assert len(error.strip().splitlines()) == 1

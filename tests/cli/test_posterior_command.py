@@ -1,0 +1,57 @@
+"""`ipe-bench posterior`: a table, files, and mistakes in one line."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from ipe_bench.cli.main import main
+
+SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "error_scale=3", "solver=[newton]")
+
+
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    """Runs the command in this process: its exit code and what it wrote on stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words: str) -> tuple[int, str, str]:
+        code = main(["posterior", *words])
+        written = capsys.readouterr()
+        return code, written.out, written.err
+
+    return run
+
+
+def test_a_table_and_files_for_each_trial(command, tmp_path):
+    code, out, _ = command(*SMALL, "baseline=[linear_lse]", "trials=2", "--particles", "400")
+    assert code == 0
+    folder = tmp_path / "outputs" / "posterior-polynomial"
+    found = json.loads((folder / "posterior.json").read_text())
+    assert [trial["trial"] for trial in found["trials"]] == [0, 1]
+    for trial in found["trials"]:
+        assert trial["settled"]
+        assert trial["estimators"]["newton"]["kl"] < 0.3 < trial["estimators"]["linear_lse"]["kl"]
+        for kind in ("png", "pdf"):
+            assert (folder / f"corner_{trial['trial']}.{kind}").stat().st_size > 5000
+    rows = [line.split() for line in out.splitlines()]
+    assert [row[-1] for row in rows if "newton" in row] == ["yes", "yes"]
+    assert [row[-1] for row in rows if "linear_lse" in row] == ["NO", "NO"]
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["readings=a.csv"], "readings: is for other commands"),
+        (["trials=1000"], "trials=1000: each takes up to a minute"),
+        (["--particles", "20"], "particles=20: give at least 80"),
+        (["--particles", "many"], "--particles: invalid int value"),
+        (["trials=0"], "trials=0: give a whole number above 0"),
+    ],
+)
+def test_mistakes_are_one_line(command, words, expected):
+    code, _, error = command(*SMALL, "baseline=[]", *words)
+    assert code == 2
+    assert expected in error
+    assert len(error.strip().splitlines()) == 1

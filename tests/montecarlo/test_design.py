@@ -1,0 +1,318 @@
+"""What to measure next: brute force, closed forms, and the Monte Carlo that a designed model is put to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import ipe_bench as ib
+from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.measurements import Gins, Measurement, Parameter, RicherGins
+from ipe_bench.measurements.base import Restricted
+from ipe_bench.trials.design import design
+from ipe_bench.trials.observability import Observability, in_words, suspects
+
+NOISE = ib.noise.Quantization()
+
+
+@dataclass(frozen=True)
+class Linear(Measurement):
+    """h(x) = A x, of which today has the first `count` readings of `most`."""
+
+    count: int = 5
+    most: int = 9
+    seed: int = 3
+    analytic = True
+
+    @property
+    def A(self) -> Array:
+        return np.random.default_rng(self.seed).normal(size=(self.most, 3))[: self.count]
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return tuple(Parameter(name) for name in "abc")
+
+    @property
+    def index(self):
+        return {"number": list(range(self.count))}
+
+    @property
+    def candidates(self) -> Measurement:
+        return replace(self, count=self.most)
+
+    def simulate(self, x: Array) -> Array:
+        return np.matmul(self.A, x[..., None])[..., 0]
+
+
+@dataclass(frozen=True)
+class Curve(Measurement):
+    """A polynomial of degree n - 1 on [-1, 1], each time to be read up to four times."""
+
+    degree: int = 2
+    times: tuple[float, ...] = tuple(np.linspace(-1, 1, 21).round(6))
+    repeats: int = 4
+    analytic = True
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return tuple(Parameter(f"c{i}") for i in range(self.degree + 1))
+
+    @property
+    def index(self):
+        return {"time": [t for t in self.times for _ in range(self.repeats)], "repeat": [*range(self.repeats)] * 21}
+
+    def simulate(self, x: Array) -> Array:
+        return np.matmul(np.vander(self.index["time"], self.degree + 1, increasing=True), x[..., None])[..., 0]
+
+
+def scenario(model: Measurement, noise=None, scale: float = 1.0) -> ib.Scenario:
+    return ib.Scenario(model, noise or ib.noise.Gaussian(0.1), error_scale=scale)
+
+
+def mean_bound(A: Array, today: Array, criterion: str) -> float:
+    P, P0 = (np.linalg.inv(a.T @ a) for a in (A, today))
+    if criterion == "D":
+        return (np.linalg.det(P) / np.linalg.det(P0)) ** (1 / (2 * len(P)))
+    return np.sqrt(np.mean(np.diag(P) / np.diag(P0)))
+
+
+@pytest.mark.parametrize("criterion", ["A", "D"])
+@pytest.mark.parametrize("seed", range(6))
+def test_the_best_choice_is_that_of_brute_force_and_none_is_below_the_limit(criterion, seed):
+    model = Linear(seed=seed)
+    today, everything = model.A, replace(model, count=9).A
+    every = {
+        rows: mean_bound(everything[list(rows)], today, criterion)
+        for count in (3, 4, 5)
+        for rows in combinations(range(9), count)
+    }
+    (way,) = design(scenario(model), criterion=criterion).ways
+    best = min(every.values())
+    assert way.sharpest.mean_bound == pytest.approx(every[way.sharpest.rows])
+    assert way.sharpest.mean_bound <= 1.02 * best  # an exchange may end next to the best
+    assert 0.6 * best < way.sharpest.least <= best * (1 + 1e-9)
+    if way.saving:
+        as_good = [rows for rows, bound in every.items() if bound <= 1]
+        assert way.saving.readings == min(map(len, as_good))
+        assert way.saving.least <= min(b for rows, b in every.items() if len(rows) == way.saving.readings) + 1e-9
+
+
+def test_a_parabola_is_best_read_at_its_ends_and_in_the_middle():
+    """The D-optimal design of quadratic regression: a third each (Smith, Biometrika 12, 1918)."""
+    (way,) = design(scenario(Curve()), by=["time", "repeat"], readings=12, criterion="D").ways
+    entries = [way.units.entries[u][0] for u in way.sharpest.taken]
+    assert sorted(set(entries)) == [-1.0, 0.0, 1.0]
+    assert [entries.count(t) for t in (-1.0, 0.0, 1.0)] == [4, 4, 4]
+    assert way.sharpest.least == pytest.approx(way.sharpest.mean_bound, rel=5e-3)
+
+
+def test_a_cubic_is_best_read_where_theory_says():
+    """The D-optimal points of a polynomial of degree p: the ends, and the zeros of P_p' (Guest, Ann. Math. Stat. 29,
+    1958); for degree 3 they are at 1/sqrt(5)."""
+    (way,) = design(scenario(Curve(3)), by=["time", "repeat"], readings=16, criterion="D").ways
+    entries = np.array([way.units.entries[u][0] for u in way.sharpest.taken])
+    inner = np.abs(entries)[np.abs(entries) < 0.99]
+    assert len(inner) == 8
+    assert np.abs(inner - 1 / np.sqrt(5)).max() < 0.06  # the grid has 0.4 and 0.5
+
+
+def test_effects_are_what_is_left_without_and_with():
+    model = Linear()
+    found = design(scenario(model))
+    everything, today = replace(model, count=9).A, model.A
+    for effect in found.effects:
+        rows = [i for i in range(5) if i != effect.entry] if effect.action == "drop" else [*range(5), effect.entry]
+        assert (effect.entry < 5) == (effect.action == "drop")
+        assert effect.readings == len(rows)
+        assert effect.mean_bound == pytest.approx(mean_bound(everything[rows], today, "A"))
+
+
+def test_bounds_and_correlations_are_those_of_the_covariance():
+    model = Linear(count=9)
+    R = Covariance(np.full(9, 0.1))
+    seen = Observability.at(model, R, np.zeros((4, 3)))
+    P = 0.01 * np.linalg.inv(model.A.T @ model.A)
+    np.testing.assert_allclose(seen.bound, np.sqrt(np.diag(P)))
+    np.testing.assert_allclose(seen.correlation, P / np.sqrt(np.outer(np.diag(P), np.diag(P))))
+    # The multiple correlation of one error with the others, by regression of draws upon draws.
+    e = np.random.default_rng(0).multivariate_normal(np.zeros(3), P, size=200_000)
+    for i in range(3):
+        others = np.delete(e, i, axis=1)
+        fitted = others @ np.linalg.lstsq(others, e[:, i])[0]
+        assert np.corrcoef(fitted, e[:, i])[0, 1] == pytest.approx(seen.multiple_correlation[i], abs=0.01)
+    scatter = e @ seen.least_observable
+    assert scatter.std() == pytest.approx(np.sqrt(np.linalg.eigvalsh(P)[-1]), rel=0.01)
+
+
+@dataclass(frozen=True)
+class Alike(Linear):
+    """Only a + b and c are in the readings."""
+
+    @property
+    def A(self) -> Array:
+        A = super().A.copy()
+        A[:, 1] = A[:, 0]
+        return A
+
+
+def test_a_direction_that_no_reading_has_is_named_and_its_bounds_are_infinite():
+    seen = Observability.at(Alike(count=9), Covariance(np.full(9, 0.1)), np.zeros((2, 3)))
+    assert not seen.observable
+    assert seen.words == "a - b"
+    assert np.isinf(seen.bound[:2]).all()
+    assert np.isfinite(seen.bound[2])
+    assert design(scenario(Alike())).ways == ()
+
+
+def test_directions_are_words():
+    assert in_words(["bx", "tilt"], np.array([1.0, -0.98])) == "bx - 0.98 tilt"
+    assert in_words(["a", "b", "c"], np.array([0.02, -2.0, 2.0])) == "b - c"
+
+
+@dataclass(frozen=True)
+class Hidden(Linear):
+    """With two errors besides: one that looks like 2 a - c, and one that looks like nothing in the model."""
+
+    @property
+    def nuisance_deviation(self) -> Array:
+        return np.array([0.5, 0.3])
+
+    @property
+    def nuisances(self) -> tuple[Parameter, ...]:
+        return Parameter("twin", "m", 10.0, "twins"), Parameter("stranger", group="strangers")
+
+    def simulate(self, x: Array) -> Array:
+        A = self.A
+        across = np.linalg.svd(A)[0][:, -1]
+        z = np.matmul(A, x[:, :3, None])[..., 0]
+        return z + x[:, 3:4] * (2 * A[:, 0] - A[:, 2]) + x[:, 4:5] * across if x.shape[1] > 3 else z
+
+
+def test_what_the_parameters_imitate_is_found_with_what_it_does():
+    model, R = Linear(count=9), Covariance(np.full(9, 0.1))
+    twin, stranger = suspects(model, R, Hidden(count=9), np.zeros((3, 3)))
+    assert (twin.name, twin.deviation, twin.unit) == ("twin", 5.0, "m")
+    np.testing.assert_allclose(twin.shift, [1.0, 0.0, -0.5], atol=1e-9)
+    assert twin.visible < 1e-20
+    assert twin.noticed == pytest.approx(1e-3)
+    assert twin.hidden
+    assert twin.words == "twin - a + 0.50 c"
+    np.testing.assert_allclose(stranger.shift, 0.0, atol=1e-9)
+    assert stranger.visible == pytest.approx(1.0)
+    assert not stranger.hidden
+    # Its residuals have a noncentral chi-square law; over N(0, 3^2) of its size in deviations of a reading.
+    sizes = 3 * np.random.default_rng(1).standard_normal(4000)
+    limit = stats.chi2.isf(1e-3, 6)
+    assert stranger.noticed == pytest.approx(np.mean(stats.ncx2.sf(limit, 6, sizes**2)), abs=0.06)
+
+
+def test_the_tilt_that_looks_like_a_bias_is_named_before_anything_is_measured():
+    found = design(scenario(Gins(), NOISE, 33.0), errors=[RicherGins(platform_misalignment=5.0)], truths=5)
+    first, second, _ = found.suspects
+    assert {first.name, second.name} == {"tilt x", "tilt y"}
+    tilts = {s.name: s for s in found.suspects}
+    assert tilts["tilt y"].words == "tilt y + 0.24 bx"
+    assert tilts["tilt x"].words.startswith("tilt x - 0.24 by")
+    # A platform that leans by an angle feels that share of gravity: 5 arcsec are 0.242 of 1e-4 g.
+    assert tilts["tilt y"].shift[0] == pytest.approx(-np.tan(np.deg2rad(5 / 3600)) / 1e-4, rel=0.02)
+    assert all(s.hidden and s.noticed < 2e-3 for s in tilts.values())
+
+
+def test_the_tilt_costs_what_the_mismatch_experiment_finds():
+    """The predicted root mean square over parameters beside Gauss-Newton's, as in the README's table."""
+    truth = RicherGins(platform_misalignment=5.0)
+    bench = replace(scenario(Gins(), NOISE, 33.0), truth=truth)
+    predicted = suspects(bench.measurement, bench.problem.R, truth, bench.truths(0, 8))
+    trials = bench.draw(0, 60)
+    estimates = ib.baselines.GaussNewton().estimate(bench.problem, trials.z)
+    error = estimates.x - trials.x
+    moved = np.sqrt(sum(s.shift**2 for s in predicted))
+    found = np.sqrt(np.mean(error**2, axis=0))
+    assert found[:2] == pytest.approx(moved[:2], rel=0.3)
+
+
+@pytest.fixture(scope="module")
+def gins():
+    return design(scenario(Gins(), NOISE, 33.0), by=["time"], truths=10)
+
+
+def test_fewer_readings_at_better_times_are_worth_more(gins):
+    (way,) = gins.ways
+    assert way.saving.readings < 240
+    assert way.saving.mean_bound <= 1
+    assert way.sharpest.readings <= 240
+    assert way.sharpest.mean_bound < 0.9
+    model = gins.measurement(way.saving)
+    assert (model.n, model.m) == (11, way.saving.readings)
+    x = 33.0 * np.random.default_rng(0).normal(size=(2, 11))
+    np.testing.assert_allclose(model.simulate(x), gins.candidates.simulate(x)[:, list(way.saving.rows)], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_gauss_newton_reaches_the_bound_of_the_designed_model(gins):
+    """The ratio of its error to that on the paper's four cases is the predicted one, on 400 trials each."""
+    (way,) = gins.ways
+    for choice in (way.saving, way.sharpest):
+        ratio = []
+        for model in (gins.measurement(choice), Gins()):
+            table = ib.run(scenario(model, NOISE, 33.0), {"gn": ib.baselines.GaussNewton()}, trials=400)
+            rows = table[table["parameter"] != "all"]
+            assert (rows["solved"] == 1).all()
+            ratio.append(rows["rmse"].to_numpy())
+        mean = np.sqrt(np.mean((ratio[0] / ratio[1]) ** 2))
+        # Eleven ratios of deviations of 400 errors each: a standard deviation of 0.05 apiece, 0.02 together.
+        assert mean == pytest.approx(choice.mean_bound, abs=0.05)
+
+
+def test_four_cases_of_the_paper_are_as_good_as_any_four():
+    """The limit says that no four velocities do better by half a per cent: the paper chose well."""
+    (way,) = design(scenario(Gins(), NOISE, 33.0), by=["case"], truths=10).ways
+    assert way.sharpest.readings == 240
+    assert 0.99 < way.sharpest.least <= way.sharpest.mean_bound <= 1
+
+
+def test_candidates_of_gins_begin_with_its_own_cases_and_say_what_they_are():
+    model = Gins()
+    more = model.candidates
+    assert isinstance(more, Gins)
+    np.testing.assert_allclose(more.cases[:4], model.cases)
+    assert np.hypot(*more.cases.T).max() == pytest.approx(np.hypot(*model.cases.T).max())
+    assert more.levels["case"][1] == "1500, 0 ft/s"
+    here, there = (list(zip(*m.index.values(), strict=True)) for m in (model, more))
+    assert set(here) < set(there)
+    x = np.random.default_rng(2).normal(size=(2, 11))
+    rows = [there.index(entry) for entry in here]
+    np.testing.assert_allclose(more.simulate(x)[:, rows], model.simulate(x), atol=1e-9)
+    assert more.taking(sorted(rows)) == model
+
+
+def test_whole_cases_are_options_and_single_readings_a_restriction():
+    more = Gins().candidates
+    assert isinstance(more, Gins)
+    case = np.array(more.index["case"])
+    two = more.taking(np.flatnonzero((case == 2) | (case == 5)).tolist())
+    assert isinstance(two, Gins)
+    assert two.injected == ((0.0, 1500.0), (1299.038, 750.0))
+    few = more.taking([0, 5, 700])
+    assert isinstance(few, Restricted)
+    assert isinstance(few.whole, Gins)
+    assert len(few.whole.cases) == 2
+    x = 10 * np.random.default_rng(2).normal(size=(2, 11))
+    np.testing.assert_allclose(few.simulate(x), more.simulate(x)[:, [0, 5, 700]], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "noise", "words"),
+    [
+        ({"by": ["colour"]}, None, "by=colour: there is no such column"),
+        ({"readings": 2}, None, "readings=2: 3 parameters want"),
+        ({}, ib.noise.Correlated(0.1, 0.5), "the errors of readings are correlated"),
+    ],
+)
+def test_mistakes_are_one_line(options, noise, words):
+    with pytest.raises(ib.UserError, match=words):
+        ib.design(scenario(Linear(), noise), **options)

@@ -1,0 +1,250 @@
+"""Theory beside experiment: closed forms of curvature, bias and misspecified bound, and the Monte Carlo beside them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+from small_models import Bent
+
+import ipe_bench as ib
+from ipe_bench.api import compute
+from ipe_bench.basics.linalg import Array, Covariance, information
+from ipe_bench.measurements import Gins, Measurement, Parameter, RicherGins
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.report.tables import all_tables
+from ipe_bench.statistics import analyse
+from ipe_bench.trials.misspecified import misspecified
+from ipe_bench.trials.roots import least_squares_root
+from ipe_bench.trials.scoring import CURVED, Block
+from ipe_bench.trials.second_order import box_bias, relative_curvatures, second_derivatives
+from ipe_bench.trials.weiss_weinstein import false_roots, threshold, weiss_weinstein
+
+RADIUS = 1.959964
+"""The 95 % region of one parameter, in deviations."""
+
+
+@dataclass(frozen=True)
+class Formula(Measurement):
+    """Readings by a formula of x (trials, n)."""
+
+    formula: Any = None
+    n_: int = 1
+    m_: int = 2
+    analytic = True
+
+    def __post_init__(self) -> None:
+        """No options."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return tuple(Parameter(f"p{i}") for i in range(self.n_))
+
+    @property
+    def index(self):
+        return {"number": list(range(self.m_))}
+
+    def simulate(self, x: Array) -> Array:
+        return np.stack(self.formula(*x.T), axis=1)
+
+
+def curvatures(model: Measurement, x: Array, sigma: float = 1.0) -> tuple[Array, Array]:
+    R = Covariance(np.full(model.m, sigma))
+    return relative_curvatures(model.jacobian(x), second_derivatives(model, x), R)
+
+
+def test_a_circle_bends_by_its_radius_and_runs_evenly():
+    model = Formula(formula=lambda t: (5 * np.cos(t), 5 * np.sin(t)))
+    intrinsic, parametric = curvatures(model, np.array([[0.3], [2.0]]), sigma=0.5)
+    np.testing.assert_allclose(intrinsic, RADIUS * 0.5 / 5, rtol=1e-5)
+    np.testing.assert_allclose(parametric, 0.0, atol=1e-6)
+
+
+def test_a_bent_scale_on_a_straight_line_is_all_parameter_effects():
+    model = Formula(formula=lambda t: (3 * t**3, 4 * t**3))
+    intrinsic, parametric = curvatures(model, np.array([[2.0]]))
+    # h = 5 t^3 along a line: h'' / h'^2.
+    np.testing.assert_allclose(parametric, RADIUS * 30 * 2 / (15 * 4) ** 2, rtol=1e-5)
+    np.testing.assert_allclose(intrinsic, 0.0, atol=1e-8)
+
+
+def test_a_sphere_bends_alike_in_all_directions():
+    model = Formula(
+        formula=lambda a, b: (7 * np.cos(a) * np.cos(b), 7 * np.sin(a) * np.cos(b), 7 * np.sin(b)), n_=2, m_=3
+    )
+    intrinsic, _ = curvatures(model, np.array([[0.4, 0.3]]))
+    np.testing.assert_allclose(intrinsic, np.sqrt(5.991465) / 7, rtol=1e-4)
+
+
+def test_the_bias_of_a_logarithm_is_half_its_variance():
+    """z = exp(t) + v is fitted by log z: -sigma^2 exp(-2 t) / 2 to second order."""
+    model = Formula(formula=lambda t: (np.exp(t),), m_=1)
+    x = np.array([[0.0], [1.0]])
+    found = box_bias(model.jacobian(x), second_derivatives(model, x), Covariance(np.array([0.1])))
+    np.testing.assert_allclose(found[:, 0], -(0.1**2) * np.exp(-2 * x[:, 0]) / 2, rtol=1e-5)
+
+
+def test_the_mean_error_of_least_squares_is_the_bias_of_box():
+    model = Bent(bend=0.3)
+    R = Covariance(np.full(12, 0.12))
+    x = np.broadcast_to([0.4, -0.3, 0.2], (30_000, 3)).copy()
+    z = model.simulate(x) + 0.12 * np.random.default_rng(0).normal(size=(30_000, 12))
+    error = least_squares_root(Problem(model, R), z, x, prior=None) - x
+    error = error[np.isfinite(error).all(axis=1)]
+    (expected,) = box_bias(model.jacobian(x[:1]), second_derivatives(model, x[:1]), R)
+    spread = error.std(axis=0) / np.sqrt(len(error))
+    assert len(error) > 29_900
+    assert (np.abs(expected) > 5 * spread).any()  # there is something to find
+    np.testing.assert_allclose(error.mean(axis=0), expected, atol=4 * spread.max(), rtol=0.15)
+
+
+def test_under_a_wrong_linear_model_the_bias_is_h_plus_times_what_is_left_out():
+    model, R = Bent(), Covariance(np.full(12, 0.3))
+    x, left_out = np.zeros((2, 3)), np.random.default_rng(1).normal(size=(2, 12))
+    found = misspecified(Problem(model, R), left_out, x, model.jacobian(x))
+    np.testing.assert_allclose(found.bias, left_out @ np.linalg.pinv(model.A).T, atol=1e-9)
+    crlb = np.sqrt(np.diag(np.linalg.inv(information(model.A, R))))
+    np.testing.assert_allclose(found.deviation, np.broadcast_to(crlb, (2, 3)), rtol=1e-9)
+
+
+def test_where_residuals_remain_the_scatter_is_the_sandwich_and_not_the_bound():
+    model, R, sigma = Bent(bend=0.3), Covariance(np.full(12, 0.05)), 0.05
+    x = np.array([[0.4, -0.3, 0.2]])
+    h = model.simulate(x) + 0.5 * np.sin(3.0 * np.arange(12))
+    problem = Problem(model, R)
+    found = misspecified(problem, h, x, model.jacobian(x))
+    trials = 8000
+    z = h + sigma * np.random.default_rng(0).normal(size=(trials, 12))
+    error = least_squares_root(problem, z, np.repeat(x + found.bias, trials, axis=0), prior=None) - x
+    error = error[np.isfinite(error).all(axis=1)]
+    assert len(error) > 0.99 * trials
+    np.testing.assert_allclose(error.mean(axis=0), found.bias[0], atol=4 * sigma / np.sqrt(trials) + 2e-3)
+    np.testing.assert_allclose(error.std(axis=0), found.deviation[0], rtol=0.04)
+    naive = np.sqrt(np.diag(np.linalg.inv(information(model.jacobian(x + found.bias)[0], R))))
+    assert (np.abs(naive / error.std(axis=0) - 1) > 0.1).any()
+
+
+RICHER = {
+    "nothing": {},
+    "quadratic": {"accelerometer_quadratic": 500.0},
+    "walk": {"gyro_random_walk": 0.001},
+    "misaligned": {"accelerometer_misalignment": 20.0, "platform_misalignment": 20.0},
+    "tilted": {"platform_misalignment": 5.0},
+}
+
+
+@pytest.mark.parametrize("errors", RICHER.values(), ids=RICHER)
+def test_the_mismatch_experiment_comes_out_as_theory_says(errors):
+    """In each trial the error less the predicted bias scatters as predicted, in every parameter."""
+    bench = replace(scenario(Gins(), 33.0), truth=RicherGins(**errors))
+    block = Block.draw(bench, 0, 80)
+    estimates, scores = block.estimate(ib.baselines.GaussNewton())
+    assert scores["solved"].all()
+    columns = block.truth_columns()
+    names = [p.name for p in bench.measurement.parameters]
+    bias, deviation = (np.stack([columns[f"{k}_{n}"] for n in names], axis=1) for k in ("pseudo_bias", "misspecified"))
+    left = (estimates.x - block.trials.x - bias) / deviation
+    # 80 trials: a root mean square of 1 with a deviation of 0.08.
+    assert np.abs(np.sqrt(np.mean(left**2, axis=0)) - 1).max() < 0.32
+    assert np.sqrt(np.mean(left**2)) == pytest.approx(1.0, abs=0.08)
+    if errors:
+        assert np.sqrt(np.mean((bias / block.crlb_deviation) ** 2)) > 1.5
+
+
+def scenario(model: Measurement, scale: float) -> ib.Scenario:
+    return ib.Scenario(model, ib.noise.Quantization(), error_scale=scale)
+
+
+def test_columns_do_not_depend_on_the_block():
+    bench = replace(scenario(Gins(), 33.0), truth=RicherGins(platform_misalignment=5.0))
+    whole, part = Block.draw(bench, 0, 6).truth_columns(), Block.draw(bench, 4, 6).truth_columns()
+    for name in ("pseudo_bias_bx", "misspecified_bx", "box_bias_bx", "curvature_intrinsic", "curvature_parameter"):
+        assert np.array_equal(whole[name][4:], part[name])
+    late = Block.draw(scenario(Gins(), 33.0), CURVED, CURVED + 2).truth_columns()
+    assert np.isnan(late["box_bias_bx"]).all()
+    assert "pseudo_bias_bx" not in late
+
+
+def test_summary_and_table_have_theory_for_least_squares_alone(tmp_path):
+    bench = ib.Scenario(Bent(bend=0.2), ib.noise.Gaussian(0.05), error_scale=0.3)
+    wrong = replace(bench, truth=Bent(bend=0.25))
+    estimators = {"gn": ib.baselines.GaussNewton(), "newton": ib.solvers.Newton()}
+    assert compute([bench, wrong], estimators, 300, tmp_path) == ()
+    found = analyse([tmp_path])
+    rows = found.summary.set_index("estimator")
+    assert rows.loc["newton", "predicted_rmse"].isna().all()
+    gn = rows.loc["gn"]
+    assert gn["predicted_rmse"].notna().all()
+    np.testing.assert_allclose(gn["rmse"], gn["predicted_rmse"], rtol=0.15)
+    # Under the wrong model the bound is no longer what happens.
+    mistaken = gn[gn["truth"].astype(str) != "nan"] if "truth" in gn else gn
+    assert (mistaken["predicted_rmse"] > 1.05 * mistaken["crlb"]).any()
+    assert "theory" in [table.name for table in all_tables(found)]
+
+
+def periodic(distance: float) -> Formula:
+    """Two places, 2 pi apart, whose readings differ in the third alone, by `distance`."""
+    step = distance / (2 * np.pi)
+    return Formula(formula=lambda t: (np.cos(t), np.sin(t), step * t), m_=3)
+
+
+def posterior_mean_error(model: Measurement, sigma: float, width: float, trials: int = 4000) -> float:
+    """Root mean square error of the posterior mean, by integration on a grid: no estimator is better."""
+    rng = np.random.default_rng(0)
+    grid = np.linspace(-6 * width, 6 * width, 6001)
+    h = model.simulate(grid[:, None])
+    x = width * rng.standard_normal(trials)
+    z = model.simulate(x[:, None]) + sigma * rng.standard_normal((trials, model.m))
+    log = -0.5 * (z**2).sum(1)[:, None] / sigma**2 + (z @ h.T - 0.5 * (h**2).sum(1)) / sigma**2
+    log = log - 0.5 * (grid / width) ** 2
+    weight = np.exp(log - log.max(axis=1, keepdims=True))
+    return float(np.sqrt(np.mean((weight @ grid / weight.sum(axis=1) - x) ** 2)))
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.1, 0.3])
+def test_the_threshold_bound_lies_between_van_trees_and_the_best_estimator(sigma):
+    model, width = periodic(0.2), 6.0
+    problem = Problem(model, Covariance(np.full(3, sigma)), np.array([width]))
+    u = width * np.random.default_rng(1).standard_normal((400, 1))
+    expected = information(model.jacobian(u), problem.R).mean(axis=0)
+    offsets = 2 * np.pi * np.array([[1.0], [2.0], [-1.0]])
+    local, whole = (float(np.sqrt(weiss_weinstein(problem, expected, c, u)[0, 0])) for c in (offsets[:0], offsets))
+    assert local == pytest.approx((expected[0, 0] + width**-2) ** -0.5)
+    best = posterior_mean_error(model, sigma, width)
+    assert local <= whole * (1 + 1e-9)
+    assert whole < 1.05 * best
+    if sigma == 0.02:
+        assert whole == pytest.approx(local, rel=0.02)  # no false root is near enough
+    if sigma == 0.1:
+        assert whole > 3 * local  # every estimator breaks, and Van Trees's bound does not know
+
+
+def test_of_a_linear_model_any_test_point_gives_the_same_bound():
+    model, rng = Bent(), np.random.default_rng(0)
+    problem = Problem(model, Covariance(np.full(12, 2.0)), np.array([1.0, 0.5, 2.0]))
+    u = rng.normal(size=(10, 3)) * problem.prior_deviation
+    expected = information(model.A, problem.R)
+    exact = np.linalg.inv(expected + np.diag([1.0, 4.0, 0.25]))
+    for offsets in (np.empty((0, 3)), 0.3 * rng.normal(size=(2, 3))):
+        np.testing.assert_allclose(weiss_weinstein(problem, expected, offsets, u), exact, rtol=1e-6)
+
+
+def test_false_roots_are_found_with_their_distance():
+    model = periodic(0.5)
+    problem = Problem(model, Covariance(np.full(3, 0.01)), np.array([6.0]))
+    x = np.array([[0.2]])
+    bound = np.full((1, 1), 0.01)
+    offsets, apart = false_roots(problem, x, np.array([[0.1], [6.4], [-6.2]]), bound)
+    assert sorted(np.round(np.abs(offsets[:, 0]), 1)) == pytest.approx([5.8, 5.8], abs=0.6)
+    np.testing.assert_allclose(
+        apart, [np.linalg.norm(model.simulate(x + c) - model.simulate(x)) / 0.01 for c in offsets], rtol=1e-6
+    )
+
+
+def test_on_gins_no_false_root_is_the_fault_of_noise():
+    found = threshold(scenario(Gins(), 33.0))
+    assert found is not None
+    assert found.confusion < 1e-6
+    np.testing.assert_allclose(found.weiss_weinstein, found.van_trees)
