@@ -534,7 +534,8 @@ def validate(
 ) -> None:
     """Raises one UserError with everything that stands in the way of this run, or of `estimating` from real readings.
 
-    Trials are drawn of the scenarios `untried` (all where it is None), to see whether numbers hold what is asked for.
+    Trials are drawn of the scenarios `untried` (all where it is None), to see whether numbers hold what is asked for;
+    none are where readings are real.
     """
     mistakes = []
     if trials < 1:
@@ -554,7 +555,7 @@ def validate(
             mistakes.append("noise=unknown: has no level to simulate with; choose another noise, or use `estimate`")
         if scenario.noise.real and trials != 1:
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
-        if untried is None or scenario in untried:
+        if not estimating and not scenario.noise.estimated and (untried is None or scenario in untried):
             mistakes += _beyond_numbers(scenario)
         mistakes += _needs(scenario.problem, estimators)
     if mistakes:
@@ -587,6 +588,8 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
     if not scenario.noise.real and not np.isfinite(few.z).all(axis=1).any():
         yield f"measurement={model.name}: none of the first {_FEW} trials has finite readings; choose smaller scales"
     for parameter, deviation in zip(model.parameters, bound, strict=True):
+        if scenario.noise.real and np.isnan(deviation):
+            return  # J lacks rank at the start, or is not finite there: that is a hard start, and no mistake
         if not 1 / LARGEST <= deviation <= LARGEST and deviation != 0:
             yield (
                 f"noise={scenario.noise.name}: {parameter.name} has a linear bound of {deviation:g} of its size, "

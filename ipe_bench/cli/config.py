@@ -114,6 +114,7 @@ def prepare() -> None:
 _FORMULA = re.compile(
     r"^(\+*(?:truth_)?measurement\.(?:expression|(?:initial|rates|outputs)\.\w+))=(?!['\"])(.*)$", re.DOTALL
 )
+_UNIT = re.compile(r"^(\+*(?:truth_)?measurement\.(?:time_)?unit)=([^'\",\[\]{}]+)$")
 _FILE = re.compile(r"^\+*(?:truth_)?measurement\.file=")
 _OPEN = re.compile(r"^(?:parameters|(?:truth_)?measurement\.(?:start|columns|initial|rates|outputs))\.")
 """Keys to which users add entries of their own names."""
@@ -184,6 +185,7 @@ def _literal(value: Any, where: str) -> str:
 
 def _in_hydras_words(override: str) -> str:
     override = re.sub(r"^(\+?)truth_measurement=", r"\1measurement@truth_measurement=", override)
+    override = _UNIT.sub(lambda found: f"{found[1]}='{found[2]}'", override)
     override = _FORMULA.sub(lambda found: f"{found[1]}='{found[2]}'", override)
     return f"++{override}" if _OPEN.match(override) else override
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -187,6 +187,19 @@ class Measurement(Component, Named, ABC):
         """Values of parameters that are known and not estimated, by name."""
         return {}
 
+    def near_bounds(self, x: Array) -> Mapping[int, float]:
+        """Which of the n parameters are next to a bound at x (n,), and that bound in their own unit."""
+        del x
+        return {}
+
+    def holding(self, values: Mapping[int, float]) -> Measurement:
+        """This model with some of the n parameters fixed at values in their own units."""
+        raise NotImplementedError(f"{self.name} holds no parameter")
+
+    def released(self, values: Mapping[int, float]) -> Measurement:
+        """This model with some of the n parameters free of bounds, starting at values in their own units."""
+        raise NotImplementedError(f"{self.name} holds no parameter")
+
     def jacobian(self, x: Array) -> Array:
         """dh/dx at each trial: (trials, n) -> (trials, m, n); complex step where analytic, else central differences."""
         return differentiate(self.simulate, x, analytic=self.analytic)
@@ -268,6 +281,15 @@ class Restricted(Measurement):
     @property
     def fixed(self) -> Mapping[str, float]:
         return self.whole.fixed
+
+    def near_bounds(self, x: Array) -> Mapping[int, float]:
+        return self.whole.near_bounds(x)
+
+    def holding(self, values: Mapping[int, float]) -> Measurement:
+        return replace(self, whole=self.whole.holding(values))
+
+    def released(self, values: Mapping[int, float]) -> Measurement:
+        return replace(self, whole=self.whole.released(values))
 
     @property
     def reading_unit(self) -> str:  # type: ignore[override]

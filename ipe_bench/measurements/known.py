@@ -6,7 +6,7 @@ numbers, so that no estimator and no draw can leave the bounds.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, UsualNoise
+
+_NEAR = 1e-2
+"""An estimate nearer to a bound than this share of the start's distance may be on its way there."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +158,25 @@ class Informed(Measurement):
 
     def natural_slope(self, x: Array) -> Array:
         return np.stack([t.slope(x[:, k]) for k, t in enumerate(self._transformed)], axis=1)
+
+    def near_bounds(self, x: Array) -> dict[int, float]:
+        found = {}
+        for k, (t, v) in enumerate(zip(self._transformed, self.natural(x[None])[0], strict=True)):
+            for bound in (t.lower, t.upper):
+                if abs(v - bound) <= _NEAR * abs(t.v0 - bound) < np.inf:
+                    found[k] = bound
+        return found
+
+    def holding(self, values: Mapping[int, float]) -> Measurement:
+        return self._with(Known(self.natural_parameters[k].name, fixed=value) for k, value in values.items())
+
+    def released(self, values: Mapping[int, float]) -> Measurement:
+        return self._with(Known(self.natural_parameters[k].name, nominal=value) for k, value in values.items())
+
+    def _with(self, known: Iterable[Known]) -> Informed:
+        """The model in which that is known, in place of what was known of the same parameters."""
+        given = {one.name: one for one in (*self.known, *known)}
+        return replace(self, known=tuple(given.values()))
 
     def inner(self, values: Array) -> Array:
         """x (trials, n) of values (trials, n) in the parameters' own units."""

@@ -19,7 +19,7 @@ from ipe_bench.estimators.least_squares import Minima, Objective, minimize
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.real.fits import Fit, present_part
+from ipe_bench.real.fits import Fit, holding, present_part
 from ipe_bench.real.profiles import Profile, half_width, profiles
 
 CONFIDENCE = 0.95
@@ -108,11 +108,11 @@ class Examination:
     direction: Direction
     influence: Influence
     fitted: Array
-    """h (m,) at the estimate,"""
+    """h (m,) at the estimate, where readings are missing too,"""
     fitted_errors: Array
     """and its standard errors: the band of the prediction is `half_width` times this;"""
     new_errors: Array
-    """that of a further reading, with its noise."""
+    """that of a further reading, with its noise; NaN where that is not known."""
     half_width: float
     minima: list[Minimum]
     """All that were found, the least first."""
@@ -127,14 +127,18 @@ class Examination:
 
 
 def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BOOTSTRAPS) -> Examination | None:
-    """Examines the least of the minima that the estimators found; None where none of them is one."""
-    told = [one for one in fits if one.status is Status.CONVERGED and np.isfinite(one.chi_square)]
+    """Examines the least of the minima that the estimators found; None where none of them is one, as with a prior."""
+    found = [one for one in fits if one.status is Status.CONVERGED and np.isfinite(one.chi_square)]
+    told = [one for one in found if not one.with_prior]
     if not told:
         return None
     best = min(told, key=_sum_of_squares)
     rows = np.flatnonzero(np.isfinite(z))
-    found = _Least.near(present_part(problem, rows, best.level), z[rows], best)
-    return None if found is None else found.examined(best.label, rows, len(z), bootstraps)
+    if best.held is not None:
+        # What is on its bound has no error; the others are examined with it held there.
+        problem, best = holding(problem, best.held_at), best.held
+    least = _Least.near(present_part(problem, rows, best.level), z[rows], best)
+    return None if least is None else least.examined(best.label, problem, rows, bootstraps)
 
 
 def _sum_of_squares(one: Fit) -> float:
@@ -176,13 +180,18 @@ class _Least:
         """The whitened Jacobian (m, n)."""
         return self.problem.R.whiten_jacobian(self.model.jacobian(self.x[None]))[0]
 
-    def examined(self, label: str, rows: Array, m: int, bootstraps: int) -> Examination:
-        model, x = self.model, self.x[None]
+    def examined(self, label: str, whole: Problem, rows: Array, bootstraps: int) -> Examination:
+        """`whole`: the problem with the readings that are missing, of which the present ones are `rows`."""
+        model, x, m = self.model, self.x[None], whole.R.m
         q = half_width(CONFIDENCE, self.freedom)
         deviation = np.sqrt(np.diag(self.P))
         ends = np.sort(model.natural(np.stack([self.x - q * deviation, self.x + q * deviation])), axis=0)
-        h, raw = model.simulate(x)[0], model.jacobian(x)[0]
+        h, raw = whole.measurement.simulate(x)[0], whole.measurement.jacobian(x)[0]
         errors = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", raw, self.P, raw), 0.0))
+        deviations = _at(rows, self.problem.R.deviations, m)
+        if np.ptp(self.problem.R.deviations) == 0:
+            # Where all readings are as good, so is one that is missing; else nobody knows.
+            deviations[:] = self.problem.R.deviations[0]
         minima = self.minima()
         return Examination(
             label,
@@ -194,9 +203,9 @@ class _Least:
             self.bootstrap(bootstraps),
             self.direction(),
             self.influence(rows, m),
-            _at(rows, h, m),
-            _at(rows, errors, m),
-            _at(rows, np.hypot(errors, self.problem.R.deviations), m),
+            h,
+            errors,
+            np.hypot(errors, deviations),
             q,
             minima,
             self.chi_square <= minima[0].chi_square + 1e-6 * max(1.0, self.chi_square),

@@ -73,9 +73,21 @@ class Fit:
     level: float | None = None
     """The factor by which the readings are noisier than R says, where it is estimated from the residuals; R and all
     that rests on it, the covariance included, have been multiplied by it already. None: R is known."""
+    held: Fit | None = None
+    """Where parameters are on their bounds: the fit of the model in which they are held there. Errors of the others are
+    from it; those on a bound have none."""
+    with_prior: bool = False
+    """Whether the estimator was told a prior, so that x is not the least-squares estimate."""
     beaten: bool = False
     """Whether another estimator's sum of squares is so much smaller that chance does not explain it: tested where the
     level is estimated, because there nothing else tells a wrong answer."""
+
+    @property
+    def held_at(self) -> dict[int, float]:
+        """Which parameters are on a bound, because the readings want them beyond it, and the bound in their own
+        unit."""
+        on_bound = [] if self.held is None else np.flatnonzero(np.isnan(self.inner)).tolist()
+        return {k: float(self.x[k]) for k in on_bound}
 
     @property
     def standard_errors(self) -> Array:
@@ -237,6 +249,7 @@ def _with_level(found: Fit, factor: float, level: float) -> Fit:
             chi_square=found.chi_square / factor**2,
             normalised=deviates,
             level=level,
+            held=None if found.held is None else _with_level(found.held, factor, level),
         )
 
 
@@ -276,6 +289,58 @@ def _fit_one(
     noise: Noise | None,
 ) -> Fit:
     """`noise` None: its level is not known, and the size of the residuals cannot be tested."""
+    found = _fit_inside(label, estimator, problem, z, rows, m, order, noise)
+    near = {} if found.with_prior else problem.measurement.near_bounds(found.inner)
+    if not 0 < len(near) < len(found.x):
+        return found
+    held = _fit_inside(label, estimator, holding(problem, near), z, rows, m, order, noise)
+    return _on_bounds(found, held, near) if _is_minimum(problem, held, near, z) else found
+
+
+def holding(problem: Problem, values: Mapping[int, float]) -> Problem:
+    """The problem with some parameters fixed at values in their own units."""
+    deviation = problem.prior_deviation
+    if deviation is not None:
+        deviation = np.delete(deviation, list(values))
+    return Problem(problem.measurement.holding(values), problem.R, deviation)
+
+
+def _is_minimum(problem: Problem, held: Fit, near: Mapping[int, float], z: Array) -> bool:
+    """Whether the sum of squares falls on beyond every bound, so that its minimum within them is on them (Nocedal and
+    Wright, Numerical Optimization, 2nd ed., 2006, theorem 12.1)."""
+    if held.status is not Status.CONVERGED:
+        return False
+    model, places = problem.measurement.released(near), list(near)
+    x = np.array(model.nominal, dtype=float)
+    x[[k for k in range(model.n) if k not in near]] = held.inner
+    with np.errstate(all="ignore"):
+        r = problem.R.whiten(z - model.simulate(x[None])[0])
+        downhill = problem.R.whiten_jacobian(model.jacobian(x[None]))[0][:, places].T @ r
+    start = problem.measurement.natural(problem.measurement.nominal[None])[0]
+    outward = np.sign(np.array(list(near.values())) - start[places])
+    return bool((downhill * outward > 0).all())
+
+
+def _on_bounds(found: Fit, held: Fit, near: Mapping[int, float]) -> Fit:
+    """The fit with some parameters on their bounds, those having no errors."""
+    n = len(found.x)
+    free = np.array([k for k in range(n) if k not in near])
+    x, inner, P, inner_P = np.empty(n), np.full(n, np.nan), np.full((n, n), np.nan), np.full((n, n), np.nan)
+    x[list(near)], x[free], inner[free] = list(near.values()), held.x, held.inner
+    P[np.ix_(free, free)], inner_P[np.ix_(free, free)] = held.covariance, held.inner_covariance
+    return replace(held, x=x, inner=inner, covariance=P, inner_covariance=inner_P, model=found.model, held=held)
+
+
+def _fit_inside(
+    label: str,
+    estimator: Estimator,
+    problem: Problem,
+    z: Array,
+    rows: NDArray[np.intp],
+    m: int,
+    order: NDArray[np.intp],
+    noise: Noise | None,
+) -> Fit:
     model, n = problem.measurement, problem.measurement.n
     estimates = estimate_safely(estimator, problem, z[None])
     message = estimates.messages.get(0, "")
@@ -318,6 +383,7 @@ def _fit_one(
         model,
         estimates.x[0],
         P,
+        with_prior="prior" in estimator.needs,
     )
 
 

@@ -97,33 +97,66 @@ def profiles(
 
     z (m,) are the readings, all present. `freedom`: see `half_width`; R is then what it was estimated to be.
     """
-    n, q, deviation = len(x), half_width(confidence, freedom), np.sqrt(np.diag(P))
-    looked = [_Looked(problem, z, x, P, j, q) for j in range(n)]
-    asked = [(one, x[one.place] + s * f * q * deviation[one.place]) for one in looked for s in (-1, 1) for f in _FIRST]
-    least = float(squared(problem.R.whiten(problem.measurement.simulate(x[None]) - z))[0])
+    return profiles_of_sets(problem, z[None], x[None], P[None], confidence=confidence, freedom=freedom)[0]
+
+
+def profiles_of_sets(
+    problem: Problem,
+    z: Array,
+    x: Array,
+    P: Array,
+    *,
+    levels: Array | None = None,
+    confidence: float = 0.95,
+    freedom: int | None = None,
+) -> list[list[Profile]]:
+    """Those of several sets of readings z (sets, m) at once, with estimates x (sets, n) and covariances P (sets, n, n).
+
+    `levels` (sets,): what each set has found R^1/2 to be multiplied by, and P has been multiplied by the square of.
+    """
+    sets, n = x.shape
+    levels = np.ones(sets) if levels is None else levels
+    q = half_width(confidence, freedom)
+    least = squared(problem.R.whiten(problem.measurement.simulate(x) - z))
+    each = [_Set(problem, z[k], x[k], P[k], float(levels[k]), float(least[k])) for k in range(sets)]
+    looked = [_Looked(one, j, q) for one in each for j in range(n)]
+    asked = [(one, one.centre + s * f * q * one.deviation) for one in looked for s in (-1, 1) for f in _FIRST]
     for _ in range(_ROUNDS + 1):
-        _look(problem, z, x, P, asked, least)
+        _look(problem, asked)
         asked = [(one, at) for one in looked for sign in (-1, 1) if (at := one.next(sign)) is not None]
         if not asked:
             break
-    return [one.profile() for one in looked]
+    return [[one.profile() for one in looked[k * n : (k + 1) * n]] for k in range(sets)]
+
+
+@dataclass(frozen=True)
+class _Set:
+    """A set of readings with its estimate; see `profiles_of_sets`."""
+
+    problem: Problem
+    z: Array
+    x: Array
+    P: Array
+    level: float
+    least: float
+    """The sum of squares at the estimate, of readings whitened by R as it is."""
 
 
 class _Looked:
     """What has been seen of one profile so far."""
 
-    def __init__(self, problem: Problem, z: Array, x: Array, P: Array, place: int, q: float) -> None:
-        self.model, self.x, self.place, self.q = problem.measurement, x, place, q
-        self.deviation = float(np.sqrt(P[place, place]))
-        self.seen: dict[float, tuple[float, Array]] = {float(x[place]): (0.0, x)}
+    def __init__(self, whole: _Set, place: int, q: float) -> None:
+        self.whole, self.place, self.q = whole, place, q
+        self.centre = float(whole.x[place])
+        self.deviation = float(np.sqrt(whole.P[place, place]))
+        self.seen: dict[float, tuple[float, Array]] = {self.centre: (0.0, whole.x)}
         self.open = {-1: False, 1: False}
         self.lower = False
 
     def side(self, sign: int) -> list[tuple[float, float]]:
         """(distance, abs zeta) on one side, outwards from the estimate."""
-        centre = float(self.x[self.place])
-        found = [(abs(v - centre), abs(zeta)) for v, (zeta, _) in self.seen.items() if sign * (v - centre) >= 0]
-        return sorted(found)
+        found = [(v - self.centre, abs(zeta)) for v, (zeta, _) in self.seen.items() if sign * (v - self.centre) >= 0]
+        return sorted((abs(distance), zeta) for distance, zeta in found)
 
     def crossing(self, sign: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
         """The first neighbours between which the profile rises over q."""
@@ -140,7 +173,7 @@ class _Looked:
 
     def next(self, sign: int) -> float | None:
         """Where to look next for an end; None where it is known, or there is none."""
-        centre, found = float(self.x[self.place]), self.crossing(sign)
+        found = self.crossing(sign)
         if self.lower or self.open[sign]:
             return None
         if found is None:
@@ -148,19 +181,19 @@ class _Looked:
             if not np.isfinite(zeta) or distance > 1e6 * self.q * self.deviation:
                 self.open[sign] = True
                 return None
-            return centre + sign * distance * min(_STRETCH, max(1.1, 1.05 * self.q / max(zeta, 1e-3)))
+            return self.centre + sign * distance * min(_STRETCH, max(1.1, 1.05 * self.q / max(zeta, 1e-3)))
         (near, below), (far, above) = found
         distance = self.end(sign) if np.isfinite(above) else (near + far) / 2
         close = min(self.q - below, above - self.q) <= _PRECISION * self.q
         if close or far - near <= _PRECISION * self.q * self.deviation * 1e-3:
             return None
         # Interpolation alone may creep up to the end from one side.
-        return centre + sign * float(np.clip(distance, near + 0.05 * (far - near), far - 0.05 * (far - near)))
+        return self.centre + sign * float(np.clip(distance, near + 0.05 * (far - near), far - 0.05 * (far - near)))
 
     def profile(self) -> Profile:
         values = np.array(sorted(self.seen))
         zeta = np.array([self.seen[v][0] for v in values])
-        centre, half = float(self.x[self.place]), self.q * self.deviation
+        centre, half = self.centre, self.q * self.deviation
         ends = [centre - self.end(-1), centre + self.end(1), centre - half, centre + half]
         with np.errstate(invalid="ignore"):
             natural = self._natural(np.concatenate([ends, values]))
@@ -171,35 +204,38 @@ class _Looked:
         return Profile(natural[4:][order], zeta[order], float(low), float(high), wald, self.lower)  # type: ignore[arg-type]
 
     def _natural(self, values: Array) -> Array:
-        points = np.repeat(self.x[None], len(values), axis=0)
+        points = np.repeat(self.whole.x[None], len(values), axis=0)
         points[:, self.place] = values
-        return self.model.natural(points)[:, self.place]
+        return self.whole.problem.measurement.natural(points)[:, self.place]
 
 
-def _look(problem: Problem, z: Array, x: Array, P: Array, asked: list[tuple[_Looked, float]], least: float) -> None:
+def _look(problem: Problem, asked: list[tuple[_Looked, float]]) -> None:
     """Minimises over the other parameters at every place that is asked for, all in one batch."""
     places, values = np.array([one.place for one, _ in asked]), np.array([at for _, at in asked])
-    rows, n = np.arange(len(asked)), len(x)
+    rows, n = np.arange(len(asked)), problem.measurement.n
     model = Pinned(problem.measurement, Tally.zeros(len(asked)), places=places, values=values)
-    readings = np.repeat(z[None], len(asked), axis=0)
-    begin = np.stack([_nearest(one, at, P) for one, at in asked])
+    readings = np.stack([one.whole.z for one, _ in asked])
+    begin = np.stack([_nearest(one, at) for one, at in asked])
     others = np.stack([np.delete(start, place) for start, place in zip(begin, places, strict=True)])
     with np.errstate(all="ignore"):
         if n > 1:
             objective = Objective(model, problem.R, readings, rows, problem.x0)
             method = LevenbergMarquardtMethod(1e-3)
             others = minimize(objective, method, others, tolerance=_TOLERANCE, max_iterations=_MOST_STEPS).x
-        rise = squared(problem.R.whiten(model.simulate(others, rows) - readings)) - least
+        sums = squared(problem.R.whiten(model.simulate(others, rows) - readings))
     full = model.whole(others, rows)
-    for (one, at), change, point in zip(asked, rise.tolist(), full, strict=True):
-        one.lower |= change < -_LOWER * max(1.0, least)
+    for (one, at), total, point in zip(asked, sums.tolist(), full, strict=True):
+        level, least = one.whole.level, one.whole.least
+        change = (total - least) / level**2
+        one.lower |= change < -_LOWER * max(1.0, least / level**2)
         zeta = np.sqrt(max(change, 0.0)) if np.isfinite(change) else np.inf
-        one.seen[at] = (float(np.sign(at - x[one.place]) * zeta), point)
+        one.seen[at] = (float(np.sign(at - one.centre) * zeta), point)
 
 
-def _nearest(one: _Looked, at: float, P: Array) -> Array:
+def _nearest(one: _Looked, at: float) -> Array:
     """Where to start for that value: the nearest point seen, moved along the line on which the others would follow in a
     linear model."""
+    P = one.whole.P
     known = [v for v, (zeta, _) in one.seen.items() if np.isfinite(zeta)]
     nearest = min(known, key=lambda v: abs(v - at))
     start = one.seen[nearest][1] + P[:, one.place] / P[one.place, one.place] * (at - nearest)

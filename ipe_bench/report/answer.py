@@ -23,6 +23,7 @@ from ipe_bench.real.fits import Fit
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report import examined
 from ipe_bench.report.words import p_value
+from ipe_bench.trials.fit_test import DRAWS
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
 if TYPE_CHECKING:
@@ -38,6 +39,8 @@ _MOST_OUTLIERS = 8
 _FEW = 0.05
 """Above this share of outliers it is the model that is wrong, and a list of readings says nothing."""
 _ALIKE = 0.02
+LEAST_FIT_P = 1 / (DRAWS + 1)
+"""Of the test of fit, where the law of the noise is simulated."""
 _FITS = {True: "yes", False: "NO", None: "not tested"}
 _NARROW = 90
 """Columns of a terminal below which the table of verdicts goes without the residual deviation."""
@@ -197,6 +200,8 @@ def _described(answer: Answer) -> dict[str, Any]:
                 "p": examined.numbers(one.p_value),
                 "fits": one.fits,
                 "passes": one.passes,
+                "with_prior": one.with_prior,
+                "on_bounds": {names[k]: value for k, value in one.held_at.items()},
                 "noise_level_estimated": None if one.level is None else examined.numbers(one.level),
                 "residual_deviation": examined.numbers(one.residual_deviation),
                 "whiteness": {
@@ -237,8 +242,12 @@ def _residual_rows(answer: Answer) -> Iterator[list[Any]]:
         more: tuple[Array, ...] = ()
         if found is not None and one.label == found.label:
             more = (*_influences(found), found.fitted_errors, found.new_errors)
+        # Of the estimator that is examined, the readings that are missing are predicted, too.
+        fitted = z - one.residuals
+        if found is not None and more:
+            fitted = np.where(np.isnan(z), found.fitted, fitted)
         for i, label in enumerate(labels):
-            values = (z[i], z[i] - one.residuals[i], one.residuals[i], one.normalised[i])
+            values = (z[i], fitted[i], one.residuals[i], one.normalised[i])
             further = [_cell(column[i]) for column in more] or [""] * len(influence)
             outlier = "yes" if one.outliers[i] else "no"
             yield [one.label, *label, *map(_cell, values), outlier, *further]
@@ -348,10 +357,15 @@ def _verdicts(fits: Sequence[Fit], width: int) -> Any:
     table.add_column("fits", no_wrap=True)
     for one in fits:
         numbers = [f"{one.residual_deviation:.4g}", f"{one.chi_square:.4g}", str(one.degrees_of_freedom)]
-        numbers += [p_value(one.p_value), p_value(one.whiteness.p_value, LEAST_P), str(int(one.outliers.sum()))]
+        numbers += [_fit_p(one), p_value(one.whiteness.p_value, LEAST_P), str(int(one.outliers.sum()))]
         status = one.status.label.replace("_", " ")
         table.add_row(escape(one.label), status, *numbers[width < _NARROW :], _FITS[one.fits])
     return table
+
+
+def _fit_p(one: Fit) -> str:
+    """p of the fit; a limit where it is the least that simulated fits can tell."""
+    return p_value(one.p_value, LEAST_FIT_P if one.p_value == LEAST_FIT_P else 0.0)
 
 
 def _notes(fits: Sequence[Fit], width: int) -> Any:
@@ -362,6 +376,8 @@ def _notes(fits: Sequence[Fit], width: int) -> Any:
         " resemble each other." + (" deviation: of the residuals, in the readings' unit." if width >= _NARROW else ""),
         *(f"{one.label}: {one.message}" for one in fits if one.message),
         *_on_levels(fits),
+        *_on_priors(fits),
+        *_on_bounds(fits),
     ]
     failing = [one.label for one in fits if not one.passes]
     if fits[0].model.fixed:
@@ -388,6 +404,26 @@ def _on_levels(fits: Sequence[Fit]) -> Iterator[str]:
             f"{', '.join(suspect)}: successive residuals resemble each other (white p below {FIT_LEVEL:g}); the model"
             " is in doubt, and standard errors are too small."
         )
+
+
+def _on_priors(fits: Sequence[Fit]) -> Iterator[str]:
+    told = [one.label for one in fits if one.with_prior]
+    if told:
+        yield (
+            f"{', '.join(told)}: with a prior. Profiles, bootstrap and influence, where given, are of least squares"
+            " without it."
+        )
+
+
+def _on_bounds(fits: Sequence[Fit]) -> Iterator[str]:
+    for one in fits:
+        if one.held is not None:
+            names = [one.model.natural_parameters[k].name for k in one.held_at]
+            bounds = ", ".join(f"{name} = {value:g}" for name, value in zip(names, one.held_at.values(), strict=True))
+            yield (
+                f"{one.label}: on its bound: {bounds}; the readings want it beyond. It has no error, and those of the"
+                " others are with it held there."
+            )
 
 
 def _outliers(model: Measurement, fits: Sequence[Fit]) -> Iterator[Any]:
@@ -428,14 +464,14 @@ def fragment(answer: Answer) -> str:
     parts.append(f"<table><thead><tr><th>parameter</th><th>unit</th>{header}</tr></thead><tbody>{body}</tbody></table>")
     verdicts = "".join(
         f"<tr><td>{escape(one.label)}</td><td>{one.status.label}</td><td>{one.chi_square:.4g}</td>"
-        f"<td>{one.degrees_of_freedom}</td><td>{p_value(one.p_value)}</td><td>{p_value(one.whiteness.p_value)}</td>"
+        f"<td>{one.degrees_of_freedom}</td><td>{_fit_p(one)}</td><td>{p_value(one.whiteness.p_value)}</td>"
         f"<td>{int(one.outliers.sum())}</td><td>{_FITS[one.fits]}</td></tr>"
         for one in answer.fits
     )
     names = ("estimator", "status", "chi-square", "degrees of freedom", "p", "white p", "outliers", "fits")
     head = "".join(f"<th>{name}</th>" for name in names)
     parts.append(f"<h3>Does the model fit?</h3><table><thead><tr>{head}</tr></thead><tbody>{verdicts}</tbody></table>")
-    notes = [*_on_levels(answer.fits)]
+    notes = [*_on_levels(answer.fits), *_on_priors(answer.fits), *_on_bounds(answer.fits)]
     if failing:
         notes.append(f"In brackets, and not an answer: {', '.join(failing)}.")
     found = answer.examination

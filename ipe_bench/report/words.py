@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from ipe_bench.statistics.records import Kind, Statistic, Where
@@ -99,6 +99,11 @@ def applies(record: Statistic, where: Where, row: Mapping[str, Any]) -> bool:
     """Whether a row can have the statistic: what solves no equation has nothing to say of solved trials. In the table
     of parameters its finished trials stand in for them."""
     return record.given != "solved" or where == "parameters" or row["equation"] != "-"
+
+
+def reported(record: Statistic, rows: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether a table has the column: one that few estimators report only where one of the rows does."""
+    return not record.rare or any(math.isfinite(row[record.name]) for row in rows)
 
 
 def shown(record: Statistic, where: Where, row: Mapping[str, Any]) -> str:

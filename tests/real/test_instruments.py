@@ -99,6 +99,44 @@ def test_bounds_move_neither_a_minimum_inside_of_them_nor_its_standard_errors(tm
         assert one.bounds[0] < low < high < one.bounds[1]
 
 
+@pytest.mark.parametrize("unknown", [False, True])
+@pytest.mark.parametrize("upper", [220.0, 231.0])
+def test_an_estimate_on_its_bound_is_the_minimum_within_the_bounds(tmp_path, upper, unknown):
+    """Against SciPy's bounded solution; what is on the bound has no error, and the others' are with it held there."""
+    path, columns = simulated(tmp_path / "a.csv", 240.0, 3)
+    t, y, sigma = columns.T
+    known = (Known("b1", nominal=200.0, lower=100.0, upper=upper), Known("b2", positive=True))
+    result = estimate(open_readings(path, Informed(Formula(SATURATION, START), known)), level_unknown=unknown)
+    bounded = least_squares(
+        lambda p: (p[0] * 100 * (1 - np.exp(-p[1] * 1e-4 * t)) - y) / sigma,
+        [2.0, 5.0],
+        bounds=([1, 0], [upper / 100, np.inf]),
+        ftol=1e-15,
+        xtol=1e-15,
+        gtol=1e-15,
+    )
+    assert result.status is Status.CONVERGED
+    assert result.held_at == {0: upper}
+    assert result.x == pytest.approx(bounded.x * [100, 1e-4], rel=1e-5)
+    x, deviations = solution(lambda p: (upper * (1 - np.exp(-p[0] * t)) - y) / sigma, [5e-4])
+    assert result.x[1] == pytest.approx(x[0], rel=1e-8)
+    assert result.degrees_of_freedom == len(t) - 1
+    level = np.sqrt(np.sum(((upper * (1 - np.exp(-x[0] * t)) - y) / sigma) ** 2) / (len(t) - 1)) if unknown else 1.0
+    assert np.isnan(result.standard_errors[0])
+    assert result.standard_errors[1] == pytest.approx(level * deviations[0], rel=1e-6)
+
+
+def test_a_minimum_near_a_bound_but_inside_is_not_on_it(tmp_path):
+    path, columns = simulated(tmp_path / "a.csv", 240.0, 3)
+    t, y, sigma = columns.T
+    x, deviations = solution(lambda p: (p[0] * (1 - np.exp(-p[1] * t)) - y) / sigma, [250, 5e-4])
+    known = (Known("b1", nominal=200.0, upper=x[0] * 1.0005),)
+    result = estimate(open_readings(path, Informed(Formula(SATURATION, START), known)))
+    assert result.held_at == {}
+    assert result.x == pytest.approx(x, rel=1e-8)
+    assert result.standard_errors == pytest.approx(deviations, rel=1e-8)
+
+
 def test_files_share_the_parameters_that_are_not_their_own(tmp_path):
     paths, data = zip(
         *(simulated(tmp_path / f"{b1}.csv", b1, k, 12 + k) for k, b1 in enumerate((240.0, 180.0))), strict=True

@@ -1,0 +1,218 @@
+"""`estimate` as people with readings of their own type it: the command, its exit code, and the numbers it leaves."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import curve_fit
+
+from ipe_bench.cli.main import main
+from ipe_bench.measurements import Nist
+
+MISRA = Nist("Misra1a")
+SATURATION = (
+    "measurement=formula",
+    "measurement.expression=b1*(1-exp(-b2*t))",
+    "measurement.start.b1=250",
+    "measurement.start.b2=5e-4",
+)
+LM = ("solver=[]", "baseline=[levenberg_marquardt]")
+
+
+@pytest.fixture
+def estimate(tmp_path, monkeypatch, capsys):
+    """Runs `estimate` in an empty folder; the exit code, what it printed, and its JSON file where it left one."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["ipe-bench"])
+
+    def run(*words: str) -> tuple[int, str, dict]:
+        code = main(["estimate", *words])
+        printed = capsys.readouterr()
+        found = Path(tmp_path / "outputs")
+        files = sorted(found.rglob("estimate.json"), key=lambda path: path.stat().st_mtime_ns) if found.is_dir() else []
+        return code, printed.out + printed.err, json.loads(files[-1].read_text()) if files and code != 2 else {}
+
+    return run
+
+
+@pytest.fixture
+def misra(tmp_path) -> tuple[np.ndarray, np.ndarray]:
+    """NIST's Misra1a as a file t, y, and with a column sigma, and its columns."""
+    (t,), y = MISRA.predictors, MISRA.readings
+    rows = [f"{a!r},{b!r}" for a, b in zip(t.tolist(), y.tolist(), strict=True)]
+    (tmp_path / "my.csv").write_text("\n".join(["t,y", *rows]))
+    sigma = [f"{row},{0.05 + 0.01 * k}" for k, row in enumerate(rows)]
+    (tmp_path / "weighted.csv").write_text("\n".join(["t,y,sigma", *sigma]))
+    return t, y
+
+
+def of(answer: dict, key: str, label: str = "levenberg_marquardt") -> dict:
+    return answer["estimators"][label][key]
+
+
+def curve(t, b1, b2):
+    return -b1 * np.expm1(-b2 * t)
+
+
+def test_a_formula_and_a_file_are_enough_where_nobody_knows_the_noise(estimate, misra):
+    """Certified values and standard deviations, without a word about noise, and three estimators unless others are
+    chosen."""
+    code, printed, answer = estimate(*SATURATION, "readings=my.csv")
+    assert code == 0, printed
+    assert list(answer["estimators"]) == ["fixed_point", "linear_lse", "levenberg_marquardt"]
+    assert "The level of the noise is estimated from the residuals" in printed
+    certified = MISRA.certified
+    assert list(of(answer, "estimates").values()) == pytest.approx(certified.parameters, rel=1e-6)
+    assert list(of(answer, "standard_errors").values()) == pytest.approx(certified.deviations, rel=1e-5)
+    assert of(answer, "p") is None
+    assert of(answer, "fits") is None
+
+
+@pytest.mark.parametrize(
+    ("words", "absolute"), [((), True), (("noise=unknown",), False)], ids=["weights", "relative weights"]
+)
+def test_a_column_of_deviations_weighs_the_readings(estimate, misra, words, absolute):
+    t, y = misra
+    sigma = 0.05 + 0.01 * np.arange(len(t))
+    code, printed, answer = estimate(*SATURATION, *LM, "readings=weighted.csv", *words)
+    assert code == 0, printed
+    x, P = curve_fit(curve, t, y, (250, 5e-4), sigma, absolute, ftol=1e-14, xtol=1e-14, gtol=1e-14)
+    assert list(of(answer, "estimates").values()) == pytest.approx(x, rel=1e-6)
+    assert list(of(answer, "standard_errors").values()) == pytest.approx(np.sqrt(np.diag(P)), rel=1e-5)
+
+
+def test_deviations_from_the_command_line_weigh_too(estimate, misra):
+    t, y = misra
+    sigma = 0.05 + 0.01 * np.arange(len(t))
+    listed = ",".join(map(repr, sigma.tolist()))
+    code, printed, answer = estimate(*SATURATION, *LM, "readings=my.csv", f"noise.deviation=[{listed}]")
+    assert code == 0, printed
+    x, _ = curve_fit(curve, t, y, (250, 5e-4), sigma, ftol=1e-14, xtol=1e-14, gtol=1e-14)
+    assert list(of(answer, "estimates").values()) == pytest.approx(x, rel=1e-6)
+
+
+def test_a_fixed_parameter_is_named_and_costs_no_degree_of_freedom(estimate, misra):
+    code, printed, answer = estimate(*SATURATION, *LM, "readings=my.csv", "parameters.b1.fixed=240")
+    assert code == 0, printed
+    assert answer["fixed"] == {"b1": 240.0}
+    assert of(answer, "degrees_of_freedom") == 13
+    t, y = misra
+    x, P = curve_fit(lambda t, b2: curve(t, 240.0, b2), t, y, (5e-4,), ftol=1e-14, xtol=1e-14, gtol=1e-14)
+    assert of(answer, "estimates")["b2"] == pytest.approx(x[0], rel=1e-7)
+    assert of(answer, "standard_errors")["b2"] == pytest.approx(np.sqrt(P[0, 0]), rel=1e-5)
+
+
+def test_exit_code_1_where_no_estimator_has_an_answer_that_passes(estimate, misra):
+    """A straight line through a curve, with deviations that are known: converged, and no answer."""
+    line = ("measurement=formula", "measurement.expression=a+b*t", "measurement.start.a=1", "measurement.start.b=1")
+    code, printed, answer = estimate(*line, *LM, "readings=my.csv", "noise.deviation=0.1")
+    assert code == 1
+    assert of(answer, "status") == "converged"
+    assert not answer["passes"]
+    assert "levenberg_marquardt: MISFIT" in printed
+    assert "±" not in printed.split("Does the model fit?")[0].split("standard error", 1)[1]
+
+
+def test_intervals_without_the_prior_are_not_told_of_an_estimate_with_one(estimate, misra):
+    words = (*SATURATION, "solver=[]", "readings=weighted.csv", "parameters.b1.deviation=1")
+    code, printed, answer = estimate(*words, "baseline=[map_lm]")
+    assert code == 0, printed
+    assert answer["examination"] is None
+    assert "map_lm: with a prior" in printed
+    t, y = misra
+    sigma = 0.05 + 0.01 * np.arange(len(t))
+    rows = np.append(t, [0.0, 0.0])
+
+    def with_prior(_, b1, b2):
+        return np.append(curve(t, b1, b2), [b1, b2])
+
+    z, s = np.append(y, [250.0, 5e-4]), np.append(sigma, [1.0, 5e-4])
+    x, P = curve_fit(with_prior, rows, z, (250, 5e-4), s, True, ftol=1e-14, xtol=1e-14, gtol=1e-14)
+    assert list(of(answer, "estimates", "map_lm").values()) == pytest.approx(x, rel=1e-5)
+    assert list(of(answer, "standard_errors", "map_lm").values()) == pytest.approx(np.sqrt(np.diag(P)), rel=1e-4)
+
+
+def test_an_epidemic_has_the_noise_of_its_counts_and_not_that_of_a_platform(estimate, tmp_path):
+    """The boarding school: beta was 1.79 ± 0.000038 with the quantisation of an inertial platform."""
+    boys = (26, 75, 228, 293, 277, 268, 190, 126, 65, 28, 12, 5)
+    rows = [f"1,{day},infected,{count}" for day, count in enumerate(boys, 3)]
+    (tmp_path / "s.csv").write_text("\n".join(["case,time [day],output,reading [people]", *rows]))
+    code, printed, answer = estimate("measurement=sir", *LM, "readings=s.csv")
+    assert code == 0, printed
+    assert 0.02 < of(answer, "standard_errors")["ln_beta"] < 0.2
+
+
+def test_two_files_share_what_is_not_their_own(estimate, tmp_path):
+    t = np.linspace(50, 700, 12)
+    rng = np.random.default_rng(3)
+    sets = [b1 * -np.expm1(-5.6e-4 * t) + 0.1 * rng.standard_normal(12) for b1 in (240.0, 180.0)]
+    for name, y in zip("ab", sets, strict=True):
+        rows = [f"{a!r},{b!r}" for a, b in zip(t.tolist(), y.tolist(), strict=True)]
+        (tmp_path / f"{name}.csv").write_text("\n".join(["t,y", *rows]))
+    code, printed, answer = estimate(
+        *SATURATION, *LM, "readings=[a.csv,b.csv]", "measurement.own=[b1]", "noise.deviation=0.1"
+    )
+    assert code == 0, printed
+    both = curve_fit(
+        lambda _, p, q, b2: np.concatenate([curve(t, p, b2), curve(t, q, b2)]), np.tile(t, 2), np.concatenate(sets),
+        (250, 250, 5e-4), np.full(24, 0.1), True, ftol=1e-14, xtol=1e-14, gtol=1e-14,
+    )  # fmt: skip
+    found = of(answer, "estimates")
+    assert [found[name] for name in ("b1_1", "b1_2", "b2")] == pytest.approx(both[0], rel=1e-6)
+
+
+def test_equations_in_a_file_are_a_model(estimate, tmp_path):
+    (tmp_path / "decay.yaml").write_text("rates: {y: -k*y}\ninitial: {y: y0}\nstart: {k: 0.5, y0: 5}\n")
+    t = np.array([0.3, 1.1, 2.0, 3.5, 6.0])
+    y = 8 * np.exp(-0.4 * t) + 0.01 * np.array([1, -2, 1, 2, -1])
+    rows = [f"{a!r},{b!r}" for a, b in zip(t.tolist(), y.tolist(), strict=True)]
+    (tmp_path / "d.csv").write_text("\n".join(["time,reading", *rows]))
+    code, printed, answer = estimate("measurement=ode", "measurement.file=decay.yaml", *LM, "readings=d.csv")
+    assert code == 0, printed
+    x, _ = curve_fit(lambda t, k, y0: y0 * np.exp(-k * t), t, y, (0.5, 5), ftol=1e-14, xtol=1e-14, gtol=1e-14)
+    assert list(of(answer, "estimates").values()) == pytest.approx(x, rel=1e-6)
+
+
+def test_a_unit_as_it_stands_and_a_row_without_a_reading_that_is_predicted(estimate, tmp_path):
+    (tmp_path / "a.csv").write_text("t [s],y [m/s^2]\n0,0.8\n1,2.3\n2,2.9\n3,4.2\n20,\n")
+    line = ("measurement=formula", "measurement.expression=a+b*t", "measurement.start.a=1", "measurement.start.b=1")
+    code, printed, answer = estimate(*line, *LM, "readings=a.csv", "measurement.unit=m/s^2", "noise.deviation=0.5")
+    assert code == 0, printed
+    assert answer["reading_unit"] == "m/s^2"
+    rows = (tmp_path / "outputs/estimate-formula/residuals.csv").read_text().splitlines()
+    last = dict(zip(rows[0].split(","), rows[-1].split(","), strict=True))
+    assert last["reading [m/s^2]"] == last["residual [m/s^2]"] == ""
+    assert float(last["fitted [m/s^2]"]) == pytest.approx(22.53, abs=1e-6)
+    # 0.5 sqrt(1/4 + 18.5^2 / 5), and with the 0.5 of a reading
+    assert float(last["fitted_error [m/s^2]"]) == pytest.approx(4.144272, rel=1e-5)
+    assert float(last["prediction_error [m/s^2]"]) == pytest.approx(4.174326, rel=1e-5)
+
+
+MISTAKES = {
+    "noise twice": (
+        ("readings=weighted.csv", "noise.deviation=0.3"),
+        "noise: is given, and the readings have a column",
+    ),
+    "unknown parameter": (("readings=my.csv", "parameters.b3.fixed=1"), "parameters.b3: "),
+    "start outside": (
+        ("readings=my.csv", "parameters.b1.upper=200"),
+        "is not inside of its bounds; give parameters.b1",
+    ),
+    "all fixed": (("readings=my.csv", "parameters.b1.fixed=1", "parameters.b2.fixed=1"), "parameters: all are fixed"),
+    "no start": (("readings=my.csv", "~measurement.start.b2"), "start"),
+    "one file twice": (("readings=[my.csv,my.csv]",), "names a file twice"),
+    "deviations too few": (("readings=my.csv", "noise.deviation=[1,2]"), "has 2 numbers; give one for each of 14"),
+}
+
+
+@pytest.mark.parametrize("case", MISTAKES)
+def test_mistakes_are_one_line_with_the_key(estimate, misra, case):
+    words, expected = MISTAKES[case]
+    code, printed, _ = estimate(*SATURATION, *LM, *words)
+    assert code == 2
+    assert expected in printed
+    assert len(printed.strip().splitlines()) == 1
