@@ -3,15 +3,17 @@ functions."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.counted import cost
 from ipe_bench.measurements.mgh import Mgh, score
 from ipe_bench.statistics.collect import Collection, Group, StoredCell
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 COLUMNS = ("function", "start", "estimator", "solved", "minimum", "sum_of_squares", "status", "cost", "gradients")
 BUDGETS = (10, 100, 1000)
@@ -25,6 +27,8 @@ def attained_table(collection: Collection) -> pd.DataFrame:
     Cost is in simulations, and in simplex gradients of n + 1 simulations, by which problems of different n are
     comparable (Moré and Wild, SIAM J. Optim. 20, 2009).
     """
+    import pandas as pd
+
     rows = []
     for group in collection.groups:
         for estimates, _ in group.cells:
@@ -37,6 +41,8 @@ def attained_table(collection: Collection) -> pd.DataFrame:
 def attained_totals(table: pd.DataFrame) -> pd.DataFrame:
     """Per estimator: problems solved, in all and from each start; how many of them its status calls converged, and how
     many converged elsewhere; median cost of all problems, endless where unsolved; and solved within `BUDGETS`."""
+    import pandas as pd
+
     rows = []
     for estimator, part in table.groupby("estimator", sort=False):
         solved = part["solved"].astype(bool)
@@ -54,6 +60,8 @@ def attained_totals(table: pd.DataFrame) -> pd.DataFrame:
 
 def data_profile(table: pd.DataFrame) -> pd.DataFrame:
     """The share of problems that each estimator solves within `at` simplex gradients, a step at each solution."""
+    import pandas as pd
+
     parts = []
     for estimator, part in table.groupby("estimator", sort=False):
         spent = np.sort(part.loc[part["solved"].astype(bool), "gradients"].to_numpy(dtype=float))
