@@ -155,6 +155,14 @@ def test_ranking_needs_replicates_and_two_estimators():
     assert alike.friedman == 1.0
 
 
+def test_friedmans_test_of_two_is_the_sign_test():
+    scores = [{"a": 1.0, "b": 2.0}] * 9 + [{"a": 2.0, "b": 1.0}] + [{"a": 1.0, "b": 1.0}] * 2
+    ranking = rank_over_replicates(scores)
+    assert ranking is not None
+    assert ranking.friedman == pytest.approx(stats.binomtest(9, 10).pvalue)
+    assert ranking.mean_ranks["a"] == pytest.approx((9 * 1 + 2 + 2 * 1.5) / 12)
+
+
 def test_profiles_of_two_estimators_by_hand():
     # Costs: a 1, 4, fails, fails; b 2, 2, 8, fails.
     a = outcomes(np.ones(4), [1, 1, 0, 0], [1, 4, 1, 1])
