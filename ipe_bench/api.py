@@ -655,6 +655,8 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
     if not scenario.noise.real and not np.isfinite(few.z).all(axis=1).any():
         yield f"measurement={model.name}: none of the first {_FEW} trials has finite readings; choose smaller scales"
     for parameter, deviation in zip(model.parameters, bound, strict=True):
+        if scenario.noise.real and np.isnan(deviation):
+            return  # J lacks rank at the start, or is not finite there: that is a hard start, and no mistake
         if not 1 / LARGEST <= deviation <= LARGEST and deviation != 0:
             yield (
                 f"noise={scenario.noise.name}: {parameter.name} has a linear bound of {deviation:g} of its size, "

@@ -7,20 +7,16 @@ from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge, Lt
-from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array, Mask, deviations, finite
+from ipe_bench.basics.linalg import Array, Mask, finite
 from ipe_bench.basics.options import Count, Positive, Whole
 from ipe_bench.basics.streams import normals, own_generators
 from ipe_bench.estimators.base import Estimates, Estimator
+from ipe_bench.estimators.fitting import Fitting, spread_of_starts
 from ipe_bench.estimators.least_squares import Minima, Objective, minimize
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
-from ipe_bench.measurements.counted import Tally
 from ipe_bench.measurements.problem import Problem
-
-_APART = 0.1
-"""Two minima further apart than this, in standard deviations of the local bound, are two."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +55,9 @@ class Multistart(Estimator):
         objective = Objective.of(problem, z, prior=False)
         tally, x0, trials = objective.model.tally, problem.x0, len(z)
         draws = normals(own_generators(self.seed, z), self.starts - 1, len(x0))
-        fitting: list[list[Array]] = [[] for _ in range(trials)]
+        fitting = Fitting.none(trials, z.shape[1], self.fit_level)
         best = self._descend(objective, problem, np.repeat(x0[None], trials, axis=0), history)
-        fits = self._note(best, np.arange(trials), fitting, z.shape[1])
+        fits = fitting.note(best, np.arange(trials))
         confirmed = np.where(fits, 0, -1)
         for k in range(self.starts - 1):
             affordable = tally.cost(len(x0)) < (np.inf if self.budget is None else self.budget)
@@ -69,15 +65,15 @@ class Multistart(Estimator):
             rows = np.flatnonzero((confirmed < self.confirmations) & affordable & ~hopeless)
             if not len(rows):
                 break
-            x = x0 + _spread(problem) * draws[rows, k]
+            x = x0 + spread_of_starts(problem) * draws[rows, k]
             again = self._descend(objective.subset(rows), problem, x, history)
-            fits = self._note(again, rows, fitting, z.shape[1])
+            fits = fitting.note(again, rows)
             confirmed[rows] += (confirmed[rows] >= 0) | fits
             better = _is_better(again, take(best, rows))
             spent = best.iterations.copy()
             spent[rows] += again.iterations
             best = replace(put(best, rows[better], take(again, better)), iterations=spent)
-        return self._report(best, tally, fitting, z.shape[1])
+        return fitting.report(best.estimates(tally, z.shape[1]))
 
     def _descend(self, objective: Objective, problem: Problem, x: Array, history: bool) -> Minima:
         return minimize(
@@ -90,40 +86,7 @@ class Multistart(Estimator):
             history=history,
         )
 
-    def _note(self, found: Minima, rows: NDArray[np.intp], fitting: list[list[Array]], readings: int) -> Mask:
-        """Adds minima that fit and were not known to `fitting`; which of the trials `rows` found one that fits."""
-        fits: Mask = found.converged & (found.fit_probability(readings) >= self.fit_level)
-        deviation = deviations(found.covariance)
-        for i in np.flatnonzero(fits):
-            known = fitting[rows[i]]
-            if all(_apart(x, found.x[i], deviation[i]) for x in known):
-                known.append(found.x[i])
-        return fits
-
-    def _report(self, best: Minima, tally: Tally, fitting: list[list[Array]], readings: int) -> Estimates:
-        estimates = best.estimates(tally, readings)
-        minima = np.array([len(known) for known in fitting], dtype=float)
-        estimates.extras |= {"minima": minima, "ambiguous": (minima > 1).astype(float)}
-        deviation = deviations(best.covariance)
-        estimates.alternatives = [
-            np.array([other for other in known if _apart(other, x, d)]).reshape(-1, len(x))
-            for known, x, d in zip(fitting, best.x, deviation, strict=True)
-        ]
-        return estimates
-
-
-def _spread(problem: Problem) -> Array:
-    """Standard deviations (n,) of the starts."""
-    if problem.prior_deviation is not None:
-        return problem.prior_deviation
-    return np.where(problem.x0 == 0, 1.0, np.abs(problem.x0))
-
 
 def _is_better(new: Minima, old: Minima) -> Mask:
     """Where a new minimum counts rather than the old one: it converged and is lower, or the old one had no end."""
     return new.converged & (~(new.chi_square >= old.chi_square) | ~old.converged)
-
-
-def _apart(a: Array, b: Array, deviation: Array) -> bool:
-    """Whether two minima (n,) are two."""
-    return bool((np.abs(a - b) / deviation).max() > _APART)

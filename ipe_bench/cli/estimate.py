@@ -27,8 +27,8 @@ from ipe_bench.real.fits import fit
 from ipe_bench.real.sources import noise_of, open_together
 from ipe_bench.runs.provenance import describe, fingerprint
 
-_STANDARD_ESTIMATORS = ("solver=[fixed_point]", "baseline=[linear_lse,levenberg_marquardt]")
-"""Unless others are chosen: the paper's two, and one that does not depend on the model being nearly linear."""
+_STANDARD_ESTIMATORS = ("solver=[auto]", "baseline=[linear_lse,levenberg_marquardt]")
+"""Unless others are chosen: the one that chooses its way by itself, and two that it can be held against."""
 
 
 def main(arguments: Sequence[str]) -> int:

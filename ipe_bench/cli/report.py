@@ -91,13 +91,13 @@ def _write(begun: Begun, output: Path, made: str) -> Collection:
 def _print_table(rows: Sequence[Mapping[str, Any]], collection: Collection) -> None:
     from ipe_bench.report.terminal import render
 
-    certified = None
+    certified = attained = None
     if any(row["noise"] == "certified" for row in rows):
-        from ipe_bench.report.certified_tables import certified_tables
+        from ipe_bench.report.certified_tables import attained_tables, certified_tables
 
-        certified = certified_tables(collection)[1]
+        certified, attained = certified_tables(collection)[1], attained_tables(collection)[1]
     out = console()
-    out.print(render(rows, certified, out.width))
+    out.print(render(rows, certified, out.width, attained))
     sys.stdout.flush()
 
 

@@ -17,7 +17,7 @@ from scipy.special import chdtrc
 from ipe_bench.basics.linalg import Array, Covariance, Mask, finite, inverse, multiply, solve
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
-from ipe_bench.estimators.driver import Solver, Standing, iterate
+from ipe_bench.estimators.driver import Ended, Solver, Standing, iterate
 from ipe_bench.measurements.counted import Counted, Tally
 from ipe_bench.measurements.problem import Problem
 
@@ -54,6 +54,7 @@ class Objective:
     z: Array
     rows: NDArray[np.intp]
     x0: Array
+    """The centre of the prior: (n,), or each trial's own (trials, n)."""
     prior_deviation: Array | None = None
 
     @classmethod
@@ -83,7 +84,8 @@ class Objective:
         return np.concatenate([J, prior], axis=1)
 
     def subset(self, kept: Mask) -> Objective:
-        return dataclasses.replace(self, z=self.z[kept], rows=self.rows[kept])
+        x0 = self.x0[kept] if self.x0.ndim == 2 else self.x0
+        return dataclasses.replace(self, z=self.z[kept], rows=self.rows[kept], x0=x0)
 
 
 @dataclass(frozen=True)
@@ -163,7 +165,7 @@ class Descent:
     scale: Array
     """What damping measures steps by: the diagonal of D (trials, n)."""
     regular: Mask
-    """Where J had full rank at the start: an end without it is then a place, and no property of the problem."""
+    """Where J had full rank somewhere on the way: an end without it is then a place, and no property of the problem."""
     mark: Array
     """The objective when it last decreased visibly,"""
     idle: NDArray[np.int64]
@@ -257,7 +259,11 @@ def minimize(
     deviations of the local bound in every parameter. An iteration is a step tried, taken or not.
     """
     limits: dict[str, Any] = {"tolerance": tolerance, "max_iterations": max_iterations, "budget": budget}
-    ended = iterate(objective, method, x, history=history, **limits)
+    return reached(objective, iterate(objective, method, x, history=history, **limits))
+
+
+def reached(objective: Objective, ended: Ended[Any]) -> Minima:
+    """What is known of the objective where an iteration of it, by states like `Descent`, ended."""
     # U^-1 U^-T: inverting U'U would lose twice the digits, and with them the sign of a variance.
     inverse_U, _ = inverse(ended.state.slope.U)
     covariance = np.matmul(inverse_U, inverse_U.swapaxes(1, 2))

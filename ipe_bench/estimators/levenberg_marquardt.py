@@ -81,7 +81,7 @@ class LevenbergMarquardtMethod(Solver[Descent]):
             np.where(taken, state.lam * factor, state.lam * state.growth),
             np.where(taken, 2.0, 2.0 * state.growth),
             np.fmax(state.scale, slope.columns) if self.deviation is None and self.sizes is None else state.scale,
-            state.regular,
+            state.regular | np.isfinite(slope.size),
             *state.watched(cost),
         )
 

@@ -428,7 +428,7 @@ def states_its_law(noise: Noise) -> None:
     law = rng.standard_normal((draws, m)) if stated is None else stated
     # Of each trial its chi-square, which is what the test of fit looks at, and one reading: trials are independent.
     for what, found, said in (("reading", w[:, 0], law[:, 0]), ("chi-square", (w**2).sum(1), (law**2).sum(1))):
-        p = ks_2samp(found, said).pvalue
+        p = float(tuple(ks_2samp(found, said))[1])  # type: ignore[arg-type]
         words = "normal, since there is no `whitened`" if stated is None else "what `whitened` draws"
         assert p > 1e-6, (
             f"the {what} of whitened errors is not distributed as {words} (Kolmogorov-Smirnov, p = {p:.1g})"

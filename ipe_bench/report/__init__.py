@@ -54,7 +54,7 @@ def write_report(directories: Path | str | Sequence[Path | str], output: Path | 
 def write_analysis(begun: Begun, output: Path) -> ReportResult:
     """Finishes an analysis and writes the report on it under `output`."""
     from ipe_bench.basics.files import write_text
-    from ipe_bench.report.certified_tables import certified_tables, without_certified
+    from ipe_bench.report.certified_tables import attained_tables, certified_tables, without_certified
     from ipe_bench.report.figures import draw_all
     from ipe_bench.report.html import render_page
     from ipe_bench.report.tables import all_tables, write_tables
@@ -64,7 +64,7 @@ def write_analysis(begun: Begun, output: Path) -> ReportResult:
     summary_path = output / "summary.csv"
     write_text(summary_path, analysis.summary.to_csv(index=False))
     certified_shown, certified = certified_tables(analysis.collection)
-    tables = [*certified_shown, *all_tables(analysis)]
+    tables = [*certified_shown, *attained_tables(analysis.collection)[0], *all_tables(analysis)]
     table_paths = write_tables(analysis, tables, output / "tables")
     figures: list[Path] = []
     drawn = []

@@ -23,6 +23,7 @@ from ipe_bench.real.fits import Fit
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report import examined
 from ipe_bench.report.words import p_value
+from ipe_bench.trials.fit_test import DRAWS
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
 if TYPE_CHECKING:
@@ -38,6 +39,8 @@ _MOST_OUTLIERS = 8
 _FEW = 0.05
 """Above this share of outliers it is the model that is wrong, and a list of readings says nothing."""
 _ALIKE = 0.02
+LEAST_FIT_P = 1 / (DRAWS + 1)
+"""Of the test of fit, where the law of the noise is simulated."""
 _FITS = {True: "yes", False: "NO", None: "not tested"}
 _NARROW = 90
 """Columns of a terminal below which the table of verdicts goes without the residual deviation."""
@@ -362,10 +365,15 @@ def _verdicts(fits: Sequence[Fit], width: int) -> Any:
     table.add_column("fits", no_wrap=True)
     for one in fits:
         numbers = [f"{one.residual_deviation:.4g}", f"{one.chi_square:.4g}", str(one.degrees_of_freedom)]
-        numbers += [p_value(one.p_value), p_value(one.whiteness.p_value, LEAST_P), str(int(one.outliers.sum()))]
+        numbers += [_fit_p(one), p_value(one.whiteness.p_value, LEAST_P), str(int(one.outliers.sum()))]
         status = one.status.label.replace("_", " ")
         table.add_row(escape(one.label), status, *numbers[width < _NARROW :], _FITS[one.fits])
     return table
+
+
+def _fit_p(one: Fit) -> str:
+    """p of the fit; a limit where it is the least that simulated fits can tell."""
+    return p_value(one.p_value, LEAST_FIT_P if one.p_value == LEAST_FIT_P else 0.0)
 
 
 def _notes(fits: Sequence[Fit], width: int) -> Any:
@@ -464,7 +472,7 @@ def fragment(answer: Answer) -> str:
     parts.append(f"<table><thead><tr><th>parameter</th><th>unit</th>{header}</tr></thead><tbody>{body}</tbody></table>")
     verdicts = "".join(
         f"<tr><td>{escape(one.label)}</td><td>{one.status.label}</td><td>{one.chi_square:.4g}</td>"
-        f"<td>{one.degrees_of_freedom}</td><td>{p_value(one.p_value)}</td><td>{p_value(one.whiteness.p_value)}</td>"
+        f"<td>{one.degrees_of_freedom}</td><td>{_fit_p(one)}</td><td>{p_value(one.whiteness.p_value)}</td>"
         f"<td>{int(one.outliers.sum())}</td><td>{_FITS[one.fits]}</td></tr>"
         for one in answer.fits
     )

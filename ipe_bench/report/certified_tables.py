@@ -8,7 +8,9 @@ from typing import Any
 import pandas as pd
 
 from ipe_bench.report.tables import Column, Table, column, words
+from ipe_bench.report.words import plain, short
 from ipe_bench.statistics.analysis import Analysis
+from ipe_bench.statistics.attained import BUDGETS, attained_table, attained_totals
 from ipe_bench.statistics.collect import Collection
 from ipe_bench.statistics.digits import certified_averages, certified_table
 
@@ -43,6 +45,55 @@ _TITLES = {
     "mean_lre_deviations": "of deviations",
     "mean_lre_rss": "of residuals",
 }
+
+
+def attained_tables(collection: Collection) -> tuple[list[Table], pd.DataFrame]:
+    """Who attains known minima, in all and problem by problem, as tables and as the totals alone; empty where no run
+    had such problems."""
+    table = attained_table(collection)
+    totals = attained_totals(table)
+    if table.empty:
+        return [], totals
+    problems = table.sort_values(["function", "start"], kind="stable", ignore_index=True)
+    minima = ["-" if v is None or pd.isna(v) else f"{int(v) + 1}" for v in problems["minimum"]]
+    shown = [
+        words("function", problems["function"]),
+        column("start", problems["start"], plain),
+        words("estimator", problems["estimator"]),
+        words("solved", ["yes" if v else "no" for v in problems["solved"]]),
+        words("minimum", minima),
+        column("sum of squares", problems["sum_of_squares"], lambda v: f"{v:.6g}"),
+        words("status", problems["status"]),
+        column("cost", problems["cost"], short),
+    ]
+    return [
+        Table("attained", "Known minima", _ATTAINED, attained_columns(totals), totals),
+        Table("attained_problems", "Known minima, problem by problem", _PROBLEMS, shown, problems),
+    ], totals
+
+
+def attained_columns(totals: pd.DataFrame) -> list[Column]:
+    """The columns of the totals as they are shown."""
+    most = totals["solved"] == totals["solved"].max()
+    columns = [words("estimator", totals["estimator"], list(most)), column("problems", totals["problems"], str)]
+    columns.append(column("solved", totals["solved"], str, list(most)))
+    starts = [name for name in totals if str(name).startswith("solved_")]
+    columns += [column(f"from {str(name).removeprefix('solved_')} x", totals[name], str) for name in starts]
+    columns.append(column("of these converged", totals["converged"], str))
+    columns.append(column("converged elsewhere", totals["elsewhere"], str))
+    columns.append(column("median cost", totals["cost_median"], short))
+    return [*columns, *(column(f"within {b}", totals[f"within_{b}"], str) for b in BUDGETS)]
+
+
+_ATTAINED = (
+    "Problems whose least minimum the estimate attains: f at most f* (1 + 1e-6) + 1e-12. From 1 x, 10 x: from these"
+    " multiples of the standard start. Of these converged: the status says so where the answer is right. Converged"
+    " elsewhere: at another minimum, or at none. Median cost: simulations over all problems, a Jacobian counting n,"
+    " infinite where unsolved. Within 10, 100, 1000: solved within so many simplex gradients of n + 1 simulations."
+)
+_PROBLEMS = (
+    "Which of a function's known minima has the estimate's sum of squares, the lowest being 1; a dash: none of them."
+)
 
 
 def _columns(table: pd.DataFrame) -> list[Column]:

@@ -12,7 +12,7 @@ from typing import Any
 import pandas as pd
 
 from ipe_bench.basics.files import write_text
-from ipe_bench.report.words import limits, p_value, percent, plain, short, shower, shown
+from ipe_bench.report.words import limits, p_value, percent, plain, reported, short, shower, shown
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.comparisons import ALPHA
 from ipe_bench.statistics.records import SCORES, STATISTICS, Kind, Statistic, Where
@@ -84,7 +84,7 @@ def all_tables(analysis: Analysis) -> list[Table]:
     """Every table that the data allow, in the order of the report."""
     if analysis.summary.empty:
         return []
-    tables = [overview(analysis), costs(analysis), comparisons(analysis), ranks(analysis)]
+    tables = [overview(analysis), costs(analysis), portfolio(analysis), comparisons(analysis), ranks(analysis)]
     tables += [parameters(analysis), calibration(analysis), endings(analysis)]
     tables += [contraction(analysis), covariances(analysis), theory(analysis), iterations(analysis)]
     return [t for t in tables if t is not None]
@@ -109,7 +109,8 @@ def overview(analysis: Analysis) -> Table:
         "Shares are of all trials. Efficiency is the bound that applies over the root mean square error: over the"
         " trials that the estimator solved, whose number stands in brackets where it is not all, and over all trials."
         " Filters and the linear estimate solve nothing, so for them there are all trials only. rmse, common: on the"
-        " trials that every estimator solved. misfit: trials whose residuals fail the test of fit at 0.1 %. Bold: the"
+        " trials that every estimator solved. misfit: trials whose residuals fail the test of fit at 0.1 %. ambiguous:"
+        " trials in which several minima fit, as far as the estimator has looked. Bold: the"
         " estimators than which none is significantly closer to the truth (Wilcoxon, Holm, 5 %), where any is beaten."
     )
     return Table("overview", "Overview", caption, columns, rows)
@@ -120,7 +121,7 @@ def statistics(where: Where, records: Sequence[Statistic], rows: pd.DataFrame) -
     columns: list[Column] = []
     told = [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]
     for record in records:
-        if where not in record.where:
+        if where not in record.where or not reported(record, told):
             continue
         title = record.titles.get(where, record.title)
         cells = [Cell(shown(record, where, row), _key(row[record.name], record.kind)) for row in told]
@@ -254,6 +255,35 @@ def comparisons(analysis: Analysis) -> Table | None:
         " scenarios. Success is the gate of the Cramér-Rao bound here, prior or not."
     )
     return Table("comparisons", "Paired comparisons", caption, columns, rows)
+
+
+def portfolio(analysis: Analysis) -> Table | None:
+    """What the best choice of an estimator would come to, and `auto` beside it."""
+    rows = analysis.portfolio
+    if rows.empty:
+        return None
+    single = rows[rows["scenario"] >= 0]
+    varying = [c for c in analysis.setting_columns if len(set(single[c].astype(str))) > 1]
+    columns = [words(c, [plain(v) for v in rows[c]]) for c in varying]
+    columns += [
+        column("error scale", rows["error_scale"], lambda v: "all" if math.isnan(v) else f"{v:g}"),
+        column("trials", rows["trials"], lambda v: f"{v:d}"),
+        column("virtual best", rows["virtual_success"], percent),
+        interval("95 % of it", rows["virtual_low"], rows["virtual_high"], percent),
+        column("at cost", rows["virtual_cost"], short),
+        words("single best", rows["single"]),
+        column("its success", rows["single_success"], percent),
+        column("its cost", rows["single_cost"], short),
+    ]
+    if rows["auto_success"].notna().any():
+        columns += [column("auto", rows["auto_success"], percent), column("its cost", rows["auto_cost"], short)]
+    caption = (
+        "Virtual best: in each trial the cheapest estimator that succeeds; the share of trials in which any does."
+        " Single best: the one estimator that succeeds most often, of several the cheapest. Costs are medians over all"
+        " trials in simulations, a trial without success costing infinitely much. The row of all error scales has the"
+        " estimators that are everywhere."
+    )
+    return Table("portfolio", "Virtual best and single best", caption, columns, rows)
 
 
 def ranks(analysis: Analysis) -> Table | None:

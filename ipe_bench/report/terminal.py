@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
-from ipe_bench.report.words import compact, limits, plain, shown
+from ipe_bench.report.words import compact, limits, plain, reported, shown
 from ipe_bench.statistics.records import STATISTICS, Statistic
 from ipe_bench.statistics.summary import ALL, COLUMNS
 
@@ -25,17 +25,22 @@ _NOT_SETTINGS = {*COLUMNS, "parameter", "unit", "estimator", "error_scale"}
 
 
 def render(
-    summary: pd.DataFrame | Sequence[Mapping[str, Any]], certified: pd.DataFrame | None = None, width: int = WIDE
+    summary: pd.DataFrame | Sequence[Mapping[str, Any]],
+    certified: pd.DataFrame | None = None,
+    width: int = WIDE,
+    attained: pd.DataFrame | None = None,
 ) -> Group:
     """One table per setting (measurement, noise, and every option that differs), a section per error scale.
 
     `summary` is the frame or its rows. Columns that do not fit the width are left out, and named below. Runs on
-    certified readings, whose mean digits are in `certified`, share one table instead.
+    certified readings, whose mean digits are in `certified`, share one table instead, and so do those on problems of
+    known minimum, whose totals are in `attained`.
     """
     from rich.console import Group
     from rich.text import Text
 
     digits = [] if certified is None or certified.empty else _digits(certified)
+    digits += [] if attained is None or attained.empty else _attained(attained)
     listed: Sequence[Any] = summary if isinstance(summary, Sequence) else summary.to_dict("records")
     rows: list[Any] = [row for row in listed if row["parameter"] == ALL and row["noise"] != "certified"]
     if not rows:
@@ -60,7 +65,9 @@ def render(
         "efficiency: the bound that applies over the root mean square error, 1 at best, with its 95 % bootstrap"
         " interval: of the solved trials (their number in brackets where it is not all), and of all. Filters and the"
         " linear estimate solve no equation. NEES: 1 where the reported covariance is right. misfit: trials whose"
-        " residuals fail the test of fit at 0.1 %. sims, time: medians per trial, a Jacobian counting what it costs."
+        " residuals fail the test of fit at 0.1 %. "
+        + ("ambiguous: several minima fit. " if any(math.isfinite(row["ambiguous"]) for row in rows) else "")
+        + "sims, time: medians per trial, a Jacobian counting what it costs."
     )
     return Group(*digits, *parts, Text(note, style="dim"))
 
@@ -74,7 +81,7 @@ def _setting(title: str, part: Sequence[Mapping[str, Any]], width: int) -> tuple
     # The number of trials stands in the title where it is the same for all.
     counts = list({row["trials"] for row in part})
     alike = len(counts) == 1
-    shown = [record for record in _SHOWN if not (alike and record.name == "trials")]
+    shown = [r for r in _SHOWN if not (alike and r.name == "trials") and reported(r, part)]
     headings = ["scale", "estimator", *_headings(shown)]
     sections = [
         [[f"{scale:g}" if i == 0 else "", str(row["estimator"]), *_cells(shown, row)] for i, row in enumerate(block)]
@@ -141,6 +148,28 @@ def _digits(averages: pd.DataFrame) -> list[Any]:
     note = (
         "digits: log relative error against the certified answer, the fewest over a data set's parameters, at most 11,"
         " averaged over the data sets. solved: four digits or more."
+    )
+    return [table, Text(note, style="dim"), Text()]
+
+
+def _attained(totals: pd.DataFrame) -> list[Any]:
+    """Problems of known minimum that are solved."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    from ipe_bench.report.certified_tables import attained_columns
+
+    table = Table(title="Known minima", title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+    columns = attained_columns(totals.sort_values("solved", ascending=False, kind="stable", ignore_index=True))
+    for each in columns:
+        table.add_column(each.title, justify="right" if each.numeric else "left")
+    for row in zip(*(each.cells for each in columns), strict=True):
+        table.add_row(*(cell.text for cell in row))
+    note = (
+        "solved: the estimate's sum of squares is the least known one, to 1e-6; of these converged: where the status"
+        " says so. median cost: simulations, infinite where unsolved. within: solved within so many times n + 1"
+        " simulations."
     )
     return [table, Text(note, style="dim"), Text()]
 

@@ -109,6 +109,11 @@ def applies(record: Statistic, where: Where, row: Mapping[str, Any]) -> bool:
     return record.given != "solved" or where == "parameters" or row["equation"] != "-"
 
 
+def reported(record: Statistic, rows: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether a table has the column: one that few estimators report only where one of the rows does."""
+    return not record.rare or any(math.isfinite(row[record.name]) for row in rows)
+
+
 def shown(record: Statistic, where: Where, row: Mapping[str, Any]) -> str:
     """A value as it stands in a table: with the number of trials that it is conditional on, where that is not all."""
     if not applies(record, where, row):

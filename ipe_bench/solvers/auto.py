@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Annotated
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any
 
 import numpy as np
 from annotated_types import Ge, Lt
@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.basics.options import Positive
+from ipe_bench.basics.options import Positive, Whole
 from ipe_bench.basics.statuses import Status
+from ipe_bench.basics.streams import normals, own_generators
 from ipe_bench.estimators.base import Estimates, Estimator
-from ipe_bench.estimators.driver import Solver, Standing, iterate
+from ipe_bench.estimators.driver import Ended, Solver, Standing, iterate
+from ipe_bench.estimators.fitting import Fitting, spread_of_starts
 from ipe_bench.estimators.ipe import begin
-from ipe_bench.estimators.least_squares import Descent, Minima, Objective, minimize, squared
+from ipe_bench.estimators.least_squares import Descent, Minima, Objective, minimize, reached, squared
+from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.counted import Counted, Tally
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers.fixed_point import FixedPoint
@@ -28,6 +31,14 @@ _ITERATIONS = 12
 _NEAR = 1e-2
 """How near to its root, in deviations, fixed-point iteration brings a trial before the search goes on from there."""
 _CHORDS = 8
+_JACOBIANS = 3
+_BENT = 100
+"""Times the tolerance: the part of a chord step that the next one may take back. The answer is then about as many
+deviations off. Steps of fewer deviations than this say nothing of how J changes."""
+_UNSETTLED = Status.MAX_ITERATIONS
+_CONFIRMATIONS = 4
+_DAMPING, _STEPS = 1e-3, 100
+"""Of a minimisation that looks for another minimum: lambda at its start, and steps tried."""
 
 FIXED_POINT, PROGRESSIVE = 1, 2
 """The stages, as extras `stage` names them."""
@@ -38,83 +49,164 @@ class Auto(Estimator):
     """The least-squares estimate, as cheaply as this problem allows.
 
     First the paper's fixed-point iteration, with H frozen at the nominal point, then Gauss-Newton steps with one
-    Jacobian, that of the root which it has found: near to linear problems are solved so. Where that does not converge,
-    or the residuals fail the test of the fit, `progressive`. Extras `stage` says which of the two answered, 1 or 2.
+    Jacobian, that of the root which it has found: near to linear problems are solved so. A step of which the next one
+    takes back more than a hundred tolerances says that J has changed; then it is computed anew. Where all that does not
+    converge, or the residuals fail the test of the fit, `progressive`. Extras `stage` says which of the two answered, 1
+    or 2. Cheapest first with a judge is how algorithm portfolios go (Gomes and Selman, Artificial Intelligence 126,
+    2001); these stages and their judge, the calibrated test of the fit, are ours.
 
-    The one Jacobian of the first stage is the covariance's, and as with every solver not counted where it ends there.
+    Where the first stage did not suffice, `confirmations` minimisations from draws of the prior look for other minima
+    that fit. Of several the one counts that is the most probable with the prior, since no residual can tell. Extras:
+    `minima`, how many distinct minima that fit were found, and `ambiguous`, 1 where there are several; `alternatives`
+    lists the others. That none was found is no proof that there is none.
+
+    One Jacobian of the first stage is the covariance's, and as with every solver not counted where it ends there.
     """
 
     tolerance: Positive = 1e-6
     """Largest Gauss-Newton step still to go, in standard deviations of the local bound."""
     fit_level: Annotated[float, Ge(0), Lt(1)] = 1e-6
     """Residuals less probable than this are taken for those of a wrong minimum."""
+    confirmations: Whole | None = None
+    """Minimisations that look for other minima that fit, where the first stage did not suffice; None: four where a
+    prior says where to look and no differential equations make each of them dear, else none."""
+    seed: Whole = 0
+    """A trial's random stream depends on this and on its readings: on nothing else in the batch."""
     budget: Positive | None = None
     """Simulations that a trial may cost, a Jacobian counting n; None: no limit."""
 
     equation = "least_squares"
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        quick, tally = self._quick(problem, z, history)
-        answered = quick.converged & (quick.fit_probability(z.shape[1]) >= self.fit_level)
-        tally.jacobians[answered] = 0.0
-        extras = {"stage": np.where(answered, FIXED_POINT, PROGRESSIVE).astype(float)}
-        first = replace(quick.estimates(tally, z.shape[1]), messages={})
-        if answered.all():
-            return replace(first, extras=first.extras | extras)
+        best, tally = self._quick(problem, z, history)
+        answered = best.converged & (best.fit_probability(z.shape[1]) >= self.fit_level)
+        tally = Tally(tally.simulations, tally.jacobians - answered, np.zeros(len(z), dtype=bool))
         left = np.flatnonzero(~answered)
-        thorough = Progressive(tolerance=self.tolerance, fit_level=self.fit_level, budget=self.budget)
-        rest = thorough.estimate(problem, z[left], history=history)
-        rest = replace(
-            rest,
-            simulations=rest.simulations + tally.simulations[left],
-            jacobians=rest.jacobians + tally.jacobians[left],
-        )
-        return _merged(first, left, rest, extras)
+        if len(left):
+            thorough = Progressive(tolerance=self.tolerance, fit_level=self.fit_level, budget=self.budget)
+            found, spent = thorough.search(problem, z[left], history=history)
+            best = put(best, left, found)
+            tally.simulations[left] += spent.simulations
+            tally.jacobians[left] += spent.jacobians
+            tally.messages.update({int(left[i]): message for i, message in spent.messages.items()})
+        fitting = Fitting.none(len(z), z.shape[1], self.fit_level)
+        fits = fitting.note(best, np.arange(len(z)))
+        best = self._confirmed(problem, z, best, tally, fitting, left[fits[left]], history)
+        estimates = fitting.report(best.estimates(tally, z.shape[1]))
+        estimates.extras["stage"] = np.where(answered, FIXED_POINT, PROGRESSIVE).astype(float)
+        return estimates
+
+    def _confirmed(
+        self,
+        problem: Problem,
+        z: Array,
+        best: Minima,
+        tally: Tally,
+        fitting: Fitting,
+        rows: NDArray[np.intp],
+        history: bool,
+    ) -> Minima:
+        """The answers, after a look for others in the trials `rows`."""
+        count, n = self._confirmations(problem), len(problem.x0)
+        if not count or not len(rows):
+            return best
+        draws = normals(own_generators(self.seed, z[rows]), count, n)
+        whole = Objective(Counted(problem.measurement, tally), problem.R, z[rows], rows, problem.x0)
+        method = LevenbergMarquardtMethod(_DAMPING, problem.prior_used())
+        limits = {"tolerance": self.tolerance, "max_iterations": _STEPS, "budget": self.budget}
+        for k in range(count):
+            x = problem.x0 + spread_of_starts(problem) * draws[:, k]
+            again = minimize(whole, method, x, history=history, **limits)
+            known = take(best, rows)
+            better = fitting.note(again, rows) & (_improbability(problem, again) < _improbability(problem, known))
+            spent = best.iterations.copy()
+            spent[rows] += again.iterations
+            best = replace(put(best, rows[better], take(again, better)), iterations=spent)
+        return best
+
+    def _confirmations(self, problem: Problem) -> int:
+        if self.confirmations is not None:
+            return self.confirmations
+        dear = problem.measurement.by_differential_equations
+        return 0 if dear or problem.prior_deviation is None else _CONFIRMATIONS
 
     def _quick(self, problem: Problem, z: Array, history: bool) -> tuple[Minima, Tally]:
         """Fixed-point iteration, then chord steps; trials that do not arrive have not converged."""
+        minima = _nowhere(problem, len(z), history)
         try:
             x, system = begin(problem, z, "linear_lse")
         except UserError:  # H lacks rank at the nominal point, which says nothing of other points
-            return _nowhere(problem, len(z), history), Tally.zeros(len(z))
+            return minima, Tally.zeros(len(z))
         limits = {"tolerance": _NEAR, "max_iterations": _ITERATIONS, "budget": self.budget}
         ended = iterate(system, FixedPoint(), x, history=history, **limits)
         tally = system.model.tally
-        near, minima = np.flatnonzero(ended.converged), _nowhere(problem, len(z), history)
-        if not len(near):
-            return minima, tally
-        counted = Tally(tally.simulations[near], tally.jacobians[near], np.zeros(len(near), dtype=bool))
-        model = Counted(problem.measurement, counted)
-        objective = Objective(model, problem.R, z[near], np.arange(len(near)), problem.x0)
-        arrived = minimize(
-            objective,
-            _Chord(),
-            ended.x[near],
-            tolerance=self.tolerance,
-            max_iterations=_CHORDS,
-            budget=self.budget,
-            history=history,
-        )
-        paths = take(ended, near).history
-        if paths is not None and arrived.history is not None:
-            paths = [np.concatenate([a, b[1:]]) for a, b in zip(paths, arrived.history, strict=True)]
-        arrived = replace(arrived, iterations=arrived.iterations + ended.iterations[near], history=paths)
-        tally.simulations[near], tally.jacobians[near] = counted.simulations, counted.jacobians
-        return put(minima, near, arrived), tally
+        near = np.flatnonzero(ended.converged)
+        if len(near):
+            whole = Objective(Counted(problem.measurement, tally), problem.R, z, np.arange(len(z)), problem.x0)
+            minima = put(minima, near, self._chords(whole, near, take(ended, near), history))
+        return minima, tally
+
+    def _chords(self, whole: Objective, rows: NDArray[np.intp], before: Ended[Any], history: bool) -> Minima:
+        """Chord steps for the trials `rows`, each time with a new Jacobian until it is that of the end."""
+        limits = {"tolerance": self.tolerance, "max_iterations": _CHORDS, "budget": self.budget}
+        result, at, start = None, np.arange(len(rows)), before
+        for _ in range(_JACOBIANS):
+            objective = whole.subset(rows[at])
+            ended = iterate(objective, _Chord(_BENT * self.tolerance), start.x, history=history, **limits)
+            bent = ended.converged & (ended.state.bend > _BENT * self.tolerance)
+            minima = reached(objective, ended)
+            minima = _after(start, replace(minima, status=np.where(bent, _UNSETTLED, minima.status).astype(np.int8)))
+            result = minima if result is None else put(result, at, minima)
+            at, start = at[bent], take(minima, bent)
+            if not len(at):
+                break
+        assert result is not None
+        return result
+
+
+def _improbability(problem: Problem, minima: Minima) -> Array:
+    """Minus twice the logarithm (trials,) of the posterior density, or of the likelihood without a prior, but for a
+    constant."""
+    prior = problem.prior_used()
+    if prior is None:
+        return minima.chi_square
+    return minima.chi_square + np.sum(((minima.x - problem.x0) / prior) ** 2, axis=1)
+
+
+def _after(first: Ended[Any] | Minima, second: Minima) -> Minima:
+    """The second of two iterations, with the iterations and iterates of both."""
+    history = second.history
+    if first.history is not None and history is not None:
+        history = [np.concatenate([a, b[1:]]) for a, b in zip(first.history, history, strict=True)]
+    return replace(second, iterations=first.iterations + second.iterations, history=history)
 
 
 @dataclass(frozen=True)
-class _Chord(Solver[Descent]):
+class _OnChords(Descent):
+    """`Descent` by chords."""
+
+    bend: Array = field(default_factory=lambda: np.zeros(0))
+    """The largest part (trials,) of a step that the next one had to take back: how far J has changed on the way."""
+
+
+@dataclass(frozen=True)
+class _Chord(Solver[_OnChords]):
     """Gauss-Newton steps with the Jacobian of the start, which is near enough to the end for it."""
 
-    def begin(self, objective: Objective, x: Array) -> Descent:
-        return Descent.at(objective, x, keep_Q=True)
+    visible: float
+    """Steps of fewer deviations are not judged by."""
 
-    def step(self, objective: Objective, state: Descent) -> Descent:
+    def begin(self, objective: Objective, x: Array) -> _OnChords:
+        state = Descent.at(objective, x, keep_Q=True)
+        return _OnChords(**vars(state), bend=np.zeros(len(x)))
+
+    def step(self, objective: Objective, state: _OnChords) -> _OnChords:
         x = state.x + state.slope.newton
         r = objective.residual(x)
         slope = state.slope.towards(r)
-        return replace(state, x=x, r=r, cost=squared(r), slope=slope, moved=state.reach(state.slope.newton))
+        bend = np.where(state.slope.size > self.visible, slope.size / state.slope.size, 0.0)
+        moved = state.reach(state.slope.newton)
+        return replace(state, x=x, r=r, cost=squared(r), slope=slope, moved=moved, bend=np.fmax(state.bend, bend))
 
     def standing(self, objective: Objective, before: Descent | None, state: Descent) -> Standing:
         return state.standing(stuck=state.rankless)
@@ -132,24 +224,4 @@ def _nowhere(problem: Problem, trials: int, history: bool) -> Minima:
         np.full((trials, n, n), np.nan),
         far,
         far,
-    )
-
-
-def _merged(first: Estimates, left: NDArray[np.intp], rest: Estimates, extras: dict[str, Array]) -> Estimates:
-    """The estimates of the first stage, but for the trials that were left to the second."""
-    assert first.covariance is not None
-    assert rest.covariance is not None
-    history = None
-    if first.history is not None and rest.history is not None:
-        history = put(first.history, left, rest.history)  # type: ignore[type-var]
-    return Estimates(
-        x=put(first.x, left, rest.x),
-        status=put(first.status, left, rest.status),
-        covariance=put(first.covariance, left, rest.covariance),
-        iterations=put(first.iterations, left, rest.iterations),
-        simulations=put(first.simulations, left, rest.simulations),
-        jacobians=put(first.jacobians, left, rest.jacobians),
-        messages={int(left[i]): message for i, message in rest.messages.items()},
-        history=history,
-        extras={name: put(values, left, rest.extras[name]) for name, values in first.extras.items()} | extras,
     )

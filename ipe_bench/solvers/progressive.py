@@ -42,12 +42,16 @@ class Progressive(Estimator):
 
     The test of the residuals is the estimator's own verdict, extras `fit_p`. A trial that fails it, and whose bulk of
     residuals is large too, is tried again: carefully from the nominal point (windows that grow slowly, damping by the
-    residual, steps bent along the curvature), then from 16, 32, ... draws of the prior, of which each window keeps
-    those that fit it best. An attempt that leads to the same minimum again ends the search; the best fit counts.
+    residual, steps bent along the curvature), then from 16, 32, ... draws of the prior, which the first windows keep
+    apart and the later ones thin out to those that fit best. An attempt that leads to the same minimum again ends the
+    search; the best fit counts.
 
     Growing windows that start one another are the incremental single shooting of Michalik, Hannemann and Marquardt
     (Comput. Chem. Eng. 33, 2009) and, with a prior, the recursive iterative batch smoother of Stepanov et al. (Sensors
-    25, 2025); the damping in the prior's metric, the judge and the pruned restarts are added here.
+    25, 2025). Many draws carried through growing data and thinned out on the way are data-tempered Monte Carlo (Chopin,
+    Biometrika 89, 2002), with minimisations for its moves; draws whose priors are centred at themselves are the
+    randomised maximum likelihood of Oliver, He and Reynolds (1996). The damping in the prior's metric, the calibrated
+    test of the fit as the judge, and the order of cheap and dear attempts are ours.
     """
 
     growth: Annotated[float, Gt(1)] = 2.0
@@ -75,6 +79,11 @@ class Progressive(Estimator):
     equation = "least_squares"
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
+        best, tally = self.search(problem, z, history=history)
+        return best.estimates(tally, z.shape[1])
+
+    def search(self, problem: Problem, z: Array, *, history: bool = False) -> tuple[Minima, Tally]:
+        """The best minimum of each trial, and what it has cost to find it."""
         kind = Stages if problem.measurement.epochs is None else Windows
         search = kind(self, problem, z, Tally.zeros(len(z)), history)
         best = search.attempt(0, np.arange(len(z)), None)
@@ -89,8 +98,7 @@ class Progressive(Estimator):
             better = _is_better(again, before)
             best = put(best, suspect[better], take(again, better))
         raised = search.tally.failed(np.arange(len(z))) & ~best.converged
-        best = replace(best, status=np.where(raised, Status.ERROR, best.status).astype(np.int8))
-        return best.estimates(search.tally, z.shape[1])
+        return replace(best, status=np.where(raised, Status.ERROR, best.status).astype(np.int8)), search.tally
 
     def _suspect(self, problem: Problem, best: Minima, tally: Tally, z: Array) -> Mask:
         """The trials that another attempt may help: (trials,)."""

@@ -22,8 +22,10 @@ _SLOW_GROWTH = 1.4
 _CAREFUL_ITERATIONS = (60, 30)
 """In the first window of a careful attempt, and in later ones."""
 _FIRST_DRAWS = 16
-_KEPT = (8, 4, 2, 2, 1)
-"""Candidates that each window keeps, of 16; in proportion of more, until one is left."""
+_RANDOMISED = 2
+"""In so many windows, which leave much open, the prior of a candidate is centred at its own start."""
+_THINNING = (1, 1, 4, 8, 16, 32, 64)
+"""Of the candidates that there were at the start, each window keeps the best one in so many; one at least."""
 _GIVEN_UP = (np.inf, 1e6, 1e3)
 """The mean squared residual above which a window's fit is a wrong one: in the first window, the second, and later."""
 _ONE = (0.03, 0.003)
@@ -35,6 +37,8 @@ class Candidates:
     """Where the candidates of some trials have come; every field has the candidates in front."""
 
     x: Array
+    start: Array
+    """Where they began."""
     owner: NDArray[np.intp]
     """The trial (candidates,) that each belongs to."""
     iterations: NDArray[np.int64]
@@ -43,19 +47,26 @@ class Candidates:
 
     @classmethod
     def at(cls, x: Array, owner: NDArray[np.intp], history: bool) -> Candidates:
-        return cls(x, owner, np.zeros(len(x), np.int64), [row[None] for row in x] if history else None)
+        return cls(x, x, owner, np.zeros(len(x), np.int64), [row[None] for row in x] if history else None)
 
     def moved(self, minima: Minima) -> Candidates:
         """The same candidates where a minimisation has led them."""
         path = self.path
         if path is not None and minima.history is not None:
             path = [np.concatenate([old, new[1:]]) for old, new in zip(path, minima.history, strict=True)]
-        return Candidates(minima.x, self.owner, self.iterations + minima.iterations, path)
+        return replace(self, x=minima.x, iterations=self.iterations + minima.iterations, path=path)
 
 
 @dataclass(frozen=True)
 class Windows(Search):
-    """From the nominal point, then carefully from there, then from 16, 32 and 64 draws of the prior."""
+    """From the nominal point, then carefully from there, then from 16, 32 and 64 draws of the prior.
+
+    The first two windows have about as many readings as there are parameters, so their fits have several minima of
+    one depth, and a common prior would draw all candidates to one of them. Until then each candidate's prior is
+    centred at its own draw, which makes the candidates about a sample of what the readings so far leave possible: the
+    randomised maximum likelihood of Oliver, He and Reynolds (5th European Conference on the Mathematics of Oil
+    Recovery, 1996).
+    """
 
     attempts = 5
     enough = 1
@@ -70,12 +81,13 @@ class Windows(Search):
         there = self._begin(k, rows, metric if prior is not None or before is None else _reach(before, self.problem.x0))
         method = LevenbergMarquardtMethod(self.options.damping, metric, by_residual=k > 0, geodesic=k > 0)
         for number, (epochs, arrived) in enumerate(self._windows(k)):
-            objective = self._window(there.owner, epochs, arrived, prior)
+            centre = there.start if number < _RANDOMISED else self.problem.x0
+            objective = self._window(there.owner, epochs, arrived, centre)
             limit = _CAREFUL_ITERATIONS[min(number, 1)] if k else self.options.window_iterations
             minima = self.minimize(
                 objective, there.owner, method, there.x, tolerance=self.options.window_tolerance, limit=limit
             )
-            fit = minima.chi_square if prior is None else minima.chi_square + _far(minima.x, self.problem.x0, prior)
+            fit = minima.chi_square if prior is None else minima.chi_square + _far(minima.x, centre, prior)
             per_reading = np.where(np.isfinite(fit), fit, np.inf) / objective.readings
             there = take(there.moved(minima), self._kept(k, number, there.owner, minima.x / metric, per_reading))
         last = LevenbergMarquardtMethod(self.options.damping, metric)
@@ -89,8 +101,7 @@ class Windows(Search):
         x0, n = self.problem.x0, self.problem.measurement.n
         draws = np.zeros((1, n))
         if k > 1:
-            count = _FIRST_DRAWS * 2 ** (k - 2)
-            draws = np.random.Generator(np.random.Philox(k)).standard_normal((count, n))
+            draws = np.random.Generator(np.random.Philox(k)).standard_normal((_draws(k), n))
         spread = np.broadcast_to(spread, (len(rows), n))
         x = (x0 + spread[:, None] * draws).reshape(-1, n)
         return Candidates.at(x, np.repeat(rows, len(draws)), self.history)
@@ -103,20 +114,18 @@ class Windows(Search):
         for stop in window_stops(len(model.epochs), growth):
             yield stop, model.rows(stop)
 
-    def _window(
-        self, owner: NDArray[np.intp], epochs: int, arrived: NDArray[np.intp], prior: Array | None
-    ) -> Objective:
-        """The objective of each candidate in a window."""
+    def _window(self, owner: NDArray[np.intp], epochs: int, arrived: NDArray[np.intp], centre: Array) -> Objective:
+        """The objective of each candidate in a window, with the prior about `centre`."""
         problem, model = self.problem, self.problem.measurement
         assert model.epochs is not None
         window = Counted(Restricted.until(model, epochs), self.spent(owner), epochs / len(model.epochs))
         R, z = problem.R.restricted(arrived), self.z[np.ix_(owner, arrived)]
-        return Objective(window, R, z, np.arange(len(owner)), problem.x0, prior)
+        return Objective(window, R, z, np.arange(len(owner)), centre, self.prior)
 
     def _kept(self, k: int, number: int, owner: NDArray[np.intp], x: Array, per_reading: Array) -> NDArray[np.intp]:
         """The candidates that go on: of each trial the best few that differ and are not given up; one in any case in
         the last attempt, and where there is no fit at all: that ends with its own status."""
-        most = _KEPT[min(number, len(_KEPT) - 1)] * (2 ** max(k - 2, 0) if number < 2 else 1)
+        most = max(1, _draws(k) // _THINNING[min(number, len(_THINNING) - 1)])
         limit = _GIVEN_UP[min(number, len(_GIVEN_UP) - 1)]
         order = np.lexsort((per_reading, owner))
         kept: list[int] = []
@@ -147,6 +156,11 @@ class Windows(Search):
         order = np.lexsort((fit, ~minima.converged, there.owner))
         owner, first = np.unique(there.owner[order], return_index=True)
         return put(result, np.searchsorted(rows, owner), take(minima, order[first]))
+
+
+def _draws(k: int) -> int:
+    """How many candidates the k-th attempt begins with."""
+    return _FIRST_DRAWS * 2 ** (k - 2) if k > 1 else 1
 
 
 def window_stops(epochs: int, growth: float) -> list[int]:

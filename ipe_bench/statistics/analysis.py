@@ -12,6 +12,7 @@ import numpy as np
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
+from ipe_bench.statistics.attained import attained_table
 from ipe_bench.statistics.calibration import POINTS, shared_level
 from ipe_bench.statistics.collect import Collection, Group, collect
 from ipe_bench.statistics.comparisons import (
@@ -25,6 +26,7 @@ from ipe_bench.statistics.comparisons import (
 )
 from ipe_bench.statistics.histories import History, trial_label
 from ipe_bench.statistics.intervals import quantile, quantiles, rms_interval
+from ipe_bench.statistics.portfolio import pooled, portfolio_row
 from ipe_bench.statistics.profiles import Profiles
 from ipe_bench.statistics.records import SCORES, capped_error, gate_radius, rows_of
 from ipe_bench.statistics.sample import Sample, Shared
@@ -69,6 +71,11 @@ class Analysis:
     within in 95 % of cases, and whether this one is `outside` (by either of its curves)."""
     contraction: pd.DataFrame
     """Per scenario, how much the fixed-point iteration contracts at the truth; empty where no file says so."""
+    portfolio: pd.DataFrame
+    """Per scenario, and over all of them where there are several (`scenario` is -1), the virtual best and the single
+    best estimator; see `portfolio.portfolio_row`."""
+    attained: pd.DataFrame
+    """Which estimator attains known minima, over all scenarios; see `attained.attained_table`."""
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -128,6 +135,7 @@ class Begun:
         for where, outcomes in self._scenarios:
             self._rows.pairs += [(where, pair) for pair in compare_pairs(outcomes)]
             self._rows.profiles.add({label: outcome for label, outcome in outcomes.items() if label in everywhere})
+        self._rows.portfolio += _portfolio_rows(self._scenarios, everywhere)
         self._scenarios.clear()
         return _analysis(self.collection, self._rows, everywhere)
 
@@ -149,6 +157,8 @@ def _analysis(collection: Collection, rows: _Rows, everywhere: set[str]) -> Anal
         convergence=_joined(rows.convergence, ("trial", "iteration", "distance")),
         calibration=_joined(rows.calibration, ("parameter", "at", "difference", "low", "high", "outside")),
         contraction=pd.DataFrame(rows.contraction),
+        portfolio=pd.DataFrame(rows.portfolio),
+        attained=attained_table(collection),
     )
 
 
@@ -166,6 +176,7 @@ class _Rows:
     correlations: list[dict[str, Any]] = field(default_factory=list)
     convergence: list[dict[str, Any]] = field(default_factory=list)
     calibration: list[dict[str, Any]] = field(default_factory=list)
+    portfolio: list[dict[str, Any]] = field(default_factory=list)
     replicates: list[tuple[int, int, str, float]] = field(default_factory=list)
     """Scenario, seed, estimator and capped error."""
     profiles: Profiles = field(default_factory=Profiles)
@@ -209,6 +220,18 @@ def _add_scenario(rows: _Rows, collection: Collection, number: int, groups: Sequ
         rows.convergence += [_convergence_rows(where, history) for history in sample.histories]
     rows.scores += scores
     return dict(groups[0].columns) | {"scenario": number}, outcomes
+
+
+def _portfolio_rows(scenarios: Sequence[_Compared], everywhere: set[str]) -> list[dict[str, Any]]:
+    """A row per scenario, and one over all of them with the estimators that are everywhere."""
+    rows = [where | row for where, outcomes in scenarios if (row := portfolio_row(outcomes))]
+    if len(rows) > 1:
+        labels = [label for label in scenarios[0][1] if label in everywhere]
+        together = portfolio_row(pooled([outcomes for _, outcomes in scenarios], labels))
+        if together:
+            nothing = dict.fromkeys(scenarios[0][0]) | {"error_scale": np.nan, "scenario": -1}
+            rows.append(nothing | together)
+    return rows
 
 
 def _everywhere(collection: Collection) -> set[str]:

@@ -18,7 +18,7 @@ from ipe_bench.statistics.calibration import overall_p, overall_words, shared_le
 from ipe_bench.statistics.consistency import clopper_pearson, mean_limits, verdict
 from ipe_bench.statistics.histories import CLOSE, FixedPointBound, fixed_point_bound, observed_constant, orders_of
 from ipe_bench.statistics.intervals import LARGEST_SAMPLE, RESAMPLES, quantile, quantiles
-from ipe_bench.statistics.sample import FIT, NIS, Sample, root_mean
+from ipe_bench.statistics.sample import AMBIGUOUS, FIT, NIS, Sample, root_mean
 from ipe_bench.statistics.sequences import rms_sequence, share_sequence
 from ipe_bench.trials.thresholds import EXPECTED, FEW, FIT_LEVEL, GATE, SAME_ROOT
 
@@ -57,6 +57,8 @@ class Statistic:
     """Its heading in tables where that is not `title`."""
     limits_titles: Mapping[Where, str] = field(default_factory=dict)
     """The headings of its interval, in tables that show that."""
+    rare: bool = False
+    """Few estimators report it: tables show its column only where one does."""
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -128,6 +130,15 @@ def _misfit(s: Sample) -> float:
     # Residuals that are not finite do not fit.
     known = FIT in s.scalars and np.isfinite(s.scalars[FIT]).any()
     return _share(~(s.scalars[FIT] >= FIT_LEVEL)) if known else np.nan
+
+
+def _ambiguous(s: Sample) -> float:
+    return float(np.mean(s.scalars[AMBIGUOUS])) if AMBIGUOUS in s.scalars else np.nan
+
+
+def _failures_flagged(s: Sample) -> float:
+    failed = ~s.scalars["success"]
+    return float(np.mean(s.scalars[AMBIGUOUS][failed])) if AMBIGUOUS in s.scalars and failed.any() else np.nan
 
 
 def _bias(s: Sample) -> Array:
@@ -803,6 +814,26 @@ STATISTICS: tuple[Statistic, ...] = (
         _misfit,
         kind="share",
         where=_EVERYWHERE,
+    ),
+    Statistic(
+        "ambiguous",
+        "ambiguous",
+        "all trials of estimators that look for it",
+        "Share in which several distinct minima fit the readings, so that no residual can tell which is the truth.",
+        _ambiguous,
+        kind="share",
+        where=_EVERYWHERE,
+        rare=True,
+    ),
+    Statistic(
+        "failures_flagged",
+        "failures flagged",
+        "trials without success of estimators that look for several minima",
+        "Share that is flagged as ambiguous.",
+        _failures_flagged,
+        kind="share",
+        where=("overview",),
+        rare=True,
     ),
     Statistic(
         "iterations_median",

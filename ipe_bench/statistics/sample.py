@@ -20,6 +20,8 @@ from ipe_bench.statistics.intervals import rms_interval
 FIT = "fit_p"
 NIS = "extra_nis"
 """Where filters report their normalised innovations squared."""
+AMBIGUOUS = "extra_ambiguous"
+"""Where estimators that look for several minima report 1 if they found some, else 0."""
 SCALARS = ("status", "solved", "success", "iterations", "simulations", "jacobians", "time_s", "nees", "crlb_distance")
 TRUTH = (
     *("contraction_K", "contraction_norm", "contraction_radius"),
@@ -28,7 +30,7 @@ TRUTH = (
 """Scalars of the truth, read where they are stored."""
 THEORY = ("box_bias", "pseudo_bias", "misspecified")
 """What theory says of least squares for each parameter, read where it is stored."""
-OPTIONAL = ("message", FIT, NIS, "root_distance")
+OPTIONAL = ("message", FIT, NIS, AMBIGUOUS, "root_distance")
 """Read where they are stored."""
 
 

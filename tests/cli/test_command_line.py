@@ -293,7 +293,7 @@ def test_estimate_leaves_numbers_residuals_and_figures_from_csv_and_parquet_alik
         table = pd.read_csv(tmp_path / "outputs" / folder / "residuals.csv")
         assert len(table) == 3 * 240
     assert results[0]["estimators"] == results[1]["estimators"]
-    found = results[0]["estimators"]["fixed_point"]
+    found = results[0]["estimators"]["auto"]
     assert found["fits"]
     assert found["outliers"] == []
     assert len(found["correlation"]) == 11

@@ -182,6 +182,7 @@ PRESETS = {
     # Ways of one class that stand in tables beside its default.
     ("baseline", "dogbox"): {"method"},
     ("baseline", "geodesic_lm"): {"geodesic"},
+    ("baseline", "minpack"): {"method"},
     ("baseline", "ukf_wide"): {"alpha"},
     # Each is one way in which the truth may be richer; the class itself is GINS as it is.
     ("measurement", "gins_misaligned"): {"accelerometer_misalignment", "platform_misalignment"},

@@ -14,9 +14,10 @@ from ipe_bench.baselines import GaussNewton, LevenbergMarquardt, MapLM
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance, information, inverse, quadratic_form
 from ipe_bench.basics.statuses import Status
-from ipe_bench.measurements import Gins, Polynomial
+from ipe_bench.measurements import Gins, Mgh, Polynomial
+from ipe_bench.measurements.mgh import score
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.noise import Gaussian, Quantization
+from ipe_bench.noise import Certified, Gaussian, Quantization
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.solvers import FixedPoint, Newton, Progressive, Relinearized
 from ipe_bench.solvers.windows import window_stops
@@ -145,6 +146,27 @@ def test_progressive_ipe_from_far_away(scale, share):
     # Its own verdict is right.
     np.testing.assert_array_equal(estimates.extras["fit_p"] > 1e-6, success)
     assert np.median(estimates.simulations + 11 * estimates.jacobians) <= 250
+
+
+@pytest.mark.slow
+def test_candidates_that_differ_find_what_a_common_prior_hides():
+    """Trials whose first windows have a second minimum of the same depth, to which the prior draws every candidate."""
+    scenario = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), 5000.0)
+    z = np.concatenate([scenario.draw(t, t + 1).z for t in (32, 392, 538, 959, 3042)])
+    with np.errstate(all="ignore"):
+        careful, all_attempts = (Progressive(restarts=k).estimate(scenario.problem, z) for k in (1, None))
+    assert (careful.extras["fit_p"] < 1e-6).all()
+    assert (all_attempts.extras["fit_p"] > 1e-3).all()
+
+
+def test_a_start_without_full_rank_does_not_hide_that_a_flat_minimum_is_reached():
+    """Chebyquad with n = 8 from 100 times its start: J is singular at the minimum, and to double precision at the
+    start as well, but not on the way."""
+    scenario = Scenario(Mgh("chebyquad", 100.0), Certified())
+    with np.errstate(all="ignore"):
+        found = Progressive().estimate(scenario.problem, scenario.draw(0, 1).z)
+    assert score(scenario.measurement, found.x[0]).solved
+    assert found.status[0] == Status.CONVERGED
 
 
 def test_the_test_of_the_fit_is_uniform_where_the_model_holds():

@@ -115,6 +115,8 @@ def test_false_alarms_keep_to_their_level():
     assert alarms < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 400)
     alone = np.mean([parts[-1].p < 0.05 for parts in verdicts])
     assert abs(alone - 0.05) < 4 * np.sqrt(0.05 * 0.95 / 400)
+    each = np.mean([part.p < 0.05 for parts in verdicts for part in parts[:-1]])
+    assert 0.03 < each < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 2000)
 
 
 def test_a_deviation_ten_per_cent_too_small_is_found_with_2000_trials():

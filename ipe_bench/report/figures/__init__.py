@@ -17,6 +17,7 @@ FIGURES = (
     "convergence",
     "cost",
     "profile_curves",
+    "data_profile",
     "ranks",
     "correlation",
     "theory",

@@ -109,7 +109,7 @@ def _tasks(analysis: Analysis) -> Iterator[Task]:
     """Every kind of figure of every setting, or of all of them together."""
     from ipe_bench.report.figures import FIGURES
 
-    if not analysis.collection.groups:
+    if not analysis.collection.groups and analysis.attained.empty:
         return
     parts, whole = views(analysis)
     for name in FIGURES:

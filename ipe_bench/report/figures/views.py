@@ -35,6 +35,7 @@ FRAMES = (
     "convergence",
     "calibration",
     "profiles",
+    "attained",
 )
 
 

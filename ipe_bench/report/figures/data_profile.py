@@ -1,0 +1,47 @@
+"""Data profile: how many problems of known minimum each estimator solves within what cost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pandas as pd
+
+from ipe_bench.report.figures import common
+from ipe_bench.report.figures.drawing import Drawing, Figure
+from ipe_bench.report.figures.views import View
+from ipe_bench.report.style import looks
+from ipe_bench.statistics.attained import data_profile
+
+
+def draw(view: View) -> Iterator[Drawing]:
+    table = view["attained"]
+    profile = data_profile(table)
+    if profile.empty:
+        return
+    problems = len(table[["function", "start"]].drop_duplicates())
+    look = looks(list(dict.fromkeys(table["estimator"])))
+    end = 1.5 * float(profile["at"].max())
+    # Each curve goes on to the end of the axis.
+    final = profile.groupby("estimator", sort=False, as_index=False)["share"].max().assign(at=end)
+    curves = pd.concat([profile, final], ignore_index=True)
+    fig, (ax,) = common.panels(1, look, height=3.4)
+    common.shares(ax, "")
+    common.lines(ax, curves, "at", "share", look, every=8, drawstyle="steps-post")
+    ax.set_xscale("log")
+    low = 0.9 * float(profile["at"].min())
+    ax.set_xlim(low, end)
+    common.log_ticks(ax.xaxis, low, end)
+    common.shares(ax, "share of problems solved")
+    ax.set(xlabel="simplex gradients, n + 1 simulations each")
+    common.legend_below(fig, [ax], look)
+    best = final.loc[final["share"].idxmax()]
+    caption = common.sentence(
+        f"{problems} problems: functions of Moré, Garbow and Hillstrom from their starts. Solved: the sum of squares is"
+        " the least known one. Data profile of Moré and Wild: the share solved within that cost, a Jacobian counting n"
+        " simulations.",
+        f"{best['estimator']} solves the most, {round(best['share'] * problems)}.",
+    )
+    yield Drawing("data_profile", "Data profile on known minima", caption, fig)
+
+
+FIGURE = Figure(draw, ("attained",), together=True)

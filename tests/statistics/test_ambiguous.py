@@ -1,0 +1,61 @@
+"""Trials in which several minima fit: flagged in what is stored, counted in the summary, shown where somebody looks."""
+
+import numpy as np
+import pytest
+
+import ipe_bench as ib
+from ipe_bench.api import compute
+from ipe_bench.baselines import LevenbergMarquardt, Multistart
+from ipe_bench.measurements import Triad
+from ipe_bench.noise import Gaussian
+from ipe_bench.report.tables import all_tables
+from ipe_bench.solvers import Auto
+from ipe_bench.statistics import analyse
+from ipe_bench.trials.scenario import Scenario
+
+LOOKING = {"auto": Auto(), "multistart": Multistart()}
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """One with estimators that look for several minima, one without."""
+    looking, blind = (tmp_path_factory.mktemp(name) for name in ("looking", "blind"))
+    scenario = Scenario(Triad(), Gaussian(1e-5), error_scale=300.0)
+    plain = {"levenberg_marquardt": LevenbergMarquardt()}
+    assert compute([scenario], LOOKING | plain, 8, looking) == ()
+    assert compute([scenario], plain | {"undamped": LevenbergMarquardt(damping=1e-6)}, 8, blind) == ()
+    return looking, blind
+
+
+def test_the_summary_counts_the_flags_that_are_stored(folders):
+    trials = ib.load(folders[0]).set_index("estimator")
+    summary = analyse([folders[0]]).summary
+    summary = summary[summary["parameter"] == "all"].set_index("estimator")
+    for label in LOOKING:
+        own = trials.loc[label]
+        flagged, failed = own["extra_ambiguous"].astype(bool), ~own["success"].astype(bool)
+        assert flagged.any()
+        assert failed.any()
+        np.testing.assert_array_equal(flagged, own["extra_minima"] > 1)
+        assert summary.loc[label, "ambiguous"] == flagged.mean()
+        assert summary.loc[label, "failures_flagged"] == flagged[failed].mean()
+    assert np.isnan(summary.loc["levenberg_marquardt", "ambiguous"])
+
+
+def test_tables_have_the_columns_only_where_somebody_looks(folders):
+    for folder, there in zip(folders, (True, False), strict=True):
+        overview = next(t for t in all_tables(analyse([folder])) if t.name == "overview")
+        titles = {c.title for c in overview.columns}
+        assert ({"ambiguous", "failures flagged"} <= titles) == there
+        assert "misfit" in titles
+
+
+def test_the_best_choices_stand_in_a_table_of_their_own(folders):
+    analysis = analyse([folders[0]])
+    table = next(t for t in all_tables(analysis) if t.name == "portfolio")
+    assert len(table) == 1
+    row = analysis.portfolio.iloc[0]
+    shares = dict(zip(analysis.summary["estimator"], analysis.summary["success"], strict=True))
+    assert row["auto_success"] == shares["auto"]
+    assert row["single_success"] == max(shares.values())
+    assert row["virtual_success"] >= row["single_success"]

@@ -1,0 +1,118 @@
+"""Runs on problems of known minimum: who attains it, what the status says, and at what cost."""
+
+import numpy as np
+import pytest
+import yaml
+from rich.console import Console
+
+from ipe_bench.api import compute, validate
+from ipe_bench.baselines import LeastSquares, LevenbergMarquardt
+from ipe_bench.measurements import Mgh
+from ipe_bench.measurements.mgh import functions
+from ipe_bench.noise import Certified
+from ipe_bench.plugins import discovery
+from ipe_bench.report import write_report
+from ipe_bench.report.certified_tables import attained_tables
+from ipe_bench.report.terminal import render
+from ipe_bench.solvers import Auto, Progressive
+from ipe_bench.statistics.attained import attained_table, attained_totals, data_profile
+from ipe_bench.statistics.collect import collect
+from ipe_bench.trials.scenario import Scenario
+
+ESTIMATORS = {
+    "progressive": Progressive(),
+    "levenberg_marquardt": LevenbergMarquardt(max_iterations=1000),
+    "minpack": LeastSquares(method="lm", start="nominal"),
+}
+PROBLEMS = [("rosenbrock", 1.0), ("rosenbrock", 10.0), ("freudenstein_roth", 1.0), ("gulf", 100.0)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("attained")
+    scenarios = [Scenario(Mgh(*problem), Certified()) for problem in PROBLEMS]
+    assert compute(scenarios, ESTIMATORS, 1, folder) == ()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def table(folder):
+    return attained_table(collect([folder])).set_index(["function", "start", "estimator"])
+
+
+def test_the_other_minimum_of_freudenstein_and_roth_is_named(table):
+    """Powell, Levenberg and Marquardt end there from the standard start; it is in every textbook."""
+    for local in ("levenberg_marquardt", "minpack"):
+        row = table.loc[("freudenstein_roth", 1.0, local)]
+        assert (row["solved"], row["minimum"]) == (False, 1)
+        assert row["sum_of_squares"] == pytest.approx(48.98425367924, rel=1e-6)
+    best = table.loc[("freudenstein_roth", 1.0, "progressive")]
+    assert (best["solved"], best["minimum"], best["status"]) == (True, 0, "converged")
+
+
+def test_costs_are_comparable_over_dimensions(table):
+    n = {"rosenbrock": 2, "freudenstein_roth": 2, "gulf": 3}
+    for (function, _, _), row in table.iterrows():
+        assert row["gradients"] == pytest.approx(row["cost"] / (n[function] + 1))
+        assert row["cost"] > 0
+
+
+def test_totals_count_what_the_table_says(table):
+    totals = attained_totals(table.reset_index()).set_index("estimator")
+    assert (totals["problems"] == 4).all()
+    for label in ESTIMATORS:
+        own = table.xs(label, level="estimator")
+        assert totals.loc[label, "solved"] == own["solved"].sum()
+        assert totals.loc[label, ["solved_1", "solved_10", "solved_100"]].sum() == own["solved"].sum()
+    assert totals.loc["progressive", ["solved", "converged", "elsewhere"]].tolist() == [4, 4, 0]
+    # A minimum that is not the least one is no solution, however well it has converged.
+    local = table.reset_index().assign(status="converged")
+    own = attained_totals(local).set_index("estimator").loc["levenberg_marquardt"]
+    assert (own["solved"], own["converged"], own["elsewhere"]) == (2, 2, 2)
+
+
+def test_a_data_profile_rises_to_the_share_that_is_solved(table):
+    rows = table.reset_index()
+    for label, part in data_profile(rows).groupby("estimator"):
+        own = rows[rows["estimator"] == label]
+        assert part["share"].is_monotonic_increasing
+        assert part["share"].iloc[-1] == own["solved"].mean()
+        for at, share in zip(part["at"], part["share"], strict=True):
+            assert share == (own["solved"] & (own["gradients"] <= at)).mean()
+
+
+def test_the_terminal_and_the_report_show_them(folder):
+    collection = collect([folder])
+    console = Console(width=140, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    with console.file:
+        console.print(render([], None, 140, attained_tables(collection)[1]))
+        shown = console.export_text()
+    assert "Known minima" in shown
+    assert "nothing is stored" not in shown
+    result = write_report([folder], folder)
+    assert {p.name for p in result.tables} >= {"attained.csv", "attained_problems.csv"}
+    assert [p.name for p in result.figures] == ["data_profile.png", "data_profile.pdf"]
+
+
+def test_a_start_without_full_rank_is_a_problem_and_no_mistake():
+    scenario = Scenario(Mgh("gulf", 100.0), Certified())
+    assert np.isnan(scenario.problem.H).any() or np.linalg.matrix_rank(scenario.problem.H) < 3
+    validate([scenario], ESTIMATORS, 1)
+
+
+def test_the_experiment_has_every_function_from_the_papers_starts():
+    config = yaml.safe_load((discovery.own_conf() / "experiment" / "mgh.yaml").read_text(encoding="utf-8"))
+    swept = config["hydra"]["sweeper"]["params"]
+    assert swept["measurement.function"].replace(" ", "").split(",") == list(functions())
+    assert [float(v) for v in swept["measurement.start"].split(",")] == [1, 10, 100]
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("estimator", [Progressive(), Auto()], ids=lambda e: type(e).__name__)
+def test_the_general_estimators_attain_all_minima_and_say_so(estimator, tmp_path):
+    scenarios = [Scenario(Mgh(f, start), Certified()) for f in functions() for start in (1.0, 10.0, 100.0)]
+    assert compute(scenarios, {"it": estimator}, 1, tmp_path) == ()
+    totals = attained_totals(attained_table(collect([tmp_path]))).iloc[0]
+    assert totals["solved"] >= 67
+    assert totals["solved_1"] == 23
+    assert totals["converged"] == totals["solved"]
