@@ -120,8 +120,8 @@ class Measurement(Component, Named, ABC):
 
     @property
     def nuisances(self) -> tuple[Parameter, ...]:
-        """What the k numbers of `nuisance_deviation` are, in their order: each a multiple of `size` `unit`s. Those of
-        one group are told of together."""
+        """What the k numbers of `nuisance_deviation` are, in their order: each a multiple of its `size`, in its `unit`.
+        Those of one group are told of together."""
         return tuple(Parameter(f"nuisance_{i + 1}", group="nuisances") for i in range(len(self.nuisance_deviation)))
 
     @property
