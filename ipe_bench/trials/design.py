@@ -159,8 +159,14 @@ def design(
     richer versions of the model, whose nuisances may look like parameters.
 
     Raises:
-        UserError: readings with correlated errors, which do not add up; an unknown column; too few readings.
+        UserError: noise of an unknown level, or with correlated errors, which do not add up; an unknown column; too few
+            readings.
     """
+    if scenario.noise.estimated:
+        raise UserError(
+            f"noise={scenario.noise.name}: without the level of the noise there are no bounds; give the deviation that"
+            " you expect, as in noise=gaussian noise.deviation=0.1"
+        )
     model, R, x = scenario.measurement, scenario.problem.R, truths_of(scenario, truths)
     today = Observability.at(model, R, x)
     found = [one for error in errors for one in suspects(model, R, error, x[:SUSPECTED])]

@@ -311,6 +311,7 @@ def test_whole_cases_are_options_and_single_readings_a_restriction():
         ({"by": ["colour"]}, None, "by=colour: there is no such column"),
         ({"readings": 2}, None, "readings=2: 3 parameters want"),
         ({}, ib.noise.Correlated(0.1, 0.5), "the errors of readings are correlated"),
+        ({}, ib.noise.Unknown(), "without the level of the noise there are no bounds"),
     ],
 )
 def test_mistakes_are_one_line(options, noise, words):
