@@ -160,9 +160,9 @@ def _attained(totals: pd.DataFrame, width: int) -> list[Any]:
     columns = attained_columns(totals.sort_values("solved", ascending=False, kind="stable", ignore_index=True))
     rows = [[cell.text for cell in row] for row in zip(*(each.cells for each in columns), strict=True)]
     note = (
-        "solved: the estimate's sum of squares is the least known one, to 1e-6; of these converged: where the status"
-        " says so. median cost: simulations, infinite where unsolved. within: solved within so many times n + 1"
-        " simulations."
+        "solved: the estimate's sum of squares is the least known one, to 1e-6; converged: of these, where the status"
+        " says so; elsewhere: converged and not solved. median cost: simulations, infinite where unsolved. in 10:"
+        " solved within 10 (n + 1) simulations."
     )
     table = _totals("Known minima", [each.title for each in columns], rows, width, "tables/attained.csv")
     return [*table, Text(note, style="dim"), Text()]
@@ -176,10 +176,14 @@ def _totals(
     from rich.table import Table
     from rich.text import Text
 
-    # Headings are folded between words, names and numbers nowhere.
-    needed = [max(len(word) for text in texts for word in text) for texts in _words_of(headings, rows)]
-    fitting = len(needed)
-    while fitting > 1 and 2 + sum(needed[:fitting]) + _PADDING * fitting > width:
+    # Where all headings fit as they are, none is folded; names and numbers never are.
+    whole, folded = (
+        [max(map(len, (*heads, *cells))) for heads, cells in zip(parts, zip(*rows, strict=True), strict=True)]
+        for parts in ([[heading] for heading in headings], [heading.split() for heading in headings])
+    )
+    widths = whole if _taken(whole) <= width else folded
+    fitting = len(widths)
+    while fitting > 1 and _taken(widths[:fitting]) > width:
         fitting -= 1
     table = Table(
         title=title,
@@ -189,9 +193,8 @@ def _totals(
         pad_edge=False,
         collapse_padding=True,
     )
-    for k, (heading, least) in enumerate(zip(headings[:fitting], needed, strict=False)):
-        folded = textwrap.fill(heading, least, break_long_words=False, break_on_hyphens=False)
-        table.add_column(folded, justify="right" if k else "left", no_wrap=True)
+    for k, (heading, room) in enumerate(zip(headings[:fitting], widths, strict=False)):
+        table.add_column(textwrap.fill(heading, room), justify="right" if k else "left", no_wrap=True)
     for row in rows:
         table.add_row(*map(Text, row[:fitting]))
     yield table
@@ -199,10 +202,9 @@ def _totals(
         yield Text(f"Too narrow for: {', '.join(headings[fitting:])}; {file} has them.", style="dim")
 
 
-def _words_of(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[list[list[str]]]:
-    """For each column, its texts as what they may not be broken within."""
-    for k, heading in enumerate(headings):
-        yield [heading.split(), *([row[k]] for row in rows)]
+def _taken(widths: Sequence[int]) -> int:
+    """By a table of such columns, with the space between them."""
+    return 2 + sum(widths) + _PADDING * len(widths)
 
 
 def _headings(records: Sequence[Statistic]) -> Iterator[str]:

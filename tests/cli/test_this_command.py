@@ -195,7 +195,7 @@ def test_a_narrow_terminal_keeps_the_names(command, width):
 @pytest.mark.parametrize("width", [60, 80, 100, 120])
 def test_a_narrow_terminal_keeps_the_names_of_those_that_attain_minima(width):
     names = ["levenberg_marquardt", "progressive"]
-    counts = dict.fromkeys(["problems", "solved", "solved_1", "solved_100", "converged", "elsewhere"], [4, 3])
+    counts = {key: [4, 3] for key in ("problems", "solved", "solved_1", "solved_100", "converged", "elsewhere")}
     budgets = {f"within_{budget}": [2, 1] for budget in (10, 100, 1000)}
     totals = pd.DataFrame({"estimator": names, **counts, "cost_median": [21.5, 1234.0], **budgets})
     console = Console(width=width)
