@@ -147,7 +147,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     estimate = add(
         "estimate",
         "parameters from real readings, and whether the model fits them",
-        "0 an estimator converged; 1 none did",
+        "0 some estimator has an answer; 1 none has, or the model fits none",
         _ESTIMATE,
     )
     estimate.add_argument("arguments", metavar="KEY=VALUE", nargs="*", help="whatever `ipe-bench run` takes")
