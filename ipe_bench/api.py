@@ -218,14 +218,19 @@ def compare(
         raise UserError(f"fail_on={wrong[0]}: {unknown(wrong[0], JUDGED, 'quantity')}")
     paths = [_paths(first_directory), _paths(first_directory if second_directory is None else second_directory)]
     if second_directory is None and (first is None or second is None):
-        raise UserError("compare: one folder is compared with itself; name another, or first=LABEL and second=LABEL")
+        raise UserError("compare: one folder is given; name another, or first=LABEL and second=LABEL")
+    if first == second and {path.resolve() for path in paths[0]} == {path.resolve() for path in paths[1]}:
+        label = "one folder" if first is None else f"{first} of one folder"
+        raise UserError(
+            f"compare: {label} is compared with itself; name another folder, or first=LABEL and second=LABEL"
+        )
     for part in paths:
         require_results(part)
     collections = [collect(part) for part in paths]
     frame = pd.DataFrame(compared(collections[0], collections[1], (first, second), alpha=alpha, anytime=anytime))
     worse = frame[(frame["finding"] == "worse") & frame["quantity"].isin(list(fail_on))]
     frame.attrs["worse"] = [
-        f"{row['second']} in {row['quantity']}, {row['measurement']}, error scale {row['error_scale']}"
+        f"{row['second']} in {row['quantity']}, {row['measurement']}, error scale {row['error_scale']:g}"
         for row in worse.to_dict("records")
     ]
     for name in ("problems", "stale"):

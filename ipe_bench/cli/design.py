@@ -19,7 +19,19 @@ from ipe_bench.plugins.construct import construct
 from ipe_bench.runs.provenance import describe
 from ipe_bench.trials.design import Criterion, design
 
-_WITHOUT_USE = ("trials", "block_size", "execution", "readings", "write_readings", "solver", "baseline", "estimators")
+_WITHOUT_USE = (
+    "trials",
+    "precision",
+    "time_limit",
+    "block_size",
+    "execution",
+    "readings",
+    "write_readings",
+    "write_readings_trial",
+    "solver",
+    "baseline",
+    "estimators",
+)
 
 
 def main(

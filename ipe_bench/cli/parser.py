@@ -27,16 +27,22 @@ _ESTIMATE = """
   ipe-bench estimate measurement=ranging readings=FILE.parquet
   ipe-bench estimate measurement=gins readings=FILE.csv "solver=[newton]" "baseline=[gauss_newton,ekf]"
   ipe-bench estimate measurement=nist/misra1a                   readings that come with the model
+  ipe-bench estimate measurement=formula "measurement.expression=a*(1-exp(-b*t))" measurement.start.a=5 \\
+      measurement.start.b=0.3 readings=FILE.csv                 your own formula of parameters and columns
 
 readings=FILE       CSV or Parquet; `ipe-bench list measurement -v` says which rows and columns a model wants.
-                    A missing reading keeps its row, with an empty cell.
+                    A missing reading keeps its row, with an empty cell. A column sigma has standard deviations.
+readings=[A,B]      several files, which share all parameters but those in measurement.own=[NAME].
 noise.deviation=X   the standard deviation of a reading; standard errors and tests rest on it.
+noise=unknown       nobody knows it: it is estimated from the residuals, and the size of these tests nothing.
+parameters.NAME.fixed=X, .lower=X, .upper=X   what is known of a parameter.
 error_scale=X       how far the parameters may lie from the nominal point: the prior of filters and map_lm.
 output=DIR          where the files go: outputs/estimate-MODEL unless given, or outputs/estimate-MODEL-2 and so on
                     where another command has written there. Nothing of another command is overwritten.
 
 Files: estimate.json (estimates, standard errors, correlations, tests, versions), residuals.csv, and as PNG and PDF
-residuals (normalised, by time) and ellipses (95 % regions of the most correlated pairs of parameters).
+residuals (normalised, by time), ellipses (95 % regions of the most correlated pairs of parameters) and, where the model
+bends, likelihood (profiles); estimate.html has all of it on one page.
 """
 _DESIGN = """
   ipe-bench design                                              the default model, gins
@@ -141,7 +147,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     estimate = add(
         "estimate",
         "parameters from real readings, and whether the model fits them",
-        "0 an estimator converged; 1 none did",
+        "0 some estimator has an answer; 1 none has, or the model fits none",
         _ESTIMATE,
     )
     estimate.add_argument("arguments", metavar="KEY=VALUE", nargs="*", help="whatever `ipe-bench run` takes")

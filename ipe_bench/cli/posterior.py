@@ -16,7 +16,15 @@ from ipe_bench.plugins import discovery as plugins
 from ipe_bench.runs.provenance import describe
 from ipe_bench.trials.posterior import reference
 
-_WITHOUT_USE = ("block_size", "execution", "readings", "write_readings", "write_readings_trial")
+_WITHOUT_USE = (
+    "precision",
+    "time_limit",
+    "block_size",
+    "execution",
+    "readings",
+    "write_readings",
+    "write_readings_trial",
+)
 _TRIALS = 3
 _MOST_TRIALS = 100
 

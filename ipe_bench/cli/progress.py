@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, ProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 from rich.progress import Task as BarTask
+from rich.table import Column
 from rich.text import Text
 
 from ipe_bench.runs.schedule import Progress, Watcher
@@ -46,7 +47,17 @@ class _Lines(logging.Handler):
         self.console.print(f"ipe-bench: {record.getMessage()}", markup=False, soft_wrap=True)
 
 
+class _Title(ProgressColumn):
+    """What gives way where the terminal is narrow; the numbers stay whole."""
+
+    def render(self, task: BarTask) -> Text:
+        return Text(task.description, no_wrap=True, overflow="ellipsis")
+
+
 class _Rate(ProgressColumn):
+    def get_table_column(self) -> Column:
+        return Column(no_wrap=True)
+
     def render(self, task: BarTask) -> Text:
         speed = task.finished_speed or task.speed
         return Text("" if speed is None else f"{_rounded(speed)} estimates/s")
@@ -54,13 +65,13 @@ class _Rate(ProgressColumn):
 
 def _bar(console: Console) -> Bar:
     columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(bar_width=24),
+        _Title(),
+        BarColumn(bar_width=10, table_column=Column(no_wrap=True)),
         TextColumn("{task.fields[state]}"),
         _Rate(),
-        TimeElapsedColumn(),
+        TimeElapsedColumn(table_column=Column(no_wrap=True)),
         TextColumn("left"),
-        TimeRemainingColumn(),
+        TimeRemainingColumn(table_column=Column(no_wrap=True)),
     )
     return Bar(*columns, console=console, speed_estimate_period=60.0)
 

@@ -359,16 +359,33 @@ def _verdicts(fits: Sequence[Fit], width: int) -> Any:
     table = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False, padding=(0, 1))
     table.add_column("estimator", overflow="fold", min_width=11)
     table.add_column("status", overflow="fold", min_width=9)
-    headings = ("deviation", "chi2", "dof", "p", "white p", "outliers")
-    for heading in headings[width < _NARROW :]:
+    shown = _sizes_shown(fits, width)
+    for heading in (*shown, "white p", "outliers"):
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("fits", no_wrap=True)
     for one in fits:
-        numbers = [f"{one.residual_deviation:.4g}", f"{one.chi_square:.4g}", str(one.degrees_of_freedom)]
-        numbers += [_fit_p(one), p_value(one.whiteness.p_value, LEAST_P), str(int(one.outliers.sum()))]
+        sizes = {
+            "deviation": _number(one.residual_deviation),
+            "chi2": _number(one.chi_square),
+            "dof": str(one.degrees_of_freedom),
+            "p": _fit_p(one),
+        }
+        numbers = [sizes[name] for name in shown]
+        numbers += [p_value(one.whiteness.p_value, LEAST_P), str(int(one.outliers.sum()))]
         status = one.status.label.replace("_", " ")
-        table.add_row(escape(one.label), status, *numbers[width < _NARROW :], _FITS[one.fits])
+        table.add_row(escape(one.label), status, *numbers, _FITS[one.fits])
     return table
+
+
+def _sizes_shown(fits: Sequence[Fit], width: int) -> tuple[str, ...]:
+    """What is told of the size of the residuals: where it makes the level, chi-square is the degrees of freedom."""
+    if all(one.level is not None for one in fits):
+        return ("deviation", "dof")
+    return ("deviation", "chi2", "dof", "p")[width < _NARROW :]
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if math.isfinite(value) else "-"
 
 
 def _fit_p(one: Fit) -> str:
@@ -381,7 +398,8 @@ def _notes(fits: Sequence[Fit], width: int) -> Any:
 
     lines = [
         f"fits: p of chi-square is at least {FIT_LEVEL:g}. white p: Ljung-Box; small where successive residuals"
-        " resemble each other." + (" deviation: of the residuals, in the readings' unit." if width >= _NARROW else ""),
+        " resemble each other."
+        + (" deviation: of the residuals, in the readings' unit." if "deviation" in _sizes_shown(fits, width) else ""),
         *(f"{one.label}: {one.message}" for one in fits if one.message),
         *_on_levels(fits),
         *_on_priors(fits),
@@ -471,12 +489,13 @@ def fragment(answer: Answer) -> str:
     parts = [f"<h3>{escape(answer.name)}: estimate ± standard error</h3>"]
     parts.append(f"<table><thead><tr><th>parameter</th><th>unit</th>{header}</tr></thead><tbody>{body}</tbody></table>")
     verdicts = "".join(
-        f"<tr><td>{escape(one.label)}</td><td>{one.status.label}</td><td>{one.chi_square:.4g}</td>"
-        f"<td>{one.degrees_of_freedom}</td><td>{_fit_p(one)}</td><td>{p_value(one.whiteness.p_value)}</td>"
+        f"<tr><td>{escape(one.label)}</td><td>{one.status.label}</td><td>{_number(one.residual_deviation)}</td>"
+        f"<td>{_number(one.chi_square) if one.level is None else '-'}</td>"
+        f"<td>{one.degrees_of_freedom}</td><td>{_fit_p(one)}</td><td>{p_value(one.whiteness.p_value, LEAST_P)}</td>"
         f"<td>{int(one.outliers.sum())}</td><td>{_FITS[one.fits]}</td></tr>"
         for one in answer.fits
     )
-    names = ("estimator", "status", "chi-square", "degrees of freedom", "p", "white p", "outliers", "fits")
+    names = ("estimator", "status", "deviation", "chi-square", "degrees of freedom", "p", "white p", "outliers", "fits")
     head = "".join(f"<th>{name}</th>" for name in names)
     parts.append(f"<h3>Does the model fit?</h3><table><thead><tr>{head}</tr></thead><tbody>{verdicts}</tbody></table>")
     notes = [*_on_levels(answer.fits), *_on_priors(answer.fits), *_on_bounds(answer.fits)]

@@ -261,7 +261,8 @@ def _ways(design: Design) -> Iterator[Any]:
 
     today = design.scenario.measurement.m
     if not design.ways:
-        yield _note("There is nothing to choose among: the candidates do not determine all parameters.")
+        why = "they are too few" if design.observability.observable else "they do not determine all parameters"
+        yield _note(f"There is nothing to choose among the candidates: {why}.")
         return
     yield _title(f"What to take instead (bounds as shares of today's, criterion {design.criterion})")
     table = _table(

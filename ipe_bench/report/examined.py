@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ipe_bench.real.examination import CONFIDENCE, Examination
+from ipe_bench.report.words import enumerate_few
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -87,10 +88,13 @@ def remarks(found: Examination, labels: Labels) -> Iterator[str]:
 def _direction(found: Examination, names: Sequence[str]) -> str:
     weights = found.direction.weights / found.standard_errors
     told = np.abs(weights) >= _SMALL_SHARE * np.abs(weights).max()
-    parts = [f"{w:+.3g} {n}" for w, n, shown in zip(found.direction.weights, names, told, strict=True) if shown]
+    parts = [f"{n} {w:+.3g}" for w, n, shown in zip(found.direction.weights, names, told, strict=True) if shown]
     index = found.direction.collinearity
     verdict = ": the readings hardly tell these apart" if index >= _COLLINEAR else ""
-    return f"Least observable: {' '.join(parts)}; collinearity index {index:.3g}{verdict}."
+    return (
+        f"Least observable: {enumerate_few(parts, len(parts))} together, which changes all readings by {1 / index:.2g}"
+        f" standard deviations; collinearity index {index:.3g}{verdict}."
+    )
 
 
 def _influence(found: Examination, labels: Labels) -> Iterator[str]:

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from rich.console import Group
 
 SCHEMA = 1
-_HEADINGS = ("trial", "modes", "noise", "estimator", "status", "divergence", "shift", "width", "energy", "honest")
 RESULT = "posterior.json"
 HONEST = 0.1
 """Nats below which a Gaussian may stand for another: a deviation 40 % too large in one direction, or a mean that is
@@ -84,21 +83,12 @@ def render(name: str, found: Sequence[Reference]) -> Group:
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(box=None, pad_edge=False)
-    for heading in (
-        "trial",
-        "modes",
-        "noise",
-        "estimator",
-        "status",
-        "divergence",
-        "shift",
-        "width",
-        "energy",
-        "honest",
-    ):
-        words = heading in ("estimator", "status", "honest")
-        table.add_column(heading, justify="left" if words else "right", overflow="fold")
+    table = Table(box=None, pad_edge=False, collapse_padding=True)
+    for heading in ("trial", "modes", "noise", "estimator", "status"):
+        words = heading in ("estimator", "status")
+        table.add_column(heading, justify="left" if words else "right", overflow="fold", no_wrap=not words)
+    for heading in ("diverg.", "shift", "width", "energy", "honest"):
+        table.add_column(heading, justify="left" if heading == "honest" else "right", no_wrap=True)
     for one in found:
         for i, (label, d) in enumerate(one.divergences.items()):
             sampled = one.posterior
@@ -107,7 +97,7 @@ def render(name: str, found: Sequence[Reference]) -> Group:
             figures = [compact(value) for value in (d.kl, d.shift, d.width, d.energy)]
             table.add_row(*head, *(Text(cell) for cell in (label, status, *figures, honesty(d, sampled))))
     lines = [
-        "divergence: of the estimator's Gaussian from the posterior's moments, in nats; noise: the same of two"
+        "diverg.: divergence of the estimator's Gaussian from the posterior's moments, in nats; noise: the same of two"
         " populations of particles, so what is not above it is chance. shift: of the mean, in the posterior's"
         " deviations per root of the number of parameters. width: deviations over the posterior's, geometric mean."
         f" energy: distance of draws. honest: a single mode, divergence at most {HONEST:g} or twice the noise, and"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from rich.console import Group
     from rich.table import Table
+    from rich.text import Text
 
 WIDE = 120
 _SHORTEST_NAME = 12
@@ -39,8 +41,8 @@ def render(
     from rich.console import Group
     from rich.text import Text
 
-    digits = [] if certified is None or certified.empty else _digits(certified)
-    digits += [] if attained is None or attained.empty else _attained(attained)
+    digits = [] if certified is None or certified.empty else _digits(certified, width)
+    digits += [] if attained is None or attained.empty else _attained(attained, width)
     listed: Sequence[Any] = summary if isinstance(summary, Sequence) else summary.to_dict("records")
     rows: list[Any] = [row for row in listed if row["parameter"] == ALL and row["noise"] != "certified"]
     if not rows:
@@ -127,51 +129,82 @@ def _says(value: Any) -> bool:
     return value is not None and not (isinstance(value, float) and math.isnan(value))
 
 
-def _digits(averages: pd.DataFrame) -> list[Any]:
+def _digits(averages: pd.DataFrame, width: int) -> list[Any]:
     """Mean correct digits on certified readings."""
-    from rich import box
-    from rich.table import Table
     from rich.text import Text
 
-    table = Table(
-        title="Certified readings", title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False
-    )
-    table.add_column("estimator")
-    for name in ("start", "data sets", "solved", "digits", "of deviations", "of residuals", "deviations to 6 digits"):
-        table.add_column(name, justify="right")
-    for row in averages.sort_values(["mean_lre_parameters", "start"], ascending=False).itertuples():
-        means = (row.mean_lre_parameters, row.mean_lre_deviations, row.mean_lre_rss)
-        counts = (row.start, row.datasets, row.solved)
-        table.add_row(
-            str(row.estimator), *map(str, counts), *(f"{v:.2f}" for v in means), str(row.deviations_to_6_digits)
-        )
+    headings = ("start", "data sets", "solved", "digits", "of deviations", "of residuals", "deviations to 6 digits")
+    rows = [
+        [
+            str(row.estimator),
+            *map(str, (row.start, row.datasets, row.solved)),
+            *(f"{v:.2f}" for v in (row.mean_lre_parameters, row.mean_lre_deviations, row.mean_lre_rss)),
+            str(row.deviations_to_6_digits),
+        ]
+        for row in averages.sort_values(["mean_lre_parameters", "start"], ascending=False).itertuples()
+    ]
     note = (
         "digits: log relative error against the certified answer, the fewest over a data set's parameters, at most 11,"
         " averaged over the data sets. solved: four digits or more."
     )
-    return [table, Text(note, style="dim"), Text()]
+    table = _totals("Certified readings", ("estimator", *headings), rows, width, "tables/certified_averages.csv")
+    return [*table, Text(note, style="dim"), Text()]
 
 
-def _attained(totals: pd.DataFrame) -> list[Any]:
+def _attained(totals: pd.DataFrame, width: int) -> list[Any]:
     """Problems of known minimum that are solved."""
-    from rich import box
-    from rich.table import Table
     from rich.text import Text
 
     from ipe_bench.report.certified_tables import attained_columns
 
-    table = Table(title="Known minima", title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
     columns = attained_columns(totals.sort_values("solved", ascending=False, kind="stable", ignore_index=True))
-    for each in columns:
-        table.add_column(each.title, justify="right" if each.numeric else "left", no_wrap=not each.numeric)
-    for row in zip(*(each.cells for each in columns), strict=True):
-        table.add_row(*(cell.text for cell in row))
+    rows = [[cell.text for cell in row] for row in zip(*(each.cells for each in columns), strict=True)]
     note = (
         "solved: the estimate's sum of squares is the least known one, to 1e-6; converged: of these, where the status"
         " says so; elsewhere: converged and not solved. median cost: simulations, infinite where unsolved. in 10:"
         " solved within 10 (n + 1) simulations."
     )
-    return [table, Text(note, style="dim"), Text()]
+    table = _totals("Known minima", [each.title for each in columns], rows, width, "tables/attained.csv")
+    return [*table, Text(note, style="dim"), Text()]
+
+
+def _totals(
+    title: str, headings: Sequence[str], rows: Sequence[Sequence[str]], width: int, file: str
+) -> Iterator[Table | Text]:
+    """A row per estimator, with as many columns as fit; `file` has those that do not."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    # Where all headings fit as they are, none is folded; names and numbers never are.
+    whole, folded = (
+        [max(map(len, (*heads, *cells))) for heads, cells in zip(parts, zip(*rows, strict=True), strict=True)]
+        for parts in ([[heading] for heading in headings], [heading.split() for heading in headings])
+    )
+    widths = whole if _taken(whole) <= width else folded
+    fitting = len(widths)
+    while fitting > 1 and _taken(widths[:fitting]) > width:
+        fitting -= 1
+    table = Table(
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        collapse_padding=True,
+    )
+    for k, (heading, room) in enumerate(zip(headings[:fitting], widths, strict=False)):
+        table.add_column(textwrap.fill(heading, room), justify="right" if k else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*map(Text, row[:fitting]))
+    yield table
+    if fitting < len(headings):
+        yield Text(f"Too narrow for: {', '.join(headings[fitting:])}; {file} has them.", style="dim")
+
+
+def _taken(widths: Sequence[int]) -> int:
+    """By a table of such columns, with the space between them."""
+    return 2 + sum(widths) + _PADDING * len(widths)
 
 
 def _headings(records: Sequence[Statistic]) -> Iterator[str]:

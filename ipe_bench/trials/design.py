@@ -159,8 +159,14 @@ def design(
     richer versions of the model, whose nuisances may look like parameters.
 
     Raises:
-        UserError: readings with correlated errors, which do not add up; an unknown column; too few readings.
+        UserError: noise of an unknown level, or with correlated errors, which do not add up; an unknown column; too few
+            readings.
     """
+    if scenario.noise.estimated:
+        raise UserError(
+            f"noise={scenario.noise.name}: without the level of the noise there are no bounds; give the deviation that"
+            " you expect, as in noise=gaussian noise.deviation=0.1"
+        )
     model, R, x = scenario.measurement, scenario.problem.R, truths_of(scenario, truths)
     today = Observability.at(model, R, x)
     found = [one for error in errors for one in suspects(model, R, error, x[:SUSPECTED])]
@@ -183,8 +189,14 @@ def design(
         raise UserError(f"readings={most}: {model.n} parameters want at least as many readings")
     judge = _Judge.against(_today_information(model, R, x, reference), slopes, criterion)
     ways = [_way(judge, _units(model, candidates, chosen, slopes), model.m, most) for chosen in columns]
-    effects = tuple(_effects(judge, model, candidates, slopes)) if today.observable else ()
     chosen_ways = tuple(way for way in ways if way is not None)
+    if readings is not None and not chosen_ways:
+        titles = " or ".join("by " + " and ".join(chosen) for chosen in columns)
+        raise UserError(
+            f"readings={readings}: no choice {titles} of so few determines all parameters, or there are fewer than"
+            f" {_FEW} to choose among; give more readings, or choose by other columns"
+        )
+    effects = tuple(_effects(judge, model, candidates, slopes)) if today.observable else ()
     return Design(scenario, criterion, candidates, today, _largest(found), limit, chosen_ways, effects)
 
 

@@ -140,6 +140,8 @@ def test_judging_by_evidence(tmp_path):
         ([], "name one or two folders"),
         (["{a}", "{b}", "{a}"], "name one or two folders"),
         (["{a}"], "name another"),
+        (["{a}", "{a}"], "is compared with itself"),
+        (["{a}", "first=it", "second=it"], "it of one folder is compared with itself"),
         (["{a}", "nowhere"], "holds no results"),
         (["{a}", "{b}", "alpha=2"], "between 0 and 1"),
         (["{a}", "{b}", "alpha=x"], "between 0 and 1"),

@@ -190,3 +190,22 @@ def test_a_narrow_terminal_keeps_the_names(command, width):
     for name in ("newton", "fixed_point"):
         row = next(line for line in lines if name in line.split())
         assert "…" not in row
+
+
+@pytest.mark.parametrize("width", [60, 80, 100, 120])
+def test_a_narrow_terminal_keeps_the_names_of_those_that_attain_minima(width):
+    names = ["levenberg_marquardt", "progressive"]
+    counts = {key: [4, 3] for key in ("problems", "solved", "solved_1", "solved_100", "converged", "elsewhere")}
+    budgets = {f"within_{budget}": [2, 1] for budget in (10, 100, 1000)}
+    totals = pd.DataFrame({"estimator": names, **counts, "cost_median": [21.5, 1234.0], **budgets})
+    console = Console(width=width)
+    with console.capture() as shown:
+        console.print(render([], width=width, attained=totals))
+    lines = shown.get().splitlines()
+    assert max(map(len, lines)) <= width
+    table = lines[: next(i for i, line in enumerate(lines) if line.startswith(("Too narrow", "solved:")))]
+    assert "…" not in "".join(table)
+    assert {"levenberg_marquardt", "progressive"} <= set(" ".join(table).split())
+    heading = " ".join(table).split()
+    for word, file in (("median", "tables/attained.csv"), ("problems", "")):
+        assert word in heading or file in shown.get().replace("\n", " ")

@@ -329,8 +329,18 @@ def test_whole_cases_are_options_and_single_readings_a_restriction():
         ({"by": ["colour"]}, None, "by=colour: there is no such column"),
         ({"readings": 2}, None, "readings=2: 3 parameters want"),
         ({}, ib.noise.Correlated(0.1, 0.5), "the errors of readings are correlated"),
+        ({}, ib.noise.Unknown(), "without the level of the noise there are no bounds"),
     ],
 )
 def test_mistakes_are_one_line(options, noise, words):
     with pytest.raises(ib.UserError, match=words):
         ib.design(scenario(Linear(), noise), **options)
+
+
+def test_fewer_readings_than_the_smallest_choice_has_are_refused():
+    """Rounds have seven readings each."""
+    with pytest.raises(ib.UserError, match="readings=5: no choice by round of so few determines all parameters"):
+        ib.design(scenario(ib.measurements.Ranging()), by=["round"], readings=5)
+    (way,) = ib.design(scenario(ib.measurements.Ranging()), by=["round"], readings=7).ways
+    assert way.sharpest.readings == 7
+    assert way.sharpest.mean_bound == pytest.approx(np.sqrt(3), rel=1e-6)

@@ -192,6 +192,9 @@ def test_summary_and_table_have_theory_for_least_squares_alone(tmp_path):
         rows = view["summary"][(view["summary"]["estimator"] == "gn") & (view["summary"]["parameter"] != "all")]
         for expected in rows["predicted_rmse"] / rows["crlb"]:
             assert np.isclose(marks, expected).any()
+        # Every mark is in view, and the bound that the legend tells of.
+        low, high = panel.get_ylim()
+        assert low < min(*marks, 1.0) <= max(*marks, 1.0) < high
         assert "gn" in drawing.figure.legends[0].get_texts()[0].get_text()
         assert "newton" not in [text.get_text() for text in drawing.figure.legends[0].get_texts()]
 

@@ -13,6 +13,7 @@ from ipe_bench.noise import Gaussian, Unknown
 from ipe_bench.real.examination import examine
 from ipe_bench.real.fits import fit
 from ipe_bench.real.profiles import profiles, profiles_of_sets
+from ipe_bench.report.examined import remarks
 from ipe_bench.trials.scenario import Scenario
 
 LM = {"lm": LevenbergMarquardt(tolerance=1e-9, max_iterations=500)}
@@ -176,6 +177,9 @@ def test_parameters_that_the_readings_do_not_tell_apart_are_the_least_observable
     assert weights[0] == pytest.approx(-weights[1], rel=0.05)
     assert abs(weights[2]) < 0.05 * abs(weights[0])
     assert found.direction.collinearity > 100
+    (told,) = [line for line in remarks(found, [{}] * model.m) if line.startswith("Least observable")]
+    change = np.linalg.norm(np.matmul(model.jacobian(found.x[None] / model.sizes)[0], weights / model.sizes)) / 0.01
+    assert f"changes all readings by {change:.2g} standard deviations" in told
 
 
 def test_another_minimum_that_fits_as_well_is_told():

@@ -51,6 +51,14 @@ def test_every_option_of_ours_says_what_it_means(group):
     assert silent == []
 
 
+def test_every_command_has_a_section(tmp_path):
+    write_reference(tmp_path)
+    page = (tmp_path / "commands.md").read_text(encoding="utf-8")
+    found = set(re.findall(r"^## (\w+)$", page, re.MULTILINE))
+    names = {"run", "estimate", "design", "posterior", "report", "compare", "status", "list", "new", "check"}
+    assert found == names
+
+
 def blocks(page: Path, language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
 

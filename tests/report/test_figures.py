@@ -116,6 +116,16 @@ def test_points_of_few_trials_are_hollow_without_an_interval_and_say_how_many(sy
     assert "trials behind the points" not in titles
 
 
+def test_points_without_an_interval_are_in_view(synthetic):
+    """Fewer than 20 trials have none, and errors that grow with the error scale are far from the bound."""
+    fill(synthetic, trials=5)
+    for drawing in drawn(error_scale, only_view(synthetic)).values():
+        for ax in drawing.figure.axes:
+            if "up to" not in ax.get_title():
+                low, high = ax.get_ylim()
+                assert all(low < y < high for _, y, _ in points(ax) if np.isfinite(y))
+
+
 def test_a_value_that_is_missing_breaks_the_line(synthetic):
     fill(synthetic, solved={("two", 10.0): 0})
     panel = drawn(error_scale, only_view(synthetic))["error_against_scale"].figure.axes[0]

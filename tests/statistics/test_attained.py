@@ -92,6 +92,11 @@ def test_the_terminal_and_the_report_show_them(folder):
     result = write_report([folder], folder)
     assert {p.name for p in result.tables} >= {"attained.csv", "attained_problems.csv"}
     assert [p.name for p in result.figures] == ["data_profile.png", "data_profile.pdf"]
+    # All that solve the most are named.
+    totals = attained_tables(collection)[1]
+    most = list(totals.loc[totals["solved"] == totals["solved"].max(), "estimator"])
+    told = f"Most, {totals['solved'].max()}, are solved by {', '.join(most)}."
+    assert told in result.report.read_text(encoding="utf-8")
 
 
 def test_a_start_without_full_rank_is_a_problem_and_no_mistake():

@@ -53,7 +53,7 @@ def _group_page(group: str, title: str) -> str:
 def _commands_page() -> str:
     """What each command says of itself when asked."""
     summary = _help()
-    commands = re.findall(r"^    (\w+)  ", summary, re.MULTILINE)
+    commands = re.findall(r"^    (\w+)(?:  |$)", summary, re.MULTILINE)
     lines = ["# Commands", "", "```text", summary, "```", ""]
     for command in commands:
         lines += [f"## {command}", "", "```text", _help(command), "```", ""]

@@ -120,7 +120,7 @@ def _dress(ax: Any, row: int, column: int, k: int, below: str, left: str) -> Non
     ax.tick_params(labelsize=6)
     if column == row:
         ax.set_yticks([])
-        ax.set_title(below, fontsize=8, pad=2)
+        ax.set_title(below, fontsize=8, pad=4)
     else:
         ax.set_yticks([-4, 0, 4], ["-4", "0", "4"] if column == 0 else [])
     if row == k - 1:
@@ -136,7 +136,13 @@ def _legend(fig: Any, ax: Any, look: Mapping[str, Look]) -> None:
     names = [common.text(label) for label in look]
     handles.append(Line2D([], [], linestyle="none", marker="o", markersize=4, color=_DRAW_COLOR))
     handles.append(Line2D([], [], linestyle="none", marker="+", markersize=7, color="black"))
-    fig.legend(handles, [*names, "posterior", "truth"], loc="outside lower center", ncols=min(6, len(handles)))
+    fig.legend(
+        handles,
+        [*names, "posterior", "truth"],
+        loc="outside lower center",
+        ncols=min(6, len(handles)),
+        title="axes: deviations of the posterior about its mean",
+    )
 
 
 def _caption(model: Measurement, one: Reference, k: int) -> str:

@@ -34,12 +34,13 @@ def draw(view: View) -> Iterator[Drawing]:
     common.shares(ax, "share of problems solved")
     ax.set(xlabel="simplex gradients, n + 1 simulations each")
     common.legend_below(fig, [ax], look)
-    best = final.loc[final["share"].idxmax()]
+    best = final[final["share"] == final["share"].max()]
     caption = common.sentence(
         f"{problems} problems: functions of Moré, Garbow and Hillstrom from their starts. Solved: the sum of squares is"
         " the least known one. Data profile of Moré and Wild: the share solved within that cost, a Jacobian counting n"
         " simulations.",
-        f"{best['estimator']} solves the most, {round(best['share'] * problems)}.",
+        f"Most, {round(best['share'].max() * problems)}, are solved by"
+        f" {common.enumerate_few(list(best['estimator']))}.",
     )
     yield Drawing("data_profile", "Data profile on known minima", caption, fig)
 

@@ -67,7 +67,9 @@ def _by_parameter(ax: Any, design: Design, look: Any) -> None:
         ax.plot(ratio, rows + 0.12 * (k - (len(design.ways) - 1) / 2), **style)
     ax.set_yticks(rows, names)
     ax.invert_yaxis()
-    ax.set(xlabel="bound with the fewest readings, as a share of today's")
+    counts = {(way.saving or way.sharpest).readings for way in design.ways}
+    chosen = f"{counts.pop()} readings" if len(counts) == 1 else "what is chosen"
+    ax.set(xlabel=f"bound with {chosen}, as a share of today's")
 
 
 def bounds_of(design: Design, choice: Choice) -> Array:

@@ -41,7 +41,7 @@ def _paper_figure(view: View, number: int, estimator: str) -> Drawing:
     rows = _in_units(view, estimator)
     groups = _groups(view.parameters)
     fig, axes = common.panels(len(groups) + 1)
-    ends = rows[["rmse_low", "rmse_high", "linear_bound"]].to_numpy()
+    ends = rows[["rmse", "rmse_low", "rmse_high", "linear_bound"]].to_numpy()
     for (group, inside), ax in zip(groups.items(), axes, strict=False):
         look = {p["name"]: Look(COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)]) for i, p in enumerate(inside)}
         common.decades(ax, ends)
@@ -98,7 +98,7 @@ def _bounds(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look], view: View) -
 def _over_bounds(ax: Any, rows: pd.DataFrame, totals: pd.DataFrame, view: View) -> None:
     ratio = "rmse_over_linear_bound"
     together = {"together": _TOGETHER}
-    common.decades(ax, np.append(rows[ratio], [1.0, *totals["rmse_low"], *totals["rmse_high"]]))
+    common.decades(ax, np.append(rows[ratio], [1.0, *totals["rmse"], *totals["rmse_low"], *totals["rmse_high"]]))
     if len(view.scales) > 1:
         table = rows.pivot_table(index="error_scale", columns="parameter", values=ratio)
         lines = ax.plot(table.index, table, color="#aaaaaa", linewidth=0.8)

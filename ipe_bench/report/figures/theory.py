@@ -47,7 +47,7 @@ def _by_parameter(ax: Any, rows: pd.DataFrame, look: Any, view: View) -> None:
     place = {name: i for i, name in enumerate(names)}
     bounds = rows["crlb"].to_numpy(dtype=float)
     ratios = {c: rows[c].to_numpy(dtype=float) / bounds for c in ("rmse", "rmse_low", "rmse_high", "predicted_rmse")}
-    common.decades(ax, np.concatenate(list(ratios.values())), 3.0)
+    common.decades(ax, np.concatenate([*ratios.values(), [1.0]]), 3.0)
     for k, (label, one) in enumerate(look.items()):
         here = (rows["estimator"] == label).to_numpy()
         x = rows["parameter"].map(place).to_numpy(dtype=float)[here] + 0.5 * ((k + 1) / (len(look) + 1) - 0.5)
@@ -63,7 +63,7 @@ def _by_parameter(ax: Any, rows: pd.DataFrame, look: Any, view: View) -> None:
 
 def _over_scales(ax: Any, totals: pd.DataFrame, look: Any, view: View) -> None:
     """All parameters together over the error scales."""
-    values = totals[["rmse", "predicted_rmse", "crlb"]].to_numpy(dtype=float)
+    values = totals[["rmse", "rmse_low", "rmse_high", "predicted_rmse", "crlb"]].to_numpy(dtype=float)
     common.decades(ax, values.ravel(), 3.0)
     common.curves(ax, totals, "rmse", look, view.scales, interval=("rmse_low", "rmse_high"))
     for line in ax.lines[:]:
@@ -95,7 +95,8 @@ def _caption(rows: pd.DataFrame, scale: float, across: bool, view: View) -> str:
         " expects: no noise is drawn for it. Where readings come from another model than is assumed, that is the"
         " distance to the parameters that fit them best and the misspecified Cramér-Rao bound about these; else the"
         " Cramér-Rao bound and the bias of second order.",
-        f"Left: each parameter over its Cramér-Rao bound at error scale {plain(float(scale))}.",
+        f"{'Left: each' if across else 'Each'} parameter over its Cramér-Rao bound at error scale"
+        f" {plain(float(scale))}.",
         "Middle: all parameters. Right: relative curvature at the truth within the region of the bound, which says"
         " nothing of false roots farther away."
         if across
