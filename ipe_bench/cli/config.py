@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, TypeVar
 
 import cloudpickle
 import yaml
@@ -30,7 +30,7 @@ from ipe_bench.measurements.nist import datasets
 from ipe_bench.noise import ModelNoise, Noise, Unknown
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
-from ipe_bench.priors.gaussian import GaussianPrior
+from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.provenance import TARGET, canonical_json, describe
 from ipe_bench.trials.scenario import Scenario
@@ -239,15 +239,6 @@ def assemble(config: DictConfig, *, estimating: bool = False) -> Job:
     return Job(scenario, estimators, execution, trials, block_size, output, precision, time_limit)
 
 
-@runtime_checkable
-class Prior(Protocol):
-    """What a scenario asks of a prior."""
-
-    def deviation(self, n: int, error_scale: float) -> Any: ...
-
-    def draw(self, nominal: Any, error_scale: float, rng: Any) -> Any: ...
-
-
 def _known(given: Any) -> tuple[Known, ...]:
     """What the key `parameters` says of each."""
     if given is None:
@@ -264,8 +255,10 @@ def _known(given: Any) -> tuple[Known, ...]:
     return tuple(found)
 
 
-def _prior(prior: GaussianPrior, model: Informed) -> GaussianPrior:
+def _prior(prior: Prior, model: Informed) -> GaussianPrior:
     """The prior with the deviations that are known of single parameters."""
+    if not isinstance(prior, GaussianPrior):
+        raise UserError(f"parameters: goes with prior=gaussian, which is told of each; prior={prior.name} is not")
     if prior.deviations is None:
         return replace(prior, deviations=model.prior_deviations)
     names = [p.name for p in model.whole.parameters]
