@@ -30,7 +30,7 @@ from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.provenance import describe, fingerprint
 from ipe_bench.runs.results import Results, require_results
 from ipe_bench.runs.schedule import RunLog, Watcher, perform, plan, work_through
-from ipe_bench.runs.store import TRUTH, Cell, Store
+from ipe_bench.runs.store import TRUTH, Cell, Store, describe_names
 from ipe_bench.statistics.sequences import Precision, Reach, next_trials
 from ipe_bench.trials.bounds import linear_bound
 from ipe_bench.trials.scenario import Scenario
@@ -618,6 +618,43 @@ def _refuse_time_limit(time_limit: float | None, precision: Precision | None = N
         raise UserError(f"time_limit={time_limit}: goes with precision; give that, or leave it out")
     if time_limit is not None and not time_limit > 0:
         raise UserError(f"time_limit={time_limit}: give a number of seconds above 0")
+
+
+def objective_columns() -> list[str]:
+    """The columns whose value over all parameters is a number: those of the summary, and those of the scores."""
+    from ipe_bench.plugins.extensions import use_statistics
+    from ipe_bench.statistics.records import SCORES, all_statistics, frame_columns
+
+    use_statistics()
+    return list(frame_columns([s for s in (*all_statistics(), *SCORES) if s.kind != "word"]))
+
+
+def objective(
+    scenario: Scenario, estimators: Mapping[str, Estimator], label: str, column: str, output: Path | str
+) -> float:
+    """What is known of an estimator by one number: a column of its row over all parameters, of all stored trials.
+
+    Columns that compare estimators, such as capped_error, are over the trials that all of these estimators have.
+
+    Raises:
+        UserError: nothing is stored, or the number is not known.
+    """
+    from ipe_bench.statistics.collect import collect
+    from ipe_bench.statistics.records import SCORES, rows_of, summary_columns_of
+    from ipe_bench.statistics.sample import Sample, Shared
+
+    collection = collect([output], {cell.key for cell in cells_of(scenario, estimators)})
+    shared = Shared.among(collection, collection.groups)
+    for group in collection.groups:
+        sample = Sample.load(collection, group, shared) if group.label == label else ()
+        if isinstance(sample, Sample) and len(sample):
+            value = float((summary_columns_of(sample)[-1] | rows_of(SCORES, sample)[-1])[column])
+            if np.isnan(value):
+                raise UserError(
+                    f"objective={label}.{column}: is not known of {describe_names(group.cells[0][0].names)}"
+                )
+            return value
+    raise UserError(f"objective={label}.{column}: no trials of {label} are stored")
 
 
 def validate(
