@@ -25,12 +25,12 @@ from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
-from ipe_bench.priors.gaussian import GaussianPrior
+from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.provenance import describe, fingerprint
 from ipe_bench.runs.results import Results, require_results
 from ipe_bench.runs.schedule import RunLog, Watcher, perform, plan, work_through
-from ipe_bench.runs.store import TRUTH, Cell, Store
+from ipe_bench.runs.store import TRUTH, Cell, Store, describe_names
 from ipe_bench.trials.bounds import linear_bound
 from ipe_bench.trials.scenario import Scenario
 
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ipe_bench.plugins.conformance import Finding
+    from ipe_bench.plugins.discovery import Option
     from ipe_bench.report import ReportResult
     from ipe_bench.report.answer import Answer
     from ipe_bench.statistics.sequences import Precision, Reach
@@ -95,6 +96,7 @@ def run(
         UserError: what was asked for cannot be computed; nothing has been computed then.
         StorageError: nothing can be stored any more.
     """
+    from ipe_bench.plugins.extensions import use_statistics
     from ipe_bench.statistics import summarize
 
     scenarios = [scenarios] if isinstance(scenarios, Scenario) else list(scenarios)
@@ -110,6 +112,8 @@ def run(
             failures, stops = compute_until(scenarios, estimators, trials, folder, **options)
         for failure in failures:
             warnings.warn(f"failed: {failure}", stacklevel=2)
+        for problem in use_statistics():
+            warnings.warn(problem, stacklevel=2)
         table = summarize([folder])
         if precision is not None:
             table.attrs["stops"] = [stop.row for stop in stops]
@@ -282,7 +286,7 @@ def estimate(
     estimators: Mapping[str, Estimator] | None = None,
     *,
     noise: Noise | None = None,
-    prior: GaussianPrior | None = None,
+    prior: Prior | None = None,
     error_scale: float | None = None,
 ) -> Answer:
     """Parameters from real readings, by every estimator: estimates, standard errors, residuals and a test of the fit.
@@ -344,7 +348,7 @@ def estimate(
     return Answer(found.model.name, found.model, found.z, fits, examine(problem, found.z, fits))
 
 
-def _real_problem(model: Measurement, noise: Noise, prior: GaussianPrior | None, error_scale: float | None) -> Problem:
+def _real_problem(model: Measurement, noise: Noise, prior: Prior | None, error_scale: float | None) -> Problem:
     """What estimators are told where readings are real: a prior only where somebody states one."""
     known = prior is not None or error_scale is not None
     scale = 1.0 if error_scale is None else error_scale
@@ -420,8 +424,9 @@ def posterior(
 def check(component: Any) -> list[Finding]:
     """Whether a component keeps the promises that every component makes: a finding per check, with its complaint.
 
-    `component` is a measurement model, noise, prior or estimator, or the folder of a plugin, all of whose options are
-    checked. A finding whose `complaint` is empty passed.
+    `component` is a measurement model, noise, prior, execution or estimator, or the folder of a plugin, all of whose
+    options are checked, statistics, figures, tables and sections among them. A finding whose `complaint` is empty
+    passed.
 
     >>> import ipe_bench as ib
     >>> findings = ib.check(ib.noise.Gaussian(0.1))
@@ -432,11 +437,36 @@ def check(component: Any) -> list[Finding]:
         UserError: there is no plugin in the folder.
     """
     from ipe_bench.plugins.conformance import check_component, check_option
-    from ipe_bench.plugins.discovery import options_in
+    from ipe_bench.plugins.discovery import RECORD_GROUPS, options_in
 
     if isinstance(component, Path | str):
-        return [finding for option in options_in(Path(component)) for finding in check_option(option)]
+        chosen = options_in(Path(component))
+        findings = [finding for o in chosen if o.group not in RECORD_GROUPS for finding in check_option(o)]
+        return findings + _check_records([o for o in chosen if o.group in RECORD_GROUPS])
     return list(check_component(getattr(component, "name", type(component).__name__), component))
+
+
+def _check_records(options: Sequence[Option]) -> list[Finding]:
+    """The findings on what reports are made of, from a small sweep and from a single trial."""
+    from ipe_bench.baselines import EKF, LinearLSE
+    from ipe_bench.measurements.polynomial import Polynomial
+    from ipe_bench.noise.gaussian import Gaussian
+    from ipe_bench.plugins.extensions import use_statistics
+    from ipe_bench.report.conformance import check_record
+    from ipe_bench.solvers import FixedPoint, Newton
+    from ipe_bench.statistics import analyse
+
+    if not options:
+        return []
+    use_statistics()
+    # The fixed point fails at the largest scale.
+    scenarios = [Scenario(Polynomial(), Gaussian(0.01), error_scale=scale) for scale in (1.0, 10.0, 100.0)]
+    estimators = {"linear_lse": LinearLSE(), "fixed_point": FixedPoint(), "newton": Newton(), "ekf": EKF()}
+    with tempfile.TemporaryDirectory(prefix="ipe-bench-") as folder:
+        compute(scenarios, estimators, 25, f"{folder}/sweep")
+        compute(scenarios[-1:], estimators, 1, f"{folder}/single")
+        analyses = [analyse([f"{folder}/{name}"]) for name in ("sweep", "single")]
+        return [finding for option in options for finding in check_record(option, analyses)]
 
 
 def _paths(directories: Directories) -> list[Path]:
@@ -595,6 +625,43 @@ def _refuse_time_limit(time_limit: float | None, precision: Precision | None = N
         raise UserError(f"time_limit={time_limit}: goes with precision; give that, or leave it out")
     if time_limit is not None and not time_limit > 0:
         raise UserError(f"time_limit={time_limit}: give a number of seconds above 0")
+
+
+def objective_columns() -> list[str]:
+    """The columns whose value over all parameters is a number: those of the summary, and those of the scores."""
+    from ipe_bench.plugins.extensions import use_statistics
+    from ipe_bench.statistics.records import SCORES, all_statistics, frame_columns
+
+    use_statistics()
+    return list(frame_columns([s for s in (*all_statistics(), *SCORES) if s.kind != "word"]))
+
+
+def objective(
+    scenario: Scenario, estimators: Mapping[str, Estimator], label: str, column: str, output: Path | str
+) -> float:
+    """What is known of an estimator by one number: a column of its row over all parameters, of all stored trials.
+
+    Columns that compare estimators, such as capped_error, are over the trials that all of these estimators have.
+
+    Raises:
+        UserError: nothing is stored, or the number is not known.
+    """
+    from ipe_bench.statistics.collect import collect
+    from ipe_bench.statistics.records import SCORES, rows_of, summary_columns_of
+    from ipe_bench.statistics.sample import Sample, Shared
+
+    collection = collect([output], {cell.key for cell in cells_of(scenario, estimators)})
+    shared = Shared.among(collection, collection.groups)
+    for group in collection.groups:
+        sample = Sample.load(collection, group, shared) if group.label == label else ()
+        if isinstance(sample, Sample) and len(sample):
+            value = float((summary_columns_of(sample)[-1] | rows_of(SCORES, sample)[-1])[column])
+            if np.isnan(value):
+                raise UserError(
+                    f"objective={label}.{column}: is not known of {describe_names(group.cells[0][0].names)}"
+                )
+            return value
+    raise UserError(f"objective={label}.{column}: no trials of {label} are stored")
 
 
 def validate(

@@ -1,6 +1,7 @@
 """The exceptions that are meant for users; everything else that is raised is a bug."""
 
 import difflib
+import traceback
 from collections.abc import Iterable
 
 
@@ -22,6 +23,14 @@ def describe_exception(error: BaseException) -> str:
     """One line for a table: the type and the first line of the message."""
     lines = str(error).splitlines()
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+
+
+def place_of(error: BaseException) -> str:
+    """What was raised, and the file and line where."""
+    if isinstance(error, SyntaxError):
+        return f"{error.filename}, line {error.lineno}: {type(error).__name__}: {error.msg}"
+    frames = traceback.extract_tb(error.__traceback__)
+    return f"{frames[-1].filename}, line {frames[-1].lineno}: {describe_exception(error)}"
 
 
 def shortened(text: str, length: int = 120) -> str:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import redirect_stdout
 from pathlib import Path
 
 from ipe_bench.api import check
@@ -26,12 +29,28 @@ def main(folders: Sequence[str]) -> int:
 
 def _check_plugin(folder: str) -> int:
     out = console()
-    findings = check(folder)
+    findings = [*check(folder), *_check_experiments(folder)]
     for finding in findings:
         out.print(_line(finding), markup=False, soft_wrap=True)
     failed = sum(bool(finding.complaint) for finding in findings)
     out.print(f"{folder}: {failed} checks failed" if failed else f"{folder}: all checks passed", markup=False)
     return failed
+
+
+def _check_experiments(folder: str) -> Iterator[Finding]:
+    """Whether each experiment of the plugin asks for what there is."""
+    from ipe_bench.cli.run import main as run
+
+    for option in plugins.options_in(Path(folder)):
+        if option.group == "experiment" and option.fault is None:
+            name, what = f"experiment={option.name}", "Asks for what there is"
+            with tempfile.TemporaryDirectory(prefix="ipe-bench-") as output, redirect_stdout(io.StringIO()):
+                try:
+                    run([f"+experiment={option.name}", f"output={output}/out", "--dry-run"])
+                except UserError as error:
+                    yield Finding(name, what, str(error))
+                else:
+                    yield Finding(name, what)
 
 
 def _line(finding: Finding) -> str:

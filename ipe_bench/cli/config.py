@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, TypeVar
 
 import cloudpickle
 import yaml
@@ -21,7 +21,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ipe_bench.api import MOST_TRIALS, TRIALS
+from ipe_bench.api import MOST_TRIALS, TRIALS, objective_columns
 from ipe_bench.basics.errors import UserError, describe_exception, unknown
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
@@ -30,7 +30,7 @@ from ipe_bench.measurements.nist import datasets
 from ipe_bench.noise import ModelNoise, Noise, Unknown
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
-from ipe_bench.priors.gaussian import GaussianPrior
+from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.provenance import TARGET, canonical_json, describe
 from ipe_bench.trials.scenario import Scenario
@@ -72,6 +72,8 @@ class Schema:
     parameters: Any = None
     """What is known of the parameters: parameters.NAME.fixed=, .nominal=, .deviation=, .lower=, .upper=, .positive=."""
     execution: Any = MISSING
+    objective: str | None = None
+    """LABEL.COLUMN, such as newton.capped_error: a number of each job, which sweepers that optimise make small."""
     estimators: dict[str, Any] = field(default_factory=dict)
 
 
@@ -91,6 +93,8 @@ class Job:
     output: str
     precision: Any = None
     time_limit: float | None = None
+    objective: tuple[str, str] | None = None
+    """The label of an estimator and a column of its row over all parameters."""
 
 
 class PluginSearchPath(SearchPathPlugin):
@@ -236,16 +240,22 @@ def assemble(config: DictConfig, *, estimating: bool = False) -> Job:
     unless = TRIALS if precision is None else MOST_TRIALS
     trials = unless if plain["trials"] is None else plain["trials"]
     block_size, output = plain["block_size"], plain["output"]
-    return Job(scenario, estimators, execution, trials, block_size, output, precision, time_limit)
+    objective = _objective(plain["objective"], list(estimators))
+    return Job(scenario, estimators, execution, trials, block_size, output, precision, time_limit, objective)
 
 
-@runtime_checkable
-class Prior(Protocol):
-    """What a scenario asks of a prior."""
-
-    def deviation(self, n: int, error_scale: float) -> Any: ...
-
-    def draw(self, nominal: Any, error_scale: float, rng: Any) -> Any: ...
+def _objective(given: str | None, labels: Sequence[str]) -> tuple[str, str] | None:
+    """The label and the column that objective=LABEL.COLUMN names."""
+    if given is None:
+        return None
+    label, dot, column = given.rpartition(".")
+    if not dot or label not in labels:
+        what = unknown(label, labels, "estimator") if dot else "write LABEL.COLUMN, such as newton.capped_error"
+        raise UserError(f"objective={given}: {what}")
+    columns = objective_columns()
+    if column not in columns:
+        raise UserError(f"objective={given}: {unknown(column, columns, 'column')}")
+    return label, column
 
 
 def _known(given: Any) -> tuple[Known, ...]:
@@ -264,8 +274,10 @@ def _known(given: Any) -> tuple[Known, ...]:
     return tuple(found)
 
 
-def _prior(prior: GaussianPrior, model: Informed) -> GaussianPrior:
+def _prior(prior: Prior, model: Informed) -> GaussianPrior:
     """The prior with the deviations that are known of single parameters."""
+    if not isinstance(prior, GaussianPrior):
+        raise UserError(f"parameters: goes with prior=gaussian, which is told of each; prior={prior.name} is not")
     if prior.deviations is None:
         return replace(prior, deviations=model.prior_deviations)
     names = [p.name for p in model.whole.parameters]

@@ -12,7 +12,9 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.plugins import discovery as plugins
 
 LONGEST = 60
-KINDS = ("solver", "baseline", "measurement", "noise", "experiment")
+RECORDS = {"statistic": "STATISTIC", "figure": "FIGURE", "table": "table", "section": "SECTION"}
+"""What reports are made of, and what each is called in its module."""
+KINDS = ("solver", "baseline", "measurement", "noise", "prior", "execution", *RECORDS, "experiment")
 
 
 def main(kind: str, name: str) -> int:
@@ -31,12 +33,13 @@ def main(kind: str, name: str) -> int:
             raise UserError(
                 f"{name}: {option.group}={name} is there already ({option.source.origin}); choose another name"
             )
+    _refuse_column(kind, name)
     folder = Path("plugins") / name
     if folder.exists():
         raise UserError(f"{folder}: is there already and is not overwritten; choose another name")
     package = f"ipe_bench_{name}"
     class_name = "".join(part.title() for part in name.split("_"))
-    words = {"kind": kind, "name": name, "package": package, "Class": class_name}
+    words = {"kind": kind, "name": name, "package": package, "Class": class_name, "record": RECORDS.get(kind, "")}
     texts = {
         "pyproject.toml": "pyproject.toml",
         "README.md": "README.md",
@@ -53,6 +56,10 @@ def main(kind: str, name: str) -> int:
             f"{package}/conf/experiment/{name}.yaml": "experiment.yaml",
             f"tests/test_{name}.py": "experiment_test.py",
         }
+    elif kind in RECORDS:
+        own = {"README.md": "record_readme.md", f"{package}/__init__.py": "record_init.py"}
+        own |= {f"{package}/conf/{kind}/{name}.yaml": "record.yaml", f"tests/test_{name}.py": "record_test.py"}
+        texts |= own
     templates = files("ipe_bench.plugins") / "templates"
     for target, source in texts.items():
         path = folder / target
@@ -60,7 +67,15 @@ def main(kind: str, name: str) -> int:
         text = (templates / f"{source}.template").read_text(encoding="utf-8")
         path.write_text(Template(text).substitute(words), encoding="utf-8")
     choices = {"solver": f'"solver=[{name}]"', "baseline": f'"baseline=[{name}]"', "experiment": f"+experiment={name}"}
-    choose = choices.get(kind, f"{kind}={name}")
-    first = f"ipe-bench run {choose} --dry-run" if kind == "experiment" else f"ipe-bench check {folder}"
-    print(f"{folder} is ready. Try:\n  {first}\n  ipe-bench run {choose} trials=100")
+    choose = "" if kind in RECORDS else choices.get(kind, f"{kind}={name}") + " "
+    print(f"{folder} is ready. Try:\n  ipe-bench check {folder}\n  ipe-bench run {choose}trials=100")
     return 0
+
+
+def _refuse_column(kind: str, name: str) -> None:
+    """A statistic is a column of the summary, which has ours already."""
+    if kind == "statistic":
+        from ipe_bench.statistics.records import SCORES, STATISTICS, frame_columns
+
+        if name in frame_columns([*STATISTICS, *SCORES]):
+            raise UserError(f"{name}: is a statistic of ours; choose another name")

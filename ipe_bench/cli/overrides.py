@@ -41,8 +41,9 @@ def read(words: Sequence[str], keys: Sequence[str], folders: Sequence[Path] = ()
         UserError: a word is none, or Hydra would not do what it says.
     """
     overrides = [_parse(word) for word in words]
+    optimises = any(o.key_or_group == "hydra/sweeper" and o.value() != "basic" for o in overrides)
     for word, override in zip(words, overrides, strict=True):
-        _check(_Word(word, override, keys, folders))
+        _check(_Word(word, override, keys, folders), optimises=optimises)
     _check_labels(words, overrides)
     experiments = [word for word, o in zip(words, overrides, strict=True) if o.key_or_group == "experiment"]
     if len(experiments) > 1:
@@ -116,7 +117,7 @@ def _plain(value: Any) -> Any:
     return value.text if isinstance(value, QuotedString) else value
 
 
-def _check(word: _Word) -> None:
+def _check(word: _Word, *, optimises: bool) -> None:
     if word.group.split("/")[0].split(".")[0] == "hydra":
         return
     if word.type is OverrideType.DEL:
@@ -128,8 +129,10 @@ def _check(word: _Word) -> None:
         _check_key(word)
     if isinstance(word.value, RangeSweep):
         _check_range(word, word.value)
-    elif isinstance(word.value, IntervalSweep):
-        raise word.error("interval() is for sweepers that optimise; give the values, such as 1,10,100")
+    elif isinstance(word.value, IntervalSweep) and not optimises:
+        raise word.error(
+            "interval() is for sweepers that optimise (hydra/sweeper=optuna); give the values, such as 1,10,100"
+        )
 
 
 def _check_deletion(word: _Word) -> None:
@@ -229,7 +232,7 @@ def _check_labels(words: Sequence[str], overrides: Sequence[Override]) -> None:
 
 
 _NO_PART_OF_A_NAME = ("name", "output", "trials", "block_size", "seed", "execution", "experiment", "hydra", "readings")
-_NO_PART_OF_A_NAME += ("precision", "time_limit", "write_readings", "write_readings_trial", "default_name")
+_NO_PART_OF_A_NAME += ("precision", "time_limit", "write_readings", "write_readings_trial", "default_name", "objective")
 _LONGEST_NAME = 80
 
 

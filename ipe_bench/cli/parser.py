@@ -200,7 +200,11 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         help="with each one's options, and the parameters and readings file of measurements",
     )
     new = add("new", "a working plugin to start from, in plugins/NAME")
-    new.add_argument("kind", metavar="KIND", help="solver, baseline, measurement, noise or experiment")
+    new.add_argument(
+        "kind",
+        metavar="KIND",
+        help="solver, baseline, measurement, noise, prior, execution, statistic, figure, table, section or experiment",
+    )
     new.add_argument("name", metavar="NAME", help="small letters, digits and underscores")
     check = add(
         "check",

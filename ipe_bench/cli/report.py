@@ -29,11 +29,10 @@ def main(arguments: Sequence[str]) -> int:
         raise UserError("report: several directories need output=DIR, as the report on all is not that of the first")
     require_results(directories)
     from ipe_bench.report.stamp import made_from
-    from ipe_bench.statistics.analysis import begin
 
     output = Path(outputs[0]) if outputs else directories[0]
     made = made_from(directories, output)
-    begun = begin(directories)
+    begun = _begin(directories)
     _print_table(begun.summary, begun.collection)
     collection = _write(begun, output, made)
     for problem in (*collection.problems, *collection.stale):
@@ -48,12 +47,11 @@ def show_command(output: Path, cells: Mapping[str, str]) -> int:
     `cells` has a line for people by key.
     """
     from ipe_bench.report.stamp import made_from
-    from ipe_bench.statistics.analysis import begin
     from ipe_bench.statistics.collect import collect
     from ipe_bench.statistics.summary import rows_of_all
 
     made = made_from([output], output)
-    begun = begin([output])
+    begun = _begin([output])
     others = sum(cell.key not in cells and cell.label != TRUTH for cell in begun.collection.current)
     if others:
         own = collect([output], cells.keys())
@@ -73,6 +71,17 @@ def show_command(output: Path, cells: Mapping[str, str]) -> int:
     if others:
         print(f"Here too  {_counted(others, 'result')} of other commands; `ipe-bench report {output}` shows all")
     return 1 if problems else 0
+
+
+def _begin(directories: Sequence[Path]) -> Begun:
+    """The analysis with the statistics of plugins, and what is wrong with those among its problems."""
+    from ipe_bench.plugins.extensions import use_statistics
+    from ipe_bench.statistics.analysis import begin
+
+    faults = use_statistics()
+    begun = begin(directories)
+    begun.collection.further += faults
+    return begun
 
 
 def _write(begun: Begun, output: Path, made: str) -> Collection:

@@ -18,7 +18,7 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from ipe_bench.api import cells_of, compute, compute_until
+from ipe_bench.api import cells_of, compute, compute_until, objective
 from ipe_bench.basics.errors import StorageError, UserError, shortened
 from ipe_bench.cli import console, interrupts
 from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, assemble, explain, prepare, rewrite
@@ -51,12 +51,24 @@ class Outcome:
         self.failures: list[str] = []
         self.stops: list[str] = []
         """How many trials each job with a precision took, and why no more."""
+        self.maximises = False
+        self.objectives: list[tuple[float, list[str]]] = []
+        """What each job came to in the column that is asked for, and what was asked of it."""
         self.dry: DryRun | None = None
         """What would be done, where nothing is to be."""
         self.mistakes: dict[str, None] = {}
         self.bug: Exception | None = None
         self.storage: StorageError | None = None
         """Nothing can be stored any more: the remaining jobs are not begun."""
+
+    def shown_objective(self) -> str:
+        """The best job in a line, with those of its words that not all jobs have."""
+        value, words = (max if self.maximises else min)(self.objectives, key=lambda known: known[0])
+        common = set.intersection(*(set(other) for _, other in self.objectives))
+        own = " ".join(word for word in words if word not in common)
+        count = len(self.objectives)
+        of = f", the {'greatest' if self.maximises else 'least'} of {count} jobs" if count > 1 else ""
+        return f"Objective {value:.6g}{of}" + (own and f": {own}")
 
 
 _outcome = Outcome()
@@ -70,6 +82,7 @@ class Watch(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         _outcome.started = _outcome.multirun = True
+        _outcome.maximises = "maximize" in str(config.hydra.sweeper.get("direction", ""))
         _outcome.elsewhere = not config.hydra.launcher["_target_"].endswith(_OWN_LAUNCHER)
         output = OmegaConf.select(config, "output")
         if output is not None:
@@ -148,6 +161,8 @@ def _conclude() -> int:
         if (output / "trials").is_dir():
             # Of jobs in other processes nothing is known but the folder.
             code = max(code, show_command(output, cells) if cells else report([str(output)]))
+    if _outcome.objectives:
+        console().print(_outcome.shown_objective(), markup=False, soft_wrap=True)
     for line in _outcome.stops:
         console().print(line, markup=False, soft_wrap=True)
     if _outcome.mistakes:
@@ -192,24 +207,26 @@ def sweeps_by_itself(words: Sequence[str], folders: Sequence[Path]) -> bool:
     return False
 
 
-def task(config: DictConfig) -> None:
-    """One job: a scenario under its estimators. A mistake in one job of a sweep does not stop the others."""
+def task(config: DictConfig) -> float | None:
+    """One job: a scenario under its estimators. A mistake in one job of a sweep does not stop the others, unless they
+    are chosen by what this one comes to, which it returns."""
     if _outcome.storage is not None:
-        return
+        return None
     try:
         job = assemble(config)
         _refuse_keys_without_use(config)
         if config.write_readings is not None:
             write_trial(job, Path(config.write_readings), config.write_readings_trial)
-            return
+            return None
         if _outcome.dry is not None:
             print(_outcome.dry.add(job, _title(job)))
-            return
+            return None
         interrupts.begin_work()
         with shown_progress(_title(job)) as watch:
             failures = _compute(job, Serial() if _launched_elsewhere() else job.execution, watch)
+        value = None if job.objective is None else _objective(job)
     except (UserError, StorageError, *CONFIG_ERRORS) as error:
-        if _launched_elsewhere():
+        if _launched_elsewhere() or config.get("objective") is not None:
             raise explain(error) if isinstance(error, CONFIG_ERRORS) else error from None
         if isinstance(error, StorageError):
             _outcome.storage = error
@@ -222,6 +239,16 @@ def task(config: DictConfig) -> None:
         _outcome.failures += failures
         own = _outcome.outputs.setdefault(Path(job.output), {})
         own.update((cell.key, describe_names(cell.names)) for cell in cells_of(job.scenario, job.estimators))
+        return value
+    return None
+
+
+def _objective(job: Job) -> float:
+    assert job.objective is not None
+    value = objective(job.scenario, job.estimators, *job.objective, job.output)
+    words = [word for word in HydraConfig.get().overrides.task if not word.startswith("objective=")]
+    _outcome.objectives.append((value, words))
+    return value
 
 
 def _compute(job: Job, execution: Execution, watch: Watcher) -> tuple[str, ...]:
@@ -258,6 +285,7 @@ _NOT_IN_TITLES = {
     "trials",
     "precision",
     "time_limit",
+    "objective",
     "block_size",
     "output",
     "name",

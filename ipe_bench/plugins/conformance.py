@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -28,8 +28,9 @@ from ipe_bench.noise.base import Noise
 from ipe_bench.noise.gaussian import Gaussian
 from ipe_bench.noise.own import ModelNoise
 from ipe_bench.plugins.construct import construct
-from ipe_bench.plugins.discovery import Option, blame
-from ipe_bench.priors.gaussian import GaussianPrior
+from ipe_bench.plugins.discovery import COMPONENT_GROUPS, Option, blame
+from ipe_bench.priors import GaussianPrior, Prior
+from ipe_bench.runs.execution import Execution, Failure
 from ipe_bench.runs.provenance import describe
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import nees
@@ -60,7 +61,7 @@ def check_component(name: str, component: Any) -> Iterator[Finding]:
     """Runs the checks of the component's kind; a component of no kind is a finding itself."""
     checks = next((c for kind, c in _CHECKS.items() if isinstance(component, kind)), None)
     if checks is None:
-        yield Finding(name, "is a component", "it is neither measurement, noise, prior, solver nor baseline")
+        yield Finding(name, "is a component", "it is neither measurement, noise, prior, solver, baseline nor execution")
         return
     for check in (describes_itself, *checks):
         title = (check.__doc__ or check.__name__).strip().splitlines()[0].rstrip(".")
@@ -79,10 +80,16 @@ def check_component(name: str, component: Any) -> Iterator[Finding]:
 
 
 def check_option(option: Option) -> Iterator[Finding]:
-    """Runs the checks on the component that an option of a plugin describes; one that cannot be made is a finding."""
+    """Runs the checks on the component that an option of a plugin describes; one that cannot be made is a finding.
+
+    Of what is no component, such as an experiment, the file alone is looked at.
+    """
     name = f"{option.group}={option.name}"
     if option.fault is not None:
         yield Finding(name, "Has a config that can be read", option.fault)
+        return
+    if option.group not in COMPONENT_GROUPS:
+        yield Finding(name, "Has a config that can be read")
         return
     try:
         component = construct(option.config, option.package or option.group)
@@ -435,6 +442,131 @@ def states_its_law(noise: Noise) -> None:
         )
 
 
+# Priors
+
+
+_MANY = 4
+"""Parameters that priors are tried with."""
+
+
+def _x0_and_deviation(prior: Prior, error_scale: float = 1.0) -> tuple[Array, Array]:
+    n = len(getattr(prior, "deviations", None) or [1.0] * _MANY)
+    return np.linspace(-1.0, 1.0, n), np.asarray(prior.deviation(n, error_scale))
+
+
+def states_its_deviations(prior: Prior) -> None:
+    """States a standard deviation for each parameter, which grows with the error scale."""
+    x0, deviation = _x0_and_deviation(prior)
+    assert deviation.shape == x0.shape, f"deviation returns {deviation.shape}, and not {x0.shape}"
+    assert np.isfinite(deviation).all(), "a deviation is not finite"
+    assert (deviation >= 0).all(), "a deviation is negative"
+    assert deviation.any(), "every deviation is 0"
+    _, tenfold = _x0_and_deviation(prior, 10.0)
+    assert np.allclose(tenfold, 10 * deviation), (
+        "at ten times the error scale the deviations are not ten times as large"
+    )
+
+
+def draws_reproducibly(prior: Prior) -> None:
+    """Draws the same parameters from the same random stream, and leaves x0 alone."""
+    x0, _ = _x0_and_deviation(prior)
+    copy = x0.copy()
+    first, second = (prior.draw(x0, 2.0, np.random.default_rng(3)) for _ in range(2))
+    assert np.array_equal(x0, copy), "draw writes into x0"
+    assert np.shape(first) == x0.shape, f"draw returns {np.shape(first)}, and not {x0.shape}"
+    assert np.array_equal(first, second), "it uses randomness besides the stream that it is given"
+
+
+def draws_what_is_told(prior: Prior) -> None:
+    """Draws independent parameters of the mean x0 and the deviations that it states, normal where it says so."""
+    from scipy.stats import kstest
+
+    x0, deviation = _x0_and_deviation(prior, 2.0)
+    rng = np.random.default_rng(7)
+    x = np.array([prior.draw(x0.copy(), 2.0, rng) for _ in range(DRAWS)]) - x0
+    assert np.array_equal(x[:, deviation == 0], np.zeros((DRAWS, int((deviation == 0).sum())))), (
+        "a parameter of deviation 0 varies"
+    )
+    w = x[:, deviation > 0] / deviation[deviation > 0]
+    off = np.abs(w.mean(axis=0)) - 6 * w.std(axis=0) / np.sqrt(DRAWS)
+    assert (off < 0).all(), f"the mean is off x0 by up to {np.abs(w.mean(axis=0)).max():.3g} of the stated deviation"
+    products = w[:, :, None] * w[:, None, :]
+    off = np.abs(products.mean(axis=0) - np.eye(w.shape[1])) - 6 * products.std(axis=0) / np.sqrt(DRAWS)
+    i, j = (int(k) for k in np.unravel_index(int(off.argmax()), off.shape))
+    assert off[i, j] < 0 or i != j, (
+        f"the draws have {w[:, i].std():.3g} times the stated deviation, on average over {DRAWS} draws"
+    )
+    assert off[i, j] < 0, f"two parameters have the correlation {products[:, i, j].mean():.2f}; estimators are told 0"
+    p = min(float(kstest(w[:, i], "norm").pvalue) for i in range(w.shape[1]))
+    assert not prior.normal or p > 1e-6, f"the draws are not normal (p = {p:.1g}); set `normal` to False"
+
+
+# Executions
+
+
+@dataclass(frozen=True)
+class _Errand:
+    """A task that takes so many steps; then it raises what it is told to."""
+
+    number: int
+    steps: int = 2
+    end: Literal["well", "error", "mistake"] = "well"
+    trusted: bool = True
+
+
+def _run_errand(errand: _Errand) -> Iterator[tuple[int, int]]:
+    for step in range(errand.steps):
+        yield errand.number, step
+    if errand.end == "error":
+        raise ValueError(f"errand {errand.number}")
+    if errand.end == "mistake":
+        raise UserError(f"errand {errand.number}")
+
+
+def does_every_task(execution: Execution) -> None:
+    """Tells of every step of every task in order, and once of its end."""
+    _account(execution, [_Errand(i, steps=i) for i in range(4)])
+
+
+def fails_a_task_alone(execution: Execution) -> None:
+    """Ends a task that raises as a failure, and does the others."""
+    _account(execution, [_Errand(0), _Errand(1, end="error"), _Errand(2)])
+
+
+def _account(execution: Execution, errands: list[_Errand]) -> None:
+    events = list(execution.run(_run_errand, errands))
+    for i, errand in enumerate(errands):
+        own = [event for event in events if event.index == i]
+        ends = [event for event in own if event.ended]
+        assert len(ends) == 1, f"of task {i} it tells {len(ends)} ends; yield Event(index, ended=True) once"
+        assert own[-1].ended, f"it tells of task {i} after its end"
+        steps = [event.step for event in own if not event.ended]
+        assert steps == [(i, k) for k in range(errand.steps)], f"of task {i} it tells the steps {steps}"
+        failure = ends[0].failure
+        if errand.end == "well":
+            assert failure is None, f"task {i} went well, and ends as {failure}"
+        else:
+            assert isinstance(failure, Failure), f"task {i} raised, and ends without a Failure; use Failure.of(error)"
+            assert f"errand {i}" in failure.message, f"the failure does not say what was raised: {failure.message}"
+    strange = {event.index for event in events} - set(range(len(errands)))
+    assert not strange, f"it tells of tasks that there are not: {sorted(strange)}"
+
+
+def ends_with_the_run(execution: Execution) -> None:
+    """Hands on what ends the whole run, a UserError or StorageError, and can be closed before its end."""
+    try:
+        list(execution.run(_run_errand, [_Errand(0, end="mistake"), _Errand(1)]))
+    except UserError:
+        pass
+    else:
+        raise AssertionError("a UserError does not end the run; raise what is in ipe_bench.runs.execution.base.FATAL")
+    events = iter(execution.run(_run_errand, [_Errand(i) for i in range(3)]))
+    next(events)
+    close = getattr(events, "close", None)
+    assert close is not None, "run returns no generator, which could be closed"
+    close()
+
+
 Check = Callable[[Any], None]
 
 _CHECKS: dict[type, tuple[Check, ...]] = {
@@ -451,5 +583,6 @@ _CHECKS: dict[type, tuple[Check, ...]] = {
     ),
     Measurement: (names_its_readings, simulates_batches, differentiates, orders_its_epochs),
     Noise: (states_its_covariance, corrupts_reproducibly, draws_what_it_states, states_its_law),
-    GaussianPrior: (),
+    Prior: (states_its_deviations, draws_reproducibly, draws_what_is_told),
+    Execution: (does_every_task, fails_a_task_alone, ends_with_the_run),
 }

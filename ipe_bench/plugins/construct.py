@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import traceback
 from collections.abc import Mapping
 from typing import Any
 
-from ipe_bench.basics.errors import UserError, describe_exception, unknown
+from ipe_bench.basics.errors import UserError, place_of, unknown
 from ipe_bench.basics.options import checked, option_types
 from ipe_bench.runs.provenance import TARGET
 
@@ -49,13 +48,28 @@ def find_class(target: Any, where: str) -> type:
     Raises:
         UserError: it is not there, not a component, abstract, or of a package that is not registered.
     """
+    cls = find_object(target, where)
     where = f"{where}.{TARGET}={target}"
-    module_name, _, class_name = str(target).rpartition(".")
+    if not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
+        raise UserError(f"{where}: is not a component (a component is a frozen dataclass)")
+    if missing := sorted(getattr(cls, "__abstractmethods__", ())):
+        raise UserError(f"{where}: is abstract; choose a class that writes {', '.join(missing)}")
+    return cls
+
+
+def find_object(target: Any, where: str) -> Any:
+    """What has that dotted name in a registered package.
+
+    Raises:
+        UserError: it is not there, cannot be imported, or is of a package that is not registered.
+    """
+    where = f"{where}.{TARGET}={target}"
+    module_name, _, name = str(target).rpartition(".")
     if module_name.split(".")[0] not in _registered_packages:
         known = ", ".join(sorted(_registered_packages))
         raise UserError(f"{where}: only classes of these packages are constructed: {known}")
     try:
-        cls = getattr(importlib.import_module(module_name), class_name)
+        return getattr(importlib.import_module(module_name), name)
     except (ImportError, AttributeError) as error:
         raise UserError(f"{where}: {_first_line(error)}") from None
     except KeyboardInterrupt:
@@ -63,12 +77,7 @@ def find_class(target: Any, where: str) -> type:
     except BaseException as error:  # a plugin may do anything while it is imported, sys.exit() too
         if _is_ours(module_name):
             raise
-        raise UserError(f"{where}: its module cannot be imported: {_place(error)}") from None
-    if not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
-        raise UserError(f"{where}: is not a component (a component is a frozen dataclass)")
-    if missing := sorted(getattr(cls, "__abstractmethods__", ())):
-        raise UserError(f"{where}: is abstract; choose a class that writes {', '.join(missing)}")
-    return cls
+        raise UserError(f"{where}: its module cannot be imported: {place_of(error)}") from None
 
 
 def _instantiate(cls: type, options: dict[str, Any], where: str) -> Any:
@@ -93,7 +102,7 @@ def _instantiate(cls: type, options: dict[str, Any], where: str) -> Any:
             raise UserError(f"{where}: {' '.join(str(error).split())}") from error
         if _is_ours(cls.__module__):
             raise
-        raise UserError(f"{where}: {cls.__name__} cannot be made: {_place(error)}") from None
+        raise UserError(f"{where}: {cls.__name__} cannot be made: {place_of(error)}") from None
 
 
 def _is_ours(module: str) -> bool:
@@ -102,11 +111,3 @@ def _is_ours(module: str) -> bool:
 
 def _first_line(error: BaseException) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
-
-
-def _place(error: BaseException) -> str:
-    """What was raised, and the file and line where."""
-    if isinstance(error, SyntaxError):
-        return f"{error.filename}, line {error.lineno}: {type(error).__name__}: {error.msg}"
-    frames = traceback.extract_tb(error.__traceback__)
-    return f"{frames[-1].filename}, line {frames[-1].lineno}: {describe_exception(error)}"

@@ -12,7 +12,7 @@ from typing import Any
 
 from ipe_bench.basics.options import describe_type, option_types
 from ipe_bench.plugins.construct import find_class
-from ipe_bench.plugins.discovery import Option
+from ipe_bench.plugins.discovery import RECORD_GROUPS, Option
 from ipe_bench.runs.provenance import TARGET
 
 
@@ -36,6 +36,8 @@ def described(option: Option) -> list[Described]:
         UserError: the class is not there, or cannot be imported.
     """
     config: Mapping[str, Any] = option.config or {}
+    if option.group in RECORD_GROUPS:
+        return []
     if option.target is None:
         return [Described(str(key), _written(value), "", "") for key, value in config.items() if key != "defaults"]
     cls = find_class(option.target, f"{option.group}.{option.name}")

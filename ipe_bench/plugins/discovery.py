@@ -27,7 +27,10 @@ from ipe_bench.plugins.construct import register_package
 
 ENTRY_POINTS = "ipe_bench.plugins"
 ESTIMATOR_GROUPS = ("solver", "baseline")
-COMPONENT_GROUPS = ("measurement", "noise", "prior", *ESTIMATOR_GROUPS)
+COMPONENT_GROUPS = ("measurement", "noise", "prior", *ESTIMATOR_GROUPS, "execution")
+RECORD_GROUPS = ("statistic", "figure", "table", "section")
+"""What a report is made of."""
+CHECKED_GROUPS = (*COMPONENT_GROUPS, *RECORD_GROUPS, "experiment")
 _LARGEST = 100_000
 """No option has more values than this."""
 _TARGET_LINE = re.compile(r"^_target_:\s*['\"]?([\w.]+)", re.MULTILINE)
@@ -291,10 +294,10 @@ def options(group: str | None = None) -> list[Option]:
 
 
 def options_in(folder: Path) -> list[Option]:
-    """The components among the options of a plugin's folder, with those that they clash with.
+    """The options of a plugin's folder that can be checked, with those that they clash with.
 
     Raises:
-        UserError: there is no plugin in the folder, or no component.
+        UserError: there is no plugin in the folder, or nothing to check.
     """
     if not folder.is_dir():
         raise UserError(f"{folder}: there is no such folder")
@@ -304,11 +307,11 @@ def options_in(folder: Path) -> list[Option]:
     found = [
         option
         for option in options()
-        if option.group in COMPONENT_GROUPS
+        if option.group in CHECKED_GROUPS
         and any(path is not None and path.is_relative_to(home) for path in (option.path, option.rival))
     ]
     if not found:
-        raise UserError(f"{folder}: holds nothing to check; its conf has no option of {', '.join(COMPONENT_GROUPS)}")
+        raise UserError(f"{folder}: holds nothing to check; its conf has no option of {', '.join(CHECKED_GROUPS)}")
     return found
 
 

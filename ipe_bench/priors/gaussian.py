@@ -9,11 +9,12 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.basics.options import Component, NonNegative
+from ipe_bench.basics.options import NonNegative
+from ipe_bench.priors.base import Prior
 
 
 @dataclass(frozen=True)
-class GaussianPrior(Component):
+class GaussianPrior(Prior):
     """N(x0, (error_scale x unit)^2), independent parameters; `deviations` widens or narrows some of them.
 
     Estimators that use a prior are told this distribution.

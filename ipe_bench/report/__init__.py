@@ -45,15 +45,20 @@ def write_report(directories: Path | str | Sequence[Path | str], output: Path | 
     Raises:
         UserError: a directory does not exist.
     """
+    from ipe_bench.plugins.extensions import use_statistics
     from ipe_bench.statistics.analysis import begin
 
+    faults = use_statistics()
     directories = [directories] if isinstance(directories, Path | str) else list(directories)
-    return write_analysis(begin(directories), Path(directories[0] if output is None else output))
+    begun = begin(directories)
+    begun.collection.further += faults
+    return write_analysis(begun, Path(directories[0] if output is None else output))
 
 
 def write_analysis(begun: Begun, output: Path) -> ReportResult:
     """Finishes an analysis and writes the report on it under `output`."""
     from ipe_bench.basics.files import write_text
+    from ipe_bench.report import extensions
     from ipe_bench.report.certified_tables import attained_tables, certified_tables, without_certified
     from ipe_bench.report.figures import draw_all
     from ipe_bench.report.html import render_page
@@ -65,14 +70,18 @@ def write_analysis(begun: Begun, output: Path) -> ReportResult:
     write_text(summary_path, analysis.summary.to_csv(index=False))
     certified_shown, certified = certified_tables(analysis.collection)
     tables = [*certified_shown, *attained_tables(analysis.collection)[0], *all_tables(analysis)]
-    table_paths = write_tables(analysis, tables, output / "tables")
+    problems = analysis.collection.further
+    tables += extensions.tables(analysis, [table.name for table in tables], problems)
+    sections = extensions.sections(analysis, [table.name for table in tables], problems)
+    further = [table for section in sections for table in section.tables]
+    table_paths = write_tables(analysis, [*tables, *further], output / "tables")
     figures: list[Path] = []
     drawn = []
     pictured = without_certified(analysis)
-    for figure in draw_all(pictured, folder):
+    for figure in draw_all(pictured, folder, problems=problems):
         figures += figure.files
         drawn.append((figure.name, figure.title, figure.caption, figure.files[0].read_bytes()))
-    page = render_page(analysis, tables, drawn)
+    page = render_page(analysis, tables, drawn, sections)
     report = output / "report.html"
     write_text(report, page)
     return ReportResult(

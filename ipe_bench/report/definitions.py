@@ -4,7 +4,7 @@ stands in its record; here are the words that records are written in, and the co
 from __future__ import annotations
 
 from ipe_bench.statistics.comparisons import TIE
-from ipe_bench.statistics.records import SCORES, STATISTICS, Statistic
+from ipe_bench.statistics.records import SCORES, STATISTICS, Statistic, all_statistics
 
 
 def _definition(record: Statistic) -> tuple[str, str]:
@@ -59,3 +59,8 @@ DEFINITIONS: tuple[tuple[str, str], ...] = (
         "Share of trials in which it succeeds within a budget (Moré and Wild, SIAM Journal on Optimization 20, 2009).",
     ),
 )
+
+
+def definitions() -> tuple[tuple[str, str], ...]:
+    """The definitions, with those of the statistics that plugins add."""
+    return (*DEFINITIONS, *map(_definition, all_statistics()[len(STATISTICS) :]))

@@ -9,8 +9,9 @@ from importlib import resources
 from typing import Any
 
 from ipe_bench import __version__
-from ipe_bench.report.definitions import DEFINITIONS
+from ipe_bench.report.definitions import definitions
 from ipe_bench.report.headline import headline
+from ipe_bench.report.sections import Written
 from ipe_bench.report.tables import Table
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.collect import Run
@@ -29,8 +30,10 @@ _SECTIONS = (
 )
 
 
-def render_page(analysis: Analysis, tables: Sequence[Table], figures: Sequence[Shown]) -> str:
-    """The page as text."""
+def render_page(
+    analysis: Analysis, tables: Sequence[Table], figures: Sequence[Shown], written: Sequence[Written] = ()
+) -> str:
+    """The page as text; what plugins have written stands behind our tables."""
     from jinja2 import Environment, StrictUndefined
 
     source = resources.files("ipe_bench.report").joinpath("templates/report.html.j2").read_text(encoding="utf-8")
@@ -45,8 +48,12 @@ def render_page(analysis: Analysis, tables: Sequence[Table], figures: Sequence[S
         problems=[*collection.problems, *collection.stale],
         title=", ".join(d.resolve().name or str(d) for d in collection.directories),
         computed=collection.runs[-1].started[:16].replace("T", " ") if collection.runs else "",
-        sections=_SECTIONS if any(t.appendix for t in tables) else [s for s in _SECTIONS if s[0] != "theory"],
+        sections=_contents(tables, written),
         tables=[_table(t) for t in tables if not t.appendix],
+        written=[
+            {"name": s.name, "title": s.title, "parts": [p if isinstance(p, str) else _table(p) for p in s.parts]}
+            for s in written
+        ],
         theory=[_table(t) for t in tables if t.appendix],
         figures=[
             {"name": name, "title": title, "caption": caption, "data": base64.b64encode(png).decode()}
@@ -55,8 +62,14 @@ def render_page(analysis: Analysis, tables: Sequence[Table], figures: Sequence[S
         nothing_failed=analysis.endings.empty and not analysis.summary.empty,
         runs=[_run(run) for run in collection.runs[-MOST_RUNS:][::-1]],
         older_runs=max(0, len(collection.runs) - MOST_RUNS),
-        definitions=DEFINITIONS,
+        definitions=definitions(),
     )
+
+
+def _contents(tables: Sequence[Table], written: Sequence[Written]) -> list[tuple[str, str]]:
+    """The sections that there are, in order."""
+    own = [s for s in _SECTIONS if s[0] != "theory" or any(t.appendix for t in tables)]
+    return [*own[:2], *((f"section-{s.name}", s.title) for s in written), *own[2:]]
 
 
 def _table(table: Table) -> dict[str, Any]:

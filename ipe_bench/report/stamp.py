@@ -17,10 +17,21 @@ from typing import Any
 
 from ipe_bench.basics.errors import StorageError
 from ipe_bench.basics.files import write_text
+from ipe_bench.plugins.extensions import digest_of_all
 from ipe_bench.runs.store import Store
 
 NAME = ".report.json"
-_CODE = ("", "report", "report/figures", "report/templates", "statistics", "runs", "trials", "measurements/nist")
+_CODE = (
+    "",
+    "report",
+    "report/figures",
+    "report/templates",
+    "statistics",
+    "runs",
+    "trials",
+    "plugins",
+    "measurements/nist",
+)
 """Folders of the package that a report comes from; read as files, since to import them would take longer."""
 _LIBRARIES = ("matplotlib", "seaborn", "pandas", "numpy", "scipy", "jinja2", "pyarrow")
 
@@ -35,6 +46,7 @@ def made_from(directories: Sequence[Path], output: Path) -> str:
     for folder in _CODE:
         for known in _digests(sorted((package / folder).glob("*.*"))).values():
             digest.update(known.encode())
+    digest.update(digest_of_all().encode())
     for library in _LIBRARIES:
         digest.update(f"{library} {metadata.version(library)};".encode())
     for directory in directories:

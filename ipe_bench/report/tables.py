@@ -15,7 +15,7 @@ from ipe_bench.basics.files import write_text
 from ipe_bench.report.words import limits, p_value, percent, plain, reported, short, shower, shown
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.comparisons import ALPHA
-from ipe_bench.statistics.records import SCORES, STATISTICS, Kind, Statistic, Where
+from ipe_bench.statistics.records import SCORES, Kind, Statistic, Where, all_statistics
 from ipe_bench.statistics.summary import ALL
 
 
@@ -90,7 +90,7 @@ def all_tables(analysis: Analysis) -> list[Table]:
     return [t for t in tables if t is not None]
 
 
-def _head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
+def head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
     """The columns that tell rows apart: those settings that differ, and the error scale."""
     varying = [c for c in analysis.setting_columns if len(set(rows[c].astype(str))) > 1]
     head = [words(c, [plain(v) for v in rows[c]]) for c in varying]
@@ -102,8 +102,8 @@ def overview(analysis: Analysis) -> Table:
     rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
     scores = analysis.scores
     best = list(scores["leads"])
-    columns = [*_head(analysis, rows), words("estimator", rows["estimator"], best)]
-    columns += statistics("overview", STATISTICS, rows)
+    columns = [*head(analysis, rows), words("estimator", rows["estimator"], best)]
+    columns += statistics("overview", all_statistics(), rows)
     columns += statistics("overview", SCORES, scores)
     caption = (
         "Shares are of all trials. Efficiency is the bound that applies over the root mean square error: over the"
@@ -137,11 +137,11 @@ def costs(analysis: Analysis) -> Table:
     """What a trial costs, and what is needed to come close to the estimator's own limit."""
     rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
     scores = analysis.scores
-    columns = [*_head(analysis, rows), words("estimator", rows["estimator"])]
-    columns += statistics("costs", STATISTICS, rows)
+    columns = [*head(analysis, rows), words("estimator", rows["estimator"])]
+    columns += statistics("costs", all_statistics(), rows)
     columns += statistics("costs", SCORES, scores)
     names = [*analysis.setting_columns, "error_scale", "estimator"]
-    data = [rows[_stored("costs", STATISTICS)], scores[_stored("costs", SCORES)]]
+    data = [rows[_stored("costs", all_statistics())], scores[_stored("costs", SCORES)]]
     caption = (
         "Medians per trial over all trials. A Jacobian counts as many simulations as there are"
         " parameters. To 0.05 σ of limit: cost until all further iterates are within 0.05 standard deviations of the"
@@ -160,15 +160,15 @@ def covariances(analysis: Analysis) -> Table | None:
     rows = analysis.summary[(analysis.summary["parameter"] == ALL) & analysis.summary["eq_14"].notna()]
     if rows.empty:
         return None
-    columns = [*_head(analysis, rows), words("estimator", rows["estimator"])]
-    columns += statistics("covariances", STATISTICS, rows)
+    columns = [*head(analysis, rows), words("estimator", rows["estimator"])]
+    columns += statistics("covariances", all_statistics(), rows)
     caption = (
         "Standard deviations over the linear bound of eq. (5), root mean square over parameters, of the estimators that"
         " solve eq. (11), over solved trials. rmse is what happened (Monte Carlo); reported is the sandwich at the"
         " estimate, which holds to first order; eq. (14) takes the compensation error for independent of the noise,"
         " which it is not. A false root is a converged trial at another root than the truth leads to."
     )
-    data = rows[[*analysis.setting_columns, "error_scale", "estimator", *_stored("covariances", STATISTICS)]]
+    data = rows[[*analysis.setting_columns, "error_scale", "estimator", *_stored("covariances", all_statistics())]]
     return Table("covariances", "Covariance of the frozen root", caption, columns, data, appendix=True)
 
 
@@ -177,8 +177,8 @@ def theory(analysis: Analysis) -> Table | None:
     rows = analysis.summary[analysis.summary["predicted_rmse"].notna()]
     if rows.empty:
         return None
-    columns = [*_head(analysis, rows), words("estimator", rows["estimator"]), words("parameter", rows["parameter"])]
-    columns += statistics("theory", STATISTICS, rows)
+    columns = [*head(analysis, rows), words("estimator", rows["estimator"]), words("parameter", rows["parameter"])]
+    columns += statistics("theory", all_statistics(), rows)
     caption = (
         "Estimators that minimise the sum of squares, over solved trials, in the parameters' own units; all: over the"
         " linear bound, root mean square over parameters. By theory: without any noise drawn, from the slopes of the"
@@ -186,7 +186,7 @@ def theory(analysis: Analysis) -> Table | None:
         " say how far linear theory reaches: they are small below 0.3."
     )
     names = ["error_scale", "estimator", "parameter", "unit"]
-    data = rows[[*analysis.setting_columns, *names, *_stored("theory", STATISTICS)]]
+    data = rows[[*analysis.setting_columns, *names, *_stored("theory", all_statistics())]]
     return Table("theory", "Theory beside experiment", caption, columns, data, appendix=True)
 
 
@@ -196,7 +196,7 @@ def iterations(analysis: Analysis) -> Table | None:
     rows = scores[(scores["eq_18_trials"] > 0) | scores["eq_23_observed"].notna()]
     if rows.empty:
         return None
-    columns = [*_head(analysis, rows), words("estimator", rows["estimator"])]
+    columns = [*head(analysis, rows), words("estimator", rows["estimator"])]
     columns += statistics("iterations", SCORES, rows)
     caption = (
         "Over the first trials, whose iterates are stored. Eq. (18) bounds fixed-point iteration where K of eq. (15) is"
@@ -212,7 +212,7 @@ def contraction(analysis: Analysis) -> Table | None:
     rows = analysis.contraction
     if rows.empty:
         return None
-    columns = _head(analysis, rows)
+    columns = head(analysis, rows)
     for name, title in (("K", "K"), ("norm", "infinity norm"), ("radius", "spectral radius")):
         columns += [
             column(f"{title}, median", rows[f"contraction_{name}_median"], short),
@@ -234,7 +234,7 @@ def comparisons(analysis: Analysis) -> Table | None:
         return None
 
     columns = [
-        *_head(analysis, rows),
+        *head(analysis, rows),
         words("first", rows["first"]),
         words("second", rows["second"]),
         column("trials", rows["trials"], lambda v: f"{v:d}"),
@@ -311,9 +311,9 @@ def ranks(analysis: Analysis) -> Table | None:
 def parameters(analysis: Analysis) -> Table:
     """Every parameter in its own unit."""
     rows = analysis.summary[analysis.summary["parameter"] != ALL]
-    columns = [*_head(analysis, rows)]
+    columns = [*head(analysis, rows)]
     columns += [words(name, rows[name]) for name in ("estimator", "parameter", "unit")]
-    columns += statistics("parameters", STATISTICS, rows)
+    columns += statistics("parameters", all_statistics(), rows)
     caption = (
         "In each parameter's own unit. Bias, std, rmse, bounds and NEES are over solved trials; median and 95 % of the"
         " absolute error, and coverage, over all trials."
@@ -327,8 +327,8 @@ def calibration(analysis: Analysis) -> Table | None:
     rows = summary[summary["parameter"] == ALL]
     if rows.empty:
         return None
-    columns = [*_head(analysis, rows), words("estimator", rows["estimator"])]
-    columns += statistics("calibration", STATISTICS, rows)
+    columns = [*head(analysis, rows), words("estimator", rows["estimator"])]
+    columns += statistics("calibration", all_statistics(), rows)
     caption = (
         "Whether the truth lies under the Gaussian that an estimator reports as that Gaussian says: over converged"
         " trials with a covariance, for NEES and every parameter together, at 5 % for each row. p: that chance alone"
@@ -336,7 +336,7 @@ def calibration(analysis: Analysis) -> Table | None:
         " each parameter came to is in the table of parameters."
     )
     names = [*analysis.setting_columns, "error_scale", "estimator", "parameter"]
-    data = summary[[*names, *_stored("calibration", STATISTICS)]]
+    data = summary[[*names, *_stored("calibration", all_statistics())]]
     return Table("calibration", "Calibration of the reported covariance", caption, columns, data)
 
 
@@ -346,7 +346,7 @@ def endings(analysis: Analysis) -> Table | None:
     if rows.empty:
         return None
     columns = [
-        *_head(analysis, rows),
+        *head(analysis, rows),
         words("estimator", rows["estimator"]),
         words("status", rows["status"]),
         column("trials", rows["trials"], lambda v: f"{v:d}"),

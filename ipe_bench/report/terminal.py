@@ -9,8 +9,9 @@ from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench.report.words import compact, limits, plain, reported, shown
-from ipe_bench.statistics.records import STATISTICS, Statistic
-from ipe_bench.statistics.summary import ALL, COLUMNS
+from ipe_bench.statistics.records import Statistic, all_statistics
+from ipe_bench.statistics.summary import ALL
+from ipe_bench.statistics.summary import columns as summary_columns
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,8 +23,6 @@ WIDE = 120
 _SHORTEST_NAME = 12
 """Narrower than this, a name is not folded."""
 _PADDING = 2
-_SHOWN = tuple(record for record in STATISTICS if "terminal" in record.where)
-_NOT_SETTINGS = {*COLUMNS, "parameter", "unit", "estimator", "error_scale"}
 
 
 def render(
@@ -47,7 +46,8 @@ def render(
     rows: list[Any] = [row for row in listed if row["parameter"] == ALL and row["noise"] != "certified"]
     if not rows:
         return Group(*digits or [Text("nothing is stored yet")])
-    columns = dict.fromkeys(c for row in rows for c in row if c not in _NOT_SETTINGS and not c.startswith("estimator."))
+    known = {*summary_columns(), "parameter", "unit", "estimator", "error_scale"}
+    columns = dict.fromkeys(c for row in rows for c in row if c not in known and not c.startswith("estimator."))
     settings: dict[str, list[Any]] = {}
     for row in rows:
         named = {k: row.get(k) for k in columns}
@@ -83,7 +83,8 @@ def _setting(title: str, part: Sequence[Mapping[str, Any]], width: int) -> tuple
     # The number of trials stands in the title where it is the same for all.
     counts = list({row["trials"] for row in part})
     alike = len(counts) == 1
-    shown = [r for r in _SHOWN if not (alike and r.name == "trials") and reported(r, part)]
+    records = [record for record in all_statistics() if "terminal" in record.where]
+    shown = [r for r in records if not (alike and r.name == "trials") and reported(r, part)]
     headings = ["scale", "estimator", *_headings(shown)]
     sections = [
         [[f"{scale:g}" if i == 0 else "", str(row["estimator"]), *_cells(shown, row)] for i, row in enumerate(block)]

@@ -93,7 +93,7 @@ def p_value(p: float, least: float = 0.0) -> str:
 def shower(kind: Kind, where: Where) -> Callable[[Any], str]:
     """How values of that kind are written in that table."""
     return {
-        "count": lambda v: f"{int(v):d}",
+        "count": lambda v: f"{int(v):d}" if math.isfinite(v) else "-",
         "share": percent,
         "number": short,
         "physical": precise if where == "parameters" else short,

@@ -1,18 +1,21 @@
 """Every statistic, each in one record: what it is called and means, over which trials, how it is computed and shown.
 
 `summary.csv`, the appendix of the report, tables and the terminal are read from these lists: who adds a record adds it
-everywhere. How trials are read and how numbers are set in type is left to others.
+everywhere, and plugins add theirs by `add_statistics`. How trials are read and how numbers are set in type is left
+to others.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from scipy.special import chdtri, gammaincinv, ndtri
 
+from ipe_bench.basics.containment import contained
+from ipe_bench.basics.errors import UserError, place_of
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.calibration import overall_p, overall_words, shared_level
 from ipe_bench.statistics.consistency import clopper_pearson, mean_limits, verdict
@@ -979,3 +982,88 @@ SCORES: tuple[Statistic, ...] = (
     ),
 )
 """Further columns of `Analysis.scores`."""
+
+
+# Those of plugins ----------------------------------------------------------------------------------------------------
+
+_RESERVED = ("measurement", "noise", "prior", "error_scale", "seed", "estimator", "parameter", "unit", "scenario")
+_added: dict[str, Statistic] = {}
+
+
+def all_statistics() -> tuple[Statistic, ...]:
+    """The records of the summary: ours, and those that were added."""
+    return (*STATISTICS, *_added.values())
+
+
+def add_statistics(records: Sequence[Statistic]) -> list[str]:
+    """Has these computed and shown beside ours, in place of those that were added before.
+
+    Returns a line for each that cannot be.
+    """
+    _added.clear()
+    faults = []
+    for record in records:
+        if fault := fault_of(record):
+            faults.append(f"statistic={getattr(record, 'name', record)}: {fault}; it is left out")
+        else:
+            _added[record.name] = record
+    return faults
+
+
+def fault_of(record: Any) -> str:
+    """What keeps a record from being added to ours and the others; empty where nothing does."""
+    if not isinstance(record, Statistic):
+        return f"is a {type(record).__name__} and not a Statistic"
+    others = [other for other in _added.values() if other is not record]
+    taken = {"leads", *_RESERVED, *frame_columns([*STATISTICS, *SCORES, *others])}
+    for column in record.columns:
+        if not (column.isidentifier() and column.isascii()):
+            return f"{column!r} is not a name for a column; use letters, digits and underscores"
+        if column in taken:
+            return f"there is a column {column} already; choose another name"
+    if record.kind not in get_args(Kind):
+        return f"kind={record.kind}: choose from {', '.join(get_args(Kind))}"
+    if wrong := [where for where in record.where if where not in get_args(Where)]:
+        return f"where={wrong[0]}: choose from {', '.join(get_args(Where))}"
+    if record.given not in ("", "solved", "common"):
+        return f"given={record.given}: choose solved, common or nothing"
+    return ""
+
+
+def summary_columns_of(sample: Sample) -> list[dict[str, Any]]:
+    """A row per parameter and one over all, of every statistic of the summary.
+
+    One that was added and raises, or gives what cannot be shown, is missing in these rows, and named in the
+    collection's problems.
+    """
+    rows = rows_of(STATISTICS, sample)
+    for record in _added.values():
+        try:
+            columns = columns_of_added(record, sample)
+        except UserError as error:
+            line = f"statistic={record.name}: {error}; it is missing where that is so"
+            sample.collection.further.append(line)
+            columns = {name: ["-" if record.kind == "word" else np.nan] * len(rows) for name in record.columns}
+        for i, row in enumerate(rows):
+            row |= {name: values[i] for name, values in columns.items()}
+    return rows
+
+
+def columns_of_added(record: Statistic, sample: Sample) -> dict[str, list[Any]]:
+    """The columns of a record of somebody else, computed where it can change nothing.
+
+    Raises:
+        UserError: it raises, or gives something else than a value per parameter and one over all.
+    """
+    try:
+        with contained():
+            columns = record.columns_of(sample.protected())
+    except Exception as error:
+        raise UserError(place_of(error)) from error
+    for name, values in columns.items():
+        if len(values) != sample.n + 1:
+            raise UserError(f"{name}: has {len(values) - 1} values for {sample.n} parameters")
+        for value in values:
+            if not isinstance(value, str if record.kind == "word" else int | float | np.number):
+                raise UserError(f"{name}: a value is a {type(value).__name__}; return a float, or NaN for none")
+    return columns

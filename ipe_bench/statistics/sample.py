@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -139,6 +139,22 @@ class Sample:
             shared=shared,
         )
 
+    def protected(self) -> Sample:
+        """The same in arrays that cannot be written into, for code that is not ours."""
+
+        def views(arrays: Mapping[str, Array]) -> dict[str, Array]:
+            return {name: _read_only(array) for name, array in arrays.items()}
+
+        arrays = ("ids", "error", "deviation", "crlb", "bayes", "linear_error", "van_trees")
+        return replace(
+            self,
+            **views({name: getattr(self, name) for name in arrays}),
+            theory=views(self.theory),
+            truth=views(self.truth),
+            scalars=views(self.scalars),
+            shared=Shared(_read_only(self.shared.present), _read_only(self.shared.solved)),
+        )
+
     def __len__(self) -> int:
         return len(self.ids)
 
@@ -258,6 +274,12 @@ class Sample:
         together = np.mean(np.where(self.solved[:, None], self.normalised, 0.0) ** 2, axis=1)
         each = np.where(self.solved[:, None], self.error, 0.0) ** 2
         return rms_interval(np.column_stack([each, together]), self.solved)
+
+
+def _read_only(array: Array) -> Array:
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def root_mean(values: Array, used: Array) -> Array:

@@ -1,5 +1,5 @@
 """`summary.csv`: a row per scenario, estimator and parameter, plus the parameter `all`; its columns are those of
-`records.STATISTICS`."""
+`records.all_statistics()`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench.statistics.collect import ALWAYS_COLUMNS, Collection, collect
-from ipe_bench.statistics.records import STATISTICS, frame_columns, rows_of
+from ipe_bench.statistics.records import STATISTICS, all_statistics, frame_columns, summary_columns_of
 from ipe_bench.statistics.sample import Sample, Shared
 
 if TYPE_CHECKING:
@@ -17,6 +17,12 @@ if TYPE_CHECKING:
 ALL = "all"
 """The row over all parameters."""
 COLUMNS = frame_columns(STATISTICS)
+"""Those of our own statistics."""
+
+
+def columns() -> tuple[str, ...]:
+    """The columns of the statistics."""
+    return frame_columns(all_statistics())
 
 
 def summarize(directories: Sequence[Path | str]) -> pd.DataFrame:
@@ -47,19 +53,19 @@ def summary_rows(sample: Sample) -> list[dict[str, Any]]:
     head = dict(group.columns) | {"estimator": group.estimator} | dict(group.options)
     labels = [{"parameter": p["name"], "unit": p["unit"]} for p in sample.parameters]
     labels.append({"parameter": ALL, "unit": "linear bound"})
-    return [head | label | row for label, row in zip(labels, rows_of(STATISTICS, sample), strict=True)]
+    return [head | label | row for label, row in zip(labels, summary_columns_of(sample), strict=True)]
 
 
 def to_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Rows as a table, columns in the order that readers know."""
     import pandas as pd
 
-    frame = pd.DataFrame(list(rows))
+    frame, known = pd.DataFrame(list(rows)), columns()
     if frame.empty:
-        return pd.DataFrame(columns=[*ALWAYS_COLUMNS, "parameter", "unit", *COLUMNS])
-    keys = [c for c in frame.columns if c not in (*COLUMNS, "parameter", "unit")]
+        return pd.DataFrame(columns=[*ALWAYS_COLUMNS, "parameter", "unit", *known])
+    keys = [c for c in frame.columns if c not in (*known, "parameter", "unit")]
     first = [c for c in ("measurement", "noise") if c in keys]
     last = ["error_scale", "estimator"]
     middle = [c for c in keys if c not in (*first, *last) and not c.startswith("estimator.")]
     options = [c for c in keys if c.startswith("estimator.")]
-    return frame[[*first, *middle, *last, *options, "parameter", "unit", *COLUMNS]]
+    return frame[[*first, *middle, *last, *options, "parameter", "unit", *known]]

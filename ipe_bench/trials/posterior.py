@@ -117,8 +117,10 @@ def reference(
     """The posterior of one trial of a scenario beside its estimators.
 
     Raises:
-        UserError: the scenario has no prior, or there are too few particles.
+        UserError: the scenario has no prior or one that is not normal, or there are too few particles.
     """
+    if not scenario.prior.normal:
+        raise UserError(f"prior={scenario.prior.name}: is not normal, as the posterior here takes it to be")
     drawn = scenario.draw(trial, trial + 1)
     sampled = sample_posterior(scenario.problem, drawn.z[0], particles=particles, seed=trial)
     estimates = {label: estimate_safely(e, scenario.problem, drawn.z, history=False) for label, e in estimators.items()}

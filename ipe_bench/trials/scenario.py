@@ -13,7 +13,7 @@ from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem, recorded_problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.own import ModelNoise, resolved
-from ipe_bench.priors.gaussian import GaussianPrior
+from ipe_bench.priors import GaussianPrior, Prior
 
 _SEEDS = 1 << 23
 """Seeds there are: seed and trial share one 64-bit number where trials are matched."""
@@ -45,7 +45,7 @@ class Scenario:
     measurement: Measurement
     noise: Noise = field(default_factory=ModelNoise)
     """The model's own unless another is given."""
-    prior: GaussianPrior = field(default_factory=GaussianPrior)
+    prior: Prior = field(default_factory=GaussianPrior)
     error_scale: float = 1.0
     """Times the prior's deviations."""
     seed: int = 0

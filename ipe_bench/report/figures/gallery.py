@@ -21,8 +21,10 @@ from importlib import import_module, metadata, resources
 from pathlib import Path
 from typing import Any, Literal
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import make_folder, write_text
-from ipe_bench.report.figures.drawing import FORMATS, Figure
+from ipe_bench.plugins.extensions import code_digest
+from ipe_bench.report.figures.drawing import FORMATS, Drawing, Figure
 from ipe_bench.report.figures.views import View, views
 from ipe_bench.report.style import house_style
 from ipe_bench.statistics.analysis import Analysis
@@ -65,9 +67,11 @@ class Task:
     """One kind of figure of one view: what is drawn, or kept, as a whole."""
 
     figure: str
-    """The module's name."""
+    """The module's name; of a plugin's figure, its dotted name."""
     view: View
     digest: str
+    plugin: str = ""
+    """The option that a plugin's figure is, such as figure=NAME."""
 
 
 def draw_all(
@@ -77,14 +81,17 @@ def draw_all(
     which: Which = "all",
     formats: Sequence[str] = FORMATS,
     processes: int | None = None,
+    problems: list[str] | None = None,
 ) -> list[Drawn]:
     """The figures that the data allow, in the order of the report, as files in the folder.
 
     `which` is all, main (the few that answer the question) or none. A figure is drawn only where the folder does not
     hold it already in these formats; with `processes` (by default 2 where there are so many CPUs) two draw at once.
     What an earlier report left in the folder and is still right stays, whatever is asked for; what is not is removed.
+    A figure of a plugin that cannot be drawn is left out, with a line added to the `problems`.
     """
-    tasks = {task.digest: task for task in _tasks(analysis)}
+    problems = [] if problems is None else problems
+    tasks = {task.digest: task for task in _tasks(analysis, problems)}
     wanted = [d for d, task in tasks.items() if which == "all" or (which == "main" and _figure(task.figure).main)]
     old = _read_index(folder)
     missing = [d for d in wanted if not _is_there(old.get(d), folder, formats)]
@@ -95,33 +102,58 @@ def draw_all(
         # What was drawn in another format before is drawn in that one too, so that all formats show the same.
         lists = {d: [kind for kind in FORMATS if kind in formats or kind in known[d]] for d in missing}
         jobs = [(tasks[d], lists[d]) for d in missing]
-        drawn = _draw(jobs, folder, processes or min(2, os.cpu_count() or 1))
-        entries |= dict(zip(missing, drawn, strict=True))
+        drawn = dict(zip(missing, _draw(jobs, folder, processes or min(2, os.cpu_count() or 1)), strict=True))
+        problems += [f"{tasks[d].plugin}: {made}; it is left out" for d, made in drawn.items() if isinstance(made, str)]
+        entries |= {d: made for d, made in drawn.items() if not isinstance(made, str)}
+    _settle_names(tasks, entries, folder, problems)
     _tidy(folder, old, entries)
     return [
         Drawn(e.name, e.title, e.caption, tuple(folder / f"{e.name}.{kind}" for kind in formats))
         for d in wanted
-        for e in entries[d]
+        for e in entries.get(d, ())
     ]
 
 
-def _tasks(analysis: Analysis) -> Iterator[Task]:
-    """Every kind of figure of every setting, or of all of them together."""
+def _settle_names(tasks: dict[str, Task], entries: dict[str, list[Entry]], folder: Path, problems: list[str]) -> None:
+    """Leaves out figures of plugins that have the file names of others, whose files are drawn again."""
+    taken: set[str] = set()
+    spoiled: set[str] = set()
+    for digest in [d for d in tasks if d in entries]:
+        names = {entry.name for entry in entries[digest]}
+        if tasks[digest].plugin and names & taken:
+            name = min(names & taken)
+            problems.append(f"{tasks[digest].plugin}: there is a figure {name} already; it is left out")
+            spoiled |= names
+            del entries[digest]
+        taken |= names
+    for digest in [d for d in entries if any(entry.name in spoiled for entry in entries[d])]:
+        made = draw_task(tasks[digest], folder, sorted({kind for e in entries[digest] for kind in e.digests}))
+        if not isinstance(made, str):
+            entries[digest] = made
+
+
+def _tasks(analysis: Analysis, problems: list[str]) -> Iterator[Task]:
+    """Every kind of figure of every setting, or of all of them together; ours first."""
+    from ipe_bench.report import extensions
     from ipe_bench.report.figures import FIGURES
 
     if not analysis.collection.groups and analysis.attained.empty:
         return
     parts, whole = views(analysis)
-    for name in FIGURES:
-        figure = _figure(name)
+    kinds = [(name, _figure(name), "", "") for name in FIGURES]
+    for option, figure in extensions.figures(problems):
+        kinds.append((str(option.target), figure, f"figure={option.name}", code_digest(option)))
+    for name, figure, plugin, code in kinds:
         for view in [whole] if figure.together else parts:
             seen = view.only(figure.frames)
-            digest = hashlib.sha256(f"{name} {_drawn_with()} {seen.digest()}".encode())
-            yield Task(name, seen, digest.hexdigest())
+            digest = hashlib.sha256(f"{name} {plugin}{code} {_drawn_with()} {seen.digest()}".encode())
+            yield Task(name, seen, digest.hexdigest(), plugin)
 
 
 def _figure(name: str) -> Figure:
-    return import_module(f"ipe_bench.report.figures.{name}").FIGURE
+    """The figure of one of our modules, or that of a plugin, whose folder is importable in this process."""
+    module, _, attribute = name.rpartition(".")
+    return getattr(import_module(module or f"ipe_bench.report.figures.{name}"), attribute if module else "FIGURE")
 
 
 @cache
@@ -137,21 +169,30 @@ def _drawn_with() -> str:
     return digest.hexdigest()
 
 
-def draw_task(task: Task, folder: Path, formats: Sequence[str]) -> list[Entry]:
-    """Draws a task's figures into the folder."""
-    entries = []
+def draw_task(task: Task, folder: Path, formats: Sequence[str]) -> list[Entry] | str:
+    """Draws a task's figures into the folder; returns why it could not, where they are a plugin's."""
+    from ipe_bench.report import extensions
+
     with house_style():
-        for drawing in _figure(task.figure).draw(task.view):
-            files = drawing.save(folder, formats)
-            digests = {kind: _digest_of(path) for kind, path in zip(formats, files, strict=True)}
-            entries.append(Entry(drawing.name, drawing.title, drawing.caption, digests))
-    return entries
+        if not task.plugin:
+            return [_saved(drawing, folder, formats) for drawing in _figure(task.figure).draw(task.view)]
+        try:
+            drawings = extensions.drawings(_figure(task.figure), task.view)
+            return extensions.guarded(lambda: [_saved(drawing, folder, formats) for drawing in drawings])
+        except UserError as error:
+            return str(error)
+
+
+def _saved(drawing: Drawing, folder: Path, formats: Sequence[str]) -> Entry:
+    files = drawing.save(folder, formats)
+    digests = {kind: _digest_of(path) for kind, path in zip(formats, files, strict=True)}
+    return Entry(drawing.name, str(drawing.title), str(drawing.caption), digests)
 
 
 Job = tuple[Task, list[str]]
 
 
-def _draw(jobs: Sequence[Job], folder: Path, processes: int) -> list[list[Entry]]:
+def _draw(jobs: Sequence[Job], folder: Path, processes: int) -> list[list[Entry] | str]:
     """The jobs' entries; a second process takes jobs from the end while this one takes them from the beginning."""
     with tempfile.TemporaryDirectory(prefix="ipe-bench-figures-") as place:
         desk = Path(place)
@@ -190,7 +231,7 @@ def claim(desk: Path, job: int) -> bool:
     return True
 
 
-def _reported(desk: Path) -> dict[int, list[Entry]]:
+def _reported(desk: Path) -> dict[int, list[Entry] | str]:
     return {int(path.name.removeprefix("done-")): pickle.loads(path.read_bytes()) for path in desk.glob("done-*")}
 
 

@@ -87,6 +87,11 @@ class View:
         frames = {name: self.frames[name] for name in names}
         return replace(self, frames=frames, parts=tuple(part.only(names) for part in self.parts))
 
+    def copied(self) -> View:
+        """The same with frames that may be written into."""
+        frames = {name: frame.copy() for name, frame in self.frames.items()}
+        return replace(self, frames=frames, parts=tuple(part.copied() for part in self.parts))
+
     def digest(self) -> str:
         """Changes with anything that a figure of this view can show."""
         digest = hashlib.sha256()

@@ -1,0 +1,77 @@
+"""What plugins add to a report: statistics, figures, tables and sections, each a record that a config file names.
+
+The file `conf/figure/NAME.yaml` has one key, `_target_`, the dotted name of the record in the plugin's package. What
+a record of each kind is, the rooms say that compute and show it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.plugins.construct import find_object
+from ipe_bench.plugins.discovery import RECORD_GROUPS, Option, options
+from ipe_bench.runs.provenance import TARGET, package_version
+from ipe_bench.statistics.records import add_statistics
+
+
+def find_record(option: Option) -> Any:
+    """The record that an option names.
+
+    Raises:
+        UserError: the file cannot be read or says something else, or the record is not there.
+    """
+    where = f"{option.group}={option.name}"
+    if option.fault is not None:
+        raise UserError(f"{where}: {option.fault}")
+    config = option.config
+    if not isinstance(config, Mapping) or set(config) != {TARGET}:
+        raise UserError(f"{where}: {option.path}: has other keys than {TARGET}, which names a {option.group}")
+    if not option.name.isidentifier():
+        raise UserError(f"{where}: {option.path}: is not a name; use letters, digits and underscores")
+    record = find_object(config[TARGET], where)
+    if option.group == "statistic" and getattr(record, "name", option.name) != option.name:
+        raise UserError(f"{where}: {config[TARGET]} is called {record.name}; give file and record one name")
+    return record
+
+
+def records(group: str, problems: list[str]) -> Iterator[tuple[Option, Any]]:
+    """The records of a group that can be found; a line is added to the problems for every other."""
+    for option in options(group):
+        try:
+            yield option, find_record(option)
+        except UserError as error:
+            problems.append(f"{error}; it is left out")
+
+
+def use_statistics() -> list[str]:
+    """Has the statistics of all plugins computed beside ours; returns a line for each that cannot be."""
+    problems: list[str] = []
+    found = [record for _, record in records("statistic", problems)]
+    return problems + add_statistics(found)
+
+
+def code_digest(option: Option) -> str:
+    """Changes with any file of the package that an option belongs to, and with its version."""
+    package = option.source.conf.parent
+    digest = hashlib.sha256(f"{option.target} {package_version(package.name)};".encode())
+    for path in sorted(package.rglob("*")):
+        if path.is_file() and "__pycache__" not in path.parts:
+            digest.update(f"{path.relative_to(package)} {_digest_of(path)};".encode())
+    return digest.hexdigest()
+
+
+def digest_of_all() -> str:
+    """Changes with the code of any plugin that adds to reports."""
+    chosen = [option for group in RECORD_GROUPS for option in options(group)]
+    return hashlib.sha256("".join(f"{o.group}={o.name} {code_digest(o)};" for o in chosen).encode()).hexdigest()
+
+
+def _digest_of(path: Path) -> str:
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return ""

@@ -1,0 +1,172 @@
+"""Figures, tables and sections of plugins: found, made where they change nothing of ours, and named where they fail.
+
+A report is whole without them: what raises, or gives something that cannot be shown, is left out with a line that says
+so.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable, Iterable
+from typing import Any, TypeVar
+
+import pandas as pd
+
+from ipe_bench.basics.containment import contained
+from ipe_bench.basics.errors import StorageError, UserError, place_of
+from ipe_bench.plugins.discovery import Option, blame
+from ipe_bench.plugins.extensions import records
+from ipe_bench.report.figures.drawing import Drawing, Figure
+from ipe_bench.report.figures.views import FRAMES, View
+from ipe_bench.report.sections import Section, Written
+from ipe_bench.report.tables import Table, latex, markdown
+from ipe_bench.statistics.analysis import Analysis
+
+T = TypeVar("T")
+_FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
+
+
+def guarded(make: Callable[[], T]) -> T:
+    """What somebody else's code makes.
+
+    Raises:
+        UserError: it raises, in a line that says where.
+    """
+    try:
+        with contained():
+            return make()
+    except (UserError, StorageError):
+        raise
+    except (Exception, SystemExit) as error:
+        raise UserError(blame(error) or place_of(error)) from error
+
+
+# Figures
+
+
+def figures(problems: list[str]) -> list[tuple[Option, Figure]]:
+    """The figures of plugins; a line is added to the problems for every one that is none."""
+    found = []
+    for option, record in records("figure", problems):
+        try:
+            found.append((option, checked_figure(record)))
+        except UserError as error:
+            problems.append(f"figure={option.name}: {error}; it is left out")
+    return found
+
+
+def checked_figure(record: Any) -> Figure:
+    """The record, where it is a figure that can be drawn from what there is.
+
+    Raises:
+        UserError: it is not.
+    """
+    if not isinstance(record, Figure):
+        raise UserError(f"is a {type(record).__name__} and not a Figure")
+    frames = (record.frames,) if isinstance(record.frames, str) else record.frames
+    if isinstance(record.frames, str) or not set(frames) <= set(FRAMES):
+        raise UserError(f"frames={','.join(frames)}: name some of {', '.join(FRAMES)}, in a tuple")
+    return record
+
+
+def drawings(figure: Figure, view: View) -> list[Drawing]:
+    """What a plugin's figure draws of a view, of which it gets a copy.
+
+    Raises:
+        UserError: it raises, or gives something else than drawings under names of their own.
+    """
+    drawn = guarded(lambda: list(figure.draw(view.copied())))
+    for drawing in drawn:
+        if not isinstance(drawing, Drawing):
+            raise UserError(f"gives a {type(drawing).__name__} and not a Drawing")
+        require_file_name(drawing.name)
+    if len({drawing.name for drawing in drawn}) < len(drawn):
+        raise UserError("two drawings have one name; end each in view.suffix")
+    return drawn
+
+
+def require_file_name(name: Any) -> None:
+    if not (isinstance(name, str) and _FILE_NAME.fullmatch(name)):
+        raise UserError(f"{name!r} is not a name for a file; use letters, digits and underscores")
+
+
+# Tables and sections
+
+
+def tables(analysis: Analysis, taken: Iterable[str], problems: list[str]) -> list[Table]:
+    """The tables of plugins, under other names than those that are taken."""
+    names, found = set(taken), []
+    for option, record in records("table", problems) if not analysis.summary.empty else ():
+        try:
+            table = made_table(record, analysis, names)
+        except UserError as error:
+            problems.append(f"table={option.name}: {error}; it is left out")
+            continue
+        if table is not None:
+            names.add(table.name)
+            found.append(table)
+    return found
+
+
+def made_table(record: Any, analysis: Analysis, taken: Iterable[str] = ()) -> Table | None:
+    """What a plugin's function makes of a copy of the analysis; None where there is nothing to show.
+
+    Raises:
+        UserError: it raises, or gives something else than a table under a name of its own.
+    """
+    if not callable(record):
+        raise UserError(f"is a {type(record).__name__} and not a function of the analysis")
+    table: Any = guarded(lambda: record(copied(analysis)))
+    if table is not None:
+        _require_table(table, taken)
+    return table
+
+
+def _require_table(table: Any, taken: Iterable[str]) -> None:
+    if not isinstance(table, Table):
+        raise UserError(f"gives a {type(table).__name__} and not a Table")
+    require_file_name(table.name)
+    if table.name in taken or table.name == "profiles":
+        raise UserError(f"there is a table {table.name} already; choose another name")
+    if not table.columns:
+        raise UserError(f"the table {table.name} has no columns; return None where there is nothing to show")
+    guarded(lambda: (markdown(table), latex(table), table.data.to_csv(index=False)))
+
+
+def sections(analysis: Analysis, taken: Iterable[str], problems: list[str]) -> list[Written]:
+    """The sections of plugins that have something to say."""
+    names, found = set(taken), []
+    for option, record in records("section", problems) if not analysis.summary.empty else ():
+        try:
+            written = made_section(option.name, record, analysis, names)
+        except UserError as error:
+            problems.append(f"section={option.name}: {error}; it is left out")
+            continue
+        names |= {table.name for table in written.tables}
+        if written.parts:
+            found.append(written)
+    return found
+
+
+def made_section(name: str, record: Any, analysis: Analysis, taken: Iterable[str] = ()) -> Written:
+    """What a plugin's section says of a copy of the analysis.
+
+    Raises:
+        UserError: it raises, or gives something else than texts and tables.
+    """
+    if not isinstance(record, Section):
+        raise UserError(f"is a {type(record).__name__} and not a Section")
+    parts = guarded(lambda: list(record.write(copied(analysis))))
+    names = set(taken)
+    for part in parts:
+        if not isinstance(part, str):
+            _require_table(part, names)
+            names.add(part.name)
+    return Written(name, str(record.title), parts)
+
+
+def copied(analysis: Analysis) -> Analysis:
+    """The analysis with frames of its own."""
+    held = {f.name: getattr(analysis, f.name) for f in dataclasses.fields(analysis)}
+    return dataclasses.replace(analysis, **{k: v.copy() for k, v in held.items() if isinstance(v, pd.DataFrame)})
