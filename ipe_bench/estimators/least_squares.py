@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array, Covariance, Mask, cholesky, finite, inverse, multiply, solve
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
@@ -31,6 +32,10 @@ _STATIONARY = 1e-3
 _WELL_CONDITIONED = 1e3
 """The condition of J, its columns scaled, up to which J' J has enough of its digits: nine or more."""
 
+_NEAR = 0.03
+"""Steps still to go of fewer deviations are computed from exact Jacobians: a coarse one leaves the gradient about a
+hundredth of a deviation from zero."""
+
 
 class Residuals(Protocol):
     """What the methods of this room minimise the squares of, for the trials of a batch."""
@@ -41,6 +46,16 @@ class Residuals(Protocol):
 
     def jacobian(self, x: Array, /) -> Array:
         """Their derivative (trials, m, n)."""
+        ...
+
+    def coarse_jacobian(self, x: Array, /) -> Array:
+        """The same near enough for steps."""
+        ...
+
+    @property
+    def exact_within(self) -> float:
+        """Where the Gauss-Newton step still to go is shorter than so many deviations, Jacobians are exact, elsewhere
+        coarse; infinite: they are exact everywhere; 0: coarse, and good enough to end with."""
         ...
 
     def subset(self, kept: Mask, /) -> Residuals:
@@ -59,6 +74,7 @@ class Objective:
     x0: Array
     """The centre of the prior: (n,), or each trial's own (trials, n)."""
     prior_deviation: Array | None = None
+    exact_within: float = np.inf
 
     @classmethod
     def of(cls, problem: Problem, z: Array, *, prior: bool, inflation: float = 1.0) -> Objective:
@@ -80,11 +96,23 @@ class Objective:
 
     def jacobian(self, x: Array) -> Array:
         """The derivative of the whitened residuals (trials, m, n) or (trials, m + n, n)."""
-        J = self.R.whiten_jacobian(self.model.jacobian(x, self.rows))
+        return self._jacobian(x, coarse=False)
+
+    def coarse_jacobian(self, x: Array) -> Array:
+        """The same near enough for steps, from `Measurement.coarse_jacobian`."""
+        return self._jacobian(x, coarse=True)
+
+    def _jacobian(self, x: Array, *, coarse: bool) -> Array:
+        J = self.R.whiten_jacobian(self.model.jacobian(x, self.rows, coarse=coarse))
         if self.prior_deviation is None:
             return J
         prior = np.broadcast_to(np.diag(1.0 / self.prior_deviation), (len(x), x.shape[1], x.shape[1]))
         return np.concatenate([J, prior], axis=1)
+
+    def coarsened(self, exact_within: float) -> Objective:
+        """The same with coarse Jacobians where steps are longer, if the model has any that are cheaper."""
+        cheaper = self.model.coarse_share < 1.0
+        return dataclasses.replace(self, exact_within=exact_within if cheaper else np.inf)
 
     def subset(self, kept: Mask) -> Objective:
         x0 = self.x0[kept] if self.x0.ndim == 2 else self.x0
@@ -182,6 +210,24 @@ def _by_orthogonal_factor(J: Array, r: Array) -> tuple[Array, Array, Array, Arra
     return Q[:, :m], U, inverse_U, gradient
 
 
+def slope_at(objective: Residuals, x: Array, r: Array, exact: Mask, *, keep_Q: bool = False) -> tuple[Slope, Mask]:
+    """The slope at x, where the residuals are r, and where it is that of an exact Jacobian: where `exact` (trials,)
+    says so, and where a coarse one has not full rank."""
+    if exact.all():
+        return Slope.of(objective.jacobian(x), r, keep_Q=keep_Q), exact
+    if exact.any():
+        coarse, believed = slope_at(objective.subset(~exact), x[~exact], r[~exact], exact[~exact], keep_Q=keep_Q)
+        near = Slope.of(objective.subset(exact).jacobian(x[exact]), r[exact], keep_Q=keep_Q)
+        both = take(near, np.zeros(len(x), np.intp))
+        return put(put(both, exact, near), ~exact, coarse), put(exact, ~exact, believed)
+    slope = Slope.of(objective.coarse_jacobian(x), r, keep_Q=keep_Q)
+    lost = ~np.isfinite(slope.size)
+    if lost.any():
+        again = Slope.of(objective.subset(lost).jacobian(x[lost]), r[lost], keep_Q=keep_Q)
+        slope = put(slope, lost, again)
+    return slope, lost
+
+
 @dataclass(frozen=True)
 class Descent:
     """What these methods carry from step to step; every field has the trials in front."""
@@ -204,18 +250,27 @@ class Descent:
     """The objective when it last decreased visibly,"""
     idle: NDArray[np.int64]
     """and how many steps ago."""
+    exact: Mask
+    """Where the slope is that of an exact Jacobian,"""
+    near: Mask
+    """and where it is from now on, since little is left to go."""
 
     @classmethod
     def at(cls, objective: Residuals, x: Array, lam: float = 0.0, *, keep_Q: bool = False) -> Descent:
         """The state at the start."""
         r = objective.residual(x)
-        slope = Slope.of(objective.jacobian(x), r, keep_Q=keep_Q)
         trials = len(x)
+        near = np.full(trials, np.isinf(objective.exact_within))
+        slope, exact = slope_at(objective, x, r, near, keep_Q=keep_Q)
         scale = np.where(slope.columns > 0, slope.columns, 1.0)
         far, regular = np.full(trials, np.inf), np.isfinite(slope.size)
         cost, idle = squared(r), np.zeros(trials, np.int64)
         damping, growth = np.full(trials, lam), np.full(trials, 2.0)
-        return cls(x, r, cost, slope, far, damping, growth, scale, regular, cost, idle)
+        return cls(x, r, cost, slope, far, damping, growth, scale, regular, cost, idle, exact, near)
+
+    def nearly(self, objective: Residuals) -> Mask:
+        """Where the next Jacobian is to be exact, and all after it."""
+        return self.near | (self.slope.size < objective.exact_within)
 
     def reach(self, step: Array) -> Array:
         """The length (trials,) of a step in standard deviations of the readings that it moves."""
@@ -236,13 +291,16 @@ class Descent:
         """Where J has not full rank (trials,)."""
         return ~np.isfinite(self.slope.size)
 
-    def standing(self, stuck: Mask) -> Standing:
-        """The Gauss-Newton step still to go says how far the gradient is from zero; the cost says what diverges."""
+    def standing(self, objective: Residuals, stuck: Mask) -> Standing:
+        """The Gauss-Newton step still to go says how far the gradient is from zero, where J is good enough to end with;
+        the cost says what diverges."""
         known = np.isfinite(self.cost) & finite(self.slope.gradient)
         level = np.where(known, np.sqrt(self.cost), np.nan)
         ending = np.where(self.rankless, Status.SINGULAR, Status.STALLED)
         size = np.where(self.rankless & self.regular, self.slope.stationary, self.slope.size)
         size = np.where(self.settled, 0.0, size)
+        if objective.exact_within > 0:
+            size = np.where(self.exact, size, np.inf)
         return Standing(size, level, self.moved, stuck, ending)
 
 
@@ -290,8 +348,11 @@ def minimize(
     """Minimises the objective from x (trials, n) by Gauss-Newton or Levenberg-Marquardt.
 
     Converged is where the Gauss-Newton step, which is the gradient in whitened units, is at most `tolerance` standard
-    deviations of the local bound in every parameter. An iteration is a step tried, taken or not.
+    deviations of the local bound in every parameter. An iteration is a step tried, taken or not. Jacobians are coarse
+    on the way, where the model has cheaper ones, and exact at the end.
     """
+    if np.isinf(objective.exact_within):
+        objective = objective.coarsened(_NEAR)
     limits: dict[str, Any] = {"tolerance": tolerance, "max_iterations": max_iterations, "budget": budget}
     return reached(objective, iterate(objective, method, x, history=history, **limits))
 
@@ -299,11 +360,22 @@ def minimize(
 def reached(objective: Objective, ended: Ended[Any]) -> Minima:
     """What is known of the objective where an iteration of it, by states like `Descent`, ended."""
     # U^-1 U^-T: inverting U'U would lose twice the digits, and with them the sign of a variance.
-    inverse_U, _ = inverse(ended.state.slope.U)
+    inverse_U, _ = inverse(_exact_slope(objective, ended.state).U)
     covariance = np.matmul(inverse_U, inverse_U.swapaxes(1, 2))
     r = ended.state.r[:, : objective.readings]
     bulk = np.median(np.abs(r), axis=1)
     return Minima(ended.x, ended.status, ended.iterations, ended.history, covariance, squared(r), bulk)
+
+
+def _exact_slope(objective: Objective, state: Descent) -> Slope:
+    """The slope where an iteration has ended; for the report alone where it ended on a coarse one, so not counted."""
+    coarse = ~state.exact & finite(state.x)
+    if objective.exact_within == 0 or not coarse.any():
+        return state.slope
+    tally = Tally.zeros(len(objective.model.tally.simulations))
+    report = dataclasses.replace(objective, model=dataclasses.replace(objective.model, tally=tally)).subset(coarse)
+    keep_Q = state.slope.Q is not None
+    return put(state.slope, coarse, Slope.of(report.jacobian(state.x[coarse]), state.r[coarse], keep_Q=keep_Q))
 
 
 def squared(r: Array) -> Array:
