@@ -31,7 +31,6 @@ from ipe_bench.runs.provenance import describe, fingerprint
 from ipe_bench.runs.results import Results, require_results
 from ipe_bench.runs.schedule import RunLog, Watcher, perform, plan, work_through
 from ipe_bench.runs.store import TRUTH, Cell, Store
-from ipe_bench.statistics.sequences import Precision, Reach, next_trials
 from ipe_bench.trials.bounds import linear_bound
 from ipe_bench.trials.scenario import Scenario
 
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     from ipe_bench.plugins.conformance import Finding
     from ipe_bench.report import ReportResult
     from ipe_bench.report.answer import Answer
+    from ipe_bench.statistics.sequences import Precision, Reach
     from ipe_bench.trials.design import Criterion, Design
     from ipe_bench.trials.posterior import Reference
 
@@ -522,6 +522,8 @@ def compute_until(
         UserError: what was asked for cannot be computed; nothing is computed then.
         StorageError: nothing can be stored any more.
     """
+    from ipe_bench.statistics.sequences import Precision, next_trials
+
     wanted, budget, began = Precision.of(precision), MOST_TRIALS if most is None else most, time.monotonic()
     _refuse_time_limit(time_limit, wanted)
     if any(scenario.noise.real for scenario in scenarios):

@@ -71,6 +71,15 @@ def test_residuals_that_cannot_be_tested():
     assert np.isnan(whiteness(np.ones(1), np.zeros((1, 0)), np.zeros((1, 1), dtype=int)).p_value)
 
 
+def test_a_single_degree_of_freedom_says_nothing_of_succession():
+    """All residuals are multiples of one vector; round-off, or where an estimator stopped, would decide."""
+    J = np.column_stack([np.ones(3), np.arange(3.0)])
+    Q, _ = np.linalg.qr(J)
+    w = np.array([1.0, -2.0, 1.0]) + 1e-7 * J[:, 1]
+    assert np.isnan(whiteness(w, Q, np.arange(3)[None]).p_value)
+    assert np.isfinite(whiteness(np.array([1.0, -2.0, 1.0]), Q[:, :1], np.arange(3)[None]).p_value)
+
+
 @pytest.mark.parametrize("correlated", [False, True])
 def test_normalised_residuals_are_standard_normal_and_flag_a_gross_error(correlated):
     deviations = np.linspace(0.5, 2.0, M)

@@ -20,6 +20,8 @@ from ipe_bench.basics.naming import Named
 from ipe_bench.basics.options import Component
 
 _COMPLEX_STEP = 1e-100
+_SMALL = 16384
+"""Bytes of the Jacobians of one call: an eighth as complex numbers of what NumPy calls a large array."""
 _CENTRAL_STEP = float(np.finfo(float).eps ** (1 / 3))
 
 
@@ -118,8 +120,8 @@ class Measurement(Component, Named, ABC):
 
     @property
     def nuisances(self) -> tuple[Parameter, ...]:
-        """What the k numbers of `nuisance_deviation` are, in their order: each a multiple of `size` `unit`s. Those of
-        one group are told of together."""
+        """What the k numbers of `nuisance_deviation` are, in their order: each a multiple of its `size`, in its `unit`.
+        Those of one group are told of together."""
         return tuple(Parameter(f"nuisance_{i + 1}", group="nuisances") for i in range(len(self.nuisance_deviation)))
 
     @property
@@ -387,6 +389,24 @@ class Restricted(Measurement):
         return self.whole.linearization()[self._rows]
 
 
+def _complex_step(h: Any, x: Array) -> Array:
+    """dh/dx (trials, m, n) by directions into the complex plane, a few trials in a call.
+
+    NumPy multiplies complex numbers with other rounding where it reuses a large temporary array for the product: in one
+    call of all trials, the bits of each would depend on how many there are.
+    """
+    trials, n = x.shape
+    steps = np.eye(n) * _COMPLEX_STEP * 1j
+    parts, begun = [], 0
+    while begun < trials or not parts:
+        few = 1 if not parts else max(1, int(_SMALL / parts[0][:1].nbytes))
+        part = x[begun : begun + few, None, :] + steps
+        z = h(part.reshape(-1, n))
+        parts.append(np.imag(z).reshape(len(part), n, -1).swapaxes(1, 2))
+        begun += few
+    return np.ascontiguousarray(np.concatenate(parts)) / _COMPLEX_STEP
+
+
 def differentiate(h: Any, x: Array, *, analytic: bool) -> Array:
     """dh/dx (trials, m, n) of a batched function h at x (trials, n), all directions in one call of h.
 
@@ -395,9 +415,7 @@ def differentiate(h: Any, x: Array, *, analytic: bool) -> Array:
     """
     trials, n = x.shape
     if analytic:
-        steps = np.eye(n) * _COMPLEX_STEP * 1j
-        z = h((x[:, None, :] + steps).reshape(trials * n, n))
-        return np.ascontiguousarray(np.imag(z).reshape(trials, n, -1).swapaxes(1, 2)) / _COMPLEX_STEP
+        return _complex_step(h, x)
     size = _CENTRAL_STEP * np.maximum(1.0, np.abs(x))
     above, below = x + size, x - size
     steps = np.eye(n)[None] * (above - below)[:, None, :] / 2

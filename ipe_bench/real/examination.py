@@ -85,7 +85,7 @@ class Bootstrap:
     high: Array
     """Percentile intervals (n,) in the parameters' own units."""
     bias: Array
-    """Mean of the answers less the estimate (n,)."""
+    """Mean of the answers less the estimate (n,), to second order."""
     converged: int
     drawn: int
 
@@ -233,11 +233,19 @@ class _Least:
 
     def bootstrap(self, draws: int) -> Bootstrap:
         """Estimates from readings simulated at the estimate, started there, with noise of R; the draws are always the
-        same ones (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 6.5)."""
+        same ones (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 6.5).
+
+        Where the level of the noise is estimated, each set has a level of its own: what the true one may be, given the
+        estimate, so that intervals are those of Student's t where the model is linear.
+        """
         rng = np.random.Generator(np.random.Philox(0))
         draws = _affordable(draws, self.J.size)
         factor = self.problem.R.factor
         e = rng.standard_normal((draws, len(self.z)))
+        level = np.ones(draws)
+        if self.freedom is not None:
+            level = np.sqrt(self.freedom / rng.chisquare(self.freedom, draws))
+        e *= level[:, None]
         h = self.model.simulate(self.x[None])[0]
         z = h + (e * factor if factor.ndim == 1 else e @ factor.T)
         minima = _minimise(self.problem, z, np.repeat(self.x[None], draws, axis=0))
@@ -248,7 +256,9 @@ class _Least:
             unknown = np.full(n, np.nan)
             return Bootstrap(unknown, unknown, unknown, len(values), draws)
         low, high = np.quantile(values, [tail, 1 - tail], axis=0)
-        return Bootstrap(low, high, values.mean(axis=0) - estimate, len(values), draws)
+        # Bias grows with the square of the level: this is that of the level that was estimated.
+        bias = ((values - estimate) / level[minima.converged, None] ** 2).mean(axis=0)
+        return Bootstrap(low, high, bias, len(values), draws)
 
     def minima(self) -> list[Minimum]:
         """Minima reached from starts that the prior draws about the nominal point, and the estimate."""

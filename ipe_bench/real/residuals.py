@@ -30,7 +30,7 @@ class Whiteness:
     """The test that successive residuals of one instrument have nothing to do with each other."""
 
     statistic: float
-    """Ljung and Box's Q; NaN where the residuals are not finite or too few to have neighbours."""
+    """Ljung and Box's Q; NaN where the residuals are not finite, or too few to have neighbours or to vary."""
     lags: int
     p_value: float
     """Chance of a Q at least this large if the model and R are right."""
@@ -84,7 +84,8 @@ def whiteness(w: Array, Q: Array, series: NDArray[np.intp], draws: int = DRAWS) 
     lags = min(_LONGEST_LAG, max(1, series.shape[1] // 5))
     exists = series >= 0
     pairs = [int(np.sum(exists[:, :-k] & exists[:, k:])) for k in range(1, lags + 1)]
-    if Q.shape[1] >= len(w) or not (np.isfinite(w).all() and w.any() and any(pairs)):
+    # A single degree of freedom leaves one direction: its residuals differ in size alone, which Q does not see.
+    if Q.shape[1] >= len(w) - 1 or not (np.isfinite(w).all() and w.any() and any(pairs)):
         return Whiteness(np.nan, lags, np.nan)
     observed = float(_ljung_box(w[None], series, pairs)[0])
     if len(w) > _MANY:
@@ -93,7 +94,6 @@ def whiteness(w: Array, Q: Array, series: NDArray[np.intp], draws: int = DRAWS) 
     as_large = 0
     for start in range(0, draws, _DRAWS_AT_ONCE):
         noise = rng.standard_normal((min(_DRAWS_AT_ONCE, draws - start), len(w)))
-        # Where one reading is left over, all Q are the same but for round-off.
         as_large += int(np.sum(_ljung_box(noise - (noise @ Q) @ Q.T, series, pairs) >= observed * (1 - 1e-9)))
     return Whiteness(observed, lags, (1 + as_large) / (1 + draws))
 

@@ -78,18 +78,18 @@ def attained_columns(totals: pd.DataFrame) -> list[Column]:
     columns = [words("estimator", totals["estimator"], list(most)), column("problems", totals["problems"], str)]
     columns.append(column("solved", totals["solved"], str, list(most)))
     starts = [name for name in totals if str(name).startswith("solved_")]
-    columns += [column(f"from {str(name).removeprefix('solved_')} x", totals[name], str) for name in starts]
-    columns.append(column("of these converged", totals["converged"], str))
-    columns.append(column("converged elsewhere", totals["elsewhere"], str))
+    columns += [column(f"{str(name).removeprefix('solved_')} x", totals[name], str) for name in starts]
+    columns.append(column("converged", totals["converged"], str))
+    columns.append(column("elsewhere", totals["elsewhere"], str))
     columns.append(column("median cost", totals["cost_median"], short))
-    return [*columns, *(column(f"within {b}", totals[f"within_{b}"], str) for b in BUDGETS)]
+    return [*columns, *(column(f"in {b}", totals[f"within_{b}"], str) for b in BUDGETS)]
 
 
 _ATTAINED = (
-    "Problems whose least minimum the estimate attains: f at most f* (1 + 1e-6) + 1e-12. From 1 x, 10 x: from these"
-    " multiples of the standard start. Of these converged: the status says so where the answer is right. Converged"
-    " elsewhere: at another minimum, or at none. Median cost: simulations over all problems, a Jacobian counting n,"
-    " infinite where unsolved. Within 10, 100, 1000: solved within so many simplex gradients of n + 1 simulations."
+    "Problems whose least minimum the estimate attains: f at most f* (1 + 1e-6) + 1e-12. 1 x, 10 x: from these"
+    " multiples of the standard start. Converged: solved, and the status says so. Elsewhere: unsolved, and the status"
+    " says converged. Median cost: simulations over all problems, a Jacobian counting n, infinite where unsolved."
+    " In 10, 100, 1000: solved within so many simplex gradients of n + 1 simulations."
 )
 _PROBLEMS = (
     "Which of a function's known minima has the estimate's sum of squares, the lowest being 1; a dash: none of them."

@@ -163,13 +163,13 @@ def _attained(totals: pd.DataFrame) -> list[Any]:
     table = Table(title="Known minima", title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
     columns = attained_columns(totals.sort_values("solved", ascending=False, kind="stable", ignore_index=True))
     for each in columns:
-        table.add_column(each.title, justify="right" if each.numeric else "left")
+        table.add_column(each.title, justify="right" if each.numeric else "left", no_wrap=not each.numeric)
     for row in zip(*(each.cells for each in columns), strict=True):
         table.add_row(*(cell.text for cell in row))
     note = (
-        "solved: the estimate's sum of squares is the least known one, to 1e-6; of these converged: where the status"
-        " says so. median cost: simulations, infinite where unsolved. within: solved within so many times n + 1"
-        " simulations."
+        "solved: the estimate's sum of squares is the least known one, to 1e-6; converged: of these, where the status"
+        " says so; elsewhere: converged and not solved. median cost: simulations, infinite where unsolved. in 10:"
+        " solved within 10 (n + 1) simulations."
     )
     return [table, Text(note, style="dim"), Text()]
 

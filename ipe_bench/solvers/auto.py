@@ -57,8 +57,8 @@ class Auto(Estimator):
 
     Where the first stage did not suffice, `confirmations` minimisations from draws of the prior look for other minima
     that fit. Of several the one counts that is the most probable with the prior, since no residual can tell. Extras:
-    `minima`, how many distinct minima that fit were found, and `ambiguous`, 1 where there are several; `alternatives`
-    lists the others. That none was found is no proof that there is none.
+    `minima`, how many distinct minima that fit were found, and `ambiguous`, 1 where there are several, 0 where the look
+    found none, which is no proof that there is none, and NaN where nobody looked; `alternatives` lists the others.
 
     One Jacobian of the first stage is the covariance's, and as with every solver not counted where it ends there.
     """
@@ -91,8 +91,11 @@ class Auto(Estimator):
             tally.messages.update({int(left[i]): message for i, message in spent.messages.items()})
         fitting = Fitting.none(len(z), z.shape[1], self.fit_level)
         fits = fitting.note(best, np.arange(len(z)))
-        best = self._confirmed(problem, z, best, tally, fitting, left[fits[left]], history)
+        examined = left[fits[left]] if self._confirmations(problem) else left[:0]
+        best = self._confirmed(problem, z, best, tally, fitting, examined, history)
         estimates = fitting.report(best.estimates(tally, z.shape[1]))
+        nobody_looked = ~np.isin(np.arange(len(z)), examined)
+        estimates.extras["ambiguous"][nobody_looked] = np.nan
         estimates.extras["stage"] = np.where(answered, FIXED_POINT, PROGRESSIVE).astype(float)
         return estimates
 
@@ -108,7 +111,7 @@ class Auto(Estimator):
     ) -> Minima:
         """The answers, after a look for others in the trials `rows`."""
         count, n = self._confirmations(problem), len(problem.x0)
-        if not count or not len(rows):
+        if not len(rows):
             return best
         draws = normals(own_generators(self.seed, z[rows]), count, n)
         whole = Objective(Counted(problem.measurement, tally), problem.R, z[rows], rows, problem.x0)

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, pseudo_inverse
 from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.ipe import starting_points
 from ipe_bench.estimators.least_squares import Minima, Objective
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.base import Restricted
-from ipe_bench.measurements.counted import Counted
+from ipe_bench.measurements.counted import Counted, Tally
 from ipe_bench.solvers.search import Search
 
 _SLOW_GROWTH = 1.4
@@ -72,10 +73,37 @@ class Windows(Search):
     enough = 1
 
     def attempt(self, k: int, rows: NDArray[np.intp], before: Minima | None) -> Minima:
-        """The k-th attempt for the trials `rows`: window after window, then all data without the prior.
+        """The k-th attempt for the trials `rows`, of which `before` is the best so far.
 
-        `before` is the best of the attempts so far: without a prior it says how far draws should reach.
+        A careful attempt without a prior takes one in its windows that reaches as far as the linear estimate says.
         """
+        if before is None or self.prior is not None or not self.options.use_prior or self._rankless:
+            return self._attempt(k, rows, before)
+        result, reach = before, self._reach(rows)
+        for size in np.unique(reach):
+            there = reach == size
+            prior = np.full(self.problem.measurement.n, size)
+            search = replace(self, problem=replace(self.problem, prior_deviation=prior))
+            result = put(result, there, search._attempt(k, rows[there], take(before, there)))
+        return result
+
+    @property
+    def _rankless(self) -> bool:
+        """Whether there is no linear estimate."""
+        return bool(pseudo_inverse(self.problem.H[None], self.problem.R)[1].any())
+
+    def _reach(self, rows: NDArray[np.intp]) -> Array:
+        """How far the parameters of the trials `rows` may lie, where no prior says so: the median of the distances in
+        the linear estimate, rounded up to a power of ten. On GINS that median is mostly right within a factor of three
+        at any scale, and a prior ten times too wide does no harm."""
+        tally = Tally.zeros(len(rows))
+        x = starting_points(self.problem, self.z[rows], "linear_lse", tally)
+        self.tally.simulations[rows] += tally.simulations
+        distance = np.median(np.abs(x - self.problem.x0), axis=1)
+        return 10.0 ** np.ceil(np.log10(np.clip(np.where(np.isfinite(distance), distance, 1.0), 1.0, 1e9)))
+
+    def _attempt(self, k: int, rows: NDArray[np.intp], before: Minima | None) -> Minima:
+        """Window after window, then all data without the prior. Where none is known, draws reach as far as `before`."""
         prior = self.prior
         metric = np.ones(self.problem.measurement.n) if prior is None else prior
         there = self._begin(k, rows, metric if prior is not None or before is None else _reach(before, self.problem.x0))

@@ -132,13 +132,18 @@ def _misfit(s: Sample) -> float:
     return _share(~(s.scalars[FIT] >= FIT_LEVEL)) if known else np.nan
 
 
+def _looked(s: Sample) -> Array:
+    """Whether the estimator has looked for several minima (trials,)."""
+    return np.isfinite(s.scalars[AMBIGUOUS]) if AMBIGUOUS in s.scalars else np.zeros(len(s), dtype=bool)
+
+
 def _ambiguous(s: Sample) -> float:
-    return float(np.mean(s.scalars[AMBIGUOUS])) if AMBIGUOUS in s.scalars else np.nan
+    return _share(s.scalars[AMBIGUOUS][looked] > 0) if (looked := _looked(s)).any() else np.nan
 
 
 def _failures_flagged(s: Sample) -> float:
     failed = ~s.scalars["success"]
-    return float(np.mean(s.scalars[AMBIGUOUS][failed])) if AMBIGUOUS in s.scalars and failed.any() else np.nan
+    return _share(s.scalars[AMBIGUOUS][failed] > 0) if _looked(s).any() and failed.any() else np.nan
 
 
 def _bias(s: Sample) -> Array:
@@ -818,7 +823,7 @@ STATISTICS: tuple[Statistic, ...] = (
     Statistic(
         "ambiguous",
         "ambiguous",
-        "all trials of estimators that look for it",
+        "the trials in which the estimator has looked for it",
         "Share in which several distinct minima fit the readings, so that no residual can tell which is the truth.",
         _ambiguous,
         kind="share",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -342,7 +343,7 @@ def test_the_bare_program_says_what_there_is(capsys, words):
     assert main(words) == 0
     text = capsys.readouterr().out
     for command in ("run", "estimate", "design", "posterior", "report", "status", "list", "new", "check", "compare"):
-        assert f"\n    {command} " in text
+        assert re.search(rf"\n    {command}\s", text)
 
 
 def test_flags_stand_anywhere_among_the_words_of_a_command(tmp_path, monkeypatch, capsys):

@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import optimize, stats
 
 import ipe_bench as ib
 from ipe_bench.basics.linalg import Array, Covariance
@@ -99,6 +99,24 @@ def test_the_best_choice_is_that_of_brute_force_and_none_is_below_the_limit(crit
         as_good = [rows for rows, bound in every.items() if bound <= 1]
         assert way.saving.readings == min(map(len, as_good))
         assert way.saving.least <= min(b for rows, b in every.items() if len(rows) == way.saving.readings) + 1e-9
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_limit_is_the_optimum_of_weights_between_nothing_and_all(seed):
+    """Beside SciPy: the relaxed problem is convex, and its optimum is below every choice."""
+    model = Linear(seed=seed)
+    everything = replace(model, count=9).A
+    scaled = everything * np.sqrt(np.diag(np.linalg.inv(model.A.T @ model.A)))
+    found = optimize.minimize(
+        lambda w: np.trace(np.linalg.inv(scaled.T @ (w[:, None] * scaled))) / 3,
+        np.full(9, 5 / 9),
+        bounds=[(0, 1)] * 9,
+        constraints={"type": "eq", "fun": lambda w: w.sum() - 5},
+        options={"ftol": 1e-12, "maxiter": 500},
+    )
+    (way,) = design(scenario(model)).ways
+    assert way.sharpest.readings == 5
+    assert 0.995 * np.sqrt(found.fun) < way.sharpest.least <= np.sqrt(found.fun) * (1 + 1e-6)
 
 
 def test_a_parabola_is_best_read_at_its_ends_and_in_the_middle():

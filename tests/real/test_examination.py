@@ -39,6 +39,19 @@ def test_profiles_of_a_linear_model_are_the_intervals_of_its_standard_errors():
     assert not found.ambiguous
 
 
+@pytest.mark.parametrize("readings", [4, 6, 12])
+def test_bootstrap_with_an_estimated_level_is_as_wide_as_students_t(readings):
+    """Of a straight line, whose intervals are exact."""
+    t = tuple(np.linspace(0.0, 1.0, readings))
+    model = Formula("a+b*t", {"a": 0.0, "b": 0.0}, {"t": t})
+    z = 1.0 + 2.0 * np.array(t) + 0.1 * np.random.default_rng(8).standard_normal(readings)
+    problem = Problem(model, Gaussian(1.0).covariance(readings))
+    found = examine(problem, z, fit(problem, z, LM, level_unknown=True), bootstraps=4000)
+    low, high = found.wald
+    assert found.bootstrap.high - found.bootstrap.low == pytest.approx(high - low, rel=0.1)
+    assert found.bootstrap.bias == pytest.approx(0.0, abs=4 * found.standard_errors.max() / np.sqrt(4000))
+
+
 def test_ends_of_a_profile_are_where_chi_square_has_risen_by_the_quantile():
     """Against a brute-force minimisation over the other parameter, on a grid."""
     z = SATURATION.simulate(np.ones((1, 2)))[0] + 0.4 * np.random.default_rng(2).standard_normal(6)

@@ -59,6 +59,8 @@ def blocks(page: Path, language: str) -> list[str]:
 @pytest.mark.parametrize("page", [p for p in WRITTEN if blocks(p, "console") or blocks(p, "python")], ids=ids)
 def test_what_a_page_says_to_type_works(page, tmp_path):
     environment = os.environ | {"NO_COLOR": "1"}
+    for name, content in re.findall(r"Write a file `(\S+)`:\n\n```text\n(.*?)```", page.read_text("utf-8"), re.DOTALL):
+        (tmp_path / name).write_text(content, encoding="utf-8")
     for line in "".join(blocks(page, "console")).splitlines():
         program = [sys.executable, "-m", "ipe_bench", *shlex.split(line.removeprefix("$ ipe-bench "))]
         done = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, env=environment, check=False)
