@@ -181,6 +181,7 @@ def _by_normal_equations(J: Array, r: Array) -> tuple[Array, Array, Array, Mask]
     The columns of J are scaled first; what is lost of U is n eps times the condition squared (Higham, Accuracy and
     Stability of Numerical Algorithms, 2002, section 20.4).
     """
+    J = np.ascontiguousarray(J)  # as the bits of a product may depend on how J lies in memory
     Jt = J.swapaxes(1, 2)
     with np.errstate(all="ignore"):
         G, along = np.matmul(Jt, J), multiply(Jt, r)
