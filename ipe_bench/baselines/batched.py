@@ -153,20 +153,6 @@ def symmetric(P: Array) -> Array:
     return (P + P.swapaxes(-1, -2)) / 2
 
 
-def rows_of_root(P: Array) -> Array:
-    """The rows of Cholesky's U with U' U = P for each trial (trials, n, n); NaN where P is not positive definite."""
-    try:
-        return np.linalg.cholesky(P).swapaxes(1, 2)
-    except np.linalg.LinAlgError:
-        result = np.full(P.shape, np.nan)
-        for i, one in enumerate(P):
-            try:
-                result[i] = np.linalg.cholesky(one).T
-            except np.linalg.LinAlgError:
-                continue
-        return result
-
-
 def principal_axes(G: Array) -> Array:
     """Orthonormal axes (trials, m, m), one per column, along which each G (trials, m, m), symmetric, is diagonal.
 

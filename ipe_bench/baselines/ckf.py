@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.baselines.batched import Rows, Stack, correct, rows_of_root
+from ipe_bench.baselines.batched import Rows, Stack, correct
 from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric, turned
-from ipe_bench.basics.linalg import Array, Mask
+from ipe_bench.basics.linalg import Array, Mask, cholesky
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class CKFStack(Stack):
         self.away = np.zeros((trials, 2 * len(P0), len(P0)))
 
     def points(self, at: Rows) -> Array:
-        U = rows_of_root(self.P[at]) * np.sqrt(self.P.shape[1])
+        U = cholesky(self.P[at]) * np.sqrt(self.P.shape[1])
         self.away[at] = np.concatenate([U, -U], axis=1)
         return self.x[at][:, None] + self.away[at]
 

@@ -49,6 +49,7 @@ class Standardized:
     readings: EpochReadings
     root: Array
     """U^-1 (trials, n, n)."""
+    exact_within: float = np.inf
 
     @property
     def n(self) -> int:
@@ -69,6 +70,8 @@ class Standardized:
     def jacobian(self, y: Array) -> Array:
         J = np.matmul(self.readings.slope(self._x(y)), self.root)
         return np.concatenate([J, np.broadcast_to(np.eye(self.n), self.root.shape)], axis=1)
+
+    coarse_jacobian = jacobian
 
     def subset(self, kept: NDArray[np.bool_]) -> Standardized:
         return Standardized(self.readings.subset(kept), self.root[kept])

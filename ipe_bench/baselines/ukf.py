@@ -8,9 +8,9 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Gt, Le
 
-from ipe_bench.baselines.batched import Rows, Stack, correct, rows_of_root
+from ipe_bench.baselines.batched import Rows, Stack, correct
 from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric, turned
-from ipe_bench.basics.linalg import Array, Mask
+from ipe_bench.basics.linalg import Array, Mask, cholesky
 from ipe_bench.basics.options import Finite, NonNegative
 
 
@@ -88,7 +88,7 @@ class UKFStack(Stack):
         self.away = np.zeros((trials, 2 * n + 1, n))
 
     def points(self, at: Rows) -> Array:
-        U = rows_of_root(self.reach * self.P[at])
+        U = cholesky(self.reach * self.P[at])
         self.away[at, 1:] = np.concatenate([U, -U], axis=1)
         return self.x[at][:, None] + self.away[at]
 

@@ -64,6 +64,20 @@ def _solve_columns(A: Array, b: Array) -> tuple[Array, Mask]:
     return x, ~finite(x)
 
 
+def cholesky(P: Array) -> Array:
+    """The upper factors U with U' U = P of each P (trials, n, n); NaN where P is not positive definite."""
+    try:
+        return np.linalg.cholesky(P).swapaxes(1, 2)
+    except np.linalg.LinAlgError:
+        U = np.full(P.shape, np.nan)
+        for i, matrix in enumerate(P):
+            try:
+                U[i] = np.linalg.cholesky(matrix).T
+            except np.linalg.LinAlgError:
+                continue
+        return U
+
+
 def deviations(P: Array) -> Array:
     """Standard deviations (trials, n) of the covariances P (trials, n, n)."""
     return np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.estimators.driver import Solver, Standing
-from ipe_bench.estimators.least_squares import Descent, Residuals, Slope, squared
+from ipe_bench.estimators.least_squares import Descent, Residuals, slope_at, squared
 
 
 @dataclass(frozen=True)
@@ -19,9 +19,11 @@ class GaussNewtonMethod(Solver[Descent]):
     def step(self, objective: Residuals, state: Descent) -> Descent:
         x = state.x + state.slope.newton
         r = objective.residual(x)
-        slope = Slope.of(objective.jacobian(x), r)
-        return replace(state, x=x, r=r, cost=squared(r), slope=slope, moved=state.reach(state.slope.newton))
+        near = state.nearly(objective)
+        slope, exact = slope_at(objective, x, r, near)
+        moved = state.reach(state.slope.newton)
+        return replace(state, x=x, r=r, cost=squared(r), slope=slope, moved=moved, exact=exact, near=near)
 
     def standing(self, objective: Residuals, before: Descent | None, state: Descent) -> Standing:
         """Where J lacks rank there is no step."""
-        return state.standing(stuck=state.rankless)
+        return state.standing(objective, stuck=state.rankless)

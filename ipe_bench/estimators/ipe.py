@@ -48,7 +48,7 @@ class System(Protocol):
         ...
 
     def J(self, x: Array) -> Array:
-        """dF/dx (trials, n, n)."""
+        """dF/dx (trials, n, n), near enough for steps: it is F that says where they end."""
         ...
 
     def solve(self, A: Array, b: Array) -> Array:
@@ -109,7 +109,7 @@ class FrozenSystem:
         return multiply(self.H_plus, self.model.simulate(x, self.rows) - self.z)
 
     def J(self, x: Array) -> Array:
-        return np.matmul(self.H_plus, self.model.jacobian(x, self.rows))
+        return np.matmul(self.H_plus, self.model.jacobian(x, self.rows, coarse=True))
 
     def solve(self, A: Array, b: Array) -> Array:
         x, singular = solve(A, b)
@@ -145,8 +145,9 @@ class FrozenSystem:
         usable = finite(x)
         inverse_slope = np.full((len(x), x.shape[1], x.shape[1]), np.nan)
         if usable.any():
-            report = dataclasses.replace(self, model=Counted.uncounted(model, int(self.rows.max()) + 1))
-            inverse_slope[usable], _ = inverse(report.subset(usable).J(x[usable]))
+            report = Counted.uncounted(model, int(self.rows.max()) + 1)
+            part = self.subset(usable)
+            inverse_slope[usable], _ = inverse(np.matmul(part.H_plus, report.jacobian(x[usable], part.rows)))
         return np.matmul(np.matmul(inverse_slope, self.covariance()), inverse_slope.swapaxes(1, 2))
 
 

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from ipe_bench.basics.linalg import Array, Covariance, Mask, finite, inverse, multiply, solve
+from ipe_bench.basics.batches import put, take
+from ipe_bench.basics.linalg import Array, Covariance, Mask, cholesky, finite, inverse, multiply, solve
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
 from ipe_bench.estimators.driver import Ended, Solver, Standing, iterate
@@ -28,6 +29,13 @@ _FLAT = 30
 _STATIONARY = 1e-3
 """where nearly means: within this part of a deviation along every column of J."""
 
+_WELL_CONDITIONED = 1e3
+"""The condition of J, its columns scaled, up to which J' J has enough of its digits: nine or more."""
+
+_NEAR = 0.03
+"""Steps still to go of fewer deviations are computed from exact Jacobians: a coarse one leaves the gradient about a
+hundredth of a deviation from zero."""
+
 
 class Residuals(Protocol):
     """What the methods of this room minimise the squares of, for the trials of a batch."""
@@ -38,6 +46,16 @@ class Residuals(Protocol):
 
     def jacobian(self, x: Array, /) -> Array:
         """Their derivative (trials, m, n)."""
+        ...
+
+    def coarse_jacobian(self, x: Array, /) -> Array:
+        """The same near enough for steps."""
+        ...
+
+    @property
+    def exact_within(self) -> float:
+        """Where the Gauss-Newton step still to go is shorter than so many deviations, Jacobians are exact, elsewhere
+        coarse; infinite: they are exact everywhere; 0: coarse, and good enough to end with."""
         ...
 
     def subset(self, kept: Mask, /) -> Residuals:
@@ -56,6 +74,7 @@ class Objective:
     x0: Array
     """The centre of the prior: (n,), or each trial's own (trials, n)."""
     prior_deviation: Array | None = None
+    exact_within: float = np.inf
 
     @classmethod
     def of(cls, problem: Problem, z: Array, *, prior: bool, inflation: float = 1.0) -> Objective:
@@ -77,11 +96,23 @@ class Objective:
 
     def jacobian(self, x: Array) -> Array:
         """The derivative of the whitened residuals (trials, m, n) or (trials, m + n, n)."""
-        J = self.R.whiten_jacobian(self.model.jacobian(x, self.rows))
+        return self._jacobian(x, coarse=False)
+
+    def coarse_jacobian(self, x: Array) -> Array:
+        """The same near enough for steps, from `Measurement.coarse_jacobian`."""
+        return self._jacobian(x, coarse=True)
+
+    def _jacobian(self, x: Array, *, coarse: bool) -> Array:
+        J = self.R.whiten_jacobian(self.model.jacobian(x, self.rows, coarse=coarse))
         if self.prior_deviation is None:
             return J
         prior = np.broadcast_to(np.diag(1.0 / self.prior_deviation), (len(x), x.shape[1], x.shape[1]))
         return np.concatenate([J, prior], axis=1)
+
+    def coarsened(self, exact_within: float) -> Objective:
+        """The same with coarse Jacobians where steps are longer, if the model has any that are cheaper."""
+        cheaper = self.model.coarse_share < 1.0
+        return dataclasses.replace(self, exact_within=exact_within if cheaper else np.inf)
 
     def subset(self, kept: Mask) -> Objective:
         x0 = self.x0[kept] if self.x0.ndim == 2 else self.x0
@@ -110,24 +141,20 @@ class Slope:
 
     @classmethod
     def of(cls, J: Array, r: Array, *, keep_Q: bool = False) -> Slope:
-        missing = max(J.shape[2] - J.shape[1], 0)
-        # Fewer readings than parameters: rows of zeros keep U square, and deficient.
-        J, r = np.pad(J, ((0, 0), (0, missing), (0, 0))), np.pad(r, ((0, 0), (0, missing)))
-        usable = finite(J) & finite(r)
-        Q, U = np.linalg.qr(np.where(usable[:, None, None], J, 0.0))
+        """Of J (trials, m, n), and residuals r (trials, m)."""
+        U, inverse_U, gradient, well = _by_normal_equations(J, r)
+        Q = np.matmul(J, inverse_U) if keep_Q else None
+        if not well.all():
+            QU, U[~well], inverse_U[~well], gradient[~well] = _by_orthogonal_factor(J[~well], r[~well])
+            if Q is not None:
+                Q[~well] = QU
         columns = np.sqrt(np.sum(U**2, axis=1))
-        scaled = U / np.where(columns > 0, columns, 1.0)[:, None, :]
-        floor = np.finfo(float).eps * max(J.shape[1:]) * np.sqrt(J.shape[2])
-        deficient = ~usable | (np.abs(np.diagonal(scaled, axis1=1, axis2=2)).min(axis=1) <= floor)
-        gradient = np.where(usable[:, None], multiply(Q.swapaxes(1, 2), r), np.nan)
-        inverse_U, _ = inverse(np.where(deficient[:, None, None], np.nan, U))
         newton = -multiply(inverse_U, gradient)
         deviation = np.sqrt(np.sum(inverse_U**2, axis=2))
         size = np.abs(newton / deviation).max(axis=1)
         size = np.where(np.isfinite(size), size, np.inf)
         along = np.abs(multiply(U.swapaxes(1, 2), gradient)) / np.where(columns > 0, columns, 1.0)
-        kept = Q[:, : r.shape[1] - missing] if keep_Q else None
-        return cls(U, gradient, columns, newton, size, along.max(axis=1), kept)
+        return cls(U, gradient, columns, newton, size, along.max(axis=1), Q)
 
     def towards(self, r: Array) -> Slope:
         """The same Jacobian with another residual r (trials, m): a chord. It needs Q."""
@@ -146,6 +173,60 @@ class Slope:
         step, _ = solve(U, -multiply(Q[:, : self.U.shape[1]].swapaxes(1, 2), self.gradient))
         change = multiply(self.U, step)
         return step, -np.einsum("ti,ti->t", change, 2.0 * self.gradient + change)
+
+
+def _by_normal_equations(J: Array, r: Array) -> tuple[Array, Array, Array, Mask]:
+    """U, U^-1, Q' r, and where J is so well conditioned that they may be had from J' J, a third of the work of QR.
+
+    The columns of J are scaled first; what is lost of U is n eps times the condition squared (Higham, Accuracy and
+    Stability of Numerical Algorithms, 2002, section 20.4).
+    """
+    J = np.ascontiguousarray(J)  # as the bits of a product may depend on how J lies in memory
+    Jt = J.swapaxes(1, 2)
+    with np.errstate(all="ignore"):
+        G, along = np.matmul(Jt, J), multiply(Jt, r)
+        columns = np.sqrt(np.diagonal(G, axis1=1, axis2=2))
+        scaled = G / (columns[:, :, None] * columns[:, None, :])
+        usable = finite(scaled) & finite(along)
+        U = cholesky(np.where(usable[:, None, None], scaled, np.eye(G.shape[1])))
+        inverse_U, _ = inverse(U)
+        well = usable & (np.linalg.norm(inverse_U, axis=(1, 2)) * np.sqrt(G.shape[1]) <= _WELL_CONDITIONED)
+        inverse_U = inverse_U / columns[:, :, None]
+        return U * columns[:, None, :], inverse_U, multiply(inverse_U.swapaxes(1, 2), along), well
+
+
+def _by_orthogonal_factor(J: Array, r: Array) -> tuple[Array, Array, Array, Array]:
+    """Q, U, U^-1 and Q' r for any J; U^-1 is NaN where J has not full rank."""
+    m, missing = J.shape[1], max(J.shape[2] - J.shape[1], 0)
+    # Fewer readings than parameters: rows of zeros keep U square, and deficient.
+    J, r = np.pad(J, ((0, 0), (0, missing), (0, 0))), np.pad(r, ((0, 0), (0, missing)))
+    usable = finite(J) & finite(r)
+    Q, U = np.linalg.qr(np.where(usable[:, None, None], J, 0.0))
+    columns = np.sqrt(np.sum(U**2, axis=1))
+    scaled = U / np.where(columns > 0, columns, 1.0)[:, None, :]
+    floor = np.finfo(float).eps * max(J.shape[1:]) * np.sqrt(J.shape[2])
+    deficient = ~usable | (np.abs(np.diagonal(scaled, axis1=1, axis2=2)).min(axis=1) <= floor)
+    gradient = np.where(usable[:, None], multiply(Q.swapaxes(1, 2), r), np.nan)
+    inverse_U, _ = inverse(np.where(deficient[:, None, None], np.nan, U))
+    return Q[:, :m], U, inverse_U, gradient
+
+
+def slope_at(objective: Residuals, x: Array, r: Array, exact: Mask, *, keep_Q: bool = False) -> tuple[Slope, Mask]:
+    """The slope at x, where the residuals are r, and where it is that of an exact Jacobian: where `exact` (trials,)
+    says so, and where a coarse one has not full rank."""
+    if exact.all():
+        return Slope.of(objective.jacobian(x), r, keep_Q=keep_Q), exact
+    if exact.any():
+        coarse, believed = slope_at(objective.subset(~exact), x[~exact], r[~exact], exact[~exact], keep_Q=keep_Q)
+        near = Slope.of(objective.subset(exact).jacobian(x[exact]), r[exact], keep_Q=keep_Q)
+        both = take(near, np.zeros(len(x), np.intp))
+        return put(put(both, exact, near), ~exact, coarse), put(exact, ~exact, believed)
+    slope = Slope.of(objective.coarse_jacobian(x), r, keep_Q=keep_Q)
+    lost = ~np.isfinite(slope.size)
+    if lost.any():
+        again = Slope.of(objective.subset(lost).jacobian(x[lost]), r[lost], keep_Q=keep_Q)
+        slope = put(slope, lost, again)
+    return slope, lost
 
 
 @dataclass(frozen=True)
@@ -170,22 +251,31 @@ class Descent:
     """The objective when it last decreased visibly,"""
     idle: NDArray[np.int64]
     """and how many steps ago."""
+    exact: Mask
+    """Where the slope is that of an exact Jacobian,"""
+    near: Mask
+    """and where it is from now on, since little is left to go."""
 
     @classmethod
     def at(cls, objective: Residuals, x: Array, lam: float = 0.0, *, keep_Q: bool = False) -> Descent:
         """The state at the start."""
         r = objective.residual(x)
-        slope = Slope.of(objective.jacobian(x), r, keep_Q=keep_Q)
         trials = len(x)
+        near = np.full(trials, np.isinf(objective.exact_within))
+        slope, exact = slope_at(objective, x, r, near, keep_Q=keep_Q)
         scale = np.where(slope.columns > 0, slope.columns, 1.0)
         far, regular = np.full(trials, np.inf), np.isfinite(slope.size)
         cost, idle = squared(r), np.zeros(trials, np.int64)
         damping, growth = np.full(trials, lam), np.full(trials, 2.0)
-        return cls(x, r, cost, slope, far, damping, growth, scale, regular, cost, idle)
+        return cls(x, r, cost, slope, far, damping, growth, scale, regular, cost, idle, exact, near)
+
+    def nearly(self, objective: Residuals) -> Mask:
+        """Where the next Jacobian is to be exact, and all after it."""
+        return self.near | (self.slope.size < objective.exact_within)
 
     def reach(self, step: Array) -> Array:
         """The length (trials,) of a step in standard deviations of the readings that it moves."""
-        return np.abs(step * np.linalg.norm(self.slope.U, axis=1)).max(axis=1)
+        return np.abs(step * self.slope.columns).max(axis=1)
 
     def watched(self, cost: Array) -> tuple[Array, NDArray[np.int64]]:
         """`mark` and `idle` after a step to an objective of that cost."""
@@ -202,13 +292,16 @@ class Descent:
         """Where J has not full rank (trials,)."""
         return ~np.isfinite(self.slope.size)
 
-    def standing(self, stuck: Mask) -> Standing:
-        """The Gauss-Newton step still to go says how far the gradient is from zero; the cost says what diverges."""
+    def standing(self, objective: Residuals, stuck: Mask) -> Standing:
+        """The Gauss-Newton step still to go says how far the gradient is from zero, where J is good enough to end with;
+        the cost says what diverges."""
         known = np.isfinite(self.cost) & finite(self.slope.gradient)
         level = np.where(known, np.sqrt(self.cost), np.nan)
         ending = np.where(self.rankless, Status.SINGULAR, Status.STALLED)
         size = np.where(self.rankless & self.regular, self.slope.stationary, self.slope.size)
         size = np.where(self.settled, 0.0, size)
+        if objective.exact_within > 0:
+            size = np.where(self.exact, size, np.inf)
         return Standing(size, level, self.moved, stuck, ending)
 
 
@@ -256,8 +349,11 @@ def minimize(
     """Minimises the objective from x (trials, n) by Gauss-Newton or Levenberg-Marquardt.
 
     Converged is where the Gauss-Newton step, which is the gradient in whitened units, is at most `tolerance` standard
-    deviations of the local bound in every parameter. An iteration is a step tried, taken or not.
+    deviations of the local bound in every parameter. An iteration is a step tried, taken or not. Jacobians are coarse
+    on the way, where the model has cheaper ones, and exact at the end.
     """
+    if np.isinf(objective.exact_within):
+        objective = objective.coarsened(_NEAR)
     limits: dict[str, Any] = {"tolerance": tolerance, "max_iterations": max_iterations, "budget": budget}
     return reached(objective, iterate(objective, method, x, history=history, **limits))
 
@@ -265,11 +361,22 @@ def minimize(
 def reached(objective: Objective, ended: Ended[Any]) -> Minima:
     """What is known of the objective where an iteration of it, by states like `Descent`, ended."""
     # U^-1 U^-T: inverting U'U would lose twice the digits, and with them the sign of a variance.
-    inverse_U, _ = inverse(ended.state.slope.U)
+    inverse_U, _ = inverse(_exact_slope(objective, ended.state).U)
     covariance = np.matmul(inverse_U, inverse_U.swapaxes(1, 2))
     r = ended.state.r[:, : objective.readings]
     bulk = np.median(np.abs(r), axis=1)
     return Minima(ended.x, ended.status, ended.iterations, ended.history, covariance, squared(r), bulk)
+
+
+def _exact_slope(objective: Objective, state: Descent) -> Slope:
+    """The slope where an iteration has ended; for the report alone where it ended on a coarse one, so not counted."""
+    coarse = ~state.exact & finite(state.x)
+    if objective.exact_within == 0 or not coarse.any():
+        return state.slope
+    tally = Tally.zeros(len(objective.model.tally.simulations))
+    report = dataclasses.replace(objective, model=dataclasses.replace(objective.model, tally=tally)).subset(coarse)
+    keep_Q = state.slope.Q is not None
+    return put(state.slope, coarse, Slope.of(report.jacobian(state.x[coarse]), state.r[coarse], keep_Q=keep_Q))
 
 
 def squared(r: Array) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 from ipe_bench.basics.batches import put
 from ipe_bench.basics.linalg import Array, finite, multiply
 from ipe_bench.estimators.driver import Solver, Standing
-from ipe_bench.estimators.least_squares import Descent, Residuals, Slope, squared
+from ipe_bench.estimators.least_squares import Descent, Residuals, slope_at, squared
 
 _LARGEST_DAMPING = 1e30
 _ROUND_OFF = 1e-8
@@ -67,10 +67,14 @@ class LevenbergMarquardtMethod(Solver[Descent]):
         factor = np.where(believed, factor, np.maximum(factor, 1.0))
         x = np.where(taken[:, None], state.x + bent, state.x)
         r = np.where(taken[:, None], r, state.r)
-        slope = state.slope
-        if taken.any():
-            there = Slope.of(objective.subset(taken).jacobian(x[taken]), r[taken], keep_Q=self.geodesic)
-            slope = put(slope, taken, there)
+        near = state.nearly(objective)
+        # Where steps of a coarse Jacobian go on failing, it may be the Jacobian.
+        doubted = ~taken & ~state.exact & (near | (state.growth > 2.0))
+        slope, exact, renewed = state.slope, state.exact, taken | doubted
+        if renewed.any():
+            part, wanted = objective.subset(renewed), (near | doubted)[renewed]
+            there, known = slope_at(part, x[renewed], r[renewed], wanted, keep_Q=self.geodesic)
+            slope, exact = put(slope, renewed, there), put(exact, renewed, known)
         cost = np.where(taken, cost, state.cost)
         return Descent(
             x,
@@ -78,16 +82,18 @@ class LevenbergMarquardtMethod(Solver[Descent]):
             cost,
             slope,
             state.reach(step),
-            np.where(taken, state.lam * factor, state.lam * state.growth),
+            np.where(taken, state.lam * factor, np.where(doubted, state.lam, state.lam * state.growth)),
             np.where(taken, 2.0, 2.0 * state.growth),
             np.fmax(state.scale, slope.columns) if self.deviation is None and self.sizes is None else state.scale,
             state.regular | np.isfinite(slope.size),
             *state.watched(cost),
+            exact,
+            near,
         )
 
     def standing(self, objective: Residuals, before: Descent | None, state: Descent) -> Standing:
         """Damping goes on where J lacks rank, until it can gain nothing more."""
-        return state.standing(stuck=state.lam > _LARGEST_DAMPING)
+        return state.standing(objective, stuck=state.lam > _LARGEST_DAMPING)
 
     def _bend(self, objective: Residuals, state: Descent, weights: Array, step: Array) -> tuple[Array, Array]:
         """The step v + a / 2 with the geodesic acceleration a, and where a is small enough beside v to be believed."""

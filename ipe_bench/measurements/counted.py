@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics.batches import put
 from ipe_bench.basics.errors import describe_exception
-from ipe_bench.basics.linalg import Array, Mask
+from ipe_bench.basics.linalg import Array, Mask, finite
 from ipe_bench.measurements.base import Measurement
 
 
@@ -61,8 +63,25 @@ class Counted:
         self.tally.simulations[rows] += self.share
         return self._each_if_raising(self.measurement.simulate, x, rows, (self.measurement.m,))
 
-    def jacobian(self, x: Array, rows: NDArray[np.intp]) -> Array:
-        """dh/dx (trials, m, n) for the trials `rows` of the tally."""
+    def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: bool = False) -> Array:
+        """dh/dx (trials, m, n) for the trials `rows` of the tally; where it is only for steps, `coarse` will do, which
+        counts as what it costs beside an exact one."""
+        if not coarse or self.coarse_share == 1.0:
+            return self._exact_jacobian(x, rows)
+        self.tally.jacobians[rows] += self.share * self.coarse_share
+        shape = (self.measurement.m, self.measurement.n)
+        J = self._each_if_raising(self.measurement.coarse_jacobian, x, rows, shape)
+        # Far away the longer steps of a coarse one may overflow where those of the readings do not.
+        lost = ~finite(J)
+        return put(J, lost, self._exact_jacobian(x[lost], rows[lost])) if lost.any() else J
+
+    @cached_property
+    def coarse_share(self) -> float:
+        """What a coarse Jacobian costs beside an exact one; 1 where the model has none that is cheaper."""
+        coarse, exact = self.measurement.coarse_jacobian_cost, self.measurement.jacobian_cost
+        return coarse / exact if coarse < exact else 1.0
+
+    def _exact_jacobian(self, x: Array, rows: NDArray[np.intp]) -> Array:
         self.tally.jacobians[rows] += self.share
         return self._each_if_raising(self.measurement.jacobian, x, rows, (self.measurement.m, self.measurement.n))
 

@@ -69,8 +69,9 @@ class Pinned(Counted):
     def simulate(self, x: Array, rows: NDArray[np.intp]) -> Array:
         return super().simulate(self.whole(x, rows), rows)
 
-    def jacobian(self, x: Array, rows: NDArray[np.intp]) -> Array:
-        return np.take_along_axis(super().jacobian(self.whole(x, rows), rows), self._others(rows)[:, None, :], axis=2)
+    def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: bool = False) -> Array:
+        J = super().jacobian(self.whole(x, rows), rows, coarse=coarse)
+        return np.take_along_axis(J, self._others(rows)[:, None, :], axis=2)
 
     def _others(self, rows: NDArray[np.intp]) -> NDArray[np.intp]:
         k = np.arange(self.measurement.n - 1)

@@ -212,7 +212,7 @@ class _Chord(Solver[_OnChords]):
         return replace(state, x=x, r=r, cost=squared(r), slope=slope, moved=moved, bend=np.fmax(state.bend, bend))
 
     def standing(self, objective: Objective, before: Descent | None, state: Descent) -> Standing:
-        return state.standing(stuck=state.rankless)
+        return state.standing(objective, stuck=state.rankless)
 
 
 def _nowhere(problem: Problem, trials: int, history: bool) -> Minima:

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics.batches import put
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, finite, information, inverse
+from ipe_bench.basics.linalg import Array, Mask, finite, information, inverse
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import Solver, Standing, iterate
-from ipe_bench.estimators.ipe import IPE, FrozenSystem, Start, State, begin, root_standing
+from ipe_bench.estimators.ipe import IPE, FrozenSystem, Start, State, begin, frozen_covariance, root_standing
 from ipe_bench.measurements.counted import Counted
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers.fixed_point import FixedPoint
@@ -105,7 +106,7 @@ class Relinearized(Solver[Round], Estimator):
             system.model.tally,
             iterations=ended.state.steps,
             history=ended.state.path if history else None,
-            covariance=_bound(problem, ended.x),
+            covariance=_bound(problem, ended.state),
         )
 
     def _relinearize(
@@ -121,10 +122,16 @@ class Relinearized(Solver[Round], Estimator):
         return Round(x, F, H_plus, deviation, inner, steps, path)
 
 
-def _bound(problem: Problem, x: Array) -> Array:
-    """(J' R^-1 J)^-1 at x (trials, n, n); for the report alone, so not counted. The model may raise at a bad end."""
-    usable = finite(x)
-    J = np.full((len(x), problem.measurement.m, x.shape[1]), np.nan)
-    model = Counted.uncounted(problem.measurement, len(x))
-    J[usable] = model.jacobian(x[usable], np.flatnonzero(usable))
-    return inverse(information(J, problem.R))[0]
+def _bound(problem: Problem, state: Round) -> Array:
+    """(J' R^-1 J)^-1 (trials, n, n) at the end: H+ R H+', where the last round has found H+ there; else computed anew,
+    for the report alone, so not counted. The model may raise at a bad end."""
+    P = frozen_covariance(state.H_plus, problem.R)
+    lost: Mask = (state.H_plus == 0).all(axis=(1, 2))
+    usable = lost & finite(state.x)
+    if not lost.any():
+        return P
+    J = np.full((len(P), problem.measurement.m, state.x.shape[1]), np.nan)
+    if usable.any():
+        model = Counted.uncounted(problem.measurement, len(P))
+        J[usable] = model.jacobian(state.x[usable], np.flatnonzero(usable))
+    return put(P, lost, inverse(information(J[lost], problem.R))[0])

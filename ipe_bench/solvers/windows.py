@@ -148,7 +148,7 @@ class Windows(Search):
         assert model.epochs is not None
         window = Counted(Restricted.until(model, epochs), self.spent(owner), epochs / len(model.epochs))
         R, z = problem.R.restricted(arrived), self.z[np.ix_(owner, arrived)]
-        return Objective(window, R, z, np.arange(len(owner)), centre, self.prior)
+        return Objective(window, R, z, np.arange(len(owner)), centre, self.prior).coarsened(0.0)
 
     def _kept(self, k: int, number: int, owner: NDArray[np.intp], x: Array, per_reading: Array) -> NDArray[np.intp]:
         """The candidates that go on: of each trial the best few that differ and are not given up; one in any case in

@@ -50,8 +50,8 @@ class _Informed(Counted):
     x: Array
     J: Array
 
-    def jacobian(self, x: Array, rows: NDArray[np.intp]) -> Array:
-        return self.J[rows] if np.array_equal(x, self.x[rows]) else super().jacobian(x, rows)
+    def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: bool = False) -> Array:
+        return self.J[rows] if np.array_equal(x, self.x[rows]) else super().jacobian(x, rows, coarse=coarse)
 
 
 def frozen_root(problem: Problem, z: Array, x_start: Array, J: Array | None = None) -> Array:

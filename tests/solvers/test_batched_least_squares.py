@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from ipe_bench.baselines import GaussNewton, LevenbergMarquardt, MapLM
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance, information, inverse, quadratic_form
 from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.least_squares import Slope
 from ipe_bench.measurements import Gins, Mgh, Polynomial
 from ipe_bench.measurements.mgh import score
 from ipe_bench.measurements.problem import Problem
@@ -36,8 +38,8 @@ LEAST_SQUARES = [
 ALL = [*LEAST_SQUARES, MapLM()]
 
 
-def gins(scale: float, trials: int = 20):
-    scenario = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), scale)
+def gins(scale: float, trials: int = 20, model: Gins | None = None):
+    scenario = Scenario(model or Gins(), Quantization(0.02286), GaussianPrior(), scale)
     return scenario.problem, scenario.draw(0, trials)
 
 
@@ -75,6 +77,45 @@ def test_a_batch_equals_its_trials_one_by_one(estimator):
         np.testing.assert_array_equal(getattr(batch, name), np.concatenate([getattr(s, name) for s in single]), name)
 
 
+def exact_inverse_of_normal_matrix(J: Array) -> Array:
+    """(J' J)^-1 (n, n) in rational numbers, by elimination."""
+    exact, n = np.vectorize(Fraction)(J), J.shape[1]
+    table = np.concatenate([exact.T @ exact, np.vectorize(Fraction)(np.eye(n))], axis=1)
+    for i in range(n):
+        table[i] /= table[i, i]
+        for j in set(range(n)) - {i}:
+            table[j] -= table[j, i] * table[i]
+    return table[:, n:]
+
+
+def test_a_step_is_exact_however_badly_conditioned_the_jacobian_is():
+    """Beside rational numbers, for conditions of 10 to 1e7 and columns of sizes 1e-100 to 1e100."""
+    rng = np.random.default_rng(1)
+    for condition in 10.0 ** np.arange(1, 8):
+        left, right = (np.linalg.qr(rng.standard_normal((k, 5)))[0] for k in (40, 5))
+        J, r = left * np.geomspace(1, 1 / condition, 5) @ right, rng.standard_normal(40)
+        sizes = 10.0 ** np.linspace(-100, 100, 5)
+        slope = Slope.of((J * sizes)[None], r[None], keep_Q=True)
+        P = exact_inverse_of_normal_matrix(J)
+        step = -P @ (np.vectorize(Fraction)(J).T @ np.vectorize(Fraction)(r))
+        step, deviation = step.astype(float), np.sqrt(np.diag(P).astype(float))
+        np.testing.assert_allclose(slope.newton[0] * sizes / deviation, step / deviation, atol=1e-8)
+        assert slope.size[0] == pytest.approx(np.abs(step / deviation).max(), rel=1e-8)
+        np.testing.assert_allclose(slope.Q[0] @ slope.U[0] / sizes, J, atol=1e-12)
+
+
+def test_trials_without_full_rank_do_not_disturb_others():
+    J, r = np.random.default_rng(2).standard_normal((2, 5, 9, 3))[0], np.ones((5, 9))
+    alone = Slope.of(J[:1], r[:1])
+    J[1, :, 2] = J[1, :, 1]
+    J[2, 4, 1] = np.nan
+    J[3] = 0.0
+    J[4] *= 1e150
+    slope = Slope.of(J, r)
+    np.testing.assert_array_equal(slope.newton[0], alone.newton[0])
+    np.testing.assert_array_equal(np.isfinite(slope.size), [True, False, False, False, True])
+
+
 def test_map_on_a_linear_model_is_the_bayesian_closed_form():
     problem = Problem(Bent(), Covariance(np.full(12, 0.3)), np.array([0.5, 2.0, 1.0]))
     A = problem.measurement.A
@@ -94,7 +135,7 @@ def test_a_parameter_that_the_prior_fixes_stays_where_it_is():
 
 
 def test_one_inner_fixed_point_step_is_gauss_newton():
-    problem, trials = gins(100.0, 5)
+    problem, trials = gins(100.0, 5, Gins(step=60.0))  # with a fixed step all Jacobians are exact
     rounds = Relinearized(FixedPoint(), inner_iterations=1).estimate(problem, trials.z, history=True)
     steps = GaussNewton().estimate(problem, trials.z, history=True)
     for a, b, P in zip(rounds.history, steps.history, steps.covariance, strict=True):

@@ -335,13 +335,13 @@ class OdeMeasurement(Measurement):
         times = self._times[: J.shape[1] // (len(self._cases) * len(self.outputs))]
         kernel.run(x, self._si_sizes, self._cases, rows, times, steps, J.reshape(-1))
 
-    @property
-    def jacobian_cost(self) -> float:
+    @cached_property
+    def jacobian_cost(self) -> float:  # type: ignore[override]
         """Arithmetic operations of a step with all tangents, over those of a simulation's step."""
         return self._jacobian_kernel.operations / self._readings_kernel.operations
 
-    @property
-    def coarse_jacobian_cost(self) -> float:
+    @cached_property
+    def coarse_jacobian_cost(self) -> float:  # type: ignore[override]
         """At the nominal parameters, or where they are at a level above 2; in simulations at the trial's level."""
         if self.step is not None:
             return self.jacobian_cost
