@@ -48,7 +48,7 @@ class System(Protocol):
         ...
 
     def J(self, x: Array) -> Array:
-        """dF/dx (trials, n, n), near enough for steps: it is F that says where they end."""
+        """dF/dx (trials, n, n)."""
         ...
 
     def solve(self, A: Array, b: Array) -> Array:
@@ -109,7 +109,7 @@ class FrozenSystem:
         return multiply(self.H_plus, self.model.simulate(x, self.rows) - self.z)
 
     def J(self, x: Array) -> Array:
-        return np.matmul(self.H_plus, self.model.jacobian(x, self.rows, coarse=True))
+        return np.matmul(self.H_plus, self.model.jacobian(x, self.rows))
 
     def solve(self, A: Array, b: Array) -> Array:
         x, singular = solve(A, b)

@@ -9,11 +9,7 @@ from ipe_bench.estimators.ipe import IPE, State, System
 
 @dataclass(frozen=True)
 class Newton(IPE):
-    """x <- x - J(x)^-1 F(x). Converges quadratically near a root with regular J, eq. (23).
-
-    Where a model has a cheaper `coarse_jacobian`, that is the J: each step then leaves about a thousandth of the error
-    besides, and the root is the same.
-    """
+    """x <- x - J(x)^-1 F(x). Converges quadratically near a root with regular J, eq. (23)."""
 
     def step(self, system: System, state: State) -> State:
         x = state.x - system.solve(system.J(state.x), state.F)
