@@ -127,7 +127,8 @@ def _settle_names(tasks: dict[str, Task], entries: dict[str, list[Entry]], folde
             del entries[digest]
         taken |= names
     for digest in [d for d in entries if any(entry.name in spoiled for entry in entries[d])]:
-        made = draw_task(tasks[digest], folder, sorted({kind for e in entries[digest] for kind in e.digests}))
+        kinds = {kind for entry in entries[digest] for kind in entry.digests}
+        made = draw_task(tasks[digest], folder, [kind for kind in FORMATS if kind in kinds])
         if not isinstance(made, str):
             entries[digest] = made
 

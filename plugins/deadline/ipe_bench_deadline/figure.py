@@ -1,0 +1,44 @@
+"""Deadlines over the error scale, and how far each is above the median."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ipe_bench.report.figures import common
+from ipe_bench.report.figures.drawing import Drawing, Figure
+from ipe_bench.report.figures.views import View
+
+
+def draw(view: View) -> Iterator[Drawing]:
+    medians = view["scores"][["error_scale", "estimator", "cost_median"]]
+    rows = view.totals.merge(medians, on=["error_scale", "estimator"])
+    rows = rows[np.isfinite(rows["deadline"]) & (rows["deadline"] > 0)]
+    if rows.empty:
+        return
+    # An end that is not known is not drawn; neither is one of a trial that cost nothing.
+    known = np.isfinite(rows["deadline_high"]) & (rows["deadline_low"] > 0)
+    low, high = rows["deadline_low"].where(known), rows["deadline_high"].where(known)
+    rows = rows.assign(low=low, high=high, tail=rows["deadline"] / rows["cost_median"].clip(lower=1))
+    look = view.with_look(rows["estimator"])
+    fig, (by, tail) = common.panels(2, look, height=3.0)
+    common.decades(by, np.concatenate([rows["deadline"], high, low]))
+    common.curves(by, rows, "deadline", look, view.scales, interval=("low", "high"), trials="trials")
+    by.set(title="99 % of trials are done by", ylabel="simulations")
+    common.decades(tail, np.append(rows["tail"], 1.0))
+    common.curves(tail, rows, "tail", look, view.scales, trials="trials")
+    tail.set(title="over the median", ylabel="ratio")
+    common.bound_line(tail, 1.0, "every trial alike")
+    common.legend_below(fig, [by, tail], look)
+    last = rows[rows["error_scale"] == view.scales[-1]].sort_values("deadline", kind="stable")
+    caption = common.sentence(
+        "The cost by which 99 % of trials are done, well or not, with its 95 % interval where there are trials enough"
+        " for one; and how many times the median that is: far above 1, a few trials take most of the time.",
+        common.UPON,
+        f"At the largest scale: {common.values_of(last, 'deadline')}. {view.label}.",
+    )
+    yield Drawing(f"deadline{view.suffix}", "How long the slowest trials take", caption, fig)
+
+
+FIGURE = Figure(draw, ("summary", "scores"))

@@ -1,0 +1,300 @@
+"""Every kind of plugin that `new` makes works, and one that does not is named and leaves the rest as it was."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from small_models import Bent
+
+from ipe_bench import Scenario, check
+from ipe_bench.cli.main import main
+from ipe_bench.cli.new import KINDS, RECORDS
+from ipe_bench.noise import Gaussian
+from ipe_bench.plugins import discovery
+from ipe_bench.plugins.conformance import check_component
+from ipe_bench.priors import GaussianPrior, Prior
+from ipe_bench.runs.execution import Event, Execution
+from ipe_bench.statistics.records import add_statistics
+from ipe_bench.trials.posterior import reference
+
+SMALL = ("measurement=polynomial", "noise=gaussian", "trials=8", "execution=serial", "output=out")
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path, monkeypatch):
+    """A working folder of its own, whose plugins are forgotten afterwards."""
+    before = dict(sys.modules)
+    path = list(sys.path)
+    monkeypatch.setenv("PYTHONPATH", "")
+    monkeypatch.chdir(tmp_path)
+    discovery.sources.cache_clear()
+    yield tmp_path
+    monkeypatch.undo()
+    sys.path[:] = path
+    for name in set(sys.modules) - set(before):
+        if name.startswith("ipe_bench_"):
+            del sys.modules[name]
+    discovery._added.clear()
+    discovery.sources.cache_clear()
+    add_statistics([])
+
+
+def write(kind: str, name: str, source: str) -> None:
+    """A plugin of one record, whose module is the source."""
+    package = Path("plugins") / name / f"ipe_bench_{name}"
+    (package / "conf" / kind).mkdir(parents=True)
+    (package / "__init__.py").write_text("")
+    (package / f"{name}.py").write_text(source)
+    target = f"ipe_bench_{name}.{name}.{RECORDS[kind]}"
+    (package / "conf" / kind / f"{name}.yaml").write_text(f"# One.\n_target_: {target}\n")
+    discovery.sources.cache_clear()
+
+
+def files(folder: str) -> dict[str, str]:
+    """The digests of the tables and figures of a report."""
+    paths = [path for part in ("tables", "figures") for path in Path(folder, part).iterdir()]
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in paths if path.name != "index.json"}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_new_makes_passes_its_checks(kind, capsys):
+    assert main(["new", kind, "mine"]) == 0
+    assert main(["check", "plugins/mine"]) == 0
+    out = capsys.readouterr().out
+    assert f"ok     {kind}=mine: " in out
+    assert "all checks passed" in out
+
+
+def test_a_report_has_what_plugins_add_beside_all_that_is_ours(capsys):
+    assert main(["run", *SMALL]) == 0
+    before = files("out")
+    for kind in RECORDS:
+        assert main(["new", kind, f"own_{kind}"]) == 0
+    discovery.sources.cache_clear()
+    assert main(["report", "out"]) == 0
+    page = Path("out/report.html").read_text(encoding="utf-8")
+    summary = pd.read_csv("out/summary.csv")
+    trials = pd.concat([summary["own_statistic"], summary["rmse"]], axis=1)
+    assert (trials["own_statistic"] >= trials["rmse"]).all()
+    for text in ("own_statistic", "What own_section says", "figure-own_figure", "table-own_table"):
+        assert text in page
+    after = files("out")
+    added = {f"own_{name}" for name in ("figure.png", "figure.pdf")}
+    added |= {f"own_{kind}.{form}" for kind in ("table", "section") for form in ("csv", "md", "tex")}
+    assert set(after) - set(before) == added
+    # A statistic stands in the tables that it names; no other table or figure has changed.
+    changed = {name for name in before if before[name] != after[name]}
+    assert {name.partition(".")[0] for name in changed} <= {"overview", "parameters", "costs"}
+    capsys.readouterr()
+    stamp = Path("out/report.html").stat().st_mtime_ns
+    assert main(["report", "out"]) == 0
+    assert Path("out/report.html").stat().st_mtime_ns == stamp
+    # The code of a plugin is part of what a report is made from.
+    module = Path("plugins/own_figure/ipe_bench_own_figure/own_figure.py")
+    digest = Path("out/figures/index.json").read_bytes()
+    module.write_text(module.read_text() + "\n# changed\n")
+    assert main(["report", "out"]) == 0
+    assert Path("out/report.html").stat().st_mtime_ns > stamp
+    assert Path("out/figures/index.json").read_bytes() != digest
+
+
+RAISING = {
+    "statistic": "from ipe_bench.statistics.records import Statistic\n"
+    "def f(s):\n    raise ValueError('broken')\nSTATISTIC = Statistic('bad', 'bad', 'all trials', 'Bad.', f)\n",
+    "figure": "from ipe_bench.report.figures.drawing import Figure\n"
+    "def f(view):\n    raise ValueError('broken')\n    yield\nFIGURE = Figure(f, ('summary',))\n",
+    "table": "def table(analysis):\n    raise ValueError('broken')\n",
+    "section": "from ipe_bench.report.sections import Section\n"
+    "def f(analysis):\n    yield 'so far'\n    raise ValueError('broken')\nSECTION = Section('Bad', f)\n",
+}
+MEDDLING = {
+    "statistic": "from ipe_bench.statistics.records import Statistic\n"
+    "def f(s):\n    s.error *= 0\n    return 1.0\nSTATISTIC = Statistic('bad', 'bad', 'all trials', 'Bad.', f)\n",
+    "figure": "from ipe_bench.report.figures.drawing import Figure\n"
+    "def f(view):\n    view['summary']['rmse'] = 0.0\n    view['scores']['cost_median'] = 1.0\n"
+    "    yield from ()\nFIGURE = Figure(f, ('summary', 'scores'), together=True)\n",
+    "table": "def table(analysis):\n    analysis.summary['rmse'] = 0.0\n",
+    "section": "from ipe_bench.report.sections import Section\n"
+    "def f(analysis):\n    analysis.summary['rmse'] = 0.0\n    yield 'Done.'\nSECTION = Section('Bad', f)\n",
+}
+
+
+@pytest.fixture
+def ours() -> dict[str, str]:
+    """The report without any plugin."""
+    assert main(["run", *SMALL]) == 0
+    return files("out")
+
+
+@pytest.mark.parametrize("kind", RECORDS)
+def test_one_that_raises_is_named_and_the_rest_is_whole(kind, ours, capsys):
+    write(kind, "bad", RAISING[kind])
+    for _ in range(2):
+        capsys.readouterr()
+        assert main(["report", "out"]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"ipe-bench: {kind}=bad: ")
+        assert "broken" in line
+    after = files("out")
+    for name in ("overview.md", "parameters.csv") if kind == "statistic" else ():
+        ours.pop(name), after.pop(name)
+    same = {name for name in ours if after.get(name) == ours[name]}
+    assert {name for name in ours if name not in same} <= (
+        {"overview.csv", "costs.csv"} if kind == "statistic" else set()
+    )
+    assert set(after) == set(ours)
+    assert main(["check", "plugins/bad"]) == 1
+
+
+@pytest.mark.parametrize("kind", RECORDS)
+def test_one_that_writes_into_what_it_is_given_changes_nothing_of_ours(kind, ours):
+    before = pd.read_csv("out/summary.csv")
+    write(kind, "bad", MEDDLING[kind])
+    assert main(["report", "out"]) == (1 if kind == "statistic" else 0)
+    after = pd.read_csv("out/summary.csv")
+    pd.testing.assert_frame_equal(after[before.columns], before)
+    figures = {name: digest for name, digest in files("out").items() if name.endswith((".png", ".pdf"))}
+    assert figures == {name: digest for name, digest in ours.items() if name.endswith((".png", ".pdf"))}
+
+
+def test_a_figure_under_the_name_of_ours_is_left_out_and_ours_stays(ours, capsys):
+    main(["new", "figure", "mine"])
+    module = Path("plugins/mine/ipe_bench_mine/mine.py")
+    module.write_text(module.read_text().replace('f"mine{view.suffix}"', '"consistency"'))
+    discovery.sources.cache_clear()
+    capsys.readouterr()
+    assert main(["report", "out"]) == 1
+    assert "figure=mine: there is a figure consistency already; it is left out" in capsys.readouterr().err
+    assert files("out") == ours
+
+
+STATISTIC = """
+from ipe_bench.statistics.records import Statistic
+STATISTIC = Statistic({!r}, "mine", "all trials", "Mine.", lambda s: {}{})
+"""
+
+
+@pytest.mark.parametrize(
+    ("source", "complaint"),
+    [
+        (STATISTIC.format("rmse", "1.0", ""), "is called rmse; give file and record one name"),
+        (STATISTIC.format("bad", "'one'", ""), "a value is a str; return a float"),
+        (STATISTIC.format("bad", "1.0", ", lambda s: s.sizes[:-1]"), "has 3 values for 4 parameters"),
+        (STATISTIC.format("bad", "1.0", ", kind='colour'"), "kind=colour: choose from"),
+        (STATISTIC.format("bad", "1.0", ", where=('nowhere',)"), "where=nowhere: choose from"),
+        (STATISTIC.format("bad", "3.0", ", limits=lambda s: (1.0, 2.0)"), "3 of linear_lse is not within its interval"),
+        (
+            "import numpy\n" + STATISTIC.format("bad", "numpy.random.default_rng().random()", ""),
+            "is another value each time",
+        ),
+        ("STATISTIC = 3\n", "is a int and not a Statistic"),
+        ("import nothing_like_it\n", "nothing_like_it"),
+        ("def f(:\n", "SyntaxError"),
+    ],
+)
+def test_a_faulty_statistic_is_found(source, complaint):
+    write("statistic", "bad", source)
+    complaints = [finding.complaint for finding in check("plugins/bad") if finding.complaint]
+    assert len(complaints) == 1
+    assert complaint in complaints[0]
+
+
+def test_a_statistic_under_the_name_of_ours_is_refused(capsys):
+    assert main(["new", "statistic", "rmse"]) == 2
+    assert "rmse: is a statistic of ours; choose another name" in capsys.readouterr().err
+
+
+@dataclass(frozen=True)
+class Flat(Prior):
+    """Says that it is normal."""
+
+    def deviation(self, n, error_scale):
+        return np.full(n, error_scale)
+
+    def draw(self, x0, error_scale, rng):
+        return x0 + np.sqrt(3) * error_scale * rng.uniform(-1, 1, len(x0))
+
+
+@dataclass(frozen=True)
+class Wide(GaussianPrior):
+    def draw(self, x0, error_scale, rng):
+        return super().draw(x0, 1.1 * error_scale, rng)
+
+
+@dataclass(frozen=True)
+class Shifted(GaussianPrior):
+    def draw(self, x0, error_scale, rng):
+        return super().draw(x0 + 0.1 * error_scale, error_scale, rng)
+
+
+@dataclass(frozen=True)
+class Common(GaussianPrior):
+    """Draws one number for all parameters."""
+
+    def draw(self, x0, error_scale, rng):
+        return x0 + error_scale * rng.standard_normal()
+
+
+@dataclass(frozen=True)
+class Deaf(GaussianPrior):
+    """Does not listen to the error scale."""
+
+    def deviation(self, n, error_scale):
+        return np.ones(n)
+
+
+@dataclass(frozen=True)
+class Swallowing(Execution):
+    """Takes what is raised for the end."""
+
+    def run(self, work, tasks):
+        for index, task in enumerate(tasks):
+            try:
+                for step in work(task):
+                    yield Event(index, step)
+            except Exception:
+                pass
+            yield Event(index, ended=True)
+
+
+@dataclass(frozen=True)
+class Hasty(Execution):
+    """Does not tell of steps."""
+
+    def run(self, work, tasks):
+        for index, task in enumerate(tasks):
+            list(work(task))
+            yield Event(index, ended=True)
+
+
+@pytest.mark.parametrize(
+    ("faulty", "complaint"),
+    [
+        (Flat(), "the draws are not normal"),
+        (Wide(), "1.1 times the stated deviation"),
+        (Shifted(), "the mean is off x0"),
+        (Common(), "two parameters have the correlation"),
+        (Deaf(), "at ten times the error scale"),
+        (Swallowing(), "ends without a Failure"),
+        (Hasty(), "it tells the steps []"),
+    ],
+    ids=lambda value: type(value).__name__ if not isinstance(value, str) else "",
+)
+def test_a_faulty_prior_or_execution_is_found(faulty, complaint):
+    assert complaint in " ".join(finding.complaint for finding in check_component("mine", faulty))
+
+
+def test_the_posterior_is_not_sampled_under_a_prior_that_is_not_normal():
+    from ipe_bench.basics.errors import UserError
+
+    class Uniform(Flat):
+        normal = False
+
+    with pytest.raises(UserError, match="prior=uniform: is not normal"):
+        reference(Scenario(Bent(0.02), Gaussian(0.1), Uniform()), {}, 0)
