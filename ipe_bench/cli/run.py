@@ -226,7 +226,7 @@ def task(config: DictConfig) -> float | None:
             failures = _compute(job, Serial() if _launched_elsewhere() else job.execution, watch)
         value = None if job.objective is None else _objective(job)
     except (UserError, StorageError, *CONFIG_ERRORS) as error:
-        if _launched_elsewhere() or config.get("objective") is not None:
+        if _launched_elsewhere() or _chosen_by_results():
             raise explain(error) if isinstance(error, CONFIG_ERRORS) else error from None
         if isinstance(error, StorageError):
             _outcome.storage = error
@@ -278,6 +278,12 @@ def _launched_elsewhere() -> bool:
     """Whether a launcher plugin of Hydra (joblib, submitit) runs the jobs: then the cores are its to share out."""
     launcher = HydraConfig.get().launcher
     return HydraConfig.get().mode == RunMode.MULTIRUN and not launcher["_target_"].endswith(_OWN_LAUNCHER)
+
+
+def _chosen_by_results() -> bool:
+    """Whether a sweeper chooses the next jobs by what the last came to: it cannot go on from one that failed."""
+    hydra_config = HydraConfig.get()
+    return hydra_config.mode == RunMode.MULTIRUN and not hydra_config.sweeper["_target_"].endswith(".BasicSweeper")
 
 
 _IN_EVERY_TITLE = {"measurement", "measurement.dataset", "truth_measurement", "noise", "error_scale", "seed"}

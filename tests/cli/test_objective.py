@@ -1,0 +1,77 @@
+"""What a job returns to sweepers that optimise is the number that its report shows."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from ipe_bench.cli.main import main
+
+SMALL = ("measurement=polynomial", "noise=gaussian", "execution=serial", "solver=[newton]", "output=out")
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def said(out: str) -> float:
+    (line,) = [line for line in out.splitlines() if line.startswith("Objective ")]
+    return float(line.split()[1].rstrip(","))
+
+
+def test_it_is_the_number_of_the_summary(capsys):
+    assert main(["run", *SMALL, "trials=10", "error_scale=10", "objective=newton.simulations_median"]) == 0
+    summary = pd.read_csv("out/summary.csv")
+    row = summary[(summary["estimator"] == "newton") & (summary["parameter"] == "all")].iloc[0]
+    assert said(capsys.readouterr().out) == row["simulations_median"]
+
+
+def test_of_a_sweep_the_least_is_said(capsys):
+    words = ["error_scale=1,100", "trials=10", "objective=newton.simulations_median"]
+    assert main(["run", "-m", *SMALL, *words]) == 0
+    out = capsys.readouterr().out
+    assert "the least of 2 jobs: error_scale=1" in out
+    summary = pd.read_csv("out/summary.csv").query("estimator == 'newton' and parameter == 'all'")
+    assert said(out) == min(summary["simulations_median"]) < max(summary["simulations_median"])
+
+
+@pytest.mark.parametrize(
+    ("objective", "complaint"),
+    [
+        ("newton.cost_medium", "objective=newton.cost_medium: there is no such column; did you mean cost_median?"),
+        ("newtn.cost_median", "objective=newtn.cost_median: there is no such estimator; did you mean newton?"),
+        ("cost_median", "objective=cost_median: write LABEL.COLUMN, such as newton.capped_error"),
+        ("newton.equation", "objective=newton.equation: there is no such column"),
+    ],
+)
+def test_a_wrong_name_is_refused_before_anything_is_computed(objective, complaint, capsys):
+    assert main(["run", *SMALL, "trials=10", f"objective={objective}"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert complaint in line
+    assert not list(Path().rglob("*.parquet"))
+
+
+def test_a_number_that_is_not_known_is_no_objective(capsys):
+    assert main(["run", *SMALL, "trials=4", "objective=linear_lse.order_median"]) == 2
+    assert "objective=linear_lse.order_median: is not known of" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("optuna") is None, reason="needs the extra optuna")
+def test_optuna_finds_cheaper_windows_for_progressive_than_the_default(capsys):
+    common = ["measurement=bearings", "noise=gaussian", "error_scale=10", "baseline=[]", "solver=[progressive]"]
+    common += ["trials=100", "execution=serial", "objective=progressive.cost_median"]
+    assert main(["run", *common, "output=default"]) == 0
+    default = said(capsys.readouterr().out)
+    sweep = ["hydra/sweeper=optuna", "hydra/sweeper/sampler=tpe", "hydra.sweeper.sampler.seed=1"]
+    sweep += ["hydra.sweeper.n_trials=12", "hydra.sweeper.n_jobs=1", "output=tuned"]
+    sweep += [
+        "estimators.progressive.growth=interval(1.2,8)",
+        "estimators.progressive.window_tolerance=interval(0.05,3)",
+    ]
+    assert main(["run", "-m", *common, *sweep]) == 0
+    assert said(capsys.readouterr().out) < 0.95 * default
