@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import binom
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.intervals import LEVEL, quantile
@@ -18,6 +17,8 @@ def limits(cost: Array, q: float = DONE) -> tuple[float, float]:
     The number of costs at or below the quantile is binomial, at least (Conover, Practical Nonparametric Statistics,
     3rd ed., 1999, section 3.2). Too few trials bound the quantile on one side only: the other end is then infinite.
     """
+    from scipy.stats import binom  # takes a second to load, which most commands need not wait for
+
     trials, tail = len(cost), (1 - LEVEL) / 2
     # With the cost of rank r as an end, r counted from 1: no more than `tail` beyond either.
     low, high = int(binom.ppf(tail, trials, q)), int(binom.ppf(1 - tail, trials, q)) + 1

@@ -12,6 +12,8 @@ from ipe_bench.report.figures.views import View
 
 
 def draw(view: View) -> Iterator[Drawing]:
+    if "deadline" not in view.totals:
+        return  # summarised where the statistic was not there
     medians = view["scores"][["error_scale", "estimator", "cost_median"]]
     rows = view.totals.merge(medians, on=["error_scale", "estimator"])
     rows = rows[np.isfinite(rows["deadline"]) & (rows["deadline"] > 0)]
