@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import bdtr
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.intervals import LEVEL, quantile
@@ -17,11 +18,10 @@ def limits(cost: Array, q: float = DONE) -> tuple[float, float]:
     The number of costs at or below the quantile is binomial, at least (Conover, Practical Nonparametric Statistics,
     3rd ed., 1999, section 3.2). Too few trials bound the quantile on one side only: the other end is then infinite.
     """
-    from scipy.stats import binom  # takes a second to load, which most commands need not wait for
-
     trials, tail = len(cost), (1 - LEVEL) / 2
     # With the cost of rank r as an end, r counted from 1: no more than `tail` beyond either.
-    low, high = int(binom.ppf(tail, trials, q)), int(binom.ppf(1 - tail, trials, q)) + 1
+    at_most = bdtr(np.arange(trials + 1), trials, q)
+    low, high = int(np.searchsorted(at_most, tail)), int(np.searchsorted(at_most, 1 - tail)) + 1
     ordered = np.concatenate([[0.0], np.sort(cost), [np.inf]])
     return float(ordered[low]), float(ordered[min(high, trials + 1)])
 
