@@ -18,7 +18,7 @@ def build(output: Path, trials: int, experiments: Sequence[str] | None = None) -
 
     Experiments that were run before with as many trials are not run again.
     """
-    from sphinx.application import Sphinx
+    from sphinx.application import Sphinx  # pyright: ignore[reportMissingImports]
 
     source = output / "source"
     shutil.rmtree(source, ignore_errors=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from docutils import nodes
-from latex2mathml.converter import convert
+from docutils import nodes  # pyright: ignore[reportMissingModuleSource]
+from latex2mathml.converter import convert  # pyright: ignore[reportMissingImports]
 
 _STYLE = "margin: 1rem 0; padding: .5rem 0; overflow-x: auto"
 
