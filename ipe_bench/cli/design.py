@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
-
-from hydra import compose, initialize_config_dir
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console
-from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, assemble, explain, prepare, rewrite
-from ipe_bench.cli.overrides import read
+from ipe_bench.cli.config import Job
+from ipe_bench.cli.single import compose_single
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
@@ -41,28 +38,11 @@ def main(
     criterion: Criterion = "A",
 ) -> int:
     """Prints tables and writes files; exit code 1 where the readings do not determine every parameter."""
-    prepare()
-    words = rewrite(arguments)
-    _refuse_keys_without_use(words)
-    read(words, KEYS)
-    try:
-        with initialize_config_dir(str(plugins.own_conf()), version_base="1.3"):
-            config = compose("config", words)
-    except Exception as error:  # what Hydra makes of overrides raises nearly anything
-        raise explain(error) from error
-    named = any(a.lstrip("+").startswith(("name=", "output=")) for a in arguments)
-    chosen = [a.partition("=")[2] for a in arguments if a.startswith("measurement=")]
-    try:
-        job = assemble(config)
-        name = chosen[-1] if chosen else job.scenario.measurement.name
-        if not named:
-            config.name = f"design-{name.replace('/', '-')}"
-    except CONFIG_ERRORS as error:
-        raise explain(error) from error
-    scenario = dataclasses.replace(job.scenario, truth=None)
+    single = compose_single("design", arguments, _refuse_keys_without_use)
+    scenario = dataclasses.replace(single.job.scenario, truth=None)
     if scenario.noise.real:
         raise UserError("noise=certified: a design is of readings that are still to be taken; choose another noise")
-    errors = _errors(job)
+    errors = _errors(single.job)
     found = design(scenario, by=by, readings=readings, criterion=criterion, errors=errors)
 
     from ipe_bench.report.answer import claim
@@ -75,10 +55,10 @@ def main(
         "readings": readings,
         "criterion": criterion,
     }
-    folder = claim(Path(config.output), asked, elsewhere=not named, result=RESULT, files=FILES)
-    files = write_design(folder, found, asked, {"measurement": name})
+    folder = claim(single.folder, asked, elsewhere=not single.named, result=RESULT, files=FILES)
+    files = write_design(folder, found, asked, {"measurement": single.measurement})
     out = console()
-    out.print(render(name, found))
+    out.print(render(single.measurement, found))
     out.print(f"In {folder}: {', '.join(path.name for path in files)}", markup=False, soft_wrap=True)
     return 0 if found.observability.observable else 1
 

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
 from ipe_bench.api import validate
@@ -17,11 +16,10 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import library_versions
 from ipe_bench.cli import console
-from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, assemble, explain, prepare, rewrite
-from ipe_bench.cli.overrides import read
+from ipe_bench.cli.config import Job
+from ipe_bench.cli.single import chosen_measurement, compose_single
 from ipe_bench.measurements import Nist
 from ipe_bench.noise import Certified, ModelNoise, Noise
-from ipe_bench.plugins import discovery as plugins
 from ipe_bench.real.examination import examine
 from ipe_bench.real.fits import fit
 from ipe_bench.real.sources import noise_of, open_together
@@ -33,35 +31,26 @@ _STANDARD_ESTIMATORS = ("solver=[auto]", "baseline=[linear_lse,levenberg_marquar
 
 def main(arguments: Sequence[str]) -> int:
     """Estimates with every chosen estimator, prints tables and writes files; exit code 1 where none is an answer."""
-    prepare()
-    words = rewrite(arguments)
-    _refuse_keys_without_use(words)
-    read(words, KEYS)
-    try:
-        with initialize_config_dir(str(plugins.own_conf()), version_base="1.3"):
-            config = compose("config", [*_STANDARD_ESTIMATORS, *words])
-    except Exception as error:  # what Hydra makes of overrides raises nearly anything
-        raise explain(error) from error
-    try:
-        job = assemble(config, estimating=True)
-    except CONFIG_ERRORS as error:
-        raise explain(error) from error
-    named = any(a.lstrip("+").startswith(("name=", "output=")) for a in arguments)
-    name = _measurement_name(arguments, job)
-    if not named:
-        config.name = f"estimate-{name.replace('/', '-')}"
-        job = replace(job, output=config.output)
-    job, z = _readings(config, job)
+    single = compose_single(
+        "estimate",
+        arguments,
+        _refuse_keys_without_use,
+        standard=_STANDARD_ESTIMATORS,
+        measurement=_measurement_name,
+        estimating=True,
+    )
+    config = single.config
+    job, z = _readings(config, single.job)
     problem = job.scenario.problem
     validate([job.scenario], job.estimators, trials=1, estimating=True)
 
     from ipe_bench.report.answer import Answer, claim, render, write_fits
 
     command = _command(config, job)
-    folder = claim(Path(job.output), command, elsewhere=not named)
+    folder = claim(single.folder, command, elsewhere=not single.named)
     fits = fit(problem, z, job.estimators, job.scenario.noise)
-    answer = Answer(name, job.scenario.measurement, z, fits, examine(problem, z, fits))
-    files = write_fits(folder, answer, command, {"measurement": name, **_provenance(config, job)})
+    answer = Answer(single.measurement, job.scenario.measurement, z, fits, examine(problem, z, fits))
+    files = write_fits(folder, answer, command, {"measurement": single.measurement, **_provenance(config, job)})
     out = console()
     out.print(render(answer, out.width))
     out.print(f"\nIn {folder}:", markup=False, soft_wrap=True)
@@ -89,12 +78,11 @@ def _refuse_keys_without_use(words: Sequence[str]) -> None:
 
 
 def _measurement_name(arguments: Sequence[str], job: Job) -> str:
-    """The option that was chosen, which says more than the class, or NIST's data set (nist/misra1a)."""
+    """As it was chosen, or NIST's data set (nist/misra1a)."""
     model = job.scenario.measurement
     if isinstance(model, Nist):
         return f"nist/{model.dataset.lower()}"
-    chosen = [a.partition("=")[2] for a in arguments if a.startswith("measurement=")]
-    return chosen[-1] if chosen else model.name
+    return chosen_measurement(arguments, job)
 
 
 def _readings(config: DictConfig, job: Job) -> tuple[Job, Array]:

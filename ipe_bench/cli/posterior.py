@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
-
-from hydra import compose, initialize_config_dir
 
 from ipe_bench.api import validate
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console
-from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, assemble, explain, prepare, rewrite
-from ipe_bench.cli.overrides import read
-from ipe_bench.plugins import discovery as plugins
+from ipe_bench.cli.single import compose_single
 from ipe_bench.runs.provenance import describe
 from ipe_bench.trials.posterior import reference
 
@@ -31,28 +26,9 @@ _MOST_TRIALS = 100
 
 def main(arguments: Sequence[str], particles: int) -> int:
     """Samples, prints a table and writes files; exit code 1 where the populations of a trial do not agree."""
-    prepare()
-    words = rewrite(arguments)
-    for word in words:
-        key = word.lstrip("+~").partition("=")[0]
-        if key.split(".")[0] in _WITHOUT_USE:
-            raise UserError(f"{key}: is for other commands, and nothing in a posterior; leave it out")
-    read(words, KEYS)
-    try:
-        with initialize_config_dir(str(plugins.own_conf()), version_base="1.3"):
-            config = compose("config", words)
-    except Exception as error:  # what Hydra makes of overrides raises nearly anything
-        raise explain(error) from error
-    named = any(a.lstrip("+").startswith(("name=", "output=")) for a in arguments)
-    chosen = [a.partition("=")[2] for a in arguments if a.startswith("measurement=")]
-    try:
-        job = assemble(config)
-        name = chosen[-1] if chosen else job.scenario.measurement.name
-        if not named:
-            config.name = f"posterior-{name.replace('/', '-')}"
-    except CONFIG_ERRORS as error:
-        raise explain(error) from error
-    trials = job.trials if any(w.lstrip("+").startswith("trials=") for w in words) else _TRIALS
+    single = compose_single("posterior", arguments, _refuse_keys_without_use)
+    job, name = single.job, single.measurement
+    trials = job.trials if any(w.lstrip("+").startswith("trials=") for w in single.words) else _TRIALS
     if trials > _MOST_TRIALS:
         raise UserError(f"trials={trials}: each takes up to a minute; give at most {_MOST_TRIALS}")
     if job.scenario.noise.real:
@@ -69,7 +45,7 @@ def main(arguments: Sequence[str], particles: int) -> int:
         "particles": particles,
     }
     files_ours = [f"corner_{trial}.{kind}" for trial in range(trials) for kind in ("png", "pdf")]
-    folder = claim(Path(config.output), command, elsewhere=not named, result=RESULT, files=files_ours)
+    folder = claim(single.folder, command, elsewhere=not single.named, result=RESULT, files=files_ours)
     found = [reference(job.scenario, job.estimators, trial, particles) for trial in range(trials)]
     files = write_posteriors(folder, job.scenario.measurement, found, command, {"measurement": name})
     scenario = f"{name}, {job.scenario.noise.name}, error scale {job.scenario.error_scale:g}"
@@ -77,3 +53,10 @@ def main(arguments: Sequence[str], particles: int) -> int:
     out.print(render(scenario, found))
     out.print(f"\nIn {folder}: {', '.join(path.name for path in files)}", markup=False, soft_wrap=True)
     return 0 if all(one.posterior.settled for one in found) else 1
+
+
+def _refuse_keys_without_use(words: Sequence[str]) -> None:
+    for word in words:
+        key = word.lstrip("+~").partition("=")[0]
+        if key.split(".")[0] in _WITHOUT_USE:
+            raise UserError(f"{key}: is for other commands, and nothing in a posterior; leave it out")

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from annotated_types import MinLen
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Positive
-from ipe_bench.measurements.base import Input, Measurement, Parameter, UsualNoise
+from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise
 from ipe_bench.measurements.triad import Magnitudes, attitudes
 
 
@@ -68,16 +68,11 @@ class Accelerometer(Magnitudes):
         return np.concatenate([self.bias, np.zeros(3), 1e3 * np.array(self.misalignment)]) / self.sizes
 
     @property
-    def inputs(self) -> tuple[Input, ...]:
-        """What the triad shows in each attitude."""
-        return tuple(Input(f"{axis} [counts]") for axis in "xyz")
+    def output_unit(self) -> str:
+        return "counts"
 
-    @property
-    def input_columns(self) -> Mapping[str, Sequence[Any]]:
-        return {i.heading: self.measured[:, k].tolist() for k, i in enumerate(self.inputs)}
-
-    def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
-        return replace(self, counts=tuple(zip(*(columns[i.heading] for i in self.inputs), strict=True)))
+    def with_outputs(self, outputs: tuple[tuple[float, float, float], ...]) -> Measurement:
+        return replace(self, counts=outputs)
 
     @cached_property
     def measured(self) -> Array:

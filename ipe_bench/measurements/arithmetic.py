@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,6 +53,19 @@ class Arithmetic:
     def __call__(self, values: Mapping[str, Any]) -> Any:
         """Its value, where `values` gives that of every name: numbers, arrays, or expressions to be recorded."""
         return _evaluate(self.tree, values)
+
+
+def require_finite(where: str, value: Any) -> None:
+    """Refuses what is not a finite number; `where` is its config key."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise UserError(f"{where}={value}: give a finite number")
+
+
+def require_parameters(where: str, names: Iterable[str], parameters: Iterable[str]) -> None:
+    """Refuses a name, under the config key `where`, that is not one of the parameters."""
+    for name in names:
+        if name not in parameters:
+            raise UserError(f"{where}: {name} is not a parameter; these are {', '.join(parameters)}")
 
 
 def read(text: str, where: str) -> Arithmetic:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.arithmetic import Arithmetic, read
+from ipe_bench.measurements.arithmetic import Arithmetic, read, require_finite, require_parameters
 from ipe_bench.measurements.base import Input, Measurement, Parameter
 from ipe_bench.measurements.ode.trace import Expression, Graph, tangent
 
@@ -53,8 +53,7 @@ class Formula(Measurement):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name, value in self.start.items():
-            if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-                raise UserError(f"start.{name}={value}: give a finite number")
+            require_finite(f"start.{name}", value)
             if name not in self._arithmetic.names:
                 wanted = ", ".join(self._arithmetic.names)
                 raise UserError(f"start.{name}: does not appear in the expression, whose names are {wanted}")
@@ -68,9 +67,7 @@ class Formula(Measurement):
         lengths = {name: len(column) for name, column in self.columns.items()}
         if len(set(lengths.values())) > 1:
             raise UserError(f"columns: have different lengths: {lengths}")
-        for name in self.own:
-            if name not in self.start:
-                raise UserError(f"own: {name} is not a parameter; these are {', '.join(self.start)}")
+        require_parameters("own", self.own, self.start)
 
     @cached_property
     def _arithmetic(self) -> Arithmetic:

@@ -48,6 +48,27 @@ class Magnitudes(Measurement):
         """The three components, each (trials, attitudes), of what acted on the triad."""
 
     @property
+    @abstractmethod
+    def output_unit(self) -> str:
+        """The unit of the outputs."""
+
+    @abstractmethod
+    def with_outputs(self, outputs: tuple[tuple[float, float, float], ...]) -> Measurement:
+        """The same triad with these outputs r_k."""
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        """What the triad shows in each attitude."""
+        return tuple(Input(f"{axis} [{self.output_unit}]") for axis in "xyz")
+
+    @property
+    def input_columns(self) -> Mapping[str, Sequence[Any]]:
+        return {i.heading: self.measured[:, k].tolist() for k, i in enumerate(self.inputs)}
+
+    def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
+        return self.with_outputs(tuple(zip(*(columns[i.heading] for i in self.inputs), strict=True)))
+
+    @property
     def index(self) -> Mapping[str, Sequence[Any]]:
         return {"attitude": list(range(1, len(self.measured) + 1))}
 
@@ -119,16 +140,11 @@ class Triad(Magnitudes):
         return np.concatenate([self.bias, self.scale, self.misalignment]) / self._plain_sizes
 
     @property
-    def inputs(self) -> tuple[Input, ...]:
-        """What the triad shows in each attitude."""
-        return tuple(Input(f"{axis} [{self.unit}]") for axis in "xyz")
+    def output_unit(self) -> str:
+        return self.unit
 
-    @property
-    def input_columns(self) -> Mapping[str, Sequence[Any]]:
-        return {i.heading: self.measured[:, k].tolist() for k, i in enumerate(self.inputs)}
-
-    def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
-        return replace(self, outputs=tuple(zip(*(columns[i.heading] for i in self.inputs), strict=True)))
+    def with_outputs(self, outputs: tuple[tuple[float, float, float], ...]) -> Measurement:
+        return replace(self, outputs=outputs)
 
     @cached_property
     def measured(self) -> Array:

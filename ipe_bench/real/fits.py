@@ -179,7 +179,7 @@ def fit(
     if noise.estimated if level_unknown is None else level_unknown:
         found = [_fit_with_level(label, one, given, z[present], *where) for label, one in estimators.items()]
     else:
-        found = [_fit_one(label, one, given, z[present], *where, noise) for label, one in estimators.items()]
+        found = [_fit_one(label, one, given, z[present], *where, noise=noise) for label, one in estimators.items()]
     return _compared(found)
 
 
@@ -278,22 +278,13 @@ def _succession(model: Measurement, present: NDArray[np.intp]) -> NDArray[np.int
     return place[np.stack([np.sort(rows) for rows in epochs]).T]
 
 
-def _fit_one(
-    label: str,
-    estimator: Estimator,
-    problem: Problem,
-    z: Array,
-    rows: NDArray[np.intp],
-    m: int,
-    order: NDArray[np.intp],
-    noise: Noise | None,
-) -> Fit:
-    """`noise` None: its level is not known, and the size of the residuals cannot be tested."""
-    found = _fit_inside(label, estimator, problem, z, rows, m, order, noise)
+def _fit_one(label: str, estimator: Estimator, problem: Problem, z: Array, *where: Any, noise: Noise | None) -> Fit:
+    """The fit within the bounds of the parameters, on some of them where its minimum lies there; see `_fit_inside`."""
+    found = _fit_inside(label, estimator, problem, z, *where, noise=noise)
     near = {} if found.with_prior else problem.measurement.near_bounds(found.inner)
     if not 0 < len(near) < len(found.x):
         return found
-    held = _fit_inside(label, estimator, holding(problem, near), z, rows, m, order, noise)
+    held = _fit_inside(label, estimator, holding(problem, near), z, *where, noise=noise)
     return _on_bounds(found, held, near) if _is_minimum(problem, held, near, z) else found
 
 
@@ -339,8 +330,11 @@ def _fit_inside(
     rows: NDArray[np.intp],
     m: int,
     order: NDArray[np.intp],
+    *,
     noise: Noise | None,
 ) -> Fit:
+    """The fit to readings z that are the `rows` of m. `noise` None: its level is not known, and the size of the
+    residuals cannot be tested."""
     model, n = problem.measurement, problem.measurement.n
     estimates = estimate_safely(estimator, problem, z[None])
     message = estimates.messages.get(0, "")

@@ -6,22 +6,12 @@ import json
 
 import pytest
 
-from ipe_bench.cli.main import main
-
 SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "error_scale=3", "solver=[newton]")
 
 
 @pytest.fixture
-def command(monkeypatch, capsys, tmp_path):
-    """Runs the command in this process: its exit code and what it wrote on stdout and stderr."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*words: str) -> tuple[int, str, str]:
-        code = main(["posterior", *words])
-        written = capsys.readouterr()
-        return code, written.out, written.err
-
-    return run
+def command(ipe_bench):
+    return lambda *words: ipe_bench("posterior", *words)
 
 
 def test_a_table_and_files_for_each_trial(command, tmp_path):

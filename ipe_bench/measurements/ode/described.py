@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Positive
-from ipe_bench.measurements.arithmetic import Arithmetic, read
+from ipe_bench.measurements.arithmetic import Arithmetic, read, require_finite, require_parameters
 from ipe_bench.measurements.base import Input, Measurement, Parameter
 from ipe_bench.measurements.ode import sampling
 from ipe_bench.measurements.ode.model import OdeMeasurement
@@ -69,8 +69,7 @@ class Ode(Measurement):
             if name not in self.rates:
                 raise UserError(f"initial.{name}: there is no such state; these have rates: {', '.join(self.rates)}")
         for name, value in self.start.items():
-            if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-                raise UserError(f"start.{name}={value}: give a finite number")
+            require_finite(f"start.{name}", value)
             if name in self.rates or name == "t":
                 raise UserError(f"start.{name}: is a state or the time, and not a parameter; rename one of them")
         known = {**dict.fromkeys(self.start), **dict.fromkeys(self.rates), "t": None}
@@ -92,9 +91,7 @@ class Ode(Measurement):
             raise UserError("start: is empty, so nothing is to be estimated; give each parameter a start")
         if any(time < 0 for time in self.times) or any(b <= a for a, b in itertools.pairwise(self.times)):
             raise UserError(f"times={list(self.times)}: give ascending numbers from 0 on")
-        for name in self.own:
-            if name not in self.start:
-                raise UserError(f"own: {name} is not a parameter; these are {', '.join(self.start)}")
+        require_parameters("own", self.own, self.start)
 
     @cached_property
     def _rates(self) -> dict[str, Arithmetic]:

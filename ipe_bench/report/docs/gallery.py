@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import json
-import os
-import re
 import shlex
 import shutil
-import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.files import write_text
+from ipe_bench.basics.files import make_folder, write_text
 from ipe_bench.plugins import discovery
+from ipe_bench.report.docs.program import printed_by
 from ipe_bench.report.figures.gallery import INDEX
 
 FIGURES = 3
 """Pictures of an experiment that its page shows."""
-_STYLE = re.compile(r"\x1b\[[0-9;]*m")
 
 
 def write_gallery(folder: Path, results: Path, trials: int, names: Sequence[str] | None) -> None:
@@ -38,28 +33,15 @@ def write_gallery(folder: Path, results: Path, trials: int, names: Sequence[str]
 def _page(option: discovery.Option, folder: Path, results: Path, trials: int) -> str:
     number = [] if (option.config or {}).get("trials") == 1 else [f"trials={trials}"]
     command = ["run", f"+experiment={option.name}", *number]
-    printed = _executed([*command, f"output={results.resolve()}"], option.name)
+    # The paths at its end are of no use to a reader.
+    printed = printed_by([*command, f"output={results.resolve()}"]).partition("\nSummary ")[0].strip()
     lines = [f"# {option.name}", "", option.summary, "", "```console", f"$ ipe-bench {shlex.join(command)}", "```", ""]
     lines += ["```text", printed, "```", ""]
+    make_folder(folder / "pictures")
     for picture, caption in _pictures(results / "figures"):
-        shutil.copyfile(picture, _made(folder / "pictures") / f"{option.name}_{picture.name}")
+        shutil.copyfile(picture, folder / "pictures" / f"{option.name}_{picture.name}")
         lines += [f"![{picture.stem.replace('_', ' ')}](pictures/{option.name}_{picture.name})", "", f"*{caption}*", ""]
     return "\n".join([*lines, "## Its config", "", "```yaml", option.text.rstrip(), "```", ""])
-
-
-def _executed(command: Sequence[str], name: str) -> str:
-    """What a command printed, without the paths at its end.
-
-    Raises:
-        UserError: it failed.
-    """
-    program = [sys.executable, "-m", "ipe_bench", *command]
-    environment = os.environ | {"COLUMNS": "80", "NO_COLOR": "1"}
-    done = subprocess.run(program, capture_output=True, text=True, env=environment, check=False)
-    if done.returncode != 0:
-        raise UserError(f"experiment={name}: ended with exit code {done.returncode}: {done.stderr[-2000:]}")
-    text = _STYLE.sub("", done.stdout)
-    return "\n".join(line.rstrip() for line in text.partition("\nSummary ")[0].strip().splitlines())
 
 
 def _pictures(folder: Path) -> list[tuple[Path, str]]:
@@ -67,8 +49,3 @@ def _pictures(folder: Path) -> list[tuple[Path, str]]:
     index = json.loads((folder / INDEX).read_text(encoding="utf-8"))
     drawn = [entry for entries in index["drawn"].values() for entry in entries]
     return [(folder / f"{entry['name']}.png", entry["caption"]) for entry in drawn[:FIGURES]]
-
-
-def _made(folder: Path) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder

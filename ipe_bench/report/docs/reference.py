@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -15,6 +12,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.plugins import discovery
 from ipe_bench.plugins.description import described
 from ipe_bench.report.definitions import DEFINITIONS
+from ipe_bench.report.docs.program import printed_by
 from ipe_bench.statistics.records import STATISTICS
 
 GROUPS = {
@@ -61,9 +59,7 @@ def _commands_page() -> str:
 
 
 def _help(*command: str) -> str:
-    program = [sys.executable, "-m", "ipe_bench", *command, "--help"]
-    environment = os.environ | {"COLUMNS": "100", "NO_COLOR": "1"}
-    return subprocess.run(program, capture_output=True, text=True, env=environment, check=True).stdout.rstrip()
+    return printed_by([*command, "--help"], columns=100).rstrip()
 
 
 def _key(group: str) -> str:

@@ -1,0 +1,77 @@
+"""One job outside of a run of Hydra's: for the commands that compute a single scenario and write one folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, assemble, explain, prepare, rewrite
+from ipe_bench.cli.overrides import read
+from ipe_bench.plugins import discovery as plugins
+
+
+def chosen_measurement(arguments: Sequence[str], job: Job) -> str:
+    """The option that was chosen, which says more than the class."""
+    chosen = [a.partition("=")[2] for a in arguments if a.startswith("measurement=")]
+    return chosen[-1] if chosen else job.scenario.measurement.name
+
+
+@dataclass(frozen=True)
+class Single:
+    """What a command was asked for."""
+
+    words: Sequence[str]
+    """The overrides in Hydra's own words."""
+    config: DictConfig
+    job: Job
+    measurement: str
+    """The model, as it was asked for."""
+    named: bool
+    """Whether the folder was named; else it is named after the command and the model."""
+
+    @property
+    def folder(self) -> Path:
+        """Where the files are to go."""
+        return Path(self.config.output)
+
+
+def compose_single(
+    command: str,
+    arguments: Sequence[str],
+    refuse: Callable[[Sequence[str]], Any],
+    *,
+    standard: Sequence[str] = (),
+    measurement: Callable[[Sequence[str], Job], str] = chosen_measurement,
+    estimating: bool = False,
+) -> Single:
+    """Composes and constructs what the arguments of a command ask for.
+
+    `refuse` raises where the overrides name what is nothing in this command; `standard` are overrides that stand unless
+    others are given; `measurement` says what the model is called.
+
+    Raises:
+        UserError: a mistake in the arguments, in one line.
+    """
+    prepare()
+    words = rewrite(arguments)
+    refuse(words)
+    read(words, KEYS)
+    try:
+        with initialize_config_dir(str(plugins.own_conf()), version_base="1.3"):
+            config = compose("config", [*standard, *words])
+    except Exception as error:  # what Hydra makes of overrides raises nearly anything
+        raise explain(error) from error
+    named = any(a.lstrip("+").startswith(("name=", "output=")) for a in arguments)
+    try:
+        job = assemble(config, estimating=estimating)
+        name = measurement(arguments, job)
+        if not named:
+            config.name = f"{command}-{name.replace('/', '-')}"
+    except CONFIG_ERRORS as error:
+        raise explain(error) from error
+    return Single(words, config, job, name, named)
