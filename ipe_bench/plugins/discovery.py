@@ -23,7 +23,6 @@ from typing import Any
 import yaml
 
 from ipe_bench.basics.errors import UserError, describe_exception
-from ipe_bench.plugins.construct import register_package
 
 ENTRY_POINTS = "ipe_bench.plugins"
 ESTIMATOR_GROUPS = ("solver", "baseline")
@@ -99,6 +98,24 @@ class Option:
         """The class that it names."""
         found = _TARGET_LINE.search(self.text)
         return found.group(1) if found else None
+
+    @property
+    def comments(self) -> dict[str, str]:
+        """By key, the comment at the end of its line, or else the one above it, which several keys may share."""
+        found: dict[str, str] = {}
+        block: list[str] = []
+        commenting = False
+        for line in self.text.splitlines():
+            if line.startswith("#"):
+                block = [*block, line] if commenting else [line]
+            key, colon, rest = line.partition(":")
+            if colon and key == "_target_":
+                block = []
+            elif colon and key.isidentifier():
+                shared = " ".join(part.lstrip("# ").strip() for part in block)
+                found[key] = rest.partition(" #")[2].strip() or shared
+            commenting = line.startswith("#")
+        return found
 
     @functools.cached_property
     def fault(self) -> str | None:
@@ -248,7 +265,7 @@ def _installed() -> Iterator[Source]:
         if spec is None or not spec.submodule_search_locations:
             _problems[f"plugin {entry.name}: {reason}; it is left out, install it again"] = None
             continue
-        register_package(entry.value.split(".")[0])
+        _register(entry.value.split(".")[0])
         version = f" {entry.dist.version}" if entry.dist else ""
         conf = Path(spec.submodule_search_locations[0]) / "conf"
         yield Source(entry.value, conf, f"{entry.dist.name if entry.dist else entry.name}{version}")
@@ -259,8 +276,15 @@ def _in_folder(folder: Path) -> Iterator[Source]:
         package = conf.parent.name
         if (conf.parent / "__init__.py").is_file():
             _make_importable(folder)
-            register_package(package)
+            _register(package)
             yield Source(package, conf, f"{folder.parent.name}/{folder.name}")
+
+
+def _register(package: str) -> None:
+    # Late: it loads NumPy, for which a shell that completes a word has no time.
+    from ipe_bench.plugins.construct import register_package
+
+    register_package(package)
 
 
 def _make_importable(folder: Path) -> None:
