@@ -22,6 +22,7 @@ COMMANDS = (
     "list",
     "check",
     "new",
+    "schema",
     "completion",
 )
 

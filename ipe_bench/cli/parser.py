@@ -96,6 +96,13 @@ output=DIR           writes comparison.csv and comparison as PNG and PDF there
 KINDS = ("solver", "baseline", "measurement", "noise", "prior", "execution")
 KINDS += ("statistic", "figure", "table", "section", "experiment")
 """Of plugins that `new` makes."""
+_SCHEMA = """
+  ipe-bench schema > ipe-bench.schema.json
+
+Visual Studio Code with the YAML extension, in settings.json: "yaml.schemas": {"ipe-bench.schema.json": "**/conf/**/*.yaml"}
+Any editor with yaml-language-server, in a file: # yaml-language-server: $schema=ipe-bench.schema.json
+Options of plugins are in it as far as they are found from here; write it again after a new one.
+"""
 _COMPLETION = """
   eval "$(ipe-bench completion bash)"             in ~/.bashrc
   eval "$(ipe-bench completion zsh)"              in ~/.zshrc, behind compinit
@@ -226,6 +233,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         "0 all checks passed; 1 some failed",
     )
     check.add_argument("folders", metavar="DIR", nargs="*", help="folders of plugins, such as plugins/my_plugin")
+    add("schema", "a JSON schema of config files, for editors that complete and check them", more=_SCHEMA)
     completion = add("completion", "the script that lets a shell complete all of this", more=_COMPLETION)
     completion.add_argument("shell", metavar="SHELL", choices=("bash", "zsh", "fish"), help="bash, zsh or fish")
     completion.add_argument("--query", action="store_true", help=argparse.SUPPRESS)

@@ -41,7 +41,7 @@ def described(option: Option) -> list[Described]:
     if option.target is None:
         return [Described(str(key), _written(value), "", "") for key, value in config.items() if key != "defaults"]
     cls = find_class(option.target, f"{option.group}.{option.name}")
-    kinds, meanings, comments = option_types(cls), _meanings(cls), option.comments
+    kinds, meanings, comments = option_types(cls), meanings(cls), option.comments
     return [
         Described(
             field.name,
@@ -76,7 +76,7 @@ def _written(value: Any) -> str:
     return "" if value == "???" else type(value).__name__ if dataclasses.is_dataclass(value) else str(value)
 
 
-def _meanings(cls: type) -> dict[str, str]:
+def meanings(cls: type) -> dict[str, str]:
     """By field, the text below it, of the class and its bases."""
     found: dict[str, str] = {}
     for base in reversed(cls.__mro__):

@@ -22,7 +22,7 @@ from ipe_bench.plugins.annotations import choices, stated
 from ipe_bench.plugins.construct import find_class
 
 pty = pytest.importorskip("pty")  # Windows has no such terminals, and none of these shells
-OURS = [o for o in discovery.options() if o.target and o.group in discovery.COMPONENT_GROUPS]
+OURS = [o for o in discovery.options() if o.source.name == "ipe-bench" and o.group in discovery.COMPONENT_GROUPS]
 
 
 def texts(line: str) -> list[str]:

@@ -54,7 +54,7 @@ def test_every_command_has_a_section(tmp_path):
     write_reference(tmp_path)
     page = (tmp_path / "commands.md").read_text(encoding="utf-8")
     found = set(re.findall(r"^## (\w+)$", page, re.MULTILINE))
-    names = {"run", "estimate", "design", "posterior", "report", "compare", "status", "list", "new", "check"}
+    names = {"run", "estimate", "design", "posterior", "report", "compare", "status", "list", "new", "check", "schema", "completion"}
     assert found == names
 
 
