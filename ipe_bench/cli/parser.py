@@ -99,7 +99,8 @@ KINDS += ("statistic", "figure", "table", "section", "experiment")
 _SCHEMA = """
   ipe-bench schema > ipe-bench.schema.json
 
-Visual Studio Code with the YAML extension, in settings.json: "yaml.schemas": {"ipe-bench.schema.json": "**/conf/**/*.yaml"}
+Visual Studio Code with its YAML extension, in settings.json:
+                    "yaml.schemas": {"ipe-bench.schema.json": "**/conf/**/*.yaml"}
 Any editor with yaml-language-server, in a file: # yaml-language-server: $schema=ipe-bench.schema.json
 Options of plugins are in it as far as they are found from here; write it again after a new one.
 """

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import typing
-from typing import Any
+from typing import Any, Optional
 
 from ipe_bench.basics.options import Count, NonNegative, Positive, Whole
 from ipe_bench.cli.config import Schema as Keys
@@ -17,8 +17,8 @@ from ipe_bench.runs.provenance import TARGET
 _LIMITED: dict[str, Any] = {
     "error_scale": Positive,
     "seed": Whole,
-    "trials": Count | None,
-    "time_limit": NonNegative | None,
+    "trials": Optional[Count],
+    "time_limit": Optional[NonNegative],
     "block_size": Count,
     "write_readings_trial": Whole,
     "readings": str | tuple[str, ...] | None,

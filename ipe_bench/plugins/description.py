@@ -41,13 +41,13 @@ def described(option: Option) -> list[Described]:
     if option.target is None:
         return [Described(str(key), _written(value), "", "") for key, value in config.items() if key != "defaults"]
     cls = find_class(option.target, f"{option.group}.{option.name}")
-    kinds, meanings, comments = option_types(cls), meanings(cls), option.comments
+    kinds, texts, comments = option_types(cls), meanings(cls), option.comments
     return [
         Described(
             field.name,
             _value(field, config),
             describe_type(kinds[field.name]),
-            meanings.get(field.name) or comments.get(field.name, ""),
+            texts.get(field.name) or comments.get(field.name, ""),
         )
         for field in dataclasses.fields(cls)
         if field.init
