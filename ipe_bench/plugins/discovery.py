@@ -14,6 +14,7 @@ import math
 import os
 import re
 import sys
+import tomllib
 import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -130,12 +131,52 @@ class Option:
             return f"{self.path}: cannot be read ({error.strerror})"
         if self.group in ESTIMATOR_GROUPS and self.package != f"estimators.{self.label}":
             return f"{self.path}: its first line must be '# @package estimators.{self.label}', or it never runs"
-        return _yaml_fault(self.path, text)
+        return _yaml_fault(self.path, text) or self._lack()
+
+    def _lack(self) -> str | None:
+        """What has to be installed before a plugin in a folder can be used."""
+        home = self.source.conf.parent.parent
+        lacking = " and ".join(_not_installed(home / "pyproject.toml"))
+        return f"needs {lacking}, not installed here; pip install {_shown(home)}" if lacking else None
 
     @property
     def label(self) -> str:
         """What an estimator is called in tables."""
         return Path(self.name).name
+
+
+@functools.cache
+def _not_installed(project: Path) -> tuple[str, ...]:
+    """The distributions that a pyproject.toml names as needed and that are not here, as far as can be told."""
+    try:
+        needed = tomllib.loads(project.read_text(encoding="utf-8"))["project"]["dependencies"]
+        names = [re.split(r"[^\w.-]", str(line))[0] for line in needed if ";" not in str(line)]
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return ()
+    return tuple(name for name in names if name and not _is_installed(name))
+
+
+def _is_installed(name: str) -> bool:
+    try:
+        importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        # One that is on the path without having been installed will do.
+        return name.replace("-", "_").isidentifier() and _has_module(name.replace("-", "_"))
+    return True
+
+
+def _has_module(name: str) -> bool:
+    try:
+        found = importlib.util.find_spec(name)
+    except (ImportError, ValueError):
+        return False
+    return found is not None and found.origin is not None  # a mere folder of that name has none
+
+
+def _shown(folder: Path) -> Path:
+    """A folder as one would type it from here."""
+    here = Path.cwd()
+    return folder.relative_to(here) if folder.is_relative_to(here) else folder
 
 
 def _yaml_fault(path: Path, text: str) -> str | None:

@@ -42,9 +42,11 @@ def test_agrees_with_ours(pair, engine, model, noise, error_scale):
     a, b = theirs.estimate(bench.problem, drawn.z), ours.estimate(bench.problem, drawn.z)
     assert (a.status == b.status).all()
     deviations = np.sqrt(np.diagonal(b.covariance, axis1=1, axis2=2))
-    assert (np.abs(a.x - b.x) < 1e-5 * deviations).all()
-    np.testing.assert_allclose(np.diagonal(a.covariance, axis1=1, axis2=2), deviations**2, rtol=1e-5)
-    np.testing.assert_allclose(a.extras["nis"], b.extras["nis"], rtol=1e-5)
+    # Sigma points lose digits where a prior is 1e4 times as wide as what is left of it.
+    close = 1e-8 if pair == "EKF" else 3e-6
+    assert (np.abs(a.x - b.x) < close * deviations).all()
+    np.testing.assert_allclose(np.diagonal(a.covariance, axis1=1, axis2=2), deviations**2, rtol=close)
+    np.testing.assert_allclose(a.extras["nis"], b.extras["nis"], rtol=close)
 
 
 @pytest.mark.parametrize("pair", PAIRS)
