@@ -255,7 +255,7 @@ def take_problems() -> list[str]:
 @functools.cache
 def sources() -> tuple[Source, ...]:
     """Ours first, then the installed plugins, then the folders `plugins/*/`; their packages become importable."""
-    found = [Source("ipe-bench", own_conf(), "built in"), *_installed()]
+    found = installed_sources()
     for folder in dict.fromkeys([*_folders(), *_added]):
         try:
             found += _in_folder(folder)
@@ -270,6 +270,11 @@ def sources() -> tuple[Source, ...]:
                 f"plugin {source.conf.parent}: {known.conf.parent} is called {source.name} too; it is left out"
             ] = None
     return tuple(unique.values())
+
+
+def installed_sources() -> list[Source]:
+    """Ours, then the installed plugins: what is the same in every folder."""
+    return [Source("ipe-bench", own_conf(), "built in"), *_installed()]
 
 
 def _same_file(a: Path, b: Path) -> bool:
