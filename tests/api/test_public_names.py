@@ -101,6 +101,16 @@ def test_a_file_and_an_array_are_estimated_alike(tmp_path, polynomial):
         np.testing.assert_array_equal(of_file.x, of_array.x)
 
 
+def test_without_estimators_they_are_those_of_the_command(polynomial):
+    from ipe_bench.cli.estimate import STANDARD_ESTIMATORS
+    from ipe_bench.cli.single import compose_single
+
+    asked = ["measurement=polynomial", "readings=z.csv"]
+    command = compose_single("estimate", asked, lambda words: None, standard=STANDARD_ESTIMATORS).job.estimators
+    fits = ib.estimate(polynomial.measurement, polynomial.draw(0, 1).z[0], noise=polynomial.noise)
+    assert {fit.label for fit in fits} == set(command)
+
+
 def test_noise_that_nobody_states_is_estimated_from_the_residuals(polynomial):
     """As `scipy.optimize.curve_fit` does without `absolute_sigma`: another implementation of the same definition."""
     from scipy.optimize import curve_fit
