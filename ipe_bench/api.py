@@ -162,7 +162,7 @@ def report(directories: Directories, output: Path | str | None = None) -> Report
     >>> import ipe_bench as ib
     >>> ib.report("outputs/nowhere")
     Traceback (most recent call last):
-    ipe_bench.basics.errors.UserError: outputs/nowhere: holds no results of ipe-bench; give the output folder of a run
+    ipe_bench.basics.errors.UserError: outputs/nowhere: there is no such directory; give one that a run wrote to
 
     Raises:
         UserError: no run ever wrote to a directory.

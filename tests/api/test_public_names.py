@@ -53,7 +53,7 @@ def test_the_python_of_the_readme_runs_as_it_stands(tmp_path, monkeypatch):
     exec(code.replace("trials=200", "trials=20"), names)
     assert set(names["table"]["estimator"]) == {"newton", "ekf"}
     assert names["rows"].groupby("estimator")["nees"].mean().loc["ekf"] > names["rows"]["nees"].min()
-    assert [fit.label for fit in names["fits"]] == ["linear_lse", "fixed_point", "levenberg_marquardt", "progressive"]
+    assert [fit.label for fit in names["fits"]] == ["linear_lse", "levenberg_marquardt", "auto"]
 
 
 @pytest.fixture(scope="module")
