@@ -450,7 +450,8 @@ _MANY = 4
 
 
 def _x0_and_deviation(prior: Prior, error_scale: float = 1.0) -> tuple[Array, Array]:
-    n = len(getattr(prior, "deviations", None) or [1.0] * _MANY)
+    given = getattr(prior, "deviations", None) or getattr(prior, "correlations", None)
+    n = len(given or [1.0] * _MANY)
     return np.linspace(-1.0, 1.0, n), np.asarray(prior.deviation(n, error_scale))
 
 
@@ -478,10 +479,15 @@ def draws_reproducibly(prior: Prior) -> None:
 
 
 def draws_what_is_told(prior: Prior) -> None:
-    """Draws independent parameters of the mean x0 and the deviations that it states, normal where it says so."""
+    """Draws parameters of the mean x0 and of the deviations and correlations that it states, normal where it says
+    so."""
     from scipy.stats import kstest
 
     x0, deviation = _x0_and_deviation(prior, 2.0)
+    stated = prior.correlation(len(x0))
+    C = np.eye(len(x0)) if stated is None else stated
+    assert C.shape == (len(x0),) * 2, f"correlation returns {C.shape}, and not {(len(x0),) * 2}"
+    C = C[np.ix_(deviation > 0, deviation > 0)]
     rng = np.random.default_rng(7)
     x = np.array([prior.draw(x0.copy(), 2.0, rng) for _ in range(DRAWS)]) - x0
     assert np.array_equal(x[:, deviation == 0], np.zeros((DRAWS, int((deviation == 0).sum())))), (
@@ -491,12 +497,14 @@ def draws_what_is_told(prior: Prior) -> None:
     off = np.abs(w.mean(axis=0)) - 6 * w.std(axis=0) / np.sqrt(DRAWS)
     assert (off < 0).all(), f"the mean is off x0 by up to {np.abs(w.mean(axis=0)).max():.3g} of the stated deviation"
     products = w[:, :, None] * w[:, None, :]
-    off = np.abs(products.mean(axis=0) - np.eye(w.shape[1])) - 6 * products.std(axis=0) / np.sqrt(DRAWS)
+    off = np.abs(products.mean(axis=0) - C) - 6 * products.std(axis=0) / np.sqrt(DRAWS)
     i, j = (int(k) for k in np.unravel_index(int(off.argmax()), off.shape))
     assert off[i, j] < 0 or i != j, (
         f"the draws have {w[:, i].std():.3g} times the stated deviation, on average over {DRAWS} draws"
     )
-    assert off[i, j] < 0, f"two parameters have the correlation {products[:, i, j].mean():.2f}; estimators are told 0"
+    assert off[i, j] < 0, (
+        f"two parameters have the correlation {products[:, i, j].mean():.2f}; estimators are told {C[i, j]:.2g}"
+    )
     p = min(float(kstest(w[:, i], "norm").pvalue) for i in range(w.shape[1]))
     assert not prior.normal or p > 1e-6, f"the draws are not normal (p = {p:.1g}); set `normal` to False"
 

@@ -261,7 +261,7 @@ def present_part(problem: Problem, rows: NDArray[np.intp], level: float | None =
 
 def _restricted(problem: Problem, rows: Array) -> Problem:
     model = Restricted(problem.measurement, tuple(rows.tolist()))
-    return Problem(model, problem.R.restricted(rows), problem.prior_deviation)
+    return replace(problem, measurement=model, R=problem.R.restricted(rows))
 
 
 def _succession(model: Measurement, present: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -290,10 +290,11 @@ def _fit_one(label: str, estimator: Estimator, problem: Problem, z: Array, *wher
 
 def holding(problem: Problem, values: Mapping[int, float]) -> Problem:
     """The problem with some parameters fixed at values in their own units."""
-    deviation = problem.prior_deviation
-    if deviation is not None:
-        deviation = np.delete(deviation, list(values))
-    return Problem(problem.measurement.holding(values), problem.R, deviation)
+    kept = [k for k in range(problem.measurement.n) if k not in values]
+    deviation, correlation = problem.prior_deviation, problem.prior_correlation
+    deviation = None if deviation is None else deviation[kept]
+    correlation = None if correlation is None else correlation[np.ix_(kept, kept)]
+    return Problem(problem.measurement.holding(values), problem.R, deviation, correlation)
 
 
 def _is_minimum(problem: Problem, held: Fit, near: Mapping[int, float], z: Array) -> bool:

@@ -104,6 +104,8 @@ class Answer:
     """One for each estimator, in the order in which they were given."""
     examination: Examination | None
     """Of the least minimum that was found; None where no estimator found any."""
+    left_out: str = ""
+    """What of the files was left out on purpose."""
 
     @property
     def passes(self) -> bool:
@@ -192,6 +194,7 @@ def _described(answer: Answer) -> dict[str, Any]:
         "readings_present": int(np.isfinite(z).sum()),
         "readings_missing": int(np.isnan(z).sum()),
         "fixed": dict(model.fixed),
+        "left_out": answer.left_out,
         "passes": answer.passes,
         "examination": None if answer.examination is None else examined.described(answer.examination, labels),
         "parameters": [{"name": p.name, "unit": p.unit} for p in model.natural_parameters],
@@ -290,7 +293,7 @@ def render(answer: Answer, width: int) -> Group:
     from rich.console import Group
 
     model, fits, found = answer.model, answer.fits, answer.examination
-    parts = [*_estimates(answer.name, model, fits, width), _verdicts(fits, width), _notes(fits, width)]
+    parts = [*_estimates(answer.name, model, fits, width), _verdicts(fits, width), _notes(answer, width)]
     parts += _outliers(model, fits)
     if found is not None and answer[found.label].passes:
         parts += ["", examined.table(found), *_remarks(answer)]
@@ -393,9 +396,10 @@ def _fit_p(one: Fit) -> str:
     return p_value(one.p_value, LEAST_FIT_P if one.p_value == LEAST_FIT_P else 0.0)
 
 
-def _notes(fits: Sequence[Fit], width: int) -> Any:
+def _notes(answer: Answer, width: int) -> Any:
     from rich.text import Text
 
+    fits = answer.fits
     lines = [
         f"fits: p of chi-square is at least {FIT_LEVEL:g}. white p: Ljung-Box; small where successive residuals"
         " resemble each other."
@@ -408,6 +412,8 @@ def _notes(fits: Sequence[Fit], width: int) -> Any:
     failing = [one.label for one in fits if not one.passes]
     if fits[0].model.fixed:
         lines.append("Fixed: " + ", ".join(f"{name} = {value:g}" for name, value in fits[0].model.fixed.items()))
+    if answer.left_out:
+        lines.append(f"Left out on purpose: {answer.left_out}.")
     if failing:
         lines.append(
             f"In brackets: {', '.join(failing)}. Not an answer: errors are not given, for they would be wrong."
@@ -501,6 +507,8 @@ def fragment(answer: Answer) -> str:
     notes = [*_on_levels(answer.fits), *_on_priors(answer.fits), *_on_bounds(answer.fits)]
     if failing:
         notes.append(f"In brackets, and not an answer: {', '.join(failing)}.")
+    if answer.left_out:
+        notes.append(f"Left out on purpose: {answer.left_out}.")
     found = answer.examination
     if found is not None and answer[found.label].passes:
         head = "".join(f"<th>{name}</th>" for name in examined.HEADINGS)
