@@ -319,7 +319,7 @@ def estimate(
     """
     from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
     from ipe_bench.noise.own import ModelNoise, Unknown
-    from ipe_bench.real.examination import examine
+    from ipe_bench.real.examination import examinations
     from ipe_bench.real.fits import fit
     from ipe_bench.real.sources import LeftOut, Readings, noise_of, open_together
     from ipe_bench.report.answer import Answer
@@ -352,7 +352,7 @@ def estimate(
         raise UserError("; ".join(lacking) + remedy)
     fits = fit(problem, found.z, estimators, known)
     return Answer(
-        found.model.name, found.model, found.z, fits, examine(problem, found.z, fits), left_out.said
+        found.model.name, found.model, found.z, fits, examinations(problem, found.z, fits), left_out.said
     )
 
 

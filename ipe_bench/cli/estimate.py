@@ -20,7 +20,7 @@ from ipe_bench.cli.config import Job
 from ipe_bench.cli.single import chosen_measurement, compose_single
 from ipe_bench.measurements import Measurement, Nist
 from ipe_bench.noise import Certified, ModelNoise, Noise
-from ipe_bench.real.examination import examine
+from ipe_bench.real.examination import examinations
 from ipe_bench.real.fits import fit
 from ipe_bench.real.sources import LeftOut, Readings, noise_of, open_together, require_enough
 from ipe_bench.runs.provenance import describe, fingerprint
@@ -50,7 +50,7 @@ def main(arguments: Sequence[str]) -> int:
     folder = claim(single.folder, command, elsewhere=not single.named)
     fits = fit(problem, z, job.estimators, job.scenario.noise)
     left_out = _left_out(config).said
-    answer = Answer(single.measurement, job.scenario.measurement, z, fits, examine(problem, z, fits), left_out)
+    answer = Answer(single.measurement, job.scenario.measurement, z, fits, examinations(problem, z, fits), left_out)
     files = write_fits(folder, answer, command, {"measurement": single.measurement, **_provenance(config, job)})
     out = console()
     out.print(render(answer, out.width))

@@ -77,7 +77,8 @@ class Table:
         for name in self.heading:
             if name not in known:
                 what = f"column {name}" if name else f"column {self.heading.index(name) + 1}, which has no name,"
-                raise self.error(f"{what} is not understood; remove it (the header must be {','.join(wanted)})")
+                remedy = f"remove it, or set ignore_columns=[{name.split(' [')[0]}]" if name else "remove it"
+                raise self.error(f"{what} is not understood; {remedy} (the header must be {','.join(wanted)})")
 
 
 def header(model: Measurement) -> list[str]:
