@@ -134,7 +134,7 @@ _FORMULA = re.compile(
 _UNIT = re.compile(r"^(\+*(?:truth_)?measurement\.(?:time_)?unit)=([^'\",\[\]{}]+)$")
 _FILE = re.compile(r"^\+*(?:truth_)?measurement\.file=")
 _PARAMETERS = re.compile(r"^\+*parameters=(?![{$]|null$)")
-_OPEN = re.compile(r"^(?:parameters|(?:truth_)?measurement\.(?:start|columns|initial|rates|outputs))\.")
+_OPEN = re.compile(r"^(?:parameters|(?:truth_)?measurement\.(?:start|columns|constants|initial|rates|outputs))\.")
 """Keys to which users add entries of their own names."""
 
 
