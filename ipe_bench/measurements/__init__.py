@@ -17,6 +17,7 @@ from ipe_bench.measurements.ode.model import OdeMeasurement
 from ipe_bench.measurements.polynomial import Polynomial
 from ipe_bench.measurements.ranging import Ranging
 from ipe_bench.measurements.sir import Sir
+from ipe_bench.measurements.six_position import SixPosition
 from ipe_bench.measurements.triad import Triad
 
 __all__ = [
@@ -40,6 +41,7 @@ __all__ = [
     "Restricted",
     "RicherGins",
     "Sir",
+    "SixPosition",
     "Triad",
     "UsualNoise",
 ]
