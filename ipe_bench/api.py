@@ -300,8 +300,9 @@ def estimate(
     the residuals (`Unknown`): then their size cannot test the fit. Filters and `map_lm` need to know how far from the
     model's nominal point the parameters may be: `error_scale` is the standard deviation of each in multiples of its
     size, and `prior` widens or narrows some, or makes them depend on each other (`ipe_bench.priors.prior_of` makes one
-    of a covariance). `ignore_rows` and `ignore_columns` of the files are left out (see `LeftOut`). `x` and `covariance` of a fit are in the parameters' own units. The answer
-    is the sequence of the fits; it shows itself in a notebook, and `table()` is a frame.
+    of a covariance). `ignore_rows` and `ignore_columns` of the files are left out (see `LeftOut`). `x` and `covariance`
+    of a fit are in the parameters' own units. The answer is the sequence of the fits; it shows itself in a notebook,
+    and `table()` is a frame.
 
     >>> import ipe_bench as ib
     >>> model = ib.measurements.Polynomial()
@@ -351,9 +352,7 @@ def estimate(
         remedy = "; give error_scale" if error_scale is None and prior is None else ""
         raise UserError("; ".join(lacking) + remedy)
     fits = fit(problem, found.z, estimators, known)
-    return Answer(
-        found.model.name, found.model, found.z, fits, examinations(problem, found.z, fits), left_out.said
-    )
+    return Answer(found.model.name, found.model, found.z, fits, examinations(problem, found.z, fits), left_out.said)
 
 
 def _real_problem(model: Measurement, noise: Noise, prior: Prior | None, error_scale: float | None) -> Problem:

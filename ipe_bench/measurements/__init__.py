@@ -1,7 +1,7 @@
 """Measurement models: what a parameter vector makes the instruments read. Config group `measurement`."""
 
 from ipe_bench.measurements.accelerometer import Accelerometer
-from ipe_bench.measurements.base import Input, Measurement, Parameter, Restricted, UsualNoise
+from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, Restricted, UsualNoise
 from ipe_bench.measurements.bearings import Bearings
 from ipe_bench.measurements.bock import Bock
 from ipe_bench.measurements.falling_body import FallingBody
@@ -38,6 +38,7 @@ __all__ = [
     "Parameter",
     "Polynomial",
     "Ranging",
+    "Recorded",
     "Restricted",
     "RicherGins",
     "Sir",

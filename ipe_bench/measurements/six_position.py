@@ -33,9 +33,9 @@ class SixPosition(Measurement):
 
         T = [[1, -yz, zy], [xz, 1, -zx], [-xy, yx, 1]],   K = diag(kx, ky, kz)
 
-    b is a bias in counts, K the scale in m/s^2 and deg/s per count, and T leads from the axes of the sensors to those of
-    the table: the angle ij is that of sensor axis i about table axis j, small. A row is a reading of one sensor, `ax` to
-    `gz`, with f and w there; w includes the rotation of the Earth where that counts, and rest is w = 0.
+    b is a bias in counts, K the scale in m/s^2 and deg/s per count, and T leads from the axes of the sensors to those
+    of the table: the angle ij is that of sensor axis i about table axis j, small. A row is a reading of one sensor,
+    `ax` to `gz`, with f and w there; w includes the rotation of the Earth where that counts, and rest is w = 0.
 
     Parameters: of the accelerometers three biases in counts (bax), three scale factors in ppm of the presumed ones
     (kax) and six angles in mrad (ayz), and the same of the gyros (bgx, kgx, gyz). The usual noise is 1 count, for

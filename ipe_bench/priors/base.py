@@ -16,8 +16,8 @@ class Prior(Component, Named, ABC):
     """A prior. A new one is a frozen dataclass that writes `deviation` and `draw`.
 
     Estimators that use a prior are told N(nominal, P0), P0 being of these deviations and of `correlation`, and the
-    Bayesian bound is the one under that. A prior of another form has draws of the same mean and covariance, and sets `normal` to False:
-    then that bound is one for estimators that know no more than mean and covariance.
+    Bayesian bound is the one under that. A prior of another form has draws of the same mean and covariance, and sets
+    `normal` to False: then that bound is one for estimators that know no more than mean and covariance.
     """
 
     normal: ClassVar[bool] = True

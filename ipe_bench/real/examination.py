@@ -213,9 +213,7 @@ def _on_bounds(
         other = np.nan
         if not singular[0] and P[0, k, k] > 0:
             inwards = int(np.sign(start[place] - bound))
-            other = end_within(
-                given, z[rows], x, P[0], k, inwards, confidence=CONFIDENCE, freedom=least.freedom
-            )
+            other = end_within(given, z[rows], x, P[0], k, inwards, confidence=CONFIDENCE, freedom=least.freedom)
         yield OnBound(place, model.natural_parameters[place], bound, float(np.clip(other, *limits[:, place])))
 
 

@@ -130,7 +130,9 @@ def table(found: Examination) -> RenderableType:
     from rich.markup import escape
     from rich.table import Table
 
-    shown = Table(title=title(found), title_justify="left", title_style="bold", box=None, pad_edge=False, padding=(0, 1))
+    shown = Table(
+        title=title(found), title_justify="left", title_style="bold", box=None, pad_edge=False, padding=(0, 1)
+    )
     for k, heading in enumerate(HEADINGS):
         shown.add_column(heading, justify="left" if k < 2 else "right", no_wrap=k == 0)
     for row in rows(found):

@@ -73,7 +73,7 @@ def fit_of(found):
 def test_files_of_one_case_each_are_estimated_together(file, tmp_path):
     path, *_ = file
     whole = fit_of(open_readings(path, MODEL))
-    heading, *rows = path.read_text().splitlines()
+    _heading, *rows = path.read_text().splitlines()
     paths = []
     for case in "123":
         own = [row.split(",") for row in rows if row.split(",")[3] == case]
@@ -107,10 +107,19 @@ def test_a_constant_of_the_config_stands_for_a_column(tmp_path):
 
 
 REFUSED = {
-    "two numbers of a case": ("case,time,feed,begin,reading\n1,1,2,1,3\n1,2,3,1,3\n", "case=1: feed is 2 in one row and 3"),
+    "two numbers of a case": (
+        "case,time,feed,begin,reading\n1,1,2,1,3\n1,2,3,1,3\n",
+        "case=1: feed is 2 in one row and 3",
+    ),
     "no column of cases": ("time,feed,begin,reading\n1,2,1,3\n2,3,1,3\n", "number the cases in a column case"),
-    "a case left out": ("case,time,feed,begin,reading\n1,1,2,1,3\n3,2,3,1,3\n", "case=3: cases are numbered 1, 2 and so"),
-    "a column left out": ("time,begin,reading\n1,2,3\n2,2,3\n", "column feed is missing; there are time, begin, reading"),
+    "a case left out": (
+        "case,time,feed,begin,reading\n1,1,2,1,3\n3,2,3,1,3\n",
+        "case=3: cases are numbered 1, 2 and so",
+    ),
+    "a column left out": (
+        "time,begin,reading\n1,2,3\n2,2,3\n",
+        "column feed is missing; there are time, begin, reading",
+    ),
     "an empty cell": ("time,feed,begin,reading\n1,,1,3\n2,3,1,3\n", "row 2, column feed: is empty"),
     "a reading twice": ("case,time,feed,begin,reading\n1,1,2,1,3\n1,1,2,1,4\n", "stands there twice"),
     "half a case": ("case,time,feed,begin,reading\n1.5,1,2,1,3\n1,1,2,1,4\n", "'1.5' is not a whole number"),
@@ -126,18 +135,26 @@ def test_a_wrong_file_is_refused(tmp_path, case):
 
 
 MISTAKES = {
-    "a name of nothing": (dict(constants={"fed": 1.0}), "constants.fed: appears in no formula"),
-    "a state": (dict(constants={"y": 1.0}), "constants.y: is a state, a parameter or the time"),
-    "of two lengths": (dict(constants={"feed": (1.0, 2.0), "begin": (1.0, 2.0, 3.0)}), "constants: have different lengths"),
-    "no number": (dict(constants={"feed": "much"}), "constants.feed=much: give a finite number"),
-    "the time by another name": (dict(outputs={"s": "gain*time*y"}), "time: is a column .* the time is t"),
+    "a name of nothing": ({"constants": {"fed": 1.0}}, "constants.fed: appears in no formula"),
+    "a state": ({"constants": {"y": 1.0}}, "constants.y: is a state, a parameter or the time"),
+    "of two lengths": (
+        {"constants": {"feed": (1.0, 2.0), "begin": (1.0, 2.0, 3.0)}},
+        "constants: have different lengths",
+    ),
+    "no number": ({"constants": {"feed": "much"}}, "constants.feed=much: give a finite number"),
+    "the time by another name": ({"outputs": {"s": "gain*time*y"}}, "time: is a column .* the time is t"),
 }
 
 
 @pytest.mark.parametrize("case", MISTAKES)
 def test_constants_that_cannot_be_are_refused(case):
     options, expected = MISTAKES[case]
-    given = dict(rates={"y": "feed - k*y"}, start={"k": 0.5, "gain": 1.0}, initial={"y": "begin"}, outputs={"s": "gain*y"})
+    given = {
+        "rates": {"y": "feed - k*y"},
+        "start": {"k": 0.5, "gain": 1.0},
+        "initial": {"y": "begin"},
+        "outputs": {"s": "gain*y"},
+    }
     with pytest.raises(UserError, match=expected):
         Ode(**(given | options))
 

@@ -72,15 +72,11 @@ def test_a_file_of_positions_and_rates_is_estimated_as_by_regression(tmp_path):
     z[10] = np.nan
     write_readings(tmp_path / "table.csv", model, z)
     heading, *rows = (tmp_path / "table.csv").read_text().splitlines()
-    assert heading == (
-        "row,sensor,fx [m/s^2],fy [m/s^2],fz [m/s^2],wx [deg/s],wy [deg/s],wz [deg/s],reading [counts]"
-    )
+    assert heading == ("row,sensor,fx [m/s^2],fy [m/s^2],fz [m/s^2],wx [deg/s],wy [deg/s],wz [deg/s],reading [counts]")
     order = rng.permutation(72)
     (tmp_path / "own.csv").write_text("\n".join([heading[4:], *(rows[i].partition(",")[2] for i in order)]))
     found = open_readings(tmp_path / "own.csv", SixPosition())
-    (result,) = fit(
-        Problem(found.model, Gaussian(0.4).covariance(72)), found.z, {"gn": GaussNewton(tolerance=1e-9)}
-    )
+    (result,) = fit(Problem(found.model, Gaussian(0.4).covariance(72)), found.z, {"gn": GaussNewton(tolerance=1e-9)})
     there = np.isfinite(z)
     sensors = np.array(model.sensors)[there]
     given = np.repeat(f, 6, axis=0)[there], np.repeat(w, 6, axis=0)[there]
@@ -119,7 +115,10 @@ def test_it_keeps_the_promises_of_models():
     ("options", "expected"),
     [
         ({"sensors": ("ax",)}, "sensors: give force and rate with them"),
-        ({"sensors": ("ux",), "force": ((0.0, 0.0, 9.8),), "rate": ((0.0,) * 3,)}, "sensor=ux: there is no such sensor"),
+        (
+            {"sensors": ("ux",), "force": ((0.0, 0.0, 9.8),), "rate": ((0.0,) * 3,)},
+            "sensor=ux: there is no such sensor",
+        ),
         ({"gravity": 0.0}, "gravity=0"),
     ],
 )

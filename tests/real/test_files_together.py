@@ -36,7 +36,10 @@ def together(paths: list[Path], *known: Known) -> Readings:
 
 
 def residuals(data, p, q, rate):
-    parts = [(b1 * (1 - np.exp(-rate * t)) - y) / sigma for b1, (t, y, sigma) in zip((p, q), [c.T for c in data])]
+    parts = [
+        (b1 * (1 - np.exp(-rate * t)) - y) / sigma
+        for b1, (t, y, sigma) in zip((p, q), [c.T for c in data], strict=True)
+    ]
     return np.concatenate(parts)
 
 
@@ -49,9 +52,9 @@ def test_bounds_that_do_not_act_change_nothing(files):
     known = (Known("b1", lower=100.0, upper=300.0), Known("b2", positive=True))
     result = estimate(open_together(paths, Informed(OWN, known)))
     x, deviations = solution(lambda p: residuals(data, *p), [250, 250, 5e-4])
-    assert of(result, result.x) == pytest.approx(dict(b1_1=x[0], b1_2=x[1], b2=x[2]), rel=1e-8)
+    assert of(result, result.x) == pytest.approx({"b1_1": x[0], "b1_2": x[1], "b2": x[2]}, rel=1e-8)
     assert of(result, result.standard_errors) == pytest.approx(
-        dict(b1_1=deviations[0], b1_2=deviations[1], b2=deviations[2]), rel=1e-8
+        {"b1_1": deviations[0], "b1_2": deviations[1], "b2": deviations[2]}, rel=1e-8
     )
 
 
@@ -59,8 +62,8 @@ def test_a_parameter_of_one_file_may_be_known_there(files):
     paths, data = files
     result = estimate(together(paths, Known("b1", lower=0.0), Known("b1_2", fixed=181.0)))
     x, deviations = solution(lambda p: residuals(data, p[0], 181.0, p[1]), [250, 5e-4])
-    assert of(result, result.x) == pytest.approx(dict(b1_1=x[0], b2=x[1]), rel=1e-8)
-    assert of(result, result.standard_errors) == pytest.approx(dict(b1_1=deviations[0], b2=deviations[1]), rel=1e-8)
+    assert of(result, result.x) == pytest.approx({"b1_1": x[0], "b2": x[1]}, rel=1e-8)
+    assert of(result, result.standard_errors) == pytest.approx({"b1_1": deviations[0], "b2": deviations[1]}, rel=1e-8)
     assert result.model.fixed == {"b1_2": 181.0}
     assert result.degrees_of_freedom == sum(map(len, data)) - 2
 
@@ -69,7 +72,7 @@ def test_a_common_parameter_may_be_fixed_for_all(files):
     paths, data = files
     result = estimate(open_together(paths, Informed(OWN, (Known("b2", fixed=5.5e-4),))))
     x, _ = solution(lambda p: residuals(data, *p, 5.5e-4), [250, 250])
-    assert of(result, result.x) == pytest.approx(dict(b1_1=x[0], b1_2=x[1]), rel=1e-8)
+    assert of(result, result.x) == pytest.approx({"b1_1": x[0], "b1_2": x[1]}, rel=1e-8)
 
 
 def test_a_bound_acts_in_the_file_that_it_is_of(files):
@@ -88,14 +91,14 @@ def test_a_bound_acts_in_the_file_that_it_is_of(files):
     expected = dict(zip(("b1_1", "b1_2", "b2"), bounded.x * [100, 100, 1e-4], strict=True))
     assert of(result, result.x) == pytest.approx(expected, rel=1e-5)
     assert [result.model.natural_parameters[k].name for k in result.held_at] == ["b1_2"]
-    x, deviations = solution(lambda p: residuals(data, p[0], 176.0, p[1]), [250, 5e-4])
+    _x, deviations = solution(lambda p: residuals(data, p[0], 176.0, p[1]), [250, 5e-4])
     errors = of(result, result.standard_errors)
     assert np.isnan(errors["b1_2"])
     assert (errors["b1_1"], errors["b2"]) == pytest.approx(tuple(deviations), rel=1e-6)
 
 
 def test_a_file_may_have_fewer_readings_than_the_model_has_parameters(tmp_path):
-    first, columns = simulated(tmp_path / "a.csv", 240.0, 5)
+    first, _columns = simulated(tmp_path / "a.csv", 240.0, 5)
     (tmp_path / "b.csv").write_text("t,y,sigma\n400,36.2,0.5\n")
     result = estimate(open_together([first, tmp_path / "b.csv"], OWN))
     assert {p.name for p in result.model.natural_parameters} == {"b1_1", "b1_2", "b2"}

@@ -55,9 +55,7 @@ def test_profiles_and_bootstrap_with_a_prior_are_the_posterior_of_a_linear_model
 def test_least_squares_and_the_prior_have_each_its_own():
     bench = Scenario(Bent(bend=0.05), Gaussian(1.0), GaussianPrior((0.3, 0.3, 0.3)), seed=3)
     z = bench.draw(0, 1).z[0]
-    answer = ib.estimate(
-        bench.measurement, z, {**LM, "map": MapLM()}, noise=bench.noise, prior=bench.prior
-    )
+    answer = ib.estimate(bench.measurement, z, {**LM, "map": MapLM()}, noise=bench.noise, prior=bench.prior)
     first, second = answer.examinations
     assert (first.label, first.with_prior, second.label, second.with_prior) == ("lm", False, "map", True)
     assert (second.standard_errors < first.standard_errors).all()
@@ -96,7 +94,9 @@ def test_truths_of_the_prior_are_in_the_penalised_profiles_as_often_as_they_say(
     z = np.column_stack([drawn.z, np.repeat(problem.x0[None], trials, axis=0)])
     found = profiles_of_sets(problem, z, estimates.x, estimates.covariance)
     truth = model.natural(drawn.x)
-    inside = np.array([[p.low <= v <= p.high for p, v in zip(row, x)] for row, x in zip(found, truth)])
+    inside = np.array(
+        [[p.low <= v <= p.high for p, v in zip(row, x, strict=True)] for row, x in zip(found, truth, strict=True)]
+    )
     assert inside.mean(axis=0) == pytest.approx([0.95, 0.95], abs=0.02)
 
 
@@ -134,7 +134,7 @@ def test_the_interval_on_a_bound_is_where_scipys_profile_rises():
     assert found is not None
 
     def chi_square(b1: float) -> float:
-        options = dict(xtol=1e-15, ftol=1e-15, gtol=1e-15)
+        options = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
         return 2 * least_squares(lambda p: (-b1 * np.expm1(-1e-4 * p[0] * t) - z) / 0.1, [5.0], **options).cost
 
     least = chi_square(235.0)
@@ -165,8 +165,7 @@ def test_truths_near_a_bound_are_in_the_intervals_at_least_as_often_as_they_say(
     assert (free.status == 0).all()
     off = free.x[:, 1] > 0
     inside = [
-        one.low <= rate <= one.high
-        for _, one in profiles_of_sets(problem, z[off], free.x[off], free.covariance[off])
+        one.low <= rate <= one.high for _, one in profiles_of_sets(problem, z[off], free.x[off], free.covariance[off])
     ]
     for k in np.flatnonzero(~off):
         x = np.array([z[k].mean() / 5.0, 0.0])

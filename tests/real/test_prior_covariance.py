@@ -92,14 +92,12 @@ def test_residuals_of_the_maximum_a_posteriori_scatter_as_is_said(bench):
 
 
 def test_a_covariance_is_of_the_parameters_in_their_own_units_and_logarithms():
-    model = informed(
-        Formula("a*exp(-b*t)", {"a": 8.0, "b": 0.2}, {"t": (0.0, 1.0, 2.0)}), (Known("b", positive=True),)
-    )
+    model = informed(Formula("a*exp(-b*t)", {"a": 8.0, "b": 0.2}, {"t": (0.0, 1.0, 2.0)}), (Known("b", positive=True),))
     P = np.array([[0.25, 0.006], [0.006, 0.0004]])
     problem = Scenario(model, Gaussian(1.0), prior_of(model, P)).problem
-    P0 = problem.prior_covariance().matrix()  # type: ignore[union-attr]
+    inner = problem.prior_covariance().matrix()  # type: ignore[union-attr]
     # x is a / 8, and (ln b - ln 0.2) / (0.2 / 0.2): db = 0.2 dx.
-    assert P0 == pytest.approx(P / np.outer([8.0, 0.2], [8.0, 0.2]), rel=1e-12)
+    assert inner == pytest.approx(P / np.outer([8.0, 0.2], [8.0, 0.2]), rel=1e-12)
 
 
 def test_from_python(tmp_path):
