@@ -272,6 +272,9 @@ def _refuse_keys_without_use(config: DictConfig) -> None:
         raise UserError(
             f"readings={config.readings}: run simulates its readings; `ipe-bench estimate` estimates from a file"
         )
+    for key in ("ignore_rows", "ignore_columns"):
+        if config[key] is not None:
+            raise UserError(f"{key}={config[key]}: is of a file of readings, for `ipe-bench estimate`; leave it out")
     if config.write_readings is None and config.write_readings_trial:
         raise UserError(f"write_readings_trial={config.write_readings_trial}: goes with write_readings=FILE")
 
