@@ -213,7 +213,7 @@ def compare(
     """
     import pandas as pd
 
-    from ipe_bench.statistics.between import JUDGED, compared, left_out
+    from ipe_bench.statistics.between import JUDGED, compared, described, left_out
     from ipe_bench.statistics.collect import collect
 
     if not 0 < alpha < 1:
@@ -234,7 +234,7 @@ def compare(
     frame = pd.DataFrame(compared(collections[0], collections[1], (first, second), alpha=alpha, anytime=anytime))
     worse = frame[(frame["finding"] == "worse") & frame["quantity"].isin(list(fail_on))]
     frame.attrs["worse"] = [
-        f"{row['second']} in {row['quantity']}, {row['measurement']}, error scale {row['error_scale']:g}"
+        f"{row['second']} in {row['quantity']}, {described(row)}"
         for row in worse.to_dict("records")
     ]
     for name in ("problems", "stale"):
@@ -519,6 +519,10 @@ def compute(
     return failures
 
 
+NARROW = "every interval is narrow enough"
+"""Why a scenario stops that has come to the precision that was asked for."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Stop:
     """How many trials a scenario took until its intervals were narrow enough, or why it took no more."""
@@ -528,6 +532,11 @@ class Stop:
     reason: str
     widest: str
     """The statistic that is farthest from the precision that was asked for, or was nearest to it last."""
+
+    @property
+    def reached(self) -> bool:
+        """Whether the precision that was asked for is there."""
+        return self.reason == NARROW
 
     @property
     def row(self) -> dict[str, Any]:
@@ -592,7 +601,7 @@ def _reason_to_stop(failed: bool, widest: Reach | None, spent: bool, late: bool)
     if failed:
         return "some blocks failed"
     if widest is not None and widest.ratio <= 1:
-        return "every interval is narrow enough"
+        return NARROW
     if spent:
         return "there are as many trials as there may be"
     return "the time is over" if late else ""

@@ -51,6 +51,8 @@ class Outcome:
         self.failures: list[str] = []
         self.stops: list[str] = []
         """How many trials each job with a precision took, and why no more."""
+        self.short = False
+        """Some job did not come to its precision."""
         self.maximises = False
         self.objectives: list[tuple[float, list[str]]] = []
         """What each job came to in the column that is asked for, and what was asked of it."""
@@ -153,7 +155,7 @@ def _conclude() -> int:
         return 0
     if _outcome.multirun and not _outcome.elsewhere and not _outcome.jobs and not _outcome.mistakes:
         raise UserError("the sweep has no jobs: check the patterns in its lists")
-    code = 1 if _outcome.failures else 0
+    code = 1 if _outcome.failures or _outcome.short else 0
     if _outcome.dry is not None and not _outcome.mistakes:
         print(_outcome.dry.summary())
         return code
@@ -258,7 +260,9 @@ def _compute(job: Job, execution: Execution, watch: Watcher) -> tuple[str, ...]:
         return compute([job.scenario], job.estimators, job.trials, job.output, **options)
     options |= {"precision": job.precision, "time_limit": job.time_limit}
     failures, (stop,) = compute_until([job.scenario], job.estimators, job.trials, job.output, **options)
-    line = f"{_title(job)}: {stop.trials} trials; {stop.reason} ({stop.widest})"
+    verdict = "" if stop.reached else "the precision is not reached: "
+    line = f"{_title(job)}: {stop.trials} trials; {verdict}{stop.reason} ({stop.widest})"
+    _outcome.short |= not stop.reached
     if _launched_elsewhere():
         print(line)
     _outcome.stops.append(line)
