@@ -484,10 +484,12 @@ def compute(
     watch: Watcher | None = None,
     record_as: str | None = None,
     further: Mapping[str, Any] | None = None,
+    command: str | None = None,
 ) -> tuple[str, ...]:
     """Computes and stores what is missing under `output`; returns the messages of what failed.
 
-    The run is recorded under a new name, or under `record_as`, in place of what is there; with `further` facts.
+    The run is recorded under a new name, or under `record_as`, in place of what is there; with `further` facts, and the
+    `command` as it was typed.
 
     Raises:
         UserError: what was asked for cannot be computed, or the folder cannot be written to; nothing is computed then.
@@ -508,7 +510,8 @@ def compute(
     execution.warm_up(perform, len(tasks))
     record = _record(scenarios, estimators, trials) | dict(further or {})
     known = None if tasks or aside else store.same_run(record)
-    identifier = known or _write_record(store, record, record_as or new_name())
+    typed = {"command": command, "blocks": len(tasks)}
+    identifier = known or _write_record(store, record | typed, record_as or new_name())
     with RunLog(store.directory / "log" / f"{identifier}.log") as log:
         for line in aside:
             log.warning(line)
@@ -556,6 +559,7 @@ def compute_until(
     execution: Execution | None = None,
     block_size: int = BLOCK_SIZE,
     watch: Watcher | None = None,
+    command: str | None = None,
 ) -> tuple[tuple[str, ...], tuple[Stop, ...]]:
     """Adds blocks to what is stored under `output` until every interval is narrow enough, there are `most` trials
     (`MOST_TRIALS` where None), or `time_limit` seconds are over, which is looked at between rounds of blocks.
@@ -574,7 +578,7 @@ def compute_until(
         raise UserError(f"precision={precision}: certified readings are one trial; leave it out")
     validate(scenarios, estimators, budget, block_size)
     options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
-    options["further"] = {"precision": dataclasses.asdict(wanted)}
+    options |= {"further": {"precision": dataclasses.asdict(wanted)}, "command": command}
     at = [_first_trials(s, estimators, Path(output), block_size, budget) for s in scenarios]
     names, failures = [new_name() for _ in scenarios], []
     stops: dict[int, Stop] = {}

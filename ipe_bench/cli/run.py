@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import shlex
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -42,6 +43,8 @@ class Outcome:
 
     def __init__(self) -> None:
         self.started = False
+        self.command: str | None = None
+        """As it was typed; not known to jobs in other processes."""
         self.multirun = False
         self.elsewhere = False
         """Jobs run in other processes, from which nothing but an exception or a file comes back."""
@@ -98,6 +101,7 @@ def main(arguments: Sequence[str]) -> int:
     """Runs Hydra on the arguments; then aggregates and shows the folders that were filled."""
     global _outcome
     _outcome = Outcome()
+    _outcome.command = shlex.join(["ipe-bench", "run", *arguments])
     if any(word in ("-h", "--help") for word in arguments):
         flags, words = ["--help"], []
     else:
@@ -256,6 +260,7 @@ def _objective(job: Job) -> float:
 def _compute(job: Job, execution: Execution, watch: Watcher) -> tuple[str, ...]:
     """Computes the trials that are asked for, or just enough; returns the messages of what failed."""
     options: dict[str, Any] = {"execution": execution, "block_size": job.block_size, "watch": watch}
+    options["command"] = _outcome.command
     if job.precision is None:
         return compute([job.scenario], job.estimators, job.trials, job.output, **options)
     options |= {"precision": job.precision, "time_limit": job.time_limit}

@@ -60,7 +60,9 @@ def write_analysis(begun: Begun, output: Path) -> ReportResult:
     from ipe_bench.basics.files import write_text
     from ipe_bench.report import extensions
     from ipe_bench.report.certified_tables import attained_tables, certified_tables, without_certified
+    from ipe_bench.report.charts import charts
     from ipe_bench.report.figures import draw_all
+    from ipe_bench.report.figures.views import views
     from ipe_bench.report.html import render_page
     from ipe_bench.report.tables import all_tables, write_tables
 
@@ -81,7 +83,7 @@ def write_analysis(begun: Begun, output: Path) -> ReportResult:
     for figure in draw_all(pictured, folder, problems=problems):
         figures += figure.files
         drawn.append((figure.name, figure.title, figure.caption, figure.files[0].read_bytes()))
-    page = render_page(analysis, tables, drawn, sections)
+    page = render_page(analysis, tables, drawn, sections, list(charts(views(pictured)[0])))
     report = output / "report.html"
     write_text(report, page)
     return ReportResult(
