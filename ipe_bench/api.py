@@ -234,8 +234,7 @@ def compare(
     frame = pd.DataFrame(compared(collections[0], collections[1], (first, second), alpha=alpha, anytime=anytime))
     worse = frame[(frame["finding"] == "worse") & frame["quantity"].isin(list(fail_on))]
     frame.attrs["worse"] = [
-        f"{row['second']} in {row['quantity']}, {described(row)}"
-        for row in worse.to_dict("records")
+        f"{row['second']} in {row['quantity']}, {described(row)}" for row in worse.to_dict("records")
     ]
     for name in ("problems", "stale"):
         frame.attrs[name] = list(dict.fromkeys(line for c in collections for line in getattr(c, name)))

@@ -71,7 +71,8 @@ def write_analysis(begun: Begun, output: Path) -> ReportResult:
     summary_path = output / "summary.csv"
     write_text(summary_path, analysis.summary.to_csv(index=False))
     certified_shown, certified = certified_tables(analysis.collection)
-    tables = [*certified_shown, *attained_tables(analysis.collection)[0], *all_tables(analysis)]
+    simulated = without_certified(analysis)
+    tables = [*certified_shown, *attained_tables(analysis.collection)[0], *all_tables(simulated, analysis)]
     problems = analysis.collection.further
     tables += extensions.tables(analysis, [table.name for table in tables], problems)
     sections = extensions.sections(analysis, [table.name for table in tables], problems)
@@ -79,11 +80,10 @@ def write_analysis(begun: Begun, output: Path) -> ReportResult:
     table_paths = write_tables(analysis, [*tables, *further], output / "tables")
     figures: list[Path] = []
     drawn = []
-    pictured = without_certified(analysis)
-    for figure in draw_all(pictured, folder, problems=problems):
+    for figure in draw_all(simulated, folder, problems=problems):
         figures += figure.files
         drawn.append((figure.name, figure.title, figure.caption, figure.files[0].read_bytes()))
-    page = render_page(analysis, tables, drawn, sections, list(charts(views(pictured)[0])))
+    page = render_page(analysis, tables, drawn, sections, list(charts(views(simulated)[0])))
     report = output / "report.html"
     write_text(report, page)
     return ReportResult(

@@ -111,9 +111,7 @@ def _pictures(figures: Sequence[Shown], charts: Sequence[Chart]) -> list[dict[st
     return [{"name": name, "chart": "", **drawn.get(name, {}), **static.get(name, {})} for name in drawn | static]
 
 
-def _contents(
-    tables: Sequence[Table], written: Sequence[Written], pictures: Sequence[Any]
-) -> list[tuple[str, str]]:
+def _contents(tables: Sequence[Table], written: Sequence[Written], pictures: Sequence[Any]) -> list[tuple[str, str]]:
     """The sections that there are, in order."""
     there = {"figures": len(pictures) > 1, "tables": bool(tables), "theory": any(t.appendix for t in tables)}
     own = [(name, title) for name, title in _SECTIONS if there.get(name, True)]

@@ -80,12 +80,13 @@ def _key(value: Any, kind: Kind = "number") -> Any:
     return "1e999" if math.isnan(number) or number == math.inf else repr(number)
 
 
-def all_tables(analysis: Analysis) -> list[Table]:
-    """Every table that the data allow, in the order of the report."""
+def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]:
+    """Every table that the data allow, in the order of the report; `whole` is the analysis whose endings are listed,
+    where this one leaves some trials out."""
     if analysis.summary.empty:
-        return []
+        return [table for table in [endings(whole or analysis)] if table is not None]
     tables = [overview(analysis), costs(analysis), portfolio(analysis), comparisons(analysis), ranks(analysis)]
-    tables += [parameters(analysis), calibration(analysis), endings(analysis)]
+    tables += [parameters(analysis), calibration(analysis), endings(whole or analysis)]
     tables += [contraction(analysis), covariances(analysis), theory(analysis), iterations(analysis)]
     return [t for t in tables if t is not None]
 

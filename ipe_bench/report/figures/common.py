@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 MOST_PANELS = 6
 COINCIDE = 0.015
 """Points nearer than this part of the axis lie upon each other."""
+REACH = 0.3
+"""Part of the span of the points that intervals may add to an axis at either end."""
+LETTER = 0.045
+"""Width of a letter under the axis of a narrow panel, as a part of that axis."""
 UPON = "Where points coincide, each marker lies smaller upon the one before it."
 
 
@@ -77,11 +81,7 @@ def scale_axis(ax: Axes, scales: Sequence[float], labels: Sequence[str]) -> None
     least = positive[0] / 10 if len(positive) < len(scales) else positive[0]
     ax.set_xscale("symlog", linthresh=positive[0], linscale=0.5) if least < positive[0] else ax.set_xscale("log")
     span = np.log10(positive[-1] / least)
-    # Neighbouring labels such as 10 and 11 would overlap: crowded ones go.
-    kept: list[float] = [] if least == positive[0] else [0.0]
-    for s in positive:
-        if not kept or np.log10(s / max(kept[-1], least)) > 0.1 * span:
-            kept.append(s)
+    kept = [0.0] * (least < positive[0]) + _labelled(positive, span)
     ax.set_xticks(kept, [plain(s) for s in kept])
     ax.set_xticks([], minor=True)
     margin = 10 ** max(0.06 * span, 0.15)
@@ -89,20 +89,45 @@ def scale_axis(ax: Axes, scales: Sequence[float], labels: Sequence[str]) -> None
     ax.set_xlabel("error scale")
 
 
-def decades(ax: Axes, values: Any, least: float = 10.0) -> None:
-    """A logarithmic axis around the values that spans at least a decade, so that scatter of a per cent looks small."""
-    values = np.asarray(values, dtype=float)
-    values = values[np.isfinite(values) & (values > 0)]
+def _labelled(scales: Sequence[float], span: float) -> list[float]:
+    """Those of ascending scales whose labels have room on an axis of so many decades: both ends, and what fits between
+    them."""
+
+    def apart(a: float, b: float) -> bool:
+        return np.log10(b / a) > span * (LETTER * (len(plain(a)) + len(plain(b))) / 2 + LETTER / 2)
+
+    kept = [scales[0]]
+    for scale in scales[1:-1]:
+        if apart(kept[-1], scale) and apart(scale, scales[-1]):
+            kept.append(scale)
+    return [*kept, scales[-1]] if len(scales) > 1 else kept
+
+
+def decades(ax: Axes, values: Any, least: float = 10.0, *, ends: Any = ()) -> None:
+    """A logarithmic axis around the values that spans at least a decade, so that scatter of a per cent looks small.
+
+    The `ends` of intervals widen it by no more than `REACH` of the values' own span, or a decade: those of heavy tails,
+    which may be as wide as numbers go, end at the panel's edge.
+    """
+    values, ends = (_positive(v) for v in (values, ends))
     if len(values) == 0:
         # A logarithmic axis without anything to show makes matplotlib warn.
         return
     ax.set_yscale("log")
-    low, high = float(values.min()) / 1.6, float(values.max()) * 1.6
+    low, high = float(values.min()), float(values.max())
+    room = max(least, (high / low) ** REACH)
+    low = max(low / room, ends.min(initial=low)) / 1.6
+    high = min(high * room, ends.max(initial=high)) * 1.6
     if high / low < least:
         middle = np.sqrt(low * high)
         low, high = middle / np.sqrt(least), middle * np.sqrt(least)
     ax.set_ylim(low, high)
     log_ticks(ax.yaxis, low, high)
+
+
+def _positive(values: Any) -> Any:
+    values = np.asarray(values, dtype=float).ravel()
+    return values[np.isfinite(values) & (values > 0)]
 
 
 def log_ticks(axis: Axis, low: float, high: float) -> None:

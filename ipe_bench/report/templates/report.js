@@ -189,7 +189,7 @@ class Chart {
     this.plot.addEventListener("pointerleave", () => this.tell(null));
     this.plot.addEventListener("blur", () => this.tell(null));
     this.plot.addEventListener("keydown", (event) => this.key(event));
-    new ResizeObserver(() => this.draw()).observe(place);
+    new ResizeObserver(() => { if (place.clientWidth !== this.width) this.draw(); }).observe(place);
   }
 
   // Controls
@@ -245,7 +245,8 @@ class Chart {
   get shown() { return this.data.series.filter((series) => !this.hidden.has(series)); }
 
   draw() {
-    const width = Math.max(280, this.place.clientWidth), height = Math.round(Math.min(420, 180 + width * 0.28));
+    this.width = this.place.clientWidth;
+    const width = Math.max(280, this.width), height = Math.round(Math.min(420, 180 + width * 0.28));
     const all = (axis, names) => this.shown.flatMap((series) => names.flatMap((name) => series.values[axis[name]] || []));
     const reference = this.y.reference === null ? [] : [this.y.reference];
     const scales = this.x.column === "error_scale" ? all(this.x, ["column"]) : null;
