@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import console
+from ipe_bench.cli import console, paper
 from ipe_bench.runs.results import require_results
 from ipe_bench.runs.store import TRUTH
 
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 def main(arguments: Sequence[str]) -> int:
     """Aggregates the directories; the report goes to the first, or to output=DIR."""
+    if paper.asked_for(arguments):
+        return paper.main(arguments)
     outputs = [a.removeprefix("output=") for a in arguments if a.startswith("output=")]
     directories = [Path(a) for a in arguments if not a.startswith("output=")]
     if not directories:

@@ -119,3 +119,34 @@ def house_style() -> Iterator[None]:
     }
     with mpl.rc_context(settings):
         yield
+
+
+PRINT: dict[Any, Any] = {
+    "axes.titlesize": 7.5,
+    "axes.labelsize": 7.5,
+    "legend.fontsize": 7,
+    "legend.columnspacing": 1.0,
+    "legend.handlelength": 1.6,
+    "legend.handletextpad": 0.4,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "lines.linewidth": 1.0,
+    "axes.titlepad": 3.0,
+    "axes.labelpad": 2.0,
+    "xtick.major.pad": 2.0,
+    "ytick.major.pad": 2.0,
+    "figure.constrained_layout.w_pad": 0.02,
+    "figure.constrained_layout.h_pad": 0.02,
+    "figure.dpi": 300,
+    "savefig.dpi": 300,
+}
+"""Sizes in a column of print, where nothing is scaled any more: 7 to 8 points are as IEEE's."""
+
+
+@contextmanager
+def print_style() -> Iterator[None]:
+    """The same look in the sizes of print."""
+    import matplotlib as mpl
+
+    with house_style(), mpl.rc_context(PRINT):
+        yield

@@ -162,7 +162,8 @@ def test_names_stay_in_sight_when_a_table_is_scrolled(desktop):
 
 
 def test_the_static_figure_is_beside_and_is_what_is_printed(desktop):
-    shown = "getComputedStyle(f.querySelector('.static')).display + ' ' + getComputedStyle(f.querySelector('.chart')).display"
+    display = "getComputedStyle(f.querySelector('{}')).display"
+    shown = f"{display.format('.static')} + ' ' + {display.format('.chart')}"
     assert chart(desktop, f"return {shown}") == "none block"
     assert chart(desktop, f"f.querySelector('button.plain').click(); return {shown}") == "block block"
     desktop.call("Emulation.setEmulatedMedia", media="print")

@@ -158,8 +158,8 @@ def _all_estimators(view: View) -> Drawing:
     seen = common.values_of(top, "rmse") or "nobody solved any trial"
     caption = common.sentence(
         "Root mean square error over the linear bound, per group of parameters and over all, on the trials that each"
-        " estimator solved, with 95 % bootstrap intervals, cut where they leave a panel. Efficiency: over the bound that"
-        f" applies at that scale, as far as {plain(NEAR)}.",
+        " estimator solved, with 95 % bootstrap intervals, cut where they leave a panel. Efficiency: over the bound"
+        f" that applies at that scale, as far as {plain(NEAR)}.",
         "Last panel: the share of trials that the others are over." if lacking else "All trials were solved.",
         common.UPON,
         f"At scale {plain(view.scales[-1])}: {seen}. {view.label}.",
