@@ -26,6 +26,7 @@ from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.priors import GaussianPrior, Prior
+from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.provenance import describe, fingerprint
 from ipe_bench.runs.results import Results, require_results
@@ -121,7 +122,7 @@ def run(
 
 
 def load(directories: Directories) -> pd.DataFrame:
-    """Every stored trial of one directory or of several: a row per trial and estimator.
+    """Every stored trial of one directory or bundle, or of several: a row per trial and estimator.
 
     Columns that say what a row belongs to: measurement, noise, prior, error_scale, seed, estimator, every key of the
     config that differs between scenarios, and `estimator.KEY` for options that differ under one label. Then what the
@@ -145,10 +146,10 @@ def load(directories: Directories) -> pd.DataFrame:
     """
     from ipe_bench.statistics.collect import collect, trials_frame
 
-    paths = _paths(directories)
-    require_results(paths)
-    collection = collect(paths)
-    frame = trials_frame(collection)
+    with opened(_paths(directories)) as paths:
+        require_results(paths)
+        collection = collect(paths)
+        frame = trials_frame(collection)
     for problem in collection.problems:
         warnings.warn(problem, stacklevel=2)
     return frame
@@ -170,8 +171,12 @@ def report(directories: Directories, output: Path | str | None = None) -> Report
     """
     from ipe_bench.report import write_report
 
-    require_results(_paths(directories))
-    return write_report(directories, output)
+    paths = _paths(directories)
+    if output is None and any(map(is_bundle, paths)):
+        raise UserError(f"{paths[0]}: a bundle is read and not written to; give output=, where the report goes")
+    with opened(paths, None if output is None else Path(output) / BUNDLES) as folders:
+        require_results(folders)
+        return write_report(folders, output)
 
 
 def compare(
@@ -211,10 +216,7 @@ def compare(
     Raises:
         UserError: there is nothing to compare.
     """
-    import pandas as pd
-
-    from ipe_bench.statistics.between import JUDGED, compared, described, left_out
-    from ipe_bench.statistics.collect import collect
+    from ipe_bench.statistics.between import JUDGED
 
     if not 0 < alpha < 1:
         raise UserError(f"alpha={alpha}: give a number between 0 and 1")
@@ -228,10 +230,32 @@ def compare(
         raise UserError(
             f"compare: {label} is compared with itself; name another folder, or first=LABEL and second=LABEL"
         )
+    with opened(paths[0]) as one, opened(paths[1]) as other:
+        frame = _compared([one, other], (first, second), alpha, anytime, fail_on)
+    if output is not None:
+        from ipe_bench.report.comparison import write
+
+        write(frame, Path(output), alpha)
+    return frame
+
+
+def _compared(
+    paths: Sequence[Sequence[Path]],
+    labels: tuple[str | None, str | None],
+    alpha: float,
+    anytime: bool,
+    fail_on: Sequence[str],
+) -> pd.DataFrame:
+    """What `compare` returns of two lists of folders."""
+    import pandas as pd
+
+    from ipe_bench.statistics.between import compared, described, left_out
+    from ipe_bench.statistics.collect import collect
+
     for part in paths:
         require_results(part)
     collections = [collect(part) for part in paths]
-    frame = pd.DataFrame(compared(collections[0], collections[1], (first, second), alpha=alpha, anytime=anytime))
+    frame = pd.DataFrame(compared(collections[0], collections[1], labels, alpha=alpha, anytime=anytime))
     worse = frame[(frame["finding"] == "worse") & frame["quantity"].isin(list(fail_on))]
     frame.attrs["worse"] = [
         f"{row['second']} in {row['quantity']}, {described(row)}" for row in worse.to_dict("records")
@@ -239,10 +263,6 @@ def compare(
     for name in ("problems", "stale"):
         frame.attrs[name] = list(dict.fromkeys(line for c in collections for line in getattr(c, name)))
     frame.attrs["notes"] = left_out(*collections)
-    if output is not None:
-        from ipe_bench.report.comparison import write
-
-        write(frame, Path(output), alpha)
     return frame
 
 
@@ -266,9 +286,9 @@ def status(directories: Directories) -> pd.DataFrame:
     """
     import pandas as pd
 
-    paths = _paths(directories)
-    require_results(paths)
-    results = Results.read(paths)
+    with opened(_paths(directories)) as paths:
+        require_results(paths)
+        results = Results.read(paths)
     counts = ("expected", "done", "missing", "failed", "stale")
     rows = [
         {**cell.names, **{name: getattr(cell, name) for name in counts}, "messages": "; ".join(cell.messages)}

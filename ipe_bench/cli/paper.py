@@ -21,7 +21,7 @@ def asked_for(words: Sequence[str]) -> bool:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Writes the files and prints their names; exit code 1 where a table is wider than asked for, or data are missing."""
+    """Writes the files and prints their names; exit code 1 where a table is too wide, or data are missing."""
     folders = [word for word in arguments if "=" not in word or Path(word).is_dir()]
     keys = _keys([word for word in arguments if word not in folders])
     if not folders:

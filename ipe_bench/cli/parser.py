@@ -84,6 +84,18 @@ width=INCHES         of a figure or table: 3.5 for one column, 7.16 for two
 """
 
 
+_BUNDLE = """
+  ipe-bench bundle outputs/paper                  outputs/paper.zip: all results, and a manifest with their digests
+  ipe-bench bundle outputs/a outputs/b output=both.zip
+  ipe-bench bundle both.zip                       is it whole, and what is its digest?
+
+The same results give the same file, so that the digest may stand in a paper. Others read it beside their own results:
+
+  ipe-bench report outputs/mine both.zip output=outputs/together
+  ipe-bench compare outputs/mine both.zip
+"""
+
+
 _COMPARE = """
 Nothing is computed: run both first. The same trials are compared one by one; folders of other seeds, in their order.
 
@@ -183,6 +195,13 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         _REPORT,
     )
     report.add_argument("arguments", metavar="DIR", nargs="*", help="folders of results, such as outputs/paper")
+    bundle = add(
+        "bundle",
+        "results in one archive to share, or whether such an archive is whole",
+        "0 done; 1 done, but something that was asked for is missing",
+        _BUNDLE,
+    )
+    bundle.add_argument("arguments", metavar="DIR", nargs="*", help="folders of results, or one bundle to check")
     compare = add(
         "compare",
         "whether a second version, setting or estimator is better or worse than a first",

@@ -1,4 +1,4 @@
-"""What goes into a paper: figures of exactly the width of a column, and tables that a strict reader of LaTeX accepts."""
+"""What goes into a paper: figures as wide as a column, and tables that a strict reader of LaTeX accepts."""
 
 from __future__ import annotations
 

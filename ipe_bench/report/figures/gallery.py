@@ -115,8 +115,8 @@ def draw_all(
 
 
 def drawings(analysis: Analysis, problems: list[str]) -> Iterator[Drawing]:
-    """Every figure that the data allow, as it would be drawn now, and not saved; one of a plugin that cannot be drawn is
-    left out, with a line added to the `problems`."""
+    """Every figure that the data allow, drawn and not saved; one of a plugin that cannot be drawn is left out, with a
+    line added to the `problems`."""
     from ipe_bench.report import extensions
 
     for task in _tasks(analysis, problems):
