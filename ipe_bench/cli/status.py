@@ -51,8 +51,10 @@ def _table(directory: str, cells: Sequence[CellState]) -> Table:
         table.add_column(heading, overflow="fold")
     for heading in ("done", *_COUNTS):
         table.add_column(heading, justify="right", overflow="fold")
+    said = ""
     for cell in cells:
+        scenario, said = "" if cell.title == said else cell.title, cell.title
         label = "(truth)" if cell.names["estimator"] == TRUTH else cell.names["estimator"]
         counts = (str(getattr(cell, name) or "") for name in _COUNTS)
-        table.add_row(Text(cell.title), Text(label), f"{cell.done} of {cell.expected or cell.done}", *counts)
+        table.add_row(Text(scenario), Text(label), f"{cell.done} of {cell.expected or cell.done}", *counts)
     return table

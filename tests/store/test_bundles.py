@@ -92,7 +92,7 @@ CHANGES = {
     "a value": lambda name, content: [(name, content.replace(b"PAR1", b"PAR2") if "trials" in name else content)],
     "a file less": lambda name, content: [] if "runs/" in name else [(name, content)],
     "a file more": lambda name, content: [(name, content), *([("theirs/trials/x.parquet", b"")] * (name == MANIFEST))],
-    "a digest": lambda name, content: [(name, content.replace(b'.json": "', b'.json": "0') if name == MANIFEST else content)],
+    "a digest": lambda name, content: [(name, content.replace(b'": "', b'": "0') if name == MANIFEST else content)],
     "no manifest": lambda name, content: [] if name == MANIFEST else [(name, content)],
 }  # fmt: skip
 
