@@ -24,7 +24,6 @@ from typing import Any
 import yaml
 
 from ipe_bench.basics.errors import UserError, describe_exception, unknown
-from ipe_bench.plugins.construct import register_package
 
 ENTRY_POINTS = "ipe_bench.plugins"
 ESTIMATOR_GROUPS = ("solver", "baseline")
