@@ -18,6 +18,7 @@ COMMANDS = (
     "posterior",
     "report",
     "compare",
+    "bundle",
     "status",
     "list",
     "check",

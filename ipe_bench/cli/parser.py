@@ -76,6 +76,23 @@ Nothing is computed again.
 
   ipe-bench report DIR                            into DIR itself
   ipe-bench report DIR1 DIR2 output=DIR           several folders together, into another
+  ipe-bench report DIR paper=overview,success_against_scale columns=error_scale,estimator,success width=3.5
+
+paper=NAMES          tables and figures for a paper instead, into DIR/paper: LaTeX (booktabs, siunitx), PDF and PNG
+columns=NAMES        those of the tables, in this order; a name that is not there is answered with those that are
+width=INCHES         of a figure or table: 3.5 for one column, 7.16 for two
+"""
+
+
+_BUNDLE = """
+  ipe-bench bundle outputs/paper                  outputs/paper.zip: all results, and a manifest with their digests
+  ipe-bench bundle outputs/a outputs/b output=both.zip
+  ipe-bench bundle both.zip                       is it whole, and what is its digest?
+
+The same results give the same file, so that the digest may stand in a paper. Others read it beside their own results:
+
+  ipe-bench report outputs/mine both.zip output=outputs/together
+  ipe-bench compare outputs/mine both.zip
 """
 
 
@@ -200,6 +217,13 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         _REPORT,
     )
     report.add_argument("arguments", metavar="DIR", nargs="*", help="folders of results, such as outputs/paper")
+    bundle = add(
+        "bundle",
+        "results in one archive to share, or whether such an archive is whole",
+        "0 done; 1 done, but something that was asked for is missing",
+        _BUNDLE,
+    )
+    bundle.add_argument("arguments", metavar="DIR", nargs="*", help="folders of results, or one bundle to check")
     compare = add(
         "compare",
         "whether a second version, setting or estimator is better or worse than a first",

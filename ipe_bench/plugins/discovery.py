@@ -16,14 +16,14 @@ import re
 import sys
 import tomllib
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from ipe_bench.basics.errors import UserError, describe_exception
+from ipe_bench.basics.errors import UserError, describe_exception, unknown
 
 ENTRY_POINTS = "ipe_bench.plugins"
 ESTIMATOR_GROUPS = ("solver", "baseline")
@@ -363,6 +363,44 @@ def options(group: str | None = None) -> list[Option]:
     return [o for o in found.values() if group is None or o.group == group]
 
 
+def composed(option: Option, seen: Sequence[str] = ()) -> dict[str, Any]:
+    """What an option says together with the options of its group that its `defaults` name, as Hydra composes them:
+    later ones replace what earlier ones say, and the file itself comes last unless `_self_` stands elsewhere.
+
+    Raises:
+        UserError: the defaults name what is not there, or what is of another group.
+    """
+    config = dict(option.config or {})
+    defaults = config.pop("defaults", [])
+    if not isinstance(defaults, list):
+        raise UserError(f"{option.path}: defaults is not a list; write defaults: [NAME]")
+    names = [*defaults, *([] if "_self_" in defaults else ["_self_"])]
+    found: dict[str, Any] = {}
+    for entry in names:
+        if entry == "_self_":
+            found = _merged(found, config)
+            continue
+        if not isinstance(entry, str):
+            raise UserError(f"{option.path}: defaults has {entry}; write names of other options of {option.group}")
+        name = entry.removesuffix("@_here_").removeprefix(f"/{option.group}/")
+        if name in (*seen, option.name):
+            raise UserError(f"{option.path}: defaults leads back to {name}; leave one of the two out")
+        known = {o.name: o for o in options(option.group)}
+        if name not in known:
+            raise UserError(f"{option.path}: defaults: {unknown(name, known, f'option of {option.group}')}")
+        found = _merged(found, composed(known[name], (*seen, option.name)))
+    return found
+
+
+def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    """Both, the second in the place of the first but where both are mappings."""
+    result = dict(first)
+    for key, value in second.items():
+        both = isinstance(value, Mapping) and isinstance(result.get(key), Mapping)
+        result[key] = _merged(result[key], value) if both else value
+    return result
+
+
 def options_in(folder: Path) -> list[Option]:
     """The options of a plugin's folder that can be checked, with those that they clash with.
 
@@ -370,7 +408,9 @@ def options_in(folder: Path) -> list[Option]:
         UserError: there is no plugin in the folder, or nothing to check.
     """
     if not folder.is_dir():
-        raise UserError(f"{folder}: there is no such folder")
+        beside = Path("plugins") / folder.name.rpartition("=")[2]
+        meant = beside if beside.is_dir() else "a plugin's folder, such as plugins/my_plugin"
+        raise UserError(f"{folder}: there is no such folder; give {meant}")
     if not add_folder(folder):
         raise UserError(f"{folder}: holds no package with a folder conf in it; see `ipe-bench new`")
     home = folder.resolve()
