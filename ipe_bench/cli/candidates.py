@@ -19,8 +19,15 @@ from ipe_bench.plugins.annotations import Stated, choices, stated
 
 COMPOSED = ("run", "estimate", "design", "posterior")
 """Commands that take KEY=VALUE."""
-_FOLDERS = ("report", "compare", "status", "check")
-_COMPARED = ("first", "second", "alpha", "anytime", "fail_on", "output")
+_KEYS_OF = {
+    "report": ("output", "paper", "columns", "width"),
+    "compare": ("first", "second", "alpha", "anytime", "fail_on", "output"),
+    "bundle": ("output",),
+    "status": (),
+    "check": (),
+}
+"""The keys of commands that take folders."""
+_BUNDLE = ".zip"
 _KEYS = "ipe_bench.cli.config.Schema"
 _KNOWN = "ipe_bench.measurements.known.Known"
 _FILES = re.compile(r"^(?:readings|write_readings|output|(?:truth_)?measurement\.file)$")
@@ -72,9 +79,10 @@ def _words_of(command: str, before: Sequence[str], current: str) -> Iterator[Can
         yield from map(Candidate, KINDS)
     elif command == "completion" and not before:
         yield from map(Candidate, ("bash", "zsh", "fish"))
-    elif command == "compare" and "=" not in current:
-        yield from (Candidate(f"{key}=", whole=False) for key in _COMPARED)
-    if command in _FOLDERS:
+    elif current.startswith("output="):
+        yield from (Candidate(f"output={p.text}", whole=p.whole) for p in _paths(current[7:], folders=True))
+    elif command in _KEYS_OF:
+        yield from (Candidate(f"{key}=", whole=False) for key in _KEYS_OF[command])
         yield from _paths(current, folders=True)
 
 
@@ -110,7 +118,8 @@ def _usable(group: str) -> list[plugins.Option]:
 
 
 def _paths(prefix: str, *, folders: bool) -> Iterator[Candidate]:
-    """Files and folders that begin so; hidden ones only where a dot is typed."""
+    """Files and folders that begin so, of files bundles alone where folders are wanted; hidden ones where a dot is
+    typed."""
     home, slash, stem = prefix.rpartition("/")
     try:
         entries = sorted(Path(home + slash or ".").iterdir())
@@ -120,7 +129,7 @@ def _paths(prefix: str, *, folders: bool) -> Iterator[Candidate]:
         if entry.name.startswith(stem) and (stem.startswith(".") or not entry.name.startswith(".")):
             if entry.is_dir():
                 yield Candidate(f"{home}{slash}{entry.name}/", whole=False)
-            elif not folders:
+            elif not folders or entry.suffix == _BUNDLE:
                 yield Candidate(f"{home}{slash}{entry.name}")
 
 

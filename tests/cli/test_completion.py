@@ -100,6 +100,10 @@ def test_files_are_offered_where_a_file_is_wanted(tmp_path, monkeypatch):
     assert texts("ipe-bench estimate readings=") == ["readings=my.csv", "readings=outputs/"]
     assert texts("ipe-bench report outputs/p") == ["outputs/paper/"]
     assert texts("ipe-bench status m") == []
+    (tmp_path / "both.zip").touch()
+    assert texts("ipe-bench compare b") == ["both.zip"]
+    assert texts("ipe-bench bundle output=b") == ["output=both.zip"]
+    assert texts("ipe-bench report c") == ["columns="]
 
 
 def test_options_of_plugins_are_offered_and_broken_ones_are_not(tmp_path, monkeypatch, capsys):
