@@ -42,8 +42,8 @@ class GinsJax(Measurement):
     readings_per_case: Count = 30
     steps_per_interval: Count = 90
     """Integration steps between two readings."""
-    chunk: Count = 64
-    """Trials that are computed together; on a GPU the more the better."""
+    chunk: Count = 8
+    """Trials that are computed together, by single trials too; on a GPU take some hundred."""
 
     reading_unit = "m/s"
 
