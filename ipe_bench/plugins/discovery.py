@@ -338,7 +338,9 @@ def options_in(folder: Path) -> list[Option]:
         UserError: there is no plugin in the folder, or nothing to check.
     """
     if not folder.is_dir():
-        raise UserError(f"{folder}: there is no such folder")
+        beside = Path("plugins") / folder.name.rpartition("=")[2]
+        meant = beside if beside.is_dir() else "a plugin's folder, such as plugins/my_plugin"
+        raise UserError(f"{folder}: there is no such folder; give {meant}")
     if not add_folder(folder):
         raise UserError(f"{folder}: holds no package with a folder conf in it; see `ipe-bench new`")
     home = folder.resolve()
