@@ -124,6 +124,37 @@ def test_the_interval_of_a_linear_parameter_on_its_bound_is_known(beyond, side):
     assert one.other == pytest.approx(expected, abs=1e-3 * s)
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+def test_profiles_of_the_others_let_a_parameter_leave_its_bound_inwards(side):
+    """Of an intercept whose slope is on its bound, against the quadratic form: the bound acts to one side only."""
+    t = np.arange(10.0)
+    A = np.column_stack([np.ones(10), t])
+    P = 0.49 * np.linalg.inv(A.T @ A)
+    sa, sb, c = *np.sqrt(np.diag(P)), P[0, 1]
+    bound = 5 - side * 0.8 * sb
+    known = Known("b", nominal=5 - 9 * side, **{"upper" if side > 0 else "lower": bound})
+    model = Informed(Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)}), (known,))
+    problem = Scenario(model, Gaussian(0.7)).problem
+    z = 2 + 5 * t
+    found = examine(problem, z, fit(problem, z, LM))
+    assert found is not None
+
+    def rise(a: float) -> float:
+        b = 5 + c / sa**2 * (a - 2)
+        b = min(b, bound) if side > 0 else max(b, bound)
+        e = np.array([a - 2, b - 5])
+        return float(e @ np.linalg.solve(P, e)) - 0.8**2
+
+    least = 2 + c / sb**2 * (bound - 5)
+    assert found.x[0] == pytest.approx(least, abs=1e-9)
+    ends = [brentq(lambda a: rise(a) - Q**2, least + s * 1e-9, least + s * 20 * sa) for s in (-1, 1)]
+    (profile,) = found.profiles
+    assert (profile.low, profile.high) == pytest.approx(tuple(ends), abs=2e-3 * sa)
+    # Held on its bound, the slope would leave far shorter an interval to one side.
+    longer, shorter = sorted((least - ends[0], ends[1] - least), reverse=True)
+    assert longer > 1.2 * shorter
+
+
 def test_the_interval_on_a_bound_is_where_scipys_profile_rises():
     rng = np.random.default_rng(8)
     t = np.linspace(50, 700, 14)
