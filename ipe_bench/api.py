@@ -26,6 +26,7 @@ from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.priors import GaussianPrior, Prior
+from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.provenance import describe, fingerprint
 from ipe_bench.runs.results import Results, require_results
@@ -121,7 +122,7 @@ def run(
 
 
 def load(directories: Directories) -> pd.DataFrame:
-    """Every stored trial of one directory or of several: a row per trial and estimator.
+    """Every stored trial of one directory or bundle, or of several: a row per trial and estimator.
 
     Columns that say what a row belongs to: measurement, noise, prior, error_scale, seed, estimator, every key of the
     config that differs between scenarios, and `estimator.KEY` for options that differ under one label. Then what the
@@ -145,10 +146,10 @@ def load(directories: Directories) -> pd.DataFrame:
     """
     from ipe_bench.statistics.collect import collect, trials_frame
 
-    paths = _paths(directories)
-    require_results(paths)
-    collection = collect(paths)
-    frame = trials_frame(collection)
+    with opened(_paths(directories)) as paths:
+        require_results(paths)
+        collection = collect(paths)
+        frame = trials_frame(collection)
     for problem in collection.problems:
         warnings.warn(problem, stacklevel=2)
     return frame
@@ -170,8 +171,12 @@ def report(directories: Directories, output: Path | str | None = None) -> Report
     """
     from ipe_bench.report import write_report
 
-    require_results(_paths(directories))
-    return write_report(directories, output)
+    paths = _paths(directories)
+    if output is None and any(map(is_bundle, paths)):
+        raise UserError(f"{paths[0]}: a bundle is read and not written to; give output=, where the report goes")
+    with opened(paths, None if output is None else Path(output) / BUNDLES) as folders:
+        require_results(folders)
+        return write_report(folders, output)
 
 
 def compare(
@@ -211,10 +216,7 @@ def compare(
     Raises:
         UserError: there is nothing to compare.
     """
-    import pandas as pd
-
-    from ipe_bench.statistics.between import JUDGED, compared, left_out
-    from ipe_bench.statistics.collect import collect
+    from ipe_bench.statistics.between import JUDGED
 
     if not 0 < alpha < 1:
         raise UserError(f"alpha={alpha}: give a number between 0 and 1")
@@ -228,22 +230,39 @@ def compare(
         raise UserError(
             f"compare: {label} is compared with itself; name another folder, or first=LABEL and second=LABEL"
         )
-    for part in paths:
-        require_results(part)
-    collections = [collect(part) for part in paths]
-    frame = pd.DataFrame(compared(collections[0], collections[1], (first, second), alpha=alpha, anytime=anytime))
-    worse = frame[(frame["finding"] == "worse") & frame["quantity"].isin(list(fail_on))]
-    frame.attrs["worse"] = [
-        f"{row['second']} in {row['quantity']}, {row['measurement']}, error scale {row['error_scale']:g}"
-        for row in worse.to_dict("records")
-    ]
-    for name in ("problems", "stale"):
-        frame.attrs[name] = list(dict.fromkeys(line for c in collections for line in getattr(c, name)))
-    frame.attrs["notes"] = left_out(*collections)
+    with opened(paths[0]) as one, opened(paths[1]) as other:
+        frame = _compared([one, other], (first, second), alpha, anytime, fail_on)
     if output is not None:
         from ipe_bench.report.comparison import write
 
         write(frame, Path(output), alpha)
+    return frame
+
+
+def _compared(
+    paths: Sequence[Sequence[Path]],
+    labels: tuple[str | None, str | None],
+    alpha: float,
+    anytime: bool,
+    fail_on: Sequence[str],
+) -> pd.DataFrame:
+    """What `compare` returns of two lists of folders."""
+    import pandas as pd
+
+    from ipe_bench.statistics.between import compared, described, left_out
+    from ipe_bench.statistics.collect import collect
+
+    for part in paths:
+        require_results(part)
+    collections = [collect(part) for part in paths]
+    frame = pd.DataFrame(compared(collections[0], collections[1], labels, alpha=alpha, anytime=anytime))
+    worse = frame[(frame["finding"] == "worse") & frame["quantity"].isin(list(fail_on))]
+    frame.attrs["worse"] = [
+        f"{row['second']} in {row['quantity']}, {described(row)}" for row in worse.to_dict("records")
+    ]
+    for name in ("problems", "stale"):
+        frame.attrs[name] = list(dict.fromkeys(line for c in collections for line in getattr(c, name)))
+    frame.attrs["notes"] = left_out(*collections)
     return frame
 
 
@@ -267,9 +286,9 @@ def status(directories: Directories) -> pd.DataFrame:
     """
     import pandas as pd
 
-    paths = _paths(directories)
-    require_results(paths)
-    results = Results.read(paths)
+    with opened(_paths(directories)) as paths:
+        require_results(paths)
+        results = Results.read(paths)
     counts = ("expected", "done", "missing", "failed", "stale")
     rows = [
         {**cell.names, **{name: getattr(cell, name) for name in counts}, "messages": "; ".join(cell.messages)}
@@ -485,10 +504,12 @@ def compute(
     watch: Watcher | None = None,
     record_as: str | None = None,
     further: Mapping[str, Any] | None = None,
+    command: str | None = None,
 ) -> tuple[str, ...]:
     """Computes and stores what is missing under `output`; returns the messages of what failed.
 
-    The run is recorded under a new name, or under `record_as`, in place of what is there; with `further` facts.
+    The run is recorded under a new name, or under `record_as`, in place of what is there; with `further` facts, and the
+    `command` as it was typed.
 
     Raises:
         UserError: what was asked for cannot be computed, or the folder cannot be written to; nothing is computed then.
@@ -509,7 +530,8 @@ def compute(
     execution.warm_up(perform, len(tasks))
     record = _record(scenarios, estimators, trials) | dict(further or {})
     known = None if tasks or aside else store.same_run(record)
-    identifier = known or _write_record(store, record, record_as or new_name())
+    typed = {"command": command, "blocks": len(tasks)}
+    identifier = known or _write_record(store, record | typed, record_as or new_name())
     with RunLog(store.directory / "log" / f"{identifier}.log") as log:
         for line in aside:
             log.warning(line)
@@ -518,6 +540,10 @@ def compute(
     if not (store.runs / f"{identifier}.json").is_file():
         raise StorageError(f"{store.directory}: lost the record of this run; the same command computes what is missing")
     return failures
+
+
+NARROW = "every interval is narrow enough"
+"""Why a scenario stops that has come to the precision that was asked for."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -529,6 +555,11 @@ class Stop:
     reason: str
     widest: str
     """The statistic that is farthest from the precision that was asked for, or was nearest to it last."""
+
+    @property
+    def reached(self) -> bool:
+        """Whether the precision that was asked for is there."""
+        return self.reason == NARROW
 
     @property
     def row(self) -> dict[str, Any]:
@@ -548,6 +579,7 @@ def compute_until(
     execution: Execution | None = None,
     block_size: int = BLOCK_SIZE,
     watch: Watcher | None = None,
+    command: str | None = None,
 ) -> tuple[tuple[str, ...], tuple[Stop, ...]]:
     """Adds blocks to what is stored under `output` until every interval is narrow enough, there are `most` trials
     (`MOST_TRIALS` where None), or `time_limit` seconds are over, which is looked at between rounds of blocks.
@@ -566,7 +598,7 @@ def compute_until(
         raise UserError(f"precision={precision}: certified readings are one trial; leave it out")
     validate(scenarios, estimators, budget, block_size)
     options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
-    options["further"] = {"precision": dataclasses.asdict(wanted)}
+    options |= {"further": {"precision": dataclasses.asdict(wanted)}, "command": command}
     at = [_first_trials(s, estimators, Path(output), block_size, budget) for s in scenarios]
     names, failures = [new_name() for _ in scenarios], []
     stops: dict[int, Stop] = {}
@@ -593,7 +625,7 @@ def _reason_to_stop(failed: bool, widest: Reach | None, spent: bool, late: bool)
     if failed:
         return "some blocks failed"
     if widest is not None and widest.ratio <= 1:
-        return "every interval is narrow enough"
+        return NARROW
     if spent:
         return "there are as many trials as there may be"
     return "the time is over" if late else ""

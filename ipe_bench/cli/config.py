@@ -23,6 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ipe_bench.api import MOST_TRIALS, TRIALS, objective_columns
 from ipe_bench.basics.errors import UserError, describe_exception, unknown
+from ipe_bench.cli.search_path import extend
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.known import Informed, Known, informed
@@ -110,12 +111,11 @@ class Job:
     """Of the files, for an estimate from them."""
 
 
-class PluginSearchPath(SearchPathPlugin):
-    """Lets Hydra find the options of plugins."""
+class PluginConfigs(SearchPathPlugin):
+    """Lets our own commands find the options of plugins, those in the working folder as well."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        for source in plugins.sources()[1:]:
-            search_path.append(source.name, source.conf.as_uri())
+        extend(search_path, plugins.sources())
 
 
 def prepare() -> None:
@@ -124,8 +124,8 @@ def prepare() -> None:
         print(f"ipe-bench: {problem}", file=sys.stderr)
     ConfigStore.instance().store("schema", node=Schema, provider="ipe-bench")
     registry = Plugins.instance()
-    if PluginSearchPath not in registry.discover(SearchPathPlugin):
-        registry.register(PluginSearchPath)
+    if PluginConfigs not in registry.discover(SearchPathPlugin):
+        registry.register(PluginConfigs)
 
 
 _FORMULA = re.compile(
