@@ -199,7 +199,8 @@ class Released:
             x = minimize(objective, method, x, tolerance=_TOLERANCE, max_iterations=_MOST_STEPS).x
             sums = squared(self.problem.R.whiten(model.simulate(x, rows) - readings))
         left = (model.whole(x, rows) - self.x)[:, self.places] * self.inwards
-        for (one, at), total, inside in zip(asked, sums.tolist(), (left >= 0).all(axis=1).tolist(), strict=True):
+        inwards = np.all(left >= 0, axis=1)
+        for (one, at), total, inside in zip(asked, sums.tolist(), inwards, strict=True):
             if inside and np.isfinite(total):
                 one.lower_to(at, total)
 

@@ -72,7 +72,7 @@ def test_a_parameter_of_one_file_may_be_known_there(files):
 def test_a_common_parameter_may_be_fixed_for_all(files):
     paths, data = files
     result = estimate(open_together(paths, Informed(OWN, (Known("b2", fixed=5.5e-4),))))
-    x, _ = solution(lambda p: residuals(data, *p, 5.5e-4), [250, 250])
+    x, _ = solution(lambda p: residuals(data, p[0], p[1], 5.5e-4), [250, 250])
     assert of(result, result.x) == pytest.approx({"b1_1": x[0], "b1_2": x[1]}, rel=1e-8)
 
 

@@ -90,6 +90,7 @@ def test_truths_of_the_prior_are_in_the_penalised_profiles_as_often_as_they_say(
     drawn = bench.draw(0, trials)
     estimates = MapLM(tolerance=1e-9).estimate(bench.problem, drawn.z)
     assert (estimates.status == 0).all()
+    assert estimates.covariance is not None
     problem, _ = penalised(bench.problem, drawn.z[0], 1.0)
     z = np.column_stack([drawn.z, np.repeat(problem.x0[None], trials, axis=0)])
     found = profiles_of_sets(problem, z, estimates.x, estimates.covariance)
@@ -165,11 +166,13 @@ def test_the_interval_on_a_bound_is_where_scipys_profile_rises():
     assert found is not None
 
     def chi_square(b1: float) -> float:
-        options = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
-        return 2 * least_squares(lambda p: (-b1 * np.expm1(-1e-4 * p[0] * t) - z) / 0.1, [5.0], **options).cost
+        def residuals(p):
+            return (-b1 * np.expm1(-1e-4 * p[0] * t) - z) / 0.1
+
+        return 2 * float(least_squares(residuals, [5.0], xtol=1e-15, ftol=1e-15, gtol=1e-15).cost)
 
     least = chi_square(235.0)
-    expected = brentq(lambda b1: chi_square(b1) - least - Q**2, 150.0, 235.0)
+    expected = float(brentq(lambda b1: chi_square(b1) - least - Q**2, 150.0, 235.0))  # type: ignore[arg-type]
     assert found.on_bounds[0].other == pytest.approx(expected, abs=1e-3 * (235.0 - expected))
 
 
@@ -194,6 +197,7 @@ def test_truths_near_a_bound_are_in_the_intervals_at_least_as_often_as_they_say(
     z = 5 * np.exp(-rate * t) + 0.5 * np.random.default_rng(9).standard_normal((trials, 6))
     free = GaussNewton(tolerance=1e-9).estimate(problem, z)
     assert (free.status == 0).all()
+    assert free.covariance is not None
     off = free.x[:, 1] > 0
     inside = [
         one.low <= rate <= one.high for _, one in profiles_of_sets(problem, z[off], free.x[off], free.covariance[off])
