@@ -307,6 +307,8 @@ def estimate(
     noise: Noise | None = None,
     prior: Prior | None = None,
     error_scale: float | None = None,
+    ignore_rows: Sequence[int | str] = (),
+    ignore_columns: Sequence[str] = (),
 ) -> Answer:
     """Parameters from real readings, by every estimator: estimates, standard errors, residuals and a test of the fit.
 
@@ -316,8 +318,10 @@ def estimate(
     noise; where neither does, the readings are taken for independent and equally noisy, and the level is estimated from
     the residuals (`Unknown`): then their size cannot test the fit. Filters and `map_lm` need to know how far from the
     model's nominal point the parameters may be: `error_scale` is the standard deviation of each in multiples of its
-    size, and `prior` widens or narrows some. `x` and `covariance` of a fit are in the parameters' own units. The answer
-    is the sequence of the fits; it shows itself in a notebook, and `table()` is a frame.
+    size, and `prior` widens or narrows some, or makes them depend on each other (`ipe_bench.priors.prior_of` makes one
+    of a covariance). `ignore_rows` and `ignore_columns` of the files are left out (see `LeftOut`). `x` and `covariance`
+    of a fit are in the parameters' own units. The answer is the sequence of the fits; it shows itself in a notebook,
+    and `table()` is a frame.
 
     >>> import ipe_bench as ib
     >>> model = ib.measurements.Polynomial()
@@ -334,15 +338,18 @@ def estimate(
     """
     from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
     from ipe_bench.noise.own import ModelNoise, Unknown
-    from ipe_bench.real.examination import examine
+    from ipe_bench.real.examination import examinations
     from ipe_bench.real.fits import fit
-    from ipe_bench.real.sources import Readings, noise_of, open_together
+    from ipe_bench.real.sources import LeftOut, Readings, noise_of, open_together
     from ipe_bench.report.answer import Answer
     from ipe_bench.solvers import Auto
 
     if estimators is None:
         estimators = {"linear_lse": LinearLSE(), "levenberg_marquardt": LevenbergMarquardt(), "auto": Auto()}
+    left_out = LeftOut(tuple(ignore_columns), tuple(ignore_rows))
     if isinstance(readings, np.ndarray):
+        if left_out:
+            raise UserError("ignore_rows, ignore_columns: are of files; set readings to NaN in an array")
         z = np.array(readings, dtype=float)
         if z.shape != (model.m,):
             raise UserError(
@@ -351,14 +358,14 @@ def estimate(
         found = Readings(model, z)
     else:
         paths = [readings] if isinstance(readings, str | Path) else readings
-        found = open_together([Path(path) for path in paths], model)
+        found = open_together([Path(path) for path in paths], model, left_out)
     known = noise_of(found, noise) or ModelNoise().of(found.model) or Unknown()
     problem = _real_problem(found.model, known, prior, error_scale)
     if lacking := _needs(problem, estimators):
         remedy = "; give error_scale" if error_scale is None and prior is None else ""
         raise UserError("; ".join(lacking) + remedy)
     fits = fit(problem, found.z, estimators, known)
-    return Answer(found.model.name, found.model, found.z, fits, examine(problem, found.z, fits))
+    return Answer(found.model.name, found.model, found.z, fits, examinations(problem, found.z, fits), left_out.said)
 
 
 def _real_problem(model: Measurement, noise: Noise, prior: Prior | None, error_scale: float | None) -> Problem:
@@ -366,7 +373,7 @@ def _real_problem(model: Measurement, noise: Noise, prior: Prior | None, error_s
     known = prior is not None or error_scale is not None
     scale = 1.0 if error_scale is None else error_scale
     problem = Scenario(model, noise, prior or GaussianPrior(), scale).problem
-    return problem if known else dataclasses.replace(problem, prior_deviation=None)
+    return problem if known else problem.without_prior()
 
 
 def design(

@@ -24,6 +24,7 @@ from ipe_bench.basics.errors import StorageError, UserError, shortened
 from ipe_bench.cli import console, interrupts
 from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, assemble, explain, prepare, rewrite
 from ipe_bench.cli.dry_run import DryRun
+from ipe_bench.cli.flags import flags_of_hydra
 from ipe_bench.cli.overrides import default_name, known_options, read
 from ipe_bench.cli.parser import INFO_TOPICS, parsers
 from ipe_bench.cli.progress import shown_progress
@@ -132,7 +133,8 @@ def _run_hydra(flags: Sequence[str], words: Sequence[str]) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     sys.argv = ["ipe-bench", *flags, *words]
     try:
-        hydra.main(version_base="1.3", config_path=str(plugins.own_conf()), config_name="config")(task)()
+        with flags_of_hydra():
+            hydra.main(version_base="1.3", config_path=str(plugins.own_conf()), config_name="config")(task)()
     except (UserError, StorageError):
         raise
     except OSError as error:  # Hydra writes its own files before our task is called
@@ -279,6 +281,9 @@ def _refuse_keys_without_use(config: DictConfig) -> None:
         raise UserError(
             f"readings={config.readings}: run simulates its readings; `ipe-bench estimate` estimates from a file"
         )
+    for key in ("ignore_rows", "ignore_columns"):
+        if config[key] is not None:
+            raise UserError(f"{key}={config[key]}: is of a file of readings, for `ipe-bench estimate`; leave it out")
     if config.write_readings is None and config.write_readings_trial:
         raise UserError(f"write_readings_trial={config.write_readings_trial}: goes with write_readings=FILE")
 
