@@ -4,8 +4,8 @@ scales, see the table.
     python tests/benchmarks/loop.py [FOLDER]
 
 Each figure is the least of some rounds; CPU time, of all processes together, is beside it, since that says about the
-same on a busy machine. Below stands what no bench can do without: a Python that loads the libraries. Checked on the way: the changed line is what was computed, and what did
-not change was not computed again.
+same on a busy machine. Below stands what no bench can do without: a Python that loads the libraries. Checked on the
+way: the changed line is what was computed, and what did not change was not computed again.
 """
 
 from __future__ import annotations
