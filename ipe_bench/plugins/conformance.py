@@ -27,11 +27,11 @@ from ipe_bench.measurements.sir import Sir
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.gaussian import Gaussian
 from ipe_bench.noise.own import ModelNoise
-from ipe_bench.plugins.construct import construct
+from ipe_bench.plugins.construct import construct, find_class
 from ipe_bench.plugins.discovery import COMPONENT_GROUPS, Option, blame, composed
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.runs.execution import Execution, Failure
-from ipe_bench.runs.provenance import describe
+from ipe_bench.runs.provenance import TARGET, describe
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import nees
 
@@ -104,7 +104,7 @@ def check_option(option: Option) -> Iterator[Finding]:
         return
     try:
         config = composed(option)
-        if required := [key for key, value in config.items() if value == "???"]:
+        if required := _required(config, option.group):
             yield Finding(name, f"Names what is to be given, {', '.join(required)}, and is tried where it is")
             return
         yield from check_component(name, construct(config, option.package or option.group))
@@ -115,6 +115,15 @@ def check_option(option: Option) -> Iterator[Finding]:
         if complaint is None:
             raise
         yield Finding(name, "Can be used", complaint)
+
+
+def _required(config: dict[str, Any], where: str) -> list[str]:
+    """What the config leaves to be given because the class cannot do without it."""
+    left = [key for key, value in config.items() if value == "???"]
+    if not left or TARGET not in config:
+        return []
+    known = {f.name: f for f in fields(find_class(config[TARGET], where))}
+    return [key for key in left if key in known and known[key].default is known[key].default_factory]
 
 
 def describes_itself(component: Any) -> None:
