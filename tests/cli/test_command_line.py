@@ -231,7 +231,7 @@ def test_hydras_own_flags_work_after_run(tmp_path):
 
 LOADED = """
 import sys
-from ipe_bench.cli.main import main
+from ipe_bench.cli.main import COMMANDS, main
 main(["--help"])
 main(["list", "--help"])
 print(sorted(m for m in ("pandas", "seaborn", "filterpy", "numba", "hydra", "numpy", "rich") if m in sys.modules))
@@ -330,7 +330,7 @@ def test_a_spoiled_parquet_file_is_named_by_row_and_column(readings, tmp_path, i
 
 
 @pytest.mark.parametrize(
-    "command", ["estimate", "design", "posterior", "report", "status", "list", "new", "check", "compare"]
+    "command", ["estimate", "design", "posterior", "report", "status", "list", "new", "check", "compare", "bundle"]
 )
 def test_every_command_has_help(tmp_path, monkeypatch, capsys, command):
     monkeypatch.chdir(tmp_path)
@@ -342,7 +342,19 @@ def test_every_command_has_help(tmp_path, monkeypatch, capsys, command):
 def test_the_bare_program_says_what_there_is(capsys, words):
     assert main(words) == 0
     text = capsys.readouterr().out
-    for command in ("run", "estimate", "design", "posterior", "report", "status", "list", "new", "check", "compare"):
+    for command in (
+        "run",
+        "estimate",
+        "design",
+        "posterior",
+        "report",
+        "status",
+        "list",
+        "new",
+        "check",
+        "compare",
+        "bundle",
+    ):
         assert re.search(rf"\n    {command}\s", text)
 
 
