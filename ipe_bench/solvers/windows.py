@@ -27,8 +27,10 @@ _RANDOMISED = 2
 """In so many windows, which leave much open, the prior of a candidate is centred at its own start."""
 _THINNING = (1, 1, 4, 8, 16, 32, 64)
 """Of the candidates that there were at the start, each window keeps the best one in so many; one at least."""
-_GIVEN_UP = (np.inf, 1e6, 1e3)
-"""The mean squared residual above which a window's fit is a wrong one: in the first window, the second, and later."""
+GIVEN_UP = 1e3
+"""The mean squared residual above which a fit is a wrong one,"""
+_GIVEN_UP = (np.inf, 1e6, GIVEN_UP)
+"""and above which a window's fit is: in the first window, the second, and later."""
 _ONE = (0.03, 0.003)
 """Candidates closer than this, in deviations of the prior, are one: in the first window, and later."""
 
