@@ -23,7 +23,8 @@ _NEAR = 1e-2
 """How near to the root of eq. (11), in deviations, they bring a trial before the Jacobian there takes over."""
 _CHORDS = 8
 """Steps with one Jacobian from then on."""
-_JACOBIANS = 3
+_JACOBIANS = 16
+"""Renewals at most, as long as each leaves the answer nearer to the minimum than the one before."""
 _BENT = 200
 """Times the tolerance: how far from the minimum, in deviations, a Jacobian that has changed may leave the answer."""
 _DEPTH = 5
@@ -159,7 +160,7 @@ class Chords:
         """Chord steps for trials that are near, each time with a new Jacobian until it is that of the end."""
         at, latest = np.arange(len(origin)), before
         whole: tuple[Minima, Slope] | None = None
-        bent = _BENT * self.tolerance
+        bent, off = _BENT * self.tolerance, np.full(len(origin), np.inf)
         for _ in range(_JACOBIANS):
             x, r, slope = latest.x, latest.state.r, latest.state.slope
             J = objective.jacobian(x)
@@ -170,10 +171,17 @@ class Chords:
             latest = _after(latest, ended)
             result = minima_of(latest, ended.state.slope, objective.readings), ended.state.slope
             whole = result if whole is None else (put(whole[0], at, result[0]), put(whole[1], at, result[1]))
-            again = (ended.state.off > bent) & (ended.status == Status.MAX_ITERATIONS)
+            now = ended.state.off
+            again = (now > bent) & (now < off) & (ended.status == Status.MAX_ITERATIONS)
             if not again.any():
                 break
-            at, origin, objective, latest = at[again], x[again], objective.subset(again), take(latest, again)
+            off, at, origin, objective, latest = (
+                now[again],
+                at[again],
+                x[again],
+                objective.subset(again),
+                take(latest, again),
+            )
         assert whole is not None
         return whole
 

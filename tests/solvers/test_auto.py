@@ -11,7 +11,7 @@ from ipe_bench.measurements.mgh import score
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Certified, Gaussian, Quantization
 from ipe_bench.solvers import Auto, FixedPoint, Progressive
-from ipe_bench.solvers.auto import FIXED_POINT, PROGRESSIVE
+from ipe_bench.solvers.auto import CHORDS, PROGRESSIVE
 from ipe_bench.trials.roots import least_squares_root
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import Block
@@ -32,7 +32,7 @@ def test_what_is_nearly_linear_costs_no_more_than_fixed_point_iteration_and_half
     scenario = Scenario(Gins(), Quantization(0.02286), error_scale=10.0)
     z = scenario.draw(0, 30).z
     quick, plain = (e.estimate(scenario.problem, z) for e in (Auto(), FixedPoint()))
-    assert (quick.extras["stage"] == FIXED_POINT).all()
+    assert (quick.extras["stage"] == CHORDS).all()
     cost = [np.median(e.simulations + 11 * e.jacobians) for e in (quick, plain)]
     assert cost[0] <= 1.5 * cost[1]
 
@@ -51,7 +51,7 @@ def test_residuals_that_do_not_fit_are_no_answer_of_the_first_stage():
     scenario = Scenario(Polynomial(strength=0.02), Gaussian(0.1), error_scale=1.0)
     z = scenario.draw(0, 4).z
     strict = Problem(scenario.measurement, Covariance(np.full(scenario.measurement.m, 1e-4)))
-    assert (Auto().estimate(scenario.problem, z).extras["stage"] == FIXED_POINT).all()
+    assert (Auto().estimate(scenario.problem, z).extras["stage"] == CHORDS).all()
     assert (Auto().estimate(strict, z).extras["stage"] == PROGRESSIVE).all()
 
 
@@ -64,7 +64,7 @@ def test_a_jacobian_that_changes_on_the_way_is_renewed(model, scale):
     with np.errstate(all="ignore"):
         estimates = Auto().estimate(problem, trials.z)
         root = least_squares_root(problem, trials.z, trials.x, prior=None)
-    first = estimates.extras["stage"] == FIXED_POINT
+    first = estimates.extras["stage"] == CHORDS
     deviation = np.sqrt(np.diagonal(estimates.covariance, axis1=1, axis2=2))
     assert first.mean() > 0.9
     assert estimates.jacobians[first].max() >= 1
