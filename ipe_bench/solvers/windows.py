@@ -148,7 +148,7 @@ class Windows(Search):
         """The objective of each candidate in a window, with the prior about `centre`."""
         problem, model = self.problem, self.problem.measurement
         assert model.epochs is not None
-        window = Counted(Restricted.until(model, epochs), self.spent(owner), epochs / len(model.epochs))
+        window = Counted(Restricted.until(model, epochs, coarse=True), self.spent(owner), epochs / len(model.epochs))
         R, z = problem.R.restricted(arrived), self.z[np.ix_(owner, arrived)]
         return Objective(window, R, z, np.arange(len(owner)), centre, self.prior).coarsened(0.0)
 

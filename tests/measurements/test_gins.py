@@ -11,6 +11,8 @@ from scipy.integrate import DOP853, solve_ivp
 from ipe_bench.measurements import Gins
 from ipe_bench.measurements.base import Restricted
 from ipe_bench.measurements.ode.levels import Search
+from ipe_bench.noise import Quantization
+from ipe_bench.trials.scenario import Scenario
 
 STEP = 0.075 * 0.3048
 LINEAR_BOUND = [
@@ -281,3 +283,16 @@ def test_epochs_are_the_times_with_all_cases_and_axes(gins):
     for k, rows in enumerate(gins.epochs):
         assert len(rows) == 8
         assert {index["time [min]"][i] for i in rows} == {3.0 * (k + 1)}
+
+
+def test_readings_of_a_window_are_near_enough_and_the_same_bits_in_any_batch():
+    """Without a search for the step, at error scales where no step is known to do."""
+    model = Gins()
+    x = Scenario(model, Quantization(0.02286), error_scale=5000.0).draw(0, 12).x
+    for stop in (1, 8, 16):
+        near = model.coarse_simulate_until(x, stop)
+        exact = model.simulate_until(x, stop)
+        off = np.abs(near - exact).max(axis=1)
+        assert off.max() < 0.1 * 0.02286 / np.sqrt(12)
+        assert (off > 0).any()
+        np.testing.assert_array_equal(model.coarse_simulate_until(x[3:4], stop), near[3:4])

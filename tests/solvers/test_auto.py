@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ipe_bench.baselines import GaussNewton, LevenbergMarquardt
 from ipe_bench.basics.linalg import Covariance
-from ipe_bench.measurements import Bearings, Gins, LotkaVolterra, Mgh, Polynomial, Triad
+from ipe_bench.measurements import Bearings, Gins, LotkaVolterra, Mgh, Polynomial, Ranging, Sir, Triad
 from ipe_bench.measurements.mgh import score
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Certified, Gaussian, Quantization
-from ipe_bench.solvers import Auto, FixedPoint, Progressive
+from ipe_bench.solvers import Auto, FixedPoint, Newton, Progressive
 from ipe_bench.solvers.auto import CHORDS, PROGRESSIVE
 from ipe_bench.trials.roots import least_squares_root
 from ipe_bench.trials.scenario import Scenario
@@ -122,6 +123,45 @@ def test_nobody_looks_for_others_where_the_first_stage_sufficed_or_each_look_is_
         np.testing.assert_array_equal(plain.simulations, asked.simulations)
         # Where nobody has looked, nobody can say that there is no other.
         assert np.isnan(plain.extras["ambiguous"]).all()
+
+
+def test_steps_that_lead_nowhere_are_given_up_early():
+    """At this scale fixed-point iteration finds no root: less than the cost of one Jacobian goes into seeing that."""
+    scenario = Scenario(Gins(), Quantization(0.02286), error_scale=2000.0)
+    z = scenario.draw(0, 20).z
+    with np.errstate(all="ignore"):
+        chosen, thorough = (e.estimate(scenario.problem, z) for e in (Auto(), Progressive()))
+    wasted = (chosen.simulations - thorough.simulations) + 11 * (chosen.jacobians - thorough.jacobians)
+    assert np.median(wasted) < 11
+
+
+CASES = {
+    "polynomial": (Polynomial(), Gaussian(0.01), (0.1, 1.0, 10.0)),
+    "ranging": (Ranging(), Gaussian(0.1), (0.1, 1.0, 10.0)),
+    "bearings": (Bearings(), Gaussian(0.5), (0.1, 1.0, 3.0)),
+    "lotka_volterra": (LotkaVolterra(), Gaussian(0.5), (0.1, 1.0, 3.0)),
+    "sir": (Sir(), Gaussian(50.0), (1.0,)),
+    "triad": (Triad(), Gaussian(1e-5), (0.1, 1.0, 10.0, 100.0)),
+    "gins": (Gins(), Quantization(0.02286), (1.0, 33.0, 100.0, 300.0, 1000.0, 3000.0)),
+}
+OTHERS = (FixedPoint(), Newton(), GaussNewton(), LevenbergMarquardt(), Progressive())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("model", "scale"), [(m, s) for m, (_, _, scales) in CASES.items() for s in scales])
+def test_it_succeeds_as_often_as_the_best_and_costs_little_more_than_the_cheapest_that_does(model, scale):
+    measurement, noise, _ = CASES[model]
+    block = Block.draw(Scenario(measurement, noise, error_scale=scale), 5000, 5100)
+
+    def figures(estimator):
+        with np.errstate(all="ignore"):
+            estimates, scored = block.estimate(estimator)
+        return scored["success"].mean(), np.median(estimates.simulations + measurement.n * estimates.jacobians)
+
+    success, cost = figures(Auto())
+    others = [figures(other) for other in OTHERS]
+    assert success >= max(share for share, _ in others) - 0.01
+    assert cost <= 1.5 * min((c for share, c in others if share >= success), default=np.inf)
 
 
 @pytest.mark.slow
