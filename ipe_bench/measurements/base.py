@@ -267,7 +267,7 @@ class Measurement(Component, Named, ABC):
         return self.jacobian(x)[:, self.rows(stop)]
 
     def coarse_jacobian_until(self, x: Array, stop: int) -> Array:
-        """`coarse_jacobian` in `rows(stop)` alone."""
+        """dh/dx in `rows(stop)` alone, near enough for fits that only start another, `|I - J~+ J|` below 0.1."""
         return self.coarse_jacobian(x)[:, self.rows(stop)]
 
     @property

@@ -20,7 +20,7 @@ from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.counted import Counted, Tally
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers.chords import Chords
-from ipe_bench.solvers.progressive import Progressive
+from ipe_bench.solvers.progressive import Progressive, accepted
 
 _CONFIRMATIONS = 4
 _DAMPING, _STEPS = 1e-3, 100
@@ -34,15 +34,16 @@ CHORDS, PROGRESSIVE = 1, 2
 class Auto(Estimator):
     """The least-squares estimate, as cheaply as this problem allows.
 
-    First the paper's fixed-point iteration, with H frozen at the nominal point, then Gauss-Newton steps with one
-    Jacobian, that of the root which it has found: near to linear problems are solved so. A step of which the next one
-    takes back more than a hundred tolerances says that J has changed; then it is computed anew. Where all that does not
-    converge, or the residuals fail the test of the fit, `progressive`. Extras `stage` says which of the two answered, 1
-    or 2. Cheapest first with a judge is how algorithm portfolios go (Gomes and Selman, Artificial Intelligence 126,
-    2001); these stages and their judge, the calibrated test of the fit, are ours.
+    First the paper's fixed-point iteration, with H frozen at the nominal point and Anderson's acceleration, given up
+    where it does not come nearer to a root; then Gauss-Newton steps with one Jacobian, that of the root which it has
+    found, computed anew as long as its change would leave the answer more than some hundred tolerances from the
+    minimum: near to linear problems are solved so. Where all that does not converge, or the residuals fail the test of
+    the fit, `progressive`, which knows what was found. Extras `stage` says which of the two answered, 1 or 2. Cheapest
+    first with a judge is how algorithm portfolios go (Gomes and Selman, Artificial Intelligence 126, 2001); these
+    stages and their judge, the calibrated test of the fit, are ours.
 
-    Where the first stage did not suffice, `confirmations` minimisations from draws of the prior look for other minima
-    that fit. Of several the one counts that is the most probable with the prior, since no residual can tell. Extras:
+    Where the first stage did not suffice, or plain fixed-point iteration would not contract at its answer, eq. (18),
+    `confirmations` minimisations from draws of the prior look for other minima that fit. Of several the one counts that is the most probable with the prior, since no residual can tell. Extras:
     `minima`, how many distinct minima that fit were found, and `ambiguous`, 1 where there are several, 0 where the look
     found none, which is no proof that there is none, and NaN where nobody looked; `alternatives` lists the others.
 
@@ -54,8 +55,8 @@ class Auto(Estimator):
     fit_level: Annotated[float, Ge(0), Lt(1)] = 1e-6
     """Residuals less probable than this are taken for those of a wrong minimum."""
     confirmations: Whole | None = None
-    """Minimisations that look for other minima that fit, where the first stage did not suffice; None: four where a
-    prior says where to look and no differential equations make each of them dear, else none."""
+    """Minimisations that look for other minima that fit, where the problem is far from linear; None: four where a prior
+    says where to look and no differential equations make each of them dear, else none."""
     seed: Whole = 0
     """A trial's random stream depends on this and on its readings: on nothing else in the batch."""
     budget: Positive | None = None
@@ -68,7 +69,8 @@ class Auto(Estimator):
         tally = objective.model.tally
         best, contracts = Chords(objective, problem.H, self.tolerance, self.budget, history).minima()
         fitting = Fitting.none(len(z), z.shape[1], self.fit_level)
-        answered = fitting.note(best, np.arange(len(z)))
+        fits = fitting.note(best, np.arange(len(z)))
+        answered = accepted(best, z.shape[1], self.fit_level)
         tally = Tally(tally.simulations, tally.jacobians - answered, np.zeros(len(z), dtype=bool))
         left = np.flatnonzero(~answered)
         if len(left):
@@ -78,7 +80,6 @@ class Auto(Estimator):
             tally.simulations[left] += spent.simulations
             tally.jacobians[left] += spent.jacobians
             tally.messages.update({int(left[i]): message for i, message in spent.messages.items()})
-        fits = answered.copy()
         fits[left] = fitting.note(take(best, left), left)
         examined = np.flatnonzero(fits & ~(answered & contracts)) if self._confirmations(problem) else left[:0]
         best = self._confirmed(problem, z, best, tally, fitting, examined, history)

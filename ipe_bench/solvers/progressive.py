@@ -70,7 +70,7 @@ class Progressive(Estimator):
     tolerance: Positive = 1e-6
     """Of the last pass: the Gauss-Newton step in standard deviations of the local bound."""
     restarts: Whole | None = None
-    """Further attempts at a trial that fails the test; None: four with windows, eleven without."""
+    """Further attempts at a trial that fails the test; None: six with windows, eleven without."""
     fit_level: Annotated[float, Ge(0), Lt(1)] = 1e-6
     """Residuals less probable than this are taken for those of a wrong minimum."""
     budget: Positive | None = None
@@ -111,9 +111,13 @@ class Progressive(Estimator):
         """The trials that another attempt may help: (trials,)."""
         hopeless = ~finite(z) | tally.failed(np.arange(len(z)))
         affordable = tally.cost(best.x.shape[1]) < (np.inf if self.budget is None else self.budget)
-        gross_errors_only = (best.bulk <= _BULK) & (z.shape[1] >= _READINGS * best.x.shape[1])
-        fits = best.converged & ((best.fit_probability(z.shape[1]) >= self.fit_level) | gross_errors_only)
-        return ~fits & ~hopeless & affordable
+        return ~accepted(best, z.shape[1], self.fit_level) & ~hopeless & affordable
+
+
+def accepted(minima: Minima, readings: int, level: float) -> Mask:
+    """Which minima (trials,) are taken for the least: those that fit, and those whose bulk of residuals does."""
+    gross_errors_only = (minima.bulk <= _BULK) & (readings >= _READINGS * minima.x.shape[1])
+    return minima.converged & ((minima.fit_probability(readings) >= level) | gross_errors_only)
 
 
 def _found_again(new: Minima, old: Minima, readings: int) -> Mask:

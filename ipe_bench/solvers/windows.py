@@ -62,7 +62,7 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Windows(Search):
-    """From the nominal point, then carefully from there, then from 16, 32 and 64 draws of the prior.
+    """From the nominal point, then carefully from there, then from 16, 32, ... 256 draws of the prior.
 
     The first two windows have about as many readings as there are parameters, so their fits have several minima of
     one depth, and a common prior would draw all candidates to one of them. Until then each candidate's prior is
@@ -71,7 +71,7 @@ class Windows(Search):
     Recovery, 1996).
     """
 
-    attempts = 5
+    attempts = 7
     enough = 1
 
     def attempt(self, k: int, rows: NDArray[np.intp], before: Minima | None) -> Minima:

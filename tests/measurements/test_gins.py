@@ -243,8 +243,19 @@ def test_bits_of_a_coarse_jacobian_depend_on_the_trial_alone():
     assert not (coarse == model.jacobian(x)).all(axis=(1, 2)).any()
     assert (np.concatenate([Gins().coarse_jacobian(row[None]) for row in x]) == coarse).all()
     assert (Gins().coarse_jacobian(x[::-1]) == coarse[::-1]).all()
-    assert (Gins().coarse_jacobian_until(x, 4) == coarse[:, model.rows(4)]).all()
-    assert (Restricted.until(model, 4).coarse_jacobian(x) == coarse[:, model.rows(4)]).all()
+    part = model.coarse_jacobian_until(x, 4)
+    assert (np.concatenate([Gins().coarse_jacobian_until(row[None], 4) for row in x]) == part).all()
+    assert (Restricted.until(model, 4).coarse_jacobian(x) == part).all()
+
+
+@pytest.mark.parametrize("scale", [300.0, 3000.0, 10000.0])
+def test_steps_with_a_coarse_jacobian_of_a_window_contract(scale):
+    model, x = Gins(), draw(scale, 20, seed=13)
+    for stop in (4, 16):
+        J, coarse = model.jacobian_until(x, stop), model.coarse_jacobian_until(x, stop)
+        size = np.linalg.norm(J, axis=1, keepdims=True)
+        left = [np.eye(11) - np.linalg.lstsq(c, j)[0] for c, j in zip(coarse / size, J / size, strict=True)]
+        assert np.linalg.norm(left, 2, axis=(1, 2)).max() < (0.01 if scale < 10000 else 0.1)
 
 
 def test_parameters_are_taken_in_any_layout_and_left_alone():
