@@ -28,8 +28,9 @@ lint: .venv/ready
 	$(BIN)/ruff format --check
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-# What everything costs beside its rivals, as a table in outputs/bench.
+# What everything costs beside its rivals, as a table in outputs/bench. PEERS=1 installs other people's libraries first.
 bench: .venv/ready
+	$(if $(PEERS),$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[peers]")
 	IPE_BENCH_THREADS=1 OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/table.py outputs/bench
 
 # The documentation, with every experiment executed, in outputs/docs/html. TRIALS=100 makes the gallery's figures finer.

@@ -162,7 +162,7 @@ def report(directories: Directories, output: Path | str | None = None) -> Report
     >>> import ipe_bench as ib
     >>> ib.report("outputs/nowhere")
     Traceback (most recent call last):
-    ipe_bench.basics.errors.UserError: outputs/nowhere: holds no results of ipe-bench; give the output folder of a run
+    ipe_bench.basics.errors.UserError: outputs/nowhere: there is no such directory; give one that a run wrote to
 
     Raises:
         UserError: no run ever wrote to a directory.
@@ -292,8 +292,8 @@ def estimate(
     """Parameters from real readings, by every estimator: estimates, standard errors, residuals and a test of the fit.
 
     `readings` is a CSV file (see `ipe_bench.real.readings`), several that share parameters, or an array z (m,) in the
-    model's order and unit; NaN is missing. Without `estimators`: `linear_lse`, `fixed_point`, `levenberg_marquardt` and
-    `progressive`. `noise` states R. Without it R is what the file says in its column sigma, or the model of its own
+    model's order and unit; NaN is missing. Without `estimators`: `linear_lse`, `levenberg_marquardt` and `auto`, as in
+    the command. `noise` states R. Without it R is what the file says in its column sigma, or the model of its own
     noise; where neither does, the readings are taken for independent and equally noisy, and the level is estimated from
     the residuals (`Unknown`): then their size cannot test the fit. Filters and `map_lm` need to know how far from the
     model's nominal point the parameters may be: `error_scale` is the standard deviation of each in multiples of its
@@ -306,9 +306,8 @@ def estimate(
     >>> for fit in ib.estimate(model, trial.z[0], noise=ib.noise.Gaussian(0.01)):
     ...     print(fit.label, fit.status.label, fit.fits)
     linear_lse converged False
-    fixed_point converged True
     levenberg_marquardt converged True
-    progressive converged True
+    auto converged True
 
     Raises:
         UserError: a file does not hold this model's readings, the array has another shape, or an estimator needs
@@ -320,15 +319,10 @@ def estimate(
     from ipe_bench.real.fits import fit
     from ipe_bench.real.sources import Readings, noise_of, open_together
     from ipe_bench.report.answer import Answer
-    from ipe_bench.solvers import FixedPoint, Progressive
+    from ipe_bench.solvers import Auto
 
     if estimators is None:
-        estimators = {
-            "linear_lse": LinearLSE(),
-            "fixed_point": FixedPoint(),
-            "levenberg_marquardt": LevenbergMarquardt(),
-            "progressive": Progressive(),
-        }
+        estimators = {"linear_lse": LinearLSE(), "levenberg_marquardt": LevenbergMarquardt(), "auto": Auto()}
     if isinstance(readings, np.ndarray):
         z = np.array(readings, dtype=float)
         if z.shape != (model.m,):

@@ -25,7 +25,7 @@ from ipe_bench.real.fits import fit
 from ipe_bench.real.sources import noise_of, open_together
 from ipe_bench.runs.provenance import describe, fingerprint
 
-_STANDARD_ESTIMATORS = ("solver=[auto]", "baseline=[linear_lse,levenberg_marquardt]")
+STANDARD_ESTIMATORS = ("solver=[auto]", "baseline=[linear_lse,levenberg_marquardt]")
 """Unless others are chosen: the one that chooses its way by itself, and two that it can be held against."""
 
 
@@ -35,7 +35,7 @@ def main(arguments: Sequence[str]) -> int:
         "estimate",
         arguments,
         _refuse_keys_without_use,
-        standard=_STANDARD_ESTIMATORS,
+        standard=STANDARD_ESTIMATORS,
         measurement=_measurement_name,
         estimating=True,
     )

@@ -127,6 +127,7 @@ def _recorded_trial(measurement: Measurement, start: int, stop: int) -> Trials:
 
 def _streams(seed: int, trial: int) -> tuple[np.random.Generator, np.random.Generator]:
     """Independent random streams for a trial's parameters and for its noise."""
-    sequence = np.random.SeedSequence(seed, spawn_key=(trial,))
-    parameters, noise = (np.random.Generator(np.random.Philox(s)) for s in sequence.spawn(2))
+    # The children that SeedSequence(seed, spawn_key=(trial,)).spawn(2) has, without making their parent.
+    children = (np.random.SeedSequence(seed, spawn_key=(trial, child)) for child in range(2))
+    parameters, noise = (np.random.Generator(np.random.Philox(child)) for child in children)
     return parameters, noise
