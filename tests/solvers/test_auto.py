@@ -171,3 +171,16 @@ def test_most_failures_among_equal_minima_are_flagged():
     failed = ~scored["success"]
     assert failed.mean() > 0.5
     assert (estimates.extras["ambiguous"][failed] == 1).mean() > 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("model", "scale", "trial"),
+    [(Gins(interval_min=30.0, readings_per_case=3), 2000.0, 1012), (Gins(), 5000.0, 22461)],
+    ids=["a bad minimum is found twice", "a bad minimum of the third window draws all candidates"],
+)
+def test_a_search_goes_on_where_the_minimum_found_is_beyond_use(model, scale, trial):
+    block = Block.draw(Scenario(model, Quantization(0.02286), error_scale=scale), trial, trial + 1)
+    with np.errstate(all="ignore"):
+        _, scored = block.estimate(Progressive())
+    assert (scored["success"] & scored["solved"]).all()
