@@ -42,7 +42,7 @@ class Auto(Estimator):
     first with a judge is how algorithm portfolios go (Gomes and Selman, Artificial Intelligence 126, 2001); these
     stages and their judge, the calibrated test of the fit, are ours.
 
-    Where the first stage did not suffice, or plain fixed-point iteration would not contract at its answer, eq. (18),
+    Where the first stage did not suffice, or plain fixed-point iteration would hardly contract at its answer, eq. (18),
     `confirmations` minimisations from draws of the prior look for other minima that fit. Of several the one counts that
     is the most probable with the prior, since no residual can tell. Extras: `minima`, how many distinct minima that fit
     were found, and `ambiguous`, 1 where there are several, 0 where the look found none, which is no proof that there is

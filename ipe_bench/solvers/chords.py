@@ -27,6 +27,8 @@ _JACOBIANS = 16
 """Renewals at most, as long as each leaves the answer nearer to the minimum than the one before."""
 _BENT = 200
 """Times the tolerance: how far from the minimum, in deviations, a Jacobian that has changed may leave the answer."""
+_CONTRACTING = 0.75
+"""The rate up to which fixed-point iteration is said to contract, so that nobody need look for another minimum."""
 _DEPTH = 5
 """Differences that accelerate a step."""
 
@@ -137,7 +139,7 @@ class Chords:
     history: bool
 
     def minima(self) -> tuple[Minima, Mask]:
-        """The least-squares minimum of each trial, and where fixed-point iteration contracts there, eq. (18).
+        """The least-squares minimum of each trial, and where fixed-point iteration contracts well there, eq. (18).
 
         Trials that do not arrive have not converged.
         """
@@ -153,7 +155,7 @@ class Chords:
         if len(near):
             found, slope = self._renewed(self.objective.subset(ended.converged), take(ended, near), x0[near])
             minima = put(minima, near, found)
-            contracts[near] = _radius(nominal, slope) < 1.0
+            contracts[near] = _radius(nominal, slope) <= _CONTRACTING
         return minima, contracts
 
     def _renewed(self, objective: Objective, before: Ended[OnChord], origin: Array) -> tuple[Minima, Slope]:
