@@ -135,6 +135,17 @@ class Covariance:
         """R itself (m, m)."""
         return np.diag(self.factor**2) if self.factor.ndim == 1 else self.factor @ self.factor.T
 
+    def inverse(self) -> Array:
+        """R^-1 (m, m)."""
+        if self.factor.ndim == 1:
+            return np.diag(self.factor**-2.0)
+        whitener = self._inverse_factor()
+        return whitener.T @ whitener
+
+    def coloured(self, w: Array) -> Array:
+        """R^1/2 w: white numbers w (..., m) of unit variance as draws of covariance R."""
+        return w * self.factor if self.factor.ndim == 1 else multiply(self.factor, w)
+
     def _inverse_factor(self) -> Array:
         return solve_triangular(self.factor, np.eye(self.m), lower=True)
 

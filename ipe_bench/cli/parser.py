@@ -76,6 +76,23 @@ Nothing is computed again.
 
   ipe-bench report DIR                            into DIR itself
   ipe-bench report DIR1 DIR2 output=DIR           several folders together, into another
+  ipe-bench report DIR paper=overview,success_against_scale columns=error_scale,estimator,success width=3.5
+
+paper=NAMES          tables and figures for a paper instead, into DIR/paper: LaTeX (booktabs, siunitx), PDF and PNG
+columns=NAMES        those of the tables, in this order; a name that is not there is answered with those that are
+width=INCHES         of a figure or table: 3.5 for one column, 7.16 for two
+"""
+
+
+_BUNDLE = """
+  ipe-bench bundle outputs/paper                  outputs/paper.zip: all results, and a manifest with their digests
+  ipe-bench bundle outputs/a outputs/b output=both.zip
+  ipe-bench bundle both.zip                       is it whole, and what is its digest?
+
+The same results give the same file, so that the digest may stand in a paper. Others read it beside their own results:
+
+  ipe-bench report outputs/mine both.zip output=outputs/together
+  ipe-bench compare outputs/mine both.zip
 """
 
 
@@ -93,6 +110,24 @@ output=DIR           writes comparison.csv and comparison as PNG and PDF there
 """
 
 
+KINDS = ("solver", "baseline", "measurement", "noise", "prior", "execution")
+KINDS += ("statistic", "figure", "table", "section", "experiment")
+"""Of plugins that `new` makes."""
+_SCHEMA = """
+  ipe-bench schema > ipe-bench.schema.json
+
+Visual Studio Code with its YAML extension, in settings.json:
+                    "yaml.schemas": {"ipe-bench.schema.json": "**/conf/**/*.yaml"}
+Any editor with yaml-language-server, in a file: # yaml-language-server: $schema=ipe-bench.schema.json
+Options of plugins are in it as far as they are found from here; write it again after a new one.
+"""
+_COMPLETION = """
+  eval "$(ipe-bench completion bash)"             in ~/.bashrc
+  eval "$(ipe-bench completion zsh)"              in ~/.zshrc, behind compinit
+  ipe-bench completion fish | source              in ~/.config/fish/config.fish
+
+TAB then completes commands, flags, groups and their options (solver=[new), keys of options (measurement.la) and values.
+"""
 INFO_TOPICS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
 
@@ -104,6 +139,9 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise UserError(f"{self.command}: {message}; see `{self.prog} --help`")
+
+    summary: str = ""
+    """What the command does, in a line."""
 
     @property
     def command(self) -> str:
@@ -141,6 +179,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         found[name] = commands.add_parser(
             name, help=what, description=f"ipe-bench {name}: {what}\n{more}", epilog=epilog
         )
+        found[name].summary = what
         return found[name]
 
     _add_run(add("run", "simulate, estimate, store and report"))
@@ -178,6 +217,13 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         _REPORT,
     )
     report.add_argument("arguments", metavar="DIR", nargs="*", help="folders of results, such as outputs/paper")
+    bundle = add(
+        "bundle",
+        "results in one archive to share, or whether such an archive is whole",
+        "0 done; 1 done, but something that was asked for is missing",
+        _BUNDLE,
+    )
+    bundle.add_argument("arguments", metavar="DIR", nargs="*", help="folders of results, or one bundle to check")
     compare = add(
         "compare",
         "whether a second version, setting or estimator is better or worse than a first",
@@ -203,7 +249,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     new.add_argument(
         "kind",
         metavar="KIND",
-        help="solver, baseline, measurement, noise, prior, execution, statistic, figure, table, section or experiment",
+        help=f"{', '.join(KINDS[:-1])} or {KINDS[-1]}",
     )
     new.add_argument("name", metavar="NAME", help="small letters, digits and underscores")
     check = add(
@@ -212,6 +258,10 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         "0 all checks passed; 1 some failed",
     )
     check.add_argument("folders", metavar="DIR", nargs="*", help="folders of plugins, such as plugins/my_plugin")
+    add("schema", "a JSON schema of config files, for editors that complete and check them", more=_SCHEMA)
+    completion = add("completion", "the script that lets a shell complete all of this", more=_COMPLETION)
+    completion.add_argument("shell", metavar="SHELL", choices=("bash", "zsh", "fish"), help="bash, zsh or fish")
+    completion.add_argument("--query", action="store_true", help=argparse.SUPPRESS)
     return program, found
 
 

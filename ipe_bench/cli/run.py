@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import shlex
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -23,6 +24,7 @@ from ipe_bench.basics.errors import StorageError, UserError, shortened
 from ipe_bench.cli import console, interrupts
 from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, assemble, explain, prepare, rewrite
 from ipe_bench.cli.dry_run import DryRun
+from ipe_bench.cli.flags import flags_of_hydra
 from ipe_bench.cli.overrides import default_name, known_options, read
 from ipe_bench.cli.parser import INFO_TOPICS, parsers
 from ipe_bench.cli.progress import shown_progress
@@ -42,6 +44,8 @@ class Outcome:
 
     def __init__(self) -> None:
         self.started = False
+        self.command: str | None = None
+        """As it was typed; not known to jobs in other processes."""
         self.multirun = False
         self.elsewhere = False
         """Jobs run in other processes, from which nothing but an exception or a file comes back."""
@@ -51,6 +55,8 @@ class Outcome:
         self.failures: list[str] = []
         self.stops: list[str] = []
         """How many trials each job with a precision took, and why no more."""
+        self.short = False
+        """Some job did not come to its precision."""
         self.maximises = False
         self.objectives: list[tuple[float, list[str]]] = []
         """What each job came to in the column that is asked for, and what was asked of it."""
@@ -96,6 +102,7 @@ def main(arguments: Sequence[str]) -> int:
     """Runs Hydra on the arguments; then aggregates and shows the folders that were filled."""
     global _outcome
     _outcome = Outcome()
+    _outcome.command = shlex.join(["ipe-bench", "run", *arguments])
     if any(word in ("-h", "--help") for word in arguments):
         flags, words = ["--help"], []
     else:
@@ -126,7 +133,8 @@ def _run_hydra(flags: Sequence[str], words: Sequence[str]) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     sys.argv = ["ipe-bench", *flags, *words]
     try:
-        hydra.main(version_base="1.3", config_path=str(plugins.own_conf()), config_name="config")(task)()
+        with flags_of_hydra():
+            hydra.main(version_base="1.3", config_path=str(plugins.own_conf()), config_name="config")(task)()
     except (UserError, StorageError):
         raise
     except OSError as error:  # Hydra writes its own files before our task is called
@@ -153,7 +161,7 @@ def _conclude() -> int:
         return 0
     if _outcome.multirun and not _outcome.elsewhere and not _outcome.jobs and not _outcome.mistakes:
         raise UserError("the sweep has no jobs: check the patterns in its lists")
-    code = 1 if _outcome.failures else 0
+    code = 1 if _outcome.failures or _outcome.short else 0
     if _outcome.dry is not None and not _outcome.mistakes:
         print(_outcome.dry.summary())
         return code
@@ -254,11 +262,14 @@ def _objective(job: Job) -> float:
 def _compute(job: Job, execution: Execution, watch: Watcher) -> tuple[str, ...]:
     """Computes the trials that are asked for, or just enough; returns the messages of what failed."""
     options: dict[str, Any] = {"execution": execution, "block_size": job.block_size, "watch": watch}
+    options["command"] = _outcome.command
     if job.precision is None:
         return compute([job.scenario], job.estimators, job.trials, job.output, **options)
     options |= {"precision": job.precision, "time_limit": job.time_limit}
     failures, (stop,) = compute_until([job.scenario], job.estimators, job.trials, job.output, **options)
-    line = f"{_title(job)}: {stop.trials} trials; {stop.reason} ({stop.widest})"
+    verdict = "" if stop.reached else "the precision is not reached: "
+    line = f"{_title(job)}: {stop.trials} trials; {verdict}{stop.reason} ({stop.widest})"
+    _outcome.short |= not stop.reached
     if _launched_elsewhere():
         print(line)
     _outcome.stops.append(line)
@@ -270,6 +281,9 @@ def _refuse_keys_without_use(config: DictConfig) -> None:
         raise UserError(
             f"readings={config.readings}: run simulates its readings; `ipe-bench estimate` estimates from a file"
         )
+    for key in ("ignore_rows", "ignore_columns"):
+        if config[key] is not None:
+            raise UserError(f"{key}={config[key]}: is of a file of readings, for `ipe-bench estimate`; leave it out")
     if config.write_readings is None and config.write_readings_trial:
         raise UserError(f"write_readings_trial={config.write_readings_trial}: goes with write_readings=FILE")
 

@@ -62,7 +62,7 @@ class Residuals(Protocol):
 
 @dataclass(frozen=True)
 class Objective:
-    """|R^-1/2 (h(x) - z)|^2, plus |(x - x0) / prior_deviation|^2 where a prior counts, for the trials `rows`."""
+    """|R^-1/2 (h(x) - z)|^2, plus |P0^-1/2 (x - x0)|^2 where a prior counts, for the trials `rows`."""
 
     model: Counted
     R: Covariance
@@ -70,15 +70,16 @@ class Objective:
     rows: NDArray[np.intp]
     x0: Array
     """The centre of the prior: (n,), or each trial's own (trials, n)."""
-    prior_deviation: Array | None = None
+    prior: Covariance | None = None
+    """P0, where it counts."""
     exact_within: float = np.inf
 
     @classmethod
     def of(cls, problem: Problem, z: Array, *, prior: bool, inflation: float = 1.0) -> Objective:
         """The objective of all readings z (trials, m); with the prior, its deviations times `inflation`."""
         model = Counted(problem.measurement, Tally.zeros(len(z)))
-        deviation = problem.prior_used(inflation) if prior else None
-        return cls(model, problem.R, z, np.arange(len(z)), problem.x0, deviation)
+        counting = problem.prior_covariance(inflation) if prior else None
+        return cls(model, problem.R, z, np.arange(len(z)), problem.x0, counting)
 
     @property
     def readings(self) -> int:
@@ -87,9 +88,9 @@ class Objective:
     def residual(self, x: Array) -> Array:
         """Whitened residuals (trials, m), followed by those of the prior (trials, n) where it counts."""
         r = self.R.whiten(self.model.simulate(x, self.rows) - self.z)
-        if self.prior_deviation is None:
+        if self.prior is None:
             return r
-        return np.concatenate([r, (x - self.x0) / self.prior_deviation], axis=1)
+        return np.concatenate([r, self.prior.whiten(x - self.x0)], axis=1)
 
     def jacobian(self, x: Array) -> Array:
         """The derivative of the whitened residuals (trials, m, n) or (trials, m + n, n)."""
@@ -101,9 +102,10 @@ class Objective:
 
     def _jacobian(self, x: Array, *, coarse: bool) -> Array:
         J = self.R.whiten_jacobian(self.model.jacobian(x, self.rows, coarse=coarse))
-        if self.prior_deviation is None:
+        if self.prior is None:
             return J
-        prior = np.broadcast_to(np.diag(1.0 / self.prior_deviation), (len(x), x.shape[1], x.shape[1]))
+        n = x.shape[1]
+        prior = np.broadcast_to(self.prior.whiten_jacobian(np.eye(n)), (len(x), n, n))
         return np.concatenate([J, prior], axis=1)
 
     def coarsened(self, exact_within: float) -> Objective:

@@ -49,6 +49,16 @@ class Joint(Measurement):
         return [f"{p.name}_{k + 1}" if p.name in part.own_parameters else p.name for p in part.natural_parameters]
 
     @cached_property
+    def copies(self) -> Mapping[str, tuple[str, ...]]:
+        """What the parameters are called here of which every file has its own, by what the model calls them."""
+        found: dict[str, list[str]] = {}
+        for k, part in enumerate(self.parts):
+            for own, name in zip(part.natural_parameters, self._names(k), strict=True):
+                if own.name in part.own_parameters:
+                    found.setdefault(own.name, []).append(name)
+        return {name: tuple(each) for name, each in found.items()}
+
+    @cached_property
     def _first(self) -> list[tuple[int, int]]:
         """The part in which each parameter appears first, and its place there."""
         found: dict[int, tuple[int, int]] = {}

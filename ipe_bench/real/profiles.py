@@ -130,6 +130,41 @@ def profiles_of_sets(
     return [[one.profile() for one in looked[k * n : (k + 1) * n]] for k in range(sets)]
 
 
+def end_within(
+    problem: Problem,
+    z: Array,
+    x: Array,
+    P: Array,
+    place: int,
+    sign: int,
+    *,
+    confidence: float = 0.95,
+    freedom: int | None = None,
+) -> float:
+    """The other end, in its own unit, of the profile interval of a parameter whose estimate is on a bound; x (n,) is
+    the minimum with it there, and `sign` leads inwards. Infinite where the readings set no limit, NaN where the bound
+    is not the minimum.
+
+    The rise of chi-square is compared with the same quantile as inside of bounds. Below the bound the true value may be
+    anywhere, and an estimate on the bound is only nearer to it than one beyond would be: the interval holds it at
+    least as often as it says, from 95 to 97.5 % where the model is linear.
+    """
+    q = half_width(confidence, freedom)
+    least = float(squared(problem.R.whiten(problem.measurement.simulate(x[None]) - z))[0])
+    looked = _Looked(_Set(problem, z, x, P, 1.0, least), place, q)
+    asked = [(looked, looked.centre + sign * f * q * looked.deviation) for f in _FIRST]
+    for _ in range(_ROUNDS + 1):
+        _look(problem, asked)
+        at = looked.next(sign)
+        if at is None:
+            break
+        asked = [(looked, at)]
+    if looked.lower:
+        return np.nan
+    end = looked.centre + sign * looked.end(sign)
+    return float(looked._natural(np.array([end]))[0])
+
+
 @dataclass(frozen=True)
 class _Set:
     """A set of readings with its estimate; see `profiles_of_sets`."""

@@ -75,7 +75,8 @@ class Scenario:
         if self.noise.real:
             return recorded_problem(self.measurement)
         model = self.measurement
-        return Problem(model, self.noise.covariance(model.m), self.prior.deviation(model.n, self.error_scale))
+        deviation, correlation = self.prior.deviation(model.n, self.error_scale), self.prior.correlation(model.n)
+        return Problem(model, self.noise.covariance(model.m), deviation, correlation)
 
     @cached_property
     def simulator(self) -> Measurement:
