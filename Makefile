@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test slow campaigns mutants lint bench docs clean
+.PHONY: run test slow campaigns plugins mutants lint bench docs clean
 
 run: .venv/ready
 	$(BIN)/ipe-bench run +experiment=paper
@@ -17,6 +17,13 @@ slow: .venv/ready
 # What takes the better part of an hour: hundreds of damaged files, wrong command lines, tables of error rates.
 campaigns: .venv/ready
 	$(BIN)/pytest -n auto -m campaign
+
+# The worked plugins that need a library of their own, with those libraries in an environment of their own.
+plugins: .venv/ready
+	$(BIN)/uv venv --quiet --allow-existing --python $(BIN)/python outputs/plugins/.venv
+	$(BIN)/uv pip install --quiet --python outputs/plugins/.venv/bin/python --editable ".[test]" \
+		--editable plugins/optimistix --editable plugins/stonesoup --editable plugins/gins_jax
+	outputs/plugins/.venv/bin/python -m pytest -m plugin plugins
 
 # Whether the tests notice changes on purpose, room by room, as a table in outputs/mutants. SAMPLE=40 draws that many.
 mutants: .venv/ready

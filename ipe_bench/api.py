@@ -257,9 +257,8 @@ def _compared(
     collections = [collect(part) for part in paths]
     frame = pd.DataFrame(compared(collections[0], collections[1], labels, alpha=alpha, anytime=anytime))
     worse = frame[(frame["finding"] == "worse") & frame["quantity"].isin(list(fail_on))]
-    frame.attrs["worse"] = [
-        f"{row['second']} in {row['quantity']}, {described(row)}" for row in worse.to_dict("records")
-    ]
+    rows = [{str(name): value for name, value in row.items()} for row in worse.to_dict("records")]
+    frame.attrs["worse"] = [f"{row['second']} in {row['quantity']}, {described(row)}" for row in rows]
     for name in ("problems", "stale"):
         frame.attrs[name] = list(dict.fromkeys(line for c in collections for line in getattr(c, name)))
     frame.attrs["notes"] = left_out(*collections)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ipe_bench.cli.chosen import SINGLE, Chosen
 from ipe_bench.cli.parser import KINDS, Parser, parsers
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.annotations import Stated, choices, stated
@@ -20,7 +21,6 @@ COMPOSED = ("run", "estimate", "design", "posterior")
 """Commands that take KEY=VALUE."""
 _FOLDERS = ("report", "compare", "status", "check")
 _COMPARED = ("first", "second", "alpha", "anytime", "fail_on", "output")
-_CHOSEN_ONE_OF = ("measurement", "noise", "prior", "execution")
 _KEYS = "ipe_bench.cli.config.Schema"
 _KNOWN = "ipe_bench.measurements.known.Known"
 _FILES = re.compile(r"^(?:readings|write_readings|output|(?:truth_)?measurement\.file)$")
@@ -128,7 +128,7 @@ class _Overrides:
     """The words KEY=VALUE of a command, and what another one may be."""
 
     def __init__(self, words: Sequence[str]) -> None:
-        self.words = [word.lstrip("+") for word in words if not word.startswith("-")]
+        self.chosen = Chosen(words)
 
     def complete(self, current: str) -> Iterator[Candidate]:
         key, equals, value = current.partition("=")
@@ -145,7 +145,7 @@ class _Overrides:
         sign = key[: len(key) - len(name)]
         group, at, _ = name.partition("@")
         if sign == "~":
-            yield from (Candidate(f"~estimators.{label}") for label in self._estimators())
+            yield from (Candidate(f"~estimators.{label}") for label in self.chosen.estimators())
         elif at:
             for option in _usable(group) if group in plugins.ESTIMATOR_GROUPS else ():
                 place = f"{group}@estimators.{option.label}_2={option.name}"
@@ -162,18 +162,18 @@ class _Overrides:
             yield Candidate("+experiment=", "an experiment that comes with the package or a plugin", whole=False)
             yield from (Candidate(f"+{group}@estimators.", whole=False) for group in plugins.ESTIMATOR_GROUPS)
             return
-        for group in (*_CHOSEN_ONE_OF, *plugins.ESTIMATOR_GROUPS, "truth_measurement"):
+        for group in (*SINGLE, *plugins.ESTIMATOR_GROUPS, "truth_measurement"):
             yield Candidate(f"{group}=", whole=False)
             if name == group and group not in plugins.ESTIMATOR_GROUPS:
                 yield Candidate(f"{group}.", whole=False)
         yield Candidate("estimators.", "options of an estimator that is chosen", whole=False)
         for field in stated(_KEYS).values():
-            if field.name not in (*_CHOSEN_ONE_OF, "truth_measurement", "estimators", "default_name"):
+            if field.name not in (*SINGLE, "truth_measurement", "estimators", "default_name"):
                 yield Candidate(f"{field.name}{'.' if field.name == 'parameters' else '='}", field.meaning, whole=False)
 
     def _keys_inside(self, head: str, sign: str) -> Iterator[Candidate]:
         if head == "estimators":
-            yield from (Candidate(f"{sign}estimators.{label}.", whole=False) for label in self._estimators())
+            yield from (Candidate(f"{sign}estimators.{label}.", whole=False) for label in self.chosen.estimators())
         elif re.fullmatch(r"parameters\.\w+", head):
             fields = (field for field in stated(_KNOWN).values() if field.name != "name")
             yield from (Candidate(f"{sign}{head}.{field.name}=", field.meaning, whole=False) for field in fields)
@@ -189,14 +189,14 @@ class _Overrides:
         group = "measurement" if key == "truth_measurement" else group
         if group in plugins.ESTIMATOR_GROUPS and not place:
             yield from _lists(value, _usable(group))
-        elif group in (*_CHOSEN_ONE_OF, *plugins.ESTIMATOR_GROUPS, "experiment"):
+        elif group in (*SINGLE, *plugins.ESTIMATOR_GROUPS, "experiment"):
             yield from _swept(value, ((option.name, option.summary) for option in _usable(group)))
         elif key in _HYDRA:
             yield from map(Candidate, _HYDRA[key])
         elif _FILES.match(key):
             yield from _paths(value, folders=key == "output")
         elif key == "objective":
-            yield from (Candidate(f"{label}.", whole=False) for label in self._estimators())
+            yield from (Candidate(f"{label}.", whole=False) for label in self.chosen.estimators())
         else:
             yield from _swept(value, ((choice, "") for choice in self._choices(key)))
 
@@ -206,52 +206,9 @@ class _Overrides:
         fields = stated(_KEYS) if not head else {} if option is None else _fields(option)
         return choices(fields[name]) if name in fields else []
 
-    # What is chosen so far
-
-    def _component(self, head: str) -> plugins.Option | None:
+    def _component(self, place: str) -> plugins.Option | None:
         """The option whose keys stand behind that one."""
-        if head in (*_CHOSEN_ONE_OF, "truth_measurement"):
-            group = "measurement" if head == "truth_measurement" else head
-            return _option(group, self._chosen(head))
-        place, _, label = head.partition(".")
-        return self._estimators().get(label) if place == "estimators" else None
-
-    def _chosen(self, key: str) -> str:
-        """The option of a group that is chosen by the words, by their experiment, or unless told otherwise."""
-        for word in reversed(self.words):
-            name, _, value = word.partition("=")
-            if name == key or name == f"measurement@{key}":
-                return value.partition(",")[0].partition("/")[0]
-        return str(self._defaults().get(key) or "")
-
-    def _estimators(self) -> dict[str, plugins.Option]:
-        """Those that are chosen, by label; where none is, all there are."""
-        found: dict[str, plugins.Option] = {}
-        for group in plugins.ESTIMATOR_GROUPS:
-            chosen: Any = self._defaults().get(group) or ()
-            for word in self.words:
-                name, _, value = word.partition("=")
-                if name == group:
-                    chosen = [part for part in re.split(r"[\[\],]+", value) if part]
-                elif name.startswith(f"{group}@estimators."):
-                    option = _option(group, value)
-                    found |= {} if option is None else {name.partition(".")[2]: option}
-            options = (_option(group, str(name)) for name in chosen)
-            found |= {option.label: option for option in options if option is not None}
-        return found
-
-    def _defaults(self) -> dict[str, Any]:
-        """What each group is unless the words say so: by their experiment, else by our config."""
-        chosen = _defaults_of(plugins.own_conf() / "config.yaml")
-        for word in self.words:
-            name, _, value = word.partition("=")
-            option = _option("experiment", value) if name == "experiment" else None
-            chosen |= {} if option is None else _defaults_of(option.path)
-        return chosen
-
-
-def _option(group: str, name: str) -> plugins.Option | None:
-    return next((option for option in _usable(group) if option.name == name), None)
+        return next(iter(self.chosen.at(place)), None)
 
 
 def _config(option: plugins.Option) -> dict[str, Any]:
@@ -266,13 +223,6 @@ def _fields(option: plugins.Option) -> dict[str, Stated]:
 def _meaning(option: plugins.Option, key: str) -> str:
     fields = _fields(option)
     return option.comments.get(key) or (fields[key].meaning if key in fields else "")
-
-
-def _defaults_of(path: Path) -> dict[str, Any]:
-    """The choices in a config's list of defaults, by group."""
-    entries = plugins.Option("", "", path, plugins.Source("", path, "")).config.get("defaults") or ()
-    pairs = (pair for entry in entries if isinstance(entry, dict) for pair in entry.items())
-    return {str(key).removeprefix("override ").lstrip("/").rpartition("@")[2]: value for key, value in pairs}
 
 
 def _swept(value: str, known: Iterable[tuple[str, str]]) -> Iterator[Candidate]:

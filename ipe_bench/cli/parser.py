@@ -35,8 +35,10 @@ readings=FILE       CSV or Parquet; `ipe-bench list measurement -v` says which r
 readings=[A,B]      several files, which share all parameters but those in measurement.own=[NAME].
 noise.deviation=X   the standard deviation of a reading; standard errors and tests rest on it.
 noise=unknown       nobody knows it: it is estimated from the residuals, and the size of these tests nothing.
-parameters.NAME.fixed=X, .lower=X, .upper=X   what is known of a parameter.
+ignore_rows=[3,7]   rows to leave out, by their numbers; ignore_columns=[NAME] leaves out columns.
+parameters.NAME.fixed=X, .lower=X, .upper=X   what is known of a parameter; parameters=FILE.yaml has that of many.
 error_scale=X       how far the parameters may lie from the nominal point: the prior of filters and map_lm.
+prior_covariance=F  the same in the parameters' own units: a CSV file of the covariance, headed by their names.
 output=DIR          where the files go: outputs/estimate-MODEL unless given, or outputs/estimate-MODEL-2 and so on
                     where another command has written there. Nothing of another command is overwritten.
 

@@ -30,6 +30,7 @@ from ipe_bench.cli.parser import INFO_TOPICS, parsers
 from ipe_bench.cli.progress import shown_progress
 from ipe_bench.cli.report import main as report
 from ipe_bench.cli.report import show_command
+from ipe_bench.cli.typed import check_options
 from ipe_bench.measurements import Nist
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.runs.execution import Execution, Serial
@@ -113,7 +114,10 @@ def main(arguments: Sequence[str]) -> int:
     elif words:
         folders = [Path(flags[i + 1]) for i, flag in enumerate(flags) if flag == "--config-dir"]
         words = rewrite(words)
-        name = default_name(read(words, KEYS, folders))
+        overrides = read(words, KEYS, folders)
+        if not {"--config-name", "--config-path"}.intersection(flags):
+            check_options(words, overrides)
+        name = default_name(overrides)
         if not {"--multirun", "--run", "--cfg", "--info"}.intersection(flags) and sweeps_by_itself(words, folders):
             flags.append("--multirun")
         words = [*words, f"default_name='{name}'"]

@@ -1,28 +1,15 @@
-"""Lets every application of Hydra find our configs.
-
-A built or editable installation has a copy of this module as `hydra_plugins.ipe_bench_configs`, where Hydra looks for
-plugins of its own; so any application of Hydra can compose `measurement: gins` or `solver: [newton]`. Every search-path
-plugin in this file is therefore one for every application.
-"""
+"""Where Hydra looks for configs: in those of plugins as well, each folder once."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
 from hydra.core.config_search_path import ConfigSearchPath
-from hydra.plugins.search_path_plugin import SearchPathPlugin
 
-from ipe_bench.plugins import discovery
-
-
-class InstalledConfigs(SearchPathPlugin):
-    """For every application: our configs and those of installed plugins, behind its own."""
-
-    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        extend(search_path, discovery.installed_sources())
+from ipe_bench.plugins.discovery import Source
 
 
-def extend(search_path: ConfigSearchPath, sources: Iterable[discovery.Source]) -> None:
+def extend(search_path: ConfigSearchPath, sources: Iterable[Source]) -> None:
     """Adds the folders that are not among those that are searched already."""
     for source in sources:
         searched = {(entry.path or "").removeprefix("file://") for entry in search_path.get_path()}

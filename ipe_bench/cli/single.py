@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 
 from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, Opened, assemble, explain, prepare, rewrite
 from ipe_bench.cli.overrides import read
+from ipe_bench.cli.typed import check_options
 from ipe_bench.plugins import discovery as plugins
 
 
@@ -60,7 +61,7 @@ def compose_single(
     prepare()
     words = rewrite(arguments)
     refuse(words)
-    read(words, KEYS)
+    check_options([*standard, *words], read(words, KEYS))
     try:
         with initialize_config_dir(str(plugins.own_conf()), version_base="1.3"):
             config = compose("config", [*standard, *words])

@@ -332,6 +332,14 @@ class Restricted(Measurement):
         return self.whole.reading_unit
 
     @property
+    def reading_name(self) -> str:  # type: ignore[override]
+        return self.whole.reading_name
+
+    @property
+    def usual_noise(self) -> UsualNoise | None:  # type: ignore[override]
+        return self.whole.usual_noise
+
+    @property
     def own_parameters(self) -> Sequence[str]:
         return self.whole.own_parameters
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise
 
 
 @dataclass(frozen=True)
@@ -134,6 +134,16 @@ class Joint(Measurement):
     @property
     def reading_unit(self) -> str:  # type: ignore[override]
         return self.parts[0].reading_unit
+
+    @property
+    def reading_name(self) -> str:  # type: ignore[override]
+        return self.parts[0].reading_name
+
+    @property
+    def usual_noise(self) -> UsualNoise | None:  # type: ignore[override]
+        """That of the parts, where it is one."""
+        known = [part.usual_noise for part in self.parts]
+        return known[0] if all(one == known[0] for one in known) else None
 
     def simulate(self, x: Array) -> Array:
         pairs = zip(self.parts, self._places, strict=True)

@@ -23,7 +23,7 @@ from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.real.fits import Fit, holding, present_part
 from ipe_bench.real.penalised import penalised
-from ipe_bench.real.profiles import Profile, end_within, half_width, profiles
+from ipe_bench.real.profiles import Profile, Released, end_within, half_width, profiles, profiles_within
 
 CONFIDENCE = 0.95
 BOOTSTRAPS = 500
@@ -166,7 +166,31 @@ def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BO
     if least is None:
         return None
     found = least.examined(best.label, problem, rows, bootstraps)
+    if not on_bounds:
+        return found
+    released = _released(whole, rows, least, best.level, on_bounds)
+    if released is not None:
+        asked = {"confidence": CONFIDENCE, "freedom": least.freedom}
+        within = profiles_within(least.problem, least.z, least.x, least.P, released, **asked)
+        found = replace(found, profiles=within)
     return replace(found, on_bounds=tuple(_on_bounds(whole, z, rows, least, best.level, on_bounds)))
+
+
+def _released(
+    problem: Problem, rows: Array, least: _Least, level: float | None, values: Mapping[int, float]
+) -> Released | None:
+    """The problem in which what is on bounds may leave them; None where nothing is known of it there."""
+    places = np.array(list(values))
+    start = problem.measurement.natural(problem.measurement.nominal[None])[0]
+    given = present_part(replace(problem, measurement=problem.measurement.released(values)), rows, level)
+    x = np.array(given.measurement.nominal, dtype=float)
+    x[np.setdiff1d(np.arange(len(x)), places)] = least.x
+    with np.errstate(all="ignore"):
+        J = given.R.whiten_jacobian(given.measurement.jacobian(x[None]))
+        P, singular = inverse(np.matmul(J.swapaxes(1, 2), J))
+    if singular[0] or not (np.diag(P[0]) > 0).all():
+        return None
+    return Released(given, x, P[0], places, np.sign(start[places] - np.array(list(values.values()))))
 
 
 def examine_with_prior(
@@ -199,21 +223,14 @@ def _on_bounds(
     """What the readings say of each parameter on its bound, the others being held on theirs."""
     model = problem.measurement
     limits = np.sort(model.natural(np.stack([np.full(model.n, -np.inf), np.full(model.n, np.inf)])), axis=0)
-    start = model.natural(model.nominal[None])[0]
     for place, bound in values.items():
         others = {k: value for k, value in values.items() if k != place}
-        part = holding(problem, others) if others else problem
         k = place - sum(other < place for other in others)
-        part = replace(part, measurement=part.measurement.released({k: bound}))
-        x = np.insert(least.x, k, part.measurement.nominal[k])
-        given = present_part(part, rows, level)
-        with np.errstate(all="ignore"):
-            J = given.R.whiten_jacobian(given.measurement.jacobian(x[None]))
-            P, singular = inverse(np.matmul(J.swapaxes(1, 2), J))
+        part = _released(holding(problem, others) if others else problem, rows, least, level, {k: bound})
         other = np.nan
-        if not singular[0] and P[0, k, k] > 0:
-            inwards = int(np.sign(start[place] - bound))
-            other = end_within(given, z[rows], x, P[0], k, inwards, confidence=CONFIDENCE, freedom=least.freedom)
+        if part is not None:
+            towards = {"confidence": CONFIDENCE, "freedom": least.freedom}
+            other = end_within(part.problem, z[rows], part.x, part.P, k, int(part.inwards[0]), **towards)
         yield OnBound(place, model.natural_parameters[place], bound, float(np.clip(other, *limits[:, place])))
 
 

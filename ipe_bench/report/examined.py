@@ -90,7 +90,7 @@ def remarks(found: Examination, labels: Labels) -> Iterator[str]:
         yield (
             f"{one.parameter.name}: its estimate is on the bound {one.bound:g}, which is one end of its interval; the"
             " other is where the profile has risen as far as inside of bounds, so it holds the true value at least as"
-            " often as it says."
+            " often as it says. Profiles of the others let it move inwards; their standard errors do not."
         )
     if found.with_prior:
         yield (

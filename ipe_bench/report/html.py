@@ -36,7 +36,7 @@ _SECTIONS = (
     ("cite", "How to cite"),
     ("definitions", "Definitions"),
 )
-_PYTHON = "from Python"
+_PYTHON, _UNKNOWN = "from Python", "a command that was not recorded"
 
 
 def render_page(
@@ -55,7 +55,7 @@ def render_page(
     script, style = _template("report.js"), _template("report.css")
     runs = _runs(collection.runs)
     pictures = _pictures(figures, charts)
-    commands = [run["command"] for run in runs if run["command"] != _PYTHON]
+    commands = [run["command"] for run in runs if run["command"] not in (_PYTHON, _UNKNOWN)]
     return environment.from_string(_template("report.html.j2")).render(
         version=__version__,
         script=Markup(script),
@@ -138,8 +138,9 @@ def _runs(runs: Sequence[Run]) -> list[dict[str, Any]]:
     commands: dict[tuple[str, str], list[Run]] = {}
     for run in runs:
         if run.record.get("blocks", 1):
-            alone = "" if run.record.get("command") else run.path.name
-            commands.setdefault((str(run.record.get("command") or _PYTHON), alone), []).append(run)
+            command = run.record.get("command", _UNKNOWN)
+            key = (_PYTHON, run.path.name) if command is None else (str(command), "")
+            commands.setdefault(key, []).append(run)
     return [_command(command, own) for (command, _), own in reversed(commands.items())]
 
 

@@ -43,7 +43,7 @@ _LIFTED = (
     "#998dfe",
     "#659551",
 )
-ON_DARK = dict(zip((*COLORS, BLACK), (*_LIFTED, WHITE), strict=True))
+ON_DARK: dict[str, str] = dict(zip((*COLORS, BLACK), (*_LIFTED, WHITE), strict=True))
 """The same colours where the ground is dark: of the same hue in OKLab, with a lightness of 0.6 + 0.4 of theirs."""
 MARKERS = ("o", "s", "D", "^", "v", "P", "d", "<", ">", "p", "h")
 DASHES: tuple[Any, ...] = ("", (5, 2), (1, 1.5), (5, 2, 1, 2))

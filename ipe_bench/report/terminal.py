@@ -114,7 +114,7 @@ def _setting(title: str, part: Sequence[Mapping[str, Any]], width: int) -> tuple
 
 
 def _fitting(headings: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> int:
-    """How many columns fit, counted from the left: the scale and the names always, of which only long ones are folded."""
+    """How many columns fit, counted from the left: the scale and the names always; long names are folded."""
     from rich.cells import cell_len
 
     needed = 2  # at both edges

@@ -14,8 +14,9 @@ from test_instruments import SATURATION, START, estimate, simulated, solution
 import ipe_bench as ib
 from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
 from ipe_bench.basics.errors import UserError
-from ipe_bench.measurements import Formula
+from ipe_bench.measurements import Formula, Sir
 from ipe_bench.measurements.known import Informed, Known, informed
+from ipe_bench.noise import Gaussian, ModelNoise
 from ipe_bench.real.sources import LeftOut, Readings, open_together
 
 OWN = Formula(SATURATION, START, own=("b1",))
@@ -71,7 +72,7 @@ def test_a_parameter_of_one_file_may_be_known_there(files):
 def test_a_common_parameter_may_be_fixed_for_all(files):
     paths, data = files
     result = estimate(open_together(paths, Informed(OWN, (Known("b2", fixed=5.5e-4),))))
-    x, _ = solution(lambda p: residuals(data, *p, 5.5e-4), [250, 250])
+    x, _ = solution(lambda p: residuals(data, p[0], p[1], 5.5e-4), [250, 250])
     assert of(result, result.x) == pytest.approx({"b1_1": x[0], "b1_2": x[1]}, rel=1e-8)
 
 
@@ -95,6 +96,19 @@ def test_a_bound_acts_in_the_file_that_it_is_of(files):
     errors = of(result, result.standard_errors)
     assert np.isnan(errors["b1_2"])
     assert (errors["b1_1"], errors["b2"]) == pytest.approx(tuple(deviations), rel=1e-6)
+
+
+def test_the_noise_of_a_model_is_that_of_its_files_in_whatever_order_they_are(tmp_path):
+    """Rows of an epidemic that are no grid, alone and with another file: the level is known, and not estimated."""
+    rows = ["11,65", "3,26", "4.5,140", "6,293", "7.25,285", "9,190"]
+    for name, own in (("a", rows), ("b", rows[::-1])):
+        (tmp_path / f"{name}.csv").write_text("\n".join(["time [day],reading [people]", *own]))
+    for paths in ([tmp_path / "a.csv"], [tmp_path / "a.csv", tmp_path / "b.csv"]):
+        for model in (Sir(), Informed(Sir(), (Known("ln_gamma", lower=-0.9),))):
+            found = open_together(paths, model)
+            assert ModelNoise().of(found.model) == Gaussian(20.0)
+            (result,) = ib.estimate(model, list(paths), LM)
+            assert result.level is None
 
 
 def test_a_file_may_have_fewer_readings_than_the_model_has_parameters(tmp_path):

@@ -90,6 +90,7 @@ def test_truths_of_the_prior_are_in_the_penalised_profiles_as_often_as_they_say(
     drawn = bench.draw(0, trials)
     estimates = MapLM(tolerance=1e-9).estimate(bench.problem, drawn.z)
     assert (estimates.status == 0).all()
+    assert estimates.covariance is not None
     problem, _ = penalised(bench.problem, drawn.z[0], 1.0)
     z = np.column_stack([drawn.z, np.repeat(problem.x0[None], trials, axis=0)])
     found = profiles_of_sets(problem, z, estimates.x, estimates.covariance)
@@ -124,6 +125,37 @@ def test_the_interval_of_a_linear_parameter_on_its_bound_is_known(beyond, side):
     assert one.other == pytest.approx(expected, abs=1e-3 * s)
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+def test_profiles_of_the_others_let_a_parameter_leave_its_bound_inwards(side):
+    """Of an intercept whose slope is on its bound, against the quadratic form: the bound acts to one side only."""
+    t = np.arange(10.0)
+    A = np.column_stack([np.ones(10), t])
+    P = 0.49 * np.linalg.inv(A.T @ A)
+    sa, sb, c = *np.sqrt(np.diag(P)), P[0, 1]
+    bound = 5 - side * 0.8 * sb
+    known = Known("b", nominal=5 - 9 * side, **{"upper" if side > 0 else "lower": bound})
+    model = Informed(Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)}), (known,))
+    problem = Scenario(model, Gaussian(0.7)).problem
+    z = 2 + 5 * t
+    found = examine(problem, z, fit(problem, z, LM))
+    assert found is not None
+
+    def rise(a: float) -> float:
+        b = 5 + c / sa**2 * (a - 2)
+        b = min(b, bound) if side > 0 else max(b, bound)
+        e = np.array([a - 2, b - 5])
+        return float(e @ np.linalg.solve(P, e)) - 0.8**2
+
+    least = 2 + c / sb**2 * (bound - 5)
+    assert found.x[0] == pytest.approx(least, abs=1e-9)
+    ends = [brentq(lambda a: rise(a) - Q**2, least + s * 1e-9, least + s * 20 * sa) for s in (-1, 1)]
+    (profile,) = found.profiles
+    assert (profile.low, profile.high) == pytest.approx(tuple(ends), abs=2e-3 * sa)
+    # Held on its bound, the slope would leave far shorter an interval to one side.
+    longer, shorter = sorted((least - ends[0], ends[1] - least), reverse=True)
+    assert longer > 1.2 * shorter
+
+
 def test_the_interval_on_a_bound_is_where_scipys_profile_rises():
     rng = np.random.default_rng(8)
     t = np.linspace(50, 700, 14)
@@ -134,11 +166,13 @@ def test_the_interval_on_a_bound_is_where_scipys_profile_rises():
     assert found is not None
 
     def chi_square(b1: float) -> float:
-        options = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
-        return 2 * least_squares(lambda p: (-b1 * np.expm1(-1e-4 * p[0] * t) - z) / 0.1, [5.0], **options).cost
+        def residuals(p):
+            return (-b1 * np.expm1(-1e-4 * p[0] * t) - z) / 0.1
+
+        return 2 * float(least_squares(residuals, [5.0], xtol=1e-15, ftol=1e-15, gtol=1e-15).cost)
 
     least = chi_square(235.0)
-    expected = brentq(lambda b1: chi_square(b1) - least - Q**2, 150.0, 235.0)
+    expected = float(brentq(lambda b1: chi_square(b1) - least - Q**2, 150.0, 235.0))  # type: ignore[arg-type]
     assert found.on_bounds[0].other == pytest.approx(expected, abs=1e-3 * (235.0 - expected))
 
 
@@ -163,6 +197,7 @@ def test_truths_near_a_bound_are_in_the_intervals_at_least_as_often_as_they_say(
     z = 5 * np.exp(-rate * t) + 0.5 * np.random.default_rng(9).standard_normal((trials, 6))
     free = GaussNewton(tolerance=1e-9).estimate(problem, z)
     assert (free.status == 0).all()
+    assert free.covariance is not None
     off = free.x[:, 1] > 0
     inside = [
         one.low <= rate <= one.high for _, one in profiles_of_sets(problem, z[off], free.x[off], free.covariance[off])

@@ -156,3 +156,23 @@ def test_colors_show_on_the_dark_ground(synthetic):
     assert min(contrast(color) for color in ON_DARK.values()) > 3
     assert len(set(ON_DARK.values())) == len(ON_DARK)
     assert min(contrast(ink), contrast(soft)) > 4.5
+
+
+def test_the_page_says_which_commands_computed_what_it_shows(synthetic):
+    """One entry for the jobs of a sweep; none for a run that found everything stored."""
+    fill(synthetic)
+    record = json.loads(next((synthetic.directory / "runs").glob("*.json")).read_text(encoding="utf-8"))
+    record = {k: v for k, v in record.items() if k not in ("schema", "run", "seal")}
+    for name, command, blocks in (
+        ("b", "ipe-bench run -m error_scale=1,10", 2),
+        ("c", "ipe-bench run -m error_scale=1,10", 1),
+        ("d", "ipe-bench run that finds it all", 0),
+        ("e", None, 3),
+    ):
+        synthetic.store.write_run(name, record | {"command": command, "blocks": blocks})
+    analysis = analyse([synthetic.directory])
+    page = render_page(analysis, all_tables(analysis), [])
+    assert page.count("<summary>") == 1 + 3
+    assert page.count("<code>ipe-bench run -m error_scale=1,10</code>") == 2
+    assert "finds it all" not in page
+    assert page.count("from Python") == 1

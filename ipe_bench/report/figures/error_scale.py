@@ -177,8 +177,8 @@ def _efficiency(ax: Any, totals: pd.DataFrame, look: Mapping[str, Look], view: V
         ratio=ratio.where(ratio <= NEAR), low=totals["rmse_low"] * per_bound, high=totals["rmse_high"] * per_bound
     )
     highs = rows["high"].where(rows["ratio"].notna() & np.isfinite(rows["high"]))
-    low, high = np.nanmin([0.9, *rows["ratio"]]), np.nanmax([1.1, *highs])
-    ax.set_ylim(0.92 * low, 1.04 * min(high, NEAR))
+    low, high = np.nanmin([0.9, *rows["ratio"]]), min(np.nanmax([1.1, *rows["ratio"], *highs]), NEAR)
+    ax.set_ylim(low - 0.06 * (high - low), high + 0.06 * (high - low))
     common.curves(ax, rows, "ratio", look, view.scales, interval=("low", "high"))
     common.bound_line(ax, 1.0, "bound")
     ax.set(title=f"all parameters, up to {plain(NEAR)} bounds", ylabel="rms error / bound at that scale")

@@ -83,7 +83,7 @@ const RAISED = { "-": "\u207b", 0: "\u2070", 1: "\u00b9", 2: "\u00b2", 3: "\u00b
 
 function tickText(value, share) {
   const power = Math.log10(value);
-  if (share || !Number.isInteger(power) || Math.abs(power) < 4) return written(value, share);
+  if (share || !Number.isInteger(power) || Math.abs(power) < 5) return written(value, share);
   return "10" + Array.from(String(power), (sign) => RAISED[sign]).join("");
 }
 
@@ -141,7 +141,7 @@ class Scale {
   }
 
   steps() {
-    const rough = (this.high - this.low) / 5, size = Math.pow(10, Math.floor(Math.log10(rough)));
+    const rough = (this.high - this.low) / 6, size = Math.pow(10, Math.floor(Math.log10(rough)));
     const step = [1, 2, 5, 10].map((k) => k * size).find((s) => s >= rough);
     const ticks = [];
     for (let k = Math.ceil(this.low / step); k * step <= this.high; k++) ticks.push(Number((k * step).toPrecision(12)));
