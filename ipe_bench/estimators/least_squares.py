@@ -343,10 +343,15 @@ def minimize(
 
 def reached(objective: Objective, ended: Ended[Any]) -> Minima:
     """What is known of the objective where an iteration of it, by states like `Descent`, ended."""
+    return minima_of(ended, _exact_slope(objective, ended.state), objective.readings)
+
+
+def minima_of(ended: Ended[Any], slope: Slope, readings: int) -> Minima:
+    """The same where the slope there is known."""
     # U^-1 U^-T: inverting U'U would lose twice the digits, and with them the sign of a variance.
-    inverse_U, _ = inverse(_exact_slope(objective, ended.state).U)
+    inverse_U, _ = inverse(slope.U)
     covariance = np.matmul(inverse_U, inverse_U.swapaxes(1, 2))
-    r = ended.state.r[:, : objective.readings]
+    r = ended.state.r[:, :readings]
     bulk = np.median(np.abs(r), axis=1)
     return Minima(ended.x, ended.status, ended.iterations, ended.history, covariance, squared(r), bulk)
 

@@ -261,12 +261,17 @@ class Measurement(Component, Named, ABC):
         """h(x) in `rows(stop)` alone; models that arrive in time stop computing there."""
         return self.simulate(x)[:, self.rows(stop)]
 
+    def coarse_simulate_until(self, x: Array, stop: int) -> Array:
+        """`simulate_until` near enough for fits that only start another, to a small part of a reading's usual noise,
+        where that is cheaper; else the same. A trial's bits depend on that trial's x alone."""
+        return self.simulate_until(x, stop)
+
     def jacobian_until(self, x: Array, stop: int) -> Array:
         """dh/dx in `rows(stop)` alone."""
         return self.jacobian(x)[:, self.rows(stop)]
 
     def coarse_jacobian_until(self, x: Array, stop: int) -> Array:
-        """`coarse_jacobian` in `rows(stop)` alone."""
+        """dh/dx in `rows(stop)` alone, near enough for fits that only start another, `|I - J~+ J|` below 0.1."""
         return self.coarse_jacobian(x)[:, self.rows(stop)]
 
     @property
@@ -284,14 +289,16 @@ class Restricted(Measurement):
     """Rows of the whole model's z, ascending."""
     stop: int | None = None
     """Where the rows all lie within the first `stop` epochs: nothing later is computed."""
+    coarse: bool = False
+    """Whether readings near enough for fits that only start another will do."""
 
     def __post_init__(self) -> None:
         """Made in every window and epoch, and of no user's options: there is nothing to check."""
 
     @classmethod
-    def until(cls, whole: Measurement, stop: int) -> Restricted:
+    def until(cls, whole: Measurement, stop: int, *, coarse: bool = False) -> Restricted:
         """The readings of the first `stop` epochs."""
-        return cls(whole, tuple(whole.rows(stop).tolist()), stop)
+        return cls(whole, tuple(whole.rows(stop).tolist()), stop, coarse)
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -378,7 +385,10 @@ class Restricted(Measurement):
         return np.searchsorted(self.whole.rows(self.stop), self._rows)
 
     def simulate(self, x: Array) -> Array:
-        z = self.whole.simulate(x) if self.stop is None else self.whole.simulate_until(x, self.stop)
+        if self.stop is None:
+            z = self.whole.simulate(x)
+        else:
+            z = (self.whole.coarse_simulate_until if self.coarse else self.whole.simulate_until)(x, self.stop)
         return z[:, self._among_arrived]
 
     def jacobian(self, x: Array) -> Array:

@@ -233,6 +233,9 @@ class Gins(OdeMeasurement):
     def simulate_until(self, x: Array, stop: int) -> Array:
         return self._shown(x, stop, self.offset)
 
+    def coarse_simulate_until(self, x: Array, stop: int) -> Array:
+        return self._shown_coarsely(x, stop, self.offset)
+
     @cached_property
     def offset(self) -> Array:
         """The velocities (m,) of the error-free system, which the read-out shows as well."""

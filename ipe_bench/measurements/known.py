@@ -233,6 +233,9 @@ class Informed(Measurement):
     def simulate_until(self, x: Array, stop: int) -> Array:
         return self.whole.simulate_until(self._whole_x(x), stop)
 
+    def coarse_simulate_until(self, x: Array, stop: int) -> Array:
+        return self.whole.coarse_simulate_until(self._whole_x(x), stop)
+
     def jacobian_until(self, x: Array, stop: int) -> Array:
         return self.whole.jacobian_until(self._whole_x(x), stop)[:, :, self._free] * self._slopes(x)
 

@@ -401,6 +401,10 @@ def orders_its_epochs(model: Measurement) -> None:
     x, stop = _points(model), max(1, len(model.epochs or ()) // 2)
     prefix, whole = model.simulate_until(x, stop), model.simulate(x)[:, model.rows(stop)]
     assert np.allclose(prefix, whole, rtol=1e-12, atol=1e-12 * np.abs(whole).max()), "a prefix differs from the whole"
+    coarse = model.coarse_simulate_until(x, stop)
+    assert np.allclose(coarse, whole, rtol=1e-3, atol=1e-3 * np.abs(whole).max()), (
+        "a coarse prefix is far from the whole"
+    )
 
 
 # Noise

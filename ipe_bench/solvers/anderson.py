@@ -37,13 +37,19 @@ class Anderson(IPE[AndersonState]):
         return AndersonState(x, F, none, none)
 
     def step(self, system: System, state: AndersonState) -> AndersonState:
-        gamma = _least_squares(state.dF, state.F)
-        x = state.x - state.F - multiply(state.dx - state.dF, gamma)
+        x = accelerated(state.x, state.F, state.dx, state.dF)
         F = system.F(x)
-        return AndersonState(x, F, _push(state.dx, x - state.x), _push(state.dF, F - state.F))
+        return AndersonState(x, F, push(state.dx, x - state.x), push(state.dF, F - state.F))
 
 
-def _push(memory: Array, newest: Array) -> Array:
+def accelerated(x: Array, F: Array, dx: Array, dF: Array) -> Array:
+    """The next x (trials, n), from the last differences of x and of F, each (trials, n, depth)."""
+    gamma = _least_squares(dF, F)
+    return x - F - multiply(dx - dF, gamma)
+
+
+def push(memory: Array, newest: Array) -> Array:
+    """The memory (trials, n, depth) with the newest difference (trials, n) in front, the oldest dropped."""
     return np.concatenate([newest[:, :, None], memory[:, :, :-1]], axis=2)
 
 

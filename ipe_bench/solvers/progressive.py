@@ -21,7 +21,7 @@ from ipe_bench.estimators.least_squares import Minima
 from ipe_bench.measurements.counted import Tally
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers.stages import Stages
-from ipe_bench.solvers.windows import Windows
+from ipe_bench.solvers.windows import GIVEN_UP, Windows
 
 _SAME_FIT = 1e-6
 """Two minima whose chi-squares differ by less than this share are one."""
@@ -44,7 +44,7 @@ class Progressive(Estimator):
     residuals is large too, is tried again: carefully from the nominal point (windows that grow slowly, damping by the
     residual, steps bent along the curvature), then from 16, 32, ... draws of the prior, which the first windows keep
     apart and the later ones thin out to those that fit best. An attempt that leads to the same minimum again ends the
-    search; the best fit counts.
+    search, unless its residuals are beyond any use; the best fit counts.
 
     Growing windows that start one another are the incremental single shooting of Michalik, Hannemann and Marquardt
     (Comput. Chem. Eng. 33, 2009) and, with a prior, the recursive iterative batch smoother of Stepanov et al. (Sensors
@@ -70,7 +70,7 @@ class Progressive(Estimator):
     tolerance: Positive = 1e-6
     """Of the last pass: the Gauss-Newton step in standard deviations of the local bound."""
     restarts: Whole | None = None
-    """Further attempts at a trial that fails the test; None: four with windows, eleven without."""
+    """Further attempts at a trial that fails the test; None: six with windows, eleven without."""
     fit_level: Annotated[float, Ge(0), Lt(1)] = 1e-6
     """Residuals less probable than this are taken for those of a wrong minimum."""
     budget: Positive | None = None
@@ -82,20 +82,27 @@ class Progressive(Estimator):
         best, tally = self.search(problem, z, history=history)
         return best.estimates(tally, z.shape[1])
 
-    def search(self, problem: Problem, z: Array, *, history: bool = False) -> tuple[Minima, Tally]:
-        """The best minimum of each trial, and what it has cost to find it."""
+    def search(
+        self, problem: Problem, z: Array, *, before: Minima | None = None, history: bool = False
+    ) -> tuple[Minima, Tally]:
+        """The best minimum of each trial, and what it has cost to find it. `before`: what is known already, minima
+        that do not fit, or none; where one of them is found again the search ends, as with its own."""
         kind = Stages if problem.measurement.epochs is None else Windows
         search = kind(self, problem, z, Tally.zeros(len(z)), history)
         best = search.attempt(0, np.arange(len(z)), None)
         repeated = np.zeros(len(z), dtype=np.int64)
+        if before is not None:
+            repeated += _found_again(best, before, z.shape[1])
+            worse = before.converged & ~_is_better(best, before)
+            best = put(best, worse, take(before, worse))
         for k in range(1, search.last + 1):
             suspect = np.flatnonzero(self._suspect(problem, best, search.tally, z) & (repeated < kind.enough))
             if not len(suspect):
                 break
-            before = take(best, suspect)
-            again = search.attempt(k, suspect, before)
-            repeated[suspect] += again.converged & before.converged & _same(again.chi_square, before.chi_square)
-            better = _is_better(again, before)
+            known = take(best, suspect)
+            again = search.attempt(k, suspect, known)
+            repeated[suspect] += _found_again(again, known, z.shape[1])
+            better = _is_better(again, known)
             best = put(best, suspect[better], take(again, better))
         raised = search.tally.failed(np.arange(len(z))) & ~best.converged
         return replace(best, status=np.where(raised, Status.ERROR, best.status).astype(np.int8)), search.tally
@@ -104,14 +111,20 @@ class Progressive(Estimator):
         """The trials that another attempt may help: (trials,)."""
         hopeless = ~finite(z) | tally.failed(np.arange(len(z)))
         affordable = tally.cost(best.x.shape[1]) < (np.inf if self.budget is None else self.budget)
-        gross_errors_only = (best.bulk <= _BULK) & (z.shape[1] >= _READINGS * best.x.shape[1])
-        fits = best.converged & ((best.fit_probability(z.shape[1]) >= self.fit_level) | gross_errors_only)
-        return ~fits & ~hopeless & affordable
+        return ~accepted(best, z.shape[1], self.fit_level) & ~hopeless & affordable
 
 
-def _same(a: Array, b: Array) -> Mask:
+def accepted(minima: Minima, readings: int, level: float) -> Mask:
+    """Which minima (trials,) are taken for the least: those that fit, and those whose bulk of residuals does."""
+    gross_errors_only = (minima.bulk <= _BULK) & (readings >= _READINGS * minima.x.shape[1])
+    return minima.converged & ((minima.fit_probability(readings) >= level) | gross_errors_only)
+
+
+def _found_again(new: Minima, old: Minima, readings: int) -> Mask:
+    """Where an attempt led to the known minimum, and that may be the least one of a model that does not quite hold."""
     with np.errstate(invalid="ignore"):  # two infinite fits are not one minimum
-        return np.abs(a - b) <= _SAME_FIT * np.maximum(a, b)
+        same = np.abs(new.chi_square - old.chi_square) <= _SAME_FIT * np.maximum(new.chi_square, old.chi_square)
+    return new.converged & old.converged & same & (new.chi_square <= GIVEN_UP * readings)
 
 
 def _is_better(new: Minima, old: Minima) -> Mask:

@@ -24,11 +24,14 @@ _CAREFUL_ITERATIONS = (60, 30)
 """In the first window of a careful attempt, and in later ones."""
 _FIRST_DRAWS = 16
 _RANDOMISED = 2
-"""In so many windows, which leave much open, the prior of a candidate is centred at its own start."""
+"""In so many windows, which leave much open, the prior of a candidate is centred at its own start; in one more with
+each attempt after the first from draws."""
 _THINNING = (1, 1, 4, 8, 16, 32, 64)
 """Of the candidates that there were at the start, each window keeps the best one in so many; one at least."""
-_GIVEN_UP = (np.inf, 1e6, 1e3)
-"""The mean squared residual above which a window's fit is a wrong one: in the first window, the second, and later."""
+GIVEN_UP = 1e3
+"""The mean squared residual above which a fit is a wrong one,"""
+_GIVEN_UP = (np.inf, 1e6, GIVEN_UP)
+"""and above which a window's fit is: in the first window, the second, and later."""
 _ONE = (0.03, 0.003)
 """Candidates closer than this, in deviations of the prior, are one: in the first window, and later."""
 
@@ -60,16 +63,17 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Windows(Search):
-    """From the nominal point, then carefully from there, then from 16, 32 and 64 draws of the prior.
+    """From the nominal point, then carefully from there, then from 16, 32, ... 256 draws of the prior.
 
     The first two windows have about as many readings as there are parameters, so their fits have several minima of
     one depth, and a common prior would draw all candidates to one of them. Until then each candidate's prior is
     centred at its own draw, which makes the candidates about a sample of what the readings so far leave possible: the
     randomised maximum likelihood of Oliver, He and Reynolds (5th European Conference on the Mathematics of Oil
-    Recovery, 1996).
+    Recovery, 1996). Where that fails, a minimum of the next window has drawn them all: so each later attempt keeps them
+    apart for one window more.
     """
 
-    attempts = 5
+    attempts = 7
     enough = 1
 
     def attempt(self, k: int, rows: NDArray[np.intp], before: Minima | None) -> Minima:
@@ -109,7 +113,7 @@ class Windows(Search):
         there = self._begin(k, rows, metric if prior is not None or before is None else _reach(before, self.problem.x0))
         method = LevenbergMarquardtMethod(self.options.damping, metric, by_residual=k > 0, geodesic=k > 0)
         for number, (epochs, arrived) in enumerate(self._windows(k)):
-            centre = there.start if number < _RANDOMISED else self.problem.x0
+            centre = there.start if number < self._randomised(k) else self.problem.x0
             objective = self._window(there.owner, epochs, arrived, centre)
             limit = _CAREFUL_ITERATIONS[min(number, 1)] if k else self.options.window_iterations
             minima = self.minimize(
@@ -123,6 +127,10 @@ class Windows(Search):
         minima = self.minimize(self.whole(there.owner), there.owner, last, there.x, tolerance=tolerance, limit=limit)
         there = there.moved(minima)
         return self._best(rows, there, replace(minima, iterations=there.iterations, history=there.path))
+
+    def _randomised(self, k: int) -> int:
+        """In how many windows of the k-th attempt each candidate has its own prior."""
+        return _RANDOMISED + max(0, k - 2)
 
     def _begin(self, k: int, rows: NDArray[np.intp], spread: Array) -> Candidates:
         """The nominal point twice, then draws about it."""
@@ -146,7 +154,7 @@ class Windows(Search):
         """The objective of each candidate in a window, with the prior about `centre`."""
         problem, model = self.problem, self.problem.measurement
         assert model.epochs is not None
-        window = Counted(Restricted.until(model, epochs), self.spent(owner), epochs / len(model.epochs))
+        window = Counted(Restricted.until(model, epochs, coarse=True), self.spent(owner), epochs / len(model.epochs))
         R, z = problem.R.restricted(arrived), self.z[np.ix_(owner, arrived)]
         prior = None if self.prior is None else Covariance(self.prior)
         return Objective(window, R, z, np.arange(len(owner)), centre, prior).coarsened(0.0)

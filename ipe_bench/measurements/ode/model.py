@@ -134,6 +134,33 @@ class OdeMeasurement(Measurement):
     def simulate_until(self, x: Array, stop: int) -> Array:
         return self._shown(x, stop, self._zeros)
 
+    def coarse_simulate_until(self, x: Array, stop: int) -> Array:
+        return self._shown_coarsely(x, stop, self._zeros)
+
+    def _shown_coarsely(self, x: Array, stop: int, offset: Array) -> Array:
+        """`_shown` without the search for the level, which takes the whole span, where a trial's rate says it well.
+
+        On GINS at an error scale of 30,000, with readings of 7e-3 m/s, the median trial is off by 4e-7 m/s at most, the
+        worst of 100 by 7e-3; at 2,000 the worst is off by 1e-4.
+        """
+        if not self._guessed:
+            return self._shown(x, stop, offset)
+        x = _own(x)
+        z = np.empty((len(x), len(self._cases) * stop * len(self.outputs)))
+        for place, rows in grouped(self._guess(x), np.arange(len(x))):
+            self._simulate(x, rows, self._steps(place), offset, z)
+        return z
+
+    @property
+    def _guessed(self) -> bool:
+        """Whether the rate says with which steps to integrate."""
+        return self.step is None and self.trusted_angle > 0 and self._rate_module is not None
+
+    def _guess(self, x: Array) -> Indices:
+        """The level of each trial by its rate alone."""
+        trusted = self._trusted(x)
+        return np.where(trusted < 0, self._first_guess(x), trusted)
+
     def _shown(self, x: Array, stop: int, offset: Array) -> Array:
         """Readings less the offset (m,)."""
         x = _own(x)
@@ -287,7 +314,9 @@ class OdeMeasurement(Measurement):
         if self.step is not None:
             return self.jacobian_until(x, stop)
         x = _own(x)
-        J, places, trusted = self._empty_jacobian(x, stop), self._search(x, self._zeros).places, self._trusted(x) == 0
+        partial = self._guessed and stop < len(self.times)
+        places = self._guess(x) if partial else self._search(x, self._zeros).places
+        J, trusted = self._empty_jacobian(x, stop), self._trusted(x) == 0
         for place, rows in grouped(np.where(trusted, -1, places), np.arange(len(x))):
             kernel, level = self._coarsened(place)
             self._differentiate(kernel, x, rows, level * self._parts, J)

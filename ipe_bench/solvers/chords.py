@@ -1,0 +1,241 @@
+"""Least squares by chords: Gauss-Newton steps with a Jacobian of nearby, each for one simulation. For problems that are
+nearly linear; what does not arrive is left to others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ipe_bench.basics.batches import put, take
+from ipe_bench.basics.linalg import Array, Mask, finite, inverse, multiply
+from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.driver import Ended, Solver, Standing, iterate
+from ipe_bench.estimators.least_squares import Minima, Objective, Slope, minima_of, squared
+from ipe_bench.solvers.anderson import accelerated, push
+
+_ITERATIONS = 25
+"""Steps with the Jacobian H of the nominal point; where more are needed, another way is cheaper."""
+_TRIED, _PER_DECADE = 6, 3
+"""After so many steps from the linear estimate, each ten that the steps still to go have shrunk by must have taken no
+more than so many, but for the first three: far from the root they wander."""
+_NEAR = 1e-2
+"""How near to the root of eq. (11), in deviations, they bring a trial before the Jacobian there takes over."""
+_CHORDS = 8
+"""Steps with one Jacobian from then on."""
+_JACOBIANS = 16
+"""Renewals at most, as long as each leaves the answer nearer to the minimum than the one before."""
+_BENT = 200
+"""Times the tolerance: how far from the minimum, in deviations, a Jacobian that has changed may leave the answer."""
+_CONTRACTING = 0.75
+"""The rate up to which fixed-point iteration is said to contract, so that nobody need look for another minimum."""
+_DEPTH = 5
+"""Differences that accelerate a step."""
+
+
+@dataclass(frozen=True)
+class OnChord:
+    """What chord steps carry; every field has the trials in front."""
+
+    x: Array
+    r: Array
+    """Whitened residuals."""
+    slope: Slope
+    """That of the chord's Jacobian, towards r."""
+    dx: Array
+    dF: Array
+    """The last differences (trials, n, depth) of x and of the steps, newest first."""
+    start: Array
+    turn: Array
+    """How much J changed (trials, m, n) on the way to the start, per unit of |J dx|."""
+    moved: Array
+    bend: Array
+    """The part (trials,) of the first step that the next one had to take back; NaN before it."""
+    begun: Array
+    """The step still to go (trials,), in deviations, after the first one,"""
+    steps: Array
+    """and how many there have been since."""
+
+    @classmethod
+    def at(cls, x: Array, r: Array, slope: Slope, turn: Array) -> OnChord:
+        nothing = np.zeros((*x.shape, min(_DEPTH, x.shape[1])))
+        unknown, far = np.full(len(x), np.nan), np.full(len(x), np.inf)
+        return cls(x, r, slope.towards(r), nothing, nothing, x, turn, far, unknown, unknown, np.full(len(x), -1))
+
+    @property
+    def wanders(self) -> Mask:
+        """Where the steps do not lead to a root soon."""
+        decades = (self.steps - _TRIED / 2) / _PER_DECADE
+        return (self.steps >= _TRIED) & (self.slope.size > self.begun * 10.0**-decades)
+
+    @property
+    def off(self) -> Array:
+        """How far from the minimum (trials,), in deviations, it may be where the steps end.
+
+        They end where J' r = 0 for the J of the start. A change of J by the part e on the way, with residuals of one
+        deviation, makes that an error of about e deviations. e is seen twice: in the part of the first step that was
+        taken back, and in the change of J on the way to the start, which is taken to go on at that rate.
+        """
+        inverse_U, _ = inverse(self.slope.U)
+        gone = np.linalg.norm(multiply(self.slope.U, self.x - self.start), axis=1)
+        J_turned = multiply(self.turn.swapaxes(1, 2), self.r) * gone[:, None]
+        error = multiply(np.matmul(inverse_U, inverse_U.swapaxes(1, 2)), J_turned)
+        by_turn = np.abs(error / np.sqrt(np.sum(inverse_U**2, axis=2))).max(axis=1)
+        return np.fmax(self.bend, by_turn)
+
+
+@dataclass(frozen=True)
+class Chord(Solver[OnChord]):
+    """Gauss-Newton steps with the Jacobian of the start, and Anderson's acceleration.
+
+    With H, the Jacobian of the nominal point, these are the fixed-point steps of eq. (17).
+    """
+
+    bent: float = np.inf
+    """Where `off` is larger, the Jacobian is of no more use."""
+
+    def begin(self, objective: Objective, x: Array) -> OnChord:
+        J = objective.jacobian(x)
+        r = objective.residual(x)
+        return OnChord.at(x, r, Slope.of(J, r, keep_Q=True), np.zeros_like(J))
+
+    def step(self, objective: Objective, state: OnChord) -> OnChord:
+        F = -state.slope.newton
+        x = accelerated(state.x, F, state.dx, state.dF)
+        r = objective.residual(x)
+        slope = state.slope.towards(r)
+        seen = np.where(state.slope.size > self.bent, slope.size / state.slope.size, 0.0)
+        bend = np.where(np.isnan(state.bend), seen, state.bend)
+        return replace(
+            state,
+            x=x,
+            r=r,
+            slope=slope,
+            dx=push(state.dx, x - state.x),
+            dF=push(state.dF, -slope.newton - F),
+            moved=np.abs((x - state.x) * slope.columns).max(axis=1),
+            bend=bend,
+            begun=np.where(np.isnan(state.begun), slope.size, state.begun),
+            steps=state.steps + 1,
+        )
+
+    def standing(self, objective: Objective, before: OnChord | None, state: OnChord) -> Standing:
+        rankless = ~np.isfinite(state.slope.size)
+        useless = state.wanders if np.isinf(self.bent) else state.off > self.bent
+        size = np.where(useless, np.inf, state.slope.size)
+        ending = np.where(rankless, Status.SINGULAR, Status.MAX_ITERATIONS)
+        return Standing(size, np.sqrt(squared(state.r)), state.moved, rankless | useless, ending)
+
+
+@dataclass(frozen=True)
+class Chords:
+    """What all trials of a batch share on their way by chords."""
+
+    objective: Objective
+    H: Array
+    """The Jacobian (m, n) at the nominal point."""
+    tolerance: float
+    budget: float | None
+    history: bool
+
+    def minima(self) -> tuple[Minima, Mask]:
+        """The least-squares minimum of each trial, and where fixed-point iteration contracts well there, eq. (18).
+
+        Trials that do not arrive have not converged.
+        """
+        x0 = np.repeat(self.objective.x0[None], len(self.objective.rows), axis=0)
+        minima, contracts = _nowhere(x0, self.history), np.zeros(len(x0), dtype=bool)
+        nominal = Slope.of(self.objective.R.whiten_jacobian(self.H[None]), np.zeros((1, len(self.H))), keep_Q=True)
+        if not np.isfinite(nominal.size).all():  # H lacks rank, which says nothing of other points
+            return minima, contracts
+        frozen = take(nominal, np.zeros(len(x0), np.intp))
+        start = OnChord.at(x0, self.objective.residual(x0), frozen, np.zeros((len(x0), *self.H.shape)))
+        ended = self._iterate(self.objective, Chord(), start, _NEAR, _ITERATIONS)
+        near = np.flatnonzero(ended.converged)
+        if len(near):
+            found, slope = self._renewed(self.objective.subset(ended.converged), take(ended, near), x0[near])
+            minima = put(minima, near, found)
+            contracts[near] = _radius(nominal, slope) <= _CONTRACTING
+        return minima, contracts
+
+    def _renewed(self, objective: Objective, before: Ended[OnChord], origin: Array) -> tuple[Minima, Slope]:
+        """Chord steps for trials that are near, each time with a new Jacobian until it is that of the end."""
+        at, latest = np.arange(len(origin)), before
+        whole: tuple[Minima, Slope] | None = None
+        bent, off = _BENT * self.tolerance, np.full(len(origin), np.inf)
+        for _ in range(_JACOBIANS):
+            x, r, slope = latest.x, latest.state.r, latest.state.slope
+            J = objective.jacobian(x)
+            assert slope.Q is not None
+            turn = (J - np.matmul(slope.Q, slope.U)) / _length(slope, x - origin)[:, None, None]
+            start = OnChord.at(x, r, Slope.of(J, r, keep_Q=True), turn)
+            ended = self._iterate(objective, Chord(bent), start, self.tolerance, _CHORDS)
+            latest = _after(latest, ended)
+            result = minima_of(latest, ended.state.slope, objective.readings), ended.state.slope
+            whole = result if whole is None else (put(whole[0], at, result[0]), put(whole[1], at, result[1]))
+            now = ended.state.off
+            again = (now > bent) & (now < off) & (ended.status == Status.MAX_ITERATIONS)
+            if not again.any():
+                break
+            off, at, origin, objective, latest = (
+                now[again],
+                at[again],
+                x[again],
+                objective.subset(again),
+                take(latest, again),
+            )
+        assert whole is not None
+        return whole
+
+    def _iterate(
+        self, objective: Objective, chord: Chord, start: OnChord, tolerance: float, limit: int
+    ) -> Ended[OnChord]:
+        return iterate(
+            objective,
+            chord,
+            start,
+            tolerance=tolerance,
+            max_iterations=limit,
+            budget=self.budget,
+            history=self.history,
+        )
+
+
+def _length(slope: Slope, step: Array) -> Array:
+    """|J dx| (trials,): the length of a step (trials, n) in deviations of the readings; infinite where it is zero."""
+    length = np.linalg.norm(multiply(slope.U, step), axis=1)
+    return np.where(length > 0, length, np.inf)
+
+
+def _radius(nominal: Slope, slope: Slope) -> Array:
+    """The spectral radius (trials,) of I - H+ J, the rate at which fixed-point iteration converges."""
+    assert nominal.Q is not None
+    assert slope.Q is not None
+    inverse_U, _ = inverse(nominal.U)
+    J_F = np.matmul(np.matmul(inverse_U, np.matmul(nominal.Q.swapaxes(1, 2), slope.Q)), slope.U)
+    usable = finite(J_F)
+    rates = np.linalg.eigvals(np.where(usable[:, None, None], np.eye(J_F.shape[1]) - J_F, 0.0))
+    return np.where(usable, np.abs(rates).max(axis=1), np.inf)
+
+
+def _after(first: Ended[OnChord], second: Ended[OnChord]) -> Ended[OnChord]:
+    """The second of two iterations, with the iterations and iterates of both."""
+    history = second.history
+    if first.history is not None and history is not None:
+        history = [np.concatenate([a, b[1:]]) for a, b in zip(first.history, history, strict=True)]
+    return replace(second, iterations=first.iterations + second.iterations, history=history)
+
+
+def _nowhere(x0: Array, history: bool) -> Minima:
+    """No answer for any trial; x0 (trials, n)."""
+    trials, n = x0.shape
+    far = np.full(trials, np.inf)
+    return Minima(
+        x0,
+        np.full(trials, Status.MAX_ITERATIONS, np.int8),
+        np.zeros(trials, np.int64),
+        [x[None] for x in x0] if history else None,
+        np.full((trials, n, n), np.nan),
+        far,
+        far,
+    )
