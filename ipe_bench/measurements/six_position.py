@@ -58,9 +58,12 @@ class SixPosition(Measurement):
     """The rate of the table, where there is no file, in deg/s,"""
     gravity: Positive = 9.80665
     """and the local gravity in m/s^2."""
-    bias: tuple[float, float, float, float, float, float] = (0.0,) * 6
+    bias: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     """Presumed biases in counts, of ax, ay, az, gx, gy, gz; with those that follow, the nominal point."""
-    scale: tuple[Positive, Positive, Positive, Positive, Positive, Positive] = (0.0024,) * 3 + (0.0076,) * 3
+    scale: tuple[Positive, Positive, Positive, Positive, Positive, Positive] = (
+        *(0.0024, 0.0024, 0.0024),
+        *(0.0076, 0.0076, 0.0076),
+    )
     """Presumed scale factors in m/s^2 per count, and in deg/s per count."""
     bias_size: Positive = 50.0
     """What one unit of error of a bias is, in counts."""

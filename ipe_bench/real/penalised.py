@@ -71,7 +71,8 @@ def penalised(problem: Problem, z: Array, inflation: float) -> tuple[Problem, Ar
     if all(factor.ndim == 1 for factor in factors):
         R = Covariance(np.concatenate(factors))
     else:
-        R = Covariance(block_diag(*(np.diag(f) if f.ndim == 1 else f for f in factors)))
+        L: Array = np.asarray(block_diag(*(np.diag(f) if f.ndim == 1 else f for f in factors)))
+        R = Covariance(L)
     model = Penalised(problem.measurement)
     whole = Problem(model, R, problem.prior_deviation, problem.prior_correlation)
     return whole, np.concatenate([z, problem.x0])
