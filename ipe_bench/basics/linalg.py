@@ -11,7 +11,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 Array: TypeAlias = NDArray[Any]
 Mask: TypeAlias = NDArray[Any]
@@ -133,6 +132,8 @@ class Covariance:
         return np.diag(self.factor**2) if self.factor.ndim == 1 else self.factor @ self.factor.T
 
     def _inverse_factor(self) -> Array:
+        from scipy.linalg import solve_triangular
+
         return solve_triangular(self.factor, np.eye(self.m), lower=True)
 
 

@@ -31,6 +31,7 @@ from ipe_bench.noise import ModelNoise, Noise, Unknown
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
 from ipe_bench.priors import GaussianPrior, Prior
+from ipe_bench.report.choice import Which, which_figures
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.provenance import TARGET, canonical_json, describe
 from ipe_bench.trials.scenario import Scenario
@@ -57,6 +58,8 @@ class Schema:
     enough trials."""
     time_limit: float | None = None
     """Seconds after which, with a precision, no more blocks are begun."""
+    figures: str = "all"
+    """Which to draw: all, main (the few that answer the question), or none."""
     block_size: int = 250
     """Trials per unit of work and of storage; changes no number."""
     readings: Any = None
@@ -95,6 +98,7 @@ class Job:
     time_limit: float | None = None
     objective: tuple[str, str] | None = None
     """The label of an estimator and a column of its row over all parameters."""
+    figures: Which = "all"
 
 
 class PluginSearchPath(SearchPathPlugin):
@@ -241,7 +245,8 @@ def assemble(config: DictConfig, *, estimating: bool = False) -> Job:
     trials = unless if plain["trials"] is None else plain["trials"]
     block_size, output = plain["block_size"], plain["output"]
     objective = _objective(plain["objective"], list(estimators))
-    return Job(scenario, estimators, execution, trials, block_size, output, precision, time_limit, objective)
+    figures = which_figures(plain["figures"])
+    return Job(scenario, estimators, execution, trials, block_size, output, precision, time_limit, objective, figures)
 
 
 def _objective(given: str | None, labels: Sequence[str]) -> tuple[str, str] | None:
