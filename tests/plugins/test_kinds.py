@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,9 +72,8 @@ def test_what_new_makes_passes_its_checks(kind, capsys):
     assert "all checks passed" in out
 
 
-def test_a_report_has_what_plugins_add_beside_all_that_is_ours(capsys):
-    assert main(["run", *SMALL]) == 0
-    before = files("out")
+def test_a_report_has_what_plugins_add_beside_all_that_is_ours(ours, capsys):
+    before = ours
     for kind in RECORDS:
         assert main(["new", kind, f"own_{kind}"]) == 0
     discovery.sources.cache_clear()
@@ -125,10 +125,22 @@ MEDDLING = {
 }
 
 
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory) -> Path:
+    """A folder with a report without any plugin."""
+    place = tmp_path_factory.mktemp("reported")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(place)
+        discovery.sources.cache_clear()
+        assert main(["run", *SMALL]) == 0
+    discovery.sources.cache_clear()
+    return place / "out"
+
+
 @pytest.fixture
-def ours() -> dict[str, str]:
-    """The report without any plugin."""
-    assert main(["run", *SMALL]) == 0
+def ours(reported) -> dict[str, str]:
+    """The report without any plugin, in this folder."""
+    shutil.copytree(reported, "out")
     return files("out")
 
 
