@@ -400,7 +400,8 @@ def plugin(tmp_path, request):
     sys.modules.pop(package, None)
 
 
-SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "trials=2", "execution=serial", "figures=none")
+SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "trials=2", "execution=serial")
+SMALL += ("figures=none",)
 
 
 def test_there_are_sixty_broken_plugins():

@@ -10,7 +10,8 @@ import pytest
 
 from ipe_bench.cli.main import main
 
-SMALL = ("measurement=polynomial", "noise=gaussian", "execution=serial", "solver=[newton]", "output=out", "figures=none")
+SMALL = ("measurement=polynomial", "noise=gaussian", "execution=serial", "solver=[newton]", "output=out")
+SMALL += ("figures=none",)
 
 
 @pytest.fixture(autouse=True)

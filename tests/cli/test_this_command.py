@@ -15,7 +15,8 @@ from ipe_bench.cli.overrides import default_name, read
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.report.terminal import render
 
-SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "execution=serial", "baseline=[]", "figures=none")
+SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "execution=serial", "baseline=[]")
+SMALL += ("figures=none",)
 
 
 @pytest.fixture
