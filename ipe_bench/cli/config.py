@@ -124,7 +124,9 @@ _FORMULA = re.compile(
 )
 _UNIT = re.compile(r"^(\+*(?:truth_)?measurement\.(?:time_)?unit)=([^'\",\[\]{}]+)$")
 _FILE = re.compile(r"^\+*(?:truth_)?measurement\.file=")
-_OPEN = re.compile(r"^(?:parameters|(?:truth_)?measurement\.(?:start|columns|initial|rates|outputs))\.")
+_OPEN = re.compile(
+    r"^(?:(?:parameters|(?:truth_)?measurement\.(?:start|columns|initial|rates|outputs))\.|execution\.options[.=])"
+)
 """Keys to which users add entries of their own names."""
 
 

@@ -31,7 +31,7 @@ from ipe_bench.cli.report import main as report
 from ipe_bench.cli.report import show_command
 from ipe_bench.measurements import Nist
 from ipe_bench.plugins import discovery as plugins
-from ipe_bench.report.choice import Which
+from ipe_bench.report.choice import Which, which_figures
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.schedule import Watcher
 from ipe_bench.runs.store import describe_names, digest
@@ -88,6 +88,7 @@ class Watch(Callback):
         _outcome.maximises = "maximize" in str(config.hydra.sweeper.get("direction", ""))
         _outcome.elsewhere = not config.hydra.launcher["_target_"].endswith(_OWN_LAUNCHER)
         output = OmegaConf.select(config, "output")
+        _outcome.figures = which_figures(OmegaConf.select(config, "figures"))
         if output is not None:
             _outcome.outputs[Path(output)] = {}
 
@@ -181,7 +182,12 @@ def _conclude() -> int:
     for output, cells in _outcome.outputs.items():
         if (output / "trials").is_dir():
             # Of jobs in other processes nothing is known but the folder.
-            code = max(code, show_command(output, cells, _outcome.figures) if cells else report([str(output)]))
+            code = max(
+                code,
+                show_command(output, cells, _outcome.figures)
+                if cells
+                else report([str(output), f"figures={_outcome.figures}"]),
+            )
     if _outcome.objectives:
         console().print(_outcome.shown_objective(), markup=False, soft_wrap=True)
     for line in _outcome.stops:
