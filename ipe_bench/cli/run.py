@@ -182,12 +182,9 @@ def _conclude() -> int:
     for output, cells in _outcome.outputs.items():
         if (output / "trials").is_dir():
             # Of jobs in other processes nothing is known but the folder.
-            code = max(
-                code,
-                show_command(output, cells, _outcome.figures)
-                if cells
-                else report([str(output), f"figures={_outcome.figures}"]),
-            )
+            which = _outcome.figures
+            own = show_command(output, cells, which) if cells else report([str(output), f"figures={which}"])
+            code = max(code, own)
     if _outcome.objectives:
         console().print(_outcome.shown_objective(), markup=False, soft_wrap=True)
     for line in _outcome.stops:

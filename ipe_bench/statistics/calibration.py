@@ -222,9 +222,7 @@ def calibrations(error: Array, deviation: Array, nees: Array, claimed: Array) ->
     claimed = claimed & ~np.isnan(nees)
     if not claimed.any():
         return []
-    e, d = error[claimed], deviation[claimed]
-    with np.errstate(all="ignore"):
-        z = np.sort(np.where(d > 0, e / d, np.copysign(np.inf, e)).T, axis=1)
+    z = [_normalised(e[claimed], d[claimed]) for e, d in zip(error.T, deviation.T, strict=True)]
     n, together = len(z), np.sort(np.sqrt(nees[claimed]))
     # Each u is below a point where z is beyond that point's quantile: 99 quantiles are had sooner than every u.
     least, radius, whole = -ndtri(POINTS), np.sqrt(chdtri(1, 1 - POINTS)), np.sqrt(chdtri(n, 1 - POINTS))
@@ -233,6 +231,12 @@ def calibrations(error: Array, deviation: Array, nees: Array, claimed: Array) ->
     found = _curves_of([*place, *size, np.searchsorted(together, whole, side="right")], len(together))
     each = [Calibration(z[i], 1, found[n + i], found[i]) for i in range(n)]
     return [*each, Calibration(together, n, found[2 * n])]
+
+
+def _normalised(e: Array, d: Array) -> Array:
+    """The errors of one parameter over what is reported of them, ascending."""
+    with np.errstate(all="ignore"):
+        return np.sort(np.where(d > 0, e / d, np.copysign(np.inf, e)))
 
 
 def overall_p(parts: Sequence[Calibration]) -> float:
