@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test slow cluster campaigns mutants lint bench docs clean
+.PHONY: run test slow cluster campaigns plugins mutants lint bench docs clean
 
 run: .venv/ready
 	$(BIN)/ipe-bench run +experiment=paper
@@ -23,6 +23,13 @@ cluster: .venv/ready
 campaigns: .venv/ready
 	$(BIN)/pytest -n auto -m campaign
 
+# The worked plugins that need a library of their own, with those libraries in an environment of their own.
+plugins: .venv/ready
+	$(BIN)/uv venv --quiet --allow-existing --python $(BIN)/python outputs/plugins/.venv
+	$(BIN)/uv pip install --quiet --python outputs/plugins/.venv/bin/python --editable ".[test]" \
+		--editable plugins/optimistix --editable plugins/stonesoup --editable plugins/gins_jax
+	outputs/plugins/.venv/bin/python -m pytest -m plugin plugins
+
 # Whether the tests notice changes on purpose, room by room, as a table in outputs/mutants. SAMPLE=40 draws that many.
 mutants: .venv/ready
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[mutants]"
@@ -33,8 +40,9 @@ lint: .venv/ready
 	$(BIN)/ruff format --check
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-# What everything costs beside its rivals, as a table in outputs/bench.
+# What everything costs beside its rivals, as a table in outputs/bench. PEERS=1 installs other people's libraries first.
 bench: .venv/ready
+	$(if $(PEERS),$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[peers]")
 	IPE_BENCH_THREADS=1 OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/table.py outputs/bench
 
 # The documentation, with every experiment executed, in outputs/docs/html. TRIALS=100 makes the gallery's figures finer.

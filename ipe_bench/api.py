@@ -26,6 +26,7 @@ from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.priors import GaussianPrior, Prior
+from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.provenance import describe, fingerprint
 from ipe_bench.runs.results import Results, require_results
@@ -122,7 +123,7 @@ def run(
 
 
 def load(directories: Directories) -> pd.DataFrame:
-    """Every stored trial of one directory or of several: a row per trial and estimator.
+    """Every stored trial of one directory or bundle, or of several: a row per trial and estimator.
 
     Columns that say what a row belongs to: measurement, noise, prior, error_scale, seed, estimator, every key of the
     config that differs between scenarios, and `estimator.KEY` for options that differ under one label. Then what the
@@ -146,10 +147,10 @@ def load(directories: Directories) -> pd.DataFrame:
     """
     from ipe_bench.statistics.collect import collect, trials_frame
 
-    paths = _paths(directories)
-    require_results(paths)
-    collection = collect(paths)
-    frame = trials_frame(collection)
+    with opened(_paths(directories)) as paths:
+        require_results(paths)
+        collection = collect(paths)
+        frame = trials_frame(collection)
     for problem in collection.problems:
         warnings.warn(problem, stacklevel=2)
     return frame
@@ -165,7 +166,7 @@ def report(directories: Directories, output: Path | str | None = None, *, figure
     >>> import ipe_bench as ib
     >>> ib.report("outputs/nowhere")
     Traceback (most recent call last):
-    ipe_bench.basics.errors.UserError: outputs/nowhere: holds no results of ipe-bench; give the output folder of a run
+    ipe_bench.basics.errors.UserError: outputs/nowhere: there is no such directory; give one that a run wrote to
 
     Raises:
         UserError: no run ever wrote to a directory, or there is no such choice of figures.
@@ -173,8 +174,12 @@ def report(directories: Directories, output: Path | str | None = None, *, figure
     """
     from ipe_bench.report import write_report
 
-    require_results(_paths(directories))
-    return write_report(directories, output, figures=figures)
+    paths = _paths(directories)
+    if output is None and any(map(is_bundle, paths)):
+        raise UserError(f"{paths[0]}: a bundle is read and not written to; give output=, where the report goes")
+    with opened(paths, None if output is None else Path(output) / BUNDLES) as folders:
+        require_results(folders)
+        return write_report(folders, output, figures=figures)
 
 
 def compare(
@@ -214,10 +219,7 @@ def compare(
     Raises:
         UserError: there is nothing to compare.
     """
-    import pandas as pd
-
-    from ipe_bench.statistics.between import JUDGED, compared, left_out
-    from ipe_bench.statistics.collect import collect
+    from ipe_bench.statistics.between import JUDGED
 
     if not 0 < alpha < 1:
         raise UserError(f"alpha={alpha}: give a number between 0 and 1")
@@ -231,22 +233,38 @@ def compare(
         raise UserError(
             f"compare: {label} is compared with itself; name another folder, or first=LABEL and second=LABEL"
         )
-    for part in paths:
-        require_results(part)
-    collections = [collect(part) for part in paths]
-    frame = pd.DataFrame(compared(collections[0], collections[1], (first, second), alpha=alpha, anytime=anytime))
-    worse = frame[(frame["finding"] == "worse") & frame["quantity"].isin(list(fail_on))]
-    frame.attrs["worse"] = [
-        f"{row['second']} in {row['quantity']}, {row['measurement']}, error scale {row['error_scale']:g}"
-        for row in worse.to_dict("records")
-    ]
-    for name in ("problems", "stale"):
-        frame.attrs[name] = list(dict.fromkeys(line for c in collections for line in getattr(c, name)))
-    frame.attrs["notes"] = left_out(*collections)
+    with opened(paths[0]) as one, opened(paths[1]) as other:
+        frame = _compared([one, other], (first, second), alpha, anytime, fail_on)
     if output is not None:
         from ipe_bench.report.comparison import write
 
         write(frame, Path(output), alpha)
+    return frame
+
+
+def _compared(
+    paths: Sequence[Sequence[Path]],
+    labels: tuple[str | None, str | None],
+    alpha: float,
+    anytime: bool,
+    fail_on: Sequence[str],
+) -> pd.DataFrame:
+    """What `compare` returns of two lists of folders."""
+    import pandas as pd
+
+    from ipe_bench.statistics.between import compared, described, left_out
+    from ipe_bench.statistics.collect import collect
+
+    for part in paths:
+        require_results(part)
+    collections = [collect(part) for part in paths]
+    frame = pd.DataFrame(compared(collections[0], collections[1], labels, alpha=alpha, anytime=anytime))
+    worse = frame[(frame["finding"] == "worse") & frame["quantity"].isin(list(fail_on))]
+    rows = [{str(name): value for name, value in row.items()} for row in worse.to_dict("records")]
+    frame.attrs["worse"] = [f"{row['second']} in {row['quantity']}, {described(row)}" for row in rows]
+    for name in ("problems", "stale"):
+        frame.attrs[name] = list(dict.fromkeys(line for c in collections for line in getattr(c, name)))
+    frame.attrs["notes"] = left_out(*collections)
     return frame
 
 
@@ -270,9 +288,9 @@ def status(directories: Directories) -> pd.DataFrame:
     """
     import pandas as pd
 
-    paths = _paths(directories)
-    require_results(paths)
-    results = Results.read(paths)
+    with opened(_paths(directories)) as paths:
+        require_results(paths)
+        results = Results.read(paths)
     counts = ("expected", "done", "missing", "failed", "stale")
     rows = [
         {**cell.names, **{name: getattr(cell, name) for name in counts}, "messages": "; ".join(cell.messages)}
@@ -291,17 +309,21 @@ def estimate(
     noise: Noise | None = None,
     prior: Prior | None = None,
     error_scale: float | None = None,
+    ignore_rows: Sequence[int | str] = (),
+    ignore_columns: Sequence[str] = (),
 ) -> Answer:
     """Parameters from real readings, by every estimator: estimates, standard errors, residuals and a test of the fit.
 
     `readings` is a CSV file (see `ipe_bench.real.readings`), several that share parameters, or an array z (m,) in the
-    model's order and unit; NaN is missing. Without `estimators`: `linear_lse`, `fixed_point`, `levenberg_marquardt` and
-    `progressive`. `noise` states R. Without it R is what the file says in its column sigma, or the model of its own
+    model's order and unit; NaN is missing. Without `estimators`: `linear_lse`, `levenberg_marquardt` and `auto`, as in
+    the command. `noise` states R. Without it R is what the file says in its column sigma, or the model of its own
     noise; where neither does, the readings are taken for independent and equally noisy, and the level is estimated from
     the residuals (`Unknown`): then their size cannot test the fit. Filters and `map_lm` need to know how far from the
     model's nominal point the parameters may be: `error_scale` is the standard deviation of each in multiples of its
-    size, and `prior` widens or narrows some. `x` and `covariance` of a fit are in the parameters' own units. The answer
-    is the sequence of the fits; it shows itself in a notebook, and `table()` is a frame.
+    size, and `prior` widens or narrows some, or makes them depend on each other (`ipe_bench.priors.prior_of` makes one
+    of a covariance). `ignore_rows` and `ignore_columns` of the files are left out (see `LeftOut`). `x` and `covariance`
+    of a fit are in the parameters' own units. The answer is the sequence of the fits; it shows itself in a notebook,
+    and `table()` is a frame.
 
     >>> import ipe_bench as ib
     >>> model = ib.measurements.Polynomial()
@@ -309,9 +331,8 @@ def estimate(
     >>> for fit in ib.estimate(model, trial.z[0], noise=ib.noise.Gaussian(0.01)):
     ...     print(fit.label, fit.status.label, fit.fits)
     linear_lse converged False
-    fixed_point converged True
     levenberg_marquardt converged True
-    progressive converged True
+    auto converged True
 
     Raises:
         UserError: a file does not hold this model's readings, the array has another shape, or an estimator needs
@@ -319,20 +340,18 @@ def estimate(
     """
     from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
     from ipe_bench.noise.own import ModelNoise, Unknown
-    from ipe_bench.real.examination import examine
+    from ipe_bench.real.examination import examinations
     from ipe_bench.real.fits import fit
-    from ipe_bench.real.sources import Readings, noise_of, open_together
+    from ipe_bench.real.sources import LeftOut, Readings, noise_of, open_together
     from ipe_bench.report.answer import Answer
-    from ipe_bench.solvers import FixedPoint, Progressive
+    from ipe_bench.solvers import Auto
 
     if estimators is None:
-        estimators = {
-            "linear_lse": LinearLSE(),
-            "fixed_point": FixedPoint(),
-            "levenberg_marquardt": LevenbergMarquardt(),
-            "progressive": Progressive(),
-        }
+        estimators = {"linear_lse": LinearLSE(), "levenberg_marquardt": LevenbergMarquardt(), "auto": Auto()}
+    left_out = LeftOut(tuple(ignore_columns), tuple(ignore_rows))
     if isinstance(readings, np.ndarray):
+        if left_out:
+            raise UserError("ignore_rows, ignore_columns: are of files; set readings to NaN in an array")
         z = np.array(readings, dtype=float)
         if z.shape != (model.m,):
             raise UserError(
@@ -341,14 +360,14 @@ def estimate(
         found = Readings(model, z)
     else:
         paths = [readings] if isinstance(readings, str | Path) else readings
-        found = open_together([Path(path) for path in paths], model)
+        found = open_together([Path(path) for path in paths], model, left_out)
     known = noise_of(found, noise) or ModelNoise().of(found.model) or Unknown()
     problem = _real_problem(found.model, known, prior, error_scale)
     if lacking := _needs(problem, estimators):
         remedy = "; give error_scale" if error_scale is None and prior is None else ""
         raise UserError("; ".join(lacking) + remedy)
     fits = fit(problem, found.z, estimators, known)
-    return Answer(found.model.name, found.model, found.z, fits, examine(problem, found.z, fits))
+    return Answer(found.model.name, found.model, found.z, fits, examinations(problem, found.z, fits), left_out.said)
 
 
 def _real_problem(model: Measurement, noise: Noise, prior: Prior | None, error_scale: float | None) -> Problem:
@@ -356,7 +375,7 @@ def _real_problem(model: Measurement, noise: Noise, prior: Prior | None, error_s
     known = prior is not None or error_scale is not None
     scale = 1.0 if error_scale is None else error_scale
     problem = Scenario(model, noise, prior or GaussianPrior(), scale).problem
-    return problem if known else dataclasses.replace(problem, prior_deviation=None)
+    return problem if known else problem.without_prior()
 
 
 def design(
@@ -487,10 +506,12 @@ def compute(
     watch: Watcher | None = None,
     record_as: str | None = None,
     further: Mapping[str, Any] | None = None,
+    command: str | None = None,
 ) -> tuple[str, ...]:
     """Computes and stores what is missing under `output`; returns the messages of what failed.
 
-    The run is recorded under a new name, or under `record_as`, in place of what is there; with `further` facts.
+    The run is recorded under a new name, or under `record_as`, in place of what is there; with `further` facts, and the
+    `command` as it was typed.
 
     Raises:
         UserError: what was asked for cannot be computed, or the folder cannot be written to; nothing is computed then.
@@ -511,7 +532,8 @@ def compute(
     execution.warm_up(perform, len(tasks))
     record = _record(scenarios, estimators, trials) | dict(further or {})
     known = None if tasks or aside else store.same_run(record)
-    identifier = known or _write_record(store, record, record_as or new_name())
+    typed = {"command": command, "blocks": len(tasks)}
+    identifier = known or _write_record(store, record | typed, record_as or new_name())
     with RunLog(store.directory / "log" / f"{identifier}.log") as log:
         for line in aside:
             log.warning(line)
@@ -520,6 +542,10 @@ def compute(
     if not (store.runs / f"{identifier}.json").is_file():
         raise StorageError(f"{store.directory}: lost the record of this run; the same command computes what is missing")
     return failures
+
+
+NARROW = "every interval is narrow enough"
+"""Why a scenario stops that has come to the precision that was asked for."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -531,6 +557,11 @@ class Stop:
     reason: str
     widest: str
     """The statistic that is farthest from the precision that was asked for, or was nearest to it last."""
+
+    @property
+    def reached(self) -> bool:
+        """Whether the precision that was asked for is there."""
+        return self.reason == NARROW
 
     @property
     def row(self) -> dict[str, Any]:
@@ -550,6 +581,7 @@ def compute_until(
     execution: Execution | None = None,
     block_size: int = BLOCK_SIZE,
     watch: Watcher | None = None,
+    command: str | None = None,
 ) -> tuple[tuple[str, ...], tuple[Stop, ...]]:
     """Adds blocks to what is stored under `output` until every interval is narrow enough, there are `most` trials
     (`MOST_TRIALS` where None), or `time_limit` seconds are over, which is looked at between rounds of blocks.
@@ -568,7 +600,7 @@ def compute_until(
         raise UserError(f"precision={precision}: certified readings are one trial; leave it out")
     validate(scenarios, estimators, budget, block_size)
     options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
-    options["further"] = {"precision": dataclasses.asdict(wanted)}
+    options |= {"further": {"precision": dataclasses.asdict(wanted)}, "command": command}
     at = [_first_trials(s, estimators, Path(output), block_size, budget) for s in scenarios]
     names, failures = [new_name() for _ in scenarios], []
     stops: dict[int, Stop] = {}
@@ -595,7 +627,7 @@ def _reason_to_stop(failed: bool, widest: Reach | None, spent: bool, late: bool)
     if failed:
         return "some blocks failed"
     if widest is not None and widest.ratio <= 1:
-        return "every interval is narrow enough"
+        return NARROW
     if spent:
         return "there are as many trials as there may be"
     return "the time is over" if late else ""

@@ -66,12 +66,12 @@ class EsMda(Estimator):
 
     def _smooth(self, objective: Objective) -> Estimates:
         """The ensemble's mean and covariance after all steps, with the means on the way."""
-        assert objective.prior_deviation is not None
-        d = objective.prior_deviation
+        assert objective.prior is not None
+        d = objective.prior.deviations
         z, n = objective.R.whiten(objective.z), len(objective.x0)
         generators = own_generators(self.seed, objective.z)
         # Members are distances from the nominal point in deviations of the prior.
-        s = normals(generators, self.members, n)
+        s = objective.prior.coloured(normals(generators, self.members, n)) / d
         path = [s.mean(axis=1)]
         for weight in geometric_weights(np.array([1.0 / self.first]), self.steps)[0]:
             going = np.flatnonzero(finite(z) & finite(s) & ~objective.model.tally.failed(objective.rows))

@@ -134,7 +134,8 @@ class _Pass:
         assert deviation is not None
         self.deviation = deviation
         self.tally = Tally.zeros(trials)
-        U0 = np.eye(n) / filter.prior_inflation
+        # U0' U0 = P0^-1, in deviations of the prior.
+        U0 = np.linalg.cholesky(np.linalg.inv(problem.scaled_prior)).T / filter.prior_inflation
         self.belief = Belief(np.zeros((trials, n)), np.repeat(U0[None], trials, axis=0))
         self.nis = np.zeros(trials)
         self.status = np.where(finite(z), Status.RUNNING, Status.NONFINITE).astype(np.int8)

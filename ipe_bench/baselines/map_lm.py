@@ -33,4 +33,4 @@ class MapLM(Batch):
         return Objective.of(problem, z, prior=True, inflation=self.prior_inflation)
 
     def method(self, objective: Objective) -> Solver[Descent]:
-        return LevenbergMarquardtMethod(self.damping, objective.prior_deviation)
+        return LevenbergMarquardtMethod(self.damping, None if objective.prior is None else objective.prior.deviations)

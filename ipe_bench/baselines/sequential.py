@@ -96,12 +96,15 @@ class Sequential(Estimator):
         """The filters of all trials, as `track`, for readings z (trials, m). A filter that has none is filterpy's."""
         raise NotImplementedError
 
+    def begin(self, problem: Problem) -> tuple[Array, Array]:
+        """P0 and Q (n, n) in deviations of the prior."""
+        return self.prior_inflation**2 * problem.scaled_prior, self.process_noise**2 * np.eye(problem.measurement.n)
+
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         for need in self.missing(problem):
             raise UserError(f"measurement={problem.measurement.name}: has no {need}, which a filter needs")
         if self.engine == "batched":
-            I = np.eye(problem.measurement.n)  # noqa: E741  the field's letter for the unit matrix
-            stack = self.stack(self.prior_inflation**2 * I, self.process_noise**2 * I, z)
+            stack = self.stack(*self.begin(problem), z)
             epochs = list(arrivals(problem))
             with np.errstate(all="ignore"):
                 return run(stack, problem, z, epochs, slopes=self.slopes, history=history)
@@ -139,9 +142,7 @@ class _Run:
         return [int(i) for i in np.flatnonzero(self.status == Status.RUNNING)]
 
     def begin(self, trial: int) -> None:
-        I = np.eye(self.problem.measurement.n)  # noqa: E741  the field's letter for the unit matrix
-        P0, Q = self.filter.prior_inflation**2 * I, self.filter.process_noise**2 * I
-        self.tracks[trial] = self.filter.track(P0, Q, self.z[trial])
+        self.tracks[trial] = self.filter.track(*self.filter.begin(self.problem), self.z[trial])
 
     def end(self, trial: int, status: Status, message: str | None = None) -> None:
         self.status[trial] = status

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 Array: TypeAlias = NDArray[Any]
 Mask: TypeAlias = NDArray[Any]
 
+_WELL_CONDITIONED = 1e3
+"""The condition of J, its columns scaled, up to which J' J has enough of its digits: nine or more."""
+
 
 def finite(a: Array) -> Mask:
     """Which trials (trials,) of a (trials, ...) are finite throughout."""
@@ -131,6 +134,17 @@ class Covariance:
         """R itself (m, m)."""
         return np.diag(self.factor**2) if self.factor.ndim == 1 else self.factor @ self.factor.T
 
+    def inverse(self) -> Array:
+        """R^-1 (m, m)."""
+        if self.factor.ndim == 1:
+            return np.diag(self.factor**-2.0)
+        whitener = self._inverse_factor()
+        return whitener.T @ whitener
+
+    def coloured(self, w: Array) -> Array:
+        """R^1/2 w: white numbers w (..., m) of unit variance as draws of covariance R."""
+        return w * self.factor if self.factor.ndim == 1 else multiply(self.factor, w)
+
     def _inverse_factor(self) -> Array:
         from scipy.linalg import solve_triangular
 
@@ -143,20 +157,49 @@ def information(J: Array, R: Covariance) -> Array:
     return np.matmul(Jw.swapaxes(-1, -2), Jw)
 
 
+def gram_factor(J: Array) -> tuple[Array, Array, Mask]:
+    """U (trials, n, n) with U' U = J' J of each J (trials, m, n), its inverse, and the mask (trials,) of where J is so
+    well conditioned that this may be had from J' J, a third of the work of QR; elsewhere they are not to be used.
+
+    The columns of J are scaled first; what is lost of U is n eps times the condition squared (Higham, Accuracy and
+    Stability of Numerical Algorithms, 2002, section 20.4).
+    """
+    J = np.ascontiguousarray(J)
+    with np.errstate(all="ignore"):
+        G = np.matmul(J.swapaxes(1, 2), J)
+        columns = np.sqrt(np.diagonal(G, axis1=1, axis2=2))
+        scaled = G / (columns[:, :, None] * columns[:, None, :])
+        usable = finite(scaled)
+        U = cholesky(np.where(usable[:, None, None], scaled, np.eye(G.shape[1])))
+        inverse_U, _ = inverse(U)
+        well = usable & (np.linalg.norm(inverse_U, axis=(1, 2)) * np.sqrt(G.shape[1]) <= _WELL_CONDITIONED)
+        return U * columns[:, None, :], inverse_U / columns[:, :, None], well
+
+
 def pseudo_inverse(H: Array, R: Covariance) -> tuple[Array, Mask]:
-    """H+ = (H' R^-1 H)^-1 H' R^-1 for H (trials, m, n), by QR of the whitened H: (trials, n, m).
+    """H+ = (H' R^-1 H)^-1 H' R^-1 for H (trials, m, n): (trials, n, m).
 
     Flags the trials whose H has not full column rank to working precision; their H+ is NaN.
     """
     Hw = R.whiten_jacobian(H)
-    usable = finite(Hw)
-    Q, U = np.linalg.qr(np.where(usable[:, None, None], Hw, 0.0))
+    _, inverse_U, well = gram_factor(Hw)
+    with np.errstate(all="ignore"):
+        # H+ R^1/2 = U^-1 U^-T Hw'
+        whitened = np.matmul(inverse_U, np.matmul(inverse_U.swapaxes(1, 2), Hw.swapaxes(1, 2)))
+    deficient = np.zeros(len(H), dtype=bool)
+    if not well.all():
+        whitened[~well], deficient[~well] = _by_orthogonal_factor(Hw[~well])
+    if R.factor.ndim == 1:
+        return whitened / R.factor, deficient
+    return np.matmul(whitened, R._inverse_factor()), deficient
+
+
+def _by_orthogonal_factor(H: Array) -> tuple[Array, Mask]:
+    """The pseudo-inverse of any H (trials, m, n), and where it has not full column rank."""
+    usable = finite(H)
+    Q, U = np.linalg.qr(np.where(usable[:, None, None], H, 0.0))
     diagonal = np.abs(np.diagonal(U, axis1=1, axis2=2))
     floor = np.finfo(float).eps * max(H.shape[1:]) * np.linalg.norm(U, axis=(1, 2))
     deficient: Mask = ~usable | (diagonal.min(axis=1) <= floor)
     U = np.where(deficient[:, None, None], np.nan, U)
-    # H+ = U^-1 Q' R^-1/2
-    whitened = solve(U, Q.swapaxes(1, 2))[0]
-    if R.factor.ndim == 1:
-        return whitened / R.factor, deficient
-    return np.matmul(whitened, R._inverse_factor()), deficient
+    return solve(U, Q.swapaxes(1, 2))[0], deficient

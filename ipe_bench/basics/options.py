@@ -137,19 +137,19 @@ def _constrained(value: Any, kind: Any, metadata: Sequence[Any], key: str) -> An
         if typing.get_origin(kind) is tuple:
             raise  # it says which entry is wrong
         raise _refusal(value, describe_type(Annotated[kind, *metadata]), key) from None
-    if not all(_COMPARISONS[type(bound)](value, bound) for bound in _bounds(metadata)):
+    if not all(_COMPARISONS[type(bound)](value, bound) for bound in bounds_of(metadata)):
         raise _refusal(value, describe_type(Annotated[kind, *metadata]), key)
     return value
 
 
-def _bounds(metadata: Iterable[Any]) -> list[Any]:
+def bounds_of(metadata: Iterable[Any]) -> list[Any]:
     """The constraints among an annotation's metadata; an `Interval` is taken apart."""
     flat: list[Any] = []
     for item in metadata:
         if type(item) in _COMPARISONS:
             flat.append(item)
         elif isinstance(item, GroupedMetadata):
-            flat += _bounds(item)
+            flat += bounds_of(item)
         elif isinstance(item, BaseMetadata):
             raise TypeError(f"{item}: is a constraint that options cannot have; write a Predicate")
     return flat
@@ -197,7 +197,7 @@ def describe_type(hint: Any) -> str:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
         words = [c.documentation for c in arguments[1:] if isinstance(c, DocInfo)]
-        return words[0] if words else _with_bounds(describe_type(arguments[0]), _bounds(arguments[1:]))
+        return words[0] if words else _with_bounds(describe_type(arguments[0]), bounds_of(arguments[1:]))
     if origin in (typing.Union, types.UnionType):
         return " or ".join(map(describe_type, arguments))
     if origin is typing.Literal:

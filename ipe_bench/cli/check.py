@@ -33,7 +33,8 @@ def _check_plugin(folder: str) -> int:
     for finding in findings:
         out.print(_line(finding), markup=False, soft_wrap=True)
     failed = sum(bool(finding.complaint) for finding in findings)
-    out.print(f"{folder}: {failed} checks failed" if failed else f"{folder}: all checks passed", markup=False)
+    verdict = f"{failed} of {len(findings)} checks failed" if failed else "all checks passed"
+    out.print(f"{folder}: {verdict}", markup=False)
     return failed
 
 

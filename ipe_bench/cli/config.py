@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import cloudpickle
 import yaml
@@ -23,20 +23,24 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ipe_bench.api import MOST_TRIALS, TRIALS, objective_columns
 from ipe_bench.basics.errors import UserError, describe_exception, unknown
+from ipe_bench.cli.search_path import extend
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.measurements.known import Informed, Known
+from ipe_bench.measurements.known import Informed, Known, informed
 from ipe_bench.measurements.nist import datasets
 from ipe_bench.noise import ModelNoise, Noise, Unknown
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
-from ipe_bench.priors import GaussianPrior, Prior
+from ipe_bench.priors import GaussianPrior, Prior, prior_of
+from ipe_bench.real.covariances import read_covariance
+from ipe_bench.real.sources import Readings
 from ipe_bench.report.choice import Which, which_figures
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.provenance import TARGET, canonical_json, describe
 from ipe_bench.trials.scenario import Scenario
 
 CONFIG_ERRORS = (HydraException, OmegaConfBaseException)
+Opened: TypeAlias = Callable[[DictConfig, Measurement], Readings | None]
 
 
 @dataclass
@@ -64,6 +68,10 @@ class Schema:
     """Trials per unit of work and of storage; changes no number."""
     readings: Any = None
     """A file of real readings, for `estimate`, or a list of files that are estimated together."""
+    ignore_rows: Any = None
+    """Rows of the file to leave out, by their numbers: their readings are missing. Of several files FILE:NUMBER."""
+    ignore_columns: Any = None
+    """Columns of the file to leave out."""
     write_readings: str | None = None
     """Write the simulated readings of one trial to this file instead of running."""
     write_readings_trial: int = 0
@@ -73,7 +81,11 @@ class Schema:
     noise: Any = MISSING
     prior: Any = MISSING
     parameters: Any = None
-    """What is known of the parameters: parameters.NAME.fixed=, .nominal=, .deviation=, .lower=, .upper=, .positive=."""
+    """What is known of the parameters: parameters.NAME.fixed=, .nominal=, .deviation=, .lower=, .upper=, .positive=; or
+    a YAML file of that, parameters=FILE."""
+    prior_covariance: Any = None
+    """P0 of the parameters in their own units, at error scale 1: a matrix in their order, or a CSV file with their
+    names in its header."""
     execution: Any = MISSING
     objective: str | None = None
     """LABEL.COLUMN, such as newton.capped_error: a number of each job, which sweepers that optimise make small."""
@@ -98,15 +110,16 @@ class Job:
     time_limit: float | None = None
     objective: tuple[str, str] | None = None
     """The label of an estimator and a column of its row over all parameters."""
+    readings: Readings | None = None
+    """Of the files, for an estimate from them."""
     figures: Which = "all"
 
 
-class PluginSearchPath(SearchPathPlugin):
-    """Lets Hydra find the options of plugins."""
+class PluginConfigs(SearchPathPlugin):
+    """Lets our own commands find the options of plugins, those in the working folder as well."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        for source in plugins.sources()[1:]:
-            search_path.append(source.name, source.conf.as_uri())
+        extend(search_path, plugins.sources())
 
 
 def prepare() -> None:
@@ -115,8 +128,8 @@ def prepare() -> None:
         print(f"ipe-bench: {problem}", file=sys.stderr)
     ConfigStore.instance().store("schema", node=Schema, provider="ipe-bench")
     registry = Plugins.instance()
-    if PluginSearchPath not in registry.discover(SearchPathPlugin):
-        registry.register(PluginSearchPath)
+    if PluginConfigs not in registry.discover(SearchPathPlugin):
+        registry.register(PluginConfigs)
 
 
 _FORMULA = re.compile(
@@ -124,8 +137,10 @@ _FORMULA = re.compile(
 )
 _UNIT = re.compile(r"^(\+*(?:truth_)?measurement\.(?:time_)?unit)=([^'\",\[\]{}]+)$")
 _FILE = re.compile(r"^\+*(?:truth_)?measurement\.file=")
+_PARAMETERS = re.compile(r"^\+*parameters=(?![{$]|null$)")
 _OPEN = re.compile(
-    r"^(?:(?:parameters|(?:truth_)?measurement\.(?:start|columns|initial|rates|outputs))\.|execution\.options[.=])"
+    r"^(?:(?:parameters|(?:truth_)?measurement\.(?:start|columns|constants|initial|rates|outputs))\."
+    r"|execution\.options[.=])"
 )
 """Keys to which users add entries of their own names."""
 
@@ -134,8 +149,17 @@ def rewrite(overrides: Sequence[str]) -> list[str]:
     """Overrides in Hydra's own words: truth_measurement= chooses from the group measurement, measurement=nist/NAME is
     measurement=nist with that data set, formulas stand in quotes that the shell has taken off, and entries are added
     where users name them."""
-    expanded = [words for o in overrides for words in (_from_file(o) if _FILE.match(o) else [_in_hydras_words(o)])]
+    expanded = [words for o in overrides for words in _expanded(o)]
     return [part for override in expanded for part in _nist(override)]
+
+
+def _expanded(override: str) -> list[str]:
+    """An override as it is, or what a file that it names says in its place."""
+    if _FILE.match(override):
+        return _from_file(override)
+    if _PARAMETERS.match(override):
+        return _from_file(override.replace("=", ".file=", 1))
+    return [_in_hydras_words(override)]
 
 
 def _nist(override: str) -> list[str]:
@@ -164,20 +188,22 @@ def _nist(override: str) -> list[str]:
 
 
 def _from_file(override: str) -> list[str]:
-    """A model's options from a YAML file, as if each had been typed there."""
+    """Options from a YAML file, as if each had been typed there."""
     key, _, name = override.partition("=")
+    group = key.removesuffix(".file").lstrip("+")
+    said = override if group != "parameters" else f"{group}={name}"
     try:
         content = yaml.safe_load(Path(name).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{override}: cannot be read ({error.__class__.__name__}); name a YAML file") from None
+        raise UserError(f"{said}: cannot be read ({error.__class__.__name__}); name a YAML file") from None
     except yaml.YAMLError as error:
-        raise UserError(f"{override}: is not YAML ({' '.join(str(error).split())})") from None
+        raise UserError(f"{said}: is not YAML ({' '.join(str(error).split())})") from None
     if not isinstance(content, dict):
-        raise UserError(f"{override}: holds no keys; write a YAML file of options such as rates, start, outputs")
+        example = "NAME: {nominal: 1}" if group == "parameters" else "rates, start, outputs"
+        raise UserError(f"{said}: holds no keys; write a YAML file of options such as {example}")
     if TARGET in content:
-        raise UserError(f"{override}: has a {TARGET}; the model is chosen by measurement=, so leave it out")
-    group = key.removesuffix(".file").lstrip("+")
-    return [f"++{group}.{k}={_literal(v, override)}" for k, v in content.items()]
+        raise UserError(f"{said}: has a {TARGET}; the model is chosen by measurement=, so leave it out")
+    return [f"++{group}.{k}={_literal(v, said)}" for k, v in content.items()]
 
 
 def _literal(value: Any, where: str) -> str:
@@ -200,10 +226,11 @@ def _in_hydras_words(override: str) -> str:
     return f"++{override}" if _OPEN.match(override) else override
 
 
-def assemble(config: DictConfig, *, estimating: bool = False) -> Job:
+def assemble(config: DictConfig, opened: Opened | None = None) -> Job:
     """The scenario, the estimators and the execution that a composed config describes; UserError by key.
 
-    `estimating`: for real readings, of which the level of the noise need not be known.
+    `opened` estimates from real readings: it opens the files that the config names. The level of their noise need not
+    be known.
     """
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(plain, dict)
@@ -220,13 +247,18 @@ def assemble(config: DictConfig, *, estimating: bool = False) -> Job:
     measurement, noise = _part(plain, "measurement", Measurement), _part(plain, "noise", Noise)
     truth = None if truth is None else _part(plain, "truth_measurement", Measurement)
     prior = _part(plain, "prior", Prior)
-    if estimating and isinstance(noise, ModelNoise):
+    readings = opened(config, measurement) if opened is not None else None
+    if readings is not None:
+        measurement = readings.model
+    if opened is not None and isinstance(noise, ModelNoise):
         noise = noise.of(measurement) or Unknown()
     known = _known(plain["parameters"])
     if known:
-        measurement = Informed(measurement, known)
-        truth = None if truth is None else Informed(truth, known)
-        prior = _prior(prior, measurement)
+        measurement = informed(measurement, known)
+        truth = None if truth is None else informed(truth, known)
+    if readings is not None:
+        readings = replace(readings, model=measurement)
+    prior = _prior(prior, measurement, plain["prior_covariance"])
     scenario = Scenario(measurement, noise, prior, plain["error_scale"], plain["seed"], truth)
     execution = _part(plain, "execution", Execution)
     estimators: dict[str, Estimator] = {}
@@ -248,7 +280,11 @@ def assemble(config: DictConfig, *, estimating: bool = False) -> Job:
     block_size, output = plain["block_size"], plain["output"]
     objective = _objective(plain["objective"], list(estimators))
     figures = which_figures(plain["figures"])
-    return Job(scenario, estimators, execution, trials, block_size, output, precision, time_limit, objective, figures)
+    return Job(
+        *(scenario, estimators, execution, trials, block_size, output, precision, time_limit, objective),
+        readings=readings,
+        figures=figures,
+    )
 
 
 def _objective(given: str | None, labels: Sequence[str]) -> tuple[str, str] | None:
@@ -281,7 +317,20 @@ def _known(given: Any) -> tuple[Known, ...]:
     return tuple(found)
 
 
-def _prior(prior: Prior, model: Informed) -> GaussianPrior:
+def _prior(prior: Prior, model: Measurement, covariance: Any) -> Prior:
+    """The prior with what is known of single parameters, or of all together."""
+    deviating = isinstance(model, Informed) and any(one.deviation is not None for one in model.known)
+    if covariance is not None:
+        if not isinstance(prior, GaussianPrior):
+            raise UserError(f"prior_covariance: is for prior=gaussian; with prior={prior.name}, leave it out")
+        if deviating or prior != GaussianPrior():
+            other = "parameters.NAME.deviation" if deviating else "prior.deviations or prior.correlations"
+            raise UserError(f"prior_covariance: says all of the prior; leave out {other}")
+        return prior_of(model, read_covariance(covariance, [p.name for p in model.natural_parameters]))
+    return prior if not isinstance(model, Informed) else _informed_prior(prior, model)
+
+
+def _informed_prior(prior: Prior, model: Informed) -> GaussianPrior:
     """The prior with the deviations that are known of single parameters."""
     if not isinstance(prior, GaussianPrior):
         raise UserError(f"parameters: goes with prior=gaussian, which is told of each; prior={prior.name} is not")

@@ -26,6 +26,8 @@ _WITHOUT_USE = (
     "readings",
     "write_readings",
     "write_readings_trial",
+    "ignore_rows",
+    "ignore_columns",
     "solver",
     "baseline",
     "estimators",

@@ -18,14 +18,14 @@ from ipe_bench.basics.machine import library_versions
 from ipe_bench.cli import console
 from ipe_bench.cli.config import Job
 from ipe_bench.cli.single import chosen_measurement, compose_single
-from ipe_bench.measurements import Nist
+from ipe_bench.measurements import Measurement, Nist
 from ipe_bench.noise import Certified, ModelNoise, Noise
-from ipe_bench.real.examination import examine
+from ipe_bench.real.examination import examinations
 from ipe_bench.real.fits import fit
-from ipe_bench.real.sources import noise_of, open_together
+from ipe_bench.real.sources import LeftOut, Readings, noise_of, open_together, require_enough
 from ipe_bench.runs.provenance import describe, fingerprint
 
-_STANDARD_ESTIMATORS = ("solver=[auto]", "baseline=[linear_lse,levenberg_marquardt]")
+STANDARD_ESTIMATORS = ("solver=[auto]", "baseline=[linear_lse,levenberg_marquardt]")
 """Unless others are chosen: the one that chooses its way by itself, and two that it can be held against."""
 
 
@@ -35,9 +35,9 @@ def main(arguments: Sequence[str]) -> int:
         "estimate",
         arguments,
         _refuse_keys_without_use,
-        standard=_STANDARD_ESTIMATORS,
+        standard=STANDARD_ESTIMATORS,
         measurement=_measurement_name,
-        estimating=True,
+        opened=_opened,
     )
     config = single.config
     job, z = _readings(config, single.job)
@@ -49,7 +49,8 @@ def main(arguments: Sequence[str]) -> int:
     command = _command(config, job)
     folder = claim(single.folder, command, elsewhere=not single.named)
     fits = fit(problem, z, job.estimators, job.scenario.noise)
-    answer = Answer(single.measurement, job.scenario.measurement, z, fits, examine(problem, z, fits))
+    left_out = _left_out(config).said
+    answer = Answer(single.measurement, job.scenario.measurement, z, fits, examinations(problem, z, fits), left_out)
     files = write_fits(folder, answer, command, {"measurement": single.measurement, **_provenance(config, job)})
     out = console()
     out.print(render(answer, out.width))
@@ -87,14 +88,39 @@ def _measurement_name(arguments: Sequence[str], job: Job) -> str:
 
 def _readings(config: DictConfig, job: Job) -> tuple[Job, Array]:
     """The readings (m,) of the file, or those that come with the model; with the latter, their own noise."""
-    if config.readings is not None:
-        found = open_together(_files(config), job.scenario.measurement)
+    found = job.readings
+    if found is not None:
+        require_enough(_files(config), found)
         noise = noise_of(found, _stated(config, job)) or job.scenario.noise
-        return replace(job, scenario=replace(job.scenario, measurement=found.model, noise=noise)), found.z
+        return replace(job, scenario=replace(job.scenario, noise=noise)), found.z
     recorded = job.scenario.measurement.recorded
     if recorded is None:
         raise UserError("readings: is not given; write readings=FILE (see `ipe-bench list measurement -v`)")
     return replace(job, scenario=replace(job.scenario, noise=Certified())), recorded.z
+
+
+def _opened(config: DictConfig, model: Measurement) -> Readings | None:
+    """The readings of the files, where there are any; what is known of parameters is still to be taken in."""
+    left_out = _left_out(config)
+    if config.readings is None:
+        if left_out:
+            raise UserError("ignore_rows, ignore_columns: are of a file; give readings=FILE, or leave them out")
+        return None
+    return open_together(_files(config), model, left_out, enough=False)
+
+
+def _left_out(config: DictConfig) -> LeftOut:
+    """What a user leaves out of the files."""
+    listed = {}
+    for key in ("ignore_rows", "ignore_columns"):
+        given = config[key]
+        names = list(given) if OmegaConf.is_list(given) else [] if given is None else [given]
+        kinds = (int, str) if key == "ignore_rows" else (str,)
+        for name in names:
+            if not isinstance(name, kinds) or isinstance(name, bool):
+                raise UserError(f"{key}={name}: give names of columns, or numbers of rows, as in {key}=[3,4]")
+        listed[key.removeprefix("ignore_")] = tuple(names)
+    return LeftOut(**listed)
 
 
 def _files(config: DictConfig) -> list[Path]:
@@ -121,6 +147,7 @@ def _command(config: DictConfig, job: Job) -> dict[str, Any]:
         "readings": None if config.readings is None else [str(path.resolve()) for path in _files(config)],
         "scenario": describe(job.scenario),
         "estimators": {label: describe(estimator) for label, estimator in job.estimators.items()},
+        **({"left_out": describe(left_out)} if (left_out := _left_out(config)) else {}),
     }
 
 

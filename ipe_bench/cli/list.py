@@ -29,7 +29,9 @@ def main(names: Sequence[str], verbose: bool) -> int:
     for name in names or known:
         group, slash, _ = name.partition("/")
         if group not in known:
-            raise UserError(f"{name}: {unknown(group, known, 'group')}")
+            homes = [f"{o.group}/{o.name}" for o in plugins.options() if o.name == name]
+            remedy = f"write {' or '.join(homes)}" if homes else unknown(group, known, "group")
+            raise UserError(f"{name}: {remedy}")
         if slash:
             _describe(out, _find(name))
         else:
@@ -104,7 +106,9 @@ def _describe_measurement(out: Console, option: plugins.Option) -> None:
         out.print(option.path.read_text(encoding="utf-8"), markup=False)
         return
 
-    table = Table(title=f"measurement={option.name}", title_justify="left", box=None, pad_edge=False)
+    # A title of the table would be broken where it is wider than the table.
+    out.print(Text(f"measurement={option.name}", style="italic"), soft_wrap=True)
+    table = Table(box=None, pad_edge=False)
     for heading in ("parameter", "size", "unit"):
         table.add_column(heading, justify="right" if heading == "size" else "left")
     for parameter in model.parameters:

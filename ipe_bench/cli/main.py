@@ -11,7 +11,21 @@ from collections.abc import Callable, Sequence
 
 from ipe_bench.cli import interrupts
 
-COMMANDS = ("run", "estimate", "design", "posterior", "report", "compare", "status", "list", "check", "new")
+COMMANDS = (
+    "run",
+    "estimate",
+    "design",
+    "posterior",
+    "report",
+    "compare",
+    "bundle",
+    "status",
+    "list",
+    "check",
+    "new",
+    "schema",
+    "completion",
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -9,12 +9,12 @@ from pathlib import Path
 from string import Template
 
 from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.cli.parser import KINDS
 from ipe_bench.plugins import discovery as plugins
 
 LONGEST = 60
 RECORDS = {"statistic": "STATISTIC", "figure": "FIGURE", "table": "table", "section": "SECTION"}
 """What reports are made of, and what each is called in its module."""
-KINDS = ("solver", "baseline", "measurement", "noise", "prior", "execution", *RECORDS, "experiment")
 
 
 def main(kind: str, name: str) -> int:

@@ -35,8 +35,10 @@ readings=FILE       CSV or Parquet; `ipe-bench list measurement -v` says which r
 readings=[A,B]      several files, which share all parameters but those in measurement.own=[NAME].
 noise.deviation=X   the standard deviation of a reading; standard errors and tests rest on it.
 noise=unknown       nobody knows it: it is estimated from the residuals, and the size of these tests nothing.
-parameters.NAME.fixed=X, .lower=X, .upper=X   what is known of a parameter.
+ignore_rows=[3,7]   rows to leave out, by their numbers; ignore_columns=[NAME] leaves out columns.
+parameters.NAME.fixed=X, .lower=X, .upper=X   what is known of a parameter; parameters=FILE.yaml has that of many.
 error_scale=X       how far the parameters may lie from the nominal point: the prior of filters and map_lm.
+prior_covariance=F  the same in the parameters' own units: a CSV file of the covariance, headed by their names.
 output=DIR          where the files go: outputs/estimate-MODEL unless given, or outputs/estimate-MODEL-2 and so on
                     where another command has written there. Nothing of another command is overwritten.
 
@@ -76,6 +78,23 @@ Nothing is computed again.
 
   ipe-bench report DIR                            into DIR itself
   ipe-bench report DIR1 DIR2 output=DIR           several folders together, into another
+  ipe-bench report DIR paper=overview,success_against_scale columns=error_scale,estimator,success width=3.5
+
+paper=NAMES          tables and figures for a paper instead, into DIR/paper: LaTeX (booktabs, siunitx), PDF and PNG
+columns=NAMES        those of the tables, in this order; a name that is not there is answered with those that are
+width=INCHES         of a figure or table: 3.5 for one column, 7.16 for two
+"""
+
+
+_BUNDLE = """
+  ipe-bench bundle outputs/paper                  outputs/paper.zip: all results, and a manifest with their digests
+  ipe-bench bundle outputs/a outputs/b output=both.zip
+  ipe-bench bundle both.zip                       is it whole, and what is its digest?
+
+The same results give the same file, so that the digest may stand in a paper. Others read it beside their own results:
+
+  ipe-bench report outputs/mine both.zip output=outputs/together
+  ipe-bench compare outputs/mine both.zip
 """
 
 
@@ -93,6 +112,24 @@ output=DIR           writes comparison.csv and comparison as PNG and PDF there
 """
 
 
+KINDS = ("solver", "baseline", "measurement", "noise", "prior", "execution")
+KINDS += ("statistic", "figure", "table", "section", "experiment")
+"""Of plugins that `new` makes."""
+_SCHEMA = """
+  ipe-bench schema > ipe-bench.schema.json
+
+Visual Studio Code with its YAML extension, in settings.json:
+                    "yaml.schemas": {"ipe-bench.schema.json": "**/conf/**/*.yaml"}
+Any editor with yaml-language-server, in a file: # yaml-language-server: $schema=ipe-bench.schema.json
+Options of plugins are in it as far as they are found from here; write it again after a new one.
+"""
+_COMPLETION = """
+  eval "$(ipe-bench completion bash)"             in ~/.bashrc
+  eval "$(ipe-bench completion zsh)"              in ~/.zshrc, behind compinit
+  ipe-bench completion fish | source              in ~/.config/fish/config.fish
+
+TAB then completes commands, flags, groups and their options (solver=[new), keys of options (measurement.la) and values.
+"""
 INFO_TOPICS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
 
@@ -104,6 +141,9 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise UserError(f"{self.command}: {message}; see `{self.prog} --help`")
+
+    summary: str = ""
+    """What the command does, in a line."""
 
     @property
     def command(self) -> str:
@@ -141,6 +181,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         found[name] = commands.add_parser(
             name, help=what, description=f"ipe-bench {name}: {what}\n{more}", epilog=epilog
         )
+        found[name].summary = what
         return found[name]
 
     _add_run(add("run", "simulate, estimate, store and report"))
@@ -178,6 +219,13 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         _REPORT,
     )
     report.add_argument("arguments", metavar="DIR", nargs="*", help="folders of results, such as outputs/paper")
+    bundle = add(
+        "bundle",
+        "results in one archive to share, or whether such an archive is whole",
+        "0 done; 1 done, but something that was asked for is missing",
+        _BUNDLE,
+    )
+    bundle.add_argument("arguments", metavar="DIR", nargs="*", help="folders of results, or one bundle to check")
     compare = add(
         "compare",
         "whether a second version, setting or estimator is better or worse than a first",
@@ -203,7 +251,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     new.add_argument(
         "kind",
         metavar="KIND",
-        help="solver, baseline, measurement, noise, prior, execution, statistic, figure, table, section or experiment",
+        help=f"{', '.join(KINDS[:-1])} or {KINDS[-1]}",
     )
     new.add_argument("name", metavar="NAME", help="small letters, digits and underscores")
     check = add(
@@ -212,6 +260,10 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         "0 all checks passed; 1 some failed",
     )
     check.add_argument("folders", metavar="DIR", nargs="*", help="folders of plugins, such as plugins/my_plugin")
+    add("schema", "a JSON schema of config files, for editors that complete and check them", more=_SCHEMA)
+    completion = add("completion", "the script that lets a shell complete all of this", more=_COMPLETION)
+    completion.add_argument("shell", metavar="SHELL", choices=("bash", "zsh", "fish"), help="bash, zsh or fish")
+    completion.add_argument("--query", action="store_true", help=argparse.SUPPRESS)
     return program, found
 
 

@@ -20,6 +20,8 @@ _WITHOUT_USE = (
     "readings",
     "write_readings",
     "write_readings_trial",
+    "ignore_rows",
+    "ignore_columns",
 )
 _TRIALS = 3
 _MOST_TRIALS = 100

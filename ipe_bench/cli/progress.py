@@ -106,7 +106,8 @@ def _line_watcher(console: Console, title: str) -> Watcher:
         elif progress.done == progress.tasks:
             failed = f", {len(progress.failures)} failed" if progress.failures else ""
             rate = progress.total / max(now - began, 1e-9)
-            say(f"{progress.tasks} blocks{failed} in {_duration(now - began)}, {_rounded(rate)} estimates/s")
+            blocks = "1 block" if progress.tasks == 1 else f"{progress.tasks} blocks"
+            say(f"{blocks}{failed} in {_duration(now - began)}, {_rounded(rate)} estimates/s")
         elif now - spoken >= LINE_EVERY_S and progress.trials:
             spoken = now
             rate = progress.trials / (now - began)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import console
+from ipe_bench.cli import console, paper
 from ipe_bench.report.choice import Which, which_figures
+from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
 from ipe_bench.runs.results import require_results
 from ipe_bench.runs.store import TRUTH
 
@@ -20,7 +22,27 @@ if TYPE_CHECKING:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Aggregates the directories; the report goes to the first, or to output=DIR."""
+    """Aggregates the directories, or bundles; the report goes to the first directory, or to output=DIR."""
+    with unpacked(arguments) as words:
+        return paper.main(words) if paper.asked_for(words) else _report(words)
+
+
+@contextlib.contextmanager
+def unpacked(words: Sequence[str]) -> Iterator[list[str]]:
+    """The words with folders in place of bundles, which go below the report.
+
+    Raises:
+        UserError: there is a bundle and no folder for the report, or it is not whole.
+    """
+    bundles = [word for word in words if is_bundle(word)]
+    outputs = [word.removeprefix("output=") for word in words if word.startswith("output=")]
+    if bundles and not outputs:
+        raise UserError(f"report: {bundles[0]}: is a bundle; say where the report goes with output=DIR")
+    with opened(bundles, Path(outputs[0]) / BUNDLES if bundles else None) as folders:
+        yield [*(word for word in words if word not in bundles), *map(str, folders)]
+
+
+def _report(arguments: Sequence[str]) -> int:
     outputs = [a.removeprefix("output=") for a in arguments if a.startswith("output=")]
     asked = [a.removeprefix("figures=") for a in arguments if a.startswith("figures=")]
     directories = [Path(a) for a in arguments if not a.startswith(("output=", "figures="))]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import shlex
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -24,11 +25,13 @@ from ipe_bench.basics.errors import StorageError, UserError, shortened
 from ipe_bench.cli import console, interrupts
 from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, assemble, explain, prepare, rewrite
 from ipe_bench.cli.dry_run import DryRun
+from ipe_bench.cli.flags import flags_of_hydra
 from ipe_bench.cli.overrides import default_name, known_options, read
 from ipe_bench.cli.parser import INFO_TOPICS, parsers
 from ipe_bench.cli.progress import shown_progress
 from ipe_bench.cli.report import main as report
 from ipe_bench.cli.report import show_command
+from ipe_bench.cli.typed import check_options
 from ipe_bench.measurements import Nist
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.report.choice import Which, which_figures
@@ -44,6 +47,8 @@ class Outcome:
 
     def __init__(self) -> None:
         self.started = False
+        self.command: str | None = None
+        """As it was typed; not known to jobs in other processes."""
         self.multirun = False
         self.elsewhere = False
         """Jobs run in other processes, from which nothing but an exception or a file comes back."""
@@ -54,6 +59,8 @@ class Outcome:
         self.failures: list[str] = []
         self.stops: list[str] = []
         """How many trials each job with a precision took, and why no more."""
+        self.short = False
+        """Some job did not come to its precision."""
         self.maximises = False
         self.objectives: list[tuple[float, list[str]]] = []
         """What each job came to in the column that is asked for, and what was asked of it."""
@@ -100,6 +107,7 @@ def main(arguments: Sequence[str]) -> int:
     """Runs Hydra on the arguments; then aggregates and shows the folders that were filled."""
     global _outcome
     _outcome = Outcome()
+    _outcome.command = shlex.join(["ipe-bench", "run", *arguments])
     if any(word in ("-h", "--help") for word in arguments):
         flags, words = ["--help"], []
     else:
@@ -110,7 +118,10 @@ def main(arguments: Sequence[str]) -> int:
     elif words:
         folders = [Path(flags[i + 1]) for i, flag in enumerate(flags) if flag == "--config-dir"]
         words = rewrite(words)
-        name = default_name(read(words, KEYS, folders))
+        overrides = read(words, KEYS, folders)
+        if not {"--config-name", "--config-path"}.intersection(flags):
+            check_options(words, overrides)
+        name = default_name(overrides)
         if not {"--multirun", "--run", "--cfg", "--info"}.intersection(flags) and sweeps_by_itself(words, folders):
             flags.append("--multirun")
         words = [*words, f"default_name='{name}'"]
@@ -130,7 +141,8 @@ def _run_hydra(flags: Sequence[str], words: Sequence[str]) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     sys.argv = ["ipe-bench", *flags, *words]
     try:
-        with _without_asking(RunMode.RUN) if _is_plain(flags, words) else contextlib.nullcontext():
+        told = _without_asking(RunMode.RUN) if _is_plain(flags, words) else contextlib.nullcontext()
+        with flags_of_hydra(), told:
             hydra.main(version_base="1.3", config_path=str(plugins.own_conf()), config_name="config")(task)()
     except (UserError, StorageError):
         raise
@@ -175,7 +187,7 @@ def _conclude() -> int:
         return 0
     if _outcome.multirun and not _outcome.elsewhere and not _outcome.jobs and not _outcome.mistakes:
         raise UserError("the sweep has no jobs: check the patterns in its lists")
-    code = 1 if _outcome.failures else 0
+    code = 1 if _outcome.failures or _outcome.short else 0
     if _outcome.dry is not None and not _outcome.mistakes:
         print(_outcome.dry.summary())
         return code
@@ -279,11 +291,14 @@ def _objective(job: Job) -> float:
 def _compute(job: Job, execution: Execution, watch: Watcher) -> tuple[str, ...]:
     """Computes the trials that are asked for, or just enough; returns the messages of what failed."""
     options: dict[str, Any] = {"execution": execution, "block_size": job.block_size, "watch": watch}
+    options["command"] = _outcome.command
     if job.precision is None:
         return compute([job.scenario], job.estimators, job.trials, job.output, **options)
     options |= {"precision": job.precision, "time_limit": job.time_limit}
     failures, (stop,) = compute_until([job.scenario], job.estimators, job.trials, job.output, **options)
-    line = f"{_title(job)}: {stop.trials} trials; {stop.reason} ({stop.widest})"
+    verdict = "" if stop.reached else "the precision is not reached: "
+    line = f"{_title(job)}: {stop.trials} trials; {verdict}{stop.reason} ({stop.widest})"
+    _outcome.short |= not stop.reached
     if _launched_elsewhere():
         print(line)
     _outcome.stops.append(line)
@@ -295,6 +310,9 @@ def _refuse_keys_without_use(config: DictConfig) -> None:
         raise UserError(
             f"readings={config.readings}: run simulates its readings; `ipe-bench estimate` estimates from a file"
         )
+    for key in ("ignore_rows", "ignore_columns"):
+        if config[key] is not None:
+            raise UserError(f"{key}={config[key]}: is of a file of readings, for `ipe-bench estimate`; leave it out")
     if config.write_readings is None and config.write_readings_trial:
         raise UserError(f"write_readings_trial={config.write_readings_trial}: goes with write_readings=FILE")
 

@@ -10,8 +10,9 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, assemble, explain, prepare, rewrite
+from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, Opened, assemble, explain, prepare, rewrite
 from ipe_bench.cli.overrides import read
+from ipe_bench.cli.typed import check_options
 from ipe_bench.plugins import discovery as plugins
 
 
@@ -47,12 +48,12 @@ def compose_single(
     *,
     standard: Sequence[str] = (),
     measurement: Callable[[Sequence[str], Job], str] = chosen_measurement,
-    estimating: bool = False,
+    opened: Opened | None = None,
 ) -> Single:
     """Composes and constructs what the arguments of a command ask for.
 
     `refuse` raises where the overrides name what is nothing in this command; `standard` are overrides that stand unless
-    others are given; `measurement` says what the model is called.
+    others are given; `measurement` says what the model is called; `opened`: see `assemble`.
 
     Raises:
         UserError: a mistake in the arguments, in one line.
@@ -60,7 +61,7 @@ def compose_single(
     prepare()
     words = rewrite(arguments)
     refuse(words)
-    read(words, KEYS)
+    check_options([*standard, *words], read(words, KEYS))
     try:
         with initialize_config_dir(str(plugins.own_conf()), version_base="1.3"):
             config = compose("config", [*standard, *words])
@@ -68,7 +69,7 @@ def compose_single(
         raise explain(error) from error
     named = any(a.lstrip("+").startswith(("name=", "output=")) for a in arguments)
     try:
-        job = assemble(config, estimating=estimating)
+        job = assemble(config, opened)
         name = measurement(arguments, job)
         if not named:
             config.name = f"{command}-{name.replace('/', '-')}"

@@ -9,6 +9,7 @@ from rich.text import Text
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console
+from ipe_bench.runs.bundles import opened
 from ipe_bench.runs.results import CellState, Results, require_results
 from ipe_bench.runs.store import TRUTH
 
@@ -19,11 +20,13 @@ def main(arguments: Sequence[str], verbose: bool = False) -> int:
     """A line per directory that is complete, else a table; exit code 1 where anything is missing or damaged."""
     if not arguments:
         raise UserError("status: name at least one directory of results, such as outputs/paper")
-    require_results(arguments)
-    found = [Results.read([directory]) for directory in arguments]
-    for directory, results in zip(arguments, found, strict=True):
-        _show(directory, results, verbose)
-    return 1 if any(results.problems for results in found) else 0
+    with opened(arguments) as folders:
+        require_results(folders)
+        found = [Results.read([folder]) for folder in folders]
+        for folder, results in zip(folders, found, strict=True):
+            # A bundle's folders are called as they were, not as where they are unpacked.
+            _show(str(folder) if str(folder) in arguments else folder.name, results, verbose)
+        return 1 if any(results.problems for results in found) else 0
 
 
 def _show(directory: str, results: Results, verbose: bool) -> None:
@@ -48,8 +51,10 @@ def _table(directory: str, cells: Sequence[CellState]) -> Table:
         table.add_column(heading, overflow="fold")
     for heading in ("done", *_COUNTS):
         table.add_column(heading, justify="right", overflow="fold")
+    said = ""
     for cell in cells:
+        scenario, said = "" if cell.title == said else cell.title, cell.title
         label = "(truth)" if cell.names["estimator"] == TRUTH else cell.names["estimator"]
         counts = (str(getattr(cell, name) or "") for name in _COUNTS)
-        table.add_row(Text(cell.title), Text(label), f"{cell.done} of {cell.expected or cell.done}", *counts)
+        table.add_row(Text(scenario), Text(label), f"{cell.done} of {cell.expected or cell.done}", *counts)
     return table

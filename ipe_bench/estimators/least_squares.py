@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array, Covariance, Mask, cholesky, finite, inverse, multiply, solve
+from ipe_bench.basics.linalg import Array, Covariance, Mask, finite, gram_factor, inverse, multiply, solve
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
 from ipe_bench.estimators.driver import Ended, Solver, Standing, iterate
@@ -27,9 +27,6 @@ _FLAT = 30
 """Steps without a visible decrease after which a nearly stationary point is as good as it gets,"""
 _STATIONARY = 1e-3
 """where nearly means: within this part of a deviation along every column of J."""
-
-_WELL_CONDITIONED = 1e3
-"""The condition of J, its columns scaled, up to which J' J has enough of its digits: nine or more."""
 
 _NEAR = 0.03
 """Steps still to go of fewer deviations are computed from exact Jacobians: a coarse one leaves the gradient about a
@@ -64,7 +61,7 @@ class Residuals(Protocol):
 
 @dataclass(frozen=True)
 class Objective:
-    """|R^-1/2 (h(x) - z)|^2, plus |(x - x0) / prior_deviation|^2 where a prior counts, for the trials `rows`."""
+    """|R^-1/2 (h(x) - z)|^2, plus |P0^-1/2 (x - x0)|^2 where a prior counts, for the trials `rows`."""
 
     model: Counted
     R: Covariance
@@ -72,15 +69,16 @@ class Objective:
     rows: NDArray[np.intp]
     x0: Array
     """The centre of the prior: (n,), or each trial's own (trials, n)."""
-    prior_deviation: Array | None = None
+    prior: Covariance | None = None
+    """P0, where it counts."""
     exact_within: float = np.inf
 
     @classmethod
     def of(cls, problem: Problem, z: Array, *, prior: bool, inflation: float = 1.0) -> Objective:
         """The objective of all readings z (trials, m); with the prior, its deviations times `inflation`."""
         model = Counted(problem.measurement, Tally.zeros(len(z)))
-        deviation = problem.prior_used(inflation) if prior else None
-        return cls(model, problem.R, z, np.arange(len(z)), problem.x0, deviation)
+        counting = problem.prior_covariance(inflation) if prior else None
+        return cls(model, problem.R, z, np.arange(len(z)), problem.x0, counting)
 
     @property
     def readings(self) -> int:
@@ -89,9 +87,9 @@ class Objective:
     def residual(self, x: Array) -> Array:
         """Whitened residuals (trials, m), followed by those of the prior (trials, n) where it counts."""
         r = self.R.whiten(self.model.simulate(x, self.rows) - self.z)
-        if self.prior_deviation is None:
+        if self.prior is None:
             return r
-        return np.concatenate([r, (x - self.x0) / self.prior_deviation], axis=1)
+        return np.concatenate([r, self.prior.whiten(x - self.x0)], axis=1)
 
     def jacobian(self, x: Array) -> Array:
         """The derivative of the whitened residuals (trials, m, n) or (trials, m + n, n)."""
@@ -103,9 +101,10 @@ class Objective:
 
     def _jacobian(self, x: Array, *, coarse: bool) -> Array:
         J = self.R.whiten_jacobian(self.model.jacobian(x, self.rows, coarse=coarse))
-        if self.prior_deviation is None:
+        if self.prior is None:
             return J
-        prior = np.broadcast_to(np.diag(1.0 / self.prior_deviation), (len(x), x.shape[1], x.shape[1]))
+        n = x.shape[1]
+        prior = np.broadcast_to(self.prior.whiten_jacobian(np.eye(n)), (len(x), n, n))
         return np.concatenate([J, prior], axis=1)
 
     def coarsened(self, exact_within: float) -> Objective:
@@ -141,7 +140,11 @@ class Slope:
     @classmethod
     def of(cls, J: Array, r: Array, *, keep_Q: bool = False) -> Slope:
         """Of J (trials, m, n), and residuals r (trials, m)."""
-        U, inverse_U, gradient, well = _by_normal_equations(J, r)
+        J = np.ascontiguousarray(J)  # as the bits of a product may depend on how J lies in memory
+        U, inverse_U, well = gram_factor(J)
+        well = well & finite(r)
+        with np.errstate(all="ignore"):
+            gradient = multiply(inverse_U.swapaxes(1, 2), multiply(J.swapaxes(1, 2), r))
         Q = np.matmul(J, inverse_U) if keep_Q else None
         if not well.all():
             QU, U[~well], inverse_U[~well], gradient[~well] = _by_orthogonal_factor(J[~well], r[~well])
@@ -172,26 +175,6 @@ class Slope:
         step, _ = solve(U, -multiply(Q[:, : self.U.shape[1]].swapaxes(1, 2), self.gradient))
         change = multiply(self.U, step)
         return step, -np.einsum("ti,ti->t", change, 2.0 * self.gradient + change)
-
-
-def _by_normal_equations(J: Array, r: Array) -> tuple[Array, Array, Array, Mask]:
-    """U, U^-1, Q' r, and where J is so well conditioned that they may be had from J' J, a third of the work of QR.
-
-    The columns of J are scaled first; what is lost of U is n eps times the condition squared (Higham, Accuracy and
-    Stability of Numerical Algorithms, 2002, section 20.4).
-    """
-    J = np.ascontiguousarray(J)  # as the bits of a product may depend on how J lies in memory
-    Jt = J.swapaxes(1, 2)
-    with np.errstate(all="ignore"):
-        G, along = np.matmul(Jt, J), multiply(Jt, r)
-        columns = np.sqrt(np.diagonal(G, axis1=1, axis2=2))
-        scaled = G / (columns[:, :, None] * columns[:, None, :])
-        usable = finite(scaled) & finite(along)
-        U = cholesky(np.where(usable[:, None, None], scaled, np.eye(G.shape[1])))
-        inverse_U, _ = inverse(U)
-        well = usable & (np.linalg.norm(inverse_U, axis=(1, 2)) * np.sqrt(G.shape[1]) <= _WELL_CONDITIONED)
-        inverse_U = inverse_U / columns[:, :, None]
-        return U * columns[:, None, :], inverse_U, multiply(inverse_U.swapaxes(1, 2), along), well
 
 
 def _by_orthogonal_factor(J: Array, r: Array) -> tuple[Array, Array, Array, Array]:

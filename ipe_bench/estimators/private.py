@@ -30,11 +30,12 @@ class Private:
 
     def __init__(self, problem: Problem, z: Array) -> None:
         self._shared, self._z = problem, z
-        prior = problem.prior_deviation
+        prior, correlation = problem.prior_deviation, problem.prior_correlation
         self.problem = Problem(
             afresh(problem.measurement),
             Covariance(problem.R.factor.copy()),
             None if prior is None else prior.copy(),
+            None if correlation is None else correlation.copy(),
         )
         self.z = z.copy()
         self.z.flags.writeable = False
@@ -48,6 +49,8 @@ class Private:
         if not _same(problem.R.factor, shared.R.factor):
             return "it writes into R"
         if not _same(problem.prior_deviation, shared.prior_deviation):
+            return "it writes into the prior"
+        if not _same(problem.prior_correlation, shared.prior_correlation):
             return "it writes into the prior"
         model = problem.measurement
         if _digest(model) != self._before or not _same(model.nominal, shared.measurement.nominal):

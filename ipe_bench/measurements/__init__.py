@@ -1,7 +1,7 @@
 """Measurement models: what a parameter vector makes the instruments read. Config group `measurement`."""
 
 from ipe_bench.measurements.accelerometer import Accelerometer
-from ipe_bench.measurements.base import Input, Measurement, Parameter, Restricted, UsualNoise
+from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, Restricted, UsualNoise
 from ipe_bench.measurements.bearings import Bearings
 from ipe_bench.measurements.bock import Bock
 from ipe_bench.measurements.falling_body import FallingBody
@@ -17,6 +17,7 @@ from ipe_bench.measurements.ode.model import OdeMeasurement
 from ipe_bench.measurements.polynomial import Polynomial
 from ipe_bench.measurements.ranging import Ranging
 from ipe_bench.measurements.sir import Sir
+from ipe_bench.measurements.six_position import SixPosition
 from ipe_bench.measurements.triad import Triad
 
 __all__ = [
@@ -37,9 +38,11 @@ __all__ = [
     "Parameter",
     "Polynomial",
     "Ranging",
+    "Recorded",
     "Restricted",
     "RicherGins",
     "Sir",
+    "SixPosition",
     "Triad",
     "UsualNoise",
 ]

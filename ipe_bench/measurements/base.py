@@ -61,7 +61,11 @@ class UsualNoise:
 
 @dataclass(frozen=True)
 class Recorded:
-    """Real readings that come with a model, and what is known of their answer."""
+    """Real readings that come with a model, and what is known of their answer.
+
+    A model whose `recorded` returns this needs no file: `ipe-bench estimate measurement=NAME` estimates from z, and
+    `ipe-bench run measurement=NAME noise=certified trials=1` scores estimators by x.
+    """
 
     z: Array
     """The readings (m,)."""
@@ -319,6 +323,14 @@ class Restricted(Measurement):
     @property
     def reading_unit(self) -> str:  # type: ignore[override]
         return self.whole.reading_unit
+
+    @property
+    def reading_name(self) -> str:  # type: ignore[override]
+        return self.whole.reading_name
+
+    @property
+    def usual_noise(self) -> UsualNoise | None:  # type: ignore[override]
+        return self.whole.usual_noise
 
     @property
     def own_parameters(self) -> Sequence[str]:

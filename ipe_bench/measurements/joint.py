@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,16 @@ class Joint(Measurement):
         """What the parameters of part k are called among those of all."""
         part = self.parts[k]
         return [f"{p.name}_{k + 1}" if p.name in part.own_parameters else p.name for p in part.natural_parameters]
+
+    @cached_property
+    def copies(self) -> Mapping[str, tuple[str, ...]]:
+        """What the parameters are called here of which every file has its own, by what the model calls them."""
+        found: dict[str, list[str]] = {}
+        for k, part in enumerate(self.parts):
+            for own, name in zip(part.natural_parameters, self._names(k), strict=True):
+                if own.name in part.own_parameters:
+                    found.setdefault(own.name, []).append(name)
+        return {name: tuple(each) for name, each in found.items()}
 
     @cached_property
     def _first(self) -> list[tuple[int, int]]:
@@ -124,6 +134,16 @@ class Joint(Measurement):
     @property
     def reading_unit(self) -> str:  # type: ignore[override]
         return self.parts[0].reading_unit
+
+    @property
+    def reading_name(self) -> str:  # type: ignore[override]
+        return self.parts[0].reading_name
+
+    @property
+    def usual_noise(self) -> UsualNoise | None:  # type: ignore[override]
+        """That of the parts, where it is one."""
+        known = [part.usual_noise for part in self.parts]
+        return known[0] if all(one == known[0] for one in known) else None
 
     def simulate(self, x: Array) -> Array:
         pairs = zip(self.parts, self._places, strict=True)

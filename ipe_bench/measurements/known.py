@@ -7,7 +7,7 @@ numbers, so that no estimator and no draw can leave the bounds.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, UsualNoise
+from ipe_bench.measurements.joint import Joint
 
 _NEAR = 1e-2
 """An estimate nearer to a bound than this share of the start's distance may be on its way there."""
@@ -63,10 +64,35 @@ class Known:
 def informed(model: Measurement, known: Sequence[Known]) -> Measurement:
     """The model in which so much is known of its parameters.
 
+    Of a parameter of which every file has its own, what is known of NAME is known of NAME_1, NAME_2 and so on, unless
+    that is said of one of them.
+
     Raises:
         UserError: of a parameter that the model does not have, or a start outside of its bounds.
     """
+    if isinstance(model, Joint):
+        known = _of_each_file(known, model)
     return Informed(model, tuple(known)) if known else model
+
+
+def _of_each_file(known: Sequence[Known], model: Joint) -> list[Known]:
+    """What is known of parameters by the names that they have among those of all files."""
+    general = [one for one in known if one.name in model.copies]
+    found = {name: replace(one, name=name) for one in general for name in model.copies[one.name]}
+    for one in known:
+        if one.name in found:
+            found[one.name] = _together(found[one.name], one)
+        elif one.name not in model.copies:
+            found[one.name] = one
+    return list(found.values())
+
+
+def _together(general: Known, own: Known) -> Known:
+    """What is known of a parameter of one file, where something is known of all: its own counts."""
+    if own.fixed is not None or general.fixed is not None:
+        return own
+    said = {f.name: getattr(own, f.name) for f in fields(own) if getattr(own, f.name) not in (None, False)}
+    return replace(general, **said)
 
 
 @dataclass(frozen=True)

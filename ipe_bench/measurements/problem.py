@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,10 +22,13 @@ class Problem:
     R: Covariance
     prior_deviation: Array | None = None
     """Standard deviation (n,) of the parameters about the nominal point; None where no prior is known."""
+    prior_correlation: Array | None = None
+    """Their correlation (n, n); None: they are independent."""
 
     def __post_init__(self) -> None:
-        if self.prior_deviation is not None:
-            object.__setattr__(self, "prior_deviation", read_only(self.prior_deviation))
+        for name in ("prior_deviation", "prior_correlation"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, read_only(getattr(self, name)))
 
     @property
     def x0(self) -> Array:
@@ -42,6 +45,21 @@ class Problem:
         if deviation is None:
             return None
         return inflation * np.maximum(deviation, _FIXED * deviation.max())
+
+    def prior_covariance(self, inflation: float = 1.0) -> Covariance | None:
+        """P0 with its deviations times `inflation`, as `prior_used` has them."""
+        deviation = self.prior_used(inflation)
+        if deviation is None or self.prior_correlation is None:
+            return None if deviation is None else Covariance(deviation)
+        return Covariance(deviation[:, None] * np.linalg.cholesky(self.prior_correlation))
+
+    @property
+    def scaled_prior(self) -> Array:
+        """P0 (n, n) in the prior's own deviations: what a filter begins with that counts in them."""
+        return np.eye(self.measurement.n) if self.prior_correlation is None else np.array(self.prior_correlation)
+
+    def without_prior(self) -> Problem:
+        return replace(self, prior_deviation=None, prior_correlation=None)
 
 
 def recorded_problem(measurement: Measurement) -> Problem:

@@ -7,7 +7,7 @@ a function that raises an AssertionError whose message is for the author; its do
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import numpy as np
@@ -28,7 +28,7 @@ from ipe_bench.noise.base import Noise
 from ipe_bench.noise.gaussian import Gaussian
 from ipe_bench.noise.own import ModelNoise
 from ipe_bench.plugins.construct import construct
-from ipe_bench.plugins.discovery import COMPONENT_GROUPS, Option, blame
+from ipe_bench.plugins.discovery import COMPONENT_GROUPS, Option, blame, composed
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.runs.execution import Execution, Failure
 from ipe_bench.runs.provenance import describe
@@ -41,6 +41,8 @@ SCATTERED = 60
 DRAWS = 10_000
 """Draws from which the covariance of a noise is known to about 1 %, or several where its tails are heavy."""
 _ROUND_OFF = 1e-9
+_SOME, _MOST = 6, 12
+"""Readings that a noise is tried on, and of which it is looked how they depend on each other."""
 
 
 class Spoiled(AssertionError):
@@ -58,11 +60,20 @@ class Finding:
 
 
 def check_component(name: str, component: Any) -> Iterator[Finding]:
-    """Runs the checks of the component's kind; a component of no kind is a finding itself."""
+    """Runs the checks of the component's kind; a component of no kind is a finding itself.
+
+    A model that takes what it knows of its readings from a file is tried with columns that are made up.
+    """
     checks = next((c for kind, c in _CHECKS.items() if isinstance(component, kind)), None)
     if checks is None:
         yield Finding(name, "is a component", "it is neither measurement, noise, prior, solver, baseline nor execution")
         return
+    if isinstance(component, Measurement) and not component.input_columns_known:
+        made_up = _with_columns(component)
+        if made_up is None:
+            yield Finding(name, "Takes columns of a file that cannot be made up, and is tried where there is one")
+            return
+        component = made_up
     for check in (describes_itself, *checks):
         title = (check.__doc__ or check.__name__).strip().splitlines()[0].rstrip(".")
         try:
@@ -92,8 +103,11 @@ def check_option(option: Option) -> Iterator[Finding]:
         yield Finding(name, "Has a config that can be read")
         return
     try:
-        component = construct(option.config, option.package or option.group)
-        yield from check_component(name, component)
+        config = composed(option)
+        if required := [key for key, value in config.items() if value == "???"]:
+            yield Finding(name, f"Names what is to be given, {', '.join(required)}, and is tried where it is")
+            return
+        yield from check_component(name, construct(config, option.package or option.group))
     except UserError as error:
         yield Finding(name, "Can be made from its config", str(error))
     except Exception as error:
@@ -284,6 +298,25 @@ def keeps_a_history_if_asked(estimator: Estimator) -> None:
 # Measurement models
 
 
+def _with_columns(model: Measurement) -> Measurement | None:
+    """The model with columns of no particular numbers, about 1, or where those must be one number with that; None where
+    it makes no sense with either."""
+    count, rng = 2 * model.n + 4, np.random.default_rng(2)
+    numbers = [i.heading for i in model.inputs if i.default is None and not i.label]
+    varied = {name: rng.permutation(np.linspace(0.5, 1.5, count)).tolist() for name in numbers}
+    same = varied | dict.fromkeys(numbers[1:], [1.0] * count)
+    labels = {i.heading: [1 if i.default is None else i.default] * count for i in model.inputs}
+    for columns in (labels | varied, labels | same):
+        try:
+            tried = model.with_inputs(columns, count)
+            with np.errstate(all="ignore"):
+                if np.isfinite(tried.simulate(_points(tried))).all():
+                    return tried
+        except UserError:
+            continue
+    return None
+
+
 def _points(model: Measurement, trials: int = 4) -> Array:
     """A tenth of a unit around the nominal point, where every model makes sense."""
     return model.nominal + 0.1 * np.random.default_rng(11).standard_normal((trials, model.n))
@@ -364,12 +397,25 @@ def orders_its_epochs(model: Measurement) -> None:
 # Noise
 
 
+def _count(noise: Noise) -> int:
+    """How many readings the noise is tried on: a few, or as many as it is made for, where an option is a list."""
+    lists = [getattr(noise, f.name) for f in fields(noise)]  # type: ignore[arg-type]
+    for m in (_SOME, *(len(value) for value in lists if isinstance(value, tuple))):
+        try:
+            noise.covariance(m)
+        except UserError:
+            continue
+        return m
+    return _SOME
+
+
 def states_its_covariance(noise: Noise) -> None:
     """States a covariance R that whitens as many readings as there are."""
     if noise.real or isinstance(noise, ModelNoise):
         return  # R comes with the readings, or with the model.
-    R = noise.covariance(6)
-    assert R.m == 6, f"covariance(6) is for {R.m} readings"
+    m = _count(noise)
+    R = noise.covariance(m)
+    assert R.m == m, f"covariance({m}) is for {R.m} readings"
     assert (R.deviations > 0).all(), "a standard deviation is not above 0"
 
 
@@ -382,7 +428,8 @@ def corrupts_reproducibly(noise: Noise) -> None:
     """Gives the same readings from the same random stream, and leaves h alone."""
     if _draws_nothing(noise):
         return
-    h, offset = np.linspace(-1.0, 1.0, 6), np.zeros(6)
+    m = _count(noise)
+    h, offset = np.linspace(-1.0, 1.0, m), np.zeros(m)
     copy = h.copy()
     first, second = (noise.corrupt(h, offset, np.random.default_rng(3)) for _ in range(2))
     assert np.array_equal(h, copy), "corrupt writes into h"
@@ -394,7 +441,7 @@ def draws_what_it_states(noise: Noise) -> None:
     """Draws errors of mean zero whose variances and correlations are those of R."""
     if _draws_nothing(noise) or not noise.true_covariance:
         return
-    m = 6
+    m = _count(noise)
     R, rng = noise.covariance(m), np.random.default_rng(7)
     # Spread over many steps of whatever rounds or repeats.
     h = rng.uniform(-1000.0, 1000.0, (DRAWS, m)) * R.deviations
@@ -402,9 +449,10 @@ def draws_what_it_states(noise: Noise) -> None:
     w = R.whiten(v)
     mean, limit = w.mean(axis=0), 6 * w.std(axis=0) / np.sqrt(DRAWS) + 0.02
     assert (np.abs(mean) < limit).all(), f"the errors' mean is {np.abs(mean).max():.3g} of the deviation that R states"
+    w = w[:, :_MOST]
     products = w[:, :, None] * w[:, None, :]
     C = products.mean(axis=0)
-    off = np.abs(C - np.eye(m)) - 6 * products.std(axis=0) / np.sqrt(DRAWS) - 0.05
+    off = np.abs(C - np.eye(w.shape[1])) - 6 * products.std(axis=0) / np.sqrt(DRAWS) - 0.05
     if (np.diag(off) > 0).any():
         i = int(np.diag(off).argmax())
         raise AssertionError(
@@ -426,7 +474,7 @@ def states_its_law(noise: Noise) -> None:
 
     if _draws_nothing(noise) or not noise.true_covariance:
         return
-    m, draws = 6, DRAWS // 5
+    m, draws = _count(noise), DRAWS // 5
     rng = np.random.default_rng(9)
     R = noise.covariance(m)
     h = rng.uniform(-1000.0, 1000.0, (draws, m)) * R.deviations
@@ -450,7 +498,8 @@ _MANY = 4
 
 
 def _x0_and_deviation(prior: Prior, error_scale: float = 1.0) -> tuple[Array, Array]:
-    n = len(getattr(prior, "deviations", None) or [1.0] * _MANY)
+    given = getattr(prior, "deviations", None) or getattr(prior, "correlations", None)
+    n = len(given or [1.0] * _MANY)
     return np.linspace(-1.0, 1.0, n), np.asarray(prior.deviation(n, error_scale))
 
 
@@ -478,10 +527,15 @@ def draws_reproducibly(prior: Prior) -> None:
 
 
 def draws_what_is_told(prior: Prior) -> None:
-    """Draws independent parameters of the mean x0 and the deviations that it states, normal where it says so."""
+    """Draws parameters of the mean x0 and of the deviations and correlations that it states, normal where it says
+    so."""
     from scipy.stats import kstest
 
     x0, deviation = _x0_and_deviation(prior, 2.0)
+    stated = prior.correlation(len(x0))
+    C = np.eye(len(x0)) if stated is None else stated
+    assert C.shape == (len(x0),) * 2, f"correlation returns {C.shape}, and not {(len(x0),) * 2}"
+    C = C[np.ix_(deviation > 0, deviation > 0)]
     rng = np.random.default_rng(7)
     x = np.array([prior.draw(x0.copy(), 2.0, rng) for _ in range(DRAWS)]) - x0
     assert np.array_equal(x[:, deviation == 0], np.zeros((DRAWS, int((deviation == 0).sum())))), (
@@ -491,12 +545,14 @@ def draws_what_is_told(prior: Prior) -> None:
     off = np.abs(w.mean(axis=0)) - 6 * w.std(axis=0) / np.sqrt(DRAWS)
     assert (off < 0).all(), f"the mean is off x0 by up to {np.abs(w.mean(axis=0)).max():.3g} of the stated deviation"
     products = w[:, :, None] * w[:, None, :]
-    off = np.abs(products.mean(axis=0) - np.eye(w.shape[1])) - 6 * products.std(axis=0) / np.sqrt(DRAWS)
+    off = np.abs(products.mean(axis=0) - C) - 6 * products.std(axis=0) / np.sqrt(DRAWS)
     i, j = (int(k) for k in np.unravel_index(int(off.argmax()), off.shape))
     assert off[i, j] < 0 or i != j, (
         f"the draws have {w[:, i].std():.3g} times the stated deviation, on average over {DRAWS} draws"
     )
-    assert off[i, j] < 0, f"two parameters have the correlation {products[:, i, j].mean():.2f}; estimators are told 0"
+    assert off[i, j] < 0, (
+        f"two parameters have the correlation {products[:, i, j].mean():.2f}; estimators are told {C[i, j]:.2g}"
+    )
     p = min(float(kstest(w[:, i], "norm").pvalue) for i in range(w.shape[1]))
     assert not prior.normal or p > 1e-6, f"the draws are not normal (p = {p:.1g}); set `normal` to False"
 

@@ -41,13 +41,13 @@ def described(option: Option) -> list[Described]:
     if option.target is None:
         return [Described(str(key), _written(value), "", "") for key, value in config.items() if key != "defaults"]
     cls = find_class(option.target, f"{option.group}.{option.name}")
-    kinds, meanings, comments = option_types(cls), _meanings(cls), _comments(option.text)
+    kinds, texts, comments = option_types(cls), meanings(cls), option.comments
     return [
         Described(
             field.name,
             _value(field, config),
             describe_type(kinds[field.name]),
-            meanings.get(field.name) or comments.get(field.name, ""),
+            texts.get(field.name) or comments.get(field.name, ""),
         )
         for field in dataclasses.fields(cls)
         if field.init
@@ -76,7 +76,7 @@ def _written(value: Any) -> str:
     return "" if value == "???" else type(value).__name__ if dataclasses.is_dataclass(value) else str(value)
 
 
-def _meanings(cls: type) -> dict[str, str]:
+def meanings(cls: type) -> dict[str, str]:
     """By field, the text below it, of the class and its bases."""
     found: dict[str, str] = {}
     for base in reversed(cls.__mro__):
@@ -91,22 +91,4 @@ def _meanings(cls: type) -> dict[str, str]:
             match field, text:
                 case ast.AnnAssign(target=ast.Name(name)), ast.Expr(value=ast.Constant(value=str(words))):
                     found[name] = " ".join(words.split())
-    return found
-
-
-def _comments(text: str) -> dict[str, str]:
-    """By key, the comment at the end of its line, or else the one above it, which several keys may share."""
-    found: dict[str, str] = {}
-    block: list[str] = []
-    commenting = False
-    for line in text.splitlines():
-        if line.startswith("#"):
-            block = [*block, line] if commenting else [line]
-        key, colon, rest = line.partition(":")
-        if colon and key == TARGET:
-            block = []
-        elif colon and key.isidentifier():
-            shared = " ".join(part.lstrip("# ").strip() for part in block)
-            found[key] = rest.partition(" #")[2].strip() or shared
-        commenting = line.startswith("#")
     return found

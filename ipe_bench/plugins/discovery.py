@@ -14,16 +14,16 @@ import math
 import os
 import re
 import sys
+import tomllib
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from ipe_bench.basics.errors import UserError, describe_exception
-from ipe_bench.plugins.construct import register_package
+from ipe_bench.basics.errors import UserError, describe_exception, unknown
 
 ENTRY_POINTS = "ipe_bench.plugins"
 ESTIMATOR_GROUPS = ("solver", "baseline")
@@ -100,6 +100,24 @@ class Option:
         found = _TARGET_LINE.search(self.text)
         return found.group(1) if found else None
 
+    @property
+    def comments(self) -> dict[str, str]:
+        """By key, the comment at the end of its line, or else the one above it, which several keys may share."""
+        found: dict[str, str] = {}
+        block: list[str] = []
+        commenting = False
+        for line in self.text.splitlines():
+            if line.startswith("#"):
+                block = [*block, line] if commenting else [line]
+            key, colon, rest = line.partition(":")
+            if colon and key == "_target_":
+                block = []
+            elif colon and key.isidentifier():
+                shared = " ".join(part.lstrip("# ").strip() for part in block)
+                found[key] = rest.partition(" #")[2].strip() or shared
+            commenting = line.startswith("#")
+        return found
+
     @functools.cached_property
     def fault(self) -> str | None:
         """Why it cannot be used, in a line with the remedy; None where it can, as far as the file tells."""
@@ -113,12 +131,52 @@ class Option:
             return f"{self.path}: cannot be read ({error.strerror})"
         if self.group in ESTIMATOR_GROUPS and self.package != f"estimators.{self.label}":
             return f"{self.path}: its first line must be '# @package estimators.{self.label}', or it never runs"
-        return _yaml_fault(self.path, text)
+        return _yaml_fault(self.path, text) or self._lack()
+
+    def _lack(self) -> str | None:
+        """What has to be installed before a plugin in a folder can be used."""
+        home = self.source.conf.parent.parent
+        lacking = " and ".join(_not_installed(home / "pyproject.toml"))
+        return f"needs {lacking}, not installed here; pip install {_shown(home)}" if lacking else None
 
     @property
     def label(self) -> str:
         """What an estimator is called in tables."""
         return Path(self.name).name
+
+
+@functools.cache
+def _not_installed(project: Path) -> tuple[str, ...]:
+    """The distributions that a pyproject.toml names as needed and that are not here, as far as can be told."""
+    try:
+        needed = tomllib.loads(project.read_text(encoding="utf-8"))["project"]["dependencies"]
+        names = [re.split(r"[^\w.-]", str(line))[0] for line in needed if ";" not in str(line)]
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return ()
+    return tuple(name for name in names if name and not _is_installed(name))
+
+
+def _is_installed(name: str) -> bool:
+    try:
+        importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        # One that is on the path without having been installed will do.
+        return name.replace("-", "_").isidentifier() and _has_module(name.replace("-", "_"))
+    return True
+
+
+def _has_module(name: str) -> bool:
+    try:
+        found = importlib.util.find_spec(name)
+    except (ImportError, ValueError):
+        return False
+    return found is not None and found.origin is not None  # a mere folder of that name has none
+
+
+def _shown(folder: Path) -> Path:
+    """A folder as one would type it from here."""
+    here = Path.cwd()
+    return folder.relative_to(here) if folder.is_relative_to(here) else folder
 
 
 def _yaml_fault(path: Path, text: str) -> str | None:
@@ -197,7 +255,7 @@ def take_problems() -> list[str]:
 @functools.cache
 def sources() -> tuple[Source, ...]:
     """Ours first, then the installed plugins, then the folders `plugins/*/`; their packages become importable."""
-    found = [Source("ipe-bench", own_conf(), "built in"), *_installed()]
+    found = installed_sources()
     for folder in dict.fromkeys([*_folders(), *_added]):
         try:
             found += _in_folder(folder)
@@ -212,6 +270,11 @@ def sources() -> tuple[Source, ...]:
                 f"plugin {source.conf.parent}: {known.conf.parent} is called {source.name} too; it is left out"
             ] = None
     return tuple(unique.values())
+
+
+def installed_sources() -> list[Source]:
+    """Ours, then the installed plugins: what is the same in every folder."""
+    return [Source("ipe-bench", own_conf(), "built in"), *_installed()]
 
 
 def _same_file(a: Path, b: Path) -> bool:
@@ -248,7 +311,7 @@ def _installed() -> Iterator[Source]:
         if spec is None or not spec.submodule_search_locations:
             _problems[f"plugin {entry.name}: {reason}; it is left out, install it again"] = None
             continue
-        register_package(entry.value.split(".")[0])
+        _register(entry.value.split(".")[0])
         version = f" {entry.dist.version}" if entry.dist else ""
         conf = Path(spec.submodule_search_locations[0]) / "conf"
         yield Source(entry.value, conf, f"{entry.dist.name if entry.dist else entry.name}{version}")
@@ -259,8 +322,15 @@ def _in_folder(folder: Path) -> Iterator[Source]:
         package = conf.parent.name
         if (conf.parent / "__init__.py").is_file():
             _make_importable(folder)
-            register_package(package)
+            _register(package)
             yield Source(package, conf, f"{folder.parent.name}/{folder.name}")
+
+
+def _register(package: str) -> None:
+    # Late: it loads NumPy, for which a shell that completes a word has no time.
+    from ipe_bench.plugins.construct import register_package
+
+    register_package(package)
 
 
 def _make_importable(folder: Path) -> None:
@@ -293,6 +363,44 @@ def options(group: str | None = None) -> list[Option]:
     return [o for o in found.values() if group is None or o.group == group]
 
 
+def composed(option: Option, seen: Sequence[str] = ()) -> dict[str, Any]:
+    """What an option says together with the options of its group that its `defaults` name, as Hydra composes them:
+    later ones replace what earlier ones say, and the file itself comes last unless `_self_` stands elsewhere.
+
+    Raises:
+        UserError: the defaults name what is not there, or what is of another group.
+    """
+    config = dict(option.config or {})
+    defaults = config.pop("defaults", [])
+    if not isinstance(defaults, list):
+        raise UserError(f"{option.path}: defaults is not a list; write defaults: [NAME]")
+    names = [*defaults, *([] if "_self_" in defaults else ["_self_"])]
+    found: dict[str, Any] = {}
+    for entry in names:
+        if entry == "_self_":
+            found = _merged(found, config)
+            continue
+        if not isinstance(entry, str):
+            raise UserError(f"{option.path}: defaults has {entry}; write names of other options of {option.group}")
+        name = entry.removesuffix("@_here_").removeprefix(f"/{option.group}/")
+        if name in (*seen, option.name):
+            raise UserError(f"{option.path}: defaults leads back to {name}; leave one of the two out")
+        known = {o.name: o for o in options(option.group)}
+        if name not in known:
+            raise UserError(f"{option.path}: defaults: {unknown(name, known, f'option of {option.group}')}")
+        found = _merged(found, composed(known[name], (*seen, option.name)))
+    return found
+
+
+def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    """Both, the second in the place of the first but where both are mappings."""
+    result = dict(first)
+    for key, value in second.items():
+        both = isinstance(value, Mapping) and isinstance(result.get(key), Mapping)
+        result[key] = _merged(result[key], value) if both else value
+    return result
+
+
 def options_in(folder: Path) -> list[Option]:
     """The options of a plugin's folder that can be checked, with those that they clash with.
 
@@ -300,7 +408,9 @@ def options_in(folder: Path) -> list[Option]:
         UserError: there is no plugin in the folder, or nothing to check.
     """
     if not folder.is_dir():
-        raise UserError(f"{folder}: there is no such folder")
+        beside = Path("plugins") / folder.name.rpartition("=")[2]
+        meant = beside if beside.is_dir() else "a plugin's folder, such as plugins/my_plugin"
+        raise UserError(f"{folder}: there is no such folder; give {meant}")
     if not add_folder(folder):
         raise UserError(f"{folder}: holds no package with a folder conf in it; see `ipe-bench new`")
     home = folder.resolve()

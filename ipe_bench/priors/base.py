@@ -15,9 +15,9 @@ from ipe_bench.basics.options import Component
 class Prior(Component, Named, ABC):
     """A prior. A new one is a frozen dataclass that writes `deviation` and `draw`.
 
-    Estimators that use a prior are told N(nominal, deviation^2) with independent parameters, and the Bayesian bound is
-    the one under that. A prior of another form has draws of the same mean and deviations, and sets `normal` to False:
-    then that bound is one for estimators that know no more than mean and deviations.
+    Estimators that use a prior are told N(nominal, P0), P0 being of these deviations and of `correlation`, and the
+    Bayesian bound is the one under that. A prior of another form has draws of the same mean and covariance, and sets
+    `normal` to False: then that bound is one for estimators that know no more than mean and covariance.
     """
 
     normal: ClassVar[bool] = True
@@ -26,6 +26,11 @@ class Prior(Component, Named, ABC):
     @abstractmethod
     def deviation(self, n: int, error_scale: float) -> Array:
         """Standard deviations (n,) of the parameters in multiples of their units."""
+
+    def correlation(self, n: int) -> Array | None:
+        """Correlation (n, n) of the parameters, positive definite; None: they are independent."""
+        del n
+        return None
 
     @abstractmethod
     def draw(self, x0: Array, error_scale: float, rng: np.random.Generator) -> Array:

@@ -1,11 +1,13 @@
 """What can be signed of an answer beyond its standard errors: intervals that follow the bends of the model, what the
 readings say least of, which of them carry the answer, and whether another answer fits as well.
 
-One least-squares minimum is examined, whichever estimator found it. Profiles have a page of their own.
+One least-squares minimum is examined, whichever estimator found it, and one with the prior where estimators are told
+one. Profiles have a page of their own, and so has the prior.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -13,14 +15,15 @@ import numpy as np
 from scipy.stats import chi2
 from scipy.stats import f as fisher
 
-from ipe_bench.basics.linalg import Array, Covariance, deviations
+from ipe_bench.basics.linalg import Array, Covariance, deviations, inverse
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.least_squares import Minima, Objective, minimize
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
-from ipe_bench.measurements.base import Measurement
+from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.real.fits import Fit, holding, present_part
-from ipe_bench.real.profiles import Profile, half_width, profiles
+from ipe_bench.real.penalised import penalised
+from ipe_bench.real.profiles import Profile, Released, end_within, half_width, profiles, profiles_within
 
 CONFIDENCE = 0.95
 BOOTSTRAPS = 500
@@ -91,6 +94,19 @@ class Bootstrap:
 
 
 @dataclass(frozen=True)
+class OnBound:
+    """A parameter whose estimate is on a bound, because the readings want it beyond."""
+
+    place: int
+    """Which of the parameters of the fit,"""
+    parameter: Parameter
+    bound: float
+    other: float
+    """and the other end of its profile interval, of which the bound is the first; infinite where the readings set no
+    limit, NaN where it was not found. See `profiles.end_within`."""
+
+
+@dataclass(frozen=True)
 class Examination:
     """An answer with all that is known of it."""
 
@@ -118,6 +134,10 @@ class Examination:
     """All that were found, the least first."""
     least: bool
     """Whether the estimate is the least minimum that was found."""
+    on_bounds: tuple[OnBound, ...] = ()
+    """Parameters that are held on their bounds, which are not among the others."""
+    with_prior: bool = False
+    """Whether it is the minimum with the prior; see `penalised`. Then its intervals count the prior, too."""
 
     @property
     def ambiguous(self) -> list[Minimum]:
@@ -126,19 +146,92 @@ class Examination:
         return [one for one in self.minima if one.as_good and (np.abs(one.x - self.x) > apart).any()]
 
 
+def examinations(problem: Problem, z: Array, fits: list[Fit]) -> tuple[Examination, ...]:
+    """Of the least-squares minimum, and of that with the prior: those that estimators have found."""
+    found = examine(problem, z, fits), examine_with_prior(problem, z, fits)
+    return tuple(one for one in found if one is not None)
+
+
 def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BOOTSTRAPS) -> Examination | None:
     """Examines the least of the minima that the estimators found; None where none of them is one, as with a prior."""
-    found = [one for one in fits if one.status is Status.CONVERGED and np.isfinite(one.chi_square)]
-    told = [one for one in found if not one.with_prior]
+    told = [one for one in _converged(fits) if not one.with_prior]
     if not told:
         return None
-    best = min(told, key=_sum_of_squares)
-    rows = np.flatnonzero(np.isfinite(z))
+    whole, best = problem, min(told, key=_sum_of_squares)
+    rows, on_bounds = np.flatnonzero(np.isfinite(z)), best.held_at
     if best.held is not None:
         # What is on its bound has no error; the others are examined with it held there.
-        problem, best = holding(problem, best.held_at), best.held
+        problem, best = holding(problem, on_bounds), best.held
     least = _Least.near(present_part(problem, rows, best.level), z[rows], best)
+    if least is None:
+        return None
+    found = least.examined(best.label, problem, rows, bootstraps)
+    if not on_bounds:
+        return found
+    released = _released(whole, rows, least, best.level, on_bounds)
+    if released is not None:
+        asked = {"confidence": CONFIDENCE, "freedom": least.freedom}
+        within = profiles_within(least.problem, least.z, least.x, least.P, released, **asked)
+        found = replace(found, profiles=within)
+    return replace(found, on_bounds=tuple(_on_bounds(whole, z, rows, least, best.level, on_bounds)))
+
+
+def _released(
+    problem: Problem, rows: Array, least: _Least, level: float | None, values: Mapping[int, float]
+) -> Released | None:
+    """The problem in which what is on bounds may leave them; None where nothing is known of it there."""
+    places = np.array(list(values))
+    start = problem.measurement.natural(problem.measurement.nominal[None])[0]
+    given = present_part(replace(problem, measurement=problem.measurement.released(values)), rows, level)
+    x = np.array(given.measurement.nominal, dtype=float)
+    x[np.setdiff1d(np.arange(len(x)), places)] = least.x
+    with np.errstate(all="ignore"):
+        J = given.R.whiten_jacobian(given.measurement.jacobian(x[None]))
+        P, singular = inverse(np.matmul(J.swapaxes(1, 2), J))
+    if singular[0] or not (np.diag(P[0]) > 0).all():
+        return None
+    return Released(given, x, P[0], places, np.sign(start[places] - np.array(list(values.values()))))
+
+
+def examine_with_prior(
+    problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BOOTSTRAPS
+) -> Examination | None:
+    """Examines the minimum with the prior that is least where the estimators with one have ended; None without any."""
+    told = [one for one in _converged(fits) if one.with_prior]
+    if not told or problem.prior_deviation is None:
+        return None
+    rows = np.flatnonzero(np.isfinite(z))
+
+    def sum_of_all(one: Fit) -> float:
+        prior = problem.prior_covariance(one.prior_inflation)
+        assert prior is not None
+        return _sum_of_squares(one) / (one.level or 1.0) ** 2 + float(np.sum(prior.whiten(one.inner - problem.x0) ** 2))
+
+    best = min(told, key=sum_of_all)
+    part = present_part(problem, rows, best.level)
+    least = _Least.near(*penalised(part, z[rows], best.prior_inflation), best, readings=len(rows))
     return None if least is None else least.examined(best.label, problem, rows, bootstraps)
+
+
+def _converged(fits: list[Fit]) -> list[Fit]:
+    return [one for one in fits if one.status is Status.CONVERGED and np.isfinite(one.chi_square)]
+
+
+def _on_bounds(
+    problem: Problem, z: Array, rows: Array, least: _Least, level: float | None, values: Mapping[int, float]
+) -> Iterator[OnBound]:
+    """What the readings say of each parameter on its bound, the others being held on theirs."""
+    model = problem.measurement
+    limits = np.sort(model.natural(np.stack([np.full(model.n, -np.inf), np.full(model.n, np.inf)])), axis=0)
+    for place, bound in values.items():
+        others = {k: value for k, value in values.items() if k != place}
+        k = place - sum(other < place for other in others)
+        part = _released(holding(problem, others) if others else problem, rows, least, level, {k: bound})
+        other = np.nan
+        if part is not None:
+            towards = {"confidence": CONFIDENCE, "freedom": least.freedom}
+            other = end_within(part.problem, z[rows], part.x, part.P, k, int(part.inwards[0]), **towards)
+        yield OnBound(place, model.natural_parameters[place], bound, float(np.clip(other, *limits[:, place])))
 
 
 def _sum_of_squares(one: Fit) -> float:
@@ -156,20 +249,22 @@ class _Least:
     chi_square: float
     freedom: int | None
     """Degrees of freedom that the level of the noise is estimated from; None where it is known."""
+    readings: int
+    """How many of z are readings: the others are the prior's means."""
 
     @classmethod
-    def near(cls, problem: Problem, z: Array, best: Fit) -> _Least | None:
+    def near(cls, problem: Problem, z: Array, best: Fit, *, readings: int | None = None) -> _Least | None:
         minima = _minimise(problem, z[None], best.inner[None])
         if not minima.converged[0] or not (np.diag(minima.covariance[0]) > 0).all():
             return None
-        free = len(z) - problem.measurement.n
-        if best.level is not None:
+        free, readings = best.degrees_of_freedom, len(z) if readings is None else readings
+        if best.level is not None and readings == len(z):
             # The minimum's own level, where the estimator's was a little higher.
             factor = float(np.sqrt(minima.chi_square[0] / free))
             problem = replace(problem, R=Covariance(problem.R.factor * factor))
             minima = replace(minima, covariance=minima.covariance * factor**2, chi_square=minima.chi_square / factor**2)
         level = None if best.level is None else free
-        return cls(problem, z, minima.x[0], minima.covariance[0], float(minima.chi_square[0]), level)
+        return cls(problem, z, minima.x[0], minima.covariance[0], float(minima.chi_square[0]), level, readings)
 
     @property
     def model(self) -> Measurement:
@@ -188,10 +283,11 @@ class _Least:
         ends = np.sort(model.natural(np.stack([self.x - q * deviation, self.x + q * deviation])), axis=0)
         h, raw = whole.measurement.simulate(x)[0], whole.measurement.jacobian(x)[0]
         errors = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", raw, self.P, raw), 0.0))
-        deviations = _at(rows, self.problem.R.deviations, m)
-        if np.ptp(self.problem.R.deviations) == 0:
+        known = self.problem.R.deviations[: self.readings]
+        deviations = _at(rows, known, m)
+        if np.ptp(known) == 0:
             # Where all readings are as good, so is one that is missing; else nobody knows.
-            deviations[:] = self.problem.R.deviations[0]
+            deviations[:] = known[0]
         minima = self.minima()
         return Examination(
             label,
@@ -209,6 +305,7 @@ class _Least:
             q,
             minima,
             self.chi_square <= minima[0].chi_square + 1e-6 * max(1.0, self.chi_square),
+            with_prior=self.readings < len(self.z),
         )
 
     def direction(self) -> Direction:
@@ -229,7 +326,7 @@ class _Least:
             cook = w**2 * leverage / (n * left**2)
             moved = self.P @ self.J.T * (w / left)
         shift = np.abs(moved / np.sqrt(np.diag(self.P))[:, None]).max(axis=0)
-        return Influence(*(_at(rows, values, m) for values in (leverage, cook, shift)))
+        return Influence(*(_at(rows, values[: self.readings], m) for values in (leverage, cook, shift)))
 
     def bootstrap(self, draws: int) -> Bootstrap:
         """Estimates from readings simulated at the estimate, started there, with noise of R; the draws are always the
@@ -245,7 +342,7 @@ class _Least:
         level = np.ones(draws)
         if self.freedom is not None:
             level = np.sqrt(self.freedom / rng.chisquare(self.freedom, draws))
-        e *= level[:, None]
+        e[:, : self.readings] *= level[:, None]
         h = self.model.simulate(self.x[None])[0]
         z = h + (e * factor if factor.ndim == 1 else e @ factor.T)
         minima = _minimise(self.problem, z, np.repeat(self.x[None], draws, axis=0))

@@ -22,7 +22,7 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.gaussian import Gaussian
 from ipe_bench.real.residuals import Whiteness, explained, normalised, outlier_limit, whiteness
-from ipe_bench.trials.fit_test import fit_probability, spread_of
+from ipe_bench.trials.fit_test import fit_probability, inflation_of, spread_of
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
 _NORMAL = Gaussian(1.0)
@@ -77,7 +77,9 @@ class Fit:
     """Where parameters are on their bounds: the fit of the model in which they are held there. Errors of the others are
     from it; those on a bound have none."""
     with_prior: bool = False
-    """Whether the estimator was told a prior, so that x is not the least-squares estimate."""
+    """Whether the estimator was told a prior, so that x is not the least-squares estimate,"""
+    prior_inflation: float = 1.0
+    """and by how much it widened its deviations."""
     beaten: bool = False
     """Whether another estimator's sum of squares is so much smaller that chance does not explain it: tested where the
     level is estimated, because there nothing else tells a wrong answer."""
@@ -261,7 +263,7 @@ def present_part(problem: Problem, rows: NDArray[np.intp], level: float | None =
 
 def _restricted(problem: Problem, rows: Array) -> Problem:
     model = Restricted(problem.measurement, tuple(rows.tolist()))
-    return Problem(model, problem.R.restricted(rows), problem.prior_deviation)
+    return replace(problem, measurement=model, R=problem.R.restricted(rows))
 
 
 def _succession(model: Measurement, present: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -290,10 +292,11 @@ def _fit_one(label: str, estimator: Estimator, problem: Problem, z: Array, *wher
 
 def holding(problem: Problem, values: Mapping[int, float]) -> Problem:
     """The problem with some parameters fixed at values in their own units."""
-    deviation = problem.prior_deviation
-    if deviation is not None:
-        deviation = np.delete(deviation, list(values))
-    return Problem(problem.measurement.holding(values), problem.R, deviation)
+    kept = [k for k in range(problem.measurement.n) if k not in values]
+    deviation, correlation = problem.prior_deviation, problem.prior_correlation
+    deviation = None if deviation is None else deviation[kept]
+    correlation = None if correlation is None else correlation[np.ix_(kept, kept)]
+    return Problem(problem.measurement.holding(values), problem.R, deviation, correlation)
 
 
 def _is_minimum(problem: Problem, held: Fit, near: Mapping[int, float], z: Array) -> bool:
@@ -378,6 +381,7 @@ def _fit_inside(
         estimates.x[0],
         P,
         with_prior="prior" in estimator.needs,
+        prior_inflation=inflation_of(estimator),
     )
 
 

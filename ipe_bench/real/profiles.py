@@ -130,6 +130,107 @@ def profiles_of_sets(
     return [[one.profile() for one in looked[k * n : (k + 1) * n]] for k in range(sets)]
 
 
+def end_within(
+    problem: Problem,
+    z: Array,
+    x: Array,
+    P: Array,
+    place: int,
+    sign: int,
+    *,
+    confidence: float = 0.95,
+    freedom: int | None = None,
+) -> float:
+    """The other end, in its own unit, of the profile interval of a parameter whose estimate is on a bound; x (n,) is
+    the minimum with it there, and `sign` leads inwards. Infinite where the readings set no limit, NaN where the bound
+    is not the minimum.
+
+    The rise of chi-square is compared with the same quantile as inside of bounds. Below the bound the true value may be
+    anywhere, and an estimate on the bound is only nearer to it than one beyond would be: the interval holds it at
+    least as often as it says, from 95 to 97.5 % where the model is linear.
+    """
+    q = half_width(confidence, freedom)
+    least = float(squared(problem.R.whiten(problem.measurement.simulate(x[None]) - z))[0])
+    looked = _Looked(_Set(problem, z, x, P, 1.0, least), place, q)
+    asked = [(looked, looked.centre + sign * f * q * looked.deviation) for f in _FIRST]
+    for _ in range(_ROUNDS + 1):
+        _look(problem, asked)
+        at = looked.next(sign)
+        if at is None:
+            break
+        asked = [(looked, at)]
+    if looked.lower:
+        return np.nan
+    end = looked.centre + sign * looked.end(sign)
+    return float(looked._natural(np.array([end]))[0])
+
+
+@dataclass(frozen=True)
+class Released:
+    """A problem in which parameters that are on their bounds may leave them inwards."""
+
+    problem: Problem
+    """With those parameters free of bounds,"""
+    x: Array
+    """the minimum (n,) with them on their bounds,"""
+    P: Array
+    """and the covariance (n, n) there."""
+    places: NDArray[np.intp]
+    """Which of the parameters they are,"""
+    inwards: Array
+    """and the sign that leads inwards, of each."""
+
+    @property
+    def others(self) -> NDArray[np.intp]:
+        return np.setdiff1d(np.arange(len(self.x)), self.places)
+
+    def relax(self, z: Array, asked: list[tuple[_Looked, float]]) -> None:
+        """Lowers what was seen with the parameters on their bounds to what is seen where they leave them."""
+        places = self.others[[one.place for one, _ in asked]]
+        values, rows = np.array([at for _, at in asked]), np.arange(len(asked))
+        model = Pinned(self.problem.measurement, Tally.zeros(len(asked)), places=places, values=values)
+        moved = (values - self.x[places]) / self.P[places, places]
+        begin = self.x + self.P[:, places].T * moved[:, None]
+        x = np.stack([np.delete(start, place) for start, place in zip(begin, places, strict=True)])
+        readings = np.repeat(z[None], len(asked), axis=0)
+        with np.errstate(all="ignore"):
+            objective = Objective(model, self.problem.R, readings, rows, self.problem.x0)
+            method = LevenbergMarquardtMethod(1e-3)
+            x = minimize(objective, method, x, tolerance=_TOLERANCE, max_iterations=_MOST_STEPS).x
+            sums = squared(self.problem.R.whiten(model.simulate(x, rows) - readings))
+        left = (model.whole(x, rows) - self.x)[:, self.places] * self.inwards
+        inwards = np.all(left >= 0, axis=1)
+        for (one, at), total, inside in zip(asked, sums.tolist(), inwards, strict=True):
+            if inside and np.isfinite(total):
+                one.lower_to(at, total)
+
+
+def profiles_within(
+    problem: Problem,
+    z: Array,
+    x: Array,
+    P: Array,
+    released: Released,
+    *,
+    confidence: float = 0.95,
+    freedom: int | None = None,
+) -> list[Profile]:
+    """Those of the parameters that are not on bounds, about the minimum x (n,) with the others held there: the latter
+    may move inwards where that fits better, so that the intervals are not those of parameters that are known."""
+    q = half_width(confidence, freedom)
+    least = float(squared(problem.R.whiten(problem.measurement.simulate(x[None]) - z))[0])
+    whole = _Set(problem, z, x, P, 1.0, least)
+    looked = [_Looked(whole, j, q) for j in range(len(x))]
+    asked = [(one, one.centre + s * f * q * one.deviation) for one in looked for s in (-1, 1) for f in _FIRST]
+    for _ in range(_ROUNDS + 1):
+        _look(problem, asked)
+        released.relax(z, asked)
+        asked = [(one, at) for one in looked for sign in (-1, 1) if (at := one.next(sign)) is not None]
+        if not asked:
+            break
+    return [one.profile() for one in looked]
+
+
 @dataclass(frozen=True)
 class _Set:
     """A set of readings with its estimate; see `profiles_of_sets`."""
@@ -153,6 +254,15 @@ class _Looked:
         self.seen: dict[float, tuple[float, Array]] = {self.centre: (0.0, whole.x)}
         self.open = {-1: False, 1: False}
         self.lower = False
+
+    def lower_to(self, at: float, total: float) -> None:
+        """Notes a sum of squares at a value where a larger one has been seen."""
+        level, least = self.whole.level, self.whole.least
+        change = (total - least) / level**2
+        zeta, point = self.seen[at]
+        if change < zeta**2:
+            self.lower |= change < -_LOWER * max(1.0, least / level**2)
+            self.seen[at] = (float(np.sign(at - self.centre) * np.sqrt(max(change, 0.0))), point)
 
     def side(self, sign: int) -> list[tuple[float, float]]:
         """(distance, abs zeta) on one side, outwards from the estimate."""

@@ -12,7 +12,7 @@ import csv
 import io
 import math
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,9 +37,11 @@ class Table:
     heading: list[str]
     rows: list[tuple[int, list[str]]]
     decimal: str = "."
+    key: str = "readings"
+    """The key of the config that names the file."""
 
     def error(self, text: str) -> UserError:
-        return UserError(f"readings={self.path}: {text}")
+        return UserError(f"{self.key}={self.path}: {text}")
 
     def number(self, text: str) -> float | None:
         """What a cell says in digits that everybody reads alike; None where it says something else."""
@@ -75,7 +77,8 @@ class Table:
         for name in self.heading:
             if name not in known:
                 what = f"column {name}" if name else f"column {self.heading.index(name) + 1}, which has no name,"
-                raise self.error(f"{what} is not understood; remove it (the header must be {','.join(wanted)})")
+                remedy = f"remove it, or set ignore_columns=[{name.split(' [')[0]}]" if name else "remove it"
+                raise self.error(f"{what} is not understood; {remedy} (the header must be {','.join(wanted)})")
 
 
 def header(model: Measurement) -> list[str]:
@@ -122,16 +125,21 @@ def read_readings(path: Path, model: Measurement) -> Array:
         UserError: the file is absent or does not hold this model's readings, by row and column.
     """
     table = read_table(path)
-    return readings_of(table, model, rows_of(table, model))
+    z = readings_of(table, model, rows_of(table, model))
+    require_enough(table.error, z, model)
+    return z
+
+
+def require_enough(error: Callable[[str], UserError], z: Array, model: Measurement) -> None:
+    """Refuses fewer readings z (m,) than the model has parameters, by what `error` makes of it."""
+    if np.isfinite(z).sum() < model.n:
+        raise error(f"{int(np.isfinite(z).sum())} readings are too few for {model.n} parameters")
 
 
 def readings_of(table: Table, model: Measurement, rows: Sequence[int]) -> Array:
     """The readings z (m,) that stand in `rows` of a table."""
     column = table.column(header(model)[-1])
-    z = np.array([table.value(*column[row]) for row in rows], dtype=float)
-    if np.isfinite(z).sum() < model.n:
-        raise table.error(f"{int(np.isfinite(z).sum())} readings are too few for {model.n} parameters")
-    return z
+    return np.array([table.value(*column[row]) for row in rows], dtype=float)
 
 
 def rows_of(table: Table, model: Measurement, also: Sequence[str] = ()) -> list[int]:
@@ -166,41 +174,42 @@ def _said(table: Table, columns: Sequence[int], row: Sequence[str]) -> str:
     return ", ".join(f"{table.heading[at]}={row[at].strip()}" for at in columns)
 
 
-def read_table(path: Path) -> Table:
-    """The header and the rows of a CSV or Parquet file.
+def read_table(path: Path, *, key: str = "readings", without: Collection[int] = ()) -> Table:
+    """The header and the rows of a CSV or Parquet file, which `key` names in the config. Rows `without` need not be
+    such rows: those with too few or too many cells are left out.
 
     Raises:
         UserError: the file is absent, or not such a table.
     """
     if not path.is_file():
-        raise UserError(f"readings={path}: there is no such file")
-    table = _read_parquet(path) if path.suffix == ".parquet" else _read_text(path)
+        raise UserError(f"{key}={path}: there is no such file")
+    table = _read_parquet(path, key) if path.suffix == ".parquet" else _read_text(path, key)
     for name in table.heading:
         if table.heading.count(name) > 1:
             what = f"column {name} stands there" if name else "columns without a name stand there"
             raise table.error(f"{what} twice; keep one")
     for number, row in table.rows:
-        if len(row) != len(table.heading):
+        if len(row) != len(table.heading) and number not in without:
             raise table.error(_miscounted(table, number, row))
     return table
 
 
-def _read_parquet(path: Path) -> Table:
+def _read_parquet(path: Path, key: str) -> Table:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
         table = pq.read_table(path)
     except (pa.ArrowException, OSError) as error:
-        raise UserError(f"readings={path}: is not a readable Parquet file") from error
+        raise UserError(f"{key}={path}: is not a readable Parquet file") from error
     names = [name for name in table.column_names if not name.startswith("__index_level_")]  # pandas' own row numbers
     table = table.select(names)
     columns = [["" if v is None else str(v) for v in column.to_pylist()] for column in table.columns]
-    return Table(path, table.column_names, list(enumerate(map(list, zip(*columns, strict=True)), 1)))
+    return Table(path, table.column_names, list(enumerate(map(list, zip(*columns, strict=True)), 1)), key=key)
 
 
-def _read_text(path: Path) -> Table:
-    text = _text_of(path)
+def _read_text(path: Path, key: str) -> Table:
+    text = _text_of(path, key)
     first = next((line for line in text.splitlines() if line.strip()), "")
     separator = next((sign for sign in ";\t" if sign in first), ",")
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
@@ -208,23 +217,23 @@ def _read_text(path: Path) -> Table:
         lines = [(reader.line_num, row) for row in reader if any(c.strip() for c in row)]
     except csv.Error as error:
         raise UserError(
-            f"readings={path}: row {reader.line_num}: is not a readable CSV file ({error}); mend the quotes"
+            f"{key}={path}: row {reader.line_num}: is not a readable CSV file ({error}); mend the quotes"
         ) from error
     if not lines:
-        raise UserError(f"readings={path}: is empty")
+        raise UserError(f"{key}={path}: is empty")
     rows = lines[1:]
     comma = separator == ";" and any(_WITH_COMMA.fullmatch(cell.strip()) for _, row in rows for cell in row)
-    return Table(path, [name.strip() for name in lines[0][1]], rows, "," if comma else ".")
+    return Table(path, [name.strip() for name in lines[0][1]], rows, "," if comma else ".", key)
 
 
-def _text_of(path: Path) -> str:
+def _text_of(path: Path, key: str) -> str:
     data = path.read_bytes()
     try:
         return data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:
         row = data.count(b"\n", 0, error.start) + 1
         raise UserError(
-            f"readings={path}: row {row}: is not a readable CSV file ({error.reason}); save it as CSV in UTF-8"
+            f"{key}={path}: row {row}: is not a readable CSV file ({error.reason}); save it as CSV in UTF-8"
         ) from error
 
 

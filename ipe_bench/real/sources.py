@@ -7,16 +7,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Input, Measurement
 from ipe_bench.measurements.joint import Joint
+from ipe_bench.measurements.known import Informed, informed
 from ipe_bench.noise import Gaussian, Noise, Unknown
 from ipe_bench.real import readings
 from ipe_bench.real.readings import Table
@@ -39,13 +40,146 @@ class Readings:
     """The columns that were read, as the file calls them."""
 
 
-def open_together(paths: Sequence[Path], model: Measurement) -> Readings:
+@dataclass(frozen=True)
+class LeftOut:
+    """What of the files is left out on purpose.
+
+    A row that is left out is a missing reading: it is predicted with its band, where its other cells can be read.
+    """
+
+    columns: tuple[str, ...] = ()
+    """Headings, with their units or without; in all files that have them."""
+    rows: tuple[int | str, ...] = ()
+    """Numbers of rows, as messages and spreadsheets count them; of several files FILE:NUMBER."""
+
+    def __bool__(self) -> bool:
+        return bool(self.columns or self.rows)
+
+    @property
+    def said(self) -> str:
+        """In words; empty where nothing is left out."""
+        parts = [("rows", self.rows), ("columns", self.columns)]
+        return "; ".join(f"{what} {', '.join(map(str, names))}" for what, names in parts if names)
+
+    def rows_of(self, path: Path, paths: Sequence[Path]) -> frozenset[int]:
+        """Those of one of the files."""
+        return frozenset(number for which, number in (self._place(row, paths) for row in self.rows) if which == path)
+
+    @staticmethod
+    def _place(row: int | str, paths: Sequence[Path]) -> tuple[Path, int]:
+        """The file and the number of a row.
+
+        Raises:
+            UserError: it names no file of those, or no row.
+        """
+        name, _, number = str(row).rpartition(":")
+        if not number.strip().isascii() or not number.strip().isdigit():
+            raise UserError(f"ignore_rows={row}: is not the number of a row; messages name rows by their number")
+        if not name and len(paths) == 1:
+            return paths[0], int(number)
+        if not name:
+            raise UserError(f"ignore_rows={row}: says not of which file; write {paths[0]}:{row}")
+        known = [path for path in paths if name in (str(path), path.name)]
+        if len(known) != 1:
+            raise UserError(f"ignore_rows={row}: {unknown(name, [str(path) for path in paths], 'file')}")
+        return known[0], int(number)
+
+
+NOTHING = LeftOut()
+
+
+def open_together(
+    paths: Sequence[Path], model: Measurement, left_out: LeftOut = NOTHING, *, enough: bool = True
+) -> Readings:
     """The readings of one file or of several; the latter share the parameters that are not a file's own.
+
+    What is known of parameters (`Informed`) is known of all files, where each has its own of each one's.
+    `enough`: refuses fewer readings than parameters.
 
     Raises:
         UserError: a file is absent or does not hold readings of this model, or files differ in what they know.
     """
-    found = [open_readings(path, model) for path in paths]
+    if isinstance(model, Informed):
+        found = open_together(paths, model.whole, left_out, enough=False)
+        found = replace(found, model=informed(found.model, model.known))
+    else:
+        tables = [readings.read_table(path, without=left_out.rows_of(path, paths)) for path in paths]
+        _require_columns(tables, left_out.columns)
+        found = _together(
+            paths,
+            [
+                _readings_in(_reduced(table, model, left_out.columns, left_out.rows_of(path, paths)), model)
+                for path, table in zip(paths, tables, strict=True)
+            ],
+        )
+    if enough:
+        require_enough(paths, found)
+    return found
+
+
+def require_enough(paths: Sequence[Path], found: Readings) -> None:
+    """Refuses fewer readings than parameters."""
+    shown = str(paths[0]) if len(paths) == 1 else f"[{','.join(map(str, paths))}]"
+    readings.require_enough(lambda text: UserError(f"readings={shown}: {text}"), found.z, found.model)
+
+
+def _require_columns(tables: Sequence[Table], columns: Sequence[str]) -> None:
+    for name in columns:
+        if all(_heading_of(name, table) is None for table in tables):
+            known = dict.fromkeys(heading for table in tables for heading in table.heading)
+            raise UserError(f"ignore_columns={name}: {unknown(name, list(known), 'column')}")
+
+
+def _heading_of(name: str, table: Table) -> str | None:
+    """The column that is meant by a name with its unit or without."""
+    return next((h for h in table.heading if name.strip() in (h, h.split(" [")[0].strip())), None)
+
+
+def _reduced(table: Table, model: Measurement, columns: Sequence[str], rows: Collection[int]) -> Table:
+    """The table without these columns, and with the readings missing in these rows."""
+    gone = {_heading_of(name, table) for name in columns}
+    kept = [k for k, name in enumerate(table.heading) if name not in gone]
+    width = len(table.heading)
+    numbers = [number for number, _ in table.rows]
+    for number in sorted(rows):
+        if number not in numbers:
+            raise UserError(
+                f"ignore_rows={number}: {table.path} has no such row; its rows are {numbers[0]} to {numbers[-1]}"
+                if numbers
+                else f"ignore_rows={number}: {table.path} has no rows"
+            )
+    table = replace(
+        table,
+        heading=[table.heading[k] for k in kept],
+        # Of other lengths are only rows that are left out.
+        rows=[(number, [row[k] for k in kept]) for number, row in table.rows if len(row) == width],
+    )
+    if not rows:
+        return table
+    emptied = [table.heading.index(name) for name in (_reading_column(table, model), SIGMA) if name in table.heading]
+    found = []
+    for number, row in table.rows:
+        if number in rows:
+            row = ["" if k in emptied else cell for k, cell in enumerate(row)]
+            if not _is_known(replace(table, rows=[(number, row)]), model):
+                continue
+        found.append((number, row))
+    return replace(table, rows=found)
+
+
+def _is_known(row: Table, model: Measurement) -> bool:
+    """Whether what a model wants to know of a reading can be read in the one row of a table."""
+    columns = [(i, _column_of(i.heading, row.heading)) for i in model.inputs]
+    try:
+        for wanted, column in columns:
+            if column is not None:
+                _input(row, wanted, *row.column(column)[0])
+    except UserError:
+        return False
+    return True
+
+
+def _together(paths: Sequence[Path], found: Sequence[Readings]) -> Readings:
     if len(found) == 1:
         return found[0]
     for one, path in zip(found, paths, strict=True):
@@ -92,7 +226,13 @@ def open_readings(path: Path, model: Measurement) -> Readings:
     Raises:
         UserError: the file is absent or does not hold readings of this model, by row and column.
     """
-    table = readings.read_table(path)
+    found = _readings_in(readings.read_table(path), model)
+    require_enough([path], found)
+    return found
+
+
+def _readings_in(table: Table, model: Measurement) -> Readings:
+    """The readings of a file, of which there may be too few."""
     sigma = _column_of(SIGMA, table.heading)
     columns = [_column_of(i.heading, table.heading) for i in model.inputs]
     there = [c for i, c in zip(model.inputs, columns, strict=True) if c is not None and not i.label]
@@ -117,14 +257,12 @@ def open_readings(path: Path, model: Measurement) -> Readings:
         for wanted, column in zip(model.inputs, columns, strict=True)
     }
     try:
-        informed = model.with_inputs(known, len(z))
+        sampled = model.with_inputs(known, len(z))
     except UserError as error:
         raise table.error(str(error)) from None
-    _require_known(table, model, (*used, *informed.index))
-    _require_order(table, informed, [i.heading for i in model.inputs])
-    if np.isfinite(z).sum() < informed.n:
-        raise table.error(f"{int(np.isfinite(z).sum())} readings are too few for {informed.n} parameters")
-    return Readings(informed, z, _sigmas(table, sigma, range(len(z)), z, shown), used)
+    _require_known(table, model, (*used, *sampled.index))
+    _require_order(table, sampled, [i.heading for i in model.inputs])
+    return Readings(sampled, z, _sigmas(table, sigma, range(len(z)), z, shown), used)
 
 
 def _require_known(table: Table, model: Measurement, known: Collection[str]) -> None:

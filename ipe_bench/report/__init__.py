@@ -65,7 +65,9 @@ def write_analysis(begun: Begun, output: Path, which: Which = "all") -> ReportRe
     from ipe_bench.basics.files import write_text
     from ipe_bench.report import extensions
     from ipe_bench.report.certified_tables import attained_tables, certified_tables, without_certified
+    from ipe_bench.report.charts import charts
     from ipe_bench.report.figures import draw_all
+    from ipe_bench.report.figures.views import views
     from ipe_bench.report.html import render_page
     from ipe_bench.report.tables import all_tables, write_tables
 
@@ -74,7 +76,8 @@ def write_analysis(begun: Begun, output: Path, which: Which = "all") -> ReportRe
     summary_path = output / "summary.csv"
     write_text(summary_path, analysis.summary.to_csv(index=False))
     certified_shown, certified = certified_tables(analysis.collection)
-    tables = [*certified_shown, *attained_tables(analysis.collection)[0], *all_tables(analysis)]
+    simulated = without_certified(analysis)
+    tables = [*certified_shown, *attained_tables(analysis.collection)[0], *all_tables(simulated, analysis)]
     problems = analysis.collection.further
     tables += extensions.tables(analysis, [table.name for table in tables], problems)
     sections = extensions.sections(analysis, [table.name for table in tables], problems)
@@ -82,11 +85,10 @@ def write_analysis(begun: Begun, output: Path, which: Which = "all") -> ReportRe
     table_paths = write_tables(analysis, [*tables, *further], output / "tables")
     figures: list[Path] = []
     drawn = []
-    pictured = without_certified(analysis)
-    for figure in draw_all(pictured, folder, which=which, problems=problems):
+    for figure in draw_all(simulated, folder, which=which, problems=problems):
         figures += figure.files
         drawn.append((figure.name, figure.title, figure.caption, figure.files[0].read_bytes()))
-    page = render_page(analysis, tables, drawn, sections)
+    page = render_page(analysis, tables, drawn, sections, list(charts(views(simulated)[0])))
     report = output / "report.html"
     write_text(report, page)
     return ReportResult(

@@ -102,8 +102,16 @@ class Answer:
     """The readings (m,); NaN where one is missing."""
     fits: list[Fit]
     """One for each estimator, in the order in which they were given."""
-    examination: Examination | None
-    """Of the least minimum that was found; None where no estimator found any."""
+    examinations: tuple[Examination, ...]
+    """Of the least minimum that was found, and of that with the prior where estimators are told one; none where no
+    estimator found any."""
+    left_out: str = ""
+    """What of the files was left out on purpose."""
+
+    @property
+    def examination(self) -> Examination | None:
+        """The first: that of least squares, unless all estimators were told a prior."""
+        return self.examinations[0] if self.examinations else None
 
     @property
     def passes(self) -> bool:
@@ -192,8 +200,12 @@ def _described(answer: Answer) -> dict[str, Any]:
         "readings_present": int(np.isfinite(z).sum()),
         "readings_missing": int(np.isnan(z).sum()),
         "fixed": dict(model.fixed),
+        "left_out": answer.left_out,
         "passes": answer.passes,
         "examination": None if answer.examination is None else examined.described(answer.examination, labels),
+        "examination_with_prior": next(
+            (examined.described(one, labels) for one in answer.examinations if one.with_prior), None
+        ),
         "parameters": [{"name": p.name, "unit": p.unit} for p in model.natural_parameters],
         "estimators": {
             one.label: {
@@ -289,21 +301,21 @@ def render(answer: Answer, width: int) -> Group:
     """The tables for a terminal of that width: as many estimators side by side as there is room for."""
     from rich.console import Group
 
-    model, fits, found = answer.model, answer.fits, answer.examination
-    parts = [*_estimates(answer.name, model, fits, width), _verdicts(fits, width), _notes(fits, width)]
+    model, fits = answer.model, answer.fits
+    parts = [*_estimates(answer.name, model, fits, width), _verdicts(fits, width), _notes(answer, width)]
     parts += _outliers(model, fits)
-    if found is not None and answer[found.label].passes:
-        parts += ["", examined.table(found), *_remarks(answer)]
-    elif found is not None and not found.least:
-        parts += ["", *_remarks(answer)]
+    for found in answer.examinations:
+        if answer[found.label].passes:
+            parts += ["", examined.table(found), *_remarks(answer, found)]
+        elif not found.least:
+            parts += ["", *_remarks(answer, found)]
     return Group(*parts)
 
 
-def _remarks(answer: Answer) -> Iterator[Any]:
+def _remarks(answer: Answer, found: Examination) -> Iterator[Any]:
     from rich.text import Text
 
-    assert answer.examination is not None
-    for remark in examined.remarks(answer.examination, _reading_labels(answer.model)):
+    for remark in examined.remarks(found, _reading_labels(answer.model)):
         yield Text(remark, style="bold" if remark.isupper() or remark.split(":")[0].isupper() else "dim")
 
 
@@ -393,9 +405,10 @@ def _fit_p(one: Fit) -> str:
     return p_value(one.p_value, LEAST_FIT_P if one.p_value == LEAST_FIT_P else 0.0)
 
 
-def _notes(fits: Sequence[Fit], width: int) -> Any:
+def _notes(answer: Answer, width: int) -> Any:
     from rich.text import Text
 
+    fits = answer.fits
     lines = [
         f"fits: p of chi-square is at least {FIT_LEVEL:g}. white p: Ljung-Box; small where successive residuals"
         " resemble each other."
@@ -408,6 +421,8 @@ def _notes(fits: Sequence[Fit], width: int) -> Any:
     failing = [one.label for one in fits if not one.passes]
     if fits[0].model.fixed:
         lines.append("Fixed: " + ", ".join(f"{name} = {value:g}" for name, value in fits[0].model.fixed.items()))
+    if answer.left_out:
+        lines.append(f"Left out on purpose: {answer.left_out}.")
     if failing:
         lines.append(
             f"In brackets: {', '.join(failing)}. Not an answer: errors are not given, for they would be wrong."
@@ -435,10 +450,7 @@ def _on_levels(fits: Sequence[Fit]) -> Iterator[str]:
 def _on_priors(fits: Sequence[Fit]) -> Iterator[str]:
     told = [one.label for one in fits if one.with_prior]
     if told:
-        yield (
-            f"{', '.join(told)}: with a prior. Profiles, bootstrap and influence, where given, are of least squares"
-            " without it."
-        )
+        yield f"{', '.join(told)}: with a prior, which counts in the standard errors as further readings would."
 
 
 def _on_bounds(fits: Sequence[Fit]) -> Iterator[str]:
@@ -501,18 +513,20 @@ def fragment(answer: Answer) -> str:
     notes = [*_on_levels(answer.fits), *_on_priors(answer.fits), *_on_bounds(answer.fits)]
     if failing:
         notes.append(f"In brackets, and not an answer: {', '.join(failing)}.")
-    found = answer.examination
-    if found is not None and answer[found.label].passes:
+    if answer.left_out:
+        notes.append(f"Left out on purpose: {answer.left_out}.")
+    for found in answer.examinations:
+        notes += examined.remarks(found, _reading_labels(answer.model))
+        if not answer[found.label].passes:
+            continue
         head = "".join(f"<th>{name}</th>" for name in examined.HEADINGS)
         lines = "".join(
             f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in examined.rows(found)
         )
         parts.append(
-            f"<h3>95 % intervals of {escape(found.label)}</h3><table><thead><tr>{head}</tr></thead>"
+            f"<h3>{escape(examined.title(found))}</h3><table><thead><tr>{head}</tr></thead>"
             f"<tbody>{lines}</tbody></table>"
         )
-    if found is not None:
-        notes += examined.remarks(found, _reading_labels(answer.model))
     return "".join([*parts, *(f"<p>{escape(note)}</p>" for note in notes)])
 
 

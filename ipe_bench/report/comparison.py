@@ -15,6 +15,7 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, house_style
 from ipe_bench.report.words import compact, duration, p_value, percent, plain
+from ipe_bench.statistics.between import NOT_SETTINGS, described
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,10 +23,6 @@ if TYPE_CHECKING:
 
 _HEADINGS = ("", "first", "second", "change", "95 %", "p", "e", "second is")
 _NAMES = {"success": "success", "error": "error", "cost": "cost", "time": "time"}
-_NOT_SETTINGS = (
-    *("first", "second", "trials", "matched_by", "quantity", "first_value", "second_value"),
-    *("change", "low", "high", "p", "e", "finding"),
-)
 _COLORS = {"better": "#009E73", "worse": "#D55E00", "": BOUND_COLOR}
 MOST_ROWS = 40
 """Comparisons that the figure shows; the CSV file has all."""
@@ -61,19 +58,14 @@ def _level(alpha: float) -> str:
 
 def _comparisons(frame: pd.DataFrame) -> Iterator[tuple[str, list[dict[str, Any]]]]:
     """Each comparison with its title, in order."""
-    settings = [c for c in frame.columns if c not in _NOT_SETTINGS]
+    settings = [c for c in frame.columns if c not in NOT_SETTINGS]
     listed: list[Any] = frame.to_dict("records")
     for _, part in groupby(listed, key=lambda row: tuple(plain(row[c]) for c in (*settings, "first", "second"))):
         rows = list(part)
         first = rows[0]
-        named = [
-            str(first[c]) if c in ("measurement", "noise") else f"{c.replace('_', ' ')} {plain(first[c])}"
-            for c in settings
-            if first[c] is not None and first[c] == first[c]
-        ]
         who = first["first"] if first["first"] == first["second"] else f"{first['first']}, then {first['second']}"
         how = "trials" if first["matched_by"] == "trial" else "trials of other seeds, matched in their order"
-        yield f"{', '.join(named)}: {who}; {first['trials']} {how}", rows
+        yield f"{described(first)}: {who}; {first['trials']} {how}", rows
 
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
@@ -174,7 +166,7 @@ def _panel(ax: Any, rows: Sequence[dict[str, Any]], quantity: str) -> None:
 
 def _row_label(row: dict[str, Any], frame: pd.DataFrame) -> str:
     """What tells this comparison from the others."""
-    settings = [c for c in frame.columns if c not in _NOT_SETTINGS]
+    settings = [c for c in frame.columns if c not in NOT_SETTINGS]
     varying = [c for c in settings if len(set(frame[c].astype(str))) > 1] or ["error_scale"]
     who = row["first"] if row["first"] == row["second"] else f"{row['first']}, {row['second']}"
     named = [f"{c.replace('_', ' ')} {plain(row[c])}" for c in varying if c in row]

@@ -50,7 +50,16 @@ def rows(found: Examination) -> list[tuple[str, str, str, str, str]]:
             interval(float(found.bootstrap.low[i]), float(found.bootstrap.high[i])),
         )
         for i, p in enumerate(found.model.natural_parameters)
+    ] + [
+        (one.parameter.name, one.parameter.unit, "-", interval(*sorted((one.bound, one.other))), "-")
+        for one in found.on_bounds
     ]
+
+
+def title(found: Examination) -> str:
+    """Of the intervals."""
+    prior = " with its prior" if found.with_prior else ""
+    return f"{CONFIDENCE:.0%} intervals of {found.label}{prior}, by three ways".replace("%", " %")
 
 
 HEADINGS = ("parameter", "unit", "standard error", "profile", "bootstrap")
@@ -77,6 +86,17 @@ def remarks(found: Examination, labels: Labels) -> Iterator[str]:
     unlimited = [n for n, p in zip(names, found.profiles, strict=True) if not math.isfinite(p.high - p.low)]
     if unlimited:
         yield f"The readings set no limit to one side of {', '.join(unlimited)}."
+    for one in found.on_bounds:
+        yield (
+            f"{one.parameter.name}: its estimate is on the bound {one.bound:g}, which is one end of its interval; the"
+            " other is where the profile has risen as far as inside of bounds, so it holds the true value at least as"
+            " often as it says. Profiles of the others let it move inwards; their standard errors do not."
+        )
+    if found.with_prior:
+        yield (
+            f"Intervals of {found.label} count the prior as further readings: profiles are of the penalised likelihood,"
+            " and the bootstrap draws the prior's means, too."
+        )
     if len(names) > 1:
         yield _direction(found, names)
     yield from _influence(found, labels)
@@ -110,8 +130,9 @@ def table(found: Examination) -> RenderableType:
     from rich.markup import escape
     from rich.table import Table
 
-    title = f"{CONFIDENCE:.0%} intervals of {found.label}, by three ways".replace("%", " %")
-    shown = Table(title=title, title_justify="left", title_style="bold", box=None, pad_edge=False, padding=(0, 1))
+    shown = Table(
+        title=title(found), title_justify="left", title_style="bold", box=None, pad_edge=False, padding=(0, 1)
+    )
     for k, heading in enumerate(HEADINGS):
         shown.add_column(heading, justify="left" if k < 2 else "right", no_wrap=k == 0)
     for row in rows(found):
@@ -160,6 +181,8 @@ def described(found: Examination, labels: Labels) -> dict[str, Any]:
             for one in found.minima
         ],
         "is_least_minimum": found.least,
+        "with_prior": found.with_prior,
+        "on_bounds": {one.parameter.name: numbers([one.bound, one.other]) for one in found.on_bounds},
         "remarks": list(remarks(found, labels)),
     }
 

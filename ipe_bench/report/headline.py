@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pandas as pd
 
+from ipe_bench.report.certified_tables import without_certified
 from ipe_bench.report.style import REFERENCE
-from ipe_bench.report.words import percent, plain, short
+from ipe_bench.report.words import enumerate_few, percent, plain, short
 from ipe_bench.statistics.analysis import Analysis
+from ipe_bench.statistics.attained import attained_totals
+from ipe_bench.statistics.digits import certified_averages, certified_table
 from ipe_bench.statistics.summary import ALL
 
 NEAR = 0.005
@@ -15,9 +20,42 @@ NEAR = 0.005
 
 
 def headline(analysis: Analysis) -> str:
+    """Who solves most on certified readings and on problems of known minimum, and who is best on simulated ones."""
+    simulated = without_certified(analysis)
+    sentences = [*_certified(analysis), *_attained(analysis)]
+    if not simulated.summary.empty:
+        sentences.append(_simulated(simulated))
+    return " ".join(sentences) or "Nothing is stored yet, so there is nothing to find."
+
+
+def _certified(analysis: Analysis) -> Iterator[str]:
+    averages = certified_averages(certified_table(analysis.collection))
+    if averages.empty:
+        return
+    each = averages.assign(digits=averages["mean_lre_parameters"] * averages["datasets"])
+    totals = each.groupby("estimator", sort=False)[["solved", "datasets", "digits"]].sum()
+    best = totals[totals["solved"] == totals["solved"].max()].sort_values("digits", ascending=False, kind="stable")
+    first = best.iloc[0]
+    yield (
+        f"Of {first['datasets']:.0f} certified problems, {enumerate_few(list(best.index))} solve"
+        f"{'s' if len(best) == 1 else ''} most, {first['solved']:.0f}, with four digits or more of every parameter;"
+        f" {best.index[0]} has {first['digits'] / first['datasets']:.1f} of 11 digits on average."
+    )
+
+
+def _attained(analysis: Analysis) -> Iterator[str]:
+    totals = attained_totals(analysis.attained) if len(analysis.attained) else analysis.attained
+    if totals.empty:
+        return
+    best = totals[totals["solved"] == totals["solved"].max()]
+    yield (
+        f"Of {best['problems'].iloc[0]} problems of known minimum, {enumerate_few(list(best['estimator']))} attain"
+        f"{'s' if len(best) == 1 else ''} most, {best['solved'].iloc[0]}."
+    )
+
+
+def _simulated(analysis: Analysis) -> str:
     """Who is best over all scenarios, how far that holds, and how the linear estimate fares where it is worst."""
-    if analysis.summary.empty:
-        return "Nothing is stored yet, so there is nothing to find."
     rows = analysis.summary[analysis.summary["parameter"] == ALL]
     best = best_estimator(analysis)
     own = rows[rows["estimator"] == best].sort_values("error_scale")

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 from collections.abc import Sequence
 from importlib import resources
 from typing import Any
 
 from ipe_bench import __version__
+from ipe_bench.report.charts import Chart
+from ipe_bench.report.citation import CITATION
 from ipe_bench.report.definitions import definitions
 from ipe_bench.report.headline import headline
 from ipe_bench.report.sections import Written
@@ -21,26 +24,43 @@ Shown = tuple[str, str, str, bytes]
 MOST_ROWS = 2000
 """Rows of one table on the page; its CSV file has all."""
 MOST_RUNS = 20
+_NAMES = ("estimator", "first", "data set", "function")
+"""Titles of the column that names a row, which stays in sight while a table is scrolled."""
+MOST_COMMANDS = 3
+"""At the head of the page; all stand with the provenance."""
 _SECTIONS = (
     ("figures", "Figures"),
     ("tables", "Tables"),
     ("theory", "Theory beside what happened"),
     ("provenance", "Configuration and provenance"),
+    ("cite", "How to cite"),
     ("definitions", "Definitions"),
 )
+_PYTHON, _UNKNOWN = "from Python", "a command that was not recorded"
 
 
 def render_page(
-    analysis: Analysis, tables: Sequence[Table], figures: Sequence[Shown], written: Sequence[Written] = ()
+    analysis: Analysis,
+    tables: Sequence[Table],
+    figures: Sequence[Shown],
+    written: Sequence[Written] = (),
+    charts: Sequence[Chart] = (),
 ) -> str:
     """The page as text; what plugins have written stands behind our tables."""
     from jinja2 import Environment, StrictUndefined
+    from markupsafe import Markup
 
-    source = resources.files("ipe_bench.report").joinpath("templates/report.html.j2").read_text(encoding="utf-8")
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     collection = analysis.collection
-    return environment.from_string(source).render(
+    script, style = _template("report.js"), _template("report.css")
+    runs = _runs(collection.runs)
+    pictures = _pictures(figures, charts)
+    commands = [run["command"] for run in runs if run["command"] not in (_PYTHON, _UNKNOWN)]
+    return environment.from_string(_template("report.html.j2")).render(
         version=__version__,
+        script=Markup(script),
+        style=Markup(style),
+        policy=_policy(script, style),
         headline=headline(analysis),
         directories=[str(d) for d in collection.directories],
         expected=collection.expected,
@@ -48,28 +68,55 @@ def render_page(
         problems=[*collection.problems, *collection.stale],
         title=", ".join(d.resolve().name or str(d) for d in collection.directories),
         computed=collection.runs[-1].started[:16].replace("T", " ") if collection.runs else "",
-        sections=_contents(tables, written),
+        commands=list(dict.fromkeys(commands))[:MOST_COMMANDS],
+        sections=_contents(tables, written, pictures),
         tables=[_table(t) for t in tables if not t.appendix],
         written=[
             {"name": s.name, "title": s.title, "parts": [p if isinstance(p, str) else _table(p) for p in s.parts]}
             for s in written
         ],
         theory=[_table(t) for t in tables if t.appendix],
-        figures=[
-            {"name": name, "title": title, "caption": caption, "data": base64.b64encode(png).decode()}
-            for name, title, caption, png in figures
-        ],
+        figures=pictures,
         nothing_failed=analysis.endings.empty and not analysis.summary.empty,
-        runs=[_run(run) for run in collection.runs[-MOST_RUNS:][::-1]],
-        older_runs=max(0, len(collection.runs) - MOST_RUNS),
+        runs=runs[:MOST_RUNS],
+        older_runs=max(0, len(runs) - MOST_RUNS),
+        citation=CITATION,
         definitions=definitions(),
     )
 
 
-def _contents(tables: Sequence[Table], written: Sequence[Written]) -> list[tuple[str, str]]:
+def _template(name: str) -> str:
+    return resources.files("ipe_bench.report").joinpath("templates", name).read_text(encoding="utf-8")
+
+
+def _policy(script: str, style: str) -> str:
+    """Nothing may be fetched or sent, and no other script or style than ours has a say."""
+    digests = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (script, style)]
+    return (
+        f"default-src 'none'; script-src 'sha256-{digests[0]}'; style-src 'sha256-{digests[1]}'; img-src data:;"
+        " base-uri 'none'; form-action 'none'"
+    )
+
+
+def _pictures(figures: Sequence[Shown], charts: Sequence[Chart]) -> list[dict[str, str]]:
+    """Charts first, each with the static figure of its name; then the other figures."""
+    static = {
+        name: {"static_title": title, "static_caption": caption, "data": base64.b64encode(png).decode()}
+        for name, title, caption, png in figures
+    }
+    drawn = {
+        chart.name: {"title": chart.title, "caption": chart.caption, "chart": chart.data, "data": ""}
+        for chart in charts
+    }
+    return [{"name": name, "chart": "", **drawn.get(name, {}), **static.get(name, {})} for name in drawn | static]
+
+
+def _contents(tables: Sequence[Table], written: Sequence[Written], pictures: Sequence[Any]) -> list[tuple[str, str]]:
     """The sections that there are, in order."""
-    own = [s for s in _SECTIONS if s[0] != "theory" or any(t.appendix for t in tables)]
-    return [*own[:2], *((f"section-{s.name}", s.title) for s in written), *own[2:]]
+    there = {"figures": len(pictures) > 1, "tables": bool(tables), "theory": any(t.appendix for t in tables)}
+    own = [(name, title) for name, title in _SECTIONS if there.get(name, True)]
+    split = next(i for i, (name, _) in enumerate(own) if name in ("theory", "provenance"))
+    return [*own[:split], *((f"section-{s.name}", s.title) for s in written), *own[split:]]
 
 
 def _table(table: Table) -> dict[str, Any]:
@@ -79,22 +126,42 @@ def _table(table: Table) -> dict[str, Any]:
         "title": table.title,
         "caption": table.caption,
         "columns": table.columns,
+        "frozen": next((i for i, c in enumerate(table.columns) if c.title in _NAMES), 0),
         "rows": rows[:MOST_ROWS],
         "cut": max(0, len(rows) - MOST_ROWS),
     }
 
 
-def _run(run: Run) -> dict[str, Any]:
-    record = run.record
-    config = {key: record[key] for key in ("config", "scenarios", "estimators") if key in record}
-    machine = record.get("machine") or {}
+def _runs(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """What was computed, by command, the last first: a sweep has a record per job, and what found everything stored
+    computed nothing."""
+    commands: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        if run.record.get("blocks", 1):
+            command = run.record.get("command", _UNKNOWN)
+            key = (_PYTHON, run.path.name) if command is None else (str(command), "")
+            commands.setdefault(key, []).append(run)
+    return [_command(command, own) for (command, _), own in reversed(commands.items())]
+
+
+def _command(command: str, runs: Sequence[Run]) -> dict[str, Any]:
+    """Everything that its jobs have in common, and each job's configuration."""
+    last = runs[-1].record
+    machine = last.get("machine") or {}
     facts = {
-        "started": run.started,
-        "trials": record.get("trials"),
-        "cells": len(record.get("cells", ())),
-        "git commit": record.get("git_commit") or "unknown",
-        "source": record.get("source"),
+        "runs": ", ".join(run.path.stem for run in runs),
+        "trials": ", ".join(dict.fromkeys(str(run.record.get("trials")) for run in runs)),
+        "cells": sum(len(run.record.get("cells", ())) for run in runs),
+        "git commit": last.get("git_commit") or "unknown",
+        "source": last.get("source"),
         "machine": ", ".join(f"{k} {v}" for k, v in machine.items()) if isinstance(machine, dict) else machine,
-        "versions": ", ".join(f"{k} {v}" for k, v in (record.get("libraries") or {}).items()),
+        "versions": ", ".join(f"{k} {v}" for k, v in (last.get("libraries") or {}).items()),
     }
-    return {"name": run.path.name, "facts": facts, "config": json.dumps(config, indent=1, ensure_ascii=False)}
+    scenarios = [scenario for run in runs for scenario in run.record.get("scenarios", ())]
+    config = {"scenarios": scenarios, "estimators": last.get("estimators", {})}
+    return {
+        "command": command,
+        "started": runs[0].started[:16].replace("T", " "),
+        "facts": facts,
+        "config": json.dumps(config, indent=1, ensure_ascii=False),
+    }

@@ -26,6 +26,25 @@ COLORS = (
     "#6900FF",
     "#1E4B00",
 )
+BLACK, WHITE = "#000000", "#ffffff"
+_LIFTED = (
+    "#52acf0",
+    "#fec365",
+    "#ff965e",
+    "#90d4ff",
+    "#53cfa1",
+    "#f7a1d0",
+    "#d46897",
+    "#ababab",
+    "#7673de",
+    "#b7974f",
+    "#ff70e0",
+    "#b7d6a8",
+    "#998dfe",
+    "#659551",
+)
+ON_DARK: dict[str, str] = dict(zip((*COLORS, BLACK), (*_LIFTED, WHITE), strict=True))
+"""The same colours where the ground is dark: of the same hue in OKLab, with a lightness of 0.6 + 0.4 of theirs."""
 MARKERS = ("o", "s", "D", "^", "v", "P", "d", "<", ">", "p", "h")
 DASHES: tuple[Any, ...] = ("", (5, 2), (1, 1.5), (5, 2, 1, 2))
 """As seaborn and matplotlib take them: lengths on and off, nothing for a solid line."""
@@ -69,7 +88,7 @@ def looks(labels: Sequence[str]) -> dict[str, Look]:
         label: Look(COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)], DASHES[(i // len(COLORS)) % len(DASHES)])
         for i, label in enumerate(rest)
     }
-    result[REFERENCE] = Look("#000000", "X", (5, 2))
+    result[REFERENCE] = Look(BLACK, "X", (5, 2))
     return {label: result[label] for label in labels}
 
 
@@ -99,4 +118,35 @@ def house_style() -> Iterator[None]:
         "svg.hashsalt": "ipe-bench",
     }
     with mpl.rc_context(settings):
+        yield
+
+
+PRINT: dict[Any, Any] = {
+    "axes.titlesize": 7.5,
+    "axes.labelsize": 7.5,
+    "legend.fontsize": 7,
+    "legend.columnspacing": 1.0,
+    "legend.handlelength": 1.6,
+    "legend.handletextpad": 0.4,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "lines.linewidth": 1.0,
+    "axes.titlepad": 3.0,
+    "axes.labelpad": 2.0,
+    "xtick.major.pad": 2.0,
+    "ytick.major.pad": 2.0,
+    "figure.constrained_layout.w_pad": 0.02,
+    "figure.constrained_layout.h_pad": 0.02,
+    "figure.dpi": 300,
+    "savefig.dpi": 300,
+}
+"""Sizes in a column of print, where nothing is scaled any more: 7 to 8 points are as IEEE's."""
+
+
+@contextmanager
+def print_style() -> Iterator[None]:
+    """The same look in the sizes of print."""
+    import matplotlib as mpl
+
+    with house_style(), mpl.rc_context(PRINT):
         yield

@@ -80,12 +80,13 @@ def _key(value: Any, kind: Kind = "number") -> Any:
     return "1e999" if math.isnan(number) or number == math.inf else repr(number)
 
 
-def all_tables(analysis: Analysis) -> list[Table]:
-    """Every table that the data allow, in the order of the report."""
+def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]:
+    """Every table that the data allow, in the order of the report; `whole` is the analysis whose endings are listed,
+    where this one leaves some trials out."""
     if analysis.summary.empty:
-        return []
+        return [table for table in [endings(whole or analysis)] if table is not None]
     tables = [overview(analysis), costs(analysis), portfolio(analysis), comparisons(analysis), ranks(analysis)]
-    tables += [parameters(analysis), calibration(analysis), endings(analysis)]
+    tables += [parameters(analysis), calibration(analysis), endings(whole or analysis)]
     tables += [contraction(analysis), covariances(analysis), theory(analysis), iterations(analysis)]
     return [t for t in tables if t is not None]
 
@@ -379,7 +380,7 @@ def markdown(table: Table) -> str:
 
 LONG = 45
 """Rows from which on a LaTeX table runs over pages."""
-_SIGNS = {
+SIGNS = {
     "µ": r"\ensuremath{\mu}",
     "σ": r"\ensuremath{\sigma}",
     "√": r"\ensuremath{\surd}",
@@ -403,7 +404,7 @@ def latex(table: Table) -> str:
     bold = [["textbf:--rwrap;" if cell.best else "" for cell in column.cells] for column in table.columns]
     style = cells.style.hide(axis="index").format_index(_show_signs, axis=1, escape="latex")
     for title, column in zip(titles, table.columns, strict=True):
-        style = style.format(_set_numbers if column.numeric else _show_signs, subset=[title], escape="latex")
+        style = style.format(_show_numbers if column.numeric else _show_signs, subset=[title], escape="latex")
     style = style.apply(lambda _: pd.DataFrame(dict(zip(titles, bold, strict=True)), index=cells.index), axis=None)
     shape = "".join("r" if c.numeric else "l" for c in table.columns)
     text = style.to_latex(
@@ -416,14 +417,18 @@ def latex(table: Table) -> str:
 def _show_signs(escaped: object) -> str:
     """What pandas' escaping leaves: signs beyond ASCII, those that pdflatex may lack by their number."""
     return "".join(
-        _SIGNS.get(char, char if char.isascii() and char.isprintable() else f"\\texttt{{U+{ord(char):04X}}}")
+        SIGNS.get(char, char if char.isascii() and char.isprintable() else f"\\texttt{{U+{ord(char):04X}}}")
         for char in " ".join(str(escaped).split())
     )
 
 
-def _set_numbers(escaped: object) -> str:
+def _show_numbers(escaped: object) -> str:
+    return set_numbers(_show_signs(escaped))
+
+
+def set_numbers(escaped: str) -> str:
     """The numbers of a cell set by siunitx, which groups digits by its own rules."""
-    text = _NUMBER.sub(lambda m: f"\\num{{{m.group().replace(',', '')}}}", _show_signs(escaped))
+    text = _NUMBER.sub(lambda m: f"\\num{{{m.group().replace(',', '')}}}", escaped)
     return text.replace(r"} \%", r"}\,\%")
 
 

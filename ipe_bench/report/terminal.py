@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 WIDE = 120
-_SHORTEST_NAME = 12
-"""Narrower than this, a name is not folded."""
+_WHOLE_NAME = 24
+"""Letters of a name up to which it stands in one line; longer ones are folded where there is no room."""
 _PADDING = 2
 
 
@@ -102,7 +102,8 @@ def _setting(title: str, part: Sequence[Mapping[str, Any]], width: int) -> tuple
     )
     for heading in headings[:fitting]:
         if heading == "estimator":
-            table.add_column(heading, overflow="fold", min_width=_SHORTEST_NAME)
+            longest = max(len(str(row["estimator"])) for row in part)
+            table.add_column(heading, overflow="fold", min_width=min(longest, _WHOLE_NAME))
         else:
             table.add_column(heading, justify="right", no_wrap=True)
     for section in sections:
@@ -113,13 +114,13 @@ def _setting(title: str, part: Sequence[Mapping[str, Any]], width: int) -> tuple
 
 
 def _fitting(headings: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> int:
-    """How many columns fit, counted from the left: the scale and the names always, long names folded at the least."""
+    """How many columns fit, counted from the left: the scale and the names always; long names are folded."""
     from rich.cells import cell_len
 
     needed = 2  # at both edges
     for i, heading in enumerate(headings):
         longest = max(cell_len(text) for text in (heading, *(row[i] for row in rows)))
-        needed += (_SHORTEST_NAME if heading == "estimator" else longest) + _PADDING
+        needed += (min(longest, _WHOLE_NAME) if heading == "estimator" else longest) + _PADDING
         if needed > width and i > 1:
             return i
     return len(headings)

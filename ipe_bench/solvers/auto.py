@@ -170,10 +170,10 @@ class Auto(Estimator):
 def _improbability(problem: Problem, minima: Minima) -> Array:
     """Minus twice the logarithm (trials,) of the posterior density, or of the likelihood without a prior, but for a
     constant."""
-    prior = problem.prior_used()
+    prior = problem.prior_covariance()
     if prior is None:
         return minima.chi_square
-    return minima.chi_square + np.sum(((minima.x - problem.x0) / prior) ** 2, axis=1)
+    return minima.chi_square + np.sum(prior.whiten(minima.x - problem.x0) ** 2, axis=1)
 
 
 def _after(first: Ended[Any] | Minima, second: Minima) -> Minima:

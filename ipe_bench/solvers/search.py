@@ -41,7 +41,8 @@ class Search(ABC):
 
     @property
     def prior(self) -> Array | None:
-        """The deviations (n,) of the prior that counts; None where none does."""
+        """The deviations (n,) of the prior that counts; None where none does. A search does without its correlations:
+        it ends in a fit without the prior."""
         return self.problem.prior_used(self.options.prior_inflation) if self.options.use_prior else None
 
     @abstractmethod

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array, pseudo_inverse
+from ipe_bench.basics.linalg import Array, Covariance, pseudo_inverse
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.ipe import starting_points
 from ipe_bench.estimators.least_squares import Minima, Objective
@@ -83,7 +83,7 @@ class Windows(Search):
         for size in np.unique(reach):
             there = reach == size
             prior = np.full(self.problem.measurement.n, size)
-            search = replace(self, problem=replace(self.problem, prior_deviation=prior))
+            search = replace(self, problem=replace(self.problem, prior_deviation=prior, prior_correlation=None))
             result = put(result, there, search._attempt(k, rows[there], take(before, there)))
         return result
 
@@ -148,7 +148,8 @@ class Windows(Search):
         assert model.epochs is not None
         window = Counted(Restricted.until(model, epochs), self.spent(owner), epochs / len(model.epochs))
         R, z = problem.R.restricted(arrived), self.z[np.ix_(owner, arrived)]
-        return Objective(window, R, z, np.arange(len(owner)), centre, self.prior).coarsened(0.0)
+        prior = None if self.prior is None else Covariance(self.prior)
+        return Objective(window, R, z, np.arange(len(owner)), centre, prior).coarsened(0.0)
 
     def _kept(self, k: int, number: int, owner: NDArray[np.intp], x: Array, per_reading: Array) -> NDArray[np.intp]:
         """The candidates that go on: of each trial the best few that differ and are not given up; one in any case in

@@ -15,7 +15,7 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.provenance import canonical_json
 from ipe_bench.statistics.analysis import outcomes_of
-from ipe_bench.statistics.collect import Collection, Group, config_leaves
+from ipe_bench.statistics.collect import Collection, Group, config_leaves, differing, shown_leaf
 from ipe_bench.statistics.comparisons import ALPHA, Outcomes, differences, holm
 from ipe_bench.statistics.paired import Effect, fair_coin, no_drift, ratio_effect, success_effect
 from ipe_bench.statistics.records import gate_radius
@@ -25,6 +25,30 @@ QUANTITIES = ("success", "error", "cost", "time")
 JUDGED = ("success", "error", "cost")
 """Those that are tested. Time is not: the trials of a block share theirs evenly, and machines differ."""
 FAIL_ON = ("success", "error")
+
+
+BOTH = " | "
+"""Stands between the values of what differs."""
+_SAYS_NOTHING = {"null": "-", "None": "-", "false": "-"}
+NOT_SETTINGS = (
+    *("first", "second", "trials", "matched_by", "quantity", "first_value", "second_value"),
+    *("change", "low", "high", "p", "e", "finding"),
+)
+"""The columns of a row that do not say what is compared."""
+_HEADINGS = {"error_scale": "error scale"}
+
+
+def described(row: Mapping[str, Any]) -> str:
+    """What a row compares, in a line for people."""
+    named = {k: v for k, v in row.items() if k not in NOT_SETTINGS and v is not None and v == v}
+    return ", ".join(
+        str(value) if key in ("measurement", "noise") else f"{_HEADINGS.get(key, key)} {_plain(value)}"
+        for key, value in named.items()
+    )
+
+
+def _plain(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 @dataclass(frozen=True)
@@ -38,9 +62,32 @@ class Match:
 
     @property
     def columns(self) -> dict[str, Any]:
-        """What tells this comparison from the others."""
-        shared = {k: v for k, v in self.first.columns.items() if k not in self.setting}
-        return shared | {k: f"{a} | {b}" for k, (a, b) in self.setting.items()}
+        """What tells this comparison from the others: what both have, then what differs, with both values."""
+        columns = {k: v for k, v in self.first.columns.items() if k not in self.setting}
+        for key, values in self.setting.items():
+            # A component is called by its name, not by its class.
+            named = [group.columns.get(key, value) for group, value in zip(self._both, values, strict=True)]
+            shown = [_SAYS_NOTHING.get(_plain(v), _plain(v)) for v in named]
+            if shown != ["-", "-"]:
+                columns[key] = BOTH.join(shown)
+        return columns | self.options
+
+    @property
+    def options(self) -> dict[str, str]:
+        """The options in which estimators of one label differ."""
+        if self.first.label != self.second.label:
+            return {}
+        configs = [{"estimator": group.footer["identity"]["estimator"]} for group in self._both]
+        leaves = [config_leaves(config) for config in configs]
+        found = {}
+        for key in differing(configs):
+            values = [_plain(shown_leaf(own[key][1])) if key in own else "-" for own in leaves]
+            found[key] = BOTH.join(_SAYS_NOTHING.get(v, v) for v in values)
+        return found
+
+    @property
+    def _both(self) -> tuple[Group, Group]:
+        return self.first, self.second
 
 
 def compared(

@@ -158,10 +158,10 @@ def _groups(cells: Sequence[StoredCell], runs: Sequence[Run]) -> tuple[Group, ..
         first = members[0]
         leaves = config_leaves(_scenario(first))
         columns = {k: first.names[k] for k in ("measurement", "noise")}
-        columns |= {k: _shown(leaves[k][1]) if k in leaves else None for k in extra}
+        columns |= {k: shown_leaf(leaves[k][1]) if k in leaves else None for k in extra}
         columns["error_scale"] = first.names["error_scale"]
         own = config_leaves(first.footer["identity"]["estimator"])
-        chosen = {k: _shown(own[k][1]) if k in own else None for k in options.get(first.label, ())}
+        chosen = {k: shown_leaf(own[k][1]) if k in own else None for k in options.get(first.label, ())}
         label = first.label + (f" ({', '.join(f'{k}={v}' for k, v in chosen.items())})" if chosen else "")
         pairs = tuple((m, truths.get(m.scenario_id)) for m in sorted(members, key=lambda m: (m.seed, m.key)))
         groups[what] = Group(columns, label, {f"estimator.{k}": v for k, v in chosen.items()}, pairs)
@@ -230,7 +230,7 @@ def _estimator_order(runs: Iterable[Run]) -> dict[str, int]:
     return {label: i for i, label in enumerate(labels)}
 
 
-def _shown(value: Any) -> Any:
+def shown_leaf(value: Any) -> Any:
     """A leaf as it stands in a table: a class by its own name, a long list by its beginning and a digest of it all."""
     if isinstance(value, str) and value.count(".") >= 2 and value.replace(".", "_").isidentifier():
         return value.rpartition(".")[2]

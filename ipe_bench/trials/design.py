@@ -187,6 +187,11 @@ def design(
     most = model.m if readings is None else readings
     if most < model.n:
         raise UserError(f"readings={most}: {model.n} parameters want at least as many readings")
+    if readings is not None and readings > candidates.m:
+        raise UserError(
+            f"readings={readings}: {model.name} has {candidates.m} readings to choose among; give at most as many, or"
+            " make room for more with its options (`ipe-bench list measurement -v`)"
+        )
     judge = _Judge.against(_today_information(model, R, x, reference), slopes, criterion)
     ways = [_way(judge, _units(model, candidates, chosen, slopes), model.m, most) for chosen in columns]
     chosen_ways = tuple(way for way in ways if way is not None)

@@ -53,11 +53,11 @@ def spread_of(estimator: Estimator, problem: Problem, J: Array, inner: Array | N
     """How the residuals scatter that an estimator leaves, with dh/dx = J (trials, m, n) near its estimates; `inner` is
     J' R^-1 J where it is known."""
     m, n = J.shape[1:]
-    deviation = problem.prior_used()
+    prior = problem.prior_covariance()
     with np.errstate(all="ignore"):
-        if "prior" in estimator.needs and deviation is not None:
+        if "prior" in estimator.needs and prior is not None:
             inner = information(J, problem.R) if inner is None else inner
-            return prior_spread(inner, m, deviation, inflation_of(estimator))
+            return prior_spread(inner, m, prior.factor, inflation_of(estimator))
         if estimator.equation == "frozen" and np.isfinite(problem.H).all():
             return frozen_spread(J, problem.H, problem.R, inner)
     return least_squares_spread(m, n, len(J))
@@ -107,11 +107,11 @@ def _by_bases(J: Array, H: Array, R: Covariance) -> Array:
         return 1 / np.minimum(cosines, 1.0) ** 2
 
 
-def prior_spread(inner: Array, m: int, deviation: Array, inflation: float = 1.0) -> Spread:
-    """For an estimate from m readings with J' R^-1 J = inner (trials, n, n) and a prior of `deviation` (n,), widened by
-    `inflation` for the estimator."""
-    n = len(deviation)
-    values = inner * np.outer(deviation, deviation)
+def prior_spread(inner: Array, m: int, factor: Array, inflation: float = 1.0) -> Spread:
+    """For an estimate from m readings with J' R^-1 J = inner (trials, n, n) and a prior of deviations `factor` (n,), or
+    with that Cholesky factor (n, n), widened by `inflation` for the estimator."""
+    n = len(factor)
+    values = inner * np.outer(factor, factor) if factor.ndim == 1 else np.matmul(np.matmul(factor.T, inner), factor)
     usable = finite(values)
     values = np.maximum(np.linalg.eigvalsh(np.where(usable[:, None, None], values, 0.0)), 0.0)
     values = np.where(usable[:, None], values, np.nan)

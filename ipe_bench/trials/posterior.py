@@ -216,9 +216,9 @@ def _modes(problem: Problem, z: Array, x: Array) -> tuple[Array, Array]:
 
 def _tempered(problem: Problem, x: Array, beta: float) -> Array:
     """beta J' R^-1 J + P0^-1 (points, n, n)."""
-    deviation = problem.prior_used()
-    assert deviation is not None
-    return beta * information(problem.measurement.jacobian(x), problem.R) + np.diag(deviation**-2.0)
+    prior = problem.prior_covariance()
+    assert prior is not None
+    return beta * information(problem.measurement.jacobian(x), problem.R) + prior.inverse()
 
 
 @dataclass
@@ -241,9 +241,9 @@ class _Population:
 
     @classmethod
     def run(cls, problem: Problem, z: Array, count: int, rng: np.random.Generator) -> _Population:
-        deviation = problem.prior_used()
-        assert deviation is not None
-        x = problem.x0 + deviation * rng.standard_normal((count, problem.measurement.n))
+        prior = problem.prior_covariance()
+        assert prior is not None
+        x = problem.x0 + prior.coloured(rng.standard_normal((count, problem.measurement.n)))
         self = cls(problem, z, rng, x, np.empty(count))
         self.log = self._log_likelihood(x)
         while self.beta < 1 and self.stages < _MOST_STAGES:
@@ -261,7 +261,9 @@ class _Population:
         return np.where(np.isfinite(squares), -0.5 * squares, -np.inf)
 
     def _log_prior(self, x: Array) -> Array:
-        return -0.5 * np.sum(((x - self.problem.x0) / self.problem.prior_used()) ** 2, axis=1)
+        prior = self.problem.prior_covariance()
+        assert prior is not None
+        return -0.5 * np.sum(prior.whiten(x - self.problem.x0) ** 2, axis=1)
 
     def _stage(self) -> None:
         """A step of temperature, resampling, and moves."""

@@ -75,7 +75,8 @@ class Scenario:
         if self.noise.real:
             return recorded_problem(self.measurement)
         model = self.measurement
-        return Problem(model, self.noise.covariance(model.m), self.prior.deviation(model.n, self.error_scale))
+        deviation, correlation = self.prior.deviation(model.n, self.error_scale), self.prior.correlation(model.n)
+        return Problem(model, self.noise.covariance(model.m), deviation, correlation)
 
     @cached_property
     def simulator(self) -> Measurement:
@@ -127,6 +128,7 @@ def _recorded_trial(measurement: Measurement, start: int, stop: int) -> Trials:
 
 def _streams(seed: int, trial: int) -> tuple[np.random.Generator, np.random.Generator]:
     """Independent random streams for a trial's parameters and for its noise."""
-    sequence = np.random.SeedSequence(seed, spawn_key=(trial,))
-    parameters, noise = (np.random.Generator(np.random.Philox(s)) for s in sequence.spawn(2))
+    # The children that SeedSequence(seed, spawn_key=(trial,)).spawn(2) has, without making their parent.
+    children = (np.random.SeedSequence(seed, spawn_key=(trial, child)) for child in range(2))
+    parameters, noise = (np.random.Generator(np.random.Philox(child)) for child in children)
     return parameters, noise

@@ -77,8 +77,8 @@ class Block:
     @cached_property
     def bayes_information(self) -> Array:
         """J' R^-1 J + P0^-1 at the truth: the inverse of the Bayesian bound."""
-        deviation = self.problem.prior_used()
-        return self.crlb_information + (0.0 if deviation is None else np.diag(deviation**-2.0))
+        prior = self.problem.prior_covariance()
+        return self.crlb_information + (0.0 if prior is None else prior.inverse())
 
     @cached_property
     def crlb_deviation(self) -> Array:
@@ -111,12 +111,12 @@ class Block:
         Theory I, 1968, sec. 2.4), the mean taken over the first `EXPECTED` truths of the scenario: in its first trial,
         and NaN in the others."""
         bound = np.full(self.trials.x.shape, np.nan)
-        deviation = self.problem.prior_used()
-        if self.trials.start == 0 and len(bound) and deviation is not None and not self.scenario.noise.real:
+        prior = self.problem.prior_covariance()
+        if self.trials.start == 0 and len(bound) and prior is not None and not self.scenario.noise.real:
             x = self.scenario.truths(0, EXPECTED)
             with np.errstate(all="ignore"):
                 expected = information(self.problem.measurement.jacobian(x), self.problem.R).mean(axis=0)
-                bound[0] = deviations(inverse((expected + np.diag(deviation**-2.0))[None])[0])[0]
+                bound[0] = deviations(inverse((expected + prior.inverse())[None])[0])[0]
         return bound
 
     def readings_at(self, x: Array) -> Array:

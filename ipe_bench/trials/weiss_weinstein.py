@@ -78,7 +78,7 @@ def weiss_weinstein(problem: Problem, information: Array, offsets: Array, u: Arr
     offsets = _telling(problem, offsets, u)
     k = len(offsets)
     G = np.zeros((n + k, n + k))
-    G[:n, :n] = information + np.diag(problem.prior_used() ** -2.0)  # type: ignore[operator]
+    G[:n, :n] = information + problem.prior_covariance().inverse()  # type: ignore[union-attr]
     alike = [_Alike.of(problem, c, u) for c in offsets]
     for i in range(k):
         G[n + i, :n] = G[:n, n + i] = -4 * alike[i].slope / alike[i].value
@@ -117,17 +117,17 @@ class _Alike:
 
     @classmethod
     def of(cls, problem: Problem, c: Array, u: Array) -> _Alike:
-        model, deviation = problem.measurement, problem.prior_used()
-        assert deviation is not None
+        model, prior = problem.measurement, problem.prior_covariance()
+        assert prior is not None
         above, below = u + c / 2, u - c / 2
         with np.errstate(all="ignore"):
             apart = problem.R.whiten(model.simulate(above) - model.simulate(below))
-            weight = np.exp(-np.sum(apart**2, axis=1) / 8 - np.sum((c / deviation) ** 2) / 8)
+            weight = np.exp(-np.sum(apart**2, axis=1) / 8 - np.sum(prior.whiten(c) ** 2) / 8)
         weight = np.where(np.isfinite(weight), weight, 0.0)
         slope, used = np.zeros(len(c)), weight > 0
         if used.any():
             both = problem.R.whiten_jacobian(model.jacobian(above[used]) + model.jacobian(below[used]))
-            fall = -np.einsum("tmi,tm->ti", both, apart[used]) / 8 - c / (4 * deviation**2)
+            fall = -np.einsum("tmi,tm->ti", both, apart[used]) / 8 - prior.inverse() @ c / 4
             slope = np.sum(weight[used, None] * fall, axis=0) / len(u)
         return cls(float(weight.mean()), slope)
 

@@ -53,7 +53,7 @@ def test_the_python_of_the_readme_runs_as_it_stands(tmp_path, monkeypatch):
     exec(code.replace("trials=200", "trials=20"), names)
     assert set(names["table"]["estimator"]) == {"newton", "ekf"}
     assert names["rows"].groupby("estimator")["nees"].mean().loc["ekf"] > names["rows"]["nees"].min()
-    assert [fit.label for fit in names["fits"]] == ["linear_lse", "fixed_point", "levenberg_marquardt", "progressive"]
+    assert [fit.label for fit in names["fits"]] == ["linear_lse", "levenberg_marquardt", "auto"]
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +99,16 @@ def test_a_file_and_an_array_are_estimated_alike(tmp_path, polynomial):
         (of_file,) = ib.estimate(polynomial.measurement, readings, chosen, noise=polynomial.noise)
         (of_array,) = ib.estimate(polynomial.measurement, z, chosen, noise=polynomial.noise)
         np.testing.assert_array_equal(of_file.x, of_array.x)
+
+
+def test_without_estimators_they_are_those_of_the_command(polynomial):
+    from ipe_bench.cli.estimate import STANDARD_ESTIMATORS
+    from ipe_bench.cli.single import compose_single
+
+    asked = ["measurement=polynomial", "readings=z.csv"]
+    command = compose_single("estimate", asked, lambda words: None, standard=STANDARD_ESTIMATORS).job.estimators
+    fits = ib.estimate(polynomial.measurement, polynomial.draw(0, 1).z[0], noise=polynomial.noise)
+    assert {fit.label for fit in fits} == set(command)
 
 
 def test_noise_that_nobody_states_is_estimated_from_the_residuals(polynomial):

@@ -22,10 +22,12 @@ from typing import Any
 
 import c_kernel
 import numpy as np
+import peers
 from scipy.integrate import solve_ivp
 
 import ipe_bench as ib
 from ipe_bench.baselines.epochs import Epoch
+from ipe_bench.basics.linalg import deviations
 from ipe_bench.basics.machine import library_versions
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.trials.scoring import Block
@@ -91,10 +93,15 @@ def simulation() -> Iterator[Row]:
     ours, fixed = least(lambda: adaptive.simulate(x), lambda: model.simulate(x))
     name = f"one simulation, batch {BATCH}, step by tolerance"
     yield Row("simulation", name, 1e6 * ours / BATCH, "µs", f"steps of {STEP_S:g} s", 1e6 * fixed / BATCH)
+    what = f"one simulation, batch {BATCH}"
+    for beside, simulate in peers.simulators(model, 1):
+        if not np.abs(simulate(x) - model.simulate(x)).max() < adaptive.tolerance:
+            raise AssertionError(f"{beside}: integrates something else, or less accurately")
+        ours, theirs = least(lambda: model.simulate(x), lambda simulate=simulate: simulate(x), rounds=3)
+        yield Row("simulation", what, 1e6 * ours / BATCH, "µs", beside, 1e6 * theirs / BATCH)
     few = x[:2]
     ours, theirs = least(lambda: model.simulate(x), lambda: [by_scipy(model, row) for row in few], rounds=2)
-    for beside, seconds in (("SciPy DOP853, rtol 1e-9", theirs / len(few)),):
-        yield Row("simulation", f"one simulation, batch {BATCH}", 1e6 * ours / BATCH, "µs", beside, 1e6 * seconds)
+    yield Row("simulation", what, 1e6 * ours / BATCH, "µs", "SciPy DOP853, rtol 1e-9", 1e6 * theirs / len(few))
 
 
 def by_scipy(model: Any, x: np.ndarray) -> np.ndarray:
@@ -146,8 +153,19 @@ def estimation() -> Iterator[Row]:
         "estimation", "LevenbergMarquardt", 1e6 * seconds / BATCH, "µs", "SciPy least_squares", 1e6 * theirs / len(few)
     )
 
+    theirs = peers.optimistix_estimator(problem, 1, 1e-8)
+    if theirs is not None:
+        some = z[:50]
+        best = B.LevenbergMarquardt().estimate(problem, some)
+        if not (np.abs(theirs(some) - best.x) < 0.01 * deviations(best.covariance)).all():
+            raise AssertionError("optimistix ends somewhere else")
+        seconds, beside = least(lambda: B.LevenbergMarquardt().estimate(problem, some), lambda: theirs(some), rounds=2)
+        name = "optimistix LevenbergMarquardt, batch 50"
+        yield Row("estimation", "LevenbergMarquardt, batch 50", 2e4 * seconds, "µs", name, 2e4 * beside)
+
     def scored() -> None:
-        fresh = Block.draw(s, 0, BATCH)
+        # Not the first block, which also holds what is taken of a few trials only.
+        fresh = Block.draw(s, BATCH, 2 * BATCH)
         fresh.truth_columns()
         for estimator in (S.FixedPoint(), B.LinearLSE()):
             fresh.estimate(estimator)
@@ -266,6 +284,7 @@ def markdown(facts: dict[str, Any], rows: list[Row]) -> str:
 
 
 def main(folder: Path, parts: list[str]) -> None:
+    peers.one_thread()
     facts, rows = machine(), []
     for part in parts or list(PARTS):
         for row in PARTS[part]():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -9,6 +11,7 @@ from synthetic_store import Pretender, Synthetic
 
 import ipe_bench as ib
 from ipe_bench.cli.main import main
+from ipe_bench.noise import Quantization
 from ipe_bench.report.comparison import draw
 
 ERROR = 0.1
@@ -106,6 +109,28 @@ def test_scenarios_that_differ_in_one_setting_are_compared_and_it_is_said(tmp_pa
     assert frame["noise.deviation"].iloc[0] == "0.2 | 0.4"
     # The errors double and so does the bound that they are measured by; only the synthetic rows know another one.
     assert frame.set_index("quantity").loc["error", "change"] == pytest.approx(1.0, rel=1e-6)
+
+
+def test_what_differs_is_named_wherever_it_stands(tmp_path, capsys):
+    """Another error scale, another kind of noise, another option under the same label: in the title of the table, and
+    where it is said what is worse."""
+    a = store(tmp_path / "a", estimator=Pretender(option=5))
+    for name, title, other in (
+        ("scale", "error scale 1 | 3", {"error_scale": 3.0}),
+        ("option", "estimator.option 5 | 6", {"estimator": Pretender(option=6)}),
+    ):
+        b = store(tmp_path / name, **{"estimator": Pretender(option=5), "factor": 2.0} | other)
+        assert main(["compare", str(a), str(b)]) == 1
+        lines = capsys.readouterr().out.splitlines()
+        assert sum(title in line for line in lines if line.endswith("200 trials")) == 1
+        assert sum(title in line for line in lines if line.startswith("worse: it in error")) == 1
+    filled = Synthetic(tmp_path / "noise")
+    scenario = replace(filled.scenario(), noise=Quantization(0.7))
+    filled.bound = lambda _: np.full(3, ERROR)
+    filled.add(scenario, "it", np.full((20, 3), ERROR), estimator=Pretender(option=5))
+    row = ib.compare(a, tmp_path / "noise").iloc[0]
+    assert row["noise"] == "gaussian | quantization"
+    assert row["noise.step"] == "- | 0.7"
 
 
 def test_scenarios_of_one_folder_alone_are_left_out_and_it_is_said(tmp_path):

@@ -62,6 +62,7 @@ def test_the_truth_that_is_asked_for_is_the_only_suspect(command):
         (["--by", "colour"], "by=colour: there is no such column"),
         (["--criterion", "E"], "--criterion: invalid choice"),
         (["--readings", "3"], "readings=3: 4 parameters want"),
+        (["--readings", "500"], "readings=500: polynomial has 40 readings to choose among"),
         (["precision=0.1"], "precision: is for `ipe-bench run`"),
         (["truth_measurement=polynomial"], "has no errors besides the parameters"),
     ],

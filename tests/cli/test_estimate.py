@@ -121,11 +121,12 @@ def test_exit_code_1_where_no_estimator_has_an_answer_that_passes(estimate, misr
     assert "±" not in printed.split("Does the model fit?")[0].split("standard error", 1)[1]
 
 
-def test_intervals_without_the_prior_are_not_told_of_an_estimate_with_one(estimate, misra):
+def test_an_estimate_with_a_prior_has_intervals_that_count_it(estimate, misra):
     words = (*SATURATION, "solver=[]", "readings=weighted.csv", "parameters.b1.deviation=1")
     code, printed, answer = estimate(*words, "baseline=[map_lm]")
     assert code == 0, printed
-    assert answer["examination"] is None
+    assert answer["examination"]["with_prior"]
+    assert answer["examination"] == answer["examination_with_prior"]
     assert "map_lm: with a prior" in printed
     t, y = misra
     sigma = 0.05 + 0.01 * np.arange(len(t))
@@ -138,6 +139,50 @@ def test_intervals_without_the_prior_are_not_told_of_an_estimate_with_one(estima
     x, P = curve_fit(with_prior, rows, z, (250, 5e-4), s, True, ftol=1e-14, xtol=1e-14, gtol=1e-14)
     assert list(of(answer, "estimates", "map_lm").values()) == pytest.approx(x, rel=1e-5)
     assert list(of(answer, "standard_errors", "map_lm").values()) == pytest.approx(np.sqrt(np.diag(P)), rel=1e-4)
+    low, high = answer["examination"]["intervals"]["profile"]["b1"]
+    assert (low, high) == pytest.approx((x[0] - 1.96 * np.sqrt(P[0, 0]), x[0] + 1.96 * np.sqrt(P[0, 0])), abs=0.1)
+
+
+def test_what_is_known_of_all_parameters_stands_in_small_files(estimate, misra, tmp_path):
+    """Starts, and a prior of both together, against SciPy with both as readings of a covariance."""
+    (tmp_path / "known.yaml").write_text("b1: {nominal: 240}\nb2: {nominal: 5.5e-4}\n")
+    (tmp_path / "prior.csv").write_text("b2,b1\n1e-10,-9e-6\n-9e-6,1\n")
+    words = ("solver=[]", "baseline=[map_lm]", "readings=weighted.csv", "parameters=known.yaml")
+    code, printed, answer = estimate(*SATURATION, *words, "prior_covariance=prior.csv")
+    assert code == 0, printed
+    t, y = misra
+    sigma = 0.05 + 0.01 * np.arange(len(t))
+    V = np.zeros((16, 16))
+    V[:14, :14], V[14:, 14:] = np.diag(sigma**2), [[1.0, -9e-6 * 1e4], [-9e-6 * 1e4, 1e-10 * 1e8]]
+    x, P = curve_fit(
+        lambda _, b1, b2: np.append(curve(t, b1, 1e-4 * b2), [b1, b2]), np.append(t, [0.0, 0.0]),
+        np.append(y, [240.0, 5.5]), (240.0, 5.5), V, True, ftol=1e-14, xtol=1e-14, gtol=1e-14,
+    )  # fmt: skip
+    assert list(of(answer, "estimates", "map_lm").values()) == pytest.approx(x * [1, 1e-4], rel=1e-6)
+    errors = np.sqrt(np.diag(P)) * [1, 1e-4]
+    assert list(of(answer, "standard_errors", "map_lm").values()) == pytest.approx(errors, rel=1e-4)
+
+
+def test_rows_and_columns_are_left_out_on_purpose(estimate, misra, tmp_path):
+    rows = (tmp_path / "my.csv").read_text().splitlines()
+    remarks = ["remark", *(f"n{k}" for k in range(14))]
+    (tmp_path / "odd.csv").write_text("\n".join(f"{row},{r}" for row, r in zip(rows, remarks, strict=True)))
+    code, printed, _ = estimate(*SATURATION, *LM, "readings=odd.csv")
+    assert code == 2
+    assert "ignore_columns=[remark]" in printed
+    code, printed, answer = estimate(*SATURATION, *LM, "readings=odd.csv", "ignore_columns=remark", "ignore_rows=[3,9]")
+    assert code == 0, printed
+    assert answer["left_out"] == "rows 3, 9; columns remark"
+    assert (answer["readings_present"], answer["readings_missing"]) == (12, 2)
+    kept = np.delete(np.arange(14), [1, 7])
+    t, y = misra
+    x, _ = curve_fit(curve, t[kept], y[kept], (250, 5e-4), ftol=1e-14, xtol=1e-14, gtol=1e-14)
+    assert list(of(answer, "estimates").values()) == pytest.approx(x, rel=1e-6)
+    # Another command, so another folder.
+    code, _, whole = estimate(*SATURATION, *LM, "readings=odd.csv", "ignore_columns=remark")
+    assert code == 0
+    assert whole["readings_present"] == 14
+    assert (tmp_path / "outputs/estimate-formula-2/estimate.json").is_file()
 
 
 def test_an_epidemic_has_the_noise_of_its_counts_and_not_that_of_a_platform(estimate, tmp_path):
@@ -209,6 +254,17 @@ MISTAKES = {
     "all fixed": (("readings=my.csv", "parameters.b1.fixed=1", "parameters.b2.fixed=1"), "parameters: all are fixed"),
     "no start": (("readings=my.csv", "~measurement.start.b2"), "start"),
     "one file twice": (("readings=[my.csv,my.csv]",), "names a file twice"),
+    "no such column": (("readings=my.csv", "ignore_columns=[u]"), "ignore_columns=u: there is no such column"),
+    "no such row": (("readings=my.csv", "ignore_rows=[40]"), "ignore_rows=40: my.csv has no such row; its rows are 2"),
+    "no covariance": (
+        ("readings=my.csv", "prior_covariance=[[1,2],[2,1]]"),
+        "prior_covariance: is not positive definite",
+    ),
+    "prior twice": (
+        ("readings=my.csv", "prior_covariance=[[1,0],[0,1]]", "parameters.b1.deviation=3"),
+        "prior_covariance: says all of the prior; leave out parameters.NAME.deviation",
+    ),
+    "no such file": (("readings=my.csv", "parameters=no.yaml"), "parameters=no.yaml: cannot be read"),
     "deviations too few": (("readings=my.csv", "noise.deviation=[1,2]"), "has 2 numbers; give one for each of 14"),
 }
 

@@ -33,7 +33,7 @@ OPTIONS = {
     "estimators.fixed_point.start": ("here", "1", "null", "[nominal]"),
     "estimators.fixed_point._target_": ("ipe_bench.solvers.Newton", "os.system", "5", "ipe_bench.solvers.Newtn"),
     "estimators.newton.tolerance": ("1e-3",),
-    "noise.step": ("0", "-1", "nan", "inf", "wide", "null", "[1]"),
+    "noise.step": ("0", "-1", "nan", "inf", "wide", "[1]"),
     "noise._target_": ("os.system", "null", "5", "ipe_bench.measurements.Gins", "ipe_bench.noise.Nothing"),
     "noise.nothing": ("1",),
     "measurement.nothing": ("1",),

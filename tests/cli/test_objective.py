@@ -63,6 +63,7 @@ def test_a_number_that_is_not_known_is_no_objective(capsys):
 
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("optuna") is None, reason="needs the extra optuna")
+@pytest.mark.filterwarnings("default")  # what Optuna 2 uses of its libraries is no error of ours
 def test_optuna_finds_cheaper_windows_for_progressive_than_the_default(capsys):
     common = ["measurement=bearings", "noise=gaussian", "error_scale=10", "baseline=[]", "solver=[progressive]"]
     common += ["trials=100", "execution=serial", "objective=progressive.cost_median"]

@@ -211,3 +211,14 @@ def test_a_narrow_terminal_keeps_the_names_of_those_that_attain_minima(width):
     heading = " ".join(table).split()
     for word, file in (("median", "tables/attained.csv"), ("problems", "")):
         assert word in heading or file in shown.get().replace("\n", " ")
+
+
+def test_a_precision_that_is_not_reached_is_said_and_has_its_exit_code(command):
+    """Of the first 60 trials no share is known to a thousandth; to a half, every share is."""
+    words = ("run", *SMALL, "solver=[newton]", "trials=60", "output=few")
+    code, out, _ = command(*words, "precision=0.001")
+    assert code == 1
+    assert "60 trials; the precision is not reached: there are as many trials as there may be" in out
+    code, out, _ = command(*words, "precision=0.5")
+    assert code == 0
+    assert "60 trials; every interval is narrow enough" in out

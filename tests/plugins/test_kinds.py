@@ -320,3 +320,24 @@ def test_the_posterior_is_not_sampled_under_a_prior_that_is_not_normal():
 
     with pytest.raises(UserError, match="prior=uniform: is not normal"):
         reference(Scenario(Bent(0.02), Gaussian(0.1), Uniform()), {}, 0)
+
+
+def test_a_plugin_without_its_library_stops_no_run_and_says_what_to_install(capsys):
+    assert main(["new", "solver", "mine"]) == 0
+    project = Path("plugins/mine/pyproject.toml")
+    text = project.read_text().replace('["ipe-bench"]', '["ipe-bench", "no-such-library>=2", "numpy"]')
+    project.write_text(text)
+    Path("plugins/mine/ipe_bench_mine/mine.py").write_text("import no_such_library\n")
+    discovery.sources.cache_clear()
+    capsys.readouterr()
+    assert main(["list", "solver"]) == 0
+    written = capsys.readouterr()
+    remedy = "needs no-such-library, not installed here; pip install plugins/mine"
+    assert written.err.splitlines() == [f"ipe-bench: solver=mine: {remedy}"]
+    assert "newton" in written.out
+    assert main(["run", *SMALL, "solver=[newton]"]) == 0
+    assert "mine" not in capsys.readouterr().err
+    assert main(["run", *SMALL, "solver=[mine]"]) == 2
+    assert capsys.readouterr().err.splitlines() == [f"ipe-bench: solver=mine: {remedy}"]
+    assert main(["check", "plugins/mine"]) == 1
+    assert remedy in capsys.readouterr().out

@@ -7,7 +7,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from synthetic_store import Pretender, Synthetic
 
 from ipe_bench.report.figures import (
     FIGURES,
+    common,
     convergence,
     correlation,
     cost,
@@ -124,6 +125,48 @@ def test_points_without_an_interval_are_in_view(synthetic):
             if "up to" not in ax.get_title():
                 low, high = ax.get_ylim()
                 assert all(low < y < high for _, y, _ in points(ax) if np.isfinite(y))
+
+
+def test_heavy_tails_leave_the_points_their_room(synthetic):
+    """One trial in sixty errs a million times: its interval goes to where it ends, the axis does not."""
+    fill(synthetic, labels=(REFERENCE, "two"))
+    scenario = synthetic.scenario(error_scale=100.0)
+    error = 0.1 * np.random.default_rng(0).standard_normal((60, 3))
+    error[0] *= 1e6
+    synthetic.add(scenario, "wild", error)
+    view = only_view(synthetic)
+    panels = drawn(error_scale, view)["error_against_scale"].figure.axes
+    low, high = panels[0].get_ylim()
+    # All panels of groups share one axis.
+    values = np.array([y for ax in panels if ax.get_ylim() == (low, high) for _, y, _ in points(ax)])
+    ends = view["by_group"]["high"]
+    assert ends[np.isfinite(ends)].max() > 10 * high
+    assert low < values.min() < values.max() < high
+    assert high / values.max() < max(10.0, (values.max() / values.min()) ** 0.3) * 2
+
+
+def test_scales_are_labelled_as_far_as_there_is_room_with_both_ends():
+    scales = [300.0, 600.0, 1000.0, 2000.0, 3000.0, 5000.0, 10000.0]
+    span = np.log10(scales[-1] / scales[0])
+    for inches in (0.8, 1.3, 2.0, 4.0, 9.0):
+        kept = common._labelled(scales, span / inches)
+        assert kept[0] == 300.0
+        assert kept[-1] == 10000.0
+        for a, b in pairwise(kept):
+            apart = np.log10(b / a) / span * inches
+            assert apart > 0.06 * (len(f"{a:g}") + len(f"{b:g}")) / 2
+    assert kept == scales
+    assert common._labelled([33.0], 1.0) == [33.0]
+
+
+def test_points_of_no_error_at_all_are_in_the_panel_of_costs(synthetic):
+    fill(synthetic, labels=(REFERENCE, "two", "three", "exact"))
+    scenario = synthetic.scenario(error_scale=100.0)
+    synthetic.add(scenario, "none", np.full((60, 3), 1e-12))
+    for ax in drawn(cost, only_view(synthetic))["cost_against_accuracy"].figure.axes:
+        if ax.get_title():
+            low, high = ax.get_ylim()
+            assert low < 0 < 2 < high
 
 
 def test_a_value_that_is_missing_breaks_the_line(synthetic):

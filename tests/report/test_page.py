@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 import numpy as np
+import pandas as pd
 import pytest
 from synthetic_store import Synthetic
 from test_report import HOSTILE, fill
@@ -67,6 +68,109 @@ def test_every_figure_is_decoded(desktop, page_file):
     assert {"success_against_scale", "error_distributions", "correlation"} < drawn
     assert len(widths) == len(drawn)
     assert min(widths) > 300
+
+
+def chart(page, script: str):
+    """What a script says of the chart of errors, its figure being `f`."""
+    return page.run(f"(function () {{ const f = document.querySelector('#figure-error_against_scale'); {script} }})()")
+
+
+def test_charts_are_drawn_and_answer_the_keyboard(desktop, page_file):
+    """Every point of the summary is there; what is said of a point is its number in the table."""
+    summary = pd.read_csv(page_file.parent / "summary.csv")
+    rows = summary[(summary["parameter"] == "all") & summary["rmse"].notna()].set_index(["estimator", "error_scale"])
+    assert chart(desktop, "return f.querySelectorAll('.plot g.series :is(circle, polygon)').length") == len(rows)
+    said = chart(
+        desktop,
+        "const plot = f.querySelector('.plot svg'); plot.focus();"
+        "for (const key of ['ArrowRight', 'ArrowDown', 'ArrowRight', 'ArrowRight'])"
+        "  plot.dispatchEvent(new KeyboardEvent('keydown', { key }));"
+        "return Array.from(f.querySelector('.note').children, c => c.textContent)",
+    )
+    row = rows.loc[("one", 100.0)]
+    assert said[0] == "one"
+    value, low, high = map(float, re.match(r".*: (\S+) \((\S+) to (\S+)\)", said[1]).groups())
+    assert value == pytest.approx(row["rmse"], rel=1e-3)
+    assert [low, high] == pytest.approx([row["rmse_low"], row["rmse_high"]], rel=1e-3)
+    assert "error scale: 100" in said
+    assert said[-1] == "80 trials"
+
+
+def test_charts_answer_the_pointer(desktop):
+    said = chart(
+        desktop,
+        "const mark = f.querySelectorAll('.plot g.series')[1].querySelector('circle, polygon').getBoundingClientRect();"
+        "f.querySelector('.plot svg').dispatchEvent(new PointerEvent('pointermove',"
+        "  { clientX: mark.x + mark.width / 2, clientY: mark.y + mark.height / 2 }));"
+        "return [f.querySelector('.note').hidden, f.querySelectorAll('.told').length]",
+    )
+    assert said == [False, 1]
+
+
+def test_series_are_hidden_and_the_axes_go_with_those_that_are_left(desktop):
+    ticks = "Array.from(f.querySelectorAll('.frame text[text-anchor=end]'), t => t.textContent)"
+    before, after, pressed, curves = chart(
+        desktop,
+        f"const before = {ticks}; const button = f.querySelector('.legend button'); button.click();"
+        f"return [before, {ticks}, button.getAttribute('aria-pressed'),"
+        "  f.querySelectorAll('.plot g.series').length]",
+    )
+    assert pressed == "false"
+    assert curves == 4
+    # The linear estimate was the one that was a hundred times the bound.
+    assert "100" in before
+    assert "100" not in after
+
+
+def test_axes_are_logarithmic_or_linear_and_show_another_column(desktop):
+    logarithmic, linear, titles = chart(
+        desktop,
+        "const y = () => Array.from(f.querySelectorAll('.plot g.series')[0].querySelectorAll('circle, polygon'),"
+        "  m => m.getBoundingClientRect().y); const before = y(); const box = f.querySelectorAll('input')[0];"
+        "box.click(); const after = y(); const choice = f.querySelectorAll('select')[1]; choice.value = '1';"
+        "choice.dispatchEvent(new Event('change'));"
+        "return [before, after, Array.from(f.querySelectorAll('.name'), t => t.textContent)]",
+    )
+    # Errors of 1, 10 and 100: equal steps on one, a tenth of each other on the other.
+    steps = [np.diff(values) for values in (logarithmic, linear)]
+    assert steps[0][0] == pytest.approx(steps[0][1], rel=0.05)
+    assert steps[1][1] == pytest.approx(10 * steps[1][0], rel=0.1)
+    assert titles[0].startswith("simulations per trial")
+
+
+def test_the_page_is_dark_where_the_reader_has_it_so(desktop, page_file):
+    color = "getComputedStyle(document.body).backgroundColor"
+    assert desktop.run(color) == "rgb(255, 255, 255)"
+    desktop.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
+    try:
+        assert max(map(int, re.findall(r"\d+", desktop.run(color)))) < 50
+        curve = chart(desktop, "return getComputedStyle(f.querySelector('.plot g.series circle, polygon')).fill")
+        assert max(map(int, re.findall(r"\d+", curve))) > 200
+    finally:
+        desktop.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}])
+
+
+def test_names_stay_in_sight_when_a_table_is_scrolled(desktop):
+    left, right, visible = desktop.run(
+        "(function () { const box = document.querySelector('#table-overview').parentElement; box.scrollLeft = 400;"
+        " const cell = box.querySelector('td.frozen').getBoundingClientRect(), frame = box.getBoundingClientRect();"
+        " return [cell.left - frame.left, frame.right - cell.right, box.scrollLeft]; })()"
+    )
+    assert visible > 0
+    assert 0 <= left <= 2
+    assert right > 0
+
+
+def test_the_static_figure_is_beside_and_is_what_is_printed(desktop):
+    display = "getComputedStyle(f.querySelector('{}')).display"
+    shown = f"{display.format('.static')} + ' ' + {display.format('.chart')}"
+    assert chart(desktop, f"return {shown}") == "none block"
+    assert chart(desktop, f"f.querySelector('button.plain').click(); return {shown}") == "block block"
+    desktop.call("Emulation.setEmulatedMedia", media="print")
+    try:
+        assert chart(desktop, f"return {shown}") == "block none"
+    finally:
+        desktop.call("Emulation.setEmulatedMedia", media="")
 
 
 def test_columns_sort_by_number_and_by_word(desktop):

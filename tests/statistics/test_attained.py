@@ -96,7 +96,10 @@ def test_the_terminal_and_the_report_show_them(folder):
     totals = attained_tables(collection)[1]
     most = list(totals.loc[totals["solved"] == totals["solved"].max(), "estimator"])
     told = f"Most, {totals['solved'].max()}, are solved by {', '.join(most)}."
-    assert told in result.report.read_text(encoding="utf-8")
+    page = result.report.read_text(encoding="utf-8")
+    assert told in page
+    assert f"problems of known minimum, {', '.join(most)} attain" in page
+    assert not {p.stem for p in result.tables} & {"overview", "calibration"}
 
 
 def test_a_start_without_full_rank_is_a_problem_and_no_mistake():

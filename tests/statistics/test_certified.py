@@ -53,6 +53,12 @@ def test_the_report_writes_the_table_and_draws_nothing_over_error_scales(folder)
     result = write_report([folder], folder)
     assert {p.name for p in result.tables} >= {"certified.csv", "certified_averages.csv"}
     assert result.figures == ()
+    # One trial without noise has no error to compare with a bound, and no covariance to calibrate.
+    shown = {p.stem for p in result.tables}
+    assert not shown & {"overview", "calibration", "costs", "comparisons", "parameters"}
+    page = result.report.read_text(encoding="utf-8")
+    # The linear estimate has no digits, the fixed point not all of them.
+    assert "Of 6 certified problems, multiscale_lm solves most, 6, with four digits or more of every parameter" in page
 
 
 def test_more_than_one_trial_is_refused_before_any_work():

@@ -23,6 +23,24 @@ def inputs(time_unit: str, outputs: Sequence[str], cases: int) -> tuple[Input, .
     )
 
 
+def cases(numbers: Sequence[int]) -> int:
+    """How many cases a file has, by the column that numbers them."""
+    known = sorted(set(numbers))
+    if known != list(range(1, len(known) + 1)):
+        raise UserError(f"case={known[-1]}: cases are numbered 1, 2 and so on; there are {', '.join(map(str, known))}")
+    return len(known)
+
+
+def of_cases(name: str, values: Sequence[float], numbers: Sequence[int], count: int) -> tuple[float, ...]:
+    """What a constant is in each of the cases, by the columns of a file: one number in all rows of a case."""
+    found: dict[int, float] = {}
+    for value, case in zip(values, numbers, strict=True):
+        if found.setdefault(case, value) != value:
+            remedy = "" if count > 1 else "; number the cases in a column case"
+            raise UserError(f"case={case}: {name} is {found[case]:g} in one row and {value:g} in another{remedy}")
+    return tuple(found[case] for case in range(1, count + 1))
+
+
 def sampled(
     columns: Mapping[str, Sequence[Any]],
     outputs: Sequence[str],

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +23,14 @@ if TYPE_CHECKING:
 MOST_PANELS = 6
 COINCIDE = 0.015
 """Points nearer than this part of the axis lie upon each other."""
+NARROWEST, ROOMY = 1.7, 2.2
+"""Inches of a panel in print: where there are many, and where there are few."""
+PRINTED_MARK = 0.62
+"""Size of a marker in print, beside that on the page."""
+REACH = 0.3
+"""Part of the span of the points that intervals may add to an axis at either end."""
+LETTER, PRINTED_LETTER = 0.08, 0.068
+"""Inches of a letter under an axis, with the space around it: on the page, and in print."""
 UPON = "Where points coincide, each marker lies smaller upon the one before it."
 
 
@@ -33,10 +43,33 @@ def text(value: Any) -> str:
     return "\u200b" + words if words.startswith("_") else words
 
 
+_column: ContextVar[float | None] = ContextVar("column", default=None)
+
+
+@contextmanager
+def column_width(inches: float) -> Iterator[None]:
+    """Figures that are drawn meanwhile are as wide as a column of print, and no panel narrower than `NARROWEST`."""
+    token = _column.set(inches)
+    try:
+        yield
+    finally:
+        _column.reset(token)
+
+
 def figure(width: float, height: float) -> Figure:
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width, height), layout="constrained")
+    column = _column.get()
+    if column is None or width == column:
+        size = width, height
+    else:
+        size = column, max(1.8, height * column / width)
+    return Figure(figsize=size, layout="constrained")
+
+
+def mark_scale() -> float:
+    """What sizes of markers are multiplied by."""
+    return 1.0 if _column.get() is None else PRINTED_MARK
 
 
 def panels(
@@ -44,10 +77,24 @@ def panels(
 ) -> tuple[Figure, list[Axes]]:
     """A figure with that many panels, unused ones switched off, and room for the legend of the estimators."""
     across = most_across or {4: 2, 7: 4, 8: 4}.get(count, 3)
+    column = _column.get()
+    if column is not None:
+        return _narrow_panels(count, min(across, count), column)
     across = min(across, count)
     down = -(-count // across)
     width = {1: 5.2, 2: 8.0, 3: 9.2}.get(across, 11.0)
     fig = figure(width, height * down + 0.4 + 0.2 * len(look or ()) / 5)
+    axes: list[Axes] = list(fig.subplots(down, across, squeeze=False).flat)
+    for ax in axes[count:]:
+        ax.set_axis_off()
+    return fig, axes[:count]
+
+
+def _narrow_panels(count: int, across: int, column: float) -> tuple[Figure, list[Axes]]:
+    """Panels in a column of print; their legend adds its own height."""
+    across = max(1, min(across, int(column / (NARROWEST if count > 3 else ROOMY))))
+    down = -(-count // across)
+    fig = figure(column, max(1.75, 0.75 * column / across) * down)
     axes: list[Axes] = list(fig.subplots(down, across, squeeze=False).flat)
     for ax in axes[count:]:
         ax.set_axis_off()
@@ -77,11 +124,7 @@ def scale_axis(ax: Axes, scales: Sequence[float], labels: Sequence[str]) -> None
     least = positive[0] / 10 if len(positive) < len(scales) else positive[0]
     ax.set_xscale("symlog", linthresh=positive[0], linscale=0.5) if least < positive[0] else ax.set_xscale("log")
     span = np.log10(positive[-1] / least)
-    # Neighbouring labels such as 10 and 11 would overlap: crowded ones go.
-    kept: list[float] = [] if least == positive[0] else [0.0]
-    for s in positive:
-        if not kept or np.log10(s / max(kept[-1], least)) > 0.1 * span:
-            kept.append(s)
+    kept = [0.0] * (least < positive[0]) + _labelled(positive, span / (ax.get_position().width * _width(ax)))
     ax.set_xticks(kept, [plain(s) for s in kept])
     ax.set_xticks([], minor=True)
     margin = 10 ** max(0.06 * span, 0.15)
@@ -89,20 +132,49 @@ def scale_axis(ax: Axes, scales: Sequence[float], labels: Sequence[str]) -> None
     ax.set_xlabel("error scale")
 
 
-def decades(ax: Axes, values: Any, least: float = 10.0) -> None:
-    """A logarithmic axis around the values that spans at least a decade, so that scatter of a per cent looks small."""
-    values = np.asarray(values, dtype=float)
-    values = values[np.isfinite(values) & (values > 0)]
+def _labelled(scales: Sequence[float], decades_an_inch: float) -> list[float]:
+    """Those of ascending scales whose labels have room: both ends, and what fits between them."""
+    letter = decades_an_inch * (LETTER if _column.get() is None else PRINTED_LETTER)
+
+    def apart(a: float, b: float) -> bool:
+        return np.log10(b / a) > letter * (len(plain(a)) + len(plain(b)) + 1) / 2
+
+    kept = [scales[0]]
+    for scale in scales[1:-1]:
+        if apart(kept[-1], scale) and apart(scale, scales[-1]):
+            kept.append(scale)
+    return [*kept, scales[-1]] if len(scales) > 1 else kept
+
+
+def _width(ax: Axes) -> float:
+    return ax.figure.get_figwidth()  # type: ignore[union-attr]
+
+
+def decades(ax: Axes, values: Any, least: float = 10.0, *, ends: Any = ()) -> None:
+    """A logarithmic axis around the values that spans at least a decade, so that scatter of a per cent looks small.
+
+    The `ends` of intervals widen it by no more than `REACH` of the values' own span, or a decade: those of heavy tails,
+    which may be as wide as numbers go, end at the panel's edge.
+    """
+    values, ends = (_positive(v) for v in (values, ends))
     if len(values) == 0:
         # A logarithmic axis without anything to show makes matplotlib warn.
         return
     ax.set_yscale("log")
-    low, high = float(values.min()) / 1.6, float(values.max()) * 1.6
+    low, high = float(values.min()), float(values.max())
+    room = max(least, (high / low) ** REACH)
+    low = max(low / room, ends.min(initial=low)) / 1.6
+    high = min(high * room, ends.max(initial=high)) * 1.6
     if high / low < least:
         middle = np.sqrt(low * high)
         low, high = middle / np.sqrt(least), middle * np.sqrt(least)
     ax.set_ylim(low, high)
     log_ticks(ax.yaxis, low, high)
+
+
+def _positive(values: Any) -> Any:
+    values = np.asarray(values, dtype=float).ravel()
+    return values[np.isfinite(values) & (values > 0)]
 
 
 def log_ticks(axis: Axis, low: float, high: float) -> None:
@@ -174,7 +246,7 @@ def curves(
         sure = rows[~few & np.isfinite(rows[low]) & np.isfinite(rows[high])]
         ax.vlines(sure["x"], sure[low], sure[high], colors=[look[e].color for e in sure[by]], linewidth=1.0, alpha=0.8)
     markers = {label: one.marker for label, one in look.items()}
-    areas = {d: (5.5 + min(2.5, 9 / len(look)) * d) ** 2 for d in range(len(look))}
+    areas = {d: (mark_scale() * (5.5 + min(2.5, 9 / len(look)) * d)) ** 2 for d in range(len(look))}
     points = style | {"markers": markers, "size": "depth", "sizes": areas, "linewidth": 0.6, "zorder": 3, "alpha": 1.0}
     if (~few).any():
         sns.scatterplot(rows[~few], x="x", y=y, ax=ax, **points)
@@ -221,7 +293,7 @@ def lines(
     style = {"linewidth": 1.4, "estimator": None, "dashes": dashes} | style
     sns.lineplot(rows, x=x, y=y, ax=ax, **style, **seaborn_style(look))
     for i, (line, label) in enumerate(zip(ax.lines[before:], present, strict=True)):
-        line.set(marker=look[label].marker, markevery=(every * i // len(present), every), markersize=5)
+        line.set(marker=look[label].marker, markevery=(every * i // len(present), every), markersize=5 * mark_scale())
         line.set(markeredgecolor="white", markeredgewidth=0.5)
 
 
@@ -239,9 +311,21 @@ def legend_below(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | N
             handles.setdefault(label, handle)
     if not handles:
         return
-    longest = max(len(label) for label in handles)
-    columns = max(1, min(len(handles), int(fig.get_figwidth() / (0.55 + 0.075 * longest))))
+    columns, printed = _legend_columns(list(handles), fig.get_figwidth()), _column.get() is not None
+    if printed:
+        fig.set_figheight(fig.get_figheight() + 0.15 * -(-len(handles) // columns) + 0.1)
     fig.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=columns)
+
+
+def _legend_columns(labels: Sequence[str], width: float) -> int:
+    """As many as fit side by side, each as wide as its longest label."""
+    handle, letter = (0.55, 0.075) if _column.get() is None else (0.38, 0.06)
+
+    def needed(columns: int) -> float:
+        parts = np.array_split(np.array([len(label) for label in labels]), columns)
+        return sum(handle + letter * float(part.max()) for part in parts)
+
+    return next((n for n in range(len(labels), 1, -1) if needed(n) <= width), 1)
 
 
 def values_of(rows: pd.DataFrame, column: str, *, most: int = 20) -> str:

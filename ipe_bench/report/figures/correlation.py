@@ -31,6 +31,7 @@ def draw(view: View) -> Iterator[Drawing]:
     tables = {label: table for label, table in tables.items() if np.isfinite(table.to_numpy()).any()}
     if not tables:
         return
+    solved = common.at_scale(view.totals, scale).set_index("estimator")["solved_trials"]
     side = 1.3 + 0.3 * view.n
     fig = common.figure(min(10.0, (side + 0.6) * len(tables) + 0.6), min(5.2, side + 0.3))
     axes = list(fig.subplots(1, len(tables), squeeze=False).flat)
@@ -42,7 +43,7 @@ def draw(view: View) -> Iterator[Drawing]:
         sns.heatmap(table, mask=np.triu(np.ones(table.shape, dtype=bool)), ax=ax, **style)
         # The first row and the last column are empty without the diagonal.
         ax.set(xlim=(0, view.n - 1), ylim=(view.n, 1), xlabel="", ylabel="")
-        ax.set_title(f"{common.text(label)}, error scale {plain(scale)}")
+        ax.set_title(f"{common.text(label)}, error scale {plain(scale)}, {solved[label]:.0f} trials")
         ax.tick_params(axis="x", rotation=90)
         ax.tick_params(axis="y", rotation=0)
     shown, table = next(iter(tables.items()))

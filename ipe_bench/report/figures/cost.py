@@ -43,7 +43,8 @@ def draw(view: View) -> Iterator[Drawing]:
         ax.set_xscale("log")
         ax.set_xlim(scores["cost"].min() / 1.5, scores["cost"].max() * 1.5)
         common.log_ticks(ax.xaxis, *ax.get_xlim())
-        ax.set_ylim(min(0.8, scores["error"].min() * 0.9), scores["error"].max() * 1.08)
+        low, high = min(0.8, scores["error"].min()), scores["error"].max()
+        ax.set_ylim(low - 0.06 * (high - low), high + 0.06 * (high - low))
         ax.set(xlabel="simulations per trial (median)", ylabel="mean error / √n, capped")
     common.legend_below(fig, axes, look)
     last = common.at_scale(scores, view.scales[-1])
@@ -69,7 +70,7 @@ def _points(ax: Any, rows: pd.DataFrame, view: View) -> None:
     look = view.with_look(rows["estimator"])
     markers = {label: one.marker for label, one in look.items()}
     # Equal points lie upon each other: the later ones are smaller, so that all are seen.
-    areas = dict(zip(look, np.linspace(110, 40, len(look)), strict=True))
+    areas = dict(zip(look, common.mark_scale() ** 2 * np.linspace(110, 40, len(look)), strict=True))
     style = common.seaborn_style(look) | {"size": "estimator", "sizes": areas}
     sns.scatterplot(rows, x="cost", y="error", markers=markers, linewidth=0.7, zorder=3, ax=ax, **style)
 

@@ -41,10 +41,9 @@ def _paper_figure(view: View, number: int, estimator: str) -> Drawing:
     rows = _in_units(view, estimator)
     groups = _groups(view.parameters)
     fig, axes = common.panels(len(groups) + 1)
-    ends = rows[["rmse", "rmse_low", "rmse_high", "linear_bound"]].to_numpy()
     for (group, inside), ax in zip(groups.items(), axes, strict=False):
         look = {p["name"]: Look(COLORS[i % len(COLORS)], MARKERS[i % len(MARKERS)]) for i, p in enumerate(inside)}
-        common.decades(ax, ends)
+        common.decades(ax, rows[["rmse", "linear_bound"]], ends=rows[["rmse_low", "rmse_high"]])
         _bounds(ax, rows, look, view)
         common.curves(ax, rows, "rmse", look, view.scales, interval=("rmse_low", "rmse_high"), by="parameter")
         sizes = {f"{plain(float(p['size']))} {p['unit']}".strip() for p in inside}
@@ -98,7 +97,7 @@ def _bounds(ax: Any, rows: pd.DataFrame, look: Mapping[str, Look], view: View) -
 def _over_bounds(ax: Any, rows: pd.DataFrame, totals: pd.DataFrame, view: View) -> None:
     ratio = "rmse_over_linear_bound"
     together = {"together": _TOGETHER}
-    common.decades(ax, np.append(rows[ratio], [1.0, *totals["rmse"], *totals["rmse_low"], *totals["rmse_high"]]))
+    common.decades(ax, np.append(rows[ratio], [1.0, *totals["rmse"]]), ends=totals[["rmse_low", "rmse_high"]])
     if len(view.scales) > 1:
         table = rows.pivot_table(index="error_scale", columns="parameter", values=ratio)
         lines = ax.plot(table.index, table, color="#aaaaaa", linewidth=0.8)
@@ -139,9 +138,9 @@ def _all_estimators(view: View) -> Drawing:
         shown, names = together, [ALL]
     lacking = bool((totals["solved_trials"] < totals["trials"]).any())
     fig, axes = common.panels(len(names) + 1 + lacking, look)
-    ends = np.concatenate([shown[["low", "high", "rmse"]].to_numpy().ravel(), totals["crlb"], [1.0]])
+    points = np.concatenate([shown["rmse"], totals["crlb"], [1.0]])
     for name, ax in zip(names, axes, strict=False):
-        common.decades(ax, ends)
+        common.decades(ax, points, ends=shown[["low", "high"]])
         rows = shown[shown["group"] == name]
         common.curves(ax, rows, "rmse", look, view.scales, interval=("low", "high"))
         common.bound_line(ax, 1.0, "bound")
@@ -159,8 +158,8 @@ def _all_estimators(view: View) -> Drawing:
     seen = common.values_of(top, "rmse") or "nobody solved any trial"
     caption = common.sentence(
         "Root mean square error over the linear bound, per group of parameters and over all, on the trials that each"
-        " estimator solved, with 95 % bootstrap intervals. Efficiency: over the bound that applies at that scale,"
-        f" as far as {plain(NEAR)}.",
+        " estimator solved, with 95 % bootstrap intervals, cut where they leave a panel. Efficiency: over the bound"
+        f" that applies at that scale, as far as {plain(NEAR)}.",
         "Last panel: the share of trials that the others are over." if lacking else "All trials were solved.",
         common.UPON,
         f"At scale {plain(view.scales[-1])}: {seen}. {view.label}.",
@@ -178,8 +177,8 @@ def _efficiency(ax: Any, totals: pd.DataFrame, look: Mapping[str, Look], view: V
         ratio=ratio.where(ratio <= NEAR), low=totals["rmse_low"] * per_bound, high=totals["rmse_high"] * per_bound
     )
     highs = rows["high"].where(rows["ratio"].notna() & np.isfinite(rows["high"]))
-    low, high = np.nanmin([0.9, *rows["ratio"]]), np.nanmax([1.1, *highs])
-    ax.set_ylim(0.92 * low, 1.04 * min(high, NEAR))
+    low, high = np.nanmin([0.9, *rows["ratio"]]), min(np.nanmax([1.1, *rows["ratio"], *highs]), NEAR)
+    ax.set_ylim(low - 0.06 * (high - low), high + 0.06 * (high - low))
     common.curves(ax, rows, "ratio", look, view.scales, interval=("low", "high"))
     common.bound_line(ax, 1.0, "bound")
     ax.set(title=f"all parameters, up to {plain(NEAR)} bounds", ylabel="rms error / bound at that scale")

@@ -113,6 +113,21 @@ def draw_all(
     ]
 
 
+def drawings(analysis: Analysis, problems: list[str]) -> Iterator[Drawing]:
+    """Every figure that the data allow, drawn and not saved; one of a plugin that cannot be drawn is left out, with a
+    line added to the `problems`."""
+    from ipe_bench.report import extensions
+
+    for task in _tasks(analysis, problems):
+        if not task.plugin:
+            yield from _figure(task.figure).draw(task.view)
+            continue
+        try:
+            yield from extensions.drawings(_figure(task.figure), task.view)
+        except UserError as error:
+            problems.append(f"{task.plugin}: {error}; it is left out")
+
+
 def _settle_names(tasks: dict[str, Task], entries: dict[str, list[Entry]], folder: Path, problems: list[str]) -> None:
     """Leaves out figures of plugins that have the file names of others, whose files are drawn again."""
     taken: set[str] = set()

@@ -55,7 +55,7 @@ def _panels(view: View, rows: pd.DataFrame, shown: list[str], column: str) -> An
             common.shares(ax, "")
             interval, trials, heading = ("success_low", "success_high"), "trials", "success"
         else:
-            common.decades(ax, np.append(part[["rmse_low", "rmse_high", "rmse"]].to_numpy().ravel(), 1.0))
+            common.decades(ax, np.append(part["rmse"], 1.0), ends=part[["rmse_low", "rmse_high"]])
             interval, trials, heading = ("rmse_low", "rmse_high"), "solved_trials", "rms error / linear bound"
         common.curves(ax, part, column, look, scales, interval=interval, by="setting", trials=trials)
         if column == "rmse":

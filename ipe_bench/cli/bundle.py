@@ -1,0 +1,44 @@
+"""`ipe-bench bundle DIR...`: results in one archive to share, and `bundle FILE`: whether one is whole."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.cli import console
+from ipe_bench.runs.bundles import SUFFIX, Bundle, is_bundle, read_bundle, write_bundle
+from ipe_bench.runs.results import Results
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Writes the archive, or checks one; exit code 1 where the folders lack something that was asked for."""
+    outputs = [word.removeprefix("output=") for word in arguments if word.startswith("output=")]
+    paths = [Path(word) for word in arguments if not word.startswith("output=")]
+    if not paths:
+        raise UserError("bundle: name at least one folder of results, such as outputs/paper, or a bundle to check")
+    if len(outputs) > 1:
+        raise UserError(f"bundle: {' '.join(f'output={o}' for o in outputs)}: give one file to write to")
+    if any(map(is_bundle, paths)):
+        if len(paths) > 1 or outputs:
+            raise UserError("bundle: one file is checked by itself; name folders to make a bundle of")
+        _show(read_bundle(paths[0]), "Whole")
+        return 0
+    path = Path(outputs[0]) if outputs else paths[0].with_name(paths[0].resolve().name + SUFFIX)
+    from ipe_bench.report.citation import CITATION
+
+    bundle = write_bundle(paths, path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX), {"citation": CITATION})
+    problems = Results.read(paths).problems
+    for problem in problems:
+        print(f"ipe-bench: {problem}", file=sys.stderr)
+    _show(bundle, "Bundle")
+    return 1 if problems else 0
+
+
+def _show(bundle: Bundle, title: str) -> None:
+    lines = (
+        f"{title:<8}{bundle.path} ({len(bundle.files)} files of {', '.join(bundle.folders)}; {bundle.size:,} bytes)",
+        f"{'Digest':<8}sha256:{bundle.digest}",
+    )
+    console().print("\n".join(lines), markup=False, soft_wrap=True)

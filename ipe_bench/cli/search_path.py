@@ -1,0 +1,17 @@
+"""Where Hydra looks for configs: in those of plugins as well, each folder once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from hydra.core.config_search_path import ConfigSearchPath
+
+from ipe_bench.plugins.discovery import Source
+
+
+def extend(search_path: ConfigSearchPath, sources: Iterable[Source]) -> None:
+    """Adds the folders that are not among those that are searched already."""
+    for source in sources:
+        searched = {(entry.path or "").removeprefix("file://") for entry in search_path.get_path()}
+        if not searched & {str(source.conf), source.conf.as_uri().removeprefix("file://")}:
+            search_path.append(source.name, source.conf.as_uri())

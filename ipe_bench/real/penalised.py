@@ -1,0 +1,77 @@
+"""A prior as further readings: what an estimate with a prior minimises is then a sum of squares like any other.
+
+So profiles of it are those of the penalised likelihood, and a bootstrap simulates the prior's means along with the
+readings, as the randomised maximum likelihood of Oliver, He and Reynolds does (5th European Conference on the
+Mathematics of Oil Recovery, 1996): where the model is linear both are the posterior's intervals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.measurements.problem import Problem
+
+
+@dataclass(frozen=True)
+class Penalised(Measurement):
+    """The readings of a model, and behind them x itself, which its prior has measured."""
+
+    whole: Measurement
+
+    def __post_init__(self) -> None:
+        """Made of a model that has been checked."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return self.whole.parameters
+
+    @property
+    def natural_parameters(self) -> tuple[Parameter, ...]:
+        return self.whole.natural_parameters
+
+    @property
+    def nominal(self) -> Array:
+        return self.whole.nominal
+
+    @cached_property
+    def m(self) -> int:
+        return self.whole.m + self.whole.n
+
+    @property
+    def index(self) -> Mapping[str, Sequence[Any]]:
+        return {"number": list(range(self.m))}
+
+    def natural(self, x: Array) -> Array:
+        return self.whole.natural(x)
+
+    def natural_slope(self, x: Array) -> Array:
+        return self.whole.natural_slope(x)
+
+    def simulate(self, x: Array) -> Array:
+        return np.concatenate([self.whole.simulate(x), x], axis=1)
+
+    def jacobian(self, x: Array) -> Array:
+        n = x.shape[1]
+        return np.concatenate([self.whole.jacobian(x), np.broadcast_to(np.eye(n), (len(x), n, n))], axis=1)
+
+
+def penalised(problem: Problem, z: Array, inflation: float) -> tuple[Problem, Array]:
+    """The problem and the readings z (m,) with the prior, its deviations times `inflation`, as n readings more."""
+    prior = problem.prior_covariance(inflation)
+    assert prior is not None
+    factors = problem.R.factor, prior.factor
+    if all(factor.ndim == 1 for factor in factors):
+        R = Covariance(np.concatenate(factors))
+    else:
+        R = Covariance(block_diag(*(np.diag(f) if f.ndim == 1 else f for f in factors)))
+    model = Penalised(problem.measurement)
+    whole = Problem(model, R, problem.prior_deviation, problem.prior_correlation)
+    return whole, np.concatenate([z, problem.x0])

@@ -1,0 +1,203 @@
+"""Tables and figures as a paper wants them: chosen columns, in the width of one column of print or of two.
+
+A table is a complete LaTeX environment of booktabs and siunitx; a figure is drawn anew at its final size, so that
+nothing is scaled. What they say is what the report says.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.files import write_text
+from ipe_bench.report.tables import LONG, SIGNS, Cell, Column, Table, all_tables, set_numbers
+from ipe_bench.statistics.analysis import Analysis
+
+COLUMN, PAGE = 3.5, 7.16
+"""Inches of IEEE's one and two columns."""
+_NARROWEST, _WIDEST = 2.0, 20.0
+POINTS_A_LETTER = 4.0
+"""Mean width of a letter of 8 points."""
+_COLUMN_GAP = 3.0
+_ESCAPED = {c: f"\\{c}" for c in "&%$#_{}"} | {
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "\\": r"\textbackslash{}",
+}
+
+
+@dataclass(frozen=True)
+class Export:
+    """What was written, and a line for every table that is too wide."""
+
+    files: tuple[Path, ...]
+    too_wide: tuple[str, ...]
+
+
+def export(
+    analysis: Analysis, folder: Path, names: Sequence[str], columns: Sequence[str] = (), width: float = COLUMN
+) -> Export:
+    """Writes the tables and figures of these names into the folder: NAME.tex, or NAME.pdf and NAME.png, and the
+    figures' captions.
+
+    Raises:
+        UserError: there is no such table, figure or column, or the width is none of paper.
+    """
+    if not _NARROWEST <= width <= _WIDEST:
+        raise UserError(f"width={width:g}: give inches, such as {COLUMN:g} for one column and {PAGE:g} for two")
+    tables = {table.name: table for table in report_tables(analysis)}
+    chosen = [chosen_columns(tables[name], columns) for name in names if name in tables]
+    if columns and not chosen:
+        raise UserError(f"columns={','.join(columns)}: goes with a table; paper={','.join(names)} names none")
+    files, captions = _figures(analysis, folder, [name for name in names if name not in tables], width, tables)
+    for table in chosen:
+        path = folder / f"{table.name}.tex"
+        write_text(path, latex_table(table, width))
+        files.append(path)
+    if captions:
+        write_text(folder / "captions.md", "\n\n".join(captions) + "\n")
+        files.append(folder / "captions.md")
+    return Export(tuple(files), tuple(line for table in chosen for line in _excess(table, width)))
+
+
+def report_tables(analysis: Analysis) -> list[Table]:
+    """Every table of the report, those on certified readings first."""
+    from ipe_bench.report import extensions
+    from ipe_bench.report.certified_tables import attained_tables, certified_tables, without_certified
+
+    shown = [*certified_tables(analysis.collection)[0], *attained_tables(analysis.collection)[0]]
+    shown += all_tables(without_certified(analysis), analysis)
+    return shown + extensions.tables(analysis, [table.name for table in shown], analysis.collection.further)
+
+
+# Tables --------------------------------------------------------------------------------------------------------------
+
+
+def column_names(table: Table) -> list[str]:
+    """What the columns are called where they are chosen: their titles in letters, digits and underscores."""
+    names: list[str] = []
+    for column in table.columns:
+        name = re.sub(r"[^a-z0-9]+", "_", column.title.lower()).strip("_") or "column"
+        names.append(name if name not in names else f"{name}_{names.count(name) + 1}")
+    return names
+
+
+def chosen_columns(table: Table, names: Sequence[str]) -> Table:
+    """The table with these columns, in this order; all where none is named.
+
+    Raises:
+        UserError: it has no such column.
+    """
+    if not names:
+        return table
+    known = dict(zip(column_names(table), table.columns, strict=True))
+    for name in names:
+        if name not in known:
+            raise UserError(f"columns={name}: {unknown(name, known, f'column of {table.name}')}")
+    return replace(table, columns=[known[name] for name in names])
+
+
+def latex_table(table: Table, width: float) -> str:
+    """A floating environment with the caption, or where rows are many a longtable."""
+    long = len(table) > LONG
+    body = [_head(table), *(" & ".join(map(_cell, row, table.columns)) + r" \\" for row in table.rows)]
+    shape = "@{}" + "".join("r" if c.numeric else "l" for c in table.columns) + "@{}"
+    caption = rf"\caption{{{escaped(table.title)}. {escaped(table.caption)}}}\label{{tab:{table.name}}}"
+    rules = [r"\toprule", body[0], r"\midrule", *([r"\endhead"] if long else []), *body[1:], r"\bottomrule"]
+    size = rf"\footnotesize\setlength{{\tabcolsep}}{{{_COLUMN_GAP:g}pt}}"
+    if long:
+        inside = ["{" + size, rf"\begin{{longtable}}{{{shape}}}", caption + r" \\", *rules, r"\end{longtable}", "}"]
+    else:
+        kind = "table" if width <= COLUMN else "table*"
+        inside = [rf"\begin{{{kind}}}[tb]", r"\centering", caption, size, rf"\begin{{tabular}}{{{shape}}}", *rules]
+        inside += [r"\end{tabular}", rf"\end{{{kind}}}"]
+    needs = "% Needs \\usepackage[T1]{fontenc} and \\usepackage{booktabs, longtable, siunitx, amsmath}."
+    needs += " A longtable stands where the text has one column." if long else ""
+    return "\n".join([needs, *inside]) + "\n"
+
+
+def _head(table: Table) -> str:
+    """Titles, stacked where they are longer than what stands below them."""
+    heads = []
+    for column, letters in zip(table.columns, map(_letters, table.columns), strict=True):
+        side = "r" if column.numeric else "l"
+        lines = [escaped(line) for line in _lines(column.title, letters)]
+        stacked = r"\\".join(lines)
+        heads.append(rf"\shortstack[{side}]{{{stacked}}}" if len(lines) > 1 else stacked)
+    return " & ".join(heads) + r" \\"
+
+
+def _lines(title: str, letters: int) -> list[str]:
+    """A title in lines of at most so many letters, words being whole."""
+    lines: list[str] = []
+    for word in title.split():
+        if lines and len(lines[-1]) + 1 + len(word) <= letters:
+            lines[-1] += f" {word}"
+        else:
+            lines.append(word)
+    return lines or [""]
+
+
+def _letters(column: Column) -> int:
+    """Of the widest cell, or of the title's longest word."""
+    cells = max((len(cell.text) for cell in column.cells), default=0)
+    return max([cells, *map(len, column.title.split())])
+
+
+def _cell(cell: Cell, column: Column) -> str:
+    text = set_numbers(escaped(cell.text)) if column.numeric else escaped(cell.text)
+    return rf"\textbf{{{text}}}" if cell.best else text
+
+
+def escaped(text: str) -> str:
+    """Plain text as LaTeX has it; a sign that pdflatex may lack by its number."""
+    return "".join(
+        _ESCAPED.get(c) or SIGNS.get(c) or (c if c.isascii() and c.isprintable() else f"\\texttt{{U+{ord(c):04X}}}")
+        for c in " ".join(text.split())
+    )
+
+
+def inches(table: Table) -> float:
+    """About how wide a table is."""
+    points = sum(POINTS_A_LETTER * _letters(column) for column in table.columns)
+    return (points + 2 * _COLUMN_GAP * (len(table.columns) - 1)) / 72
+
+
+def _excess(table: Table, width: float) -> Iterator[str]:
+    if inches(table) > width:
+        yield (
+            f"{table.name}: is about {inches(table):.1f} in wide, and {width:g} in were asked for; choose"
+            f" with columns= among {', '.join(column_names(table))}"
+        )
+
+
+# Figures -------------------------------------------------------------------------------------------------------------
+
+
+def _figures(
+    analysis: Analysis, folder: Path, names: Sequence[str], width: float, tables: dict[str, Table]
+) -> tuple[list[Path], list[str]]:
+    """Their files and captions."""
+    from ipe_bench.report.certified_tables import without_certified
+    from ipe_bench.report.figures.common import column_width
+    from ipe_bench.report.figures.gallery import drawings
+    from ipe_bench.report.style import print_style
+
+    files: list[Path] = []
+    captions: list[str] = []
+    seen: list[str] = []
+    with print_style(), column_width(width):
+        for drawing in drawings(without_certified(analysis), analysis.collection.further) if names else ():
+            seen.append(drawing.name)
+            if drawing.name in names:
+                files += drawing.save(folder)
+                captions.append(f"**{drawing.name}.** {drawing.title}. {drawing.caption}")
+            if set(names) <= set(seen):
+                break
+    for name in names:
+        if name not in seen:
+            raise UserError(f"paper={name}: {unknown(name, [*tables, *seen], 'table or figure')}")
+    return files, captions

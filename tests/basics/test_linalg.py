@@ -1,0 +1,62 @@
+"""Batched algebra beside NumPy's own, one matrix at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ipe_bench.basics.linalg import Covariance, gram_factor, pseudo_inverse
+
+M, N = 30, 5
+
+
+def conditioned(condition: float, trials: int = 4) -> np.ndarray:
+    """Matrices (trials, M, N) of columns of equal length and about this condition."""
+    rng = np.random.default_rng(0)
+    Q = np.linalg.qr(rng.normal(size=(trials, M, N)))[0]
+    V = np.linalg.qr(rng.normal(size=(trials, N, N)))[0]
+    return np.matmul(Q * np.geomspace(1.0, 1.0 / condition, N), V)
+
+
+@pytest.mark.parametrize("condition", [1.0, 20.0, 900.0, 3e3, 1e6, 1e10])
+@pytest.mark.parametrize("units", [1.0, 1e9])
+def test_a_pseudo_inverse_loses_no_more_digits_than_its_matrix(condition, units):
+    """Round-off of eps times the condition, from normal equations that squared; whatever units the columns have."""
+    H = conditioned(condition) * np.geomspace(1.0, units, N)
+    R = Covariance(np.linspace(0.1, 0.3, M))
+    found, deficient = pseudo_inverse(H, R)
+    assert not deficient.any()
+    for A, A_plus in zip(H, found, strict=True):
+        scale = np.linalg.norm(A, axis=0)
+        expected = np.linalg.pinv(A / scale / R.factor[:, None]) / R.factor
+        share = np.linalg.norm(A_plus * scale[:, None] - expected) / np.linalg.norm(expected)
+        assert share < 100 * np.finfo(float).eps * min(condition, 1e3) * condition
+
+
+def test_correlated_readings_are_whitened_first():
+    L = np.linalg.cholesky(0.7 ** np.abs(np.subtract.outer(np.arange(M), np.arange(M))))
+    H = conditioned(10.0)
+    found, _ = pseudo_inverse(H, Covariance(L))
+    inverse_R = np.linalg.inv(L @ L.T)
+    for A, A_plus in zip(H, found, strict=True):
+        np.testing.assert_allclose(A_plus, np.linalg.solve(A.T @ inverse_R @ A, A.T @ inverse_R), rtol=1e-9, atol=1e-12)
+
+
+def test_a_matrix_without_full_rank_spoils_its_own_trial_only():
+    H = conditioned(10.0, 3)
+    H[1, :, 2] = H[1, :, 0]
+    H[2, 0, 0] = np.nan
+    R = Covariance(np.ones(M))
+    found, deficient = pseudo_inverse(H, R)
+    assert deficient.tolist() == [False, True, True]
+    np.testing.assert_array_equal(found[:1], pseudo_inverse(H[:1], R)[0])
+    assert np.isnan(found[1:]).all()
+
+
+def test_a_gram_factor_is_refused_where_too_few_digits_are_left():
+    J = np.concatenate([conditioned(100.0, 1), conditioned(1e5, 1)])
+    U, inverse_U, well = gram_factor(J)
+    assert well.tolist() == [True, False]
+    np.testing.assert_allclose(U[0].T @ U[0], J[0].T @ J[0], rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(U[0] @ inverse_U[0], np.eye(N), atol=1e-10)
+    assert np.array_equal(U[0], np.triu(U[0]))

@@ -1,0 +1,48 @@
+"""Where Hydra's launchers run the jobs of a sweep changes no number."""
+
+from __future__ import annotations
+
+from importlib.metadata import distributions
+
+import pandas as pd
+import pytest
+
+import ipe_bench as ib
+from ipe_bench.cli.main import main
+
+LAUNCHERS = {"joblib": "hydra-joblib-launcher", "submitit_local": "hydra-submitit-launcher"}
+SWEEP = ["measurement=polynomial", "noise=gaussian", "trials=12", "error_scale=1,10", "seed=1,2", "solver=[newton]"]
+
+
+def needs(distribution: str) -> None:
+    if distribution not in {found.name for found in distributions()}:
+        pytest.skip(f"needs {distribution}")
+
+
+def rows(folder: str) -> pd.DataFrame:
+    found = ib.load(folder).drop(columns="time_s")
+    return found.sort_values(["seed", "error_scale", "estimator", "trial"], ignore_index=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", LAUNCHERS)
+@pytest.mark.filterwarnings("default")  # what launchers use of their libraries is no error of ours
+def test_rows_are_those_of_a_serial_sweep(launcher, tmp_path, monkeypatch, capsys):
+    needs(LAUNCHERS[launcher])
+    monkeypatch.chdir(tmp_path)
+    assert main(["run", "-m", *SWEEP, "execution=serial", "output=serial"]) == 0
+    assert main(["run", "-m", *SWEEP, f"hydra/launcher={launcher}", "output=launched"]) == 0
+    serial = rows("serial")
+    assert len(serial) == 4 * 12 * 2
+    pd.testing.assert_frame_equal(rows("launched"), serial, check_exact=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", LAUNCHERS)
+@pytest.mark.filterwarnings("default")
+def test_a_job_that_is_refused_is_told_and_no_success(launcher, tmp_path, monkeypatch, capsys):
+    needs(LAUNCHERS[launcher])
+    monkeypatch.chdir(tmp_path)
+    words = [*SWEEP, "objective=newton.no_such_column", f"hydra/launcher={launcher}", "output=out"]
+    assert main(["run", "-m", *words]) == 2
+    assert "there is no such column" in capsys.readouterr().err.splitlines()[-1]

@@ -1,0 +1,106 @@
+"""What a terminal of 80, 100 or 120 columns shows: names are whole, and nothing is cut."""
+
+from __future__ import annotations
+
+import io
+import re
+
+import numpy as np
+import pytest
+from rich.console import Console
+from synthetic_store import Synthetic
+
+import ipe_bench as ib
+import ipe_bench.cli
+from ipe_bench.cli.main import main
+from ipe_bench.report import figures
+from ipe_bench.report.answer import render
+
+WIDTHS = (80, 100, 120)
+SHORT = ("linear_lse", "fixed_point", "levenberg_marquardt", "scipy_least_squares")
+LONG = "progressive_with_windows_and_restarts_of_a_very_long_name"
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    """Two folders of a sweep over scale and noise, one of which lacks some trials."""
+    rng = np.random.default_rng(0)
+    found = []
+    for name, factor in (("a", 1.0), ("b", 1.3)):
+        store = Synthetic(tmp_path_factory.mktemp(name) / name)
+        for scale in (1.0, 1000.0):
+            for sigma in (0.2, 0.4):
+                for label in (*SHORT, LONG):
+                    store.add(store.scenario(error_scale=scale, sigma=sigma), label, factor * rng.normal(size=(30, 3)))
+        store.record(30 if name == "a" else 40)
+        found.append(str(store.directory))
+    return found
+
+
+@pytest.fixture(params=WIDTHS)
+def screen(request, monkeypatch, capsys):
+    """Runs a command on a screen of that width: its lines but for those that are left to the terminal to fold."""
+    monkeypatch.setattr(ipe_bench.cli, "_WIDTH_WITHOUT_TERMINAL", request.param)
+    monkeypatch.setattr(figures, "draw_all", lambda *_, **__: [])
+
+    def run(*words: str) -> list[str]:
+        main(list(words))
+        lines = capsys.readouterr().out.splitlines()
+        folded = ("worse: ", "missing: ", "Summary", "Tables", "Figures", "Report", "/")
+        kept = [line for line in lines if not line.startswith(folded)]
+        assert max(map(len, kept)) <= request.param
+        assert not any("…" in line for line in kept)
+        return kept
+
+    return run
+
+
+def rows(lines: list[str], name: str) -> int:
+    return sum(name in line.split() for line in lines)
+
+
+def test_a_report_names_every_estimator_of_every_scenario(screen, folders, tmp_path):
+    lines = screen("report", folders[0], f"output={tmp_path / 'out'}")
+    for name in SHORT:
+        assert rows(lines, name) == 4
+    assert sum(line.count(LONG[-8:]) for line in lines) == 4
+    assert any("deviation=0.4" in line for line in lines)
+
+
+def test_status_names_every_estimator_and_each_scenario_once(screen, folders):
+    lines = screen("status", folders[1], "-v")
+    for name in SHORT:
+        assert rows(lines, name) == 4
+    assert sum("30 of 40" in line for line in lines) == 24
+
+
+def test_a_comparison_names_who_and_which_setting(screen, folders):
+    text = " ".join(" ".join(screen("compare", *folders)).split())
+    for name in (*SHORT, LONG):
+        assert text.count(f": {name};") == 4
+    assert text.count("noise.deviation 0.4") == 10
+
+
+def test_lists_name_every_option(screen):
+    lines = screen("list", "baseline")
+    for name in ("linear_lse", "levenberg_marquardt", "multiple_shooting", "recursive_update"):
+        assert rows(lines, name) == 1
+
+
+@pytest.fixture(scope="module")
+def answer():
+    model = ib.measurements.Polynomial()
+    z = ib.Scenario(model, ib.noise.Gaussian(0.01), error_scale=3.0).draw(0, 1).z[0]
+    estimators = {"levenberg_marquardt": ib.baselines.LevenbergMarquardt(), LONG: ib.solvers.Newton()}
+    return ib.estimate(model, z, estimators, noise=ib.noise.Gaussian(0.01))
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_an_answer_names_every_estimator(answer, width):
+    out = io.StringIO()
+    Console(file=out, width=width).print(render(answer, width))
+    lines = out.getvalue().splitlines()
+    assert max(map(len, lines)) <= width
+    assert not re.search(r"\w…", out.getvalue())  # a range has blanks around it
+    assert "levenberg_marquardt" in out.getvalue()
+    assert LONG[-8:] in out.getvalue()

@@ -1,0 +1,79 @@
+"""An option of a wrong type, or one that nothing chosen has, is refused before anything is composed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+COMMON = ("measurement=polynomial", "noise=gaussian", "execution=serial", "output=out", "trials=5")
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["noise.deviation=0.1,abc"], "noise.deviation=abc: give a number above 0 or a list"),
+        (["noise.deviation=0.1,0"], "noise.deviation=0: give a number above 0 or a list"),
+        (["seed=1,first"], "seed=first: give a whole number from 0 up"),
+        (["error_scale=1,-1"], "error_scale=-1.0: give a number above 0"),
+        (["measurement.strength=0.1,[1]"], "measurement.strength=[1]: give a finite number"),
+        (["measurement=polynomial,gins", "measurement.rounds=5"], "measurement.rounds: there is no such option"),
+        (["estimators.fixed_point.start=nominal,here"], "estimators.fixed_point.start=here: choose one of"),
+        (["+baseline@estimators.a=ekf,ukf", "estimators.a.engine=x,y"], "estimators.a.engine=x: choose one of"),
+        (["execution.threads=1,2"], "execution.threads: there is no such option"),
+        (["+prior.width=1,2"], "prior.width: there is no such option"),
+    ],
+)
+def test_no_job_of_a_sweep_begins_where_one_would_be_refused(words, complaint, ipe_bench):
+    code, _, err = ipe_bench("run", "-m", *COMMON, *words)
+    assert code == 2
+    (line,) = err.splitlines()
+    assert line.startswith(f"ipe-bench: {complaint}")
+    assert not list(Path().rglob("*.parquet"))
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["estimators.fixed_point.tol=3"], "estimators.fixed_point.tol: there is no such option (there are: budget,"),
+        (["noise.deviaton=3"], "noise.deviaton: there is no such option; did you mean deviation?"),
+        (["measurement.degree=high"], "measurement.degree: there is no such option"),
+        (["+experiment=triad", "measurement.field=wide"], "measurement.field=wide: give a number above 0"),
+    ],
+)
+def test_a_config_with_it_is_not_even_printed(words, complaint, ipe_bench):
+    chosen = COMMON if "experiment" not in words[0] else ()
+    code, out, err = ipe_bench("run", *chosen, *words, "--cfg", "job")
+    assert code == 2
+    assert not out
+    (line,) = err.splitlines()
+    assert line.startswith(f"ipe-bench: {complaint}")
+
+
+@pytest.mark.parametrize("command", ["estimate", "design", "posterior"])
+def test_every_command_that_composes_refuses_it(command, ipe_bench):
+    code, _, err = ipe_bench(command, "measurement=ranging", "measurement.rounds=many")
+    assert code == 2
+    assert "measurement.rounds=many: give a whole number above 0" in err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["measurement=ranging,gnss", "measurement.rounds=5"],  # of one of the two
+        ["noise.deviation=${error_scale}"],
+        ["noise.deviation='${error_scale}'"],
+        ["noise._target_=ipe_bench.noise.StudentT", "+noise.degrees=5"],
+        ["+experiment=triad", "measurement.field=5"],
+        ["solver=[newton]", "+solver@estimators.b=broyden", "estimators.b.tolerance=1e-3"],
+        ["measurement=nist/misra1a", "measurement.start=2"],
+        ["estimators.fixed_point.budget=null,50"],
+    ],
+)
+def test_what_may_be_right_is_left_to_hydra(words):
+    from ipe_bench.cli.config import KEYS, rewrite
+    from ipe_bench.cli.overrides import read
+    from ipe_bench.cli.typed import check_options
+
+    words = rewrite(words)
+    check_options(words, read(words, KEYS))

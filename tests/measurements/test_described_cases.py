@@ -1,0 +1,165 @@
+"""Differential equations of several cases that a file describes, against their solution in closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import curve_fit
+
+from ipe_bench.baselines import LevenbergMarquardt
+from ipe_bench.basics.errors import UserError
+from ipe_bench.measurements import Ode
+from ipe_bench.measurements.known import Informed, Known
+from ipe_bench.noise import Gaussian
+from ipe_bench.plugins.conformance import check_component
+from ipe_bench.real.fits import fit
+from ipe_bench.real.readings import write_readings
+from ipe_bench.real.sources import open_readings, open_together
+from ipe_bench.trials.scenario import Scenario
+
+FEED, BEGIN = (2.0, 0.0, 5.0), (1.0, 9.0, 4.0)
+MODEL = Ode({"y": "feed - k*y"}, {"k": 0.5, "gain": 1.0}, {"y": "begin"}, {"shown": "gain*y"}, tolerance=1e-11)
+LM = {"lm": LevenbergMarquardt(tolerance=1e-10, max_iterations=300)}
+
+
+def solution(case, t, k, gain):
+    """y' = feed - k y from y(0) = begin."""
+    feed, begin = np.array(FEED)[case], np.array(BEGIN)[case]
+    return gain * (feed / k + (begin - feed / k) * np.exp(-k * t))
+
+
+@pytest.fixture
+def file(tmp_path):
+    """Three cases, each at times of its own, in no order; and the columns case (from 0), t, reading."""
+    rng = np.random.default_rng(2)
+    case = np.repeat([0, 1, 2], [4, 6, 5])
+    t = np.round(rng.uniform(0.1, 6.0, 15), 3)
+    z = solution(case, t, 0.37, 1.4) + 0.05 * rng.standard_normal(15)
+    order = rng.permutation(15)
+    rows = [f"{FEED[c]},{float(z[i])!r},{t[i]},{c + 1},{BEGIN[c]},0.05" for i in order for c in [case[i]]]
+    (tmp_path / "a.csv").write_text("\n".join(["feed,reading,time,case,begin [g],sigma", *rows]))
+    return tmp_path / "a.csv", case[order], t[order], z[order]
+
+
+def test_cases_have_inputs_and_initial_states_of_their_own(file):
+    path, case, t, z = file
+    found = open_readings(path, MODEL)
+    assert found.z == pytest.approx(z, abs=1e-15)
+    x = np.array([[0.9, 1.3], [0.6, 0.8]])
+    h = found.model.simulate(x)
+    for row, (k, gain) in zip(h, x * [0.5, 1.0], strict=True):
+        assert row == pytest.approx(solution(case, t, k, gain), abs=1e-9)
+
+
+def test_an_estimate_from_several_cases_is_scipys(file):
+    path, case, t, z = file
+    result = fit_of(open_readings(path, MODEL))
+    x, P = curve_fit(
+        lambda t, k, gain: solution(case, t, k, gain), t, z, (0.5, 1.0), np.full(15, 0.05), True,
+        ftol=1e-15, xtol=1e-15, gtol=1e-15,
+    )  # fmt: skip
+    assert result.x == pytest.approx(x, rel=1e-8)
+    assert result.standard_errors == pytest.approx(np.sqrt(np.diag(P)), rel=1e-6)
+    bounded = fit_of(open_together([path], Informed(MODEL, (Known("k", positive=True),))))
+    assert bounded.x == pytest.approx(x, rel=1e-8)
+
+
+def fit_of(found):
+    problem = Scenario(found.model, Gaussian(0.05)).problem
+    (result,) = fit(problem, found.z, LM)
+    return result
+
+
+def test_files_of_one_case_each_are_estimated_together(file, tmp_path):
+    path, *_ = file
+    whole = fit_of(open_readings(path, MODEL))
+    _heading, *rows = path.read_text().splitlines()
+    paths = []
+    for case in "123":
+        own = [row.split(",") for row in rows if row.split(",")[3] == case]
+        paths.append(tmp_path / f"case{case}.csv")
+        paths[-1].write_text("\n".join(["feed,reading,time,begin", *(",".join((*r[:3], r[4])) for r in own)]))
+    together = fit_of(open_together(paths, MODEL))
+    assert together.x == pytest.approx(whole.x, rel=1e-7)
+
+
+def test_a_model_in_the_config_has_its_cases_there(tmp_path):
+    model = Ode(
+        {"y": "feed - k*y"}, {"k": 0.5, "gain": 1.0}, {"y": "begin"}, {"shown": "gain*y"},
+        times=(1.0, 2.0), constants={"feed": FEED, "begin": 1.0},
+    )  # fmt: skip
+    assert model.index["case"] == [1, 1, 2, 2, 3, 3]
+    z = model.simulate(np.array([[1.0, 1.0]]))[0]
+    expected = [f / 0.5 + (1 - f / 0.5) * np.exp(-0.5 * t) for f in FEED for t in (1.0, 2.0)]
+    assert z == pytest.approx(expected, abs=1e-7)
+    assert not [f for f in check_component("ode", model) if f.complaint]
+    write_readings(tmp_path / "w.csv", model, z)
+    assert (tmp_path / "w.csv").read_text().splitlines()[0] == "case,time,output,feed,begin,reading"
+    again = open_readings(tmp_path / "w.csv", MODEL)
+    assert again.model.simulate(np.array([[1.0, 1.0]]))[0] == pytest.approx(z, abs=1e-6)
+
+
+def test_a_constant_of_the_config_stands_for_a_column(tmp_path):
+    (tmp_path / "a.csv").write_text("time,reading,begin\n1,2,1\n2,3,1\n3,3,1\n")
+    model = Ode({"y": "feed - k*y"}, {"k": 0.5, "gain": 1.0}, {"y": "begin"}, {"s": "gain*y"}, constants={"feed": 2.0})
+    h = open_readings(tmp_path / "a.csv", model).model.simulate(np.array([[1.0, 1.0]]))[0]
+    assert h == pytest.approx([4 - 3 * np.exp(-0.5 * t) for t in (1, 2, 3)], abs=1e-6)
+
+
+REFUSED = {
+    "two numbers of a case": (
+        "case,time,feed,begin,reading\n1,1,2,1,3\n1,2,3,1,3\n",
+        "case=1: feed is 2 in one row and 3",
+    ),
+    "no column of cases": ("time,feed,begin,reading\n1,2,1,3\n2,3,1,3\n", "number the cases in a column case"),
+    "a case left out": (
+        "case,time,feed,begin,reading\n1,1,2,1,3\n3,2,3,1,3\n",
+        "case=3: cases are numbered 1, 2 and so",
+    ),
+    "a column left out": (
+        "time,begin,reading\n1,2,3\n2,2,3\n",
+        "column feed is missing; there are time, begin, reading",
+    ),
+    "an empty cell": ("time,feed,begin,reading\n1,,1,3\n2,3,1,3\n", "row 2, column feed: is empty"),
+    "a reading twice": ("case,time,feed,begin,reading\n1,1,2,1,3\n1,1,2,1,4\n", "stands there twice"),
+    "half a case": ("case,time,feed,begin,reading\n1.5,1,2,1,3\n1,1,2,1,4\n", "'1.5' is not a whole number"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_wrong_file_is_refused(tmp_path, case):
+    text, expected = REFUSED[case]
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(UserError, match=expected):
+        open_readings(tmp_path / "a.csv", MODEL)
+
+
+MISTAKES = {
+    "a name of nothing": ({"constants": {"fed": 1.0}}, "constants.fed: appears in no formula"),
+    "a state": ({"constants": {"y": 1.0}}, "constants.y: is a state, a parameter or the time"),
+    "of two lengths": (
+        {"constants": {"feed": (1.0, 2.0), "begin": (1.0, 2.0, 3.0)}},
+        "constants: have different lengths",
+    ),
+    "no number": ({"constants": {"feed": "much"}}, "constants.feed=much: give a finite number"),
+    "the time by another name": ({"outputs": {"s": "gain*time*y"}}, "time: is a column .* the time is t"),
+}
+
+
+@pytest.mark.parametrize("case", MISTAKES)
+def test_constants_that_cannot_be_are_refused(case):
+    options, expected = MISTAKES[case]
+    given = {
+        "rates": {"y": "feed - k*y"},
+        "start": {"k": 0.5, "gain": 1.0},
+        "initial": {"y": "begin"},
+        "outputs": {"s": "gain*y"},
+    }
+    with pytest.raises(UserError, match=expected):
+        Ode(**(given | options))
+
+
+def test_a_misspelt_parameter_is_told_of_with_both_remedies():
+    model = Ode({"y": "-kk*y"}, {"y0": 1.0}, {"y": "y0"}, times=(1.0, 2.0))
+    with pytest.raises(UserError, match=r"kk is not known; give it a start, measurement.start.kk=1, .*constants.kk"):
+        model.simulate(np.ones((1, 1)))

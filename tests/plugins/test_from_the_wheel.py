@@ -1,0 +1,81 @@
+"""Outside of the checkout, from the wheel: every kind of plugin is made, checked, run and seen in the report."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import ipe_bench
+from ipe_bench.cli.parser import KINDS
+
+ROOT = Path(ipe_bench.__file__).parents[1]
+pytestmark = pytest.mark.slow
+
+
+def python(*words: str, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, *words]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, env=os.environ | variables, check=False)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    done = python("-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", ".", str(ROOT), cwd=folder)
+    if done.returncode:
+        pytest.skip(f"no wheel can be built here: {done.stderr.splitlines()[-1]}")
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory) -> Path:
+    """The wheel's content, as an installation leaves it."""
+    site = tmp_path_factory.mktemp("site")
+    zipfile.ZipFile(wheel).extractall(site)
+    return site
+
+
+def test_all_kinds_of_plugins_are_made_checked_run_and_seen(installed, tmp_path):
+    def run(*words: str) -> str:
+        done = python("-m", "ipe_bench", *words, cwd=tmp_path, PYTHONPATH=str(installed), COLUMNS="200")
+        assert done.returncode == 0, f"{words}\n{done.stdout}\n{done.stderr}"
+        assert done.stderr == "" or words[0] == "run"
+        return done.stdout
+
+    where = python("-c", "import ipe_bench; print(ipe_bench.__file__)", cwd=tmp_path, PYTHONPATH=str(installed))
+    assert Path(where.stdout.strip()).is_relative_to(installed)
+    for kind in KINDS:
+        run("new", kind, f"own_{kind}")
+    for kind in KINDS:
+        assert "all checks passed" in run("check", f"plugins/own_{kind}")
+        assert f"own_{kind}" in run("list", kind)
+    chosen = [f"{kind}=own_{kind}" for kind in ("measurement", "noise", "prior", "execution")]
+    chosen += ["solver=[own_solver]", "baseline=[own_baseline]", "trials=20", "output=out"]
+    printed = run("run", *chosen)
+    assert "own_solver" in printed
+    assert "own_baseline" in printed
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    for text in ("own_measurement", "own_noise", "own_solver", "own_baseline"):
+        assert text in page
+    for text in ("own_statistic", "figure-own_figure", "table-own_table", "What own_section says"):
+        assert text in page
+    assert "own_execution" in (tmp_path / "out" / "log" / ".hydra" / "config.yaml").read_text(encoding="utf-8")
+    printed = run("run", "+experiment=own_experiment", "trials=5", "output=other")
+    assert "Report" in printed
+
+
+def test_another_application_of_hydra_finds_our_configs(installed, tmp_path):
+    (tmp_path / "app.py").write_text(
+        "import hydra\n"
+        "@hydra.main(version_base='1.3', config_path='conf', config_name='config')\n"
+        "def main(config):\n    print(config.measurement._target_)\nmain()\n"
+    )
+    (tmp_path / "conf").mkdir()
+    (tmp_path / "conf" / "config.yaml").write_text("defaults: [measurement: gins]\nhydra: {run: {dir: .}}\n")
+    done = python("app.py", cwd=tmp_path, PYTHONPATH=str(installed))
+    assert done.stdout.splitlines() == ["ipe_bench.measurements.Gins"], done.stderr

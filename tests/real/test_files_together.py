@@ -1,0 +1,214 @@
+"""Several files of a model whose parameters are fixed, bounded or one file's own, against SciPy; and what is left out
+of a file on purpose, against a file without it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from test_instruments import SATURATION, START, estimate, simulated, solution
+
+import ipe_bench as ib
+from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
+from ipe_bench.basics.errors import UserError
+from ipe_bench.measurements import Formula, Sir
+from ipe_bench.measurements.known import Informed, Known, informed
+from ipe_bench.noise import Gaussian, ModelNoise
+from ipe_bench.real.sources import LeftOut, Readings, open_together
+
+OWN = Formula(SATURATION, START, own=("b1",))
+LM = {"lm": LevenbergMarquardt(tolerance=1e-10, max_iterations=300)}
+
+
+@pytest.fixture
+def files(tmp_path) -> tuple[list[Path], list[np.ndarray]]:
+    """Two files of one rate and two amplitudes, 240 and 180, and their columns t, y, sigma."""
+    found = [simulated(tmp_path / f"{b1}.csv", float(b1), k, 12 + k) for k, b1 in enumerate((240, 180))]
+    return [path for path, _ in found], [columns for _, columns in found]
+
+
+def together(paths: list[Path], *known: Known) -> Readings:
+    """The files with what is known of the parameters that they have together."""
+    found = open_together(paths, OWN)
+    return replace(found, model=informed(found.model, known))
+
+
+def residuals(data, p, q, rate):
+    parts = [
+        (b1 * (1 - np.exp(-rate * t)) - y) / sigma
+        for b1, (t, y, sigma) in zip((p, q), [c.T for c in data], strict=True)
+    ]
+    return np.concatenate(parts)
+
+
+def of(result, values) -> dict[str, float]:
+    return dict(zip([p.name for p in result.model.natural_parameters], values, strict=True))
+
+
+def test_bounds_that_do_not_act_change_nothing(files):
+    paths, data = files
+    known = (Known("b1", lower=100.0, upper=300.0), Known("b2", positive=True))
+    result = estimate(open_together(paths, Informed(OWN, known)))
+    x, deviations = solution(lambda p: residuals(data, *p), [250, 250, 5e-4])
+    assert of(result, result.x) == pytest.approx({"b1_1": x[0], "b1_2": x[1], "b2": x[2]}, rel=1e-8)
+    assert of(result, result.standard_errors) == pytest.approx(
+        {"b1_1": deviations[0], "b1_2": deviations[1], "b2": deviations[2]}, rel=1e-8
+    )
+
+
+def test_a_parameter_of_one_file_may_be_known_there(files):
+    paths, data = files
+    result = estimate(together(paths, Known("b1", lower=0.0), Known("b1_2", fixed=181.0)))
+    x, deviations = solution(lambda p: residuals(data, p[0], 181.0, p[1]), [250, 5e-4])
+    assert of(result, result.x) == pytest.approx({"b1_1": x[0], "b2": x[1]}, rel=1e-8)
+    assert of(result, result.standard_errors) == pytest.approx({"b1_1": deviations[0], "b2": deviations[1]}, rel=1e-8)
+    assert result.model.fixed == {"b1_2": 181.0}
+    assert result.degrees_of_freedom == sum(map(len, data)) - 2
+
+
+def test_a_common_parameter_may_be_fixed_for_all(files):
+    paths, data = files
+    result = estimate(open_together(paths, Informed(OWN, (Known("b2", fixed=5.5e-4),))))
+    x, _ = solution(lambda p: residuals(data, p[0], p[1], 5.5e-4), [250, 250])
+    assert of(result, result.x) == pytest.approx({"b1_1": x[0], "b1_2": x[1]}, rel=1e-8)
+
+
+def test_a_bound_acts_in_the_file_that_it_is_of(files):
+    """On the bound in one file and free in the other, where SciPy's bounded minimum is."""
+    paths, data = files
+    known = (Known("b1", lower=100.0, upper=300.0), Known("b1_2", nominal=160.0, upper=176.0))
+    result = estimate(together(paths, *known))
+    bounded = least_squares(
+        lambda p: residuals(data, 100 * p[0], 100 * p[1], 1e-4 * p[2]),
+        [2.0, 1.6, 5.0],
+        bounds=([1, 1, 0], [3, 1.76, np.inf]),
+        ftol=1e-15,
+        xtol=1e-15,
+        gtol=1e-15,
+    )
+    expected = dict(zip(("b1_1", "b1_2", "b2"), bounded.x * [100, 100, 1e-4], strict=True))
+    assert of(result, result.x) == pytest.approx(expected, rel=1e-5)
+    assert [result.model.natural_parameters[k].name for k in result.held_at] == ["b1_2"]
+    _x, deviations = solution(lambda p: residuals(data, p[0], 176.0, p[1]), [250, 5e-4])
+    errors = of(result, result.standard_errors)
+    assert np.isnan(errors["b1_2"])
+    assert (errors["b1_1"], errors["b2"]) == pytest.approx(tuple(deviations), rel=1e-6)
+
+
+def test_the_noise_of_a_model_is_that_of_its_files_in_whatever_order_they_are(tmp_path):
+    """Rows of an epidemic that are no grid, alone and with another file: the level is known, and not estimated."""
+    rows = ["11,65", "3,26", "4.5,140", "6,293", "7.25,285", "9,190"]
+    for name, own in (("a", rows), ("b", rows[::-1])):
+        (tmp_path / f"{name}.csv").write_text("\n".join(["time [day],reading [people]", *own]))
+    for paths in ([tmp_path / "a.csv"], [tmp_path / "a.csv", tmp_path / "b.csv"]):
+        for model in (Sir(), Informed(Sir(), (Known("ln_gamma", lower=-0.9),))):
+            found = open_together(paths, model)
+            assert ModelNoise().of(found.model) == Gaussian(20.0)
+            (result,) = ib.estimate(model, list(paths), LM)
+            assert result.level is None
+
+
+def test_a_file_may_have_fewer_readings_than_the_model_has_parameters(tmp_path):
+    first, _columns = simulated(tmp_path / "a.csv", 240.0, 5)
+    (tmp_path / "b.csv").write_text("t,y,sigma\n400,36.2,0.5\n")
+    result = estimate(open_together([first, tmp_path / "b.csv"], OWN))
+    assert {p.name for p in result.model.natural_parameters} == {"b1_1", "b1_2", "b2"}
+    alone = estimate(open_together([first], OWN))
+    # One reading and one parameter more: the first file's answer is its own.
+    assert of(result, result.x)["b1_1"] == pytest.approx(alone.x[0], rel=1e-7)
+
+
+MISTAKES = {
+    "no such file's": (Known("b1_3", fixed=1.0), r"parameters.b1_3: there is no such parameter; did you mean b1_2"),
+    "start outside": (Known("b1_2", upper=200.0), r"parameters.b1_2: its start, 250, is not inside"),
+}
+
+
+@pytest.mark.parametrize("case", MISTAKES)
+def test_mistakes_name_the_file_s_own_parameter(files, case):
+    known, expected = MISTAKES[case]
+    with pytest.raises(UserError, match=expected):
+        together(files[0], known)
+
+
+# What is left out on purpose
+
+
+def test_rows_that_are_left_out_are_those_that_are_not_there_and_are_predicted(tmp_path):
+    path, columns = simulated(tmp_path / "a.csv", 240.0, 6)
+    lines = path.read_text().splitlines()
+    (tmp_path / "b.csv").write_text("\n".join([*lines[:3], *lines[4:7], *lines[8:]]))
+    model, line = Formula(SATURATION, START), LinearLSE()
+    left, short = (
+        ib.estimate(model, path, {**LM, "line": line}, ignore_rows=[4, 8]),
+        ib.estimate(model, tmp_path / "b.csv", {**LM, "line": line}),
+    )
+    for label in ("lm", "line"):
+        assert left[label].x.tolist() == short[label].x.tolist()
+        assert left[label].p_value == pytest.approx(short[label].p_value, rel=1e-12)
+    assert np.flatnonzero(np.isnan(left.z)).tolist() == [2, 6]
+    x, t = left["lm"].x, columns[:, 0]
+    assert left.examination is not None
+    assert left.examination.fitted == pytest.approx(x[0] * -np.expm1(-x[1] * t), rel=1e-6)
+    assert left.left_out == "rows 4, 8"
+    assert "Left out on purpose: rows 4, 8." in str(left)
+    assert "Left out on purpose: rows 4, 8." in left._repr_html_()
+
+
+def test_a_row_that_nobody_can_read_may_be_left_out(tmp_path):
+    """A word for a reading, a word for a time, and a row of totals with a cell too few."""
+    line = Formula("a+b*t", {"a": 1.0, "b": 1.0})
+    (tmp_path / "a.csv").write_text("t,y,sigma\n0,1,1\n1,saturated,?\n2,3.2,1\nlunch,,\n3,4,1\nsum,8.2\n")
+    with pytest.raises(UserError, match="row 7: has 2 cells"):
+        open_together([tmp_path / "a.csv"], line)
+    found = open_together([tmp_path / "a.csv"], line, LeftOut(rows=(3, 5, 7)))
+    assert found.model.index["t"] == [0.0, 1.0, 2.0, 3.0]
+    assert found.z == pytest.approx([1.0, np.nan, 3.2, 4.0], nan_ok=True)
+    assert found.deviations == pytest.approx([1.0, np.nan, 1.0, 1.0], nan_ok=True)
+
+
+def test_columns_are_left_out_with_their_units_or_without(tmp_path):
+    line = Formula("a+b*t", {"a": 1.0, "b": 1.0})
+    (tmp_path / "a.csv").write_text("t,remark,T [C],y,sigma\n0,x,20,1,1\n1,,21,2,9\n2,y,22,4,1\n")
+    found = open_together([tmp_path / "a.csv"], line, LeftOut(columns=("remark", "T", "sigma")))
+    assert found.z.tolist() == [1.0, 2.0, 4.0]
+    assert found.deviations is None
+    assert open_together([tmp_path / "a.csv"], line, LeftOut(("remark", "T [C]"))).deviations is not None
+
+
+def test_of_several_files_a_row_is_of_one(files):
+    paths, data = files
+    found = open_together(paths, OWN, LeftOut(rows=(f"{paths[1].name}:2", f"{paths[0]}:3")))
+    assert np.flatnonzero(np.isnan(found.z)).tolist() == [1, len(data[0])]
+
+
+NOT_THERE = {
+    "a column": (LeftOut(("u",)), r"ignore_columns=u: there is no such column \(there are: sigma, t, y\)"),
+    "a row": (LeftOut(rows=(14,)), r"ignore_rows=14: .*240.csv has no such row; its rows are 2 to 13"),
+    "the header": (LeftOut(rows=(1,)), r"ignore_rows=1: .* has no such row"),
+    "no number": (LeftOut(rows=("three",)), r"ignore_rows=three: is not the number of a row"),
+    "no such file": (LeftOut(rows=("c.csv:3",)), r"ignore_rows=c.csv:3: there is no such file"),
+    "what is needed": (LeftOut(("t",)), r"column t is missing"),
+    "the readings": (LeftOut(("y",)), r"column y is missing, which holds the readings"),
+    "nearly all": (LeftOut(rows=tuple(range(3, 14))), r"1 readings are too few for 2 parameters"),
+}
+
+
+@pytest.mark.parametrize("case", NOT_THERE)
+def test_what_is_not_there_cannot_be_left_out(files, case):
+    left_out, expected = NOT_THERE[case]
+    with pytest.raises(UserError, match=expected):
+        open_together(files[0][:1], OWN, left_out)
+
+
+def test_a_row_of_several_files_without_its_file_is_refused(files):
+    with pytest.raises(UserError, match=r"ignore_rows=3: says not of which file; write .*240.csv:3"):
+        open_together(files[0], OWN, LeftOut(rows=(3,)))
+
+
+def test_an_array_has_neither_rows_nor_columns():
+    with pytest.raises(UserError, match="set readings to NaN in an array"):
+        ib.estimate(ib.measurements.Polynomial(), np.zeros(40), LM, ignore_rows=[3])

@@ -1,0 +1,210 @@
+"""Intervals of estimates that use a prior, and of estimates on a bound, against closed forms and by their coverage."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq, least_squares
+from scipy.stats import norm
+from small_models import Bent
+
+import ipe_bench as ib
+from ipe_bench.baselines import EKF, GaussNewton, LevenbergMarquardt, MapLM
+from ipe_bench.measurements import Formula
+from ipe_bench.measurements.known import Informed, Known
+from ipe_bench.noise import Gaussian, Unknown
+from ipe_bench.priors import GaussianPrior
+from ipe_bench.real.examination import examine, examine_with_prior
+from ipe_bench.real.fits import fit
+from ipe_bench.real.penalised import penalised
+from ipe_bench.real.profiles import end_within, profiles_of_sets
+from ipe_bench.trials.scenario import Scenario
+
+Q = norm.isf(0.025)
+LM = {"lm": LevenbergMarquardt(tolerance=1e-10, max_iterations=300)}
+
+
+@pytest.mark.parametrize("inflation", [1.0, 2.5])
+@pytest.mark.parametrize("correlated", [False, True])
+def test_profiles_and_bootstrap_with_a_prior_are_the_posterior_of_a_linear_model(correlated, inflation):
+    C = ((1.0, 0.8, 0.0), (0.8, 1.0, 0.3), (0.0, 0.3, 1.0)) if correlated else None
+    bench = Scenario(Bent(), Gaussian(3.0), GaussianPrior((1.0, 0.3, 2.0), C), seed=2)
+    z = bench.draw(0, 1).z[0]
+    z[4] = np.nan
+    map_lm = MapLM(tolerance=1e-10, prior_inflation=inflation)
+    fits = fit(bench.problem, z, {"map": map_lm, "ekf": EKF(prior_inflation=inflation)})
+    found = examine_with_prior(bench.problem, z, fits, bootstraps=4000)
+    assert found is not None
+    A = np.delete(np.asarray(bench.measurement.A), 4, axis=0)  # type: ignore[attr-defined]
+    d = inflation * np.array([1.0, 0.3, 2.0])
+    P0 = np.outer(d, d) * (np.eye(3) if C is None else np.array(C))
+    P = np.linalg.inv(A.T @ A / 9.0 + np.linalg.inv(P0))
+    sizes = bench.measurement.sizes
+    x, s = P @ A.T @ np.delete(z, 4) / 9.0 * sizes, np.sqrt(np.diag(P)) * sizes
+    assert found.x == pytest.approx(x, abs=1e-7)
+    assert found.standard_errors == pytest.approx(s, rel=1e-7)
+    ends = np.array([(p.low, p.high) for p in found.profiles]).T
+    assert ends == pytest.approx(np.array([x - Q * s, x + Q * s]), abs=2e-3 * s.min())
+    # 4000 draws know a tail quantile to .04 of a deviation.
+    assert (np.abs(np.array([found.bootstrap.low, found.bootstrap.high]) - ends) / s).max() < 0.17
+    assert np.isnan(found.influence.leverage[4])
+    assert found.fitted == pytest.approx(np.asarray(bench.measurement.A) @ (x / sizes), abs=1e-6)  # type: ignore[attr-defined]
+    assert found.with_prior
+
+
+def test_least_squares_and_the_prior_have_each_its_own():
+    bench = Scenario(Bent(bend=0.05), Gaussian(1.0), GaussianPrior((0.3, 0.3, 0.3)), seed=3)
+    z = bench.draw(0, 1).z[0]
+    answer = ib.estimate(bench.measurement, z, {**LM, "map": MapLM()}, noise=bench.noise, prior=bench.prior)
+    first, second = answer.examinations
+    assert (first.label, first.with_prior, second.label, second.with_prior) == ("lm", False, "map", True)
+    assert (second.standard_errors < first.standard_errors).all()
+    for found in (first, second):
+        assert found.x == pytest.approx(answer[found.label].x, abs=1e-4)
+    assert "95 % intervals of map with its prior" in str(answer)
+    assert "95 % intervals of map with its prior" in answer._repr_html_()
+    alone = ib.estimate(bench.measurement, z, {"map": MapLM()}, noise=bench.noise, prior=bench.prior)
+    assert alone.examination is not None
+    assert alone.examination.with_prior
+
+
+def test_a_level_that_is_estimated_scales_the_readings_and_not_the_prior():
+    """Where the prior says nearly all, the interval is the prior's, whatever the level."""
+    model = Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(range(12))})
+    prior = GaussianPrior((0.02, 0.002))
+    rng = np.random.default_rng(4)
+    for sigma in (5.0, 50.0):
+        z = 1 + np.arange(12) + sigma * rng.standard_normal(12)
+        answer = ib.estimate(model, z, {"map": MapLM()}, noise=Unknown(), prior=prior)
+        assert answer.examination is not None
+        low, high = answer.examination.bootstrap.low, answer.examination.bootstrap.high
+        assert (high - low) / 2 / Q == pytest.approx([0.02, 0.002], rel=0.15)
+
+
+@pytest.mark.slow
+def test_truths_of_the_prior_are_in_the_penalised_profiles_as_often_as_they_say():
+    """A decay of few readings, the prior from far to near: coverage over truths that the prior draws."""
+    model = Formula("a*exp(-b*t)", {"a": 8.0, "b": 0.5}, {"t": (0.5, 1.0, 2.0, 4.0)})
+    bench = Scenario(model, Gaussian(1.0), GaussianPrior((0.3, 0.4), ((1.0, 0.6), (0.6, 1.0))), seed=1)
+    trials = 1000
+    drawn = bench.draw(0, trials)
+    estimates = MapLM(tolerance=1e-9).estimate(bench.problem, drawn.z)
+    assert (estimates.status == 0).all()
+    assert estimates.covariance is not None
+    problem, _ = penalised(bench.problem, drawn.z[0], 1.0)
+    z = np.column_stack([drawn.z, np.repeat(problem.x0[None], trials, axis=0)])
+    found = profiles_of_sets(problem, z, estimates.x, estimates.covariance)
+    truth = model.natural(drawn.x)
+    inside = np.array(
+        [[p.low <= v <= p.high for p, v in zip(row, x, strict=True)] for row, x in zip(found, truth, strict=True)]
+    )
+    assert inside.mean(axis=0) == pytest.approx([0.95, 0.95], abs=0.02)
+
+
+# On a bound
+
+
+@pytest.mark.parametrize("beyond", [0.0, 0.5, 3.0])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_the_interval_of_a_linear_parameter_on_its_bound_is_known(beyond, side):
+    """Chi-square about an unbounded estimate e deviations beyond the bound has risen by q^2 at -e + sqrt(e^2 + q^2)
+    inside of it."""
+    t = np.arange(10.0)
+    A = np.column_stack([np.ones(10), t])
+    s = 0.7 * np.sqrt(np.linalg.inv(A.T @ A)[1, 1])
+    z = 2 + 5 * t  # the unbounded estimate is 5
+    bound = 5 - side * (beyond * s + 1e-9)
+    known = Known("b", nominal=5 - 9 * side, **{"upper" if side > 0 else "lower": bound})
+    model = Informed(Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)}), (known,))
+    problem = Scenario(model, Gaussian(0.7)).problem
+    found = examine(problem, z, fit(problem, z, LM))
+    assert found is not None
+    (one,) = found.on_bounds
+    assert (one.parameter.name, one.bound) == ("b", bound)
+    expected = bound - side * s * (-beyond + np.sqrt(beyond**2 + Q**2))
+    assert one.other == pytest.approx(expected, abs=1e-3 * s)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_profiles_of_the_others_let_a_parameter_leave_its_bound_inwards(side):
+    """Of an intercept whose slope is on its bound, against the quadratic form: the bound acts to one side only."""
+    t = np.arange(10.0)
+    A = np.column_stack([np.ones(10), t])
+    P = 0.49 * np.linalg.inv(A.T @ A)
+    sa, sb, c = *np.sqrt(np.diag(P)), P[0, 1]
+    bound = 5 - side * 0.8 * sb
+    known = Known("b", nominal=5 - 9 * side, **{"upper" if side > 0 else "lower": bound})
+    model = Informed(Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)}), (known,))
+    problem = Scenario(model, Gaussian(0.7)).problem
+    z = 2 + 5 * t
+    found = examine(problem, z, fit(problem, z, LM))
+    assert found is not None
+
+    def rise(a: float) -> float:
+        b = 5 + c / sa**2 * (a - 2)
+        b = min(b, bound) if side > 0 else max(b, bound)
+        e = np.array([a - 2, b - 5])
+        return float(e @ np.linalg.solve(P, e)) - 0.8**2
+
+    least = 2 + c / sb**2 * (bound - 5)
+    assert found.x[0] == pytest.approx(least, abs=1e-9)
+    ends = [brentq(lambda a: rise(a) - Q**2, least + s * 1e-9, least + s * 20 * sa) for s in (-1, 1)]
+    (profile,) = found.profiles
+    assert (profile.low, profile.high) == pytest.approx(tuple(ends), abs=2e-3 * sa)
+    # Held on its bound, the slope would leave far shorter an interval to one side.
+    longer, shorter = sorted((least - ends[0], ends[1] - least), reverse=True)
+    assert longer > 1.2 * shorter
+
+
+def test_the_interval_on_a_bound_is_where_scipys_profile_rises():
+    rng = np.random.default_rng(8)
+    t = np.linspace(50, 700, 14)
+    z = -240 * np.expm1(-5.6e-4 * t) + 0.1 * rng.standard_normal(14)
+    model = Formula("b1*(1-exp(-b2*t))", {"b1": 200.0, "b2": 5e-4}, {"t": tuple(t)})
+    problem = Scenario(Informed(model, (Known("b1", upper=235.0),)), Gaussian(0.1)).problem
+    found = examine(problem, z, fit(problem, z, LM))
+    assert found is not None
+
+    def chi_square(b1: float) -> float:
+        def residuals(p):
+            return (-b1 * np.expm1(-1e-4 * p[0] * t) - z) / 0.1
+
+        return 2 * float(least_squares(residuals, [5.0], xtol=1e-15, ftol=1e-15, gtol=1e-15).cost)
+
+    least = chi_square(235.0)
+    expected = float(brentq(lambda b1: chi_square(b1) - least - Q**2, 150.0, 235.0))  # type: ignore[arg-type]
+    assert found.on_bounds[0].other == pytest.approx(expected, abs=1e-3 * (235.0 - expected))
+
+
+def test_an_interval_ends_at_the_other_bound_where_the_readings_say_nothing():
+    t = np.arange(6.0)
+    known = Known("b", nominal=0.5, lower=0.0, upper=1.0)
+    model = Informed(Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)}), (known,))
+    problem = Scenario(model, Gaussian(30.0)).problem
+    z = 2 + 5 * t
+    found = examine(problem, z, fit(problem, z, LM))
+    assert found is not None
+    assert (found.on_bounds[0].bound, found.on_bounds[0].other) == (1.0, 0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rate", [0.0, 0.02, 0.04])
+def test_truths_near_a_bound_are_in_the_intervals_at_least_as_often_as_they_say(rate):
+    """A decay that is hardly one, with a rate that cannot be negative: on its bound or off it."""
+    t, trials = np.arange(1.0, 7.0), 1000
+    model = Formula("a*exp(-b*t)", {"a": 5.0, "b": 0.1}, {"t": tuple(t)})
+    problem = Scenario(model, Gaussian(0.5)).problem
+    z = 5 * np.exp(-rate * t) + 0.5 * np.random.default_rng(9).standard_normal((trials, 6))
+    free = GaussNewton(tolerance=1e-9).estimate(problem, z)
+    assert (free.status == 0).all()
+    assert free.covariance is not None
+    off = free.x[:, 1] > 0
+    inside = [
+        one.low <= rate <= one.high for _, one in profiles_of_sets(problem, z[off], free.x[off], free.covariance[off])
+    ]
+    for k in np.flatnonzero(~off):
+        x = np.array([z[k].mean() / 5.0, 0.0])
+        J = problem.R.whiten_jacobian(model.jacobian(x[None]))[0]
+        inside.append(rate <= end_within(problem, z[k], x, np.linalg.inv(J.T @ J), 1, +1))
+    assert 50 < (~off).sum() < 600
+    assert np.mean(inside) >= 0.95 - 2 * np.sqrt(0.95 * 0.05 / trials)

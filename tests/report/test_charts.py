@@ -1,0 +1,178 @@
+"""Charts of the page hold the numbers of the summary, whoever's names they bear, and can be read on dark ground."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from test_report import HOSTILE, fill
+
+from ipe_bench.report.charts import charts
+from ipe_bench.report.figures.views import views
+from ipe_bench.report.html import render_page
+from ipe_bench.report.style import COLORS, ON_DARK
+from ipe_bench.report.tables import all_tables
+from ipe_bench.statistics import analyse
+
+
+def drawn(analysis):
+    return {chart.name: json.loads(chart.data) for chart in charts(views(analysis)[0])}
+
+
+class Page(HTMLParser):
+    """The charts of a page, its policy, and the texts of its script and style."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.charts: list[dict] = []
+        self.policy, self.inside, self.texts = "", "", {}
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        given = dict(attrs)
+        if "data-chart" in given:
+            self.charts.append(json.loads(given["data-chart"]))
+        if given.get("http-equiv") == "Content-Security-Policy":
+            self.policy = given["content"]
+        self.inside = tag
+
+    def handle_data(self, data):
+        if self.inside in ("script", "style"):
+            self.texts[self.inside] = self.texts.get(self.inside, "") + data
+
+    def handle_endtag(self, tag):
+        self.inside = ""
+
+
+def test_every_number_is_that_of_the_summary(synthetic):
+    fill(synthetic)
+    analysis = analyse([synthetic.directory])
+    total = analysis.summary[analysis.summary["parameter"] == "all"].set_index(["estimator", "error_scale"])
+    found = drawn(analysis)
+    assert set(found) == {"error_against_scale", "success_against_scale", "consistency"}
+    names = {
+        "solved_share": "solved",
+        "nees": "nees",
+        "success_low": "success_low",
+        "rmse": "rmse",
+        "success": "success",
+    }
+    compared = 0
+    for data in found.values():
+        assert [series["name"] for series in data["series"]] == ["linear_lse", "one", "two"]
+        for series in data["series"]:
+            values = series["values"]
+            assert values["error_scale"] == [1, 10, 100]
+            for column in names.keys() & values.keys():
+                expected = [total.loc[(series["name"], scale), names[column]] for scale in values["error_scale"]]
+                assert values[column] == pytest.approx(expected, rel=5e-5)
+                compared += 1
+    assert compared >= 9
+
+
+def test_an_interval_of_consistency_holds_one_where_the_mean_is_within_its_limits(synthetic):
+    fill(synthetic)
+    analysis = analyse([synthetic.directory])
+    total = analysis.summary[analysis.summary["parameter"] == "all"].set_index(["estimator", "error_scale"])
+    inside = []
+    for series in drawn(analysis)["consistency"]["series"]:
+        values = series["values"]
+        for scale, low, high in zip(values["error_scale"], values["nees_from"], values["nees_to"], strict=True):
+            row = total.loc[(series["name"], scale)]
+            inside.append(low <= 1 <= high)
+            assert inside[-1] == (row["nees_low"] <= row["nees"] <= row["nees_high"])
+    assert 0 < sum(inside) < len(inside)
+
+
+def test_ten_estimators_at_seven_scales_take_little_room(synthetic):
+    fill(synthetic, labels=[f"estimator_{i}" for i in range(10)], scales=[10.0**k for k in range(7)], trials=20)
+    sizes = {chart.name: len(chart.data) for chart in charts(views(analyse([synthetic.directory]))[0])}
+    assert sum(sizes.values()) < 40_000
+
+
+def test_with_one_scale_a_chart_is_against_cost(synthetic):
+    fill(synthetic, scales=(33.0,))
+    (chart, *_) = charts(views(analyse([synthetic.directory]))[0])
+    assert chart.title == "Error against cost"
+    assert json.loads(chart.data)["x"][0]["column"] == "cost_median"
+
+
+def test_what_is_not_a_number_is_null(synthetic):
+    fill(synthetic, labels=("one",))
+    scenario = synthetic.scenario(error_scale=1.0)
+    synthetic.add(scenario, "lost", np.full((80, 3), np.nan), status="error", solved=False)
+    found = drawn(analyse([synthetic.directory]))["error_against_scale"]
+    (lost,) = [series for series in found["series"] if series["name"] == "lost"]
+    assert lost["values"]["rmse"] == [None]
+    assert "NaN" not in json.dumps(found)
+
+
+def test_hostile_names_come_through_as_texts(synthetic):
+    fill(synthetic, labels=("linear_lse", HOSTILE, "a\"b'c&amp;</div>"))
+    analysis = analyse([synthetic.directory])
+    text = render_page(analysis, all_tables(analysis), [], (), list(charts(views(analysis)[0])))
+    page = Page(text)
+    assert len(page.charts) == 3
+    assert {series["name"] for series in page.charts[0]["series"]} == {"linear_lse", HOSTILE, "a\"b'c&amp;</div>"}
+
+
+def test_the_policy_lets_in_our_script_and_style_and_nothing_else(synthetic):
+    fill(synthetic)
+    analysis = analyse([synthetic.directory])
+    page = Page(render_page(analysis, all_tables(analysis), []))
+    rules = dict(rule.strip().split(" ", 1) for rule in page.policy.split(";"))
+    assert rules["default-src"] == rules["base-uri"] == rules["form-action"] == "'none'"
+    assert rules["img-src"] == "data:"
+    assert set(rules) == {"default-src", "script-src", "style-src", "img-src", "base-uri", "form-action"}
+    for tag in ("script", "style"):
+        digest = base64.b64encode(hashlib.sha256(page.texts[tag].encode()).digest()).decode()
+        assert rules[f"{tag}-src"] == f"'sha256-{digest}'"
+
+
+def _luminance(color: str) -> float:
+    """Relative luminance (WCAG 2.1)."""
+    rgb = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def test_colors_show_on_the_dark_ground(synthetic):
+    """A contrast of 3 at least, as WCAG 2.1 asks of graphics; the ground is the one that the page has."""
+    fill(synthetic)
+    analysis = analyse([synthetic.directory])
+    style = Page(render_page(analysis, all_tables(analysis), [])).texts["style"]
+    dark = style[style.index("prefers-color-scheme: dark") :]
+    ground, ink, soft = (re.search(rf"--{name}: (#\w+)", dark)[1] for name in ("ground", "ink", "soft"))
+
+    def contrast(color: str) -> float:
+        return (_luminance(color) + 0.05) / (_luminance(ground) + 0.05)
+
+    assert set(COLORS) <= set(ON_DARK)
+    assert min(contrast(color) for color in ON_DARK.values()) > 3
+    assert len(set(ON_DARK.values())) == len(ON_DARK)
+    assert min(contrast(ink), contrast(soft)) > 4.5
+
+
+def test_the_page_says_which_commands_computed_what_it_shows(synthetic):
+    """One entry for the jobs of a sweep; none for a run that found everything stored."""
+    fill(synthetic)
+    record = json.loads(next((synthetic.directory / "runs").glob("*.json")).read_text(encoding="utf-8"))
+    record = {k: v for k, v in record.items() if k not in ("schema", "run", "seal")}
+    for name, command, blocks in (
+        ("b", "ipe-bench run -m error_scale=1,10", 2),
+        ("c", "ipe-bench run -m error_scale=1,10", 1),
+        ("d", "ipe-bench run that finds it all", 0),
+        ("e", None, 3),
+    ):
+        synthetic.store.write_run(name, record | {"command": command, "blocks": blocks})
+    analysis = analyse([synthetic.directory])
+    page = render_page(analysis, all_tables(analysis), [])
+    assert page.count("<summary>") == 1 + 3
+    assert page.count("<code>ipe-bench run -m error_scale=1,10</code>") == 2
+    assert "finds it all" not in page
+    assert page.count("from Python") == 1

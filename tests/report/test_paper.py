@@ -1,0 +1,148 @@
+"""What goes into a paper: figures as wide as a column, and tables that a strict reader of LaTeX accepts."""
+
+from __future__ import annotations
+
+import re
+
+import pandas as pd
+import pytest
+from test_report import HOSTILE, fill
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.cli.main import main
+from ipe_bench.report.paper import COLUMN, PAGE, export, inches, latex_table
+from ipe_bench.report.tables import Table, interval, words
+from ipe_bench.report.words import percent
+from ipe_bench.statistics import analyse
+
+COMMANDS = {
+    *("begin", "end", "centering", "caption", "label", "footnotesize", "setlength", "tabcolsep", "toprule", "midrule"),
+    *("bottomrule", "endhead", "textbf", "num", "shortstack", "ensuremath", "mu", "sigma", "surd", "times"),
+    *("textasciitilde", "textasciicircum", "textbackslash", "textless", "textgreater", "textbar", "textquotedbl"),
+    *("texttt", "textsuperscript"),
+}
+TOKENS = re.compile(r"\\([a-zA-Z]+)|\\([^a-zA-Z])|%[^\n]*\n|([{}])|([^\\{}%]+)")
+
+
+def read(text: str) -> list[list[str]]:
+    """The cells of a table, as they are typeset.
+
+    Fails where a command is not known, a brace is not closed, a sign has a meaning in LaTeX that is not meant here, a
+    number is not one of siunitx, or rows differ in their number of cells.
+    """
+    depth, at, environments = 0, 0, []
+    for match in TOKENS.finditer(text):
+        assert match.start() == at, text[at : at + 40]
+        at = match.end()
+        command, sign, brace, plain = match.groups()
+        assert command is None or command in COMMANDS, command
+        assert sign is None or sign in "&%$#_{},\\"
+        depth += {"{": 1, "}": -1}.get(brace or "", 0)
+        assert depth >= 0
+        assert plain is None or not set(plain) & set("$#_^~"), plain
+    assert at == len(text)
+    assert depth == 0
+    for kind, name in re.findall(r"\\(begin|end)\{([a-z*]+)\}", text):
+        if kind == "begin":
+            environments.append(name)
+        else:
+            assert environments.pop() == name
+    assert environments == []
+    for number in re.findall(r"\\num\{([^}]*)\}", text):
+        assert re.fullmatch(r"-?\d+(\.\d+)?(e[+-]?\d+)?", number), number
+    rules = re.split(r"\\(?:toprule|midrule|bottomrule)\n", text)
+    shape = re.search(r"\{@\{\}([lr]+)@\{\}\}", text)[1]
+    rows = [row for part in rules[1:3] for row in part.replace("\\endhead\n", "").strip().split("\n")]
+    cells = [re.split(r"(?<!\\)&", row.removesuffix(r"\\")) for row in rows]
+    assert all(row.endswith(r"\\") for row in rows)
+    assert {len(row) for row in cells} == {len(shape)}
+    return [[typeset(cell) for cell in row] for row in cells]
+
+
+def typeset(cell: str) -> str:
+    """What a reader sees: a control word swallows the blanks behind it, a control sign does not."""
+    cell = re.sub(r"\\(?:num|textbf)\{([^{}]*)\}", r"\1", re.sub(r"\\num\{([^{}]*)\}", r"\1", cell))
+    cell = re.sub(r"\\shortstack\[[lr]\]\{(.*)\}", lambda m: m[1].replace(r"\\", " "), cell)
+    return re.sub(r"\\([%&#_{}$])", r"\1", cell.replace(r"\,", " ")).strip()
+
+
+def test_the_reader_refuses_what_latex_would():
+    good = latex_table(Table("t", "T", "C", [words("a", ["b"])], pd.DataFrame()), COLUMN)
+    assert read(good) == [["a"], ["b"]]
+    for bad in (good + "}", good.replace("b \\\\", "b & c \\\\"), good.replace("b \\\\", "b_1 \\\\"), good + "\\foo"):
+        with pytest.raises(AssertionError):
+            read(bad)
+
+
+def test_intervals_read_as_they_are_meant():
+    column = interval("95 % of it", [0.996, 1.0, float("nan")], [1.0, 1.0, 1.0], percent)
+    rows = read(latex_table(Table("t", "T", "C", [column], pd.DataFrame()), COLUMN))
+    assert rows == [["95 % of it"], ["99.6 % to 100 %"], ["100 % to 100 %"], ["-"]]
+
+
+def test_tables_say_what_the_report_says_whatever_the_names(synthetic, tmp_path):
+    fill(synthetic, labels=("linear_lse", HOSTILE, "$x_1$ & \\frac{a}{b} 50 % ~ ^ # 中 µ"))
+    analysis = analyse([synthetic.directory])
+    done = export(analysis, tmp_path, ["overview"], ["estimator", "success", "error_scale", "95_of_success"], PAGE)
+    assert [path.name for path in done.files] == ["overview.tex"]
+    rows = read(done.files[0].read_text(encoding="utf-8"))
+    assert rows[0] == ["estimator", "success", "error scale", "95 % of success"]
+    assert len(rows) == 1 + 9
+    own = analysis.summary[analysis.summary["parameter"] == "all"].reset_index(drop=True)
+    assert [row[1] for row in rows[1:]] == [percent(v) for v in own["success"]]
+    assert [row[3] for row in rows[1:]] == [
+        f"{percent(low)} to {percent(high)}" for low, high in zip(own["success_low"], own["success_high"], strict=True)
+    ]
+
+
+def test_a_table_that_is_too_wide_is_said_to_be(synthetic, tmp_path, capsys):
+    fill(synthetic)
+    words_given = ["report", str(synthetic.directory), "paper=overview", f"output={tmp_path}"]
+    assert main([*words_given, "width=3.5"]) == 1
+    assert "overview: is about" in capsys.readouterr().err
+    assert main([*words_given, "width=3.5", "columns=error_scale,estimator,success"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_a_wider_table_is_longer_by_its_columns():
+    one = Table("t", "T", "C", [words("a", ["b" * 20])], pd.DataFrame())
+    two = Table("t", "T", "C", [words("a", ["b" * 20])] * 2, pd.DataFrame())
+    assert inches(one) == pytest.approx(20 * 4 / 72)
+    assert inches(two) == pytest.approx(2 * inches(one) + 6 / 72)
+
+
+@pytest.mark.parametrize("width", [COLUMN, PAGE])
+def test_a_figure_is_as_wide_as_the_column(synthetic, tmp_path, width):
+    fill(synthetic)
+    done = export(analyse([synthetic.directory]), tmp_path, ["success_against_scale"], width=width)
+    assert [path.name for path in done.files] == [
+        *("success_against_scale.png", "success_against_scale.pdf", "captions.md")
+    ]
+    box = re.search(rb"/MediaBox \[ *([\d. ]+) *\]", done.files[1].read_bytes())
+    left, _, right, _ = map(float, box[1].split())
+    assert (right - left) / 72 == pytest.approx(width, abs=0.01)
+    assert "Clopper-Pearson" in done.files[2].read_text(encoding="utf-8")
+
+
+def test_drawing_for_a_paper_leaves_the_report_as_it_is(synthetic, tmp_path):
+    from ipe_bench.report.figures import draw_all
+
+    fill(synthetic)
+    analysis = analyse([synthetic.directory])
+    before = draw_all(analysis, tmp_path / "a", which="main", formats=("png",), processes=1)[0].files[0].read_bytes()
+    export(analysis, tmp_path / "p", ["figure_2"])
+    after = draw_all(analysis, tmp_path / "b", which="main", formats=("png",), processes=1)[0].files[0].read_bytes()
+    assert before == after
+
+
+def test_mistakes_name_what_there_is(synthetic, tmp_path):
+    fill(synthetic)
+    analysis = analyse([synthetic.directory])
+    for names, columns, width, said in (
+        (["overveiw"], [], COLUMN, "did you mean overview"),
+        (["overview"], ["sucess"], COLUMN, "did you mean success"),
+        (["overview"], [], 90.0, "give inches"),
+        (["figure_2"], ["success"], COLUMN, "goes with a table"),
+    ):
+        with pytest.raises(UserError, match=said):
+            export(analysis, tmp_path, names, columns, width)

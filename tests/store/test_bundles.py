@@ -1,0 +1,164 @@
+"""A bundle is what it was made of, the same bytes wherever it is made, and nothing at all once anything is changed."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from synthetic_store import Synthetic
+
+import ipe_bench as ib
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.files import BLANK_SEAL, seal
+from ipe_bench.cli.main import main
+from ipe_bench.runs.bundles import MANIFEST, opened, read_bundle, write_bundle
+
+
+def fill(folder: Path, factor: float = 1.0, trials: int = 30) -> Path:
+    store = Synthetic(folder)
+    error = 0.1 * factor * np.random.default_rng(0).standard_normal((trials, 3))
+    for label in ("linear_lse", "one"):
+        store.add(store.scenario(), label, error)
+    store.record(trials)
+    return folder
+
+
+@pytest.fixture
+def bundle(tmp_path):
+    return write_bundle([fill(tmp_path / "theirs")], tmp_path / "theirs.zip")
+
+
+def rewritten(path: Path, target: Path, change) -> Path:
+    """A copy of an archive whose entries went through `change`, a function of (name, content)."""
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(target, "w") as new:
+        for name in old.namelist():
+            for kept, content in change(name, old.read(name)):
+                new.writestr(kept, content)
+    return target
+
+
+def test_what_is_read_from_a_bundle_is_what_was_stored(bundle, tmp_path):
+    pd.testing.assert_frame_equal(ib.load(bundle.path), ib.load(tmp_path / "theirs"))
+    table = ib.status(bundle.path)
+    assert table.attrs["problems"] == []
+    assert table["done"].tolist() == [30, 30, 30]
+
+
+def test_the_same_results_give_the_same_bytes_anywhere(bundle, tmp_path):
+    copy = tmp_path / "elsewhere" / "theirs"
+    shutil.copytree(tmp_path / "theirs", copy)
+    again = write_bundle([copy], tmp_path / "again.zip")
+    assert again.path.read_bytes() == bundle.path.read_bytes()
+    assert again.digest == bundle.digest
+
+
+def test_the_manifest_has_the_digest_of_every_file(bundle, tmp_path):
+    names = {f"theirs/{p.relative_to(tmp_path / 'theirs')}" for p in (tmp_path / "theirs").rglob("*.*") if p.is_file()}
+    assert set(bundle.files) == {name for name in names if "/." not in name}
+    for name, digest in bundle.files.items():
+        assert hashlib.sha256((tmp_path / name).read_bytes()).hexdigest() == digest
+
+
+def test_two_folders_are_compared_with_ones_own(bundle, tmp_path):
+    mine = fill(tmp_path / "mine", factor=2.0)
+    frame = ib.compare(mine, bundle.path).set_index(["first", "quantity"])
+    assert frame.loc[("one", "error"), "change"] == pytest.approx(0.5)
+    assert frame.loc[("one", "error"), "finding"] == "better"
+
+
+def test_a_report_on_ones_own_and_a_bundle(bundle, tmp_path, capsys):
+    mine = Synthetic(tmp_path / "mine")
+    mine.add(mine.scenario(error_scale=3.0), "one", np.full((20, 3), 0.1))
+    mine.record(20)
+    out = tmp_path / "out"
+    words = ["report", str(mine.directory), str(bundle.path), f"output={out}"]
+    assert main(words) == 0
+    summary = pd.read_csv(out / "summary.csv")
+    assert set(summary["error_scale"]) == {1.0, 3.0}
+    before = (out / "report.html").stat().st_mtime_ns
+    assert main(words) == 0
+    assert (out / "report.html").stat().st_mtime_ns == before
+    assert main(["report", str(bundle.path)]) == 2
+    assert "say where the report goes with output=DIR" in capsys.readouterr().err
+
+
+CHANGES = {
+    "a value": lambda name, content: [(name, content.replace(b"PAR1", b"PAR2") if "trials" in name else content)],
+    "a file less": lambda name, content: [] if "runs/" in name else [(name, content)],
+    "a file more": lambda name, content: [(name, content), *([("theirs/trials/x.parquet", b"")] * (name == MANIFEST))],
+    "a digest": lambda name, content: [(name, content.replace(b'": "', b'": "0') if name == MANIFEST else content)],
+    "no manifest": lambda name, content: [] if name == MANIFEST else [(name, content)],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_a_bundle_that_was_changed_is_refused_in_one_line_and_leaves_nothing(bundle, tmp_path, change, capsys):
+    bad = rewritten(bundle.path, tmp_path / "bad.zip", change)
+    mine = fill(tmp_path / "mine")
+    out = tmp_path / "out"
+    for words in (["compare", str(mine), str(bad)], ["report", str(mine), str(bad), f"output={out}"]):
+        assert main(words) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert str(bad) in line
+    assert not out.exists()
+
+
+def test_any_byte_that_is_changed_is_noticed(bundle, tmp_path):
+    """Or is one of the zip's own, which says nothing of the results: then these are read as they were."""
+    whole = bundle.path.read_bytes()
+    expected = ib.load(bundle.path)
+    noticed = 0
+    for at in np.linspace(0, len(whole) - 1, 60).astype(int):
+        bad = tmp_path / "bad.zip"
+        bad.write_bytes(whole[:at] + bytes([whole[at] ^ 0x41]) + whole[at + 1 :])
+        try:
+            pd.testing.assert_frame_equal(ib.load(bad), expected)
+        except UserError:
+            noticed += 1
+    assert noticed > 45
+
+
+@pytest.mark.parametrize("name", ["../evil.json", "/runs/evil.json", "theirs/../../runs/x.json", "theirs/log/x.json"])
+def test_a_manifest_cannot_write_elsewhere(bundle, tmp_path, name):
+    """Not even one whose seal was made anew."""
+
+    def change(entry, content):
+        if entry == MANIFEST:
+            record = json.loads(content)
+            record["files"][name] = hashlib.sha256(b"{}").hexdigest()
+            yield entry, seal(json.dumps(record | {"seal": BLANK_SEAL}).encode())
+            yield name, b"{}"
+        else:
+            yield entry, content
+
+    bad = rewritten(bundle.path, tmp_path / "bad.zip", change)
+    before = set(tmp_path.rglob("*"))
+    with pytest.raises(UserError, match="is no name of a result"), opened([bad], tmp_path / "a" / "b"):
+        pass
+    assert set(tmp_path.rglob("*")) == before
+
+
+def test_commands_make_and_check_bundles(tmp_path, capsys):
+    folder = fill(tmp_path / "mine")
+    assert main(["bundle", str(folder)]) == 0
+    made = capsys.readouterr().out
+    with zipfile.ZipFile(tmp_path / "mine.zip") as archive:
+        digest = hashlib.sha256(archive.read(MANIFEST)).hexdigest()
+    assert f"sha256:{digest}" in made
+    assert main(["bundle", str(tmp_path / "mine.zip")]) == 0
+    assert f"sha256:{digest}" in capsys.readouterr().out
+    fill(folder, factor=2.0, trials=40)
+    assert main(["bundle", str(folder)]) == 2
+    assert "holds other results" in capsys.readouterr().err
+    next((folder / "trials").glob("*-0-40.parquet")).unlink()
+    assert main(["bundle", str(folder), f"output={tmp_path / 'part.zip'}"]) == 1
+    assert "missing" in capsys.readouterr().err
+    assert len(read_bundle(tmp_path / "part.zip").files) > 0
+    assert main(["bundle", str(tmp_path)]) == 2
+    assert main(["bundle"]) == 2
