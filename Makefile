@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: run test slow campaigns plugins mutants lint bench docs clean
+.PHONY: run test slow cluster campaigns plugins mutants lint bench docs clean
 
 run: .venv/ready
 	$(BIN)/ipe-bench run +experiment=paper
@@ -13,6 +13,11 @@ test: .venv/ready
 # What takes minutes: Monte Carlo, end-to-end and browser checks.
 slow: .venv/ready
 	$(BIN)/pytest -m "slow or browser"
+
+# Slurm: two nodes on this machine. On Debian, `apt-get install slurm-wlm munge` first; as root.
+cluster: .venv/ready
+	$(BIN)/uv pip install --quiet --python $(BIN)/python "hydra-submitit-launcher>=1.2"
+	$(BIN)/pytest -m cluster
 
 # What takes the better part of an hour: hundreds of damaged files, wrong command lines, tables of error rates.
 campaigns: .venv/ready

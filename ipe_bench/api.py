@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from ipe_bench.plugins.discovery import Option
     from ipe_bench.report import ReportResult
     from ipe_bench.report.answer import Answer
+    from ipe_bench.report.choice import Which
     from ipe_bench.statistics.sequences import Precision, Reach
     from ipe_bench.trials.design import Criterion, Design
     from ipe_bench.trials.posterior import Reference
@@ -155,8 +156,10 @@ def load(directories: Directories) -> pd.DataFrame:
     return frame
 
 
-def report(directories: Directories, output: Path | str | None = None) -> ReportResult:
+def report(directories: Directories, output: Path | str | None = None, *, figures: Which = "all") -> ReportResult:
     """Writes summary.csv, tables/, figures/ and report.html from what is stored, into `output` or the first directory.
+
+    `figures` are all that the data allow, main (the few that answer the question) or none.
 
     The result names the files, and has the summary itself and a line per piece that is missing, failed or damaged.
 
@@ -166,7 +169,7 @@ def report(directories: Directories, output: Path | str | None = None) -> Report
     ipe_bench.basics.errors.UserError: outputs/nowhere: there is no such directory; give one that a run wrote to
 
     Raises:
-        UserError: no run ever wrote to a directory.
+        UserError: no run ever wrote to a directory, or there is no such choice of figures.
         StorageError: the files cannot be written.
     """
     from ipe_bench.report import write_report
@@ -176,7 +179,7 @@ def report(directories: Directories, output: Path | str | None = None) -> Report
         raise UserError(f"{paths[0]}: a bundle is read and not written to; give output=, where the report goes")
     with opened(paths, None if output is None else Path(output) / BUNDLES) as folders:
         require_results(folders)
-        return write_report(folders, output)
+        return write_report(folders, output, figures=figures)
 
 
 def compare(

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from scipy.linalg import LinAlgWarning
 
 from ipe_bench.baselines.batched import Stack, run
 from ipe_bench.baselines.epochs import Epoch, arrivals
@@ -109,6 +108,8 @@ class Sequential(Estimator):
             epochs = list(arrivals(problem))
             with np.errstate(all="ignore"):
                 return run(stack, problem, z, epochs, slopes=self.slopes, history=history)
+        from scipy.linalg import LinAlgWarning
+
         with np.errstate(all="ignore"), warnings.catch_warnings():
             # SciPy warns of an ill-conditioned S, which R's smallness beside a wide prior explains.
             warnings.simplefilter("ignore", LinAlgWarning)

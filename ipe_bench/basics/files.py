@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import os
 import socket
+import tempfile
 import uuid
 from collections.abc import Callable
 from pathlib import Path
@@ -51,6 +52,18 @@ def make_folder(path: Path) -> None:
 def write_text(path: Path, text: str) -> None:
     """Writes a text file in one piece; see `write_atomically`."""
     write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+
+
+def cache_folder() -> Path:
+    """Where what is compiled or parsed once is kept between processes: `IPE_BENCH_CACHE`, or the user's cache."""
+    chosen = os.environ.get("IPE_BENCH_CACHE")
+    base = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "ipe-bench"
+    try:
+        base.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=base):
+            return base
+    except OSError:
+        return Path(tempfile.mkdtemp(prefix="ipe-bench-"))
 
 
 _SEAL = b"ipe_bench_sha256:"

@@ -11,7 +11,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 Array: TypeAlias = NDArray[Any]
 Mask: TypeAlias = NDArray[Any]
@@ -147,6 +146,8 @@ class Covariance:
         return w * self.factor if self.factor.ndim == 1 else multiply(self.factor, w)
 
     def _inverse_factor(self) -> Array:
+        from scipy.linalg import solve_triangular
+
         return solve_triangular(self.factor, np.eye(self.m), lower=True)
 
 

@@ -34,6 +34,7 @@ from ipe_bench.plugins.construct import construct
 from ipe_bench.priors import GaussianPrior, Prior, prior_of
 from ipe_bench.real.covariances import read_covariance
 from ipe_bench.real.sources import Readings
+from ipe_bench.report.choice import Which, which_figures
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.provenance import TARGET, canonical_json, describe
 from ipe_bench.trials.scenario import Scenario
@@ -61,6 +62,8 @@ class Schema:
     enough trials."""
     time_limit: float | None = None
     """Seconds after which, with a precision, no more blocks are begun."""
+    figures: str = "all"
+    """Which to draw: all, main (the few that answer the question), or none."""
     block_size: int = 250
     """Trials per unit of work and of storage; changes no number."""
     readings: Any = None
@@ -109,6 +112,7 @@ class Job:
     """The label of an estimator and a column of its row over all parameters."""
     readings: Readings | None = None
     """Of the files, for an estimate from them."""
+    figures: Which = "all"
 
 
 class PluginConfigs(SearchPathPlugin):
@@ -134,7 +138,10 @@ _FORMULA = re.compile(
 _UNIT = re.compile(r"^(\+*(?:truth_)?measurement\.(?:time_)?unit)=([^'\",\[\]{}]+)$")
 _FILE = re.compile(r"^\+*(?:truth_)?measurement\.file=")
 _PARAMETERS = re.compile(r"^\+*parameters=(?![{$]|null$)")
-_OPEN = re.compile(r"^(?:parameters|(?:truth_)?measurement\.(?:start|columns|constants|initial|rates|outputs))\.")
+_OPEN = re.compile(
+    r"^(?:(?:parameters|(?:truth_)?measurement\.(?:start|columns|constants|initial|rates|outputs))\."
+    r"|execution\.options[.=])"
+)
 """Keys to which users add entries of their own names."""
 
 
@@ -272,7 +279,12 @@ def assemble(config: DictConfig, opened: Opened | None = None) -> Job:
     trials = unless if plain["trials"] is None else plain["trials"]
     block_size, output = plain["block_size"], plain["output"]
     objective = _objective(plain["objective"], list(estimators))
-    return Job(scenario, estimators, execution, trials, block_size, output, precision, time_limit, objective, readings)
+    figures = which_figures(plain["figures"])
+    return Job(
+        *(scenario, estimators, execution, trials, block_size, output, precision, time_limit, objective),
+        readings=readings,
+        figures=figures,
+    )
 
 
 def _objective(given: str | None, labels: Sequence[str]) -> tuple[str, str] | None:

@@ -83,6 +83,8 @@ Nothing is computed again.
 paper=NAMES          tables and figures for a paper instead, into DIR/paper: LaTeX (booktabs, siunitx), PDF and PNG
 columns=NAMES        those of the tables, in this order; a name that is not there is answered with those that are
 width=INCHES         of a figure or table: 3.5 for one column, 7.16 for two
+
+figures=all          which to draw: all, main (the few that answer the question) or none
 """
 
 

@@ -15,6 +15,7 @@ _WITHOUT_USE = (
     "precision",
     "time_limit",
     "block_size",
+    "figures",
     "execution",
     "readings",
     "write_readings",

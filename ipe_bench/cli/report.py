@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console, paper
+from ipe_bench.report.choice import Which, which_figures
 from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
 from ipe_bench.runs.results import require_results
 from ipe_bench.runs.store import TRUTH
@@ -42,7 +44,9 @@ def unpacked(words: Sequence[str]) -> Iterator[list[str]]:
 
 def _report(arguments: Sequence[str]) -> int:
     outputs = [a.removeprefix("output=") for a in arguments if a.startswith("output=")]
-    directories = [Path(a) for a in arguments if not a.startswith("output=")]
+    asked = [a.removeprefix("figures=") for a in arguments if a.startswith("figures=")]
+    directories = [Path(a) for a in arguments if not a.startswith(("output=", "figures="))]
+    figures = which_figures(asked[-1] if asked else "all")
     if not directories:
         raise UserError("report: name at least one directory of results, such as outputs/paper")
     if len(outputs) > 1:
@@ -50,37 +54,43 @@ def _report(arguments: Sequence[str]) -> int:
     if len(directories) > 1 and not outputs:
         raise UserError("report: several directories need output=DIR, as the report on all is not that of the first")
     require_results(directories)
-    from ipe_bench.report.stamp import made_from
+    from ipe_bench.report.stamp import made_from, note
 
     output = Path(outputs[0]) if outputs else directories[0]
-    made = made_from(directories, output)
+    made, view = made_from(directories, output, figures), _view("everything")
+    if _show_again(output, made, view):
+        return 0
     begun = _begin(directories)
-    _print_table(begun.summary, begun.collection)
-    collection = _write(begun, output, made)
+    table = _print_table(begun.summary, begun.collection)
+    collection = _write(begun, output, made, figures)
     for problem in (*collection.problems, *collection.stale):
         print(f"ipe-bench: {problem}", file=sys.stderr)
     _print_places(output)
+    note(output, made, view, [table, ""])
     return 1 if collection.problems else 0
 
 
-def show_command(output: Path, cells: Mapping[str, str]) -> int:
+def show_command(output: Path, cells: Mapping[str, str], figures: Which = "all") -> int:
     """Writes the report on all that the folder holds, and prints what belongs to these cells; the exit code.
 
     `cells` has a line for people by key.
     """
-    from ipe_bench.report.stamp import made_from
+    from ipe_bench.report.stamp import made_from, note
+
+    made, view = made_from([output], output, figures), _view(" ".join(sorted(cells)))
+    if _show_again(output, made, view):
+        return 0
     from ipe_bench.statistics.collect import collect
     from ipe_bench.statistics.summary import rows_of_all
 
-    made = made_from([output], output)
     begun = _begin([output])
     others = sum(cell.key not in cells and cell.label != TRUTH for cell in begun.collection.current)
     if others:
         own = collect([output], cells.keys())
-        _print_table(rows_of_all(own), own)
+        table = _print_table(rows_of_all(own), own)
     else:
-        _print_table(begun.summary, begun.collection)
-    problems = _write(begun, output, made).problems
+        table = _print_table(begun.summary, begun.collection)
+    problems = _write(begun, output, made, figures).problems
     # What is wrong with a file or a folder may concern anybody; what other commands lack does not.
     of_cells = [p for p in problems if p.startswith(("missing: ", "failed: "))]
     elsewhere = [p for p in of_cells if not any(line in p for line in cells.values())]
@@ -90,9 +100,31 @@ def show_command(output: Path, cells: Mapping[str, str]) -> int:
         told = f"{_counted(len(elsewhere), 'problem')} of other commands; `ipe-bench status {output}` lists them"
         print(f"ipe-bench: {output}: {told}", file=sys.stderr)
     _print_places(output)
-    if others:
-        print(f"Here too  {_counted(others, 'result')} of other commands; `ipe-bench report {output}` shows all")
+    more = f"Here too  {_counted(others, 'result')} of other commands; `ipe-bench report {output}` shows all\n"
+    print(more if others else "", end="")
+    note(output, made, view, [table, more if others else ""])
     return 1 if problems else 0
+
+
+def _view(of: str) -> str:
+    """What is shown of a report, and how: of which cells, how wide and in which colours."""
+    out = console()
+    how = f"{out.width} {out.is_terminal} {out.color_system} {out.encoding} {out.legacy_windows}"
+    return hashlib.sha256(f"{of}; {how}".encode()).hexdigest()[:16]
+
+
+def _show_again(output: Path, made: str, view: str) -> bool:
+    """Prints what was printed of this report before, where nothing has changed since; nothing is computed for it."""
+    from ipe_bench.report.stamp import shown
+
+    known = shown(output, made, view)
+    if known is None:
+        return False
+    table, more = known
+    print(table, end="")
+    _print_places(output)
+    print(more, end="")
+    return True
 
 
 def _begin(directories: Sequence[Path]) -> Begun:
@@ -106,7 +138,7 @@ def _begin(directories: Sequence[Path]) -> Begun:
     return begun
 
 
-def _write(begun: Begun, output: Path, made: str) -> Collection:
+def _write(begun: Begun, output: Path, made: str, figures: Which) -> Collection:
     """Writes the report unless it is there already; returns what it is on, with all problems."""
     from ipe_bench.report.stamp import is_current, leave
 
@@ -114,12 +146,13 @@ def _write(begun: Begun, output: Path, made: str) -> Collection:
     if not is_current(output, made, [*collection.problems, *collection.stale]):
         from ipe_bench.report import write_analysis
 
-        result = write_analysis(begun, output)
+        result = write_analysis(begun, output, figures)
         leave(output, made, [*collection.problems, *collection.stale], result.files)
     return collection
 
 
-def _print_table(rows: Sequence[Mapping[str, Any]], collection: Collection) -> None:
+def _print_table(rows: Sequence[Mapping[str, Any]], collection: Collection) -> str:
+    """Prints the table; returns what was written."""
     from ipe_bench.report.terminal import render
 
     certified = attained = None
@@ -128,8 +161,10 @@ def _print_table(rows: Sequence[Mapping[str, Any]], collection: Collection) -> N
 
         certified, attained = certified_tables(collection)[1], attained_tables(collection)[1]
     out = console()
-    out.print(render(rows, certified, out.width, attained))
-    sys.stdout.flush()
+    with out.capture() as written:
+        out.print(render(rows, certified, out.width, attained))
+    print(written.get(), end="", flush=True)
+    return written.get()
 
 
 def _print_places(output: Path) -> None:

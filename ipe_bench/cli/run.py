@@ -8,11 +8,12 @@ import os
 import shlex
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra._internal.hydra import Hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import MissingConfigException
 from hydra.experimental.callback import Callback
@@ -33,6 +34,7 @@ from ipe_bench.cli.report import show_command
 from ipe_bench.cli.typed import check_options
 from ipe_bench.measurements import Nist
 from ipe_bench.plugins import discovery as plugins
+from ipe_bench.report.choice import Which, which_figures
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.schedule import Watcher
 from ipe_bench.runs.store import describe_names, digest
@@ -53,6 +55,7 @@ class Outcome:
         self.jobs = 0
         self.outputs: dict[Path, dict[str, str]] = {}
         """The folders that were filled, and by key a line for each cell that was asked for."""
+        self.figures: Which = "all"
         self.failures: list[str] = []
         self.stops: list[str] = []
         """How many trials each job with a precision took, and why no more."""
@@ -92,6 +95,7 @@ class Watch(Callback):
         _outcome.maximises = "maximize" in str(config.hydra.sweeper.get("direction", ""))
         _outcome.elsewhere = not config.hydra.launcher["_target_"].endswith(_OWN_LAUNCHER)
         output = OmegaConf.select(config, "output")
+        _outcome.figures = which_figures(OmegaConf.select(config, "figures"))
         if output is not None:
             _outcome.outputs[Path(output)] = {}
 
@@ -137,7 +141,8 @@ def _run_hydra(flags: Sequence[str], words: Sequence[str]) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     sys.argv = ["ipe-bench", *flags, *words]
     try:
-        with flags_of_hydra():
+        told = _without_asking(RunMode.RUN) if _is_plain(flags, words) else contextlib.nullcontext()
+        with flags_of_hydra(), told:
             hydra.main(version_base="1.3", config_path=str(plugins.own_conf()), config_name="config")(task)()
     except (UserError, StorageError):
         raise
@@ -157,6 +162,23 @@ def _run_hydra(flags: Sequence[str], words: Sequence[str]) -> None:
         raise explain(error) from error
 
 
+def _is_plain(flags: Sequence[str], words: Sequence[str]) -> bool:
+    """Whether nothing that is asked for can say hydra.mode: neither a word, nor an experiment, nor another folder."""
+    asks = any("hydra" in word or "experiment" in word for word in words)
+    return not flags and not asks and len(plugins.sources()) == 1
+
+
+@contextlib.contextmanager
+def _without_asking(mode: RunMode) -> Iterator[None]:
+    """Hydra composes the whole config once more only to learn its mode: here it is told."""
+    asked = Hydra.get_mode
+    Hydra.get_mode = lambda self, config_name, overrides: mode
+    try:
+        yield
+    finally:
+        Hydra.get_mode = asked
+
+
 def _conclude() -> int:
     """Shows what the jobs came to; the exit code."""
     if _outcome.storage is not None:
@@ -172,7 +194,9 @@ def _conclude() -> int:
     for output, cells in _outcome.outputs.items():
         if (output / "trials").is_dir():
             # Of jobs in other processes nothing is known but the folder.
-            code = max(code, show_command(output, cells) if cells else report([str(output)]))
+            which = _outcome.figures
+            own = show_command(output, cells, which) if cells else report([str(output), f"figures={which}"])
+            code = max(code, own)
     if _outcome.objectives:
         console().print(_outcome.shown_objective(), markup=False, soft_wrap=True)
     for line in _outcome.stops:
@@ -249,6 +273,7 @@ def task(config: DictConfig) -> float | None:
         raise
     else:
         _outcome.failures += failures
+        _outcome.figures = job.figures
         own = _outcome.outputs.setdefault(Path(job.output), {})
         own.update((cell.key, describe_names(cell.names)) for cell in cells_of(job.scenario, job.estimators))
         return value
@@ -311,6 +336,7 @@ _NOT_IN_TITLES = {
     "time_limit",
     "objective",
     "block_size",
+    "figures",
     "output",
     "name",
     "default_name",

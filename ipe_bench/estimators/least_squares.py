@@ -12,7 +12,6 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
 
 from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array, Covariance, Mask, finite, gram_factor, inverse, multiply, solve
@@ -311,6 +310,8 @@ class Minima:
     def fit_probability(self, readings: int) -> Array:
         """The chi-square test of the fit (trials,): how probable residuals at least this large are if the model holds,
         R is right and the minimum is the global one."""
+        from scipy.special import chdtrc
+
         return chdtrc(max(readings - self.x.shape[1], 1), self.chi_square)
 
     def estimates(self, tally: Tally, readings: int) -> Estimates:

@@ -15,7 +15,6 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.plugins.construct import find_object
 from ipe_bench.plugins.discovery import RECORD_GROUPS, Option, options
 from ipe_bench.runs.provenance import TARGET, package_version
-from ipe_bench.statistics.records import add_statistics
 
 
 def find_record(option: Option) -> Any:
@@ -49,6 +48,8 @@ def records(group: str, problems: list[str]) -> Iterator[tuple[Option, Any]]:
 
 def use_statistics() -> list[str]:
     """Has the statistics of all plugins computed beside ours; returns a line for each that cannot be."""
+    from ipe_bench.statistics.records import add_statistics
+
     problems: list[str] = []
     found = [record for _, record in records("statistic", problems)]
     return problems + add_statistics(found)

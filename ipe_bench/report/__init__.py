@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ipe_bench.report.choice import Which, which_figures
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -39,24 +41,27 @@ class ReportResult:
         return (self.summary_path, *self.tables, *self.figures, self.report)
 
 
-def write_report(directories: Path | str | Sequence[Path | str], output: Path | str | None = None) -> ReportResult:
+def write_report(
+    directories: Path | str | Sequence[Path | str], output: Path | str | None = None, *, figures: Which = "all"
+) -> ReportResult:
     """Writes summary.csv, tables/, figures/ and report.html from what is stored, under `output` or the first directory.
 
     Raises:
-        UserError: a directory does not exist.
+        UserError: a directory does not exist, or there is no such choice of `figures` (all, main or none).
     """
     from ipe_bench.plugins.extensions import use_statistics
     from ipe_bench.statistics.analysis import begin
 
+    which_figures(figures)
     faults = use_statistics()
     directories = [directories] if isinstance(directories, Path | str) else list(directories)
     begun = begin(directories)
     begun.collection.further += faults
-    return write_analysis(begun, Path(directories[0] if output is None else output))
+    return write_analysis(begun, Path(directories[0] if output is None else output), figures)
 
 
-def write_analysis(begun: Begun, output: Path) -> ReportResult:
-    """Finishes an analysis and writes the report on it under `output`."""
+def write_analysis(begun: Begun, output: Path, which: Which = "all") -> ReportResult:
+    """Finishes an analysis and writes the report on it under `output`, with these figures."""
     from ipe_bench.basics.files import write_text
     from ipe_bench.report import extensions
     from ipe_bench.report.certified_tables import attained_tables, certified_tables, without_certified
@@ -80,7 +85,7 @@ def write_analysis(begun: Begun, output: Path) -> ReportResult:
     table_paths = write_tables(analysis, [*tables, *further], output / "tables")
     figures: list[Path] = []
     drawn = []
-    for figure in draw_all(simulated, folder, problems=problems):
+    for figure in draw_all(simulated, folder, which=which, problems=problems):
         figures += figure.files
         drawn.append((figure.name, figure.title, figure.caption, figure.files[0].read_bytes()))
     page = render_page(analysis, tables, drawn, sections, list(charts(views(simulated)[0])))
@@ -102,9 +107,13 @@ class _Callable(types.ModuleType):
     """`ipe_bench.report` is this room once it is imported, and a public function before: so the room can be called."""
 
     def __call__(
-        self, directories: Path | str | Sequence[Path | str], output: Path | str | None = None
+        self,
+        directories: Path | str | Sequence[Path | str],
+        output: Path | str | None = None,
+        *,
+        figures: Which = "all",
     ) -> ReportResult:
-        return write_report(directories, output)
+        return write_report(directories, output, figures=figures)
 
 
 sys.modules[__name__].__class__ = _Callable

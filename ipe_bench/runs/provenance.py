@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -17,6 +18,8 @@ from typing import Any
 
 import numpy as np
 
+from ipe_bench.basics.errors import StorageError
+from ipe_bench.basics.files import BLANK_SEAL, cache_folder, is_sealed, seal, write_atomically
 from ipe_bench.basics.options import component_classes
 
 TARGET = "_target_"
@@ -28,6 +31,8 @@ WITHOUT_NUMBERS = tuple(
     )
 )
 """Modules and rooms that no number of a trial comes from: they word messages, name, store, summarise and show."""
+_MOST_SOURCES = 2000
+"""Kept in the cache; beyond it, only those that this process read."""
 _SESSION = uuid.uuid4().hex
 """Stands for source that no file holds, as of a notebook: what it computed is nobody's but this session's."""
 
@@ -70,6 +75,7 @@ def fingerprint(components: Iterable[Any]) -> dict[str, Any]:
             modules |= _import_closure(cls.__module__)
     packages = sorted({m.split(".")[0] for m in modules})
     digest = hashlib.sha256("".join(f"{m} {_digest_of(m)}\n" for m in sorted(modules)).encode())
+    _known().keep()
     return {"versions": {p: package_version(p) for p in packages}, "source": digest.hexdigest()[:16]}
 
 
@@ -109,14 +115,7 @@ def _imports(module: str) -> tuple[str, ...]:
     if path is None or path.suffix != ".py":
         return ()
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-    names: set[str] = set()
-    for node in ast.walk(_tree_of(path)):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            base = "." * node.level + (node.module or "")
-            base = importlib.util.resolve_name(base, package) if node.level else base
-            names |= {base} | {f"{base}.{alias.name}" for alias in node.names}
+    names = {importlib.util.resolve_name(name, package) for name in _source_of(path)["imports"]}
     own = {module.split(".")[0], "ipe_bench"}
     return tuple(sorted(n for n in names if n.split(".")[0] in own and _is_module(n)))
 
@@ -140,8 +139,66 @@ def _path_of(module: str) -> Path | None:
 
 
 @functools.cache
-def _tree_of(path: Path) -> ast.Module:
-    return ast.parse(path.read_bytes())
+def _source_of(path: Path) -> dict[str, Any]:
+    """What a source file imports, as it is written there, and the digest of its numerical code with the JSON files
+    beside it, tables of constants."""
+    content = path.read_bytes()
+    tables = b"".join(table.read_bytes() for table in sorted(path.parent.glob("*.json")))
+    return _known().get(content, tables)
+
+
+class _Sources:
+    """What was found in sources before, by the digest of all their bytes: to parse them takes longer than all else in
+    a run that has nothing to compute."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.found: dict[str, dict[str, Any]] = {}
+        self.used: set[str] = set()
+        with contextlib.suppress(OSError, ValueError, KeyError):
+            content = path.read_bytes()
+            if is_sealed(content):
+                self.found = json.loads(content)["found"]
+        self.stored = set(self.found)
+
+    def get(self, content: bytes, tables: bytes) -> dict[str, Any]:
+        key = hashlib.sha256(hashlib.sha256(content).digest() + tables).hexdigest()
+        if key not in self.found:
+            tree = ast.parse(content)
+            code = numerical_code(tree).encode()
+            self.found[key] = {"imports": _imported(tree), "digest": hashlib.sha256(code + tables).hexdigest()}
+        self.used.add(key)
+        return self.found[key]
+
+    def keep(self) -> None:
+        """Leaves what was found to later processes, where there is a place for it."""
+        if self.stored.issuperset(self.used):
+            return
+        if len(self.found) > _MOST_SOURCES:
+            self.found = {key: self.found[key] for key in self.used}
+        self.stored = set(self.found)
+        text = json.dumps({"found": self.found, "seal": BLANK_SEAL})
+        with contextlib.suppress(StorageError):
+            write_atomically(self.path, lambda temporary: temporary.write_bytes(seal(text.encode())))
+
+
+@functools.cache
+def _known() -> _Sources:
+    reader = hashlib.sha256(Path(__file__).read_bytes() + sys.version.encode()).hexdigest()[:16]
+    return _Sources(cache_folder() / f"sources-{reader}.json")
+
+
+def _imported(tree: ast.Module) -> list[str]:
+    """The names of modules, and of what may be modules, that are imported; with leading dots where relative."""
+    names: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = "." * node.level + (node.module or "")
+            dot = "." if node.module else ""
+            names |= {base} | {f"{base}{dot}{alias.name}" for alias in node.names}
+    return sorted(names)
 
 
 @functools.cache
@@ -150,9 +207,10 @@ def _digest_of(module: str) -> str:
     path = _path_of(module)
     if path is None:
         return "" if hasattr(sys.modules.get(module), "__path__") else _SESSION
-    code = numerical_code(_tree_of(path)).encode() if path.suffix == ".py" else path.read_bytes()
+    if path.suffix == ".py":
+        return _source_of(path)["digest"]
     tables = b"".join(table.read_bytes() for table in sorted(path.parent.glob("*.json")))
-    return hashlib.sha256(code + tables).hexdigest()
+    return hashlib.sha256(path.read_bytes() + tables).hexdigest()
 
 
 def numerical_code(tree: Any) -> str:

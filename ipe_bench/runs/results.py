@@ -29,7 +29,7 @@ from ipe_bench.runs.provenance import canonical_json
 from ipe_bench.runs.store import TRUTH, Store, describe_names, gaps, title
 from ipe_bench.runs.verified import Verified, signature
 
-_KEPT_BYTES = 1 << 28
+_KEPT_BYTES = 1 << 26
 """Rows that are kept in memory after they were read, so that no file is read twice where memory allows."""
 
 
@@ -362,19 +362,24 @@ class Results:
         A piece that cannot be used any more, or lacks one of the `columns`, is named in `problems`, and left out.
         """
         names = None if columns is None else list(dict.fromkeys(["trial", *columns, *optional]))
-        tables = [table for table in (self._rows(piece, columns) for piece in cell.pieces) if table is not None]
+        tables = [table for piece in cell.pieces if (table := self._rows(piece, columns, names)) is not None]
         if not tables:
             return {name: np.empty(0) for name in names or ["trial"]}
         table = pa.concat_tables(tables, promote_options="default")
+        tables.clear()
         trial, order = np.unique(as_array(table["trial"]), return_index=True)
         whole = len(order) == table.num_rows and np.array_equal(order, np.arange(len(order)))
         result = {}
-        for name in table.column_names if names is None else [n for n in names if n in table.column_names]:
+        for name in list(table.column_names):
             values = as_array(table[name])
             result[name] = values if whole else values[order]
+            # Each column is copied where there are several pieces: the first copy need not outlive the second.
+            table = table.drop_columns([name])
+        pa.default_memory_pool().release_unused()
         return result | {"trial": trial}
 
-    def _rows(self, piece: Piece, columns: Sequence[str] | None) -> pa.Table | None:
+    def _rows(self, piece: Piece, columns: Sequence[str] | None, names: Sequence[str] | None) -> pa.Table | None:
+        """The columns `names` of a piece that are there, all where it is None; it must have the `columns`."""
         with self.naming(piece.path):
             table = self._kept.get(piece.path)
             if table is None:
@@ -382,7 +387,7 @@ class Results:
                 self._keep(piece.path, table)
             if lacking := [name for name in columns or () if name not in table.column_names]:
                 raise Unusable(f"damaged: has no column {lacking[0]}")
-            return table
+            return table if names is None else table.select([name for name in names if name in table.column_names])
         return None
 
     def _keep(self, path: Path, table: pa.Table) -> None:

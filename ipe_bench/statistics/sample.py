@@ -114,15 +114,27 @@ class Sample:
             for name in (*bounds, *linear, *TRUTH):
                 rows[name] = _aligned(rows["trial"], known, name)
             parts.append(rows)
-        joined = {key: np.concatenate([p[key] for p in parts]) for key in parts[0] if all(key in p for p in parts)}
+
+        def column(name: str) -> Array:
+            """Of all parts, which are told to forget it: what is read of a million trials fits into memory once."""
+            pieces = [part.pop(name) for part in parts]
+            return pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
 
         def matrix(kind: str) -> Array:
-            return np.stack([joined.pop(f"{kind}_{name}") for name in names], axis=1).astype(float, copy=False)
+            columns = [column(f"{kind}_{name}") for name in names]
+            if all(c.strides == (0,) for c in columns):  # nothing of it is stored
+                return np.broadcast_to(np.nan, (len(ids), len(names)))
+            values = np.empty((len(ids), len(names)))
+            for i in range(len(names)):
+                values[:, i] = columns[i]
+                columns[i] = values[:0, 0]
+            return values
 
-        ids = np.stack([joined.pop("seed"), joined.pop("trial")], axis=1).astype(np.int64)
+        ids = np.stack([column("seed"), column("trial")], axis=1).astype(np.int64)
+        truth = {name: column(name) for name in TRUTH}
+        scalars = {name: column(name) for name in (*SCALARS, *OPTIONAL) if all(name in part for part in parts)}
         for name in ("solved", "success"):
-            joined[name] = joined[name].astype(bool)
-        truth = {name: joined.pop(name) for name in TRUTH}
+            scalars[name] = scalars[name].astype(bool)
         return cls(
             collection,
             group,
@@ -135,7 +147,7 @@ class Sample:
             van_trees=matrix("van_trees"),
             theory={kind: matrix(kind) for kind in THEORY},
             truth=truth,
-            scalars=joined,
+            scalars=scalars,
             shared=shared,
         )
 
@@ -293,6 +305,6 @@ def root_mean(values: Array, used: Array) -> Array:
 def _aligned(trial: Array, known: Mapping[str, Array] | None, name: str) -> Array:
     """A column of the truth in the order of the estimates' trials; NaN where it is missing."""
     if known is None or name not in known or len(known["trial"]) == 0:
-        return np.full(len(trial), np.nan)
+        return np.broadcast_to(np.nan, len(trial))
     at = np.minimum(np.searchsorted(known["trial"], trial), len(known["trial"]) - 1)
     return np.where(known["trial"][at] == trial, known[name][at], np.nan)

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from scipy.special import chdtrc
 
 from ipe_bench.basics.linalg import Array, Covariance, finite, information, inverse
 from ipe_bench.estimators.base import Estimator
@@ -134,6 +133,8 @@ def fit_probability(squares: Array, spread: Spread, noise: Noise, H: Array, R: C
     NaN where there are no residuals, or none to spare. Where spread is not that of least squares, the sum is scaled to
     the mean and variance of a sum that is (Satterthwaite, Biometrics Bulletin 2, 1946).
     """
+    from scipy.special import chdtrc
+
     m, n = H.shape
     if m <= n:
         return np.full(len(squares), np.nan)

@@ -12,7 +12,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri, chndtr
 
 from ipe_bench.basics.linalg import Array, Covariance, multiply
 from ipe_bench.measurements.base import Measurement, Parameter
@@ -214,6 +213,8 @@ def _told(truth: Measurement) -> Iterator[tuple[str, str, float, list[int]]]:
 
 def _noticed(left: Array, degrees: int) -> float:
     """The mean chance of a misfit, over truths and draws of the nuisances, for what they leave (truths, m, k)."""
+    from scipy.special import chdtri, chndtr
+
     rng = np.random.Generator(np.random.Philox(0))
     drawn = rng.standard_normal((_DRAWS, left.shape[2]))
     inner = np.matmul(left.swapaxes(1, 2), left)

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import chdtri
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import (
@@ -222,6 +221,8 @@ class Block:
         P = estimates.covariance
         squared = np.full(trials, np.nan) if P is None else nees(error, P)
         deviation = np.full(error.shape, np.nan) if P is None else deviations(P)
+        from scipy.special import chdtri
+
         return {
             "trial": np.arange(self.trials.start, self.trials.stop),
             **_by_parameter("error", names, error),

@@ -120,7 +120,7 @@ def test_mistakes_are_told_before_anything_is_computed(tmp_path, given, remedy):
 def test_the_command_says_how_many_trials_it_took_and_why(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = ["measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "error_scale=3", "solver=[newton]"]
-    words += ["baseline=[]", "execution=serial", "block_size=50", "output=out"]
+    words += ["baseline=[]", "execution=serial", "block_size=50", "output=out", "figures=none"]
     assert main(["run", *words, "precision=0.05"]) == 0
     out = capsys.readouterr().out
     assert " trials; every interval is narrow enough (newton: success ± " in out

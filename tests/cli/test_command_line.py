@@ -17,6 +17,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def ipe_bench(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Runs a command as users do, in a process of its own."""
     return subprocess.run(
         [sys.executable, "-m", "ipe_bench", *arguments],
         cwd=folder,
@@ -44,28 +45,48 @@ def in_process(monkeypatch, capsys):
     return run
 
 
+@pytest.fixture
+def here(monkeypatch, capsys):
+    """Runs a command in this process, and answers as one in a process of its own does."""
+    for variable in ("HYDRA_FULL_ERROR", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        monkeypatch.setenv(variable, "1")
+
+    def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+        monkeypatch.chdir(folder)
+        monkeypatch.setattr(sys, "argv", ["ipe-bench"])
+        plugins.sources.cache_clear()
+        capsys.readouterr()
+        code = main(list(arguments))
+        written = capsys.readouterr()
+        return subprocess.CompletedProcess(arguments, code, written.out, written.err)
+
+    return run
+
+
 @pytest.fixture(scope="module")
 def readings(tmp_path_factory) -> Path:
     """Readings of one simulated trial."""
     folder = tmp_path_factory.mktemp("readings")
-    result = ipe_bench("run", "error_scale=10", "write_readings=trial.csv", folder=folder)
-    assert result.returncode == 0, result.stderr
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(sys, "argv", ["ipe-bench"])
+        assert main(["run", "error_scale=10", "write_readings=trial.csv"]) == 0
     return folder / "trial.csv"
 
 
 def test_a_sweep_leaves_tables_figures_and_a_report(tmp_path):
-    result = ipe_bench("run", "-m", "error_scale=1,10", "trials=20", folder=tmp_path)
+    result = ipe_bench("run", "-m", "error_scale=1,10", "trials=20", "figures=main", folder=tmp_path)
     assert result.returncode == 0, result.stderr
     assert (tmp_path / "outputs/gins-error_scale=1,10/summary.csv").is_file()
     assert "fixed_point" in result.stdout
-    again = ipe_bench("run", "-m", "error_scale=1,10", "trials=20", folder=tmp_path)
+    again = ipe_bench("run", "-m", "error_scale=1,10", "trials=20", "figures=main", folder=tmp_path)
     assert again.stderr.count("nothing left to compute") == 2
 
 
-def test_estimates_from_a_file_find_the_parameters_that_made_it(readings):
+def test_estimates_from_a_file_find_the_parameters_that_made_it(readings, here):
     import re
 
-    result = ipe_bench("estimate", f"readings={readings}", "error_scale=10", folder=readings.parent)
+    result = here("estimate", f"readings={readings}", "error_scale=10", folder=readings.parent)
     assert result.returncode == 0, result.stderr
     truth = {
         name: float(value)
@@ -135,8 +156,8 @@ def test_a_mistake_is_one_line_with_exit_code_2(tmp_path, in_process, case):
     assert not (tmp_path / "outputs").exists() or not list((tmp_path / "outputs").rglob("*.parquet"))
 
 
-def test_a_sweep_whose_patterns_match_nothing_says_so(tmp_path):
-    result = ipe_bench("run", "-m", "solver=glob(nothing*)", folder=tmp_path)
+def test_a_sweep_whose_patterns_match_nothing_says_so(tmp_path, here):
+    result = here("run", "-m", "solver=glob(nothing*)", folder=tmp_path)
     assert result.returncode == 2
     assert "the sweep has no jobs" in result.stderr
 
@@ -170,18 +191,18 @@ def test_a_spoiled_readings_file_is_named_by_row_and_column(readings, tmp_path, 
     assert len(error.strip().splitlines()) == 1
 
 
-def test_a_missing_reading_is_an_empty_cell(readings, tmp_path):
+def test_a_missing_reading_is_an_empty_cell(readings, tmp_path, here):
     lines = readings.read_text().splitlines()
     path = tmp_path / "missing.csv"
     path.write_text("\n".join([*lines[:5], "1,9.0,vx,", *lines[6:]]))
-    result = ipe_bench("estimate", f"readings={path}", "error_scale=10", folder=tmp_path)
+    result = here("estimate", f"readings={path}", "error_scale=10", folder=tmp_path)
     assert result.returncode == 0, result.stderr
     assert " 228 " in result.stdout
 
 
-def test_nothing_is_overwritten(readings):
+def test_nothing_is_overwritten(readings, here):
     before = readings.read_text()
-    result = ipe_bench("run", f"write_readings={readings}", folder=readings.parent)
+    result = here("run", f"write_readings={readings}", folder=readings.parent)
     assert result.returncode == 2
     assert "is not overwritten" in result.stderr
     assert readings.read_text() == before
@@ -209,14 +230,12 @@ def test_a_data_set_may_be_written_as_an_option_of_its_own(overrides, expected):
         assert rewrite(overrides) == expected
 
 
-def test_data_sets_are_swept_by_either_spelling(tmp_path):
-    certified = ("noise=certified", "trials=1", "measurement.start=1,2")
-    first = ipe_bench("run", "-m", "measurement=nist/misra1a,nist/boxbod", *certified, folder=tmp_path)
+def test_data_sets_are_swept_by_either_spelling(tmp_path, here):
+    certified = ("noise=certified", "trials=1", "measurement.start=1,2", "figures=none")
+    first = here("run", "-m", "measurement=nist/misra1a,nist/boxbod", *certified, folder=tmp_path)
     assert first.returncode == 0, first.stderr
     assert "nist BoxBOD" in first.stderr
-    again = ipe_bench(
-        "run", "-m", "measurement=nist", "measurement.dataset=Misra1a,BoxBOD", *certified, folder=tmp_path
-    )
+    again = here("run", "-m", "measurement=nist", "measurement.dataset=Misra1a,BoxBOD", *certified, folder=tmp_path)
     assert again.stderr.count("nothing left to compute") == 4
 
 
@@ -249,7 +268,7 @@ def test_plugins_in_the_working_folder_are_found_and_run(tmp_path):
     (tmp_path / "plugins").symlink_to(ROOT / "plugins")
     listed = ipe_bench("list", "solver", folder=tmp_path)
     assert "plugins/relaxed_fixed_point" in listed.stdout
-    result = ipe_bench("run", "solver=[relaxed]", "baseline=[]", "trials=5", folder=tmp_path)
+    result = ipe_bench("run", "solver=[relaxed]", "baseline=[]", "trials=5", "figures=none", folder=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "relaxed" in result.stdout
 
@@ -272,7 +291,7 @@ def as_parquet(csv_file: Path, path: Path, change=lambda table: table) -> Path:
     return path
 
 
-def test_estimate_leaves_numbers_residuals_and_figures_from_csv_and_parquet_alike(readings, tmp_path):
+def test_estimate_leaves_numbers_residuals_and_figures_from_csv_and_parquet_alike(readings, tmp_path, here):
     import json
 
     import pandas as pd
@@ -280,7 +299,7 @@ def test_estimate_leaves_numbers_residuals_and_figures_from_csv_and_parquet_alik
     as_parquet(readings, tmp_path / "trial.parquet")
     results = []
     for file in (readings, tmp_path / "trial.parquet", readings):
-        ran = ipe_bench("estimate", f"readings={file}", "error_scale=10", folder=tmp_path)
+        ran = here("estimate", f"readings={file}", "error_scale=10", folder=tmp_path)
         assert ran.returncode == 0, ran.stderr
         assert all(len(line) <= 120 for line in ran.stdout.splitlines())
     # The second file is another command, and the third run is the first command again.

@@ -19,6 +19,7 @@ KEYS = {
     "block_size": ("null", "many", "1.5", "[1]", "0", "-5", "inf"),
     "seed": ("null", "first", "1.5", "[]", "-1", "99999999999999999999"),
     "error_scale": ("null", "big", "[1,2]", "0", "-1", "nan", "inf", "-inf", "1e101", "1e308", "true"),
+    "figures": ("null", "some", "1", "[all]", "true"),
     "write_readings_trial": ("null", "1.5", "-1", "3", "last"),
     "name": ("", ".", "..", "null", "[a]", "{a: 1}"),
     "output": ("", ".", "null", "[a]", LONG, "/proc/x", "/dev/null/x", "${nothing}", "'${nothing}'", "loop/x"),
@@ -400,6 +401,7 @@ def plugin(tmp_path, request):
 
 
 SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "trials=2", "execution=serial")
+SMALL += ("figures=none",)
 
 
 def test_there_are_sixty_broken_plugins():

@@ -11,6 +11,7 @@ import pytest
 from ipe_bench.cli.main import main
 
 SMALL = ("measurement=polynomial", "noise=gaussian", "execution=serial", "solver=[newton]", "output=out")
+SMALL += ("figures=none",)
 
 
 @pytest.fixture(autouse=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,7 @@ from ipe_bench.statistics.records import add_statistics
 from ipe_bench.trials.posterior import reference
 
 SMALL = ("measurement=polynomial", "noise=gaussian", "trials=8", "execution=serial", "output=out")
+MAIN = "figures=main"
 
 
 @pytest.fixture(autouse=True)
@@ -56,6 +58,17 @@ def write(kind: str, name: str, source: str) -> None:
     discovery.sources.cache_clear()
 
 
+def edit_figure(name: str, *changes: tuple[str, str]) -> None:
+    """Counts a new figure among the main ones, and changes its source in other ways."""
+    module = Path("plugins") / name / f"ipe_bench_{name}" / f"{name}.py"
+    source = module.read_text()
+    for old, new in (('Figure(draw, ("summary",))', 'Figure(draw, ("summary",), main=True)'), *changes):
+        assert old in source
+        source = source.replace(old, new)
+    module.write_text(source)
+    discovery.sources.cache_clear()
+
+
 def files(folder: str) -> dict[str, str]:
     """The digests of the tables and figures of a report."""
     paths = [path for part in ("tables", "figures") for path in Path(folder, part).iterdir()]
@@ -71,13 +84,12 @@ def test_what_new_makes_passes_its_checks(kind, capsys):
     assert "all checks passed" in out
 
 
-def test_a_report_has_what_plugins_add_beside_all_that_is_ours(capsys):
-    assert main(["run", *SMALL]) == 0
-    before = files("out")
+def test_a_report_has_what_plugins_add_beside_all_that_is_ours(ours, capsys):
+    before = ours
     for kind in RECORDS:
         assert main(["new", kind, f"own_{kind}"]) == 0
-    discovery.sources.cache_clear()
-    assert main(["report", "out"]) == 0
+    edit_figure("own_figure")
+    assert main(["report", "out", MAIN]) == 0
     page = Path("out/report.html").read_text(encoding="utf-8")
     summary = pd.read_csv("out/summary.csv")
     trials = pd.concat([summary["own_statistic"], summary["rmse"]], axis=1)
@@ -93,13 +105,13 @@ def test_a_report_has_what_plugins_add_beside_all_that_is_ours(capsys):
     assert {name.partition(".")[0] for name in changed} <= {"overview", "parameters", "costs"}
     capsys.readouterr()
     stamp = Path("out/report.html").stat().st_mtime_ns
-    assert main(["report", "out"]) == 0
+    assert main(["report", "out", MAIN]) == 0
     assert Path("out/report.html").stat().st_mtime_ns == stamp
     # The code of a plugin is part of what a report is made from.
     module = Path("plugins/own_figure/ipe_bench_own_figure/own_figure.py")
     digest = Path("out/figures/index.json").read_bytes()
     module.write_text(module.read_text() + "\n# changed\n")
-    assert main(["report", "out"]) == 0
+    assert main(["report", "out", MAIN]) == 0
     assert Path("out/report.html").stat().st_mtime_ns > stamp
     assert Path("out/figures/index.json").read_bytes() != digest
 
@@ -108,7 +120,7 @@ RAISING = {
     "statistic": "from ipe_bench.statistics.records import Statistic\n"
     "def f(s):\n    raise ValueError('broken')\nSTATISTIC = Statistic('bad', 'bad', 'all trials', 'Bad.', f)\n",
     "figure": "from ipe_bench.report.figures.drawing import Figure\n"
-    "def f(view):\n    raise ValueError('broken')\n    yield\nFIGURE = Figure(f, ('summary',))\n",
+    "def f(view):\n    raise ValueError('broken')\n    yield\nFIGURE = Figure(f, ('summary',), main=True)\n",
     "table": "def table(analysis):\n    raise ValueError('broken')\n",
     "section": "from ipe_bench.report.sections import Section\n"
     "def f(analysis):\n    yield 'so far'\n    raise ValueError('broken')\nSECTION = Section('Bad', f)\n",
@@ -118,17 +130,29 @@ MEDDLING = {
     "def f(s):\n    s.error *= 0\n    return 1.0\nSTATISTIC = Statistic('bad', 'bad', 'all trials', 'Bad.', f)\n",
     "figure": "from ipe_bench.report.figures.drawing import Figure\n"
     "def f(view):\n    view['summary']['rmse'] = 0.0\n    view['scores']['cost_median'] = 1.0\n"
-    "    yield from ()\nFIGURE = Figure(f, ('summary', 'scores'), together=True)\n",
+    "    yield from ()\nFIGURE = Figure(f, ('summary', 'scores'), together=True, main=True)\n",
     "table": "def table(analysis):\n    analysis.summary['rmse'] = 0.0\n",
     "section": "from ipe_bench.report.sections import Section\n"
     "def f(analysis):\n    analysis.summary['rmse'] = 0.0\n    yield 'Done.'\nSECTION = Section('Bad', f)\n",
 }
 
 
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory) -> Path:
+    """A folder with a report without any plugin."""
+    place = tmp_path_factory.mktemp("reported")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(place)
+        discovery.sources.cache_clear()
+        assert main(["run", *SMALL, MAIN]) == 0
+    discovery.sources.cache_clear()
+    return place / "out"
+
+
 @pytest.fixture
-def ours() -> dict[str, str]:
-    """The report without any plugin."""
-    assert main(["run", *SMALL]) == 0
+def ours(reported) -> dict[str, str]:
+    """The report without any plugin, in this folder."""
+    shutil.copytree(reported, "out")
     return files("out")
 
 
@@ -137,7 +161,7 @@ def test_one_that_raises_is_named_and_the_rest_is_whole(kind, ours, capsys):
     write(kind, "bad", RAISING[kind])
     for _ in range(2):
         capsys.readouterr()
-        assert main(["report", "out"]) == 1
+        assert main(["report", "out", MAIN]) == 1
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f"ipe-bench: {kind}=bad: ")
         assert "broken" in line
@@ -156,7 +180,7 @@ def test_one_that_raises_is_named_and_the_rest_is_whole(kind, ours, capsys):
 def test_one_that_writes_into_what_it_is_given_changes_nothing_of_ours(kind, ours):
     before = pd.read_csv("out/summary.csv")
     write(kind, "bad", MEDDLING[kind])
-    assert main(["report", "out"]) == (1 if kind == "statistic" else 0)
+    assert main(["report", "out", MAIN]) == (1 if kind == "statistic" else 0)
     after = pd.read_csv("out/summary.csv")
     pd.testing.assert_frame_equal(after[before.columns], before)
     figures = {name: digest for name, digest in files("out").items() if name.endswith((".png", ".pdf"))}
@@ -165,12 +189,10 @@ def test_one_that_writes_into_what_it_is_given_changes_nothing_of_ours(kind, our
 
 def test_a_figure_under_the_name_of_ours_is_left_out_and_ours_stays(ours, capsys):
     main(["new", "figure", "mine"])
-    module = Path("plugins/mine/ipe_bench_mine/mine.py")
-    module.write_text(module.read_text().replace('f"mine{view.suffix}"', '"consistency"'))
-    discovery.sources.cache_clear()
+    edit_figure("mine", ('f"mine{view.suffix}"', '"success_against_scale"'))
     capsys.readouterr()
-    assert main(["report", "out"]) == 1
-    assert "figure=mine: there is a figure consistency already; it is left out" in capsys.readouterr().err
+    assert main(["report", "out", MAIN]) == 1
+    assert "figure=mine: there is a figure success_against_scale already; it is left out" in capsys.readouterr().err
     assert files("out") == ours
 
 

@@ -26,13 +26,20 @@ def ids(path: Path) -> str:
     return str(path.relative_to(PAGES))
 
 
+@pytest.fixture(scope="module")
+def generated(tmp_path_factory) -> Path:
+    """The pages that nobody writes."""
+    folder = tmp_path_factory.mktemp("generated")
+    write_reference(folder / "reference")
+    write_gallery(folder / "gallery", folder, 1, [])
+    return folder
+
+
 @pytest.mark.parametrize("page", WRITTEN, ids=ids)
-def test_links_lead_to_pages(page, tmp_path):
-    write_reference(tmp_path / "reference")
-    write_gallery(tmp_path / "gallery", tmp_path, 1, [])
+def test_links_lead_to_pages(page, generated):
     for link in re.findall(r"\]\(([^)#]+)\)", page.read_text(encoding="utf-8")):
         target = (page.parent / link).resolve()
-        made = tmp_path / target.relative_to(PAGES.resolve())
+        made = generated / target.relative_to(PAGES.resolve())
         assert target.exists() or made.exists(), link
 
 
@@ -51,9 +58,8 @@ def test_every_option_of_ours_says_what_it_means(group):
     assert silent == []
 
 
-def test_every_command_has_a_section(tmp_path):
-    write_reference(tmp_path)
-    page = (tmp_path / "commands.md").read_text(encoding="utf-8")
+def test_every_command_has_a_section(generated):
+    page = (generated / "reference" / "commands.md").read_text(encoding="utf-8")
     found = set(re.findall(r"^## (\w+)$", page, re.MULTILINE))
     assert found == set(COMMANDS)
 

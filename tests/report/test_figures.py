@@ -338,13 +338,30 @@ def stored(synthetic, tmp_path):
     return analyse([synthetic.directory]), tmp_path / "figures"
 
 
+@pytest.fixture(scope="module")
+def once_drawn(tmp_path_factory):
+    """An analysis, and a folder with all that can be drawn of it."""
+    place = tmp_path_factory.mktemp("once")
+    store = Synthetic(place / "store")
+    fill(store, labels=(REFERENCE, "fixed_point"), scales=(1.0, 10.0), names=("a", "b"))
+    analysis = analyse([store.directory])
+    return analysis, draw_all(analysis, place / "figures", formats=("png",), processes=1), place / "figures"
+
+
+@pytest.fixture
+def all_drawn(once_drawn, tmp_path):
+    """The analysis, and a copy of the folder to spoil."""
+    analysis, _, folder = once_drawn
+    shutil.copytree(folder, tmp_path / "copy")
+    return analysis, tmp_path / "copy"
+
+
 def times(folder: Path) -> dict[str, int]:
     return {p.name: p.stat().st_mtime_ns for p in folder.iterdir()}
 
 
-def test_what_has_not_changed_is_not_drawn_again(stored, monkeypatch):
-    analysis, folder = stored
-    first = draw_all(analysis, folder, formats=("png",), processes=1)
+def test_what_has_not_changed_is_not_drawn_again(once_drawn, monkeypatch):
+    analysis, first, folder = once_drawn
     before = times(folder)
     monkeypatch.setattr(gallery, "draw_task", lambda *_: pytest.fail("drawn again"))
     second = draw_all(analysis, folder, formats=("png",), processes=1)
@@ -352,9 +369,8 @@ def test_what_has_not_changed_is_not_drawn_again(stored, monkeypatch):
     assert times(folder) == before
 
 
-def test_only_what_shows_the_change_is_drawn_again(stored):
-    analysis, folder = stored
-    draw_all(analysis, folder, formats=("png",), processes=1)
+def test_only_what_shows_the_change_is_drawn_again(all_drawn):
+    analysis, folder = all_drawn
     before = times(folder)
     scores = analysis.scores.assign(cost_median=analysis.scores["cost_median"] * 2)
     draw_all(replace(analysis, scores=scores), folder, formats=("png",), processes=1)
@@ -363,20 +379,20 @@ def test_only_what_shows_the_change_is_drawn_again(stored):
     assert not {"success_against_scale.png", "error_against_scale.png", "profiles.png"} & changed
 
 
-def test_other_code_draws_again(stored, monkeypatch):
-    analysis, folder = stored
-    draw_all(analysis, folder, which="main", formats=("png",), processes=1)
+def test_other_code_draws_again(all_drawn, monkeypatch):
+    analysis, folder = all_drawn
     before = times(folder)
     monkeypatch.setattr(gallery, "_drawn_with", lambda: "other code")
-    draw_all(analysis, folder, which="main", formats=("png",), processes=1)
-    assert all(time != before[name] for name, time in times(folder).items())
+    found = draw_all(analysis, folder, which="main", formats=("png",), processes=1)
+    names = [path.name for drawn in found for path in drawn.files]
+    assert len(names) == 4
+    assert all(times(folder)[name] != before[name] for name in names)
 
 
 @pytest.mark.parametrize("damage", ["cut", "edited", "removed", "index"])
-def test_damaged_figures_are_drawn_again(stored, damage):
-    analysis, folder = stored
-    (picture, *_) = draw_all(analysis, folder, which="main", formats=("png",), processes=1)
-    path = picture.files[0]
+def test_damaged_figures_are_drawn_again(all_drawn, damage):
+    analysis, folder = all_drawn
+    path = folder / "success_against_scale.png"
     whole = path.read_bytes()
     if damage == "cut":
         path.write_bytes(whole[:100])
@@ -392,11 +408,12 @@ def test_damaged_figures_are_drawn_again(stored, damage):
 
 def test_stale_figures_go_and_foreign_files_stay(synthetic, tmp_path):
     folder = tmp_path / "figures"
-    fill(synthetic)
+    small = {"labels": (REFERENCE, "fixed_point"), "scales": (1.0, 10.0), "names": ("a",)}
+    fill(synthetic, **small)
     draw_all(analyse([synthetic.directory]), folder, which="main", formats=("png",), processes=1)
     (folder / "mine.png").write_bytes(b"of the user")
     assert (folder / "success_against_scale.png").exists()
-    fill(synthetic, sigma=0.4)
+    fill(synthetic, sigma=0.4, **small)
     draw_all(analyse([synthetic.directory]), folder, which="main", formats=("png",), processes=1)
     assert not (folder / "success_against_scale.png").exists()
     assert len(list(folder.glob("success_against_scale_*.png"))) == 2
@@ -414,8 +431,8 @@ def test_an_index_cannot_remove_files_elsewhere(stored):
     assert victim.exists()
 
 
-def test_main_none_and_formats(stored):
-    analysis, folder = stored
+def test_main_none_and_formats(once_drawn, tmp_path):
+    analysis, folder = once_drawn[0], tmp_path / "figures"
     assert draw_all(analysis, folder, which="none") == []
     assert not folder.exists()
     main = draw_all(analysis, folder, which="main", formats=("png",), processes=1)
@@ -432,9 +449,8 @@ def test_main_none_and_formats(stored):
     assert not list(folder.glob("*.p*"))
 
 
-def test_two_processes_draw_the_same_bytes(stored, tmp_path, monkeypatch):
-    analysis, folder = stored
-    alone = draw_all(analysis, folder, formats=("png",), processes=1)
+def test_two_processes_draw_the_same_bytes(once_drawn, tmp_path, monkeypatch):
+    analysis, alone, _ = once_drawn
     # The helper gets everything: this process claims nothing.
     monkeypatch.setattr(gallery, "claim", lambda *_: False)
     helped = draw_all(analysis, tmp_path / "two", formats=("png",), processes=2)
@@ -443,8 +459,8 @@ def test_two_processes_draw_the_same_bytes(stored, tmp_path, monkeypatch):
         assert a.files[0].read_bytes() == b.files[0].read_bytes()
 
 
-def test_a_helper_that_dies_costs_nothing_but_time(stored, monkeypatch):
-    analysis, folder = stored
+def test_a_helper_that_dies_costs_nothing_but_time(once_drawn, tmp_path, monkeypatch):
+    analysis, folder = once_drawn[0], tmp_path / "figures"
     monkeypatch.setattr(gallery.sys, "executable", shutil.which("false") or "/nonexistent")
     found = draw_all(analysis, folder, which="main", formats=("png",), processes=2)
     assert all(path.exists() for d in found for path in d.files)

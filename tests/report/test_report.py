@@ -21,9 +21,11 @@ from synthetic_store import Seeker, Synthetic
 from ipe_bench.noise import Quantization
 from ipe_bench.report import write_report
 from ipe_bench.report.definitions import DEFINITIONS
+from ipe_bench.report.figures import correlation, distributions, nees
 from ipe_bench.report.figures.ranks import cliques
+from ipe_bench.report.figures.views import views
 from ipe_bench.report.headline import headline
-from ipe_bench.report.style import looks
+from ipe_bench.report.style import house_style, looks
 from ipe_bench.report.tables import Table, all_tables, interval, latex, markdown, words
 from ipe_bench.report.terminal import render
 from ipe_bench.report.words import compact, duration, percent, short
@@ -51,7 +53,7 @@ def fill(
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     store = Synthetic(tmp_path_factory.mktemp("report") / "store")
-    fill(store, seeds=5)
+    fill(store, scales=(1.0, 10.0), seeds=5)
     return write_report([store.directory], store.directory)
 
 
@@ -145,7 +147,12 @@ def test_the_table_in_the_terminal_fits_100_columns(synthetic):
 
 
 def test_hostile_names_are_shown_and_not_run(synthetic):
-    fill(synthetic, labels=("linear_lse", HOSTILE, "$x_1$ & \\frac{a}{b} | *b*"), names=(HOSTILE, "_b%", "c#~^\u03b1"))
+    fill(
+        synthetic,
+        labels=("linear_lse", HOSTILE, "$x_1$ & \\frac{a}{b} | *b*"),
+        names=(HOSTILE, "_b%", "c#~^\u03b1"),
+        scales=(1.0, 10.0),
+    )
     result = write_report([synthetic.directory], synthetic.directory / "out")
     page = result.report.read_text(encoding="utf-8")
     assert HOSTILE not in page
@@ -303,10 +310,13 @@ def test_settings_that_differ_have_figures_of_their_own(synthetic, tmp_path):
     quantized = [replace(s, noise=Quantization(0.7)) for s in gaussian[:2]]
     synthetic.bound = lambda scenario: np.full(3, 0.1)
     for scenario in (*gaussian, *quantized):
-        for label in ("linear_lse", "one", "two"):
+        for label in ("linear_lse", "one"):
             synthetic.add(scenario, label, 0.1 * rng.normal(size=(40, 3)))
-    result = write_report([synthetic.directory], tmp_path / "out")
+    result = write_report([synthetic.directory], tmp_path / "out", figures="main")
     names = {p.stem for p in result.figures}
+    with house_style():
+        for view in views(analyse([synthetic.directory]))[0]:
+            names |= {d.name for module in (distributions, correlation, nees) for d in module.draw(view)}
     settings = ("gaussian-0.2", "gaussian-0.4", "quantization")
     for kind in ("figure_2", "success_against_scale", "error_distributions", "correlation", "consistency"):
         assert {n for n in names if n.startswith(f"{kind}_")} == {f"{kind}_{s}" for s in settings}

@@ -13,9 +13,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from ipe_bench.cli.main import main
+from ipe_bench.report.stamp import NAME
 from ipe_bench.runs.columns import as_array
 
-HEAVY = ("numba", "pandas", "scipy.stats", "scipy.integrate", "matplotlib", "seaborn", "jinja2")
+HEAVY = ("numba", "pandas", "scipy", "matplotlib", "seaborn", "jinja2", "asyncio", "ipe_bench.statistics.records")
 COMMAND = """
 import json, sys
 from ipe_bench.cli.main import main
@@ -26,7 +27,8 @@ print(json.dumps([code, [name for name in names if name in sys.modules]]))
 
 
 def run(folder: Path, *more: str) -> int:
-    return main(["run", "measurement=polynomial", "noise=gaussian", "trials=4", f"output={folder}", *more])
+    words = ["run", "measurement=polynomial", "noise=gaussian", "trials=4", "figures=none"]
+    return main([*words, f"output={folder}", *more])
 
 
 def written(folder: Path) -> dict[str, int]:
@@ -37,13 +39,13 @@ def written(folder: Path) -> dict[str, int]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("stamp") / "out"
-    assert run(folder) == 0
+    assert run(folder, "figures=main") == 0
     return folder
 
 
 def test_a_run_with_nothing_to_do_leaves_everything_as_it_is(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before, records = written(folder), sorted(folder.glob("runs/*.json"))
-    assert run(folder) == 0
+    assert run(folder, "figures=main") == 0
     assert written(folder) == before
     assert sorted(folder.glob("runs/*.json")) == records
     assert "polynomial, gaussian: 4 trials per row" in capsys.readouterr().out
@@ -65,18 +67,68 @@ def test_more_trials_make_another_report(folder: Path) -> None:
     assert run(folder, "trials=6") == 0
 
 
+def test_what_is_shown_again_is_what_was_shown(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    printed = []
+    for _ in range(3):
+        assert run(folder, "estimators.fixed_point.max_iterations=7") == 0
+        printed.append(capsys.readouterr().out)
+    assert printed[0] == printed[1] == printed[2]
+    assert "Here too" in printed[0]
+    # Of the same folder, another command and another width show something else.
+    for words in (["solver=[newton]"], ["solver=[newton]"]):
+        assert run(folder, *words) == 0
+        assert "newton" in (shown := capsys.readouterr().out)
+        assert shown not in printed
+    assert main(["report", str(folder), "figures=none"]) == 0
+    assert "max_iterations" in capsys.readouterr().out
+
+
+def test_what_was_shown_is_not_shown_of_a_report_that_has_changed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path
+    assert run(folder) == 0
+    shown = capsys.readouterr().out
+    stamp = json.loads((folder / NAME).read_text())
+    stamp["shown"] = {view: ["a table that nobody printed\n", more] for view, (_, more) in stamp["shown"].items()}
+    (folder / NAME).write_text(json.dumps(stamp))
+    assert run(folder) == 0
+    assert "a table that nobody printed" in capsys.readouterr().out  # it is the stamp that is read
+    next(folder.glob("trials/*.parquet")).unlink()
+    assert run(folder) == 0
+    again = capsys.readouterr().out
+    assert "a table that nobody printed" not in again
+    assert [line.split()[:6] for line in again.splitlines()] == [line.split()[:6] for line in shown.splitlines()]
+
+
+def test_figures_are_all_the_main_ones_or_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    drawn = {}
+    for which in ("none", "main"):
+        assert run(tmp_path, f"figures={which}") == 0
+        drawn[which] = {path.stem for path in tmp_path.glob("figures/*.png")}
+        page = (tmp_path / "report.html").read_text(encoding="utf-8")
+        assert page.count("<img") == len(drawn[which])
+    assert drawn["none"] == set()
+    assert "error_against_scale" in drawn["main"]
+    assert main(["report", str(tmp_path), "figures=none"]) == 0
+    assert "<img" not in (tmp_path / "report.html").read_text(encoding="utf-8")
+    capsys.readouterr()
+    assert main(["report", str(tmp_path), "figures=some"]) == 2
+    assert "figures=some: choose all, main or none" in capsys.readouterr().err
+
+
 def test_a_damaged_file_is_named_however_often_the_report_was_made(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(tmp_path) == 0
+    assert run(tmp_path, "figures=none") == 0
     (tmp_path / "trials" / "0123456789abcdef-0-4.parquet").write_bytes(b"nothing")
     for _ in range(2):
-        assert main(["report", str(tmp_path)]) == 1
+        assert main(["report", str(tmp_path), "figures=none"]) == 1
         assert "0123456789abcdef-0-4.parquet" in capsys.readouterr().err
 
 
 def test_nothing_heavy_is_loaded_where_nothing_is_to_be_done(tmp_path: Path) -> None:
-    words = ["run", "trials=1", f"output={tmp_path}"]
+    words = ["run", "trials=1", "figures=none", f"output={tmp_path}"]
     for loaded in (None, []):
         command = [sys.executable, "-c", COMMAND, json.dumps(HEAVY), *words]
         done = subprocess.run(command, capture_output=True, text=True, check=True)

@@ -155,6 +155,7 @@ def test_a_sweep_over_lists_names_what_differs_in_tables_status_and_files(tmp_pa
     monkeypatch.chdir(tmp_path)
     one, other = ("[" + ",".join(str(list(b)).replace(" ", "") for b in part) + "]" for part in (BEACONS, BEACONS[:4]))
     arguments = ["noise=gaussian", "noise.deviation=0.1", "trials=20", "solver=[]", "execution=serial", "output=out"]
+    arguments += ["figures=none"]
     assert main(["run", "-m", "measurement=ranging", f"measurement.beacons={one},{other}", *arguments]) == 0
     titles = titles_in(capsys.readouterr().out)
     assert len(titles) == len(set(titles)) == 2

@@ -18,12 +18,12 @@ import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics.files import cache_folder
 from ipe_bench.basics.machine import cores
 from ipe_bench.measurements.ode.source import Equations, Source
 from ipe_bench.measurements.ode.tableau import Tableau
@@ -38,23 +38,11 @@ _WORTH_THREADS = 40_000
 """Steps times lanes times states from which a second thread gains more than it costs, some 150 microseconds."""
 
 
-def _cache_folder() -> Path:
-    """Where generated modules and their machine code are kept between processes."""
-    chosen = os.environ.get("IPE_BENCH_CACHE")
-    base = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "ipe-bench"
-    try:
-        base.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=base):
-            return base
-    except OSError:
-        return Path(tempfile.mkdtemp(prefix="ipe-bench-"))
-
-
 @functools.cache
 def load(source: str) -> ModuleType:
     """The module of a generated source, compiled at most once per machine."""
     name = f"ipe_bench_kernel_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
-    path = _cache_folder() / f"{name}.py"
+    path = cache_folder() / f"{name}.py"
     if not path.exists():
         _LOG.info("compiling an integrator, once per machine: it is kept in %s", path.parent)
         with tempfile.NamedTemporaryFile("w", dir=path.parent, suffix=".tmp", delete=False) as file:

@@ -19,11 +19,12 @@ from dataclasses import asdict, dataclass, field
 from functools import cache
 from importlib import import_module, metadata, resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import make_folder, write_text
 from ipe_bench.plugins.extensions import code_digest
+from ipe_bench.report.choice import Which
 from ipe_bench.report.figures.drawing import FORMATS, Drawing, Figure
 from ipe_bench.report.figures.views import View, views
 from ipe_bench.report.style import house_style
@@ -33,8 +34,6 @@ INDEX = "index.json"
 SCHEMA = 1
 WORTH_HELP = 3
 """So many figures to draw are worth a second process, which needs a second or more to start."""
-
-Which = Literal["all", "main", "none"]
 
 
 @dataclass(frozen=True)

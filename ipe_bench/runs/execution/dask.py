@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
 import atexit
-import concurrent.futures
 import contextlib
 import functools
 import json
@@ -27,7 +25,6 @@ from ipe_bench.runs.execution.processes import supervise
 
 log = logging.getLogger(__name__)
 
-_CANCELLED = (asyncio.CancelledError, concurrent.futures.CancelledError)
 _CONNECT_S = 30
 _PATIENCE_S = 15.0
 """So long nothing is said while a cluster has no workers."""
@@ -79,7 +76,7 @@ class Dask(Execution):
                 error = None if future.cancelled() else future.exception()
                 if isinstance(error, FATAL):
                     raise error
-                if future.cancelled() or isinstance(error, _CANCELLED):
+                if future.cancelled() or isinstance(error, _cancelled()):
                     raise _lost(client)
                 if error is not None:  # Dask gave up on it: its workers died again and again
                     failure = Failure("died", f"{type(error).__name__}: {' '.join(str(error).split())}")
@@ -89,16 +86,25 @@ class Dask(Execution):
                 for step in steps:
                     yield Event(index, step)
                 yield Event(index, ended=True, failure=failure)
-        except (*_CANCELLED, OSError) as error:  # what as_completed raises where the scheduler is gone
+        except (*_cancelled(), OSError) as error:  # what as_completed raises where the scheduler is gone
             raise _lost(client) from error
         finally:
             heard.set()
-            with contextlib.suppress(Exception, *_CANCELLED):
+            with contextlib.suppress(Exception, *_cancelled()):
                 client.cancel(list(futures), force=True)
 
     def _client(self) -> Any:
         options = json.dumps(dict(self.options), sort_keys=True, default=str)
         return _connect(self.workers, self.address, self.jobqueue, options)
+
+
+@functools.cache
+def _cancelled() -> tuple[type[BaseException], ...]:
+    """What is raised of a task that was called off."""
+    import asyncio
+    import concurrent.futures
+
+    return asyncio.CancelledError, concurrent.futures.CancelledError
 
 
 def _lost(client: Any) -> StorageError:
