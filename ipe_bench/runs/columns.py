@@ -21,10 +21,8 @@ def _of(chunk: pa.Array) -> Array:
     kind, start, stop = chunk.type, chunk.offset, chunk.offset + len(chunk)
     if pa.types.is_string(kind) or pa.types.is_large_string(kind):
         # A million words are few different ones, each kept once.
-        coded = chunk.dictionary_encode()
-        words = np.array([*coded.dictionary.to_pylist(), None], dtype=object)
-        places = coded.indices.fill_null(len(words) - 1)
-        return words[_of(places)]
+        coded = chunk.dictionary_encode(null_encoding="encode")
+        return np.array(coded.dictionary.to_pylist(), dtype=object)[_of(coded.indices)]
     if chunk.null_count or not (pa.types.is_boolean(kind) or pa.types.is_integer(kind) or pa.types.is_floating(kind)):
         return chunk.to_numpy(zero_copy_only=False)
     data = chunk.buffers()[1]

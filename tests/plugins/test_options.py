@@ -206,6 +206,8 @@ PARTS_OF_A_REPORT = ("statistic", "figure", "table", "section")
 )
 def test_conf_says_what_the_class_says(option):
     config: Any = OmegaConf.to_container(OmegaConf.load(option.path))
+    if option.fault is not None and "not installed here" in option.fault:
+        pytest.skip(option.fault)
     component = construct(config, option.group)
     fields = {f.name: f for f in dataclasses.fields(component) if f.init}
     assert set(config) - {"_target_"} <= set(fields)

@@ -58,14 +58,8 @@ def run(folder: Path) -> None:
 
 
 def summary(folder: Path) -> pd.DataFrame:
+    add_statistics([])  # those of plugins in the working folder, which a report takes up
     return summarize([folder]).drop(columns="time_median_s")
-
-
-@pytest.fixture(autouse=True)
-def only_ours() -> Iterator[None]:
-    """The statistics of plugins in the working folder, which a report takes up, are forgotten after each test."""
-    yield
-    add_statistics([])
 
 
 @pytest.fixture(scope="module")
