@@ -92,7 +92,7 @@ def _setting(title: str, part: Sequence[Mapping[str, Any]], width: int) -> tuple
     ]
     fitting = _fitting(headings, [row for section in sections for row in section], width)
     table = Table(
-        title=Text(f"{title}: {counts[0]} trials per row" if alike else title),
+        title=Text(f"{title}: {counts[0]} trial{'s' * (counts[0] != 1)} per row" if alike else title),
         title_justify="left",
         title_style="bold",
         box=box.SIMPLE_HEAD,

@@ -169,6 +169,15 @@ def test_points_of_no_error_at_all_are_in_the_panel_of_costs(synthetic):
             assert low < 0 < 2 < high
 
 
+def test_the_efficient_line_is_in_the_panel_of_costs_where_all_are_better_by_luck(synthetic):
+    scenario = synthetic.scenario(error_scale=1.0)
+    for label in (REFERENCE, "two"):
+        synthetic.add(scenario, label, np.full((60, 3), 1e-3))
+    (ax,) = drawn(cost, only_view(synthetic))["cost_against_accuracy"].figure.axes
+    low, high = ax.get_ylim()
+    assert low < 0.1 < 1.0 < high
+
+
 def test_a_value_that_is_missing_breaks_the_line(synthetic):
     fill(synthetic, solved={("two", 10.0): 0})
     panel = drawn(error_scale, only_view(synthetic))["error_against_scale"].figure.axes[0]

@@ -43,7 +43,7 @@ def draw(view: View) -> Iterator[Drawing]:
         ax.set_xscale("log")
         ax.set_xlim(scores["cost"].min() / 1.5, scores["cost"].max() * 1.5)
         common.log_ticks(ax.xaxis, *ax.get_xlim())
-        low, high = min(0.8, scores["error"].min()), scores["error"].max()
+        low, high = min(0.8, scores["error"].min()), max(1.0, scores["error"].max())
         ax.set_ylim(low - 0.06 * (high - low), high + 0.06 * (high - low))
         ax.set(xlabel="simulations per trial (median)", ylabel="mean error / √n, capped")
     common.legend_below(fig, axes, look)
