@@ -12,7 +12,7 @@ test: .venv/ready
 
 # What takes minutes: Monte Carlo, end-to-end and browser checks.
 slow: .venv/ready
-	$(BIN)/pytest -m "slow or browser"
+	$(BIN)/pytest -n auto --dist worksteal --durations=40 -m "slow or browser"
 
 # Slurm: two nodes on this machine. On Debian, `apt-get install slurm-wlm munge` first; as root.
 cluster: .venv/ready
