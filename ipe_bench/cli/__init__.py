@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
+
+from ipe_bench.basics.errors import UserError, unknown
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -16,3 +19,20 @@ def console() -> Console:
 
     shown = Console(highlight=False)
     return shown if shown.is_terminal else Console(highlight=False, width=_WIDTH_WITHOUT_TERMINAL)
+
+
+def given_keys(command: str, words: Sequence[str], keys: Collection[str]) -> dict[str, str]:
+    """The words KEY=VALUE after a command that Hydra does not read.
+
+    Raises:
+        UserError: a key is none of `keys`, or stands there twice.
+    """
+    found: dict[str, str] = {}
+    for word in words:
+        key, _, value = word.partition("=")
+        if key not in keys:
+            raise UserError(f"{command}: {word}: {unknown(key, keys, 'key')}")
+        if key in found:
+            raise UserError(f"{command}: {word}: {key} stands there twice; give it once")
+        found[key] = value
+    return found

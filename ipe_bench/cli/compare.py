@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.cli import console
+from ipe_bench.basics.errors import UserError
+from ipe_bench.cli import console, given_keys
 
 KEYS = ("first", "second", "alpha", "anytime", "fail_on", "output")
 
@@ -38,17 +38,11 @@ def main(arguments: Sequence[str]) -> int:
 
 def _keys(words: Sequence[str]) -> dict[str, Any]:
     """The keys as `compare` takes them."""
-    found: dict[str, Any] = {}
-    for word in words:
-        key, _, value = word.partition("=")
-        if key not in KEYS:
-            raise UserError(f"compare: {word}: {unknown(key, KEYS, 'key')}")
-        if key in found:
-            raise UserError(f"compare: {word}: {key} stands there twice; give it once")
+    found = given_keys("compare", words, KEYS)
+    for key, value in found.items():
         if not value:
-            raise UserError(f"compare: {word}: give it a value")
-        found[key] = _value(key, value)
-    return found
+            raise UserError(f"compare: {key}=: give it a value")
+    return {key: _value(key, value) for key, value in found.items()}
 
 
 def _value(key: str, value: str) -> Any:

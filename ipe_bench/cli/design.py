@@ -9,29 +9,14 @@ from typing import Any
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console
 from ipe_bench.cli.config import Job
-from ipe_bench.cli.single import compose_single
+from ipe_bench.cli.single import NOT_OF_ONE_SCENARIO, compose_single, first_of
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
 from ipe_bench.runs.provenance import describe
 from ipe_bench.trials.design import Criterion, design
 
-_WITHOUT_USE = (
-    "trials",
-    "precision",
-    "time_limit",
-    "block_size",
-    "figures",
-    "execution",
-    "readings",
-    "write_readings",
-    "write_readings_trial",
-    "ignore_rows",
-    "ignore_columns",
-    "solver",
-    "baseline",
-    "estimators",
-)
+_WITHOUT_USE = (*NOT_OF_ONE_SCENARIO, "trials", "solver", "baseline", "estimators")
 
 
 def main(
@@ -67,11 +52,10 @@ def main(
 
 
 def _refuse_keys_without_use(words: Sequence[str]) -> None:
-    for word in words:
-        key = word.lstrip("+~").partition("=")[0]
-        if key.split(".")[0].split("@")[0] in _WITHOUT_USE:
-            remedy = "; the number to choose is --readings NUMBER" if key == "readings" else ""
-            raise UserError(f"{key}: is for `ipe-bench run`, and nothing in a design; leave it out{remedy}")
+    key = first_of(_WITHOUT_USE, words)
+    if key is not None:
+        remedy = "; the number to choose is --readings NUMBER" if key == "readings" else ""
+        raise UserError(f"{key}: is for `ipe-bench run`, and nothing in a design; leave it out{remedy}")
 
 
 def _errors(job: Job) -> list[Measurement]:

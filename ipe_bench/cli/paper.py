@@ -6,8 +6,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.cli import console
+from ipe_bench.basics.errors import UserError
+from ipe_bench.cli import console, given_keys
 from ipe_bench.runs.results import require_results
 
 KEYS = ("paper", "columns", "width", "output")
@@ -23,7 +23,7 @@ def asked_for(words: Sequence[str]) -> bool:
 def main(arguments: Sequence[str]) -> int:
     """Writes the files and prints their names; exit code 1 where a table is too wide, or data are missing."""
     folders = [word for word in arguments if "=" not in word or Path(word).is_dir()]
-    keys = _keys([word for word in arguments if word not in folders])
+    keys = given_keys("report", [word for word in arguments if word not in folders], KEYS)
     if not folders:
         raise UserError("report: name at least one directory of results, such as outputs/paper")
     names = _listed(keys.get("paper", ""))
@@ -44,18 +44,6 @@ def main(arguments: Sequence[str]) -> int:
     for line in (*analysis.problems, *analysis.stale, *done.too_wide):
         print(f"ipe-bench: {line}", file=sys.stderr)
     return 1 if analysis.problems or done.too_wide else 0
-
-
-def _keys(words: Sequence[str]) -> dict[str, str]:
-    found: dict[str, str] = {}
-    for word in words:
-        key, _, value = word.partition("=")
-        if key not in KEYS:
-            raise UserError(f"report: {word}: {unknown(key, KEYS, 'key')}")
-        if key in found:
-            raise UserError(f"report: {word}: {key} stands there twice; give it once")
-        found[key] = value
-    return found
 
 
 def _listed(value: str) -> list[str]:

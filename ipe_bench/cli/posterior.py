@@ -7,22 +7,10 @@ from collections.abc import Sequence
 from ipe_bench.api import validate
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console
-from ipe_bench.cli.single import compose_single
+from ipe_bench.cli.single import NOT_OF_ONE_SCENARIO, compose_single, first_of
 from ipe_bench.runs.provenance import describe
 from ipe_bench.trials.posterior import reference
 
-_WITHOUT_USE = (
-    "precision",
-    "time_limit",
-    "block_size",
-    "figures",
-    "execution",
-    "readings",
-    "write_readings",
-    "write_readings_trial",
-    "ignore_rows",
-    "ignore_columns",
-)
 _TRIALS = 3
 _MOST_TRIALS = 100
 
@@ -59,7 +47,6 @@ def main(arguments: Sequence[str], particles: int) -> int:
 
 
 def _refuse_keys_without_use(words: Sequence[str]) -> None:
-    for word in words:
-        key = word.lstrip("+~").partition("=")[0]
-        if key.split(".")[0] in _WITHOUT_USE:
-            raise UserError(f"{key}: is for other commands, and nothing in a posterior; leave it out")
+    key = first_of(NOT_OF_ONE_SCENARIO, words)
+    if key is not None:
+        raise UserError(f"{key}: is for other commands, and nothing in a posterior; leave it out")

@@ -15,6 +15,26 @@ from ipe_bench.cli.overrides import read
 from ipe_bench.cli.typed import check_options
 from ipe_bench.plugins import discovery as plugins
 
+NOT_OF_ONE_SCENARIO = (
+    "precision",
+    "time_limit",
+    "block_size",
+    "figures",
+    "execution",
+    "readings",
+    "write_readings",
+    "write_readings_trial",
+    "ignore_rows",
+    "ignore_columns",
+)
+"""Keys of what other commands do: to run many trials, and to read files."""
+
+
+def first_of(keys: Sequence[str], words: Sequence[str]) -> str | None:
+    """The first key that the overrides name which is one of these, or below one; None where there is none."""
+    named = (word.lstrip("+~").partition("=")[0] for word in words)
+    return next((key for key in named if key.split(".")[0].split("@")[0] in keys), None)
+
 
 def chosen_measurement(arguments: Sequence[str], job: Job) -> str:
     """The option that was chosen, which says more than the class."""

@@ -7,7 +7,9 @@ Applied Statistics 37, 1988; Bates and Watts, Nonlinear Regression Analysis and 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,12 +123,7 @@ def profiles_of_sets(
     least = squared(problem.R.whiten(problem.measurement.simulate(x) - z))
     each = [_Set(problem, z[k], x[k], P[k], float(levels[k]), float(least[k])) for k in range(sets)]
     looked = [_Looked(one, j, q) for one in each for j in range(n)]
-    asked = [(one, one.centre + s * f * q * one.deviation) for one in looked for s in (-1, 1) for f in _FIRST]
-    for _ in range(_ROUNDS + 1):
-        _look(problem, asked)
-        asked = [(one, at) for one in looked for sign in (-1, 1) if (at := one.next(sign)) is not None]
-        if not asked:
-            break
+    _find_ends(problem, looked)
     return [[one.profile() for one in looked[k * n : (k + 1) * n]] for k in range(sets)]
 
 
@@ -152,13 +149,7 @@ def end_within(
     q = half_width(confidence, freedom)
     least = float(squared(problem.R.whiten(problem.measurement.simulate(x[None]) - z))[0])
     looked = _Looked(_Set(problem, z, x, P, 1.0, least), place, q)
-    asked = [(looked, looked.centre + sign * f * q * looked.deviation) for f in _FIRST]
-    for _ in range(_ROUNDS + 1):
-        _look(problem, asked)
-        at = looked.next(sign)
-        if at is None:
-            break
-        asked = [(looked, at)]
+    _find_ends(problem, [looked], signs=(sign,))
     if looked.lower:
         return np.nan
     end = looked.centre + sign * looked.end(sign)
@@ -184,21 +175,14 @@ class Released:
     def others(self) -> NDArray[np.intp]:
         return np.setdiff1d(np.arange(len(self.x)), self.places)
 
-    def relax(self, z: Array, asked: list[tuple[_Looked, float]]) -> None:
+    def relax(self, z: Array, asked: _Asked) -> None:
         """Lowers what was seen with the parameters on their bounds to what is seen where they leave them."""
         places = self.others[[one.place for one, _ in asked]]
-        values, rows = np.array([at for _, at in asked]), np.arange(len(asked))
-        model = Pinned(self.problem.measurement, Tally.zeros(len(asked)), places=places, values=values)
+        values = np.array([at for _, at in asked])
         moved = (values - self.x[places]) / self.P[places, places]
         begin = self.x + self.P[:, places].T * moved[:, None]
-        x = np.stack([np.delete(start, place) for start, place in zip(begin, places, strict=True)])
-        readings = np.repeat(z[None], len(asked), axis=0)
-        with np.errstate(all="ignore"):
-            objective = Objective(model, self.problem.R, readings, rows, self.problem.x0)
-            method = LevenbergMarquardtMethod(1e-3)
-            x = minimize(objective, method, x, tolerance=_TOLERANCE, max_iterations=_MOST_STEPS).x
-            sums = squared(self.problem.R.whiten(model.simulate(x, rows) - readings))
-        left = (model.whole(x, rows) - self.x)[:, self.places] * self.inwards
+        x, sums = _fit_others(self.problem, places, values, np.repeat(z[None], len(asked), axis=0), begin)
+        left = (x - self.x)[:, self.places] * self.inwards
         inwards = np.all(left >= 0, axis=1)
         for (one, at), total, inside in zip(asked, sums.tolist(), inwards, strict=True):
             if inside and np.isfinite(total):
@@ -221,13 +205,7 @@ def profiles_within(
     least = float(squared(problem.R.whiten(problem.measurement.simulate(x[None]) - z))[0])
     whole = _Set(problem, z, x, P, 1.0, least)
     looked = [_Looked(whole, j, q) for j in range(len(x))]
-    asked = [(one, one.centre + s * f * q * one.deviation) for one in looked for s in (-1, 1) for f in _FIRST]
-    for _ in range(_ROUNDS + 1):
-        _look(problem, asked)
-        released.relax(z, asked)
-        asked = [(one, at) for one in looked for sign in (-1, 1) if (at := one.next(sign)) is not None]
-        if not asked:
-            break
+    _find_ends(problem, looked, relax=lambda asked: released.relax(z, asked))
     return [one.profile() for one in looked]
 
 
@@ -320,27 +298,57 @@ class _Looked:
         return self.whole.problem.measurement.natural(points)[:, self.place]
 
 
-def _look(problem: Problem, asked: list[tuple[_Looked, float]]) -> None:
+_Asked: TypeAlias = "list[tuple[_Looked, float]]"
+"""Which parameters of which sets are to be looked at, and where."""
+
+
+def _find_ends(
+    problem: Problem,
+    looked: Sequence[_Looked],
+    signs: Sequence[int] = (-1, 1),
+    relax: Callable[[_Asked], None] | None = None,
+) -> None:
+    """Looks at all these parameters in rounds, until their ends on these sides are found; `relax` may lower what a
+    round has seen."""
+    asked = [(one, one.centre + s * f * one.q * one.deviation) for one in looked for s in signs for f in _FIRST]
+    for _ in range(_ROUNDS + 1):
+        _look(problem, asked)
+        if relax is not None:
+            relax(asked)
+        asked = [(one, at) for one in looked for sign in signs if (at := one.next(sign)) is not None]
+        if not asked:
+            break
+
+
+def _look(problem: Problem, asked: _Asked) -> None:
     """Minimises over the other parameters at every place that is asked for, all in one batch."""
     places, values = np.array([one.place for one, _ in asked]), np.array([at for _, at in asked])
-    rows, n = np.arange(len(asked)), problem.measurement.n
-    model = Pinned(problem.measurement, Tally.zeros(len(asked)), places=places, values=values)
     readings = np.stack([one.whole.z for one, _ in asked])
     begin = np.stack([_nearest(one, at) for one, at in asked])
-    others = np.stack([np.delete(start, place) for start, place in zip(begin, places, strict=True)])
-    with np.errstate(all="ignore"):
-        if n > 1:
-            objective = Objective(model, problem.R, readings, rows, problem.x0)
-            method = LevenbergMarquardtMethod(1e-3)
-            others = minimize(objective, method, others, tolerance=_TOLERANCE, max_iterations=_MOST_STEPS).x
-        sums = squared(problem.R.whiten(model.simulate(others, rows) - readings))
-    full = model.whole(others, rows)
+    full, sums = _fit_others(problem, places, values, readings, begin)
     for (one, at), total, point in zip(asked, sums.tolist(), full, strict=True):
         level, least = one.whole.level, one.whole.least
         change = (total - least) / level**2
         one.lower |= change < -_LOWER * max(1.0, least / level**2)
         zeta = np.sqrt(max(change, 0.0)) if np.isfinite(change) else np.inf
         one.seen[at] = (float(np.sign(at - one.centre) * zeta), point)
+
+
+def _fit_others(
+    problem: Problem, places: NDArray[np.intp], values: Array, readings: Array, begin: Array
+) -> tuple[Array, Array]:
+    """The minima (asked, n) with the parameters `places` at `values` (asked,), and the sums of squares there (asked,),
+    for readings (asked, m), from `begin` (asked, n)."""
+    rows = np.arange(len(values))
+    model = Pinned(problem.measurement, Tally.zeros(len(values)), places=places, values=values)
+    x = np.stack([np.delete(start, place) for start, place in zip(begin, places, strict=True)])
+    with np.errstate(all="ignore"):
+        if x.shape[1]:
+            objective = Objective(model, problem.R, readings, rows, problem.x0)
+            method = LevenbergMarquardtMethod(1e-3)
+            x = minimize(objective, method, x, tolerance=_TOLERANCE, max_iterations=_MOST_STEPS).x
+        sums = squared(problem.R.whiten(model.simulate(x, rows) - readings))
+    return model.whole(x, rows), sums
 
 
 def _nearest(one: _Looked, at: float) -> Array:
