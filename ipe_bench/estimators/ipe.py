@@ -94,14 +94,13 @@ class FrozenSystem:
         Raises:
             UserError: H has not full column rank.
         """
-        H_plus, deficient = pseudo_inverse(problem.H[None], problem.R)
-        if deficient.any():
+        if problem.rankless:
             raise UserError(
                 f"measurement={problem.measurement.name}: H has not full column rank at the nominal point: some "
                 "parameters cannot be told apart there, so there is no linear estimate to start from; give another "
                 "nominal point, start=nominal or best for least squares, or an estimator with a prior"
             )
-        model = Counted(problem.measurement, Tally.zeros(len(z)))
+        model, H_plus = Counted(problem.measurement, Tally.zeros(len(z))), problem.H_plus[None]
         deviation = deviations(frozen_covariance(H_plus, problem.R))
         return cls(model, H_plus, deviation, problem.R, z, np.arange(len(z)))
 
@@ -178,7 +177,7 @@ def starting_points(problem: Problem, z: Array, start: Start, tally: Tally) -> A
     Raises:
         UserError: linear_lse is asked for, and there is none.
     """
-    if start == "nominal" or (start == "best" and pseudo_inverse(problem.H[None], problem.R)[1].any()):
+    if start == "nominal" or (start == "best" and problem.rankless):
         return np.repeat(problem.x0[None], len(z), axis=0)
     x, system = begin(problem, z, start)
     tally.simulations += system.model.tally.simulations

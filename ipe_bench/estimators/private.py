@@ -17,6 +17,7 @@ from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.options import component_classes
 from ipe_bench.measurements.problem import Problem
 
+_LINEAR = ("H", "H_plus")
 T = TypeVar("T")
 
 
@@ -55,7 +56,7 @@ class Private:
         model = problem.measurement
         if _digest(model) != self._before or not _same(model.nominal, shared.measurement.nominal):
             return "it changes the model"
-        if "H" in vars(problem) and not _same(problem.H, shared.H):
+        if any(name in vars(problem) and not _same(getattr(problem, name), getattr(shared, name)) for name in _LINEAR):
             return "it writes into H"
         return ""
 

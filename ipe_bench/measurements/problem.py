@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array, Covariance, read_only
+from ipe_bench.basics.linalg import Array, Covariance, pseudo_inverse, read_only
 from ipe_bench.measurements.base import Measurement
 
 _FIXED = 1e-9
@@ -38,6 +38,16 @@ class Problem:
     def H(self) -> Array:
         """H (m, n) of eq. (1)."""
         return read_only(self.measurement.linearization())
+
+    @cached_property
+    def H_plus(self) -> Array:
+        """H+ (n, m) = (H' R^-1 H)^-1 H' R^-1; NaN where H has not full column rank."""
+        return read_only(pseudo_inverse(self.H[None], self.R)[0][0])
+
+    @property
+    def rankless(self) -> bool:
+        """Whether H has not full column rank, so that there is no linear estimate."""
+        return bool(np.isnan(self.H_plus).all())
 
     def prior_used(self, inflation: float = 1.0) -> Array | None:
         """The prior's standard deviations (n,) times `inflation`; a parameter that the prior fixes is nearly fixed."""

@@ -33,7 +33,7 @@ class Quantization(Noise):
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         shift = self.step * (rng.random(h.shape) - 0.5) if self.dither else 0.0
-        return self.step * np.round((offset + h + shift) / self.step) - offset - shift
+        return self.step * np.rint((offset + h + shift) / self.step) - offset - shift
 
     def whitened(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
         """Uniform."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array, Covariance, pseudo_inverse
+from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.ipe import starting_points
 from ipe_bench.estimators.least_squares import Minima, Objective
@@ -81,7 +81,7 @@ class Windows(Search):
 
         A careful attempt without a prior takes one in its windows that reaches as far as the linear estimate says.
         """
-        if before is None or self.prior is not None or not self.options.use_prior or self._rankless:
+        if before is None or self.prior is not None or not self.options.use_prior or self.problem.rankless:
             return self._attempt(k, rows, before)
         result, reach = before, self._reach(rows)
         for size in np.unique(reach):
@@ -90,11 +90,6 @@ class Windows(Search):
             search = replace(self, problem=replace(self.problem, prior_deviation=prior, prior_correlation=None))
             result = put(result, there, search._attempt(k, rows[there], take(before, there)))
         return result
-
-    @property
-    def _rankless(self) -> bool:
-        """Whether there is no linear estimate."""
-        return bool(pseudo_inverse(self.problem.H[None], self.problem.R)[1].any())
 
     def _reach(self, rows: NDArray[np.intp]) -> Array:
         """How far the parameters of the trials `rows` may lie, where no prior says so: the median of the distances in

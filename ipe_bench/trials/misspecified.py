@@ -13,7 +13,7 @@ import numpy as np
 
 from ipe_bench.basics.linalg import Array, deviations, inverse
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.trials.roots import least_squares_root
+from ipe_bench.trials.roots import Known, least_squares_root
 
 _STEP = 1e-4
 
@@ -34,7 +34,7 @@ def misspecified(problem: Problem, h: Array, x: Array, J: Array) -> Misspecified
     The pseudo-true parameters minimise |h - h(x)| in the metric of R. About them estimates scatter with A^-1 B A^-1,
     B = J' R^-1 J and A = B - sum_i (R^-1 r)_i d2h_i with the residuals r that remain there.
     """
-    root = least_squares_root(problem, h, x, J, prior=None)
+    root = least_squares_root(problem, h, x, Known(J), prior=None)
     found = np.isfinite(root).all(axis=1)
     bias, deviation = np.full(x.shape, np.nan), np.full(x.shape, np.nan)
     if found.any():

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.batches import put
+from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array
 from ipe_bench.estimators.driver import Ended, Solver, iterate
 from ipe_bench.estimators.gauss_newton import GaussNewtonMethod
@@ -43,33 +43,53 @@ class _Chord(IPE[_ChordState]):
         return _ChordState(x, system.F(x), state.J)
 
 
+@dataclass(frozen=True)
+class Known:
+    """What the model says at starts x (trials, n), where that is known already."""
+
+    J: Array
+    """dh/dx (trials, m, n)."""
+    h: Array | None = None
+    """h (trials, m)."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Informed(Counted):
-    """A model whose dh/dx (trials, m, n) at the starts x (trials, n) is known, so that it is not computed there."""
+    """A model that does not compute again what is known at the starts x (trials, n)."""
 
     x: Array
-    J: Array
+    known: Known
+
+    def simulate(self, x: Array, rows: NDArray[np.intp]) -> Array:
+        h = self.known.h
+        return super().simulate(x, rows) if h is None or not self._at_start(x, rows) else h[rows]
 
     def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: bool = False) -> Array:
-        return self.J[rows] if np.array_equal(x, self.x[rows]) else super().jacobian(x, rows, coarse=coarse)
+        if not self._at_start(x, rows):
+            return super().jacobian(x, rows, coarse=coarse)
+        J = self.known.J
+        return J if len(rows) == len(J) else J[rows]
+
+    def _at_start(self, x: Array, rows: NDArray[np.intp]) -> bool:
+        return np.array_equal(x, self.x[rows])
 
 
-def frozen_root(problem: Problem, z: Array, x_start: Array, J: Array | None = None) -> Array:
+def frozen_root(problem: Problem, z: Array, x_start: Array, known: Known | None = None) -> Array:
     """The root (trials, n) of the frozen equation (11) next to x_start (trials, n), for readings z (trials, m); NaN
-    where there is none. J (trials, m, n) is dh/dx at x_start, where it is known.
+    where there is none.
 
     Chord steps with the Jacobian at x_start, which is enough where x_start is the truth; Newton's method for the trials
     where it is not.
     """
-    return _first_root(lambda z: FrozenSystem.at_nominal(problem, z), ((_Chord(), 8), (Newton(), 20)), z, x_start, J)
+    attempts = ((_Chord(), 8), (Newton(), 20))
+    return _first_root(lambda z: FrozenSystem.at_nominal(problem, z), attempts, z, x_start, known)
 
 
 def least_squares_root(
-    problem: Problem, z: Array, x_start: Array, J: Array | None = None, *, prior: float | None
+    problem: Problem, z: Array, x_start: Array, known: Known | None = None, *, prior: float | None
 ) -> Array:
     """The minimum (trials, n) of |h(x) - z| in the metric of R next to x_start (trials, n); MAP where `prior` says by
-    how much to widen the prior's deviations. NaN where none is found. J (trials, m, n) is dh/dx at x_start, where it
-    is known.
+    how much to widen the prior's deviations. NaN where none is found.
 
     Gauss-Newton; Levenberg-Marquardt for the trials where that fails.
     """
@@ -77,7 +97,8 @@ def least_squares_root(
     def objective(z: Array) -> Objective:
         return Objective.of(problem, z, prior=prior is not None, inflation=prior or 1.0)
 
-    return _first_root(objective, ((GaussNewtonMethod(), 20), (LevenbergMarquardtMethod(1e-3), 100)), z, x_start, J)
+    attempts = ((GaussNewtonMethod(), 20), (LevenbergMarquardtMethod(1e-3), 100))
+    return _first_root(objective, attempts, z, x_start, known)
 
 
 def _first_root(
@@ -85,17 +106,18 @@ def _first_root(
     attempts: Sequence[tuple[Solver[Any], int]],
     z: Array,
     x_start: Array,
-    J: Array | None,
+    known: Known | None,
 ) -> Array:
     """Where the first method that converges ends: each has that many iterations from x_start."""
     x, missing = np.full(x_start.shape, np.nan), np.arange(len(z))
     for method, limit in attempts:
         if len(missing):
-            system = equations(z[missing])
-            if J is not None:
-                known = _Informed(system.model.measurement, system.model.tally, x=x_start[missing], J=J[missing])
-                system = replace(system, model=known)
-            ended: Ended[Any] = iterate(system, method, x_start[missing], tolerance=_TOLERANCE, max_iterations=limit)
+            system, start = equations(z[missing]), x_start[missing]
+            if known is not None:
+                here = known if len(missing) == len(z) else take(known, missing)
+                informed = _Informed(system.model.measurement, system.model.tally, x=start, known=here)
+                system = replace(system, model=informed)
+            ended: Ended[Any] = iterate(system, method, start, tolerance=_TOLERANCE, max_iterations=limit)
             x = put(x, missing[ended.converged], ended.x[ended.converged])
             missing = missing[~ended.converged]
     return x

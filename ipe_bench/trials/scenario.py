@@ -9,12 +9,15 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, read_only
+from ipe_bench.basics.streams import numbered
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem, recorded_problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.own import ModelNoise, resolved
 from ipe_bench.priors import GaussianPrior, Prior
 
+_PARAMETERS, _NOISE = 0, 1
+"""The two random streams of a trial."""
 _SEEDS = 1 << 23
 """Seeds there are: seed and trial share one 64-bit number where trials are matched."""
 
@@ -26,6 +29,8 @@ class Trials:
     start: int
     x: Array
     z: Array
+    h: Array | None = None
+    """The readings (trials, m) before noise, where they are those of the model that estimators are told."""
 
     @property
     def stop(self) -> int:
@@ -85,9 +90,7 @@ class Scenario:
 
     def truths(self, start: int, stop: int) -> Array:
         """The true parameters (trials, n) of trials start to stop, as `draw` draws them."""
-        nominal = self.simulator.nominal
-        draws = (_streams(self.seed, trial)[0] for trial in range(start, stop))
-        return np.stack([self.prior.draw(nominal, self.error_scale, rng) for rng in draws])
+        return self._drawn(start, stop)[:, : self.simulator.n]
 
     def draw(self, start: int, stop: int) -> Trials:
         """Trials start to stop. Trial t has random streams of its own, so it is the same in whatever block it is drawn.
@@ -96,27 +99,28 @@ class Scenario:
         """
         if self.noise.real:
             return _recorded_trial(self.measurement, start, stop)
-        model = self.simulator
-        streams = [_streams(self.seed, trial) for trial in range(start, stop)]
-        x, h = self._without_noise([rng for rng, _ in streams])
-        z = np.stack([self.noise.corrupt(h[i], model.offset, rng) for i, (_, rng) in enumerate(streams)])
-        return Trials(start, x, z)
+        drawn, offset = self._drawn(start, stop), self.simulator.offset
+        h = self.simulator.simulate(read_only(drawn))
+        kept = read_only(h.copy()) if self.truth is None else None  # a noise may write into what it is given
+        streams = numbered(self.seed, start, stop, _NOISE)
+        z = np.stack([self.noise.corrupt(row, offset, rng) for row, rng in zip(h, streams, strict=True)])
+        x = np.ascontiguousarray(drawn[:, : self.simulator.n])
+        return Trials(start, x, z, kept)
 
     def error_free(self, start: int, stop: int) -> Array:
         """The readings (trials, m) of trials start to stop before noise is added; those of a richer truth with what
         else acts on them."""
-        return self._without_noise([_streams(self.seed, trial)[0] for trial in range(start, stop)])[1]
+        return self.simulator.simulate(read_only(self._drawn(start, stop)))
 
-    def _without_noise(self, streams: list[np.random.Generator]) -> tuple[Array, Array]:
-        """x (trials, n) and h (trials, m), drawn from each trial's stream of parameters."""
-        model = self.simulator
-        x = np.stack([self.prior.draw(read_only(model.nominal), self.error_scale, rng) for rng in streams])
-        deviation = model.nuisance_deviation
-        if not len(deviation):
-            return x, model.simulate(read_only(x))
-        # After the parameters, from the same stream: a richer truth keeps the parameters of the trial.
-        drawn = [deviation * rng.standard_normal(len(deviation)) for rng in streams]
-        return x, model.simulate(np.column_stack([x, drawn]))
+    def _drawn(self, start: int, stop: int) -> Array:
+        """x (trials, n), and behind it the nuisances (trials, k), drawn from each trial's stream of parameters."""
+        n, deviation = self.simulator.n, self.simulator.nuisance_deviation
+        nominal, drawn = read_only(self.simulator.nominal), np.empty((stop - start, n + len(deviation)))
+        for row, rng in zip(drawn, numbered(self.seed, start, stop, _PARAMETERS), strict=True):
+            row[:n] = self.prior.draw(nominal, self.error_scale, rng)
+            # After the parameters, from the same stream: a richer truth keeps the parameters of the trial.
+            row[n:] = deviation * rng.standard_normal(len(deviation))
+        return drawn
 
 
 def _recorded_trial(measurement: Measurement, start: int, stop: int) -> Trials:
@@ -124,11 +128,3 @@ def _recorded_trial(measurement: Measurement, start: int, stop: int) -> Trials:
         raise UserError("noise=certified: has one trial; set trials=1")
     assert measurement.recorded is not None
     return Trials(0, measurement.recorded.x[None], measurement.recorded.z[None])
-
-
-def _streams(seed: int, trial: int) -> tuple[np.random.Generator, np.random.Generator]:
-    """Independent random streams for a trial's parameters and for its noise."""
-    # The children that SeedSequence(seed, spawn_key=(trial,)).spawn(2) has, without making their parent.
-    children = (np.random.SeedSequence(seed, spawn_key=(trial, child)) for child in range(2))
-    parameters, noise = (np.random.Generator(np.random.Philox(child)) for child in children)
-    return parameters, noise

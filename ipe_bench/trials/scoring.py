@@ -20,7 +20,6 @@ from ipe_bench.basics.linalg import (
     information,
     inverse,
     multiply,
-    pseudo_inverse,
     quadratic_form,
     read_only,
     solve,
@@ -32,7 +31,7 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.trials.contraction import contraction_of, curvature
 from ipe_bench.trials.fit_test import Spread, fit_probability, inflation_of, spread_of
 from ipe_bench.trials.misspecified import misspecified
-from ipe_bench.trials.roots import frozen_root, least_squares_root
+from ipe_bench.trials.roots import Known, frozen_root, least_squares_root
 from ipe_bench.trials.scenario import Scenario, Trials
 from ipe_bench.trials.second_order import box_bias, relative_curvatures, second_derivatives
 from ipe_bench.trials.thresholds import EXPECTED, GATE, SAME_ROOT
@@ -69,6 +68,11 @@ class Block:
             return self.problem.measurement.jacobian(read_only(self.trials.x))
 
     @cached_property
+    def readings(self) -> Array:
+        """h (trials, m) at the truth, of the model that estimators are told; NaN where it fails."""
+        return self.readings_at(self.trials.x) if self.trials.h is None else self.trials.h
+
+    @cached_property
     def crlb_information(self) -> Array:
         """J' R^-1 J at the truth (trials, n, n): the inverse of the Cramér-Rao bound."""
         with np.errstate(all="ignore"):
@@ -90,7 +94,7 @@ class Block:
         estimate, and what the paper's theorems ask of the model there."""
         names = [p.name for p in self.problem.measurement.parameters]
         bayes = deviations(inverse(self.bayes_information)[0])
-        H_plus, _ = pseudo_inverse(self.problem.H[None], self.problem.R)
+        H_plus = self.problem.H_plus[None]
         contracts = contraction_of(np.matmul(H_plus, self.jacobian))
         return {
             "trial": np.arange(self.trials.start, self.trials.stop),
@@ -98,7 +102,7 @@ class Block:
             **_by_parameter("crlb", names, self.crlb_deviation),
             **_by_parameter("bayes", names, bayes),
             **_by_parameter("van_trees", names, self._van_trees()),
-            **_by_parameter("linear_error", names, multiply(H_plus, self.trials.z - self.readings_at(self.trials.x))),
+            **_by_parameter("linear_error", names, multiply(H_plus, self.trials.z - self.readings)),
             "contraction_K": contracts.K,
             "contraction_norm": contracts.infinity_norm,
             "contraction_radius": contracts.spectral_radius,
@@ -171,8 +175,12 @@ class Block:
         key = (equation, inflation)
         if key not in self._roots:
             with np.errstate(all="ignore"):
-                self._roots[key] = _root_from(self.problem, self.trials, self.jacobian, equation, inflation)
+                self._roots[key] = _root_from(self.problem, self.trials, self._at_truth, equation, inflation)
         return self._roots[key]
+
+    @cached_property
+    def _at_truth(self) -> Known:
+        return Known(self.jacobian, self.readings)
 
     def estimate(self, estimator: Estimator) -> tuple[Estimates, Columns]:
         """What an estimator makes of the block, and its score."""
@@ -262,15 +270,15 @@ def nees(error: Array, P: Array) -> Array:
     return np.where(reported, np.where(usable, np.einsum("ti,ti->t", e, x), np.inf), np.nan)
 
 
-def _root_from(problem: Problem, trials: Trials, J: Array, equation: Equation, inflation: float) -> Array:
-    """The root next to the truth, where dh/dx is J (trials, m, n)."""
+def _root_from(problem: Problem, trials: Trials, known: Known, equation: Equation, inflation: float) -> Array:
+    """The root next to the truth, where this is known."""
     if equation == "frozen":
         try:
-            return frozen_root(problem, trials.z, trials.x, J)
+            return frozen_root(problem, trials.z, trials.x, known)
         except UserError:
             # H lacks rank, so there is no such equation; the estimators that solve it say so.
             return np.full(trials.x.shape, np.nan)
-    return least_squares_root(problem, trials.z, trials.x, J, prior=inflation if equation == "map" else None)
+    return least_squares_root(problem, trials.z, trials.x, known, prior=inflation if equation == "map" else None)
 
 
 def _by_parameter(prefix: str, names: list[str], values: Array) -> Columns:
