@@ -127,13 +127,13 @@ def iterate(
                 for row, x in zip(active, state.x, strict=True):
                     iterates[row].append(x)
         rows = equations.rows
-        spent = tally.cost(n)[rows] >= (np.inf if budget is None else budget)
+        spent = budget is not None and tally.cost(n)[rows] >= budget
         last = Status.MAX_ITERATIONS if iteration == max_iterations else Status.RUNNING
         now = _endings(standing, tally.failed(rows), tally.singular[rows], begun, spent, tolerance, last)
         status[active] = now
         going = now == Status.RUNNING
         if not going.all():
-            ended = put(ended, active[~going], take(state, ~going))
+            ended = state if len(state.x) == trials else put(ended, active[~going], take(state, ~going))
             if not going.any():
                 break
             active, begun = active[going], begun[going]
@@ -142,7 +142,7 @@ def iterate(
 
 
 def _endings(
-    standing: Standing, failed: Mask, singular: Mask, begun: Array, spent: Mask, tolerance: float, last: Status
+    standing: Standing, failed: Mask, singular: Mask, begun: Array, spent: Mask | bool, tolerance: float, last: Status
 ) -> NDArray[np.int8]:
     """The status of each trial: the first line that holds, else `last`."""
     lines = (
@@ -150,9 +150,12 @@ def _endings(
         (singular, Status.SINGULAR),
         (~np.isfinite(standing.level), Status.NONFINITE),
         (standing.size <= tolerance, Status.CONVERGED),
-        (np.broadcast_to(standing.stuck, begun.shape), standing.ending),
+        (standing.stuck, standing.ending),
         (standing.level > FAR * begun, Status.DIVERGED),
         (standing.moved < TINY_STEP * tolerance, standing.ending),
         (spent, Status.BUDGET),
     )
-    return np.select([holds for holds, _ in lines], [ending for _, ending in lines], last).astype(np.int8)
+    status = np.full(begun.shape, last, np.int8)
+    for holds, ending in reversed(lines):
+        np.copyto(status, ending, where=holds, casting="unsafe")
+    return status

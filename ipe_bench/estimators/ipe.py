@@ -37,6 +37,10 @@ Start = Literal["linear_lse", "nominal", "best"]
 readings fit better."""
 
 
+_NEAR = 0.03
+"""Where F is larger, in standard deviations of the linear bound, a step is as good with a coarse Jacobian."""
+
+
 class System(Protocol):
     """A square system F(x) = 0 for each trial of a batch: all that a solver sees of the problem.
 
@@ -47,8 +51,9 @@ class System(Protocol):
         """The residual at x; NaN where the model fails."""
         ...
 
-    def J(self, x: Array) -> Array:
-        """dF/dx (trials, n, n)."""
+    def J(self, x: Array, F: Array | None = None) -> Array:
+        """dF/dx (trials, n, n). Where F is given it is for a step from there: near enough for that, and exact near a
+        root, so that an order of two is not lost."""
         ...
 
     def solve(self, A: Array, b: Array) -> Array:
@@ -107,8 +112,9 @@ class FrozenSystem:
     def F(self, x: Array) -> Array:
         return multiply(self.H_plus, self.model.simulate(x, self.rows) - self.z)
 
-    def J(self, x: Array) -> Array:
-        return np.matmul(self.H_plus, self.model.jacobian(x, self.rows))
+    def J(self, x: Array, F: Array | None = None) -> Array:
+        coarse = False if F is None else np.abs(F / self.deviation).max(axis=1) > _NEAR
+        return np.matmul(self.H_plus, self.model.jacobian(x, self.rows, coarse=coarse))
 
     def solve(self, A: Array, b: Array) -> Array:
         x, singular = solve(A, b)

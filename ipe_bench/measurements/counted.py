@@ -39,6 +39,8 @@ class Tally:
 
     def failed(self, rows: NDArray[np.intp]) -> Mask:
         """Which of the trials `rows` an exception has ended."""
+        if not self.messages:
+            return np.zeros(len(rows), dtype=bool)
         return np.isin(rows, list(self.messages))
 
 
@@ -63,11 +65,18 @@ class Counted:
         self.tally.simulations[rows] += self.share
         return self._each_if_raising(self.measurement.simulate, x, rows, (self.measurement.m,))
 
-    def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: bool = False) -> Array:
+    def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: Mask | bool = False) -> Array:
         """dh/dx (trials, m, n) for the trials `rows` of the tally; where it is only for steps, `coarse` will do, which
         counts as what it costs beside an exact one."""
-        if not coarse or self.coarse_share == 1.0:
+        if self.coarse_share == 1.0 or not np.any(coarse):
             return self._exact_jacobian(x, rows)
+        if np.all(coarse):
+            return self._coarse_jacobian(x, rows)
+        J = np.empty((len(x), self.measurement.m, self.measurement.n))
+        J[coarse], J[~coarse] = self._coarse_jacobian(x[coarse], rows[coarse]), self._exact_jacobian(x[~coarse], rows[~coarse])
+        return J
+
+    def _coarse_jacobian(self, x: Array, rows: NDArray[np.intp]) -> Array:
         self.tally.jacobians[rows] += self.share * self.coarse_share
         shape = (self.measurement.m, self.measurement.n)
         J = self._each_if_raising(self.measurement.coarse_jacobian, x, rows, shape)

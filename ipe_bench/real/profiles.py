@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.estimators.least_squares import Objective, minimize, squared
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.counted import Counted, Tally
@@ -71,7 +71,7 @@ class Pinned(Counted):
     def simulate(self, x: Array, rows: NDArray[np.intp]) -> Array:
         return super().simulate(self.whole(x, rows), rows)
 
-    def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: bool = False) -> Array:
+    def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: Mask | bool = False) -> Array:
         J = super().jacobian(self.whole(x, rows), rows, coarse=coarse)
         return np.take_along_axis(J, self._others(rows)[:, None, :], axis=2)
 

@@ -34,7 +34,7 @@ class Broyden(IPE[BroydenState]):
         columns = np.broadcast_to(np.eye(n), (len(x), n, n))
         if self.initial == "identity":
             return BroydenState(x, F, columns)
-        J = system.J(x)
+        J = system.J(x, F)
         return BroydenState(x, F, np.stack([system.solve(J, columns[:, i]) for i in range(n)], axis=2))
 
     def step(self, system: System, state: BroydenState) -> BroydenState:

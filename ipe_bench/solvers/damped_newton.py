@@ -25,7 +25,7 @@ class DampedNewton(IPE):
     halvings: Whole = 30
 
     def step(self, system: System, state: State) -> State:
-        direction = -system.solve(system.J(state.x), state.F)
+        direction = -system.solve(system.J(state.x, state.F), state.F)
         size = _norm(state.F)
         t = np.ones(len(size))
         F = system.F(state.x + direction)

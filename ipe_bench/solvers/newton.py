@@ -12,5 +12,5 @@ class Newton(IPE):
     """x <- x - J(x)^-1 F(x). Converges quadratically near a root with regular J, eq. (23)."""
 
     def step(self, system: System, state: State) -> State:
-        x = state.x - system.solve(system.J(state.x), state.F)
+        x = state.x - system.solve(system.J(state.x, state.F), state.F)
         return State(x, system.F(x))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.estimators.driver import Ended, Solver, iterate
 from ipe_bench.estimators.gauss_newton import GaussNewtonMethod
 from ipe_bench.estimators.ipe import IPE, FrozenSystem, State, System
@@ -64,7 +64,7 @@ class _Informed(Counted):
         h = self.known.h
         return super().simulate(x, rows) if h is None or not self._at_start(x, rows) else h[rows]
 
-    def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: bool = False) -> Array:
+    def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: Mask | bool = False) -> Array:
         if not self._at_start(x, rows):
             return super().jacobian(x, rows, coarse=coarse)
         J = self.known.J
