@@ -6,17 +6,31 @@ the batch. A singular matrix spoils its own trial only.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics.machine import keep_freed_memory
+
+if TYPE_CHECKING:
+    # Loaded by its path, and so that results are known to depend on it.
+    from ipe_bench.basics import definite as definite
+
 Array: TypeAlias = NDArray[Any]
 Mask: TypeAlias = NDArray[Any]
 
+keep_freed_memory()
+
 _WELL_CONDITIONED = 1e3
 """The condition of J, its columns scaled, up to which J' J has enough of its digits: nine or more."""
+
+_COMPILED = 8
+"""Parameters from which on matrices are factored in compiled code: the fits of one small problem take less time than it
+takes to load a compiler."""
 
 
 def finite(a: Array) -> Mask:
@@ -165,8 +179,16 @@ def gram_factor(J: Array) -> tuple[Array, Array, Mask]:
     Stability of Numerical Algorithms, 2002, section 20.4).
     """
     J = np.ascontiguousarray(J)
+    return definite_factor(np.matmul(J.swapaxes(1, 2), J))
+
+
+def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
+    """The same from G = J' J itself (trials, n, n)."""
+    if G.shape[1] >= _COMPILED:
+        U, inverse_U, size = np.zeros(G.shape), np.zeros(G.shape), np.empty(len(G))
+        _compiled().factor(np.ascontiguousarray(G), U, inverse_U, size)
+        return U, inverse_U, size * np.sqrt(G.shape[1]) <= _WELL_CONDITIONED
     with np.errstate(all="ignore"):
-        G = np.matmul(J.swapaxes(1, 2), J)
         columns = np.sqrt(np.diagonal(G, axis1=1, axis2=2))
         scaled = G / (columns[:, :, None] * columns[:, None, :])
         usable = finite(scaled)
@@ -174,6 +196,13 @@ def gram_factor(J: Array) -> tuple[Array, Array, Mask]:
         inverse_U, _ = inverse(U)
         well = usable & (np.linalg.norm(inverse_U, axis=(1, 2)) * np.sqrt(G.shape[1]) <= _WELL_CONDITIONED)
         return U * columns[:, None, :], inverse_U / columns[:, :, None], well
+
+
+@functools.cache
+def _compiled() -> Any:
+    from ipe_bench.basics.compiled import load
+
+    return load(Path(__file__).with_name("definite.py").read_text(encoding="utf-8"), "a factorisation")
 
 
 def pseudo_inverse(H: Array, R: Covariance) -> tuple[Array, Mask]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array, Covariance, Mask, finite, gram_factor, inverse, multiply, solve
+from ipe_bench.basics.linalg import Array, Covariance, Mask, definite_factor, finite, gram_factor, inverse, multiply, solve
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
 from ipe_bench.estimators.driver import Ended, Solver, Standing, iterate
@@ -122,6 +122,8 @@ class Slope:
     """J = Q U of each trial: all that a step needs to know of the Jacobian."""
 
     U: Array
+    inverse_U: Array
+    """NaN where J has not full rank."""
     gradient: Array
     """Q' r (trials, n): the part of the residual that a step can remove."""
     columns: Array
@@ -156,25 +158,34 @@ class Slope:
         size = np.abs(newton / deviation).max(axis=1)
         size = np.where(np.isfinite(size), size, np.inf)
         along = np.abs(multiply(U.swapaxes(1, 2), gradient)) / np.where(columns > 0, columns, 1.0)
-        return cls(U, gradient, columns, newton, size, along.max(axis=1), Q)
+        return cls(U, inverse_U, gradient, columns, newton, size, along.max(axis=1), Q)
 
     def towards(self, r: Array) -> Slope:
         """The same Jacobian with another residual r (trials, m): a chord. It needs Q."""
         assert self.Q is not None
         gradient = multiply(self.Q.swapaxes(1, 2), r)
-        inverse_U, _ = inverse(np.where(np.isfinite(self.size)[:, None, None], self.U, np.nan))
-        newton = -multiply(inverse_U, gradient)
-        size = np.abs(newton / np.sqrt(np.sum(inverse_U**2, axis=2))).max(axis=1)
+        newton = -multiply(self.inverse_U, gradient)
+        size = np.abs(newton / np.sqrt(np.sum(self.inverse_U**2, axis=2))).max(axis=1)
         size = np.where(np.isfinite(size), size, np.inf)
         return dataclasses.replace(self, gradient=gradient, newton=newton, size=size)
 
     def damped(self, weights: Array) -> tuple[Array, Array]:
         """The step that minimises |r + J s|^2 + |weights s|^2, and the decrease of |r + J s|^2 + that it predicts."""
-        diagonal = weights[:, :, None] * np.eye(self.U.shape[1])
-        Q, U = np.linalg.qr(np.concatenate([self.U, diagonal], axis=1))
-        step, _ = solve(U, -multiply(Q[:, : self.U.shape[1]].swapaxes(1, 2), self.gradient))
+        with np.errstate(over="ignore"):  # a damping beyond all bounds is left to the other way
+            squares = weights[:, :, None] ** 2 * np.eye(self.U.shape[1])
+        _, root, well = definite_factor(np.matmul(self.U.swapaxes(1, 2), self.U) + squares)
+        step = -multiply(root, multiply(root.swapaxes(1, 2), multiply(self.U.swapaxes(1, 2), self.gradient)))
+        if not well.all():
+            step[~well] = _damped_step(self.U[~well], weights[~well], self.gradient[~well])
         change = multiply(self.U, step)
         return step, -np.einsum("ti,ti->t", change, 2.0 * self.gradient + change)
+
+
+def _damped_step(U: Array, weights: Array, gradient: Array) -> Array:
+    """The step that minimises |gradient + U s|^2 + |weights s|^2 for any U."""
+    n = U.shape[1]
+    Q, V = np.linalg.qr(np.concatenate([U, weights[:, :, None] * np.eye(n)], axis=1))
+    return solve(V, -multiply(Q[:, :n].swapaxes(1, 2), gradient))[0]
 
 
 def _by_orthogonal_factor(J: Array, r: Array) -> tuple[Array, Array, Array, Array]:

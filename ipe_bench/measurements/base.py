@@ -378,11 +378,10 @@ class Restricted(Measurement):
         return np.array(self.kept, dtype=np.intp)
 
     @cached_property
-    def _among_arrived(self) -> NDArray[np.intp]:
-        """Where the kept rows stand in what the whole model returns."""
-        if self.stop is None:
-            return self._rows
-        return np.searchsorted(self.whole.rows(self.stop), self._rows)
+    def _among_arrived(self) -> NDArray[np.intp] | slice:
+        """Where the kept rows stand in what the whole model returns; a slice where they are all of it."""
+        arrived = np.arange(self.whole.m) if self.stop is None else self.whole.rows(self.stop)
+        return slice(None) if np.array_equal(arrived, self._rows) else np.searchsorted(arrived, self._rows)
 
     def simulate(self, x: Array) -> Array:
         if self.stop is None:

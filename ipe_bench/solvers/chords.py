@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array, Mask, finite, inverse, multiply
+from ipe_bench.basics.linalg import Array, Mask, finite, multiply
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.driver import Ended, Solver, Standing, iterate
 from ipe_bench.estimators.least_squares import Minima, Objective, Slope, minima_of, squared
@@ -76,7 +76,7 @@ class OnChord:
         deviation, makes that an error of about e deviations. e is seen twice: in the part of the first step that was
         taken back, and in the change of J on the way to the start, which is taken to go on at that rate.
         """
-        inverse_U, _ = inverse(self.slope.U)
+        inverse_U = self.slope.inverse_U
         gone = np.linalg.norm(multiply(self.slope.U, self.x - self.start), axis=1)
         J_turned = multiply(self.turn.swapaxes(1, 2), self.r) * gone[:, None]
         error = multiply(np.matmul(inverse_U, inverse_U.swapaxes(1, 2)), J_turned)
@@ -211,8 +211,7 @@ def _radius(nominal: Slope, slope: Slope) -> Array:
     """The spectral radius (trials,) of I - H+ J, the rate at which fixed-point iteration converges."""
     assert nominal.Q is not None
     assert slope.Q is not None
-    inverse_U, _ = inverse(nominal.U)
-    J_F = np.matmul(np.matmul(inverse_U, np.matmul(nominal.Q.swapaxes(1, 2), slope.Q)), slope.U)
+    J_F = np.matmul(np.matmul(nominal.inverse_U, np.matmul(nominal.Q.swapaxes(1, 2), slope.Q)), slope.U)
     usable = finite(J_F)
     rates = np.linalg.eigvals(np.where(usable[:, None, None], np.eye(J_F.shape[1]) - J_F, 0.0))
     return np.where(usable, np.abs(rates).max(axis=1), np.inf)

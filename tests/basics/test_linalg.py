@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ipe_bench.basics.linalg import Covariance, gram_factor, pseudo_inverse
+from ipe_bench.basics.linalg import Covariance, definite_factor, gram_factor, pseudo_inverse
 
 M, N = 30, 5
 
@@ -60,3 +60,32 @@ def test_a_gram_factor_is_refused_where_too_few_digits_are_left():
     np.testing.assert_allclose(U[0].T @ U[0], J[0].T @ J[0], rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(U[0] @ inverse_U[0], np.eye(N), atol=1e-10)
     assert np.array_equal(U[0], np.triu(U[0]))
+
+
+@pytest.mark.parametrize("n", [1, 5, 8, 11, 40])
+def test_a_factor_is_that_of_lapack_whether_compiled_or_not(n):
+    """From 8 columns on it is compiled code; the columns' sizes are nothing to either."""
+    rng = np.random.default_rng(n)
+    J = rng.normal(size=(7, 3 * n, n)) * np.geomspace(1e-9, 1e9, n)
+    U, inverse_U, well = definite_factor(np.matmul(J.swapaxes(1, 2), J))
+    assert well.all()
+    columns = np.linalg.norm(J, axis=1)[:, None, :]
+    R = np.linalg.qr(J, mode="r")
+    R = R * np.sign(np.diagonal(R, axis1=1, axis2=2))[:, :, None]
+    np.testing.assert_allclose(U / columns, R / columns, rtol=1e-11, atol=1e-13)
+    np.testing.assert_allclose(np.matmul(U, inverse_U), np.broadcast_to(np.eye(n), U.shape), atol=1e-12)
+    for A in (U, inverse_U):
+        assert np.array_equal(A, np.triu(A))
+    alone = definite_factor(np.matmul(J[3:4].swapaxes(1, 2), J[3:4]))
+    assert all(np.array_equal(a[3:4], b) for a, b in zip((U, inverse_U, well), alone, strict=True))
+
+
+@pytest.mark.parametrize("n", [3, 12])
+def test_a_matrix_that_is_not_definite_has_no_factor_and_spoils_no_other(n):
+    G = np.repeat(np.eye(n)[None], 6, axis=0)
+    G[1, 1, 1] = -1.0
+    G[2, 0, 0] = np.nan
+    G[3] = 1.0
+    G[4, 2] = G[4, :, 2] = 0.0
+    _, _, well = definite_factor(G)
+    assert well.tolist() == [True, False, False, False, False, True]

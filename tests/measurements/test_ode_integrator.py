@@ -10,7 +10,7 @@ from ipe_bench.measurements import LotkaVolterra, OdeMeasurement, Parameter, Pol
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode import tableau
 from ipe_bench.measurements.ode.coarse import contraction
-from ipe_bench.measurements.ode.kernel import load
+from ipe_bench.basics.compiled import load
 from ipe_bench.measurements.ode.levels import coarser, ladder
 from ipe_bench.runs import provenance
 

@@ -16,11 +16,12 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics.compiled import load
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Input, Measurement
 from ipe_bench.measurements.ode import sampling
 from ipe_bench.measurements.ode.coarse import CONTRACTION, MOST_RK4, Coarseness, contraction
-from ipe_bench.measurements.ode.kernel import Kernel, load
+from ipe_bench.measurements.ode.kernel import Kernel
 from ipe_bench.measurements.ode.levels import Found, Indices, Remembered, Search, grouped, ladder
 from ipe_bench.measurements.ode.source import Equations, Variation, jacobian_source, rate_source, simulation_source
 from ipe_bench.measurements.ode.tableau import DOP853, RK4
