@@ -67,11 +67,9 @@ class Standardized:
         """The whitened residuals, followed by y: the maximum a posteriori has the least squares of these."""
         return np.concatenate([self.readings.misfit(self._x(y)), y], axis=1)
 
-    def jacobian(self, y: Array) -> Array:
+    def slopes(self, y: Array, *, coarse: bool) -> tuple[Array, None]:
         J = np.matmul(self.readings.slope(self._x(y)), self.root)
-        return np.concatenate([J, np.broadcast_to(np.eye(self.n), self.root.shape)], axis=1)
-
-    coarse_jacobian = jacobian
+        return np.concatenate([J, np.broadcast_to(np.eye(self.n), self.root.shape)], axis=1), None
 
     def subset(self, kept: NDArray[np.bool_]) -> Standardized:
         return Standardized(self.readings.subset(kept), self.root[kept])

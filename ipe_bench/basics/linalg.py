@@ -18,7 +18,7 @@ from ipe_bench.basics.machine import keep_freed_memory
 
 if TYPE_CHECKING:
     # Loaded by its path, and so that results are known to depend on it.
-    from ipe_bench.basics import definite as definite
+    from ipe_bench.basics import normal as normal
 
 Array: TypeAlias = NDArray[Any]
 Mask: TypeAlias = NDArray[Any]
@@ -167,23 +167,34 @@ class Covariance:
 
 def information(J: Array, R: Covariance) -> Array:
     """The Fisher information J' R^-1 J for J (..., m, n)."""
+    if J.ndim == 3 and R.factor.ndim == 1:
+        return normal_equations(J, np.zeros(J.shape[:2]), R.factor)[0]
     Jw = R.whiten_jacobian(J)
     return np.matmul(Jw.swapaxes(-1, -2), Jw)
 
 
-def gram_factor(J: Array) -> tuple[Array, Array, Mask]:
-    """U (trials, n, n) with U' U = J' J of each J (trials, m, n), its inverse, and the mask (trials,) of where J is so
-    well conditioned that this may be had from J' J, a third of the work of QR; elsewhere they are not to be used.
+def normal_equations(J: Array, r: Array, deviation: Array | None = None) -> tuple[Array, Array]:
+    """A' A (trials, n, n) and A' r (trials, n) for J (trials, m, n) and r (trials, m), where A is J with its rows
+    divided by `deviation` (m,), or J."""
+    J = np.ascontiguousarray(J)  # as the bits of a product may depend on how J lies in memory
+    trials, m, n = J.shape
+    with np.errstate(all="ignore"):
+        if n >= _COMPILED:
+            weights = np.ones(m) if deviation is None else 1.0 / deviation
+            G, gradient = np.empty((trials, n, n)), np.empty((trials, n))
+            _compiled().equations(J, weights, np.ascontiguousarray(r), G, gradient)
+            return G, gradient
+        A = J if deviation is None else J / deviation[:, None]
+        return np.matmul(A.swapaxes(1, 2), A), multiply(A.swapaxes(1, 2), r)
+
+
+def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
+    """U (trials, n, n) with U' U = G of each G = J' J (trials, n, n), its inverse, and the mask (trials,) of where J is
+    so well conditioned that this may be had from J' J, a third of the work of QR; elsewhere they are not to be used.
 
     The columns of J are scaled first; what is lost of U is n eps times the condition squared (Higham, Accuracy and
     Stability of Numerical Algorithms, 2002, section 20.4).
     """
-    J = np.ascontiguousarray(J)
-    return definite_factor(np.matmul(J.swapaxes(1, 2), J))
-
-
-def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
-    """The same from G = J' J itself (trials, n, n)."""
     if G.shape[1] >= _COMPILED:
         U, inverse_U, size = np.zeros(G.shape), np.zeros(G.shape), np.empty(len(G))
         _compiled().factor(np.ascontiguousarray(G), U, inverse_U, size)
@@ -202,7 +213,7 @@ def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
 def _compiled() -> Any:
     from ipe_bench.basics.compiled import load
 
-    return load(Path(__file__).with_name("definite.py").read_text(encoding="utf-8"), "a factorisation")
+    return load(Path(__file__).with_name("normal.py").read_text(encoding="utf-8"), "normal equations")
 
 
 def pseudo_inverse(H: Array, R: Covariance) -> tuple[Array, Mask]:
@@ -210,8 +221,8 @@ def pseudo_inverse(H: Array, R: Covariance) -> tuple[Array, Mask]:
 
     Flags the trials whose H has not full column rank to working precision; their H+ is NaN.
     """
-    Hw = R.whiten_jacobian(H)
-    _, inverse_U, well = gram_factor(Hw)
+    Hw = np.ascontiguousarray(R.whiten_jacobian(H))
+    _, inverse_U, well = definite_factor(information(H, R))
     with np.errstate(all="ignore"):
         # H+ R^1/2 = U^-1 U^-T Hw'
         whitened = np.matmul(inverse_U, np.matmul(inverse_U.swapaxes(1, 2), Hw.swapaxes(1, 2)))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array, Covariance, Mask, definite_factor, finite, gram_factor, inverse, multiply, solve
+from ipe_bench.basics.linalg import Array, Covariance, Mask, definite_factor, finite, inverse, multiply, normal_equations, solve
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
 from ipe_bench.estimators.driver import Ended, Solver, Standing, iterate
@@ -40,12 +40,9 @@ class Residuals(Protocol):
         """The residuals (trials, m) at x (trials, n), of unit variance."""
         ...
 
-    def jacobian(self, x: Array, /) -> Array:
-        """Their derivative (trials, m, n)."""
-        ...
-
-    def coarse_jacobian(self, x: Array, /) -> Array:
-        """The same near enough for steps."""
+    def slopes(self, x: Array, /, *, coarse: bool) -> tuple[Array, Array | None]:
+        """Their derivative (trials, m, n), or one near enough for steps; and what is left to divide its rows by (m,),
+        None where nothing is."""
         ...
 
     @property
@@ -93,19 +90,20 @@ class Objective:
 
     def jacobian(self, x: Array) -> Array:
         """The derivative of the whitened residuals (trials, m, n) or (trials, m + n, n)."""
-        return self._jacobian(x, coarse=False)
+        J, deviation = self.slopes(x, coarse=False)
+        return J if deviation is None else J / deviation[:, None]
 
-    def coarse_jacobian(self, x: Array) -> Array:
-        """The same near enough for steps, from `Measurement.coarse_jacobian`."""
-        return self._jacobian(x, coarse=True)
-
-    def _jacobian(self, x: Array, *, coarse: bool) -> Array:
-        J = self.R.whiten_jacobian(self.model.jacobian(x, self.rows, coarse=coarse))
+    def slopes(self, x: Array, *, coarse: bool) -> tuple[Array, Array | None]:
+        """The same, or from `Measurement.coarse_jacobian`, before its rows (m,) or (m + n,) are divided by those
+        deviations, if there are any."""
+        J, deviation = self.model.jacobian(x, self.rows, coarse=coarse), self.R.factor
+        if deviation.ndim == 2:
+            J, deviation = self.R.whiten_jacobian(J), np.ones(J.shape[1])
         if self.prior is None:
-            return J
+            return J, deviation
         n = x.shape[1]
         prior = np.broadcast_to(self.prior.whiten_jacobian(np.eye(n)), (len(x), n, n))
-        return np.concatenate([J, prior], axis=1)
+        return np.concatenate([J, prior], axis=1), np.concatenate([deviation, np.ones(n)])
 
     def coarsened(self, exact_within: float) -> Objective:
         """The same with coarse Jacobians where steps are longer, if the model has any that are cheaper."""
@@ -140,16 +138,19 @@ class Slope:
     """(trials, m, n), where a method asks for it."""
 
     @classmethod
-    def of(cls, J: Array, r: Array, *, keep_Q: bool = False) -> Slope:
-        """Of J (trials, m, n), and residuals r (trials, m)."""
-        J = np.ascontiguousarray(J)  # as the bits of a product may depend on how J lies in memory
-        U, inverse_U, well = gram_factor(J)
+    def of(cls, J: Array, r: Array, deviation: Array | None = None, *, keep_Q: bool = False) -> Slope:
+        """Of J (trials, m, n), its rows divided by `deviation` (m,), and residuals r (trials, m)."""
+        G, along = normal_equations(J, r, deviation)
+        U, inverse_U, well = definite_factor(G)
         well = well & finite(r)
         with np.errstate(all="ignore"):
-            gradient = multiply(inverse_U.swapaxes(1, 2), multiply(J.swapaxes(1, 2), r))
-        Q = np.matmul(J, inverse_U) if keep_Q else None
+            gradient = multiply(inverse_U.swapaxes(1, 2), along)
+        if deviation is not None and keep_Q:
+            J, deviation = J / deviation[:, None], None
+        Q = np.matmul(np.ascontiguousarray(J), inverse_U) if keep_Q else None
         if not well.all():
-            QU, U[~well], inverse_U[~well], gradient[~well] = _by_orthogonal_factor(J[~well], r[~well])
+            ill = J[~well] if deviation is None else J[~well] / deviation[:, None]
+            QU, U[~well], inverse_U[~well], gradient[~well] = _by_orthogonal_factor(ill, r[~well])
             if Q is not None:
                 Q[~well] = QU
         columns = np.sqrt(np.sum(U**2, axis=1))
@@ -208,18 +209,23 @@ def slope_at(objective: Residuals, x: Array, r: Array, exact: Mask, *, keep_Q: b
     """The slope at x, where the residuals are r, and where it is that of an exact Jacobian: where `exact` (trials,)
     says so, and where a coarse one has not full rank."""
     if exact.all():
-        return Slope.of(objective.jacobian(x), r, keep_Q=keep_Q), exact
+        return _slope_of(objective, x, r, coarse=False, keep_Q=keep_Q), exact
     if exact.any():
         coarse, believed = slope_at(objective.subset(~exact), x[~exact], r[~exact], exact[~exact], keep_Q=keep_Q)
-        near = Slope.of(objective.subset(exact).jacobian(x[exact]), r[exact], keep_Q=keep_Q)
+        near = _slope_of(objective.subset(exact), x[exact], r[exact], coarse=False, keep_Q=keep_Q)
         both = take(near, np.zeros(len(x), np.intp))
         return put(put(both, exact, near), ~exact, coarse), put(exact, ~exact, believed)
-    slope = Slope.of(objective.coarse_jacobian(x), r, keep_Q=keep_Q)
+    slope = _slope_of(objective, x, r, coarse=True, keep_Q=keep_Q)
     lost = ~np.isfinite(slope.size)
     if lost.any():
-        again = Slope.of(objective.subset(lost).jacobian(x[lost]), r[lost], keep_Q=keep_Q)
+        again = _slope_of(objective.subset(lost), x[lost], r[lost], coarse=False, keep_Q=keep_Q)
         slope = put(slope, lost, again)
     return slope, lost
+
+
+def _slope_of(objective: Residuals, x: Array, r: Array, *, coarse: bool, keep_Q: bool) -> Slope:
+    J, deviation = objective.slopes(x, coarse=coarse)
+    return Slope.of(J, r, deviation, keep_Q=keep_Q)
 
 
 @dataclass(frozen=True)
@@ -361,7 +367,9 @@ def reached(objective: Objective, ended: Ended[Any]) -> Minima:
 def minima_of(ended: Ended[Any], slope: Slope, readings: int) -> Minima:
     """The same where the slope there is known."""
     # U^-1 U^-T: inverting U'U would lose twice the digits, and with them the sign of a variance.
-    inverse_U, _ = inverse(slope.U)
+    inverse_U, lost = slope.inverse_U, ~finite(slope.inverse_U)
+    if lost.any():
+        inverse_U = put(inverse_U, lost, inverse(slope.U[lost])[0])
     covariance = np.matmul(inverse_U, inverse_U.swapaxes(1, 2))
     r = ended.state.r[:, :readings]
     bulk = np.median(np.abs(r), axis=1)
@@ -376,7 +384,8 @@ def _exact_slope(objective: Objective, state: Descent) -> Slope:
     tally = Tally.zeros(len(objective.model.tally.simulations))
     report = dataclasses.replace(objective, model=dataclasses.replace(objective.model, tally=tally)).subset(coarse)
     keep_Q = state.slope.Q is not None
-    return put(state.slope, coarse, Slope.of(report.jacobian(state.x[coarse]), state.r[coarse], keep_Q=keep_Q))
+    exact = _slope_of(report, state.x[coarse], state.r[coarse], coarse=False, keep_Q=keep_Q)
+    return put(state.slope, coarse, exact)
 
 
 def squared(r: Array) -> Array:

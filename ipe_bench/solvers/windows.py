@@ -159,6 +159,8 @@ class Windows(Search):
         the last attempt, and where there is no fit at all: that ends with its own status."""
         most = max(1, _draws(k) // _THINNING[min(number, len(_THINNING) - 1)])
         limit = _GIVEN_UP[min(number, len(_GIVEN_UP) - 1)]
+        if len(np.unique(owner)) == len(owner):  # nothing to choose among
+            return np.flatnonzero((per_reading <= limit) | (k == self.last) | np.isinf(per_reading))
         order = np.lexsort((per_reading, owner))
         kept: list[int] = []
         for _, group in itertools.groupby(order.tolist(), key=lambda i: owner[i]):

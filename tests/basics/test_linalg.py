@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ipe_bench.basics.linalg import Covariance, definite_factor, gram_factor, pseudo_inverse
+from ipe_bench.basics.linalg import Covariance, definite_factor, normal_equations, pseudo_inverse, read_only
 
 M, N = 30, 5
 
@@ -53,9 +53,9 @@ def test_a_matrix_without_full_rank_spoils_its_own_trial_only():
     assert np.isnan(found[1:]).all()
 
 
-def test_a_gram_factor_is_refused_where_too_few_digits_are_left():
+def test_a_factor_is_refused_where_too_few_digits_are_left():
     J = np.concatenate([conditioned(100.0, 1), conditioned(1e5, 1)])
-    U, inverse_U, well = gram_factor(J)
+    U, inverse_U, well = definite_factor(np.matmul(J.swapaxes(1, 2), J))
     assert well.tolist() == [True, False]
     np.testing.assert_allclose(U[0].T @ U[0], J[0].T @ J[0], rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(U[0] @ inverse_U[0], np.eye(N), atol=1e-10)
@@ -89,3 +89,22 @@ def test_a_matrix_that_is_not_definite_has_no_factor_and_spoils_no_other(n):
     G[4, 2] = G[4, :, 2] = 0.0
     _, _, well = definite_factor(G)
     assert well.tolist() == [True, False, False, False, False, True]
+
+
+@pytest.mark.parametrize("n", [1, 3, 8, 11, 12, 13, 14])
+@pytest.mark.parametrize("m", [1, 7, 240])
+def test_normal_equations_are_those_of_weighted_rows(n, m):
+    rng = np.random.default_rng(n)
+    J, r, deviation = rng.normal(size=(5, m, n)), rng.normal(size=(5, m)), rng.uniform(0.1, 9.0, m)
+    A = J / deviation[:, None]
+    for given, rows in ((deviation, A), (None, J)):
+        G, along = normal_equations(J, r, given)
+        np.testing.assert_allclose(G, np.einsum("tia,tib->tab", rows, rows), rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(along, np.einsum("tia,ti->ta", rows, r), rtol=1e-12, atol=1e-12)
+        assert np.array_equal(G, G.swapaxes(1, 2))
+        alone = normal_equations(J[2:3], r[2:3], given)
+        assert np.array_equal(alone[0], G[2:3])
+        assert np.array_equal(alone[1], along[2:3])
+        # How the numbers lie in memory is nothing to the bits, nor whether they may be written to.
+        assert np.array_equal(normal_equations(read_only(J), read_only(r), given)[0], G)
+        assert np.array_equal(normal_equations(np.asfortranarray(J), r, given)[0], G)
