@@ -23,7 +23,10 @@ def take(batch: B, kept: NDArray[Any]) -> B:
 
 
 def put(batch: B, where: NDArray[Any], part: B) -> B:
-    """A copy of the batch in which the trials `where`, a mask or indices, are those of `part`, in its order."""
+    """A copy of the batch in which the trials `where`, a mask or indices, are those of `part`, in its order; `part`
+    itself where the mask holds everywhere."""
+    if where.dtype == bool and where.all():
+        return part
     if isinstance(batch, list):
         replaced: dict[int, Any] = dict(zip(_indices(where), part, strict=True))  # type: ignore[call-overload]
         return [replaced.get(i, row) for i, row in enumerate(batch)]  # pyright: ignore[reportReturnType]

@@ -71,7 +71,8 @@ class GaussianPrior(Prior):
         """One parameter vector (n,)."""
         n = len(x0)
         white, C = rng.standard_normal(n), self.correlation(n)
-        return x0 + self.deviation(n, error_scale) * (white if C is None else np.linalg.cholesky(C) @ white)
+        deviation = error_scale if self.deviations is None else self.deviation(n, error_scale)
+        return x0 + deviation * (white if C is None else np.linalg.cholesky(C) @ white)
 
 
 def prior_of(model: Measurement, P: Array) -> GaussianPrior:

@@ -35,7 +35,7 @@ class Broyden(IPE[BroydenState]):
         if self.initial == "identity":
             return BroydenState(x, F, columns)
         J = system.J(x, F)
-        return BroydenState(x, F, np.stack([system.solve(J, columns[:, i]) for i in range(n)], axis=2))
+        return BroydenState(x, F, system.solve(J, columns))
 
     def step(self, system: System, state: BroydenState) -> BroydenState:
         s = -multiply(state.B, state.F)

@@ -19,7 +19,7 @@ from typing import cast
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array, Covariance, finite, information, inverse
+from ipe_bench.basics.linalg import Array, Covariance, definite_factor, finite, information, inverse
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
@@ -91,7 +91,8 @@ def frozen_spread(J: Array, H: Array, R: Covariance, inner: Array | None = None)
         np.where(singular[:, None, None], np.eye(n), inverted.swapaxes(1, 2) @ scaled @ inverted)
     )
     others = np.where((usable & ~singular)[:, None], np.maximum(others, 1.0), np.inf)
-    bent = usable & (np.linalg.eigvalsh(scaled)[:, 0] < _ILL_CONDITIONED)
+    bent = usable & ~definite_factor(scaled)[2]
+    bent[bent] = np.linalg.eigvalsh(scaled[bent])[:, 0] < _ILL_CONDITIONED
     if bent.any():
         others[bent] = _by_bases(J[bent], H, R)
     # With fewer than n readings to spare the largest angles are those that are left.

@@ -15,10 +15,11 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import (
     Array,
     Mask,
+    definite_factor,
     deviations,
     finite,
     information,
-    inverse,
+    inverse_deviations,
     multiply,
     quadratic_form,
     read_only,
@@ -87,13 +88,15 @@ class Block:
     @cached_property
     def crlb_deviation(self) -> Array:
         """Standard deviations (trials, n) of the Cramér-Rao bound at the truth."""
-        return deviations(inverse(self.crlb_information)[0])
+        with np.errstate(all="ignore"):
+            return inverse_deviations(self.crlb_information)
 
     def truth_columns(self) -> Columns:
         """The truth and its bounds, in multiples of the parameters' units, what the noise alone makes of the linear
         estimate, and what the paper's theorems ask of the model there."""
         names = [p.name for p in self.problem.measurement.parameters]
-        bayes = deviations(inverse(self.bayes_information)[0])
+        with np.errstate(all="ignore"):
+            bayes = inverse_deviations(self.bayes_information)
         H_plus = self.problem.H_plus[None]
         contracts = contraction_of(np.matmul(H_plus, self.jacobian))
         return {
@@ -120,7 +123,7 @@ class Block:
             x = self.scenario.truths(0, EXPECTED)
             with np.errstate(all="ignore"):
                 expected = information(self.problem.measurement.jacobian(x), self.problem.R).mean(axis=0)
-                bound[0] = deviations(inverse((expected + prior.inverse())[None])[0])[0]
+                bound[0] = inverse_deviations((expected + prior.inverse())[None])[0]
         return bound
 
     def readings_at(self, x: Array) -> Array:
@@ -225,7 +228,7 @@ class Block:
             root = self.reference_root(estimator.equation, inflation_of(estimator))
             apart = (np.abs(estimates.x - root) / self.crlb_deviation).max(axis=1)
             solved = solved & (apart <= SAME_ROOT)
-        trials = len(error)
+        trials, labels = len(error), {s: Status(s).label for s in np.unique(status).tolist()}
         P = estimates.covariance
         squared = np.full(trials, np.nan) if P is None else nees(error, P)
         deviation = np.full(error.shape, np.nan) if P is None else deviations(P)
@@ -235,7 +238,7 @@ class Block:
             "trial": np.arange(self.trials.start, self.trials.stop),
             **_by_parameter("error", names, error),
             **_by_parameter("deviation", names, deviation),
-            "status": np.array([Status(s).label for s in status], dtype=object),
+            "status": np.array([labels[s] for s in status.tolist()], dtype=object),
             "message": np.array([estimates.messages.get(i, "") for i in range(trials)], dtype=object),
             "iterations": estimates.iterations,
             "simulations": estimates.simulations,
@@ -265,9 +268,19 @@ def nees(error: Array, P: Array) -> Array:
         e, C = error / deviation, P / (deviation[:, :, None] * deviation[:, None, :])
     usable: Mask = np.asarray(np.isfinite(e).all(axis=1) & np.isfinite(C).all(axis=(1, 2)))
     C = np.where(usable[:, None, None], C, np.eye(error.shape[1]))
-    x, singular = solve(C, np.where(usable[:, None], e, 0.0))
-    usable = usable & ~singular & (np.linalg.eigvalsh(C)[:, 0] > 0)
-    return np.where(reported, np.where(usable, np.einsum("ti,ti->t", e, x), np.inf), np.nan)
+    e = np.where(usable[:, None], e, 0.0)
+    _, inverse_U, definite = definite_factor(C)
+    squared = np.sum(multiply(inverse_U.swapaxes(1, 2), e) ** 2, axis=1)
+    if not definite.all():
+        squared[~definite] = _nees_of_any(e[~definite], C[~definite])
+    return np.where(reported, np.where(usable, squared, np.inf), np.nan)
+
+
+def _nees_of_any(e: Array, C: Array) -> Array:
+    """e' C^-1 e; infinite where C is not positive definite."""
+    x, singular = solve(C, e)
+    definite = ~singular & (np.linalg.eigvalsh(C)[:, 0] > 0)
+    return np.where(definite, np.einsum("ti,ti->t", e, x), np.inf)
 
 
 def _root_from(problem: Problem, trials: Trials, known: Known, equation: Equation, inflation: float) -> Array:

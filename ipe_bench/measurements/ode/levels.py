@@ -124,9 +124,14 @@ class Remembered:
 
     def look_up(self, x: Array) -> Indices:
         """The places (trials,); -1 where not known."""
-        return np.array([self._places.get(row.tobytes(), -1) for row in x], dtype=np.intp)
+        return np.array([self._places.get(key, -1) for key in _bits(x)], dtype=np.intp)
 
     def keep(self, x: Array, places: Indices) -> None:
         if len(self._places) + len(x) > _REMEMBERED:
             self._places.clear()
-        self._places.update(zip((row.tobytes() for row in x), places.tolist(), strict=True))
+        self._places.update(zip(_bits(x), places.tolist(), strict=True))
+
+
+def _bits(x: Array) -> list[bytes]:
+    """Of each trial of x (trials, n)."""
+    return np.ascontiguousarray(x).view(f"V{8 * x.shape[1]}").ravel().tolist() if len(x) else []
