@@ -111,7 +111,7 @@ class Objective:
         return dataclasses.replace(self, exact_within=exact_within if cheaper else np.inf)
 
     def subset(self, kept: Mask) -> Objective:
-        if kept.all():
+        if kept.dtype == bool and kept.all():
             return self
         x0 = self.x0[kept] if self.x0.ndim == 2 else self.x0
         return dataclasses.replace(self, z=self.z[kept], rows=self.rows[kept], x0=x0)
