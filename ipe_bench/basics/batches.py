@@ -5,7 +5,7 @@ A batch is an array or a list with the trials in front, or a dataclass whose fie
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
@@ -35,6 +35,20 @@ def put(batch: B, where: NDArray[Any], part: B) -> B:
     result = np.copy(batch)  # type: ignore[arg-type]
     result[where] = part
     return result  # pyright: ignore[reportReturnType]
+
+
+def gather(parts: Sequence[tuple[NDArray[np.intp], B]]) -> B:
+    """The batch of which each part has the trials at these indices, all of them together."""
+    rows = np.concatenate([rows for rows, _ in parts])
+    return parts[0][1] if len(parts) == 1 else take(_join([part for _, part in parts]), np.argsort(rows))
+
+
+def _join(batches: Sequence[B]) -> B:
+    """Batches one after another."""
+    first = batches[0]
+    if isinstance(first, list):
+        return [row for batch in batches for row in batch]  # type: ignore[return-value,union-attr]
+    return _each(lambda *parts: _join(parts), *batches) if is_dataclass(first) else np.concatenate(batches)  # type: ignore
 
 
 def _each(change: Callable[..., Any], *batches: Any) -> Any:

@@ -13,7 +13,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.batches import put, take
+from ipe_bench.basics.batches import gather, take
 from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.counted import Counted
@@ -111,11 +111,12 @@ def iterate(
     Converged is where `Standing.size` is at most `tolerance`. `budget` bounds the simulations of a trial, a Jacobian
     counting n; None: no limit. Finished trials leave the batch.
     """
-    state = ended = solver.begin(equations, start) if isinstance(start, np.ndarray) else start
+    state = solver.begin(equations, start) if isinstance(start, np.ndarray) else start
     trials, n = state.x.shape
     tally, active = equations.model.tally, np.arange(trials)
     status, iterations = np.full(trials, Status.RUNNING, np.int8), np.zeros(trials, np.int64)
     iterates = [[row] for row in state.x] if history else None
+    ended: list[tuple[NDArray[np.intp], S]] = []
     standing = solver.standing(equations, None, state)
     begun = np.maximum(standing.level, 1.0)
     for iteration in range(max_iterations + 1):
@@ -133,12 +134,12 @@ def iterate(
         status[active] = now
         going = now == Status.RUNNING
         if not going.all():
-            ended = state if len(state.x) == trials else put(ended, active[~going], take(state, ~going))
+            ended.append((active[~going], take(state, ~going) if going.any() else state))
             if not going.any():
                 break
             active, begun = active[going], begun[going]
             equations, state = equations.subset(going), take(state, going)
-    return Ended(ended, status, iterations, None if iterates is None else [np.array(x) for x in iterates])
+    return Ended(gather(ended) if ended else state, status, iterations, None if iterates is None else [np.array(x) for x in iterates])
 
 
 def _endings(
