@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from ipe_bench.basics.machine import keep_freed_memory
 
 if TYPE_CHECKING:
-    # Loaded by its path, and so that results are known to depend on it.
+    # Compiled from their text, and here so that results are known to depend on them.
+    from ipe_bench.basics import definite as definite
     from ipe_bench.basics import normal as normal
 
 Array: TypeAlias = NDArray[Any]
@@ -28,9 +29,11 @@ keep_freed_memory()
 _WELL_CONDITIONED = 1e3
 """The condition of J, its columns scaled, up to which J' J has enough of its digits: nine or more."""
 
-_COMPILED = 8
-"""Parameters from which on matrices are factored in compiled code: the fits of one small problem take less time than it
-takes to load a compiler."""
+
+def own(x: Array) -> Array:
+    """The same numbers as compiled code takes them: contiguous, and not marked as read-only."""
+    x = np.ascontiguousarray(x, dtype=float)
+    return x if x.flags.writeable else x.copy()
 
 
 def finite(a: Array) -> Mask:
@@ -186,16 +189,12 @@ def information(J: Array, R: Covariance) -> Array:
 def normal_equations(J: Array, r: Array, deviation: Array | None = None) -> tuple[Array, Array]:
     """A' A (trials, n, n) and A' r (trials, n) for J (trials, m, n) and r (trials, m), where A is J with its rows
     divided by `deviation` (m,), or J."""
-    J = np.ascontiguousarray(J)  # as the bits of a product may depend on how J lies in memory
     trials, m, n = J.shape
     with np.errstate(all="ignore"):
-        if n >= _COMPILED:
-            weights = np.ones(m) if deviation is None else 1.0 / deviation
-            G, gradient = np.empty((trials, n, n)), np.empty((trials, n))
-            _compiled().equations(J, weights, np.ascontiguousarray(r), G, gradient)
-            return G, gradient
-        A = J if deviation is None else J / deviation[:, None]
-        return np.matmul(A.swapaxes(1, 2), A), multiply(A.swapaxes(1, 2), r)
+        weights = np.ones(m) if deviation is None else 1.0 / deviation
+        G, gradient = np.empty((trials, n, n)), np.empty((trials, n))
+        _compiled("normal")(own(J), weights, own(r), G, gradient, np.empty((n, m)))
+        return G, gradient
 
 
 def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
@@ -205,25 +204,18 @@ def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
     The columns of J are scaled first; what is lost of U is n eps times the condition squared (Higham, Accuracy and
     Stability of Numerical Algorithms, 2002, section 20.4).
     """
-    if G.shape[1] >= _COMPILED:
-        U, inverse_U, size = np.zeros(G.shape), np.zeros(G.shape), np.empty(len(G))
-        _compiled().factor(np.ascontiguousarray(G), U, inverse_U, size)
-        return U, inverse_U, size * np.sqrt(G.shape[1]) <= _WELL_CONDITIONED
-    with np.errstate(all="ignore"):
-        columns = np.sqrt(np.diagonal(G, axis1=1, axis2=2))
-        scaled = G / (columns[:, :, None] * columns[:, None, :])
-        usable = finite(scaled)
-        U = cholesky(np.where(usable[:, None, None], scaled, np.eye(G.shape[1])))
-        inverse_U, _ = inverse(U)
-        well = usable & (np.linalg.norm(inverse_U, axis=(1, 2)) * np.sqrt(G.shape[1]) <= _WELL_CONDITIONED)
-        return U * columns[:, None, :], inverse_U / columns[:, :, None], well
+    n = G.shape[1]
+    U, inverse_U, size = np.zeros(G.shape), np.zeros(G.shape), np.empty(len(G))
+    _compiled("definite")(own(G), U, inverse_U, size, np.empty((3, n, n)))
+    return U, inverse_U, size * np.sqrt(n) <= _WELL_CONDITIONED
 
 
 @functools.cache
-def _compiled() -> Any:
+def _compiled(name: str) -> Any:
+    """The function of a module of this room."""
     from ipe_bench.basics.compiled import load
 
-    return load(Path(__file__).with_name("normal.py").read_text(encoding="utf-8"), "normal equations")
+    return load(Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8"), "linear algebra")
 
 
 def pseudo_inverse(H: Array, R: Covariance) -> tuple[Array, Mask]:

@@ -1,29 +1,21 @@
-"""Normal equations of many small problems, one after another in compiled code: LAPACK takes longer to be called than
-to solve them.
+"""Normal equations of many small problems, one after another in compiled code: LAPACK takes longer to be called than to
+compute them.
 
-`linalg` loads this file by its path, as `compiled` has it, and nobody imports it.
+`linalg` hands this file to `compiled`, and nobody imports it.
 """
 
-import numpy as np
-from numba import float64, njit, types, void
-
-
-def _given(axes):
-    """An array that is read, and may be read-only."""
-    return types.Array(float64, axes, "C", readonly=True)
+from numba import njit
 
 
 @njit(
-    void(_given(3), _given(1), _given(2), float64[:, :, ::1], float64[:, ::1]),
-    nogil=True,
-    cache=True,
+    "void(float64[:, :, ::1], float64[::1], float64[:, ::1], float64[:, :, ::1], float64[:, ::1], float64[:, ::1])",
     error_model="numpy",
     fastmath={"reassoc", "contract", "nsz"},
 )
-def equations(J, weights, r, G, gradient):
-    """G = A' A and the gradient A' r for each J (m, n) and r (m,), where A is J with its rows times the weights (m,)."""
+def equations(J, weights, r, G, gradient, A):
+    """G = A' A and the gradient A' r for each J (m, n) and r (m,), where A is J with its rows times the weights (m,);
+    the last argument is room for A' (n, m)."""
     m, n = J.shape[1:]
-    A = np.empty((n, m))
     for t in range(J.shape[0]):
         for i in range(m):
             for a in range(n):
@@ -52,42 +44,3 @@ def equations(J, weights, r, G, gradient):
         for a in range(n):
             for b in range(a):
                 G[t, b, a] = G[t, a, b]
-
-
-@njit(
-    void(_given(3), float64[:, :, ::1], float64[:, :, ::1], float64[::1]),
-    nogil=True,
-    cache=True,
-    error_model="numpy",
-)
-def factor(G, U, inverse_U, size):
-    """For each G (n, n), scaled to a diagonal of ones: the upper Cholesky factor U, its inverse and the Frobenius norm
-    of that inverse, not a number where there is none. U and its inverse are scaled back."""
-    n = G.shape[1]
-    columns = np.empty(n)
-    L = np.zeros((n, n))
-    V = np.zeros((n, n))
-    for t in range(G.shape[0]):
-        for i in range(n):
-            columns[i] = np.sqrt(G[t, i, i])
-        for i in range(n):
-            for j in range(i + 1):
-                rest = G[t, i, j] / (columns[i] * columns[j])
-                for k in range(j):
-                    rest -= L[i, k] * L[j, k]
-                L[i, j] = np.sqrt(rest) if i == j else rest / L[j, j]
-        squares = 0.0
-        for j in range(n):
-            V[j, j] = 1.0 / L[j, j]
-            squares += V[j, j] * V[j, j]
-            for i in range(j + 1, n):
-                rest = 0.0
-                for k in range(j, i):
-                    rest -= L[i, k] * V[j, k]
-                V[j, i] = rest / L[i, i]
-                squares += V[j, i] * V[j, i]
-        size[t] = np.sqrt(squares)
-        for i in range(n):
-            for j in range(i, n):
-                U[t, i, j] = L[j, i] * columns[j]
-                inverse_U[t, i, j] = V[i, j] / columns[i]

@@ -57,15 +57,15 @@ def spawned_keys(seed: int, start: int, stop: int, child: int) -> NDArray[np.uin
     """
     if stop > _WORD:
         sequences = (np.random.SeedSequence(seed, spawn_key=(trial, child)) for trial in range(start, stop))
-        return np.array([sequence.generate_state(2, np.uint64) for sequence in sequences]).reshape(-1, 2)
+        return np.array([sequence.generate_state(2, np.uint64) for sequence in sequences], np.uint64).reshape(-1, 2)
     trials = np.arange(start, stop, dtype=np.uint32)
     pool = [np.full(len(trials), word) for word in np.random.SeedSequence(seed).pool]
     constants = _constants(*_ENTROPY, skipped=_MIXED_BEFORE)
     for word in (trials, np.full(len(trials), child, np.uint32)):
         pool = [_folded(_LEFT * mixed - _RIGHT * _hashed(word, constants)) for mixed in pool]
     constants = _constants(*_OUTPUT)
-    words = [_hashed(mixed, constants).astype(np.uint64) for mixed in pool]
-    return np.stack([words[0] | words[1] << np.uint64(32), words[2] | words[3] << np.uint64(32)], axis=1)
+    words = np.stack([_hashed(mixed, constants) for mixed in pool], axis=1)
+    return words.astype("<u4").view("<u8").astype(np.uint64)
 
 
 def _constants(first: int, factor: int, *, skipped: int = 0) -> Iterator[tuple[np.uint32, np.uint32]]:

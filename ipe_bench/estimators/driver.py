@@ -139,7 +139,8 @@ def iterate(
                 break
             active, begun = active[going], begun[going]
             equations, state = equations.subset(going), take(state, going)
-    return Ended(gather(ended) if ended else state, status, iterations, None if iterates is None else [np.array(x) for x in iterates])
+    paths = None if iterates is None else [np.array(x) for x in iterates]
+    return Ended(gather(ended) if ended else state, status, iterations, paths)
 
 
 def _endings(

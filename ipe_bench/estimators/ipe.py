@@ -57,8 +57,8 @@ class System(Protocol):
         ...
 
     def solve(self, A: Array, b: Array) -> Array:
-        """A^-1 b for each trial: A (trials, n, n), b (trials, n) or (trials, n, k). Where A is singular the trial ends as
-        such."""
+        """A^-1 b for each trial: A (trials, n, n), b (trials, n) or (trials, n, k). Where A is singular the trial ends
+        as such."""
         ...
 
     def subset(self, kept: Mask) -> System:

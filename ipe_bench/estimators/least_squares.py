@@ -14,7 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array, Covariance, Mask, definite_factor, finite, inverse, multiply, normal_equations, solve
+from ipe_bench.basics.linalg import (
+    Array,
+    Covariance,
+    Mask,
+    definite_factor,
+    finite,
+    inverse,
+    multiply,
+    normal_equations,
+    solve,
+)
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
 from ipe_bench.estimators.driver import Ended, Solver, Standing, iterate

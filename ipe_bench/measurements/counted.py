@@ -66,14 +66,15 @@ class Counted:
         return self._each_if_raising(self.measurement.simulate, x, rows, (self.measurement.m,))
 
     def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: Mask | bool = False) -> Array:
-        """dh/dx (trials, m, n) for the trials `rows` of the tally; where it is only for steps, `coarse` will do, which
+        """dh/dx (trials, m, n) for the trials `rows` of the tally. Where it is only for steps `coarse` will do, which
         counts as what it costs beside an exact one."""
         if self.coarse_share == 1.0 or not np.any(coarse):
             return self._exact_jacobian(x, rows)
         if np.all(coarse):
             return self._coarse_jacobian(x, rows)
         J = np.empty((len(x), self.measurement.m, self.measurement.n))
-        J[coarse], J[~coarse] = self._coarse_jacobian(x[coarse], rows[coarse]), self._exact_jacobian(x[~coarse], rows[~coarse])
+        J[coarse] = self._coarse_jacobian(x[coarse], rows[coarse])
+        J[~coarse] = self._exact_jacobian(x[~coarse], rows[~coarse])
         return J
 
     def _coarse_jacobian(self, x: Array, rows: NDArray[np.intp]) -> Array:

@@ -13,6 +13,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,11 +61,11 @@ class Kernel:
 
     @functools.cached_property
     def _wide(self) -> Callable[..., None]:
-        return load(self._source.text).integrate
+        return _with_room(self._source, WIDTH)
 
     @functools.cached_property
     def _narrow(self) -> Callable[..., None]:
-        return load(self.source(self.equations, self.tableau, NARROW).text).integrate
+        return _with_room(self.source(self.equations, self.tableau, NARROW), NARROW)
 
     def run(
         self,
@@ -107,3 +108,13 @@ class Kernel:
         work_on()
         for other in others:
             other.result()
+
+
+def _with_room(source: Source, width: int) -> Callable[..., None]:
+    """What a source integrates, given the room that it needs."""
+    integrate = load(source.text)
+
+    def function(*arguments: Any) -> None:
+        integrate(*arguments, np.empty(source.work), np.empty(2 * width, np.int64))
+
+    return function

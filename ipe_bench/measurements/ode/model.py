@@ -10,14 +10,13 @@ import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from types import ModuleType
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.compiled import load
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.compiled import Function, load
+from ipe_bench.basics.linalg import Array, own
 from ipe_bench.measurements.base import Input, Measurement
 from ipe_bench.measurements.ode import sampling
 from ipe_bench.measurements.ode.coarse import CONTRACTION, MOST_RK4, Coarseness, contraction
@@ -26,7 +25,7 @@ from ipe_bench.measurements.ode.levels import Found, Indices, Remembered, Search
 from ipe_bench.measurements.ode.source import Equations, Variation, jacobian_source, rate_source, simulation_source
 from ipe_bench.measurements.ode.tableau import DOP853, RK4
 
-_STAYS = ("_readings_kernel", "_rk4_kernel", "_rate_module", "_jacobian_kernel", "_equations", "_remembered")
+_STAYS = ("_readings_kernel", "_rk4_kernel", "_rate_function", "_jacobian_kernel", "_equations", "_remembered")
 _ANGLE_AT_START = 0.7
 """Radians over which the first step that is tried lets the solution turn."""
 
@@ -146,7 +145,7 @@ class OdeMeasurement(Measurement):
         """
         if not self._guessed:
             return self._shown(x, stop, offset)
-        x = _own(x)
+        x = own(x)
         z = np.empty((len(x), len(self._cases) * stop * len(self.outputs)))
         for place, rows in grouped(self._guess(x), np.arange(len(x))):
             self._simulate(x, rows, self._steps(place), offset, z)
@@ -155,7 +154,7 @@ class OdeMeasurement(Measurement):
     @property
     def _guessed(self) -> bool:
         """Whether the rate says with which steps to integrate."""
-        return self.step is None and self.trusted_angle > 0 and self._rate_module is not None
+        return self.step is None and self.trusted_angle > 0 and self._rate_function is not None
 
     def _guess(self, x: Array) -> Indices:
         """The level of each trial by its rate alone."""
@@ -164,7 +163,7 @@ class OdeMeasurement(Measurement):
 
     def _shown(self, x: Array, stop: int, offset: Array) -> Array:
         """Readings less the offset (m,)."""
-        x = _own(x)
+        x = own(x)
         z = np.empty((len(x), len(self._cases) * stop * len(self.outputs)))
         common = self._common_steps(x)
         if common is not None:
@@ -196,15 +195,15 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def _si_sizes(self) -> Array:
-        return _own(self.si_sizes)
+        return own(self.si_sizes)
 
     @cached_property
     def _cases(self) -> Array:
-        return _own(self.cases)
+        return own(self.cases)
 
     @cached_property
     def _times(self) -> Array:
-        return _own(self.times)
+        return own(self.times)
 
     def _prefix(self, z: Array, stop: int) -> Array:
         if stop == len(self.times):
@@ -240,10 +239,10 @@ class OdeMeasurement(Measurement):
     def _rates(self, x: Array) -> tuple[Array, float]:
         """The rate of each trial, and the fastest of all; not a number where nothing is known."""
         rates = np.full(len(x), np.nan)
-        return rates, self._rate_module.rates(x, self._si_sizes, rates) if self._rate_module else np.inf
+        return rates, self._rate_function(x, self._si_sizes, rates) if self._rate_function else np.inf
 
     @cached_property
-    def _rate_module(self) -> ModuleType | None:
+    def _rate_function(self) -> Function | None:
         return load(rate_source(self._equations)) if self._equations.rate else None
 
     @cached_property
@@ -254,14 +253,14 @@ class OdeMeasurement(Measurement):
     def _first_guess(self, x: Array) -> Indices:
         """Where on the ladder the search begins: steps of half a radian, or what the nominal parameters need."""
         top = len(self._ladder) - 1
-        if self._rate_module is None:
+        if self._rate_function is None:
             return np.where(np.isfinite(x).all(axis=1), self._nominal_place, top)
         wanted = np.nan_to_num(self._rates(x)[0] * self._longest / _ANGLE_AT_START, nan=np.inf)
         return np.clip(np.searchsorted(self._ladder, wanted), 1, top)
 
     @cached_property
     def _nominal_place(self) -> int:
-        return max(1, int(self._find(_own(self.nominal[None]), np.array([1]), self._zeros).places[0]))
+        return max(1, int(self._find(own(self.nominal[None]), np.array([1]), self._zeros).places[0]))
 
     @cached_property
     def _remembered(self) -> Remembered:
@@ -304,7 +303,7 @@ class OdeMeasurement(Measurement):
 
     def jacobian_until(self, x: Array, stop: int) -> Array:
         """dh/dx by the variational equations, integrated by the same formula and steps as the readings of that x."""
-        x = _own(x)
+        x = own(x)
         J = self._empty_jacobian(x, stop)
         for rows, steps in self._grouped_by_steps(x):
             self._differentiate(self._jacobian_kernel, x, rows, steps, J)
@@ -314,7 +313,7 @@ class OdeMeasurement(Measurement):
         """dh/dx with longer steps, or by a cheaper formula, where that was measured to contract; see `coarse`."""
         if self.step is not None:
             return self.jacobian_until(x, stop)
-        x = _own(x)
+        x = own(x)
         partial = self._guessed and stop < len(self.times)
         places = self._guess(x) if partial else self._search(x, self._zeros).places
         J, trusted = self._empty_jacobian(x, stop), self._trusted(x) == 0
@@ -336,7 +335,7 @@ class OdeMeasurement(Measurement):
     @cached_property
     def _coarseness(self) -> Coarseness:
         """Measured at the nominal parameters."""
-        x, everything = _own(self.nominal[None]), len(self.times)
+        x, everything = own(self.nominal[None]), len(self.times)
         level, J = int(self._ladder[self._search(x, self._zeros).places[0]]), self.jacobian(x)
         rk4 = next(
             (k for k in range(1, MOST_RK4 + 1) if level <= 2 and self._contraction(x, k, J) <= CONTRACTION), None
@@ -377,8 +376,8 @@ class OdeMeasurement(Measurement):
         """At the nominal parameters, or where they are at a level above 2; in simulations at the trial's level."""
         if self.step is not None:
             return self.jacobian_cost
-        place = int(self._search(_own(self.nominal[None]), self._zeros).places[0])
-        trusted = self._trusted(_own(self.nominal[None]))[0] == 0
+        place = int(self._search(own(self.nominal[None]), self._zeros).places[0])
+        trusted = self._trusted(own(self.nominal[None]))[0] == 0
         kernel, level = self._coarsened(-1 if trusted else place)
         return kernel.operations * level / (self._readings_kernel.operations * int(self._ladder[place]))
 
@@ -412,9 +411,3 @@ class OdeMeasurement(Measurement):
         return Equations(
             self.states, self.n, constants, outputs, self.start, self.rhs, self.read, self.variation, self.rate
         )
-
-
-def _own(x: Array) -> Array:
-    """The same numbers as the compiled code takes them: contiguous, and not marked as read-only."""
-    x = np.ascontiguousarray(x, dtype=float)
-    return x if x.flags.writeable else x.copy()
