@@ -27,6 +27,7 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
+from ipe_bench.runs.compaction import tidy
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.provenance import describe, fingerprint
 from ipe_bench.runs.results import Results, require_results
@@ -538,7 +539,8 @@ def compute(
         for line in aside:
             log.warning(line)
         failures = work_through(tasks, execution, store, watch or (lambda progress: None), log)
-    store.require()
+        store.require()
+        tidy(store, {cell.key for part in cells for cell in part}, log.info)
     if not (store.runs / f"{identifier}.json").is_file():
         raise StorageError(f"{store.directory}: lost the record of this run; the same command computes what is missing")
     return failures

@@ -163,29 +163,12 @@ class Results:
         trials, runs = self._files(store.trials, ".parquet", keys), self._files(store.runs, ".json")
         found: dict[str, list[Piece]] = {}
         footers: dict[str, Mapping[str, Any]] = {}
-        listed, unread = set(trials), list(trials)
-        while unread:
-            gone = False
-            for path in unread:
-                with self.naming(path):
-                    piece = Piece.parse(path)
-                    footer = verified.footer(path, piece.key)
-                    if footer is None:
-                        before = signature(path)
-                        try:
-                            footer, table = piece.read()
-                        except Gone:
-                            gone = True
-                            continue
-                        self._keep(path, table)
-                        verified.note(path, before, footer)
-                    found.setdefault(piece.key, []).append(piece)
-                    footers[piece.key] = footer
+        listed: set[Path] = set()
+        while trials:
+            listed.update(trials)
+            gone = [path for path in trials if not self._read_piece(path, verified, found, footers)]
             # What went away meanwhile was merged into larger files, which were not there yet when these were listed.
-            unread = (
-                [path for path in self._files(store.trials, ".parquet", keys) if path not in listed] if gone else []
-            )
-            listed.update(unread)
+            trials = [p for p in self._files(store.trials, ".parquet", keys) if p not in listed] if gone else []
         for path in self._files(store.histories, ".parquet", keys):
             if not verified.knows(path):
                 with self.naming(path):
@@ -205,9 +188,28 @@ class Results:
         for key, pieces in found.items():
             before_these = self.stored[key].pieces if key in self.stored else ()
             self.stored[key] = StoredCell(footers[key], (*before_these, *pieces))
-        if keys is None and not trials and not runs:
+        if keys is None and not listed and not runs:
             self.problem(f"{store.directory}: holds no results of ipe-bench")
         verified.save()
+
+    def _read_piece(
+        self, path: Path, verified: Verified, found: dict[str, list[Piece]], footers: dict[str, Mapping[str, Any]]
+    ) -> bool:
+        """Adds the piece to what is found, if it is whole; False where it is not there any more."""
+        with self.naming(path):
+            piece = Piece.parse(path)
+            footer = verified.footer(path, piece.key)
+            if footer is None:
+                before = signature(path)
+                try:
+                    footer, table = piece.read()
+                except Gone:
+                    return False
+                self._keep(path, table)
+                verified.note(path, before, footer)
+            found.setdefault(piece.key, []).append(piece)
+            footers[piece.key] = footer
+        return True
 
     def _files(self, folder: Path, suffix: str, keys: Keys[str] | None = None) -> list[Path]:
         """What lies in a folder under a name with that suffix; with `keys`, what belongs to their cells alone."""

@@ -198,6 +198,7 @@ class Ledger:
         self.watch = watch
         self.total = sum(_weight(task, cell) for task in tasks for cell in task.cells)
         self.left = Counter((id(cell.scenario), task.start, task.stop) for task in tasks for cell in task.cells)
+        self.done = 0
         self.trials = 0
         self.failures: list[str] = []
         self.tell()
@@ -205,6 +206,7 @@ class Ledger:
     def close(self, task: Task, cell: Cell, failure: Failure | None, seconds: float | None = None) -> None:
         """Notes that a cell of a task is stored, or has failed for good."""
         self.left[id(cell.scenario), task.start, task.stop] -= 1
+        self.done += self.left[id(cell.scenario), task.start, task.stop] == 0
         self.trials += _weight(task, cell)
         what = f"{describe_names(cell.names)}, trials {task.start} to {task.stop}"
         if failure is None:
@@ -216,8 +218,7 @@ class Ledger:
         self.tell()
 
     def tell(self) -> None:
-        done = sum(left == 0 for left in self.left.values())
-        self.watch(Progress(done, len(self.left), self.trials, self.total, tuple(self.failures)))
+        self.watch(Progress(self.done, len(self.left), self.trials, self.total, tuple(self.failures)))
 
 
 def work_through(

@@ -332,7 +332,7 @@ def _ending_rows(sample: Sample) -> list[dict[str, Any]]:
         message = "" if messages is None or messages[i] is None else str(messages[i])
         ending = (str(sample.scalars["status"][i]), message)
         counts[ending] += 1
-        first.setdefault(ending, trial_label(*sample.id_of(i)))
+        first.setdefault(ending, trial_label(*sample.id_of(int(i))))
     shown = counts.most_common(MESSAGES)
     rest = sum(counts.values()) - sum(count for _, count in shown)
     result = [

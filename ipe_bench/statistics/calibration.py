@@ -323,7 +323,7 @@ def median_limits(values: Array, level: float = LEVEL) -> tuple[float, float]:
     k = int(_least(count, np.array([0.5]), np.array([(1 - level) / 2]))[0]) if count >= FEW else 0
     if k == 0:
         return -np.inf, np.inf
-    ordered = np.sort(values)
+    ordered = np.partition(values, (k - 1, count - k))
     return float(ordered[k - 1]), float(ordered[count - k])
 
 

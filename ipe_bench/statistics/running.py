@@ -1,7 +1,7 @@
 """Sums that are taken some rows at a time, so that a million trials need not be in memory at once.
 
-Numbers in, numbers out: matrices are (k, rows), what counts is (rows,) boolean, None for all of them. Which trials these
-are, and what the sums mean, is left to `statistics.sums`.
+Numbers in, numbers out: matrices are (k, rows), what counts is (rows,) boolean, None for all of them. Which trials
+these are, and what the sums mean, is left to `statistics.sums`.
 """
 
 from __future__ import annotations

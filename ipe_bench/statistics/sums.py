@@ -97,10 +97,10 @@ class Sums:
         self.van_trees.add(r.van_trees**2, ~np.isnan(r.van_trees[0]))
         self.compensation.add((r.error - r.linear_error) ** 2, r.solved)
         wrong, scatter, box = (r.theory[kind] for kind in ("pseudo_bias", "misspecified", "box_bias"))
-        used = r.solved & np.isfinite(wrong).all(axis=0) & np.isfinite(scatter).all(axis=0)
+        used: Array = np.asarray(r.solved & np.isfinite(wrong).all(axis=0) & np.isfinite(scatter).all(axis=0))
         self.wrong.add(wrong, used)
         self.wrong_mse.add(wrong**2 + scatter**2, used)
-        known = np.isfinite(box).all(axis=0)
+        known: Array = np.asarray(np.isfinite(box).all(axis=0))
         self.box.add(box, known)
         self.box_square.add(box**2, known)
         for name, values in r.curvature.items():
