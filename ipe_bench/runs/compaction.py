@@ -49,7 +49,7 @@ def compact(store: Store, keys: Keys[str], *, many: int = MANY, trials: int = TR
 
 
 def tidy(store: Store, keys: Keys[str], say: Callable[[str], None]) -> None:
-    """Merges the small files of these cells. Where that cannot be done they stay as they are, and nothing is missing."""
+    """Merges the small files of these cells. Where that cannot be done they stay as they are, and nothing is lost."""
     try:
         gone = compact(store, keys)
         if gone:

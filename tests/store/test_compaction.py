@@ -138,7 +138,10 @@ print(count)
 """
 
 
-@pytest.mark.parametrize("moment", [1, 2, 3, 4, 5, 17, 18, 19, 60])
+LATER = [pytest.param(moment, marks=pytest.mark.slow) for moment in (2, 5, 17, 18, 19, 60)]
+
+
+@pytest.mark.parametrize("moment", [1, 3, 4, *LATER])
 def test_killed_at_any_moment_every_trial_is_there_and_the_next_time_it_ends(tmp_path, moment):
     """Before and after a large file is on the disk, between its name and the first removal, and amid the removals."""
     filled(tmp_path)
@@ -155,7 +158,7 @@ def test_readers_that_listed_the_small_files_find_the_rows_in_the_large_ones(tmp
     filled(tmp_path)
     expected = everything(tmp_path)
     results = Results.read([tmp_path])
-    results._kept.clear()  # noqa: SLF001 - as if there were more than fits into memory
+    results._kept.clear()
     merge(tmp_path)
     found = {key: results.load(cell, None) for key, cell in results.stored.items()}
     assert results.problems == []
@@ -165,7 +168,7 @@ def test_readers_that_listed_the_small_files_find_the_rows_in_the_large_ones(tmp
 def test_a_file_that_goes_away_for_good_is_named(tmp_path):
     filled(tmp_path)
     results = Results.read([tmp_path])
-    results._kept.clear()  # noqa: SLF001
+    results._kept.clear()
     path = next((tmp_path / "trials").glob("*-9-12.parquet"))
     path.unlink()
     rows = results.load(results.stored[path.name.partition("-")[0]], None)
