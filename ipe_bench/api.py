@@ -523,6 +523,7 @@ def compute(
     stored = [any(Path(output).glob(f"trials/{Cell(scenario).key}-*.parquet")) for scenario in scenarios]
     untried = [scenario for scenario, known in zip(scenarios, stored, strict=True) if not known]
     execution = execution or Serial()
+    block_size = block_size_for(trials) if block_size is None else block_size
     if block_size > 0:
         # Workers start while this process looks at what is asked for.
         execution.warm_up(perform, len(untried) * -(-trials // block_size))
@@ -544,7 +545,9 @@ def compute(
             log.warning(line)
         failures = work_through(tasks, execution, store, watch or (lambda progress: None), log)
         store.require()
-        tidy(store, {cell.key for part in cells for cell in part}, log.info)
+        gone, hindrances = tidy(store, {cell.key for part in cells for cell in part}, execution)
+        for line in [f"{gone} small files were merged into larger ones"] * bool(gone) + hindrances:
+            log.info(line)
     if not (store.runs / f"{identifier}.json").is_file():
         raise StorageError(f"{store.directory}: lost the record of this run; the same command computes what is missing")
     return failures

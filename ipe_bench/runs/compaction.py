@@ -10,8 +10,8 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Collection as Keys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from ipe_bench.basics.errors import StorageError
 from ipe_bench.basics.files import write_atomically
 from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.columns import as_array
+from ipe_bench.runs.execution.base import Execution
 from ipe_bench.runs.pieces import Piece, Unusable
 from ipe_bench.runs.store import Store, encode
 
@@ -33,29 +34,55 @@ TRIALS = 50_000
 """
 
 
-def compact(store: Store, keys: Keys[str], *, many: int = MANY, trials: int = TRIALS) -> int:
-    """Merges the files of those of the cells with these keys that have `many` small ones; returns how many are gone.
+@dataclass(frozen=True)
+class Merge:
+    """A task: files of one cell without a gap between them, the longer of two that begin alike first."""
+
+    pieces: tuple[Piece, ...]
+
+    @property
+    def trusted(self) -> bool:
+        """It runs no code of others."""
+        return True
+
+
+def merges(store: Store, keys: Keys[str], *, many: int = MANY, trials: int = TRIALS) -> list[Merge]:
+    """What can be merged of those of the cells with these keys that have `many` small files."""
+    crowded = [
+        pieces
+        for pieces in _by_key(store, keys).values()
+        if sum(piece.stop - piece.start < trials for piece in pieces) >= many
+    ]
+    return [Merge(tuple(run)) for pieces in crowded for run in _runs(pieces, trials) if len(run) > 1]
+
+
+def perform(task: Merge) -> Iterator[int]:
+    """Merges the files of one task, and yields how many are gone. Runs wherever the execution has it run.
 
     Files that are damaged, or of which another version of the libraries wrote some, are not merged.
 
     Raises:
         StorageError: the folder cannot be written to any more; everything that was there is there.
     """
-    gone = 0
-    for pieces in _by_key(store, keys).values():
-        if sum(piece.stop - piece.start < trials for piece in pieces) >= many:
-            gone += sum(_replace(group) for run in _runs(pieces, trials) for group in _alike(run))
-    return gone
+    for group in _alike(task.pieces):
+        yield _replace(group)
+    pa.default_memory_pool().release_unused()
 
 
-def tidy(store: Store, keys: Keys[str], say: Callable[[str], None]) -> None:
-    """Merges the small files of these cells. Where that cannot be done they stay as they are, and nothing is lost."""
+def tidy(
+    store: Store, keys: Keys[str], execution: Execution, *, many: int = MANY, trials: int = TRIALS
+) -> tuple[int, list[str]]:
+    """Merges the small files of these cells; how many are gone, and what stood in the way: then they stay as they are,
+    and nothing is lost."""
+    tasks, gone, hindrances = merges(store, keys, many=many, trials=trials), 0, []
     try:
-        gone = compact(store, keys)
-        if gone:
-            say(f"{gone} small files were merged into larger ones")
+        for event in execution.run(perform, tasks) if tasks else ():
+            gone += 0 if event.ended else int(event.step)
+            if event.failure is not None:
+                hindrances.append(event.failure.message)
     except StorageError as error:
-        say(f"small files are not merged: {error}")
+        hindrances.append(str(error))
+    return gone, hindrances
 
 
 def _by_key(store: Store, keys: Keys[str]) -> dict[str, list[Piece]]:
@@ -97,8 +124,6 @@ class _Part:
 
 def _alike(run: Sequence[Piece]) -> Iterator[list[_Part]]:
     """The parts of a run that can be one file: whole ones in succession with the same footer and the same columns."""
-    if len(run) < 2:
-        return
     parts: list[_Part | None] = []
     for piece in run:
         try:

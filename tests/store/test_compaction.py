@@ -19,7 +19,10 @@ from ipe_bench.api import compute
 from ipe_bench.baselines import LinearLSE
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
-from ipe_bench.runs.compaction import MANY, compact
+from ipe_bench.runs import compaction
+from ipe_bench.runs.compaction import MANY, tidy
+from ipe_bench.runs.execution.processes import Processes
+from ipe_bench.runs.execution.serial import Serial
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.store import Store
 from ipe_bench.statistics import summarize
@@ -59,8 +62,11 @@ def assert_same(found, expected) -> None:
             np.testing.assert_array_equal(found[key][name], values)
 
 
-def merge(folder: Path) -> int:
-    return compact(Store(folder), set(Results.read([folder]).stored), many=2, trials=WINDOW)
+def merge(folder: Path, execution=None, many: int = 2) -> int:
+    keys = set(Results.read([folder]).stored)
+    gone, hindrances = tidy(Store(folder), keys, execution or Serial(), many=many, trials=WINDOW)
+    assert hindrances == []
+    return gone
 
 
 def names(folder: Path) -> list[str]:
@@ -77,11 +83,29 @@ def test_the_rows_are_the_same_in_fewer_files(tmp_path):
     assert merge(tmp_path) == 0
 
 
-def test_nothing_is_merged_of_a_few_files_or_of_other_cells(tmp_path):
-    synthetic = filled(tmp_path)
+def test_workers_merge_as_this_process_does(tmp_path):
+    filled(tmp_path)
+    expected = everything(tmp_path)
+    assert merge(tmp_path, Processes(workers=2)) == 68
+    assert names(tmp_path) == sorted(2 * ["0-42.parquet", "42-81.parquet", "81-100.parquet"])
+    assert_same(everything(tmp_path), expected)
+
+
+def test_a_file_that_the_disk_does_not_give_back_stands_for_none(tmp_path, monkeypatch):
+    filled(tmp_path)
     before = names(tmp_path)
-    assert compact(Store(tmp_path), set(synthetic.cells), many=35, trials=WINDOW) == 0
-    assert compact(Store(tmp_path), {"0" * 16}, many=2, trials=WINDOW) == 0
+    monkeypatch.setattr(compaction, "_write_to_disk", lambda path, content: path.write_bytes(content[:-20] + 20 * b"x"))
+    gone, (line,) = tidy(Store(tmp_path), set(Results.read([tmp_path]).stored), Serial(), many=2, trials=WINDOW)
+    assert gone == 0
+    assert "does not match its digest just after it was written" in line
+    assert set(before) < set(names(tmp_path))
+
+
+def test_nothing_is_merged_of_a_few_files_or_of_other_cells(tmp_path):
+    filled(tmp_path)
+    before = names(tmp_path)
+    assert merge(tmp_path, many=35) == 0
+    assert tidy(Store(tmp_path), {"0" * 16}, Serial(), many=2, trials=WINDOW) == (0, [])
     assert names(tmp_path) == before
 
 
@@ -93,7 +117,7 @@ def test_a_gap_a_damaged_file_and_one_by_other_libraries_stay_as_they_are(tmp_pa
     damaged = path["18-21"].read_bytes()[:-9] + b"x" * 9
     path["18-21"].write_bytes(damaged)
     forge(path["27-30"], lambda rows, footer: footer.update(libraries={"numpy": "0.1"}))
-    compact(Store(tmp_path), {cell.key}, many=2, trials=WINDOW)
+    tidy(Store(tmp_path), {cell.key}, Serial(), many=2, trials=WINDOW)
     mine = sorted(p.name.partition("-")[2] for p in (tmp_path / "trials").glob(f"{cell.key}-*"))
     ranges = ["0-9", "12-18", "18-21", "21-27", "27-30", "30-42", "42-81", "81-100"]
     assert mine == sorted(f"{r}.parquet" for r in ranges)
@@ -101,20 +125,21 @@ def test_a_gap_a_damaged_file_and_one_by_other_libraries_stay_as_they_are(tmp_pa
 
 
 def test_what_a_larger_file_holds_is_read_once_and_goes(tmp_path):
-    synthetic = filled(tmp_path)
+    filled(tmp_path)
     expected = everything(tmp_path)
     small = {path: path.read_bytes() for path in (tmp_path / "trials").iterdir()}
     merge(tmp_path)
     for path in list(small)[::2]:
         path.write_bytes(small[path])
     assert_same(everything(tmp_path), expected)
-    assert compact(Store(tmp_path), set(synthetic.cells), many=2, trials=WINDOW) == len(list(small)[::2])
+    assert merge(tmp_path) == len(list(small)[::2])
     assert_same(everything(tmp_path), expected)
 
 
 KILLED = """
 import os, signal, sys
-from ipe_bench.runs.compaction import compact
+from ipe_bench.runs.compaction import tidy
+from ipe_bench.runs.execution.serial import Serial
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.store import Store
 folder, moment = sys.argv[1], int(sys.argv[2])
@@ -133,7 +158,7 @@ os.fsync, os.replace = deadly(os.fsync), deadly(os.replace)
 os.unlink = deadly(os.unlink)
 import pathlib
 pathlib.os.unlink = os.unlink
-compact(Store(folder), keys, many=2, trials=40)
+tidy(Store(folder), keys, Serial(), many=2, trials=40)
 print(count)
 """
 
