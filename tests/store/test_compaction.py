@@ -136,6 +136,22 @@ def test_what_a_larger_file_holds_is_read_once_and_goes(tmp_path):
     assert_same(everything(tmp_path), expected)
 
 
+def test_ranges_that_overlap_are_read_and_merged_once(tmp_path):
+    """Two runs with other sizes of blocks: trials 20 to 29 and 45 to 59 were computed twice."""
+    error = np.random.default_rng(1).standard_normal((TRIALS, 3))
+    synthetic = Synthetic(tmp_path)
+    for start, stop in ((0, 30), (20, 50), (45, 60), (47, 52), (60, TRIALS)):
+        synthetic.add(synthetic.scenario(), "mine", error[start:stop], start=start)
+    synthetic.record(TRIALS)
+    expected = everything(tmp_path)
+    for rows in expected.values():
+        np.testing.assert_array_equal(rows["trial"], np.arange(TRIALS))
+    (cell,) = (c for c in synthetic.cells.values() if c.label == "mine")
+    np.testing.assert_array_equal(expected[cell.key]["error_a"], error[:, 0])
+    assert merge(tmp_path) > 0
+    assert_same(everything(tmp_path), expected)
+
+
 KILLED = """
 import os, signal, sys
 from ipe_bench.runs.compaction import tidy
