@@ -2,7 +2,8 @@
 
 A file's name is a digest of the constructed objects and of the numerical source; how many trials there are
 and how they were cut into blocks is not part of it, so the results of one key are a union of ranges. A file appears
-under its name complete or not at all. Reading is left to `runs.results`.
+under its name complete or not at all. Reading is left to `runs.results`, to make few files of many to
+`runs.compaction`.
 """
 
 from __future__ import annotations
