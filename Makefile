@@ -41,9 +41,10 @@ lint: .venv/ready
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 # What everything costs beside its rivals, as a table in outputs/bench. PEERS=1 installs other people's libraries first.
+# PARTS=scale runs a million trials with their report instead, which takes minutes; SCALE=100000 that many.
 bench: .venv/ready
 	$(if $(PEERS),$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[peers]")
-	IPE_BENCH_THREADS=1 OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/table.py outputs/bench
+	IPE_BENCH_THREADS=1 OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/table.py outputs/bench $(PARTS)
 
 # The documentation, with every experiment executed, in outputs/docs/html. TRIALS=100 makes the gallery's figures finer.
 docs: .venv/ready

@@ -27,10 +27,11 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
+from ipe_bench.runs.compaction import tidy
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.provenance import describe, fingerprint
 from ipe_bench.runs.results import Results, require_results
-from ipe_bench.runs.schedule import RunLog, Watcher, perform, plan, work_through
+from ipe_bench.runs.schedule import BLOCK_SIZE, RunLog, Watcher, block_size_for, perform, plan, work_through
 from ipe_bench.runs.store import TRUTH, Cell, Store, describe_names
 from ipe_bench.trials.bounds import linear_bound
 from ipe_bench.trials.scenario import Scenario
@@ -47,7 +48,6 @@ if TYPE_CHECKING:
     from ipe_bench.trials.design import Criterion, Design
     from ipe_bench.trials.posterior import Reference
 
-BLOCK_SIZE = 250
 TRIALS = 1000
 """Where neither a number nor a precision is asked for."""
 MOST_TRIALS = 100_000
@@ -68,7 +68,7 @@ def run(
     time_limit: float | None = None,
     output: Path | str | None = None,
     execution: Execution | None = None,
-    block_size: int = BLOCK_SIZE,
+    block_size: int | None = None,
     watch: Watcher | None = None,
 ) -> pd.DataFrame:
     """Runs every estimator on the same trials of every scenario and summarises what is known of them.
@@ -502,13 +502,15 @@ def compute(
     output: Path | str,
     *,
     execution: Execution | None = None,
-    block_size: int = BLOCK_SIZE,
+    block_size: int | None = None,
     watch: Watcher | None = None,
     record_as: str | None = None,
     further: Mapping[str, Any] | None = None,
     command: str | None = None,
 ) -> tuple[str, ...]:
     """Computes and stores what is missing under `output`; returns the messages of what failed.
+
+    Trials are computed `block_size` at once, which changes no number: where it is None, so many as are quickest.
 
     The run is recorded under a new name, or under `record_as`, in place of what is there; with `further` facts, and the
     `command` as it was typed.
@@ -521,6 +523,7 @@ def compute(
     stored = [any(Path(output).glob(f"trials/{Cell(scenario).key}-*.parquet")) for scenario in scenarios]
     untried = [scenario for scenario, known in zip(scenarios, stored, strict=True) if not known]
     execution = execution or Serial()
+    block_size = block_size_for(trials) if block_size is None else block_size
     if block_size > 0:
         # Workers start while this process looks at what is asked for.
         execution.warm_up(perform, len(untried) * -(-trials // block_size))
@@ -541,7 +544,10 @@ def compute(
         for line in aside:
             log.warning(line)
         failures = work_through(tasks, execution, store, watch or (lambda progress: None), log)
-    store.require()
+        store.require()
+        gone, hindrances = tidy(store, {cell.key for part in cells for cell in part}, execution)
+        for line in [f"{gone} small files were merged into larger ones"] * bool(gone) + hindrances:
+            log.info(line)
     if not (store.runs / f"{identifier}.json").is_file():
         raise StorageError(f"{store.directory}: lost the record of this run; the same command computes what is missing")
     return failures
@@ -582,7 +588,7 @@ def compute_until(
     precision: float | Mapping[str, float],
     time_limit: float | None = None,
     execution: Execution | None = None,
-    block_size: int = BLOCK_SIZE,
+    block_size: int | None = None,
     watch: Watcher | None = None,
     command: str | None = None,
 ) -> tuple[tuple[str, ...], tuple[Stop, ...]]:
@@ -602,6 +608,7 @@ def compute_until(
     if any(scenario.noise.real for scenario in scenarios):
         raise UserError(f"precision={precision}: certified readings are one trial; leave it out")
     validate(scenarios, estimators, budget, block_size)
+    block_size = BLOCK_SIZE if block_size is None else block_size
     options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
     options |= {"further": {"precision": dataclasses.asdict(wanted)}, "command": command}
     at = [_first_trials(s, estimators, Path(output), block_size, budget) for s in scenarios]
@@ -706,7 +713,7 @@ def validate(
     scenarios: Sequence[Scenario],
     estimators: Mapping[str, Estimator],
     trials: int,
-    block_size: int = BLOCK_SIZE,
+    block_size: int | None = None,
     *,
     untried: Sequence[Scenario] | None = None,
     estimating: bool = False,
@@ -719,10 +726,11 @@ def validate(
     mistakes = []
     if trials < 1:
         mistakes.append(f"trials={trials}: give a whole number above 0")
-    if block_size < 1:
-        mistakes.append(f"block_size={block_size}: give a whole number above 0")
-    elif trials > MOST_BLOCKS * block_size:
-        mistakes.append(f"trials={trials}: are more than {MOST_BLOCKS} blocks of block_size={block_size}")
+    size = block_size_for(trials) if block_size is None else block_size
+    if size < 1:
+        mistakes.append(f"block_size={size}: give a whole number above 0")
+    elif trials > MOST_BLOCKS * size:
+        mistakes.append(f"trials={trials}: are more than {MOST_BLOCKS} blocks of block_size={size}")
     if not scenarios:
         mistakes.append("there is no scenario; give at least one")
     if TRUTH in estimators:

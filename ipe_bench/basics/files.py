@@ -74,7 +74,7 @@ BLANK_SEAL = (_SEAL + b"0" * 64).decode()
 def seal(content: bytes) -> bytes:
     """The content with the SHA-256 digest of all of it in place of the last `BLANK_SEAL` in it."""
     at = content.rindex(BLANK_SEAL.encode()) + len(_SEAL)
-    return content[:at] + hashlib.sha256(content).hexdigest().encode() + content[at + 64 :]
+    return b"".join([content[:at], hashlib.sha256(content).hexdigest().encode(), content[at + 64 :]])
 
 
 def is_sealed(content: bytes) -> bool | None:
@@ -83,5 +83,8 @@ def is_sealed(content: bytes) -> bool | None:
     if at < 0:
         return None
     at += len(_SEAL)
-    blank = content[:at] + b"0" * 64 + content[at + 64 :]
-    return hashlib.sha256(blank).hexdigest().encode() == content[at : at + 64]
+    view = memoryview(content)
+    digest = hashlib.sha256(view[:at])
+    digest.update(b"0" * 64)
+    digest.update(view[at + 64 :])
+    return digest.hexdigest().encode() == content[at : at + 64]

@@ -64,8 +64,8 @@ class Schema:
     """Seconds after which, with a precision, no more blocks are begun."""
     figures: str = "all"
     """Which to draw: all, main (the few that answer the question), or none."""
-    block_size: int = 250
-    """Trials per unit of work and of storage; changes no number."""
+    block_size: int | None = None
+    """Trials per unit of work; changes no number. 250 unless given, and up to 1000 of a hundred thousand trials."""
     readings: Any = None
     """A file of real readings, for `estimate`, or a list of files that are estimated together."""
     ignore_rows: Any = None
@@ -104,7 +104,7 @@ class Job:
     execution: Execution
     trials: int
     """Or the most there may be, where there is a precision."""
-    block_size: int
+    block_size: int | None
     output: str
     precision: Any = None
     time_limit: float | None = None

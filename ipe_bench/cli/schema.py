@@ -24,7 +24,7 @@ class _Limited:
     seed: Whole
     trials: Count | None
     time_limit: NonNegative | None
-    block_size: Count
+    block_size: Count | None
     write_readings_trial: Whole
     readings: str | tuple[str, ...] | None
 

@@ -113,4 +113,10 @@ def _installed() -> list[str]:
 
 
 def _digests(paths: Iterable[Path]) -> dict[str, str]:
-    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in paths if path.is_file()}
+    found = {}
+    for path in paths:
+        # Another command may be merging small files at this moment.
+        with contextlib.suppress(FileNotFoundError):
+            if path.is_file():
+                found[str(path)] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return found

@@ -11,6 +11,7 @@ import functools
 import json
 import os
 import stat
+from collections.abc import Collection as Keys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,10 +45,15 @@ class Outdated(Unusable):
     """It is whole, as far as can be told, and in the format of an older version."""
 
 
+class Gone(Unusable):
+    """It is not there any more: what it held may have been merged into a larger file."""
+
+
 def read_sealed(path: Path) -> bytes:
     """The content of a plain file, of which not one bit has changed since it was written.
 
     Raises:
+        Gone: there is no such file.
         Unusable: it is a link, a folder or a pipe, cannot be read, or has changed.
     """
     try:
@@ -55,6 +61,8 @@ def read_sealed(path: Path) -> bytes:
         if not stat.S_ISREG(os.lstat(path).st_mode):
             raise Unusable("damaged: is not a plain file")
         content = path.read_bytes()
+    except FileNotFoundError:
+        raise Gone("damaged: went away while it was read") from None
     except OSError as error:
         raise Unusable(f"damaged: cannot be read ({error.strerror or error})") from None
     sealed = is_sealed(content)
@@ -73,12 +81,14 @@ def _is_old(content: bytes) -> bool:
     return b'"schema":1,' in content or record
 
 
-def _read_table(path: Path) -> tuple[Mapping[str, Any], pa.Table]:
-    """The footer and the rows, which are without metadata, so that tables join."""
+def _read_table(path: Path, columns: Keys[str] | None = None) -> tuple[Mapping[str, Any], pa.Table]:
+    """The footer and the rows, which are without metadata, so that tables join; those of the `columns` that are there,
+    all where it is None."""
     try:
         with pq.ParquetFile(pa.BufferReader(read_sealed(path))) as file:
-            table = file.read(use_threads=False)
-        footer = _checked_footer((table.schema.metadata or {})[FOOTER])
+            names = None if columns is None else [n for n in file.schema_arrow.names if n in columns]
+            table = file.read(columns=names, use_threads=False)
+            footer = _checked_footer((file.schema_arrow.metadata or {})[FOOTER])
     except (pa.ArrowException, OSError, KeyError) as error:
         raise Unusable(f"foreign: is not a table of ipe-bench ({type(error).__name__})") from None
     for name, column in zip(table.column_names, table.columns, strict=True):
@@ -114,8 +124,13 @@ def _check_names(names: Mapping[str, Any]) -> None:
         float(names["error_scale"])
 
 
-def _check_rows(table: pa.Table, rules: Mapping[str, Rule], start: int | None = None) -> None:
+def _check_rows(
+    table: pa.Table, rules: Mapping[str, Rule], start: int | None = None, columns: Keys[str] | None = None
+) -> None:
+    """Raises Unusable where the rows are not as they must be; of the `columns` alone where only those were read."""
     rows: dict[str, Array] = {name: as_array(table[name]) for name in table.column_names}
+    if columns is not None:
+        rules = {name: rule for name, rule in rules.items() if name in columns}
     for fault in faults(rows, rules, start):
         raise Unusable(f"damaged: {fault}")
 
@@ -145,19 +160,22 @@ class Piece:
             raise Foreign("foreign: its name is not one of ipe-bench")
         return cls(path, parts[0], int(parts[1]), int(parts[2]))
 
-    def read(self) -> tuple[Mapping[str, Any], pa.Table]:
-        """Its footer and its rows.
+    def read(self, columns: Keys[str] | None = None) -> tuple[Mapping[str, Any], pa.Table]:
+        """Its footer and its rows: all bytes are held against the digest, and what is read against its rules.
+
+        Of the `columns`, those that are there are read; all of them where it is None.
 
         Raises:
+            Gone: there is no such file any more.
             Unusable: it is damaged, or not one of ours.
         """
-        footer, table = _read_table(self.path)
+        footer, table = _read_table(self.path, columns)
         if footer["key"] != self.key:
             raise Unusable(f"foreign: its content belongs to {footer['key']}")
         if table.num_rows != self.stop - self.start:
             raise Unusable(f"damaged: has {table.num_rows} of {self.stop - self.start} rows")
         truth = footer["names"]["estimator"] == TRUTH
-        _check_rows(table, trial_rules(_parameters(footer), truth=truth), self.start)
+        _check_rows(table, trial_rules(_parameters(footer), truth=truth), self.start, columns)
         return footer, table
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Collection as Keys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -24,13 +24,17 @@ import pyarrow as pa
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.columns import as_array
-from ipe_bench.runs.pieces import Failed, Foreign, Outdated, Piece, Run, Unusable, read_history
+from ipe_bench.runs.pieces import Failed, Foreign, Gone, Outdated, Piece, Run, Unusable, read_history
 from ipe_bench.runs.provenance import canonical_json
 from ipe_bench.runs.store import TRUTH, Store, describe_names, gaps, title
 from ipe_bench.runs.verified import Verified, signature
 
+CHUNK = 1 << 14
+"""Rows that are looked at together: few enough to stay in a processor's cache."""
 _KEPT_BYTES = 1 << 26
 """Rows that are kept in memory after they were read, so that no file is read twice where memory allows."""
+_FEW_TRIALS = 50_000
+"""A cell of so many is read whole and kept; of a larger one, only the columns that are asked for are read."""
 
 
 @dataclass(frozen=True)
@@ -151,8 +155,7 @@ class Results:
             results._read_directory(Store(path), keys)
         results.runs = tuple(sorted(results.runs, key=lambda r: (r.started, r.path.name)))
         for key, cell in results.stored.items():
-            ordered = sorted(cell.pieces, key=lambda p: (p.start, p.stop, str(p.path)))
-            results.stored[key] = replace(cell, pieces=tuple(ordered))
+            results.stored[key] = replace(cell, pieces=tuple(sorted(cell.pieces, key=_reading_order)))
         return results
 
     def _read_directory(self, store: Store, keys: Keys[str] | None) -> None:
@@ -160,17 +163,12 @@ class Results:
         trials, runs = self._files(store.trials, ".parquet", keys), self._files(store.runs, ".json")
         found: dict[str, list[Piece]] = {}
         footers: dict[str, Mapping[str, Any]] = {}
-        for path in trials:
-            with self.naming(path):
-                piece = Piece.parse(path)
-                footer = verified.footer(path, piece.key)
-                if footer is None:
-                    before = signature(path)
-                    footer, table = piece.read()
-                    self._keep(path, table)
-                    verified.note(path, before, footer)
-                found.setdefault(piece.key, []).append(piece)
-                footers[piece.key] = footer
+        listed: set[Path] = set()
+        while trials:
+            listed.update(trials)
+            gone = [path for path in trials if not self._read_piece(path, verified, found, footers)]
+            # What went away meanwhile was merged into larger files, which were not there yet when these were listed.
+            trials = [p for p in self._files(store.trials, ".parquet", keys) if p not in listed] if gone else []
         for path in self._files(store.histories, ".parquet", keys):
             if not verified.knows(path):
                 with self.naming(path):
@@ -190,9 +188,28 @@ class Results:
         for key, pieces in found.items():
             before_these = self.stored[key].pieces if key in self.stored else ()
             self.stored[key] = StoredCell(footers[key], (*before_these, *pieces))
-        if keys is None and not trials and not runs:
+        if keys is None and not listed and not runs:
             self.problem(f"{store.directory}: holds no results of ipe-bench")
         verified.save()
+
+    def _read_piece(
+        self, path: Path, verified: Verified, found: dict[str, list[Piece]], footers: dict[str, Mapping[str, Any]]
+    ) -> bool:
+        """Adds the piece to what is found, if it is whole; False where it is not there any more."""
+        with self.naming(path):
+            piece = Piece.parse(path)
+            footer = verified.footer(path, piece.key)
+            if footer is None:
+                before = signature(path)
+                try:
+                    footer, table = piece.read()
+                except Gone:
+                    return False
+                self._keep(path, table)
+                verified.note(path, before, footer)
+            found.setdefault(piece.key, []).append(piece)
+            footers[piece.key] = footer
+        return True
 
     def _files(self, folder: Path, suffix: str, keys: Keys[str] | None = None) -> list[Path]:
         """What lies in a folder under a name with that suffix; with `keys`, what belongs to their cells alone."""
@@ -361,34 +378,65 @@ class Results:
 
         A piece that cannot be used any more, or lacks one of the `columns`, is named in `problems`, and left out.
         """
-        names = None if columns is None else list(dict.fromkeys(["trial", *columns, *optional]))
-        tables = [table for piece in cell.pieces if (table := self._rows(piece, columns, names)) is not None]
-        if not tables:
-            return {name: np.empty(0) for name in names or ["trial"]}
-        table = pa.concat_tables(tables, promote_options="default")
-        tables.clear()
-        trial, order = np.unique(as_array(table["trial"]), return_index=True)
-        whole = len(order) == table.num_rows and np.array_equal(order, np.arange(len(order)))
-        result = {}
-        for name in list(table.column_names):
-            values = as_array(table[name])
-            result[name] = values if whole else values[order]
-            # Each column is copied where there are several pieces: the first copy need not outlive the second.
-            table = table.drop_columns([name])
-        pa.default_memory_pool().release_unused()
-        return result | {"trial": trial}
+        parts = list(self._parts(cell, columns, optional))
+        if not parts:
+            return {name: np.empty(0) for name in ("trial", *(columns or ()), *optional)}
+        return _joined(parts)
 
-    def _rows(self, piece: Piece, columns: Sequence[str] | None, names: Sequence[str] | None) -> pa.Table | None:
+    def chunks(
+        self, cell: StoredCell, columns: Sequence[str], optional: Sequence[str] = (), rows: int = CHUNK
+    ) -> Iterator[dict[str, Array]]:
+        """The same some rows at a time, however they are cut into files: each chunk but the last has that many."""
+        held: list[dict[str, Array]] = []
+        count = 0
+        for part in self._parts(cell, columns, optional):
+            held.append(part)
+            count += len(part["trial"])
+            if count >= rows:
+                whole, cut = _joined(held), count - count % rows
+                for at in range(0, cut, rows):
+                    yield {name: values[at : at + rows] for name, values in whole.items()}
+                held = [{name: values[cut:] for name, values in whole.items()}]
+                count -= cut
+        if count:
+            yield _joined(held)
+
+    def _parts(
+        self, cell: StoredCell, columns: Sequence[str] | None, optional: Sequence[str] = ()
+    ) -> Iterator[dict[str, Array]]:
+        """The rows of one piece after another, without the trials that an earlier one had."""
+        names = None if columns is None else dict.fromkeys(["trial", *columns, *optional])
+        whole = names is None or cell.trials <= _FEW_TRIALS
+        waiting, known, reached = deque(cell.pieces), {piece.path for piece in cell.pieces}, 0
+        while waiting:
+            piece = waiting.popleft()
+            if piece.stop <= reached:
+                continue
+            with self.naming(piece.path):
+                try:
+                    table = self._rows(piece, columns, None if whole else names)
+                except Gone:
+                    merged = [p for p in _pieces_beside(piece) if p.path not in known]
+                    if not merged:
+                        raise
+                    known.update(p.path for p in merged)
+                    waiting = deque(sorted([*waiting, *merged], key=_reading_order))
+                    continue
+                skipped = max(0, reached - piece.start)
+                reached = piece.stop
+                shown = table.column_names if names is None else [n for n in names if n in table.column_names]
+                yield {name: as_array(table[name])[skipped:] for name in shown}
+
+    def _rows(self, piece: Piece, columns: Sequence[str] | None, names: Keys[str] | None) -> pa.Table:
         """The columns `names` of a piece that are there, all where it is None; it must have the `columns`."""
-        with self.naming(piece.path):
-            table = self._kept.get(piece.path)
-            if table is None:
-                table = piece.read()[1]
+        table = self._kept.get(piece.path)
+        if table is None:
+            table = piece.read(names)[1]
+            if names is None:
                 self._keep(piece.path, table)
-            if lacking := [name for name in columns or () if name not in table.column_names]:
-                raise Unusable(f"damaged: has no column {lacking[0]}")
-            return table if names is None else table.select([name for name in names if name in table.column_names])
-        return None
+        if lacking := [name for name in columns or () if name not in table.column_names]:
+            raise Unusable(f"damaged: has no column {lacking[0]}")
+        return table
 
     def _keep(self, path: Path, table: pa.Table) -> None:
         self._kept[path] = table
@@ -406,6 +454,38 @@ class Results:
                 table = self._kept[path] if path in self._kept else read_history(path)[1]
                 return {name: as_array(table[name]) for name in ("trial", *columns)}
         return None
+
+
+def _reading_order(piece: Piece) -> tuple[int, int, str]:
+    """Of two that begin with the same trial, the longer one first: what lies within it need not be read."""
+    return piece.start, -piece.stop, str(piece.path)
+
+
+def _pieces_beside(gone: Piece) -> list[Piece]:
+    """The pieces of the same cell in its folder that hold some of its trials."""
+    found = [Piece.parse(path) for path in gone.path.parent.glob(f"{gone.key}-*-*.parquet")]
+    return [piece for piece in found if piece.start < gone.stop and piece.stop > gone.start]
+
+
+def _joined(parts: list[dict[str, Array]]) -> dict[str, Array]:
+    """Rows one after another; where some lack a column, it is NaN or None there. The parts are used up."""
+    if len(parts) == 1:
+        return parts[0]
+    lengths = [len(part["trial"]) for part in parts]
+    names = list(dict.fromkeys(name for part in parts for name in part))
+    return {
+        # Each column is copied: the first copy need not outlive the second.
+        name: _concatenated([part.pop(name, None) for part in parts], lengths)
+        for name in names
+    }
+
+
+def _concatenated(columns: Sequence[Array | None], lengths: Sequence[int]) -> Array:
+    kinds = {column.dtype.kind for column in columns if column is not None}
+    nothing = np.nan if kinds <= set("fiu") else None
+    return np.concatenate(
+        [np.full(n, nothing) if column is None else column for column, n in zip(columns, lengths, strict=True)]
+    )
 
 
 def _names_aside(path: Path) -> Iterator[Path]:

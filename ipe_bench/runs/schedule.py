@@ -32,6 +32,8 @@ from ipe_bench.trials.scoring import HISTORIES, Block
 
 log = logging.getLogger(__name__)
 
+BLOCK_SIZE = 250
+"""Trials: at the least, where nobody says how many."""
 TRIES = 2
 """How often a cell of a block may take its process with it before it counts as failed."""
 
@@ -82,8 +84,21 @@ class Progress:
 Watcher = Callable[[Progress], None]
 
 
-def plan(directory: Path, cells: Sequence[Cell], results: Results, trials: int, block_size: int) -> list[Task]:
+LARGEST_BLOCK = 1000
+"""Of more trials at once, the arrays leave a processor's cache: each trial takes longer again."""
+_WORTH_BLOCKS = 100
+
+
+def block_size_for(trials: int) -> int:
+    """What is computed at once where nobody says: 250 trials, and more where there still are a hundred blocks."""
+    return min(max(trials // _WORTH_BLOCKS // BLOCK_SIZE, 1) * BLOCK_SIZE, LARGEST_BLOCK)
+
+
+def plan(
+    directory: Path, cells: Sequence[Cell], results: Results, trials: int, block_size: int | None = None
+) -> list[Task]:
     """Blocks on a fixed grid, each with the cells of one scenario that lack some of its trials."""
+    block_size = block_size_for(trials) if block_size is None else block_size
     lacking: dict[tuple[int, int], list[Cell]] = {}
     for cell in cells:
         for start, stop in results.missing(cell.key, trials):
@@ -98,14 +113,14 @@ def perform(task: Task) -> Iterator[Done | str]:
 
     An exception in one cell fails that cell alone.
     """
-    store = Store(task.directory)
-    _check_source(task.cells)
+    store, cells = Store(task.directory), _recalled(task)
+    _check_source(cells)
     with _alone(), contained():
-        block = Block.draw(task.cells[0].scenario, task.start, task.stop)
+        block = Block.draw(cells[0].scenario, task.start, task.stop)
         # What all cells share, and the loading of compiled code, is not to be charged to the first of them.
         _ = block.crlb_information
     yield PREPARED
-    for index, cell in enumerate(task.cells):
+    for index, cell in enumerate(cells):
         began = time.perf_counter()
         failure = None
         try:
@@ -118,6 +133,21 @@ def perform(task: Task) -> Iterator[Done | str]:
                 raise  # a user's Ctrl-C; where it is ignored, in worker processes, there can be none
             failure = Failure.of(error)
         yield Done(index, time.perf_counter() - began, failure)
+
+
+_recent: dict[str, Cell] = {}
+_MOST_RECENT = 64
+
+
+def _recalled(task: Task) -> tuple[Cell, ...]:
+    """The cells of a task as this process had them before, with all that they have worked out meanwhile: to trace a
+    model and to describe what is constructed takes as long as some ten trials. Those of this package alone: what code
+    of others leaves in an object stays in its block."""
+    if not task.trusted:
+        return task.cells
+    if len(_recent) > _MOST_RECENT:
+        _recent.clear()
+    return tuple(_recent.setdefault(cell.key, cell) for cell in task.cells)
 
 
 def _alone() -> Any:
@@ -198,6 +228,7 @@ class Ledger:
         self.watch = watch
         self.total = sum(_weight(task, cell) for task in tasks for cell in task.cells)
         self.left = Counter((id(cell.scenario), task.start, task.stop) for task in tasks for cell in task.cells)
+        self.done = 0
         self.trials = 0
         self.failures: list[str] = []
         self.tell()
@@ -205,6 +236,7 @@ class Ledger:
     def close(self, task: Task, cell: Cell, failure: Failure | None, seconds: float | None = None) -> None:
         """Notes that a cell of a task is stored, or has failed for good."""
         self.left[id(cell.scenario), task.start, task.stop] -= 1
+        self.done += self.left[id(cell.scenario), task.start, task.stop] == 0
         self.trials += _weight(task, cell)
         what = f"{describe_names(cell.names)}, trials {task.start} to {task.stop}"
         if failure is None:
@@ -216,8 +248,7 @@ class Ledger:
         self.tell()
 
     def tell(self) -> None:
-        done = sum(left == 0 for left in self.left.values())
-        self.watch(Progress(done, len(self.left), self.trials, self.total, tuple(self.failures)))
+        self.watch(Progress(self.done, len(self.left), self.trials, self.total, tuple(self.failures)))
 
 
 def work_through(

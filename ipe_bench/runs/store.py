@@ -2,7 +2,8 @@
 
 A file's name is a digest of the constructed objects and of the numerical source; how many trials there are
 and how they were cut into blocks is not part of it, so the results of one key are a union of ranges. A file appears
-under its name complete or not at all. Reading is left to `runs.results`.
+under its name complete or not at all. Reading is left to `runs.results`, to make few files of many to
+`runs.compaction`.
 """
 
 from __future__ import annotations
@@ -243,8 +244,12 @@ def encode(columns: Mapping[str, Array], footer: Mapping[str, Any]) -> bytes:
     """A Parquet file with these columns and this footer, and the digest of all of it."""
     metadata = {FOOTER: canonical_json(footer).encode(), b"seal": BLANK_SEAL.encode()}
     table = pa.Table.from_arrays([_arrow(v) for v in columns.values()], names=list(columns), metadata=metadata)
+    # Texts are few different ones, numbers are all different and alike in their first bytes.
+    texts = [field.name for field in table.schema if pa.types.is_string(field.type)]
+    floats = [field.name for field in table.schema if pa.types.is_floating(field.type)]
+    how: dict[str, Any] = {"compression": "lz4", "use_dictionary": texts, "use_byte_stream_split": floats}
     buffer = pa.BufferOutputStream()
-    pq.write_table(table, buffer, compression="zstd")
+    pq.write_table(table, buffer, write_statistics=False, **how)
     return seal(buffer.getvalue().to_pybytes())
 
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.statistics.attained import attained_table
 from ipe_bench.statistics.calibration import POINTS, shared_level
@@ -25,7 +24,7 @@ from ipe_bench.statistics.comparisons import (
     rank_over_replicates,
 )
 from ipe_bench.statistics.histories import History, trial_label
-from ipe_bench.statistics.intervals import quantile, quantiles, rms_interval
+from ipe_bench.statistics.intervals import quantile, quantiles
 from ipe_bench.statistics.portfolio import pooled, portfolio_row
 from ipe_bench.statistics.profiles import Profiles
 from ipe_bench.statistics.records import SCORES, capped_error, gate_radius, rows_of
@@ -220,8 +219,8 @@ def _add_scenario(rows: _Rows, collection: Collection, number: int, groups: Sequ
         scores.append(where | rows_of(SCORES, sample)[-1])
         outcomes[group.estimator] = outcome = outcomes_of(sample)
         rows.replicates += [
-            (number, int(seed), group.estimator, capped_error(sample, sample.ids[:, 0] == seed))
-            for seed in np.unique(sample.ids[:, 0])
+            (number, int(seed), group.estimator, capped_error(sample, sample.seeds == seed))
+            for seed in np.unique(sample.seeds)
         ]
         rows.distributions.append(_distribution(where, outcome))
         rows.correlations.append(_correlation_rows(where, sample))
@@ -297,26 +296,24 @@ def numbered(group: Group, number: int) -> dict[str, Any]:
 
 def outcomes_of(sample: Sample) -> Outcomes:
     """What comparisons and profiles need of a sample, by ascending seed and trial."""
-    order = np.argsort(sample.number, kind="stable")
     success = sample.distance <= gate_radius(sample.n)
     values = (sample.number, sample.distance, success, sample.cost)
+    if np.all(sample.number[1:] > sample.number[:-1]):
+        return Outcomes(*values)
+    order = np.argsort(sample.number, kind="stable")
     return Outcomes(*(v[order] for v in values))
 
 
 def _group_rows(sample: Sample) -> list[dict[str, Any]]:
     """Per group of parameters, in the order of the parameters; the group's bound is one in these units."""
-    members: dict[str, list[int]] = {}
-    for i, parameter in enumerate(sample.parameters):
-        members.setdefault(parameter.get("group") or parameter["name"], []).append(i)
-    rows = []
-    solved = sample.solved
-    squares = np.where(solved[:, None], sample.normalised, 0.0) ** 2
-    means = np.stack([squares[:, which].mean(axis=1) for which in members.values()], axis=1)
-    lows, highs = rms_interval(means, solved)
-    for i, name in enumerate(members):
-        rmse = float(np.sqrt(means[solved, i].mean())) if solved.any() else np.nan
-        rows.append(head(sample.group) | {"group": name, "rmse": rmse, "low": lows[i], "high": highs[i]})
-    return rows
+    sums, first = sample.sums, sample.n + 1
+    totals = sums.binned.sums.sum(axis=0)[first:]
+    rmse = np.sqrt(totals / sums.mse.count) if sums.mse.count else np.full(len(totals), np.nan)
+    low, high = (ends[first:] for ends in sample.rmse_limits)
+    return [
+        head(sample.group) | {"group": name, "rmse": float(rmse[i]), "low": low[i], "high": high[i]}
+        for i, name in enumerate(sample.members)
+    ]
 
 
 _CONTRACTION = ("contraction_K", "contraction_norm", "contraction_radius")
@@ -344,7 +341,7 @@ def _ending_rows(sample: Sample) -> list[dict[str, Any]]:
         message = "" if messages is None or messages[i] is None else str(messages[i])
         ending = (str(sample.scalars["status"][i]), message)
         counts[ending] += 1
-        first.setdefault(ending, trial_label(*sample.ids[i]))
+        first.setdefault(ending, trial_label(*sample.id_of(int(i))))
     shown = counts.most_common(MESSAGES)
     rest = sum(counts.values()) - sum(count for _, count in shown)
     result = [
@@ -383,22 +380,8 @@ def _calibration_rows(where: dict[str, Any], sample: Sample) -> Iterator[dict[st
 def _correlation_rows(where: dict[str, Any], sample: Sample) -> dict[str, Any]:
     names = [str(p["name"]) for p in sample.parameters]
     n = len(names)
-    values = _correlation(sample).ravel()
+    values = sample.sums.correlation.ravel()
     return where | {"row": np.repeat(names, n), "column": np.tile(names, n), "value": values}
-
-
-def _correlation(sample: Sample) -> Array:
-    """(n, n); NaN where an error does not vary or there are too few trials."""
-    used = sample.error[sample.solved]
-    n = sample.error.shape[1]
-    if len(used) < 3:
-        return np.full((n, n), np.nan)
-    # Errors over their bounds first: parameters may differ by many orders of magnitude.
-    centred = (used - used.mean(axis=0)) / sample.linear_bound
-    covariance = centred.T @ centred
-    deviation = np.sqrt(np.diag(covariance))
-    with np.errstate(all="ignore"):
-        return covariance / np.outer(deviation, deviation)
 
 
 def _convergence_rows(where: dict[str, Any], history: History) -> dict[str, Any]:

@@ -6,7 +6,8 @@ stands for the limit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -31,6 +32,8 @@ class History:
     """(iterates,) from the last iterate, in deviations of the bound."""
     cost: float
     """Of the whole trial."""
+    truth: Mapping[str, float] = field(default_factory=dict)
+    """What the paper's theorems ask of the model at the truth, by its column; NaN where it is not stored."""
 
     @property
     def cost_to_limit(self) -> float:

@@ -7,6 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from ipe_bench.basics.linalg import Array
+from ipe_bench.statistics.running import Bins
 from ipe_bench.trials.thresholds import FEW
 
 LEVEL = 0.95
@@ -27,13 +28,18 @@ def rms_interval(squares: Array, used: Array, level: float = LEVEL) -> tuple[Arr
     `LARGEST_SAMPLE` trials, groups of consecutive ones are drawn, which is as good since trials are independent.
     """
     trials, k = squares.shape
-    if used.sum() < FEW:
-        return np.full(k, np.nan), np.full(k, np.nan)
-    sums = np.where(used[:, None], squares, 0.0)
-    counts = used.astype(float)[:, None]
-    if trials > LARGEST_SAMPLE:
-        edges = np.linspace(0, trials, LARGEST_SAMPLE, endpoint=False).astype(int)
-        sums, counts = np.add.reduceat(sums, edges), np.add.reduceat(counts, edges)
+    sums, counts = Bins(k, trials, LARGEST_SAMPLE), Bins(1, trials, LARGEST_SAMPLE)
+    if trials:
+        sums.add(np.where(used[:, None], squares, 0.0).T)
+        counts.add(used.astype(float)[None])
+    return rms_interval_of(sums.sums, counts.sums, level)
+
+
+def rms_interval_of(sums: Array, counts: Array, level: float = LEVEL) -> tuple[Array, Array]:
+    """The same from sums of squares (groups, k) of groups of trials in succession, and how many were used (groups, 1)
+    in each; see `rms_interval`."""
+    if counts.sum() < FEW:
+        return np.full(sums.shape[1], np.nan), np.full(sums.shape[1], np.nan)
     with np.errstate(all="ignore"):
         # A sum of squares beside its own size: errors may be anything from 1e-200 to 1e200.
         size = sums.max(axis=0)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 import numpy as np
-from scipy.special import chdtri, gammaincinv, ndtri
+from scipy.special import chdtri, gammaincinv
 
 from ipe_bench.basics.containment import contained
 from ipe_bench.basics.errors import UserError, place_of
@@ -20,9 +20,9 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.calibration import overall_p, overall_words, shared_level
 from ipe_bench.statistics.consistency import clopper_pearson, mean_limits, verdict
 from ipe_bench.statistics.histories import CLOSE, FixedPointBound, fixed_point_bound, observed_constant, orders_of
-from ipe_bench.statistics.intervals import LARGEST_SAMPLE, RESAMPLES, quantile, quantiles
-from ipe_bench.statistics.sample import AMBIGUOUS, FIT, NIS, Sample, root_mean
-from ipe_bench.statistics.sequences import rms_sequence, share_sequence
+from ipe_bench.statistics.intervals import LARGEST_SAMPLE, RESAMPLES, quantile
+from ipe_bench.statistics.sample import AMBIGUOUS, FIT, NIS, QUANTILES, Sample
+from ipe_bench.statistics.sequences import rms_sequence_of, share_sequence
 from ipe_bench.trials.thresholds import EXPECTED, FEW, FIT_LEVEL, GATE, SAME_ROOT
 
 Kind = Literal["count", "share", "number", "physical", "seconds", "probability", "word"]
@@ -119,14 +119,13 @@ def _success_sequence(s: Sample) -> Limits:
 
 
 def _rmse_sequence(s: Sample) -> Limits:
-    together = np.mean(s.normalised[s.solved] ** 2, axis=1)
-    low, high = rms_sequence(together[:, None])
-    return float(low[0]), float(high[0])
+    low, high = rms_sequence_of(s.sums.squares)
+    return float(low[-1]), float(high[-1])
 
 
 def _rmse_sequence_each(s: Sample) -> Limits:
-    low, high = rms_sequence(s.error[s.solved] ** 2)
-    return low * s.sizes, high * s.sizes
+    low, high = rms_sequence_of(s.sums.squares)
+    return low[:-1] * s.sizes, high[:-1] * s.sizes
 
 
 def _misfit(s: Sample) -> float:
@@ -150,47 +149,42 @@ def _failures_flagged(s: Sample) -> float:
 
 
 def _bias(s: Sample) -> Array:
-    return s.error[s.solved].mean(axis=0) if s.solved.any() else np.full(s.n, np.nan)
+    return s.sums.bias.value
 
 
 def _std(s: Sample) -> Array:
-    return s.error[s.solved].std(axis=0, ddof=1) if s.solved.sum() > 1 else np.full(s.n, np.nan)
+    return s.sums.std
 
 
 def _rmse_common(s: Sample) -> Array:
-    return root_mean(s.error, s.solved & s.solved_by_all)
+    return s.sums.mse_common.root
 
 
 def _crlb(s: Sample) -> Array:
-    return root_mean(s.crlb, s.solved)
+    return s.sums.crlb.root
 
 
 def _bayes(s: Sample) -> Array:
-    return root_mean(s.bayes, s.solved)
+    return s.sums.bayes.root
 
 
 def _van_trees(s: Sample) -> Array:
-    return root_mean(s.van_trees, ~np.isnan(s.van_trees[:, 0]))
+    return s.sums.van_trees.root
 
 
 def _applying_bound(s: Sample) -> Array:
-    return root_mean(s.bound, s.solved)
+    return s.sums.bayes.root if s.bound_kind == "bayes" else s.sums.crlb.root
 
 
 def _reported(s: Sample) -> Array:
-    return root_mean(s.deviation, s.solved & np.isfinite(s.deviation).all(axis=1))
+    return s.sums.reported.root
 
 
 def _eq_14(s: Sample) -> Array:
     """Eq. (14): eq. (5) plus the mean square of H+ dN, which at a root of eq. (11) is the error less H+ v."""
     if s.group.footer.get("equation") != "frozen":
         return np.full(s.n, np.nan)
-    compensation = root_mean(s.error - s.linear_error, s.solved)
-    return np.sqrt(s.linear_bound**2 + compensation**2)
-
-
-def _known(values: Array) -> Array:
-    return values[np.isfinite(values)]
+    return np.sqrt(s.linear_bound**2 + s.sums.compensation.value)
 
 
 def _rms(values: Array) -> float:
@@ -203,18 +197,12 @@ def _predicted(s: Sample) -> tuple[Array, Array]:
     Where readings come from another model, from each trial's pseudo-true parameters and the scatter about them; where
     they do not, from the Cramér-Rao bound and Box's bias.
     """
-    nothing = np.full(s.n, np.nan)
     if s.group.footer.get("equation") != "least_squares":
-        return nothing, nothing
-    wrong, scatter, box = (s.theory[kind] for kind in ("pseudo_bias", "misspecified", "box_bias"))
-    used = s.solved & np.isfinite(wrong).all(axis=1) & np.isfinite(scatter).all(axis=1)
+        return np.full(s.n, np.nan), np.full(s.n, np.nan)
     if s.group.footer["identity"]["scenario"].get("truth") is not None:
-        if not used.any():
-            return nothing, nothing
-        return wrong[used].mean(axis=0), np.sqrt(np.mean(wrong[used] ** 2 + scatter[used] ** 2, axis=0))
-    known = np.asarray(np.isfinite(box).all(axis=1))
-    bias = box[known].mean(axis=0) if known.any() else nothing
-    return bias, np.sqrt(_crlb(s) ** 2 + (root_mean(box, known) ** 2 if known.any() else 0.0))
+        return s.sums.wrong.value, s.sums.wrong_mse.root
+    box = s.sums.box_square
+    return s.sums.box.value, np.sqrt(s.sums.crlb.value + (box.value if box.count else 0.0))
 
 
 def _predicted_bias(s: Sample) -> Array:
@@ -246,12 +234,12 @@ def _rmse(s: Sample) -> Array:
 
 def _rmse_limits(s: Sample) -> Limits:
     low, high = s.rmse_limits
-    return float(low[-1]), float(high[-1])
+    return float(low[s.n]), float(high[s.n])
 
 
 def _rmse_limits_each(s: Sample) -> Limits:
     low, high = s.rmse_limits
-    return low[:-1] * s.sizes, high[:-1] * s.sizes
+    return low[: s.n] * s.sizes, high[: s.n] * s.sizes
 
 
 def _efficiency(s: Sample) -> float:
@@ -270,12 +258,11 @@ def _efficiency_limits_each(s: Sample) -> Limits:
 
 
 def _rmse_all(s: Sample) -> Array:
-    with np.errstate(over="ignore"):
-        return np.sqrt(np.mean(np.where(np.isfinite(s.error), s.error, np.inf) ** 2, axis=0))
+    return s.sums.mse_all.root
 
 
 def _bound_all(s: Sample) -> Array:
-    return np.sqrt(np.mean(s.bound**2, axis=0))
+    return (s.sums.bayes_all if s.bound_kind == "bayes" else s.sums.crlb_all).root
 
 
 def _efficiency_each(s: Sample) -> Array:
@@ -284,10 +271,10 @@ def _efficiency_each(s: Sample) -> Array:
 
 def _error_quantile(q: float) -> tuple[Callable[[Sample], float], Callable[[Sample], Array]]:
     def overall(s: Sample) -> float:
-        return quantile(np.sqrt(np.mean(s.normalised**2, axis=1)), q)
+        return quantile(s.sums.together, q)
 
     def each(s: Sample) -> Array:
-        return np.array([quantiles(np.abs(column), np.array([q]))[0] for column in s.error.T]) * s.sizes
+        return s.error_quantiles[QUANTILES.index(q)] * s.sizes
 
     return overall, each
 
@@ -300,12 +287,7 @@ def _nees(s: Sample) -> float:
 def _nees_each(s: Sample) -> Array:
     if not (s.reports_covariance and s.solved.any()):
         return np.full(s.n, np.nan)
-    return np.mean(_errors_over_reported(s)[s.solved] ** 2, axis=0)
-
-
-def _errors_over_reported(s: Sample) -> Array:
-    with np.errstate(all="ignore"):
-        return np.abs(s.error) / s.deviation
+    return s.sums.nees.value
 
 
 def _nees_limits(s: Sample) -> Limits:
@@ -324,7 +306,7 @@ def _coverage(s: Sample) -> float:
 def _coverage_each(s: Sample) -> Array:
     if not s.reports_covariance:
         return np.full(s.n, np.nan)
-    return (_errors_over_reported(s) <= -ndtri(0.025)).mean(axis=0)
+    return s.sums.covered.value
 
 
 def _claims(s: Sample) -> int:
@@ -379,7 +361,7 @@ def _fixed_point_bounds(s: Sample) -> list[FixedPointBound]:
     """Eq. (18) for each stored history of fixed-point iteration whose K at the truth is below 1."""
     if not _is(s, "FixedPoint"):
         return []
-    return [fixed_point_bound(h.iterates, float(K)) for h in s.histories if (K := s.truth["contraction_K"][h.row]) < 1]
+    return [fixed_point_bound(h.iterates, K) for h in s.histories if (K := h.truth["contraction_K"]) < 1]
 
 
 def _constants(s: Sample) -> Array:
@@ -387,7 +369,7 @@ def _constants(s: Sample) -> Array:
     without those that are over too soon to tell."""
     if not _is(s, "Newton"):
         return np.empty((0, 2))
-    pairs = [(observed_constant(h.iterates), float(s.truth["curvature_M"][h.row])) for h in s.histories]
+    pairs = [(observed_constant(h.iterates), h.truth["curvature_M"]) for h in s.histories]
     return np.array([pair for pair in pairs if np.isfinite(pair).all()]).reshape(-1, 2)
 
 
@@ -628,7 +610,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "the first trials",
         "Median relative curvature of the surface of readings at the truth, within the 95 % region of the bound (Bates"
         " and Watts, J. R. Stat. Soc. B 42, 1980): linear theory holds well below 0.3.",
-        lambda s: quantile(_known(s.truth["curvature_intrinsic"]), 0.5),
+        lambda s: quantile(s.sums.known_curvature("curvature_intrinsic"), 0.5),
         where=("theory",),
     ),
     Statistic(
@@ -636,7 +618,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "parameter curvature",
         "the first trials",
         "The same of the parameters' lines on that surface: how uneven they are.",
-        lambda s: quantile(_known(s.truth["curvature_parameter"]), 0.5),
+        lambda s: quantile(s.sums.known_curvature("curvature_parameter"), 0.5),
         where=("theory",),
     ),
     Statistic(

@@ -16,6 +16,7 @@ from scipy.special import betaln
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
+from ipe_bench.statistics.running import Squares
 from ipe_bench.trials.thresholds import FEW
 
 if TYPE_CHECKING:
@@ -74,14 +75,18 @@ def mean_sequence(deviation: Array, count: int, level: float = LEVEL) -> Array:
 
 def rms_sequence(squares: Array, level: float = LEVEL) -> tuple[Array, Array]:
     """Root mean square (k,) of squares (trials, k): the sequence of the logarithm of their mean; NaN below `FEW`."""
-    count = len(squares)
-    if count < FEW:
-        return np.full(squares.shape[1], np.nan), np.full(squares.shape[1], np.nan)
+    running = Squares(squares.shape[1])
+    running.add(squares.T)
+    return rms_sequence_of(running, level)
+
+
+def rms_sequence_of(squares: Squares, level: float = LEVEL) -> tuple[Array, Array]:
+    """The same from running sums of them; see `rms_sequence`."""
+    size, mean = squares.size, squares.mean
+    if squares.count < FEW:
+        return np.full(len(size), np.nan), np.full(len(size), np.nan)
     with np.errstate(all="ignore"):
-        size = squares.max(axis=0)
-        scaled = np.where(size > 0, squares / size, 0.0)
-        mean, deviation = scaled.mean(axis=0), scaled.std(axis=0, ddof=1)
-        reach = mean_sequence(deviation / mean, count, level) / 2
+        reach = mean_sequence(squares.deviation / mean, squares.count, level) / 2
         root = np.sqrt(size * mean)
         return np.where(size > 0, root * np.exp(-reach), 0.0), np.where(size > 0, root * np.exp(reach), 0.0)
 
@@ -127,9 +132,8 @@ class Precision:
             share = float(sample.scalars["success"].mean())
             found.append(Reach(sample.group.estimator, "success", max(high - share, share - low), self.success))
         if self.rmse is not None:
-            together = np.mean(sample.normalised[sample.solved] ** 2, axis=1)[:, None]
-            low, high = rms_sequence(together)
-            half = float(np.sqrt(high[0] / low[0])) - 1 if low[0] > 0 else np.inf
+            low, high = (float(end[-1]) for end in rms_sequence_of(sample.sums.squares))
+            half = float(np.sqrt(high / low)) - 1 if low > 0 else np.inf
             found.append(Reach(sample.group.estimator, "rmse", half if np.isfinite(half) else np.inf, self.rmse))
         return found
 

@@ -251,7 +251,25 @@ def _timed(command: list[str], environment: dict[str, str]) -> tuple[float, floa
     return wall, cpu, table or wall
 
 
+def scale() -> Iterator[Row]:
+    """Many trials with their report, beside a tenth of them; not among the parts unless it is asked for."""
+    from scale import TRIALS, WORKERS, measured
+
+    few, many = measured(TRIALS // 10), measured(TRIALS)
+    what, tenth = f"{TRIALS:,} trials, two estimators", f"{few.trials:,} trials"
+    for name, a, b in (("run with report", many.run, few.run), ("report alone", many.report, few.report)):
+        yield Row("scale", f"{what}: {name}", a.wall_s, "s wall", tenth, b.wall_s)
+        yield Row("scale", f"{what}: {name}", a.cpu_s, "s CPU", tenth, b.cpu_s)
+        yield Row("scale", f"{what}: {name}, its own peak", a.own_mb, "MB", tenth, b.own_mb)
+    yield Row("scale", f"{what}: largest of {WORKERS} workers", many.run.others_mb, "MB", tenth, few.run.others_mb)
+    yield Row("scale", f"{what}: all processes at once", many.run.together_mb, "MB", tenth, few.run.together_mb)
+    yield Row("scale", f"{what}: on disk", many.bytes_stored / 1e6, "MB", tenth, few.bytes_stored / 1e6)
+    yield Row("scale", f"{what}: on disk", many.files, "files", tenth, few.files)
+
+
 PARTS = {f.__name__: f for f in (simulation, jacobians, estimation, filters, loop)}
+LONG = {"scale": scale}
+"""Takes minutes: only where it is asked for."""
 
 
 def machine() -> dict[str, Any]:
@@ -287,7 +305,7 @@ def main(folder: Path, parts: list[str]) -> None:
     peers.one_thread()
     facts, rows = machine(), []
     for part in parts or list(PARTS):
-        for row in PARTS[part]():
+        for row in (PARTS | LONG)[part]():
             rows.append(row)
             print(f"{row.part:11s} {row.what:52s} {row.value:9.3g} {row.unit:7s} x{row.ratio:<8.3g} {row.beside}")
     folder.mkdir(parents=True, exist_ok=True)

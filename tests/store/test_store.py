@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -17,9 +18,11 @@ from small_models import Bent
 from ipe_bench import Scenario, run
 from ipe_bench.api import compute
 from ipe_bench.baselines import LinearLSE
+from ipe_bench.measurements import Polynomial
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.runs.results import Results
+from ipe_bench.runs.schedule import Task, _recalled, block_size_for
 from ipe_bench.runs.store import Cell, Store
 from ipe_bench.solvers import FixedPoint, Newton
 
@@ -75,6 +78,21 @@ def test_trials_are_the_same_bits_for_any_block_size(tmp_path, block_size):
     whole, cut = (rows(Store(tmp_path / name), cell) for name in ("whole", "cut"))
     for name in whole:
         np.testing.assert_array_equal(whole[name], cut[name])
+
+
+def test_blocks_grow_with_the_number_of_trials_while_there_are_a_hundred():
+    sizes = [block_size_for(trials) for trials in (0, 1, 1000, 49_999, 50_000, 75_000, 100_000, 10**7)]
+    assert sizes == [250, 250, 250, 250, 500, 750, 1000, 1000]
+
+
+def test_a_process_keeps_what_it_found_out_of_our_models_and_of_no_others(tmp_path):
+    """Tasks come as copies; what one of them has traced serves the next, but code of others may have left its marks."""
+    ours = Scenario(Polynomial(), Gaussian(0.1), GaussianPrior(), 1.0)
+    for chosen, kept in ((ours, True), (scenario(), False)):
+        task = Task(tmp_path, (Cell(chosen), Cell(chosen, "newton", Newton())), 0, 10)
+        first, second = (_recalled(pickle.loads(pickle.dumps(task))) for _ in range(2))
+        assert [a is b for a, b in zip(first, second, strict=True)] == [kept, kept]
+        assert [cell.key for cell in second] == [cell.key for cell in task.cells]
 
 
 def test_the_key_follows_every_constant(tmp_path):
