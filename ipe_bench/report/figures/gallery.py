@@ -27,7 +27,7 @@ from ipe_bench.plugins.extensions import code_digest
 from ipe_bench.report.choice import Which
 from ipe_bench.report.figures.drawing import FORMATS, Drawing, Figure
 from ipe_bench.report.figures.views import View, views
-from ipe_bench.report.style import house_style
+from ipe_bench.report.style import house_style, report_style
 from ipe_bench.statistics.analysis import Analysis
 
 INDEX = "index.json"
@@ -188,9 +188,10 @@ def draw_task(task: Task, folder: Path, formats: Sequence[str]) -> list[Entry] |
     """Draws a task's figures into the folder; returns why it could not, where they are a plugin's."""
     from ipe_bench.report import extensions
 
-    with house_style():
-        if not task.plugin:
+    if not task.plugin:
+        with report_style():
             return [_saved(drawing, folder, formats) for drawing in _figure(task.figure).draw(task.view)]
+    with house_style():
         try:
             drawings = extensions.drawings(_figure(task.figure), task.view)
             return extensions.guarded(lambda: [_saved(drawing, folder, formats) for drawing in drawings])
