@@ -70,4 +70,4 @@ def _two_figures(value: float) -> str:
     return f"{value:.1f}".replace("-0.0", "0.0").replace("-", "\N{MINUS SIGN}")
 
 
-FIGURE = Figure(draw, ("summary", "scores", "correlations"))
+FIGURE = Figure(draw, ("summary", "scores", "correlations"), weight=4.0)

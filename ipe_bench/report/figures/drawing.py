@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ipe_bench.basics.files import write_atomically
+from ipe_bench.basics.files import write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -35,7 +35,9 @@ class Figure:
     together: bool = False
     """Drawn once of all settings, not once of each."""
     main: bool = False
-    """Belongs to the few that answer the question; see `draw_all`."""
+    """Belongs to the few that answer the question; see `Gallery`."""
+    weight: float = 1.0
+    """About how long it takes to draw beside others: what takes longest is begun first."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Drawing:
         rendered = self.rendered(formats)
         paths = tuple(folder / f"{self.name}.{kind}" for kind in formats)
         for path, kind in zip(paths, formats, strict=True):
-            write_atomically(path, lambda temporary, content=rendered[kind]: temporary.write_bytes(content))
+            write_bytes(path, rendered[kind])
         return paths
 
     def rendered(self, formats: Sequence[str]) -> dict[str, bytes]:
