@@ -120,7 +120,7 @@ def serve() -> None:
     # What plugins print must not come between the answers.
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    _prepare(asked)
+    _prepare()
     while True:
         path, content = pickle.loads(asked.get())
         sys.path[:] = path
@@ -136,16 +136,14 @@ def _listen(questions: IO[bytes], asked: queue.SimpleQueue[bytes]) -> None:
         os._exit(0)
 
 
-def _prepare(asked: queue.SimpleQueue[bytes]) -> None:
-    """Loads what every figure needs; what few need as well, where nobody waits yet."""
+def _prepare() -> None:
+    """Loads what every figure needs."""
     import matplotlib.backends.backend_agg
     import matplotlib.figure  # noqa: F401
 
     import ipe_bench.report.extensions
     import ipe_bench.report.figures.gallery  # noqa: F401
 
-    if asked.empty():
-        import seaborn  # noqa: F401
     # What is loaded stays: the collector need not look through it after every figure.
     gc.freeze()
 

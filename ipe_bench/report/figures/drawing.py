@@ -82,18 +82,19 @@ class Drawing:
     def _pdf(self) -> bytes:
         from matplotlib.backends.backend_pdf import FigureCanvasPdf
 
-        return _printed(FigureCanvasPdf(self.figure).print_pdf, metadata={"CreationDate": None})
+        return self._printed(FigureCanvasPdf(self.figure).print_pdf, metadata={"CreationDate": None})
 
     def _svg(self) -> bytes:
         from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-        return _printed(FigureCanvasSVG(self.figure).print_svg, metadata={"Date": None})
+        return self._printed(FigureCanvasSVG(self.figure).print_svg, metadata={"Date": None})
 
-
-def _printed(write: Callable[..., Any], **options: Any) -> bytes:
-    file = BytesIO()
-    write(file, **options)
-    return file.getvalue()
+    def _printed(self, write: Callable[..., Any], **options: Any) -> bytes:
+        file, dpi = BytesIO(), self.figure.dpi
+        write(file, **options)
+        # Both leave the figure in points.
+        self.figure.set_dpi(dpi)
+        return file.getvalue()
 
 
 def png(pixels: np.ndarray, dpi: float) -> bytes:

@@ -11,7 +11,7 @@ import hashlib
 import json
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from importlib import import_module, metadata, resources
 from pathlib import Path
@@ -104,11 +104,10 @@ class Gallery:
         self.entries = {d: _intact(self.old[d], folder) for d in self.tasks if d in self.old}
         self.missing: dict[str, Job] = {}
         for digest in self.wanted:
-            if digest not in self.entries or not all(set(formats) <= set(e.digests) for e in self.entries[digest]):
-                known = {kind for entry in self.entries.get(digest, ()) for kind in entry.digests}
-                # What was drawn in another format before is drawn in that one too, so that all formats show the same.
-                kinds = tuple(kind for kind in FORMATS if kind in formats or kind in known)
-                self.missing[digest] = (self.tasks[digest], kinds)
+            known = self.entries.get(digest)
+            lacking = [kind for kind in formats if known is None or any(kind not in e.digests for e in known)]
+            if lacking:
+                self.missing[digest] = (self.tasks[digest], tuple(lacking))
         self.work = _Work(self.missing)
 
     @classmethod
@@ -144,7 +143,9 @@ class Gallery:
             if isinstance(pictures, str):
                 self.problems.append(f"{self.tasks[digest].plugin}: {pictures}; it is left out")
             else:
-                self.entries[digest] = [picture.saved(self.folder) for picture in pictures]
+                known = {entry.name: entry.digests for entry in self.entries.get(digest, ())}
+                saved = [picture.saved(self.folder) for picture in pictures]
+                self.entries[digest] = [replace(e, digests=known.get(e.name, {}) | e.digests) for e in saved]
         entries = {d: self.entries[d] for d in self.tasks if d in self.entries}
         _settle_names(self.tasks, entries, self.folder, self.problems)
         _tidy(self.folder, self.old, entries)
