@@ -78,10 +78,10 @@ def _report(arguments: Sequence[str]) -> int:
 def _drawing_help(output: Path, made: Made, figures: Which) -> Iterator[None]:
     """A second process that is there when there are figures to draw, where any may be."""
     from ipe_bench.report.helper import drawing_help
-    from ipe_bench.report.stamp import begun_anew
+    from ipe_bench.report.stamp import is_out_of_date
 
     with drawing_help() as helper:
-        if figures != "none" and begun_anew(output, made):
+        if figures != "none" and is_out_of_date(output, made):
             helper.start()
         yield
 

@@ -66,9 +66,7 @@ def write_report(
     return write_analysis(begun, Path(directories[0] if output is None else output), figures, kinds)
 
 
-def write_analysis(
-    begun: Begun, output: Path, which: Which = "all", formats: Sequence[str] = (PAGE,)
-) -> ReportResult:
+def write_analysis(begun: Begun, output: Path, which: Which = "all", formats: Sequence[str] = (PAGE,)) -> ReportResult:
     """Finishes an analysis and writes the report on it under `output`, with these figures in these formats."""
     from ipe_bench.basics.files import write_text
     from ipe_bench.report import extensions

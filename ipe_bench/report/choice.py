@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any, Literal, cast, get_args
 
 from ipe_bench.basics.errors import UserError
@@ -31,10 +31,9 @@ def file_formats(asked: Any) -> tuple[str, ...]:
     Raises:
         UserError: there is no such format.
     """
-    several = isinstance(asked, Iterable) and not isinstance(asked, str)
+    several = isinstance(asked, Sequence) and not isinstance(asked, str)
     words = [str(word).strip() for word in asked] if several else str(asked).strip("[]").split(",")
-    names = [name for name in (word.strip() for word in words) if name]
-    for name in names:
-        if name not in FORMATS:
-            raise UserError(f"formats={','.join(names)}: {name} is none; name {', '.join(FORMATS[:-1])} or {FORMATS[-1]}")
+    names = [word.strip() for word in words]
+    if not names or not set(names) <= set(FORMATS):
+        raise UserError(f"formats={','.join(names)}: choose among {', '.join(FORMATS[:-1])} and {FORMATS[-1]}")
     return tuple(kind for kind in FORMATS if kind == PAGE or kind in names)

@@ -76,7 +76,7 @@ def is_current(output: Path, made: Made, problems: Sequence[str]) -> bool:
     return _current(output, made, list(problems)) is not None
 
 
-def begun_anew(output: Path, made: Made) -> bool:
+def is_out_of_date(output: Path, made: Made) -> bool:
     """Whether the report under `output` has to be made, for all that can be known before anything is read."""
     return _current(output, made, None) is None
 

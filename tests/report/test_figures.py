@@ -599,10 +599,17 @@ def test_nobody_helps_where_there_is_nothing_to_draw_or_one_process_alone(once_d
 
 def test_what_fails_while_figures_are_drawn_leaves_no_helper(once_drawn, tmp_path):
     analysis = once_drawn[0]
-    with pytest.raises(ZeroDivisionError), drawing_help() as helper:
-        helper.start()
-        process = helper._process
-        with Gallery.open(analysis, tmp_path / "figures"):
-            raise ZeroDivisionError
+    seen = []
+
+    def fail():
+        with drawing_help() as helper:
+            helper.start()
+            seen.append(helper._process)
+            with Gallery.open(analysis, tmp_path / "figures"):
+                raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    (process,) = seen
     assert process.returncode is not None
     assert not (tmp_path / "figures").exists()

@@ -55,7 +55,7 @@ def fill(
 def result(tmp_path_factory):
     store = Synthetic(tmp_path_factory.mktemp("report") / "store")
     fill(store, scales=(1.0, 10.0), seeds=5)
-    return write_report([store.directory], store.directory)
+    return write_report([store.directory], store.directory, formats="pdf")
 
 
 def test_everything_is_written(result):

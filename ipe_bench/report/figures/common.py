@@ -302,7 +302,15 @@ def _depths(ax: Axes, rows: pd.DataFrame, y: str, look: Mapping[str, Look], by: 
 
 
 def lines(
-    ax: Axes, rows: pd.DataFrame, x: str, y: str, look: Mapping[str, Look], *, every: int = 1, sort: bool = True, **style: Any
+    ax: Axes,
+    rows: pd.DataFrame,
+    x: str,
+    y: str,
+    look: Mapping[str, Look],
+    *,
+    every: int = 1,
+    sort: bool = True,
+    **style: Any,
 ) -> None:
     """A line per estimator through points that are already dense, with a marker at every so many: each estimator's at
     other ones, so that markers stand side by side where curves coincide."""

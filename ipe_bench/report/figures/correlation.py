@@ -73,7 +73,7 @@ def _heatmap(ax: Axes, table: pd.DataFrame, *, numbered: bool) -> QuadMesh:
     for i, j in zip(*np.nonzero(~np.ma.getmaskarray(values) & numbered), strict=True):
         light = _luminance(mesh.to_rgba(values[i, j])[:3]) > MIDDLE
         style = {"color": ".15" if light else "white", "ha": "center", "va": "center", "fontsize": 6.5}
-        ax.text(places[j], places[i], _two_figures(values[i, j]), **style)
+        ax.text(float(places[j]), float(places[i]), _two_figures(float(values[i, j])), **style)
     return mesh
 
 

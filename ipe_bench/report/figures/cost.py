@@ -69,9 +69,7 @@ def _points(ax: Any, rows: pd.DataFrame, view: View) -> None:
     # Equal points lie upon each other: the later ones are smaller, so that all are seen.
     areas = dict(zip(look, common.mark_scale() ** 2 * np.linspace(110, 40, len(look)), strict=True))
     labels = list(rows["estimator"])
-    common.marks(
-        ax, rows["cost"], rows["error"], [look[e] for e in labels], [areas[e] for e in labels], linewidth=0.7
-    )
+    common.marks(ax, rows["cost"], rows["error"], [look[e] for e in labels], [areas[e] for e in labels], linewidth=0.7)
 
 
 def _ways(ax: Any, rows: pd.DataFrame, view: View) -> None:

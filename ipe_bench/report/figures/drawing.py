@@ -61,7 +61,7 @@ class Drawing:
         """The content of a file of each of these formats."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-        # Layout once, with a renderer that is made once, and one drawing per file: `savefig` draws everything five times.
+        # Layout once, with a renderer that is made once, and one drawing per file: `savefig` would draw all five times.
         FigureCanvasAgg(self.figure)
         engine = self.figure.get_layout_engine()
         if engine is not None:
@@ -110,7 +110,7 @@ def png(pixels: np.ndarray, dpi: float) -> bytes:
     chunks = (
         (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)),
         (b"pHYs", struct.pack(">IIB", metre, metre, 1)),
-        (b"IDAT", zlib.compress(rows, 6)),
+        (b"IDAT", zlib.compress(rows.data, 6)),
         (b"IEND", b""),
     )
     parts = [struct.pack(">I", len(d)) + name + d + struct.pack(">I", zlib.crc32(name + d)) for name, d in chunks]

@@ -99,7 +99,9 @@ class Gallery:
         self.folder = folder
         self.problems = problems
         self.tasks = {task.digest: task for task in _tasks(analysis, problems)}
-        self.wanted = [d for d, t in self.tasks.items() if which == "all" or (which == "main" and _figure(t.figure).main)]
+        self.wanted = [
+            d for d, t in self.tasks.items() if which == "all" or (which == "main" and _figure(t.figure).main)
+        ]
         self.old = _read_index(folder)
         self.entries = {d: _intact(self.old[d], folder) for d in self.tasks if d in self.old}
         self.missing: dict[str, Job] = {}

@@ -100,7 +100,7 @@ class _Grid:
         width, height = fig.bbox.width, fig.bbox.height
         pad = spaces["w_pad"] * fig.dpi, spaces["h_pad"] * fig.dpi
         renderer = fig.canvas.get_renderer()  # type: ignore[attr-defined]
-        legends = [legend.get_tightbbox(renderer).height + 2 * pad[1] for legend in fig.legends]
+        legends = [legend.get_window_extent(renderer).height + 2 * pad[1] for legend in fig.legends]
         return cls(
             fig.axes,
             (width, height),
@@ -130,9 +130,7 @@ class _Grid:
         x = np.cumsum(left) + np.cumsum(right) - right + np.cumsum(widths) - widths
         y = self.size[1] - np.cumsum(top) - np.cumsum(bottom) + bottom - height * np.arange(1, rows + 1)
         for ax, i, j in zip(self.panels, self.row, self.column, strict=True):
-            ax.set_position(
-                (x[j] / self.size[0], y[i] / self.size[1], widths[j] / self.size[0], height / self.size[1])
-            )
+            ax.set_position((x[j] / self.size[0], y[i] / self.size[1], widths[j] / self.size[0], height / self.size[1]))
         return True
 
     @staticmethod
