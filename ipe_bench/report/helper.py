@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import importlib
 import os
 import pickle
 import queue
@@ -23,6 +24,12 @@ from typing import IO, Any, TypeVar
 from ipe_bench.basics.machine import cores
 
 Told = TypeVar("Told")
+_LOADED = (
+    "matplotlib.backends.backend_agg",
+    "matplotlib.figure",
+    "ipe_bench.report.extensions",
+    "ipe_bench.report.figures.gallery",
+)
 _LENGTH = struct.Struct(">Q")
 
 
@@ -138,12 +145,8 @@ def _listen(questions: IO[bytes], asked: queue.SimpleQueue[bytes]) -> None:
 
 def _prepare() -> None:
     """Loads what every figure needs."""
-    import matplotlib.backends.backend_agg
-    import matplotlib.figure  # noqa: F401
-
-    import ipe_bench.report.extensions
-    import ipe_bench.report.figures.gallery  # noqa: F401
-
+    for name in _LOADED:
+        importlib.import_module(name)
     # What is loaded stays: the collector need not look through it after every figure.
     gc.freeze()
 
