@@ -73,7 +73,6 @@ def write_analysis(begun: Begun, output: Path, which: Which = "all", formats: Se
     from ipe_bench.report.certified_tables import attained_tables, certified_tables, without_certified
     from ipe_bench.report.charts import charts
     from ipe_bench.report.figures import Gallery
-    from ipe_bench.report.figures.views import views
     from ipe_bench.report.html import render_page
     from ipe_bench.report.tables import all_tables, write_tables
 
@@ -91,7 +90,7 @@ def write_analysis(begun: Begun, output: Path, which: Which = "all", formats: Se
         further = [table for section in sections for table in section.tables]
         table_paths = write_tables(analysis, [*tables, *further], output / "tables")
         drawn = gallery.drawn()
-    page = render_page(analysis, tables, drawn, sections, list(charts(views(simulated)[0])))
+    page = render_page(analysis, tables, drawn, sections, list(charts(gallery.parts)))
     report = output / "report.html"
     write_text(report, page)
     return ReportResult(

@@ -98,7 +98,9 @@ class Gallery:
     def __init__(self, analysis: Analysis, folder: Path, which: Which, formats: Sequence[str], problems: list[str]):
         self.folder = folder
         self.problems = problems
-        self.tasks = {task.digest: task for task in _tasks(analysis, problems)}
+        self.parts, whole = views(analysis)
+        """The settings one by one."""
+        self.tasks = {task.digest: task for task in _tasks(analysis, self.parts, whole, problems)}
         self.wanted = [
             d for d, t in self.tasks.items() if which == "all" or (which == "main" and _figure(t.figure).main)
         ]
@@ -167,7 +169,7 @@ def drawings(analysis: Analysis, problems: list[str]) -> Iterator[Drawing]:
     line added to the `problems`."""
     from ipe_bench.report import extensions
 
-    for task in _tasks(analysis, problems):
+    for task in _tasks(analysis, *views(analysis), problems):
         if not task.plugin:
             yield from _figure(task.figure).draw(task.view)
             continue
@@ -196,14 +198,13 @@ def _settle_names(tasks: dict[str, Task], entries: dict[str, list[Entry]], folde
             entries[digest] = [picture.saved(folder) for picture in made]
 
 
-def _tasks(analysis: Analysis, problems: list[str]) -> Iterator[Task]:
+def _tasks(analysis: Analysis, parts: Sequence[View], whole: View, problems: list[str]) -> Iterator[Task]:
     """Every kind of figure of every setting, or of all of them together; ours first."""
     from ipe_bench.report import extensions
     from ipe_bench.report.figures import FIGURES
 
     if not analysis.collection.groups and analysis.attained.empty:
         return
-    parts, whole = views(analysis)
     kinds = [(name, _figure(name), "", "") for name in FIGURES]
     for option, figure in extensions.figures(problems):
         kinds.append((str(option.target), figure, f"figure={option.name}", code_digest(option)))
