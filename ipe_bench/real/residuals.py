@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
-from scipy.special import ndtri
+from scipy.special import chdtrc, ndtri
 
 from ipe_bench.basics.linalg import Array, Covariance
 
