@@ -156,10 +156,17 @@ def load(directories: Directories) -> pd.DataFrame:
     return frame
 
 
-def report(directories: Directories, output: Path | str | None = None, *, figures: Which = "all") -> ReportResult:
+def report(
+    directories: Directories,
+    output: Path | str | None = None,
+    *,
+    figures: Which = "all",
+    formats: str | Sequence[str] = "png",
+) -> ReportResult:
     """Writes summary.csv, tables/, figures/ and report.html from what is stored, into `output` or the first directory.
 
-    `figures` are all that the data allow, main (the few that answer the question) or none.
+    `figures` are all that the data allow, main (the few that answer the question) or none. They are PNG files; with
+    `formats` such as "pdf" or ["pdf", "svg"] they are written so as well.
 
     The result names the files, and has the summary itself and a line per piece that is missing, failed or damaged.
 
@@ -169,7 +176,7 @@ def report(directories: Directories, output: Path | str | None = None, *, figure
     ipe_bench.basics.errors.UserError: outputs/nowhere: there is no such directory; give one that a run wrote to
 
     Raises:
-        UserError: no run ever wrote to a directory, or there is no such choice of figures.
+        UserError: no run ever wrote to a directory, or there is no such choice of figures or formats.
         StorageError: the files cannot be written.
     """
     from ipe_bench.report import write_report
@@ -179,7 +186,7 @@ def report(directories: Directories, output: Path | str | None = None, *, figure
         raise UserError(f"{paths[0]}: a bundle is read and not written to; give output=, where the report goes")
     with opened(paths, None if output is None else Path(output) / BUNDLES) as folders:
         require_results(folders)
-        return write_report(folders, output, figures=figures)
+        return write_report(folders, output, figures=figures, formats=formats)
 
 
 def compare(

@@ -34,7 +34,7 @@ from ipe_bench.plugins.construct import construct
 from ipe_bench.priors import GaussianPrior, Prior, prior_of
 from ipe_bench.real.covariances import read_covariance
 from ipe_bench.real.sources import Readings
-from ipe_bench.report.choice import Which, which_figures
+from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.provenance import TARGET, canonical_json, describe
 from ipe_bench.trials.scenario import Scenario
@@ -64,6 +64,8 @@ class Schema:
     """Seconds after which, with a precision, no more blocks are begun."""
     figures: str = "all"
     """Which to draw: all, main (the few that answer the question), or none."""
+    formats: Any = "png"
+    """Of the figures' files: png, and what is named of pdf and svg as well."""
     block_size: int | None = None
     """Trials per unit of work; changes no number. 250 unless given, and up to 1000 of a hundred thousand trials."""
     readings: Any = None
@@ -113,6 +115,7 @@ class Job:
     readings: Readings | None = None
     """Of the files, for an estimate from them."""
     figures: Which = "all"
+    formats: tuple[str, ...] = (PAGE,)
 
 
 class PluginConfigs(SearchPathPlugin):
@@ -137,6 +140,7 @@ _FORMULA = re.compile(
 )
 _UNIT = re.compile(r"^(\+*(?:truth_)?measurement\.(?:time_)?unit)=([^'\",\[\]{}]+)$")
 _FILE = re.compile(r"^\+*(?:truth_)?measurement\.file=")
+_FORMATS = re.compile(r"^formats=(\w+(?:,\w+)+)$")
 _PARAMETERS = re.compile(r"^\+*parameters=(?![{$]|null$)")
 _OPEN = re.compile(
     r"^(?:(?:parameters|(?:truth_)?measurement\.(?:start|columns|constants|initial|rates|outputs))\."
@@ -221,6 +225,8 @@ def _literal(value: Any, where: str) -> str:
 
 def _in_hydras_words(override: str) -> str:
     override = re.sub(r"^(\+?)truth_measurement=", r"\1measurement@truth_measurement=", override)
+    # Several formats are no sweep.
+    override = _FORMATS.sub(r"formats=[\1]", override)
     override = _UNIT.sub(lambda found: f"{found[1]}='{found[2]}'", override)
     override = _FORMULA.sub(lambda found: f"{found[1]}='{found[2]}'", override)
     return f"++{override}" if _OPEN.match(override) else override
@@ -284,6 +290,7 @@ def assemble(config: DictConfig, opened: Opened | None = None) -> Job:
         *(scenario, estimators, execution, trials, block_size, output, precision, time_limit, objective),
         readings=readings,
         figures=figures,
+        formats=file_formats(plain["formats"]),
     )
 
 

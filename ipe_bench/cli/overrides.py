@@ -233,7 +233,7 @@ def _check_labels(words: Sequence[str], overrides: Sequence[Override]) -> None:
 
 _NO_PART_OF_A_NAME = ("name", "output", "trials", "block_size", "seed", "execution", "experiment", "hydra", "readings")
 _NO_PART_OF_A_NAME += ("precision", "time_limit", "write_readings", "write_readings_trial", "default_name", "objective")
-_NO_PART_OF_A_NAME += ("figures",)
+_NO_PART_OF_A_NAME += ("figures", "formats")
 _LONGEST_NAME = 80
 
 

@@ -85,6 +85,7 @@ columns=NAMES        those of the tables, in this order; a name that is not ther
 width=INCHES         of a figure or table: 3.5 for one column, 7.16 for two
 
 figures=all          which to draw: all, main (the few that answer the question) or none
+formats=pdf,svg      as these as well; figures are PNG files, and others are written when they are asked for
 """
 
 

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console, paper
-from ipe_bench.report.choice import Which, which_figures
+from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
 from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
 from ipe_bench.runs.results import require_results
 from ipe_bench.runs.store import TRUTH
 
 if TYPE_CHECKING:
+    from ipe_bench.report.stamp import Made
     from ipe_bench.statistics.analysis import Begun
     from ipe_bench.statistics.collect import Collection
 
@@ -45,8 +46,10 @@ def unpacked(words: Sequence[str]) -> Iterator[list[str]]:
 def _report(arguments: Sequence[str]) -> int:
     outputs = [a.removeprefix("output=") for a in arguments if a.startswith("output=")]
     asked = [a.removeprefix("figures=") for a in arguments if a.startswith("figures=")]
-    directories = [Path(a) for a in arguments if not a.startswith(("output=", "figures="))]
+    named = [a.removeprefix("formats=") for a in arguments if a.startswith("formats=")]
+    directories = [Path(a) for a in arguments if not a.startswith(("output=", "figures=", "formats="))]
     figures = which_figures(asked[-1] if asked else "all")
+    formats = file_formats(named[-1] if named else PAGE)
     if not directories:
         raise UserError("report: name at least one directory of results, such as outputs/paper")
     if len(outputs) > 1:
@@ -57,12 +60,13 @@ def _report(arguments: Sequence[str]) -> int:
     from ipe_bench.report.stamp import made_from, note
 
     output = Path(outputs[0]) if outputs else directories[0]
-    made, view = made_from(directories, output, figures), _view("everything")
+    made, view = made_from(directories, output, figures, formats), _view("everything")
     if _show_again(output, made, view):
         return 0
-    begun = _begin(directories)
-    table = _print_table(begun.summary, begun.collection)
-    collection = _write(begun, output, made, figures)
+    with _drawing_help(output, made, figures):
+        begun = _begin(directories)
+        table = _print_table(begun.summary, begun.collection)
+        collection = _write(begun, output, made, figures)
     for problem in (*collection.problems, *collection.stale):
         print(f"ipe-bench: {problem}", file=sys.stderr)
     _print_places(output)
@@ -70,27 +74,35 @@ def _report(arguments: Sequence[str]) -> int:
     return 1 if collection.problems else 0
 
 
-def show_command(output: Path, cells: Mapping[str, str], figures: Which = "all") -> int:
+@contextlib.contextmanager
+def _drawing_help(output: Path, made: Made, figures: Which) -> Iterator[None]:
+    """A second process that is there when there are figures to draw, where any may be."""
+    from ipe_bench.report.helper import drawing_help
+    from ipe_bench.report.stamp import is_out_of_date
+
+    with drawing_help() as helper:
+        if figures != "none" and is_out_of_date(output, made):
+            helper.start()
+        yield
+
+
+def show_command(
+    output: Path, cells: Mapping[str, str], figures: Which = "all", formats: tuple[str, ...] = (PAGE,)
+) -> int:
     """Writes the report on all that the folder holds, and prints what belongs to these cells; the exit code.
 
     `cells` has a line for people by key.
     """
     from ipe_bench.report.stamp import made_from, note
 
-    made, view = made_from([output], output, figures), _view(" ".join(sorted(cells)))
+    made, view = made_from([output], output, figures, formats), _view(" ".join(sorted(cells)))
     if _show_again(output, made, view):
         return 0
-    from ipe_bench.statistics.collect import collect
-    from ipe_bench.statistics.summary import rows_of_all
-
-    begun = _begin([output])
-    others = sum(cell.key not in cells and cell.label != TRUTH for cell in begun.collection.current)
-    if others:
-        own = collect([output], cells.keys())
-        table = _print_table(rows_of_all(own), own)
-    else:
-        table = _print_table(begun.summary, begun.collection)
-    problems = _write(begun, output, made, figures).problems
+    with _drawing_help(output, made, figures):
+        begun = _begin([output])
+        others = sum(cell.key not in cells and cell.label != TRUTH for cell in begun.collection.current)
+        table = _print_own_table(output, cells) if others else _print_table(begun.summary, begun.collection)
+        problems = _write(begun, output, made, figures).problems
     # What is wrong with a file or a folder may concern anybody; what other commands lack does not.
     of_cells = [p for p in problems if p.startswith(("missing: ", "failed: "))]
     elsewhere = [p for p in of_cells if not any(line in p for line in cells.values())]
@@ -106,6 +118,15 @@ def show_command(output: Path, cells: Mapping[str, str], figures: Which = "all")
     return 1 if problems else 0
 
 
+def _print_own_table(output: Path, cells: Mapping[str, str]) -> str:
+    """Prints the table of these cells alone; returns what was written."""
+    from ipe_bench.statistics.collect import collect
+    from ipe_bench.statistics.summary import rows_of_all
+
+    own = collect([output], cells.keys())
+    return _print_table(rows_of_all(own), own)
+
+
 def _view(of: str) -> str:
     """What is shown of a report, and how: of which cells, how wide and in which colours."""
     out = console()
@@ -113,7 +134,7 @@ def _view(of: str) -> str:
     return hashlib.sha256(f"{of}; {how}".encode()).hexdigest()[:16]
 
 
-def _show_again(output: Path, made: str, view: str) -> bool:
+def _show_again(output: Path, made: Made, view: str) -> bool:
     """Prints what was printed of this report before, where nothing has changed since; nothing is computed for it."""
     from ipe_bench.report.stamp import shown
 
@@ -138,7 +159,7 @@ def _begin(directories: Sequence[Path]) -> Begun:
     return begun
 
 
-def _write(begun: Begun, output: Path, made: str, figures: Which) -> Collection:
+def _write(begun: Begun, output: Path, made: Made, figures: Which) -> Collection:
     """Writes the report unless it is there already; returns what it is on, with all problems."""
     from ipe_bench.report.stamp import is_current, leave
 
@@ -146,7 +167,7 @@ def _write(begun: Begun, output: Path, made: str, figures: Which) -> Collection:
     if not is_current(output, made, [*collection.problems, *collection.stale]):
         from ipe_bench.report import write_analysis
 
-        result = write_analysis(begun, output, figures)
+        result = write_analysis(begun, output, figures, made.formats)
         leave(output, made, [*collection.problems, *collection.stale], result.files)
     return collection
 

@@ -35,7 +35,8 @@ from ipe_bench.cli.report import show_command
 from ipe_bench.cli.typed import check_options
 from ipe_bench.measurements import Nist
 from ipe_bench.plugins import discovery as plugins
-from ipe_bench.report.choice import Which, which_figures
+from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
+from ipe_bench.report.helper import Helper, drawing_help
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.schedule import Watcher
 from ipe_bench.runs.store import describe_names, digest
@@ -59,6 +60,9 @@ class Outcome:
         self.outputs: dict[Path, dict[str, str]] = {}
         """The folders that were filled, and by key a line for each cell that was asked for."""
         self.figures: Which = "all"
+        self.formats: tuple[str, ...] = (PAGE,)
+        self.helper = Helper()
+        """What draws while this process computes."""
         self.failures: list[str] = []
         self.stops: list[str] = []
         """How many trials each job with a precision took, and why no more."""
@@ -99,6 +103,7 @@ class Watch(Callback):
         _outcome.elsewhere = not config.hydra.launcher["_target_"].endswith(_OWN_LAUNCHER)
         output = OmegaConf.select(config, "output")
         _outcome.figures = which_figures(OmegaConf.select(config, "figures"))
+        _outcome.formats = file_formats(OmegaConf.select(config, "formats"))
         if output is not None:
             _outcome.outputs[Path(output)] = {}
 
@@ -129,6 +134,7 @@ def main(arguments: Sequence[str]) -> int:
             flags.append("--multirun")
         words = [*words, f"default_name='{name}'"]
     with contextlib.ExitStack() as stack:
+        _outcome.helper = stack.enter_context(drawing_help())
         if "--dry-run" in flags:
             _outcome.dry = DryRun()
             flags.remove("--dry-run")
@@ -136,7 +142,7 @@ def main(arguments: Sequence[str]) -> int:
             log = stack.enter_context(tempfile.TemporaryDirectory(prefix="ipe-bench-"))
             words += [f"hydra.run.dir='{log}'", f"hydra.sweep.dir='{log}'"]
         _run_hydra(flags, words)
-    return _conclude()
+        return _conclude()
 
 
 def _run_hydra(flags: Sequence[str], words: Sequence[str]) -> None:
@@ -218,8 +224,9 @@ def _conclude() -> int:
     for output, cells in _outcome.outputs.items():
         if (output / "trials").is_dir():
             # Of jobs in other processes nothing is known but the folder.
-            which = _outcome.figures
-            own = show_command(output, cells, which) if cells else report([str(output), f"figures={which}"])
+            which, formats = _outcome.figures, _outcome.formats
+            words = [str(output), f"figures={which}", f"formats={','.join(formats)}"]
+            own = show_command(output, cells, which, formats) if cells else report(words)
             code = max(code, own)
     if _outcome.objectives:
         console().print(_outcome.shown_objective(), markup=False, soft_wrap=True)
@@ -283,6 +290,10 @@ def task(config: DictConfig) -> float | None:
             return None
         interrupts.begin_work()
         with shown_progress(_title(job)) as watch:
+            if job.figures != "none" and not _launched_elsewhere():
+                watch = _outcome.helper.start_when_there_is_work(watch)
+                if not (Path(job.output) / "trials").exists():
+                    _outcome.helper.start()
             failures = _compute(job, Serial() if _launched_elsewhere() else job.execution, watch)
         value = None if job.objective is None else _objective(job)
     except (UserError, StorageError, *CONFIG_ERRORS) as error:
@@ -297,7 +308,7 @@ def task(config: DictConfig) -> float | None:
         raise
     else:
         _outcome.failures += failures
-        _outcome.figures = job.figures
+        _outcome.figures, _outcome.formats = job.figures, job.formats
         own = _outcome.outputs.setdefault(Path(job.output), {})
         own.update((cell.key, describe_names(cell.names)) for cell in cells_of(job.scenario, job.estimators))
         return value
@@ -361,6 +372,7 @@ _NOT_IN_TITLES = {
     "objective",
     "block_size",
     "figures",
+    "formats",
     "output",
     "name",
     "default_name",

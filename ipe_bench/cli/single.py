@@ -20,6 +20,7 @@ NOT_OF_ONE_SCENARIO = (
     "time_limit",
     "block_size",
     "figures",
+    "formats",
     "execution",
     "readings",
     "write_readings",

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ipe_bench.report.choice import Which, which_figures
+from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,60 +42,62 @@ class ReportResult:
 
 
 def write_report(
-    directories: Path | str | Sequence[Path | str], output: Path | str | None = None, *, figures: Which = "all"
+    directories: Path | str | Sequence[Path | str],
+    output: Path | str | None = None,
+    *,
+    figures: Which = "all",
+    formats: str | Sequence[str] = PAGE,
 ) -> ReportResult:
     """Writes summary.csv, tables/, figures/ and report.html from what is stored, under `output` or the first directory.
 
     Raises:
-        UserError: a directory does not exist, or there is no such choice of `figures` (all, main or none).
+        UserError: a directory does not exist, or there is no such choice of `figures` (all, main or none) or of
+            `formats` (png, pdf and svg).
     """
     from ipe_bench.plugins.extensions import use_statistics
     from ipe_bench.statistics.analysis import begin
 
+    kinds = file_formats(formats)
     which_figures(figures)
     faults = use_statistics()
     directories = [directories] if isinstance(directories, Path | str) else list(directories)
     begun = begin(directories)
     begun.collection.further += faults
-    return write_analysis(begun, Path(directories[0] if output is None else output), figures)
+    return write_analysis(begun, Path(directories[0] if output is None else output), figures, kinds)
 
 
-def write_analysis(begun: Begun, output: Path, which: Which = "all") -> ReportResult:
-    """Finishes an analysis and writes the report on it under `output`, with these figures."""
+def write_analysis(begun: Begun, output: Path, which: Which = "all", formats: Sequence[str] = (PAGE,)) -> ReportResult:
+    """Finishes an analysis and writes the report on it under `output`, with these figures in these formats."""
     from ipe_bench.basics.files import write_text
     from ipe_bench.report import extensions
     from ipe_bench.report.certified_tables import attained_tables, certified_tables, without_certified
     from ipe_bench.report.charts import charts
-    from ipe_bench.report.figures import draw_all
-    from ipe_bench.report.figures.views import views
+    from ipe_bench.report.figures import Gallery
     from ipe_bench.report.html import render_page
     from ipe_bench.report.tables import all_tables, write_tables
 
     analysis = begun.finish()
-    folder = output / "figures"
     summary_path = output / "summary.csv"
     write_text(summary_path, analysis.summary.to_csv(index=False))
     certified_shown, certified = certified_tables(analysis.collection)
     simulated = without_certified(analysis)
-    tables = [*certified_shown, *attained_tables(analysis.collection)[0], *all_tables(simulated, analysis)]
     problems = analysis.collection.further
-    tables += extensions.tables(analysis, [table.name for table in tables], problems)
-    sections = extensions.sections(analysis, [table.name for table in tables], problems)
-    further = [table for section in sections for table in section.tables]
-    table_paths = write_tables(analysis, [*tables, *further], output / "tables")
-    figures: list[Path] = []
-    drawn = []
-    for figure in draw_all(simulated, folder, which=which, problems=problems):
-        figures += figure.files
-        drawn.append((figure.name, figure.title, figure.caption, figure.files[0].read_bytes()))
-    page = render_page(analysis, tables, drawn, sections, list(charts(views(simulated)[0])))
+    # A second process draws while this one writes tables.
+    with Gallery.open(simulated, output / "figures", which, formats, problems) as gallery:
+        tables = [*certified_shown, *attained_tables(analysis.collection)[0], *all_tables(simulated, analysis)]
+        tables += extensions.tables(analysis, [table.name for table in tables], problems)
+        sections = extensions.sections(analysis, [table.name for table in tables], problems)
+        further = [table for section in sections for table in section.tables]
+        table_paths = write_tables(analysis, [*tables, *further], output / "tables")
+        drawn = gallery.drawn()
+    page = render_page(analysis, tables, drawn, sections, list(charts(gallery.parts)))
     report = output / "report.html"
     write_text(report, page)
     return ReportResult(
         analysis.summary,
         summary_path,
         table_paths,
-        tuple(figures),
+        tuple(path for figure in drawn for path in figure.files),
         report,
         analysis.problems,
         analysis.stale,
@@ -112,8 +114,9 @@ class _Callable(types.ModuleType):
         output: Path | str | None = None,
         *,
         figures: Which = "all",
+        formats: str | Sequence[str] = PAGE,
     ) -> ReportResult:
-        return write_report(directories, output, figures=figures)
+        return write_report(directories, output, figures=figures, formats=formats)
 
 
 sys.modules[__name__].__class__ = _Callable

@@ -13,14 +13,13 @@ from ipe_bench import __version__
 from ipe_bench.report.charts import Chart
 from ipe_bench.report.citation import CITATION
 from ipe_bench.report.definitions import definitions
+from ipe_bench.report.figures.gallery import Drawn
 from ipe_bench.report.headline import headline
 from ipe_bench.report.sections import Written
 from ipe_bench.report.tables import Table
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.collect import Run
 
-Shown = tuple[str, str, str, bytes]
-"""Name, title, caption and PNG of a figure."""
 MOST_ROWS = 2000
 """Rows of one table on the page; its CSV file has all."""
 MOST_RUNS = 20
@@ -42,7 +41,7 @@ _PYTHON, _UNKNOWN = "from Python", "a command that was not recorded"
 def render_page(
     analysis: Analysis,
     tables: Sequence[Table],
-    figures: Sequence[Shown],
+    figures: Sequence[Drawn],
     written: Sequence[Written] = (),
     charts: Sequence[Chart] = (),
 ) -> str:
@@ -98,11 +97,16 @@ def _policy(script: str, style: str) -> str:
     )
 
 
-def _pictures(figures: Sequence[Shown], charts: Sequence[Chart]) -> list[dict[str, str]]:
+def _pictures(figures: Sequence[Drawn], charts: Sequence[Chart]) -> list[dict[str, Any]]:
     """Charts first, each with the static figure of its name; then the other figures."""
     static = {
-        name: {"static_title": title, "static_caption": caption, "data": base64.b64encode(png).decode()}
-        for name, title, caption, png in figures
+        one.name: {
+            "static_title": one.title,
+            "static_caption": one.caption,
+            "data": base64.b64encode(one.files[0].read_bytes()).decode(),
+            "files": [path.name for path in one.files],
+        }
+        for one in figures
     }
     drawn = {
         chart.name: {"title": chart.title, "caption": chart.caption, "chart": chart.data, "data": ""}

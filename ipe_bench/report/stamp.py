@@ -13,13 +13,14 @@ import json
 import os
 import sys
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ipe_bench.basics.errors import StorageError
 from ipe_bench.basics.files import write_text
 from ipe_bench.plugins.extensions import digest_of_all
-from ipe_bench.report.choice import Which
+from ipe_bench.report.choice import PAGE, Which
 from ipe_bench.runs.store import Store
 
 NAME = ".report.json"
@@ -39,8 +40,18 @@ _VIEWS = 8
 """Widths of terminals and commands whose tables are kept."""
 
 
-def made_from(directories: Sequence[Path], output: Path, figures: Which = "all") -> str:
-    """A digest of what a report on these directories, with these figures, is made from.
+@dataclass(frozen=True)
+class Made:
+    """What a report is made from, and the formats of figures that are asked for: one that has more is the same."""
+
+    digest: str
+    formats: tuple[str, ...] = (PAGE,)
+
+
+def made_from(
+    directories: Sequence[Path], output: Path, figures: Which = "all", formats: tuple[str, ...] = (PAGE,)
+) -> Made:
+    """What a report on these directories, with these figures in these formats, is made from.
 
     Taken before anything is read: what is written meanwhile then makes the next report another one.
     """
@@ -57,44 +68,51 @@ def made_from(directories: Sequence[Path], output: Path, figures: Which = "all")
         for folder in (store.trials, store.histories, store.runs, store.failed):
             for path, known in _digests(sorted(folder.glob("*"))).items():
                 digest.update(f"{path} {known};".encode())
-    return digest.hexdigest()
+    return Made(digest.hexdigest(), formats)
 
 
-def is_current(output: Path, made: str, problems: Sequence[str]) -> bool:
+def is_current(output: Path, made: Made, problems: Sequence[str]) -> bool:
     """Whether the report under `output` was made from this with these problems, and its files are as written."""
     return _current(output, made, list(problems)) is not None
 
 
-def shown(output: Path, made: str, view: str) -> list[str] | None:
+def is_out_of_date(output: Path, made: Made) -> bool:
+    """Whether the report under `output` has to be made, for all that can be known before anything is read."""
+    return _current(output, made, None) is None
+
+
+def shown(output: Path, made: Made, view: str) -> list[str] | None:
     """What was last printed of this report, of which nothing is missing or damaged, in this view of it; None where it
     was not, or where anything of the report has changed."""
     known = _current(output, made, [])
     return None if known is None else known.get("shown", {}).get(view)
 
 
-def note(output: Path, made: str, view: str, texts: list[str]) -> None:
+def note(output: Path, made: Made, view: str, texts: list[str]) -> None:
     """Keeps what is printed of the report under `output` for `shown`."""
     known = _current(output, made, [])
     if known is not None and known.get("shown", {}).get(view) != texts:
         _write(output, known | {"shown": dict([*known.get("shown", {}).items(), (view, texts)][-_VIEWS:])})
 
 
-def _current(output: Path, made: str, problems: list[str]) -> dict[str, Any] | None:
-    """The stamp, where the report under `output` was made from this with these problems, and its files are as
-    written."""
+def _current(output: Path, made: Made, problems: list[str] | None) -> dict[str, Any] | None:
+    """The stamp, where the report under `output` was made from this with these problems, or whatever problems where
+    none are given, and its files are as written."""
     try:
         known: Any = json.loads((output / NAME).read_text(encoding="utf-8"))
         files = {output / name: digest for name, digest in known["files"].items()}
-        same = known["from"] == made and known["problems"] == problems
+        same = known["from"] == made.digest and set(made.formats) <= set(known["formats"])
+        same = same and (problems is None or known["problems"] == problems)
         return known if same and files and _digests(files) == {str(p): d for p, d in files.items()} else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
 
-def leave(output: Path, made: str, problems: Sequence[str], files: Iterable[Path]) -> None:
+def leave(output: Path, made: Made, problems: Sequence[str], files: Iterable[Path]) -> None:
     """States what the report under `output` was made from, and which files belong to it."""
     digests = {str(Path(path).relative_to(output)): digest for path, digest in _digests(files).items()}
-    _write(output, {"from": made, "problems": list(problems), "files": digests})
+    stamp = {"from": made.digest, "formats": list(made.formats), "problems": list(problems), "files": digests}
+    _write(output, stamp)
 
 
 def _write(output: Path, stamp: dict[str, Any]) -> None:

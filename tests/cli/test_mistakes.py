@@ -20,6 +20,7 @@ KEYS = {
     "seed": ("null", "first", "1.5", "[]", "-1", "99999999999999999999"),
     "error_scale": ("null", "big", "[1,2]", "0", "-1", "nan", "inf", "-inf", "1e101", "1e308", "true"),
     "figures": ("null", "some", "1", "[all]", "true"),
+    "formats": ("null", "tiff", "1", "[]", "''", "{a: 1}", "[png,eps]", "true"),
     "write_readings_trial": ("null", "1.5", "-1", "3", "last"),
     "name": ("", ".", "..", "null", "[a]", "{a: 1}"),
     "output": ("", ".", "null", "[a]", LONG, "/proc/x", "/dev/null/x", "${nothing}", "'${nothing}'", "loop/x"),

@@ -97,7 +97,7 @@ def test_a_report_has_what_plugins_add_beside_all_that_is_ours(ours, capsys):
     for text in ("own_statistic", "What own_section says", "figure-own_figure", "table-own_table"):
         assert text in page
     after = files("out")
-    added = {f"own_{name}" for name in ("figure.png", "figure.pdf")}
+    added = {"own_figure.png"}
     added |= {f"own_{kind}.{form}" for kind in ("table", "section") for form in ("csv", "md", "tex")}
     assert set(after) - set(before) == added
     # A statistic stands in the tables that it names; no other table or figure has changed.
@@ -183,8 +183,8 @@ def test_one_that_writes_into_what_it_is_given_changes_nothing_of_ours(kind, our
     assert main(["report", "out", MAIN]) == (1 if kind == "statistic" else 0)
     after = pd.read_csv("out/summary.csv")
     pd.testing.assert_frame_equal(after[before.columns], before)
-    figures = {name: digest for name, digest in files("out").items() if name.endswith((".png", ".pdf"))}
-    assert figures == {name: digest for name, digest in ours.items() if name.endswith((".png", ".pdf"))}
+    figures = {name: digest for name, digest in files("out").items() if name.endswith(".png")}
+    assert figures == {name: digest for name, digest in ours.items() if name.endswith(".png")}
 
 
 def test_a_figure_under_the_name_of_ours_is_left_out_and_ours_stays(ours, capsys):

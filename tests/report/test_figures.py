@@ -4,6 +4,7 @@
 # (matplotlib's collections are not typed)
 from __future__ import annotations
 
+import io
 import json
 import shutil
 from dataclasses import replace
@@ -15,8 +16,10 @@ import pandas as pd
 import pytest
 from synthetic_store import Pretender, Synthetic
 
+from ipe_bench.report import helper as helper_module
 from ipe_bench.report.figures import (
     FIGURES,
+    Gallery,
     common,
     convergence,
     correlation,
@@ -29,7 +32,9 @@ from ipe_bench.report.figures import (
 )
 from ipe_bench.report.figures import settings as settings_figure
 from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.figures.layout import PanelLayout
 from ipe_bench.report.figures.views import View, views
+from ipe_bench.report.helper import drawing_help
 from ipe_bench.report.style import COLORS, REFERENCE, Look, house_style, looks
 from ipe_bench.statistics import analyse
 
@@ -447,22 +452,115 @@ def test_main_none_and_formats(once_drawn, tmp_path):
     main = draw_all(analysis, folder, which="main", formats=("png",), processes=1)
     assert {d.name for d in main} == {"figure_2", "figure_3", "error_against_scale", "success_against_scale"}
     assert {p.suffix for p in folder.iterdir()} == {".png", ".json"}
-    both = draw_all(analysis, folder, which="main", processes=1)
-    assert all(path.exists() for d in both for path in d.files)
-    assert {path.suffix for d in both for path in d.files} == {".png", ".pdf"}
+    before = times(folder)
+    both = draw_all(analysis, folder, which="main", formats=("png", "pdf"), processes=1)
+    assert [{path.suffix for path in d.files} for d in both] == [{".png", ".pdf"}] * len(main)
+    # What is asked for later is drawn, and nothing else.
+    assert {name for name, time in times(folder).items() if before.get(name) != time} == {
+        "index.json", *(f"{d.name}.pdf" for d in main)
+    }  # fmt: skip
+    # What is there and right is named whatever is asked for, and what is not there is not.
+    (folder / "figure_2.pdf").unlink()
+    named = {path.name for d in draw_all(analysis, folder, which="main", processes=1) for path in d.files}
+    assert named == {p.name for p in folder.iterdir()} - {"index.json"}
     # A PDF that is still right stays where none is asked for, and goes where it is no more.
     draw_all(analysis, folder, which="none")
-    assert len(list(folder.glob("*.pdf"))) == len(main)
+    assert len(list(folder.glob("*.pdf"))) == len(main) - 1
     other = replace(analysis, summary=analysis.summary.assign(success=0.5))
     draw_all(other, folder, which="none")
     assert not list(folder.glob("*.p*"))
 
 
-def test_two_processes_draw_the_same_bytes(once_drawn, tmp_path, monkeypatch):
+def test_a_picture_is_the_pixels_that_were_drawn(synthetic):
+    fill(synthetic, labels=(REFERENCE, "two"))
+    with house_style():
+        drawing = next(iter(success.draw(only_view(synthetic))))
+        content = drawing.rendered(("pdf", "svg", "png"))
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from PIL import Image
+
+    canvas = FigureCanvasAgg(drawing.figure)
+    canvas.draw()
+    with Image.open(io.BytesIO(content["png"])) as image:
+        image.load()
+        assert image.mode == "RGB"
+        assert image.info["dpi"] == pytest.approx((150, 150), abs=0.02)
+        assert np.array_equal(np.asarray(image), np.asarray(canvas.buffer_rgba())[:, :, :3])
+    assert content["pdf"].startswith(b"%PDF-")
+    assert content["svg"].startswith(b"<?xml")
+
+
+def test_labels_run_into_nothing(synthetic):
+    """Nothing of a panel leaves the figure or enters another panel; long names of groups and settings included."""
+    fill(synthetic, names=("a" * 30, "b"))
+    view = only_view(synthetic)
+    for module in (error_scale, success, nees, cost):
+        for drawing in drawn(module, view).values():
+            drawing.rendered(("png",))
+            fig = drawing.figure
+            renderer = fig.canvas.get_renderer()
+            panels = [ax for ax in fig.axes if ax.axison]
+            legend = fig.legends[0].get_window_extent(renderer)
+            boxes = [ax.get_tightbbox(renderer, for_layout_only=True) for ax in panels]
+            assert legend.y0 >= 0
+            for ax, box in zip(panels, boxes, strict=True):
+                assert 0 <= box.x0 < box.x1 <= fig.bbox.x1
+                assert legend.y1 <= box.y0 < box.y1 <= fig.bbox.y1
+                assert ax.bbox.width > 100
+                assert not any(box.overlaps(other.bbox) for other in panels if other is not ax)
+
+
+def test_the_panels_stand_where_constrained_layout_puts_them(synthetic):
+    fill(synthetic)
+    view = only_view(synthetic)
+    places = []
+    for layout in (PanelLayout, "constrained"):
+        (drawing,) = drawn(success, view).values()
+        drawing.figure.set_layout_engine(layout if isinstance(layout, str) else layout())
+        drawing.rendered(("png",))
+        places.append(np.array([ax.get_position().extents for ax in drawing.figure.axes]))
+    np.testing.assert_allclose(*places, atol=2e-3)
+
+
+def test_what_is_not_a_plain_grid_has_room_as_well():
+    with house_style():
+        fig, (ax, _) = common.panels(2)
+        mesh = ax.pcolormesh([[0.0, 1.0], [2.0, 3.0]])
+        bar = fig.colorbar(mesh, ax=ax, label="height")
+        Drawing("own", "Own", "A caption.", fig).rendered(("png",))
+    renderer = fig.canvas.get_renderer()
+    inside = [one.get_tightbbox(renderer) for one in (ax, bar.ax)]
+    assert not inside[0].overlaps(inside[1])
+    assert all(0 <= box.x0 < box.x1 <= fig.bbox.x1 for box in inside)
+
+
+def test_powers_of_ten_are_written_plainly():
+    assert [common.power_of_ten(v) for v in (1e-12, 0.1, 1.0, 1e3, 1e25)] == ["10⁻¹²", "10⁻¹", "10⁰", "10³", "10²⁵"]
+
+
+def test_the_house_style_is_seaborns_white_grid_but_for_what_it_says_itself():
+    import matplotlib as mpl
+    import seaborn as sns
+
+    expected = {**sns.axes_style("whitegrid"), **sns.plotting_context("paper", font_scale=1.05)}
+    ours = {name for name in expected if name.endswith("labelsize") or name.startswith(("grid.", "font.", "image."))}
+    ours |= {"axes.titlesize", "legend.fontsize", "axes.edgecolor"}
+    with house_style():
+        for name in expected.keys() - ours:
+            value = expected[name]
+            assert mpl.rcParams[name] == (pytest.approx(value) if isinstance(value, float) else value), name
+
+
+def test_two_processes_draw_the_same_bytes(once_drawn, tmp_path):
     analysis, alone, _ = once_drawn
-    # The helper gets everything: this process claims nothing.
-    monkeypatch.setattr(gallery, "claim", lambda *_: False)
-    helped = draw_all(analysis, tmp_path / "two", formats=("png",), processes=2)
+    with drawing_help() as helper:
+        helper.start()
+        with Gallery.open(analysis, tmp_path / "two") as gallery:
+            # The helper gets everything: this process waits.
+            gallery.work.thread.join()
+            assert gallery.work.done.keys() == gallery.missing.keys()
+            helped = gallery.drawn()
+        assert helper.ask(eval, "'seaborn' in __import__('sys').modules") is False
     assert [(d.name, d.caption) for d in helped] == [(d.name, d.caption) for d in alone]
     for a, b in zip(alone, helped, strict=True):
         assert a.files[0].read_bytes() == b.files[0].read_bytes()
@@ -470,6 +568,48 @@ def test_two_processes_draw_the_same_bytes(once_drawn, tmp_path, monkeypatch):
 
 def test_a_helper_that_dies_costs_nothing_but_time(once_drawn, tmp_path, monkeypatch):
     analysis, folder = once_drawn[0], tmp_path / "figures"
-    monkeypatch.setattr(gallery.sys, "executable", shutil.which("false") or "/nonexistent")
-    found = draw_all(analysis, folder, which="main", formats=("png",), processes=2)
+    monkeypatch.setattr(helper_module.sys, "executable", shutil.which("false") or "/nonexistent")
+    with drawing_help() as helper:
+        helper.start()
+        found = draw_all(analysis, folder, which="main")
     assert all(path.exists() for d in found for path in d.files)
+
+
+def test_what_the_helper_cannot_draw_is_drawn_here(once_drawn, tmp_path, monkeypatch):
+    analysis, alone, _ = once_drawn
+
+    def ask(self, function, *arguments):
+        raise ConnectionError("killed in the middle")
+
+    monkeypatch.setattr(helper_module.Helper, "ask", ask)
+    with drawing_help() as helper:
+        helper.start()
+        found = draw_all(analysis, tmp_path / "figures", which="main")
+    whole = {d.name: d.files[0].read_bytes() for d in alone}
+    assert [d.files[0].read_bytes() for d in found] == [whole[d.name] for d in found]
+
+
+def test_nobody_helps_where_there_is_nothing_to_draw_or_one_process_alone(once_drawn, tmp_path, monkeypatch):
+    analysis, _, folder = once_drawn
+    monkeypatch.setattr(helper_module.Helper, "start", lambda self: pytest.fail("started"))
+    draw_all(analysis, folder)
+    draw_all(analysis, tmp_path / "none", which="none")
+    draw_all(analysis, tmp_path / "one", which="main", processes=1)
+
+
+def test_what_fails_while_figures_are_drawn_leaves_no_helper(once_drawn, tmp_path):
+    analysis = once_drawn[0]
+    seen = []
+
+    def fail():
+        with drawing_help() as helper:
+            helper.start()
+            seen.append(helper._process)
+            with Gallery.open(analysis, tmp_path / "figures"):
+                raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    (process,) = seen
+    assert process.returncode is not None
+    assert not (tmp_path / "figures").exists()

@@ -55,7 +55,7 @@ def fill(
 def result(tmp_path_factory):
     store = Synthetic(tmp_path_factory.mktemp("report") / "store")
     fill(store, scales=(1.0, 10.0), seeds=5)
-    return write_report([store.directory], store.directory)
+    return write_report([store.directory], store.directory, formats="pdf")
 
 
 def test_everything_is_written(result):
@@ -74,7 +74,10 @@ def test_everything_is_written(result):
 
 def test_the_page_stands_alone_and_says_the_headline(result):
     page = result.report.read_text(encoding="utf-8")
-    assert not re.search(r"""(src|href)\s*=\s*["'](?!data:|#)""", page)
+    # It shows nothing but what is in it; it leads to the figures' files beside it, as far as there are any.
+    assert not re.search(r"""src\s*=\s*["'](?!data:)""", page)
+    led_to = set(re.findall(r"""href\s*=\s*["'](?!data:|#)([^"']*)""", page))
+    assert led_to == {f"figures/{path.name}" for path in result.figures}
     # The name of SVG's namespace is no address that anything is fetched from.
     said = re.sub(r"base64,[^\"]*|http-equiv|http://www.w3.org/2000/svg", "", page)
     assert "http" not in said

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from ipe_bench.cli.main import main
+from ipe_bench.report import figures
+from ipe_bench.report.helper import Helper
 from ipe_bench.report.stamp import NAME
 from ipe_bench.runs.columns import as_array
 
@@ -115,6 +118,72 @@ def test_figures_are_all_the_main_ones_or_none(tmp_path: Path, capsys: pytest.Ca
     capsys.readouterr()
     assert main(["report", str(tmp_path), "figures=some"]) == 2
     assert "figures=some: choose all, main or none" in capsys.readouterr().err
+
+
+def test_files_in_other_formats_come_when_they_are_asked_for_and_are_named_while_they_are_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(figures, "FIGURES", ("success", "cost"))
+
+    def links() -> set[str]:
+        return set(re.findall(r'href="figures/([^"]+)"', (tmp_path / "report.html").read_text(encoding="utf-8")))
+
+    def kinds() -> set[str]:
+        return {path.suffix for path in tmp_path.glob("figures/*.*")} - {".json"}
+
+    assert run(tmp_path, "figures=all") == 0
+    assert kinds() == {".png"}
+    first = written(tmp_path)
+    # Two formats are no sweep, and the pictures that are there stay as they are.
+    assert run(tmp_path, "figures=all", "formats=pdf,svg") == 0
+    assert kinds() == {".png", ".pdf", ".svg"}
+    assert "multirun" not in "".join(path.name for path in tmp_path.iterdir())
+    after = written(tmp_path)
+    assert all(after[name] == time for name, time in first.items() if name.endswith(".png"))
+    assert links() == {path.name for path in tmp_path.glob("figures/*.*")} - {"index.json"}
+    # What has more formats than are asked for is what is asked for.
+    for formats in ("formats=pdf", "formats=[svg,png]", "formats=png"):
+        assert run(tmp_path, "figures=all", formats) == 0
+        assert written(tmp_path) == after
+    # A file that is gone is drawn where it is asked for, and not spoken of where it is not.
+    (tmp_path / "figures" / "cost_against_accuracy.pdf").unlink()
+    assert run(tmp_path, "figures=all") == 0
+    assert "cost_against_accuracy.pdf" not in links()
+    assert "success_against_scale.pdf" in links()
+    assert main(["report", str(tmp_path), "figures=all", "formats=png,pdf"]) == 0
+    assert "cost_against_accuracy.pdf" in links()
+    assert (tmp_path / "figures" / "cost_against_accuracy.pdf").exists()
+    # Other data: what nobody asks for any more is not there any more.
+    assert run(tmp_path, "figures=all", "trials=5") == 0
+    assert kinds() == {".png"}
+    assert {name.rpartition(".")[2] for name in links()} == {"png"}
+    capsys.readouterr()
+    assert main(["report", str(tmp_path), "formats=pdf,tiff"]) == 2
+    assert "formats=pdf,tiff: choose among png, pdf and svg" in capsys.readouterr().err
+
+
+def test_a_second_process_is_there_early_and_only_where_something_is_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[bool] = []
+
+    def noted(helper: Helper) -> None:
+        started.append(any(tmp_path.glob("trials/*")))
+
+    monkeypatch.setattr(Helper, "start", noted)
+    monkeypatch.setattr(figures, "FIGURES", ("success",))
+    assert run(tmp_path, "figures=all") == 0
+    # Before anything is stored where nothing is, and at any rate before it is drawn.
+    assert started[0] is False
+    started.clear()
+    assert run(tmp_path, "figures=all") == 0
+    assert run(tmp_path, "trials=6") == 0
+    assert run(tmp_path, "trials=6") == 0
+    assert main(["report", str(tmp_path), "figures=none"]) == 0
+    assert main(["run", "measurement=polynomial", "--dry-run", f"output={tmp_path / 'other'}"]) == 0
+    assert started == []
+    assert run(tmp_path, "trials=8", "figures=all") == 0
+    assert started
 
 
 def test_a_damaged_file_is_named_however_often_the_report_was_made(

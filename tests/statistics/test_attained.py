@@ -91,7 +91,7 @@ def test_the_terminal_and_the_report_show_them(folder):
     assert "nothing is stored" not in shown
     result = write_report([folder], folder)
     assert {p.name for p in result.tables} >= {"attained.csv", "attained_problems.csv"}
-    assert [p.name for p in result.figures] == ["data_profile.png", "data_profile.pdf"]
+    assert [p.name for p in result.figures] == ["data_profile.png"]
     # All that solve the most are named.
     totals = attained_tables(collection)[1]
     most = list(totals.loc[totals["solved"] == totals["solved"].max(), "estimator"])

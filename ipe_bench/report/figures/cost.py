@@ -65,14 +65,11 @@ def efficient(n: int) -> float:
 
 
 def _points(ax: Any, rows: pd.DataFrame, view: View) -> None:
-    import seaborn as sns
-
     look = view.with_look(rows["estimator"])
-    markers = {label: one.marker for label, one in look.items()}
     # Equal points lie upon each other: the later ones are smaller, so that all are seen.
     areas = dict(zip(look, common.mark_scale() ** 2 * np.linspace(110, 40, len(look)), strict=True))
-    style = common.seaborn_style(look) | {"size": "estimator", "sizes": areas}
-    sns.scatterplot(rows, x="cost", y="error", markers=markers, linewidth=0.7, zorder=3, ax=ax, **style)
+    labels = list(rows["estimator"])
+    common.marks(ax, rows["cost"], rows["error"], [look[e] for e in labels], [areas[e] for e in labels], linewidth=0.7)
 
 
 def _ways(ax: Any, rows: pd.DataFrame, view: View) -> None:

@@ -9,31 +9,29 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
-import pickle
-import subprocess
-import sys
-import tempfile
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from importlib import import_module, metadata, resources
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.files import make_folder, write_text
+from ipe_bench.basics.files import make_folder, write_bytes, write_text
 from ipe_bench.plugins.extensions import code_digest
-from ipe_bench.report.choice import Which
-from ipe_bench.report.figures.drawing import FORMATS, Drawing, Figure
+from ipe_bench.report.choice import FORMATS, PAGE, Which
+from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View, views
-from ipe_bench.report.style import house_style
+from ipe_bench.report.helper import Helper, drawing_help
+from ipe_bench.report.style import house_style, report_style
 from ipe_bench.statistics.analysis import Analysis
 
 INDEX = "index.json"
 SCHEMA = 1
-WORTH_HELP = 3
-"""So many figures to draw are worth a second process, which needs a second or more to start."""
+WORTH_HELP = 5
+"""So many kinds of figures are worth a second process that is not there yet and needs a second to start."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,7 @@ class Drawn:
     title: str
     caption: str
     files: tuple[Path, ...]
-    """One per format, in the order asked for."""
+    """One per format that is there, as the data are now: the page's, then those that were asked for now or before."""
 
 
 @dataclass(frozen=True)
@@ -78,39 +76,92 @@ def draw_all(
     folder: Path,
     *,
     which: Which = "all",
-    formats: Sequence[str] = FORMATS,
+    formats: Sequence[str] = (PAGE,),
     processes: int | None = None,
     problems: list[str] | None = None,
 ) -> list[Drawn]:
-    """The figures that the data allow, in the order of the report, as files in the folder.
+    """The figures that the data allow, in the order of the report, as files in the folder; see `Gallery`."""
+    with Gallery.open(analysis, folder, which, formats, problems, processes) as gallery:
+        return gallery.drawn()
+
+
+class Gallery:
+    """A folder that is to hold the figures that the data allow.
 
     `which` is all, main (the few that answer the question) or none. A figure is drawn only where the folder does not
-    hold it already in these formats; with `processes` (by default 2 where there are so many CPUs) two draw at once.
+    hold it already in these formats; with `processes` (by default as many as there are cores, two at most) a second
+    one draws from the beginning on, and this one what is left as soon as it is asked for what is `drawn`.
     What an earlier report left in the folder and is still right stays, whatever is asked for; what is not is removed.
     A figure of a plugin that cannot be drawn is left out, with a line added to the `problems`.
     """
-    problems = [] if problems is None else problems
-    tasks = {task.digest: task for task in _tasks(analysis, problems)}
-    wanted = [d for d, task in tasks.items() if which == "all" or (which == "main" and _figure(task.figure).main)]
-    old = _read_index(folder)
-    missing = [d for d in wanted if not _is_there(old.get(d), folder, formats)]
-    entries = {d: _intact(old[d], folder) for d in tasks if d in old}
-    if missing:
-        make_folder(folder)
-        known = {d: {kind for entry in entries.get(d, ()) for kind in entry.digests} for d in missing}
-        # What was drawn in another format before is drawn in that one too, so that all formats show the same.
-        lists = {d: [kind for kind in FORMATS if kind in formats or kind in known[d]] for d in missing}
-        jobs = [(tasks[d], lists[d]) for d in missing]
-        drawn = dict(zip(missing, _draw(jobs, folder, processes or min(2, os.cpu_count() or 1)), strict=True))
-        problems += [f"{tasks[d].plugin}: {made}; it is left out" for d, made in drawn.items() if isinstance(made, str)]
-        entries |= {d: made for d, made in drawn.items() if not isinstance(made, str)}
-    _settle_names(tasks, entries, folder, problems)
-    _tidy(folder, old, entries)
-    return [
-        Drawn(e.name, e.title, e.caption, tuple(folder / f"{e.name}.{kind}" for kind in formats))
-        for d in wanted
-        for e in entries.get(d, ())
-    ]
+
+    def __init__(self, analysis: Analysis, folder: Path, which: Which, formats: Sequence[str], problems: list[str]):
+        self.folder = folder
+        self.problems = problems
+        self.parts, whole = views(analysis)
+        """The settings one by one."""
+        self.tasks = {task.digest: task for task in _tasks(analysis, self.parts, whole, problems)}
+        self.wanted = [
+            d for d, t in self.tasks.items() if which == "all" or (which == "main" and _figure(t.figure).main)
+        ]
+        self.old = _read_index(folder)
+        self.entries = {d: _intact(self.old[d], folder) for d in self.tasks if d in self.old}
+        self.missing: dict[str, Job] = {}
+        for digest in self.wanted:
+            known = self.entries.get(digest)
+            lacking = [kind for kind in formats if known is None or any(kind not in e.digests for e in known)]
+            if lacking:
+                self.missing[digest] = (self.tasks[digest], tuple(lacking))
+        self.work = _Work(self.missing)
+
+    @classmethod
+    @contextlib.contextmanager
+    def open(
+        cls,
+        analysis: Analysis,
+        folder: Path,
+        which: Which = "all",
+        formats: Sequence[str] = (PAGE,),
+        problems: list[str] | None = None,
+        processes: int | None = None,
+    ) -> Iterator[Gallery]:
+        """A gallery whose second process draws what is missing while this one does something else."""
+        gallery = cls(analysis, folder, which, formats, [] if problems is None else problems)
+        with drawing_help() as helper:
+            if processes != 1 and gallery.missing:
+                if len(gallery.missing) >= WORTH_HELP:
+                    helper.start()
+                gallery.work.share(helper)
+            try:
+                yield gallery
+            finally:
+                gallery.work.give_up()
+
+    def drawn(self) -> list[Drawn]:
+        """The figures in the order of the report, all of them in the folder."""
+        made = self.work.finished()
+        if made:
+            make_folder(self.folder)
+        for digest in self.missing:
+            pictures = made[digest]
+            if isinstance(pictures, str):
+                self.problems.append(f"{self.tasks[digest].plugin}: {pictures}; it is left out")
+            else:
+                known = {entry.name: entry.digests for entry in self.entries.get(digest, ())}
+                saved = [picture.saved(self.folder) for picture in pictures]
+                self.entries[digest] = [replace(e, digests=known.get(e.name, {}) | e.digests) for e in saved]
+        entries = {d: self.entries[d] for d in self.tasks if d in self.entries}
+        _settle_names(self.tasks, entries, self.folder, self.problems)
+        _tidy(self.folder, self.old, entries)
+        return [
+            Drawn(e.name, e.title, e.caption, tuple(self.folder / f"{e.name}.{kind}" for kind in _in_order(e.digests)))
+            for d in self.wanted
+            for e in entries.get(d, ())
+        ]
+
+
+def _in_order(kinds: Iterable[str]) -> list[str]:
+    return [kind for kind in FORMATS if kind in set(kinds)]
 
 
 def drawings(analysis: Analysis, problems: list[str]) -> Iterator[Drawing]:
@@ -118,7 +169,7 @@ def drawings(analysis: Analysis, problems: list[str]) -> Iterator[Drawing]:
     line added to the `problems`."""
     from ipe_bench.report import extensions
 
-    for task in _tasks(analysis, problems):
+    for task in _tasks(analysis, *views(analysis), problems):
         if not task.plugin:
             yield from _figure(task.figure).draw(task.view)
             continue
@@ -142,19 +193,18 @@ def _settle_names(tasks: dict[str, Task], entries: dict[str, list[Entry]], folde
         taken |= names
     for digest in [d for d in entries if any(entry.name in spoiled for entry in entries[d])]:
         kinds = {kind for entry in entries[digest] for kind in entry.digests}
-        made = draw_task(tasks[digest], folder, [kind for kind in FORMATS if kind in kinds])
+        made = draw_task(tasks[digest], _in_order(kinds))
         if not isinstance(made, str):
-            entries[digest] = made
+            entries[digest] = [picture.saved(folder) for picture in made]
 
 
-def _tasks(analysis: Analysis, problems: list[str]) -> Iterator[Task]:
+def _tasks(analysis: Analysis, parts: Sequence[View], whole: View, problems: list[str]) -> Iterator[Task]:
     """Every kind of figure of every setting, or of all of them together; ours first."""
     from ipe_bench.report import extensions
     from ipe_bench.report.figures import FIGURES
 
     if not analysis.collection.groups and analysis.attained.empty:
         return
-    parts, whole = views(analysis)
     kinds = [(name, _figure(name), "", "") for name in FIGURES]
     for option, figure in extensions.figures(problems):
         kinds.append((str(option.target), figure, f"figure={option.name}", code_digest(option)))
@@ -184,74 +234,85 @@ def _drawn_with() -> str:
     return digest.hexdigest()
 
 
-def draw_task(task: Task, folder: Path, formats: Sequence[str]) -> list[Entry] | str:
-    """Draws a task's figures into the folder; returns why it could not, where they are a plugin's."""
+@dataclass(frozen=True)
+class Picture:
+    """A drawn figure, its files in memory."""
+
+    name: str
+    title: str
+    caption: str
+    files: dict[str, bytes]
+    """By format."""
+
+    @classmethod
+    def of(cls, drawing: Drawing, formats: Sequence[str]) -> Picture:
+        return cls(drawing.name, str(drawing.title), str(drawing.caption), drawing.rendered(formats))
+
+    def saved(self, folder: Path) -> Entry:
+        for kind, content in self.files.items():
+            write_bytes(folder / f"{self.name}.{kind}", content)
+        digests = {kind: hashlib.sha256(content).hexdigest() for kind, content in self.files.items()}
+        return Entry(self.name, self.title, self.caption, digests)
+
+
+def draw_task(task: Task, formats: Sequence[str]) -> list[Picture] | str:
+    """Draws a task's figures; returns why it could not, where they are a plugin's."""
     from ipe_bench.report import extensions
 
+    if not task.plugin:
+        with report_style():
+            return [Picture.of(drawing, formats) for drawing in _figure(task.figure).draw(task.view)]
     with house_style():
-        if not task.plugin:
-            return [_saved(drawing, folder, formats) for drawing in _figure(task.figure).draw(task.view)]
         try:
             drawings = extensions.drawings(_figure(task.figure), task.view)
-            return extensions.guarded(lambda: [_saved(drawing, folder, formats) for drawing in drawings])
+            return extensions.guarded(lambda: [Picture.of(drawing, formats) for drawing in drawings])
         except UserError as error:
             return str(error)
 
 
-def _saved(drawing: Drawing, folder: Path, formats: Sequence[str]) -> Entry:
-    files = drawing.save(folder, formats)
-    digests = {kind: _digest_of(path) for kind, path in zip(formats, files, strict=True)}
-    return Entry(drawing.name, str(drawing.title), str(drawing.caption), digests)
+Job = tuple[Task, tuple[str, ...]]
 
 
-Job = tuple[Task, list[str]]
+class _Work:
+    """Jobs that two processes do: the helper those that take longest, from the beginning on, and this one the others,
+    when it is asked for all of them."""
 
+    def __init__(self, jobs: Mapping[str, Job]) -> None:
+        self.jobs = jobs
+        self.done: dict[str, list[Picture] | str] = {}
+        self.waiting = deque(sorted(jobs, key=lambda digest: -_figure(jobs[digest][0].figure).weight))
+        self.helper: Helper | None = None
+        self.thread: Thread | None = None
 
-def _draw(jobs: Sequence[Job], folder: Path, processes: int) -> list[list[Entry] | str]:
-    """The jobs' entries; a second process takes jobs from the end while this one takes them from the beginning."""
-    with tempfile.TemporaryDirectory(prefix="ipe-bench-figures-") as place:
-        desk = Path(place)
-        helper = _start_helper(jobs, folder, desk) if processes > 1 and len(jobs) >= WORTH_HELP else None
-        try:
-            done = {i: draw_task(jobs[i][0], folder, jobs[i][1]) for i in range(len(jobs)) if claim(desk, i)}
-            if helper is not None:
-                helper.wait()
-                done |= _reported(desk)
-        finally:
-            if helper is not None:
-                helper.kill()
-                helper.wait()
-        # What a helper took and did not bring back is drawn here, and raises here what stopped it there.
-        return [done[i] if i in done else draw_task(task, folder, formats) for i, (task, formats) in enumerate(jobs)]
+    def share(self, helper: Helper) -> None:
+        """Hands jobs to the helper from here on, where it is started."""
+        if helper.started:
+            self.helper, self.thread = helper, Thread(target=self._hand_over, args=(helper,), daemon=True)
+            self.thread.start()
 
+    def _hand_over(self, helper: Helper) -> None:
+        with contextlib.suppress(IndexError, ConnectionError):
+            while True:
+                digest = self.waiting.popleft()
+                self.done[digest] = helper.ask(draw_task, *self.jobs[digest])
 
-def _start_helper(jobs: Sequence[Job], folder: Path, desk: Path) -> subprocess.Popen[bytes] | None:
-    """A second Python that draws; not forked, since this process may have threads, and not by multiprocessing, which
-    would run the user's script again."""
-    (desk / "jobs").write_bytes(pickle.dumps((list(jobs), folder.absolute())))
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    command = [sys.executable, "-m", "ipe_bench.report.figures.helper", str(desk)]
-    with contextlib.suppress(OSError):
-        quiet = subprocess.DEVNULL
-        return subprocess.Popen(command, env=environment, stdin=quiet, stdout=quiet, stderr=quiet)
-    return None
+    def finished(self) -> dict[str, list[Picture] | str]:
+        """What all jobs came to."""
+        with contextlib.suppress(IndexError):
+            while True:
+                digest = self.waiting.pop()
+                self.done[digest] = draw_task(*self.jobs[digest])
+        if self.thread is not None:
+            self.thread.join()
+        # What the helper took and did not bring back is drawn here, and raises here what stopped it there.
+        return {d: self.done[d] if d in self.done else draw_task(*job) for d, job in self.jobs.items()}
 
-
-def claim(desk: Path, job: int) -> bool:
-    """Whether the job is this process's to do: the first to ask has it."""
-    try:
-        (desk / f"claimed-{job}").touch(exist_ok=False)
-    except FileExistsError:
-        return False
-    return True
-
-
-def _reported(desk: Path) -> dict[int, list[Entry] | str]:
-    return {int(path.name.removeprefix("done-")): pickle.loads(path.read_bytes()) for path in desk.glob("done-*")}
-
-
-def _is_there(entries: Sequence[Entry] | None, folder: Path, formats: Sequence[str]) -> bool:
-    return entries is not None and all(entry.intact(folder, kind) for entry in entries for kind in formats)
+    def give_up(self) -> None:
+        """Leaves undone what is not done."""
+        self.waiting.clear()
+        if self.helper is not None and self.thread is not None and self.thread.is_alive():
+            self.helper.stop()
+            self.thread.join()
 
 
 def _intact(entries: Sequence[Entry], folder: Path) -> list[Entry]:

@@ -13,11 +13,11 @@ from ipe_bench.report.words import p_value
 
 
 def draw(view: View) -> Iterator[Drawing]:
-    import seaborn as sns
-
     ranking = view.ranking
     if ranking is None or len(ranking.mean_ranks) < 3 or not view.look.keys() >= ranking.mean_ranks.keys():
         return
+    import seaborn as sns
+
     ordered = sorted(ranking.mean_ranks, key=lambda label: ranking.mean_ranks[label])
     k, difference = len(ordered), ranking.critical_difference
     ranks = [ranking.mean_ranks[label] for label in ordered]

@@ -138,7 +138,16 @@ def _keys(frame: pd.DataFrame, columns: Sequence[str]) -> list[tuple[str, ...]]:
     """What each row's setting is; frames over all settings have none."""
     if not set(columns) <= set(frame.columns):
         return [()] * len(frame)
-    return list(zip(*(frame[c].map(_word) for c in columns), strict=True)) if columns else [()] * len(frame)
+    return list(zip(*(_words(frame[c]) for c in columns), strict=True)) if columns else [()] * len(frame)
+
+
+def _words(column: pd.Series) -> Any:
+    """What `_word` makes of a column of few different values."""
+    if column.dtype == object:
+        # True and 1 are two settings here, and one value there.
+        return column.map(_word)
+    codes, values = pd.factorize(column, use_na_sentinel=False)
+    return np.array([_word(value) for value in values], dtype=object)[codes]
 
 
 def _word(value: Any) -> str:
