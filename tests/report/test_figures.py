@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from importlib import import_module
 from itertools import combinations, pairwise
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import pandas as pd
 import pytest
 from synthetic_store import Pretender, Synthetic
 
+from ipe_bench.report import figures
 from ipe_bench.report.figures import (
     FIGURES,
     common,
@@ -358,6 +360,12 @@ def once_drawn(tmp_path_factory):
 
 
 @pytest.fixture
+def few(monkeypatch):
+    """Two kinds of figures, of which the first is a main one, where it does not matter what is drawn."""
+    monkeypatch.setattr(figures, "FIGURES", ("success", "cost"))
+
+
+@pytest.fixture
 def all_drawn(once_drawn, tmp_path):
     """The analysis, and a copy of the folder to spoil."""
     analysis, _, folder = once_drawn
@@ -388,18 +396,18 @@ def test_only_what_shows_the_change_is_drawn_again(all_drawn):
     assert not {"success_against_scale.png", "error_against_scale.png", "profiles.png"} & changed
 
 
-def test_other_code_draws_again(all_drawn, monkeypatch):
+def test_other_code_draws_again(all_drawn, few, monkeypatch):
     analysis, folder = all_drawn
     before = times(folder)
     monkeypatch.setattr(gallery, "_drawn_with", lambda: "other code")
-    found = draw_all(analysis, folder, which="main", formats=("png",), processes=1)
-    names = [path.name for drawn in found for path in drawn.files]
-    assert len(names) == 4
+    found = draw_all(analysis, folder, formats=("png",), processes=1)
+    names = {path.name for drawn in found for path in drawn.files}
+    assert {"success_against_scale.png", "cost_against_accuracy.png"} <= names
     assert all(times(folder)[name] != before[name] for name in names)
 
 
 @pytest.mark.parametrize("damage", ["cut", "edited", "removed", "index"])
-def test_damaged_figures_are_drawn_again(all_drawn, damage):
+def test_damaged_figures_are_drawn_again(all_drawn, few, damage):
     analysis, folder = all_drawn
     path = folder / "success_against_scale.png"
     whole = path.read_bytes()
@@ -415,7 +423,7 @@ def test_damaged_figures_are_drawn_again(all_drawn, damage):
     assert path.read_bytes() == whole
 
 
-def test_stale_figures_go_and_foreign_files_stay(synthetic, tmp_path):
+def test_stale_figures_go_and_foreign_files_stay(synthetic, few, tmp_path):
     folder = tmp_path / "figures"
     small = {"labels": (REFERENCE, "fixed_point"), "scales": (1.0, 10.0), "names": ("a",)}
     fill(synthetic, **small)
@@ -440,12 +448,19 @@ def test_an_index_cannot_remove_files_elsewhere(stored):
     assert victim.exists()
 
 
-def test_main_none_and_formats(once_drawn, tmp_path):
+def test_the_main_figures_are_four(once_drawn):
+    names = {drawn.name for drawn in once_drawn[1]}
+    assert {"figure_2", "figure_3", "error_against_scale", "success_against_scale"} < names
+    modules = {name: import_module(f"{figures.__name__}.{name}") for name in FIGURES}
+    assert {name for name, module in modules.items() if module.FIGURE.main} == {"error_scale", "success"}
+
+
+def test_main_none_and_formats(once_drawn, few, tmp_path):
     analysis, folder = once_drawn[0], tmp_path / "figures"
     assert draw_all(analysis, folder, which="none") == []
     assert not folder.exists()
     main = draw_all(analysis, folder, which="main", formats=("png",), processes=1)
-    assert {d.name for d in main} == {"figure_2", "figure_3", "error_against_scale", "success_against_scale"}
+    assert [d.name for d in main] == ["success_against_scale"]
     assert {p.suffix for p in folder.iterdir()} == {".png", ".json"}
     both = draw_all(analysis, folder, which="main", processes=1)
     assert all(path.exists() for d in both for path in d.files)
@@ -458,18 +473,26 @@ def test_main_none_and_formats(once_drawn, tmp_path):
     assert not list(folder.glob("*.p*"))
 
 
-def test_two_processes_draw_the_same_bytes(once_drawn, tmp_path, monkeypatch):
-    analysis, alone, _ = once_drawn
+@pytest.mark.parametrize("kinds", [FIGURES[:3], pytest.param(FIGURES, marks=pytest.mark.slow)], ids=["three", "all"])
+def test_two_processes_draw_the_same_bytes(once_drawn, kinds, tmp_path, monkeypatch):
+    analysis, _, folder = once_drawn
+    monkeypatch.setattr(figures, "FIGURES", kinds)
     # The helper gets everything: this process claims nothing.
     monkeypatch.setattr(gallery, "claim", lambda *_: False)
+    monkeypatch.setattr(gallery, "draw_task", lambda *_: pytest.fail("drawn here"))
     helped = draw_all(analysis, tmp_path / "two", formats=("png",), processes=2)
-    assert [(d.name, d.caption) for d in helped] == [(d.name, d.caption) for d in alone]
-    for a, b in zip(alone, helped, strict=True):
-        assert a.files[0].read_bytes() == b.files[0].read_bytes()
+    assert len(helped) > 3
+    for drawn in helped:
+        assert drawn.files[0].read_bytes() == (folder / drawn.files[0].name).read_bytes()
 
 
-def test_a_helper_that_dies_costs_nothing_but_time(once_drawn, tmp_path, monkeypatch):
+def test_a_helper_that_dies_costs_nothing_but_time(once_drawn, few, tmp_path, monkeypatch):
     analysis, folder = once_drawn[0], tmp_path / "figures"
+    monkeypatch.setattr(gallery, "WORTH_HELP", 1)
+    started = []
+    popen = gallery.subprocess.Popen
+    monkeypatch.setattr(gallery.subprocess, "Popen", lambda *a, **b: started.append(popen(*a, **b)) or started[-1])
     monkeypatch.setattr(gallery.sys, "executable", shutil.which("false") or "/nonexistent")
     found = draw_all(analysis, folder, which="main", formats=("png",), processes=2)
-    assert all(path.exists() for d in found for path in d.files)
+    assert len(started) == 1
+    assert [path.exists() for d in found for path in d.files] == [True]
