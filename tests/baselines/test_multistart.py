@@ -76,7 +76,7 @@ def lowest_of_a_grid(z: Array) -> float:
 
 
 def test_the_lowest_of_many_minima_is_found_where_one_start_is_lost():
-    problem, trials = draw(Wave(), 0.1, 1.0, 40)
+    problem, trials = draw(Wave(), 0.1, 1.0, 20)
     wanted = np.array([lowest_of_a_grid(z) for z in trials.z])
     single = LevenbergMarquardt().estimate(problem, trials.z).x[:, 0]
     found = Multistart(starts=40).estimate(problem, trials.z)

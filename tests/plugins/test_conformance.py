@@ -39,8 +39,8 @@ def complaints(component) -> str:
     return "; ".join(f.complaint for f in check_component("mine", component) if f.complaint)
 
 
-DEAR = ("enkf", "ukf_wide")
-"""An ensemble for every reading; the same class as another option."""
+DEAR = ("enkf", "ukf_wide", "iplf", "recursive_update", "lm_iekf")
+"""Ensembles and iterations for every reading take seconds; ukf_wide is of the same class as another option."""
 
 
 @pytest.mark.parametrize(
