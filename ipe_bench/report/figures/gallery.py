@@ -90,9 +90,14 @@ def draw_all(
     A figure of a plugin that cannot be drawn is left out, with a line added to the `problems`.
     """
     problems = [] if problems is None else problems
+    old = _read_index(folder)
+    if which == "none" and not old:
+        from ipe_bench.report import extensions
+
+        list(extensions.figures(problems))  # what cannot be used is told all the same
+        return []
     tasks = {task.digest: task for task in _tasks(analysis, problems)}
     wanted = [d for d, task in tasks.items() if which == "all" or (which == "main" and _figure(task.figure).main)]
-    old = _read_index(folder)
     missing = [d for d in wanted if not _is_there(old.get(d), folder, formats)]
     entries = {d: _intact(old[d], folder) for d in tasks if d in old}
     if missing:
