@@ -520,11 +520,14 @@ def compute(
     # What is stored of a scenario shows that its numbers can be computed with, without drawing any.
     stored = [any(Path(output).glob(f"trials/{Cell(scenario).key}-*.parquet")) for scenario in scenarios]
     untried = [scenario for scenario, known in zip(scenarios, stored, strict=True) if not known]
+    execution = execution or Serial()
+    if block_size > 0:
+        # Workers start while this process looks at what is asked for.
+        execution.warm_up(perform, len(untried) * -(-trials // block_size))
     validate(scenarios, estimators, trials, block_size, untried=untried)
     # Absolute: workers may have another working folder.
     store = Store(Path(output).absolute())
     store.prepare()
-    execution = execution or Serial()
     cells = [cells_of(scenario, estimators) for scenario in scenarios]
     results = Results.read([store.directory], keys={cell.key for part in cells for cell in part})
     aside = results.set_aside()

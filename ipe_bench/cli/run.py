@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra._internal.config_loader_impl import ConfigLoaderImpl as ConfigLoader
 from hydra._internal.hydra import Hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import MissingConfigException
@@ -40,6 +41,8 @@ from ipe_bench.runs.schedule import Watcher
 from ipe_bench.runs.store import describe_names, digest
 
 _OWN_LAUNCHER = ".BasicLauncher"
+_KEPT_CONFIGS = 100
+"""Of a large sweep all together would need more memory than its trials."""
 
 
 class Outcome:
@@ -142,7 +145,7 @@ def _run_hydra(flags: Sequence[str], words: Sequence[str]) -> None:
     sys.argv = ["ipe-bench", *flags, *words]
     try:
         told = _without_asking(RunMode.RUN) if _is_plain(flags, words) else contextlib.nullcontext()
-        with flags_of_hydra(), told:
+        with flags_of_hydra(), told, _composing_jobs_once():
             hydra.main(version_base="1.3", config_path=str(plugins.own_conf()), config_name="config")(task)()
     except (UserError, StorageError):
         raise
@@ -166,6 +169,27 @@ def _is_plain(flags: Sequence[str], words: Sequence[str]) -> bool:
     """Whether nothing that is asked for can say hydra.mode: neither a word, nor an experiment, nor another folder."""
     asks = any("hydra" in word or "experiment" in word for word in words)
     return not flags and not asks and len(plugins.sources()) == 1
+
+
+@contextlib.contextmanager
+def _composing_jobs_once() -> Iterator[None]:
+    """Hydra composes every job of a sweep to see whether it can be, and again to run it: the first config is kept."""
+    compose, kept = ConfigLoader.load_sweep_config, {}
+
+    def composed(self: ConfigLoader, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
+        key = tuple(sweep_overrides)
+        known = kept.pop(key, None)
+        if known is None:
+            known = compose(self, master_config, sweep_overrides)
+            if len(kept) < _KEPT_CONFIGS:
+                kept[key] = known
+        return known
+
+    ConfigLoader.load_sweep_config = composed
+    try:
+        yield
+    finally:
+        ConfigLoader.load_sweep_config = compose
 
 
 @contextlib.contextmanager

@@ -14,7 +14,7 @@ from typing import Any
 from ipe_bench.basics.errors import UserError
 from ipe_bench.plugins.construct import find_object
 from ipe_bench.plugins.discovery import RECORD_GROUPS, Option, options
-from ipe_bench.runs.provenance import TARGET, package_version
+from ipe_bench.runs.provenance import TARGET
 
 
 def find_record(option: Option) -> Any:
@@ -56,9 +56,9 @@ def use_statistics() -> list[str]:
 
 
 def code_digest(option: Option) -> str:
-    """Changes with any file of the package that an option belongs to, and with its version."""
+    """Changes with any file of the package that an option belongs to."""
     package = option.source.conf.parent
-    digest = hashlib.sha256(f"{option.target} {package_version(package.name)};".encode())
+    digest = hashlib.sha256(f"{option.target};".encode())
     for path in sorted(package.rglob("*")):
         if path.is_file() and "__pycache__" not in path.parts:
             digest.update(f"{path.relative_to(package)} {_digest_of(path)};".encode())

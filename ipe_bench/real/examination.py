@@ -12,8 +12,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.stats import chi2
-from scipy.stats import f as fisher
+from scipy.special import chdtri, fdtri
 
 from ipe_bench.basics.linalg import Array, Covariance, deviations, inverse
 from ipe_bench.basics.statuses import Status
@@ -368,9 +367,9 @@ class _Least:
         return self._told_apart(minima)
 
     def _told_apart(self, minima: Minima) -> list[Minimum]:
-        limit = float(chi2.ppf(CONFIDENCE, len(self.x)))
+        limit = float(chdtri(len(self.x), 1 - CONFIDENCE))
         if self.freedom is not None:
-            limit = float(len(self.x) * fisher.ppf(CONFIDENCE, len(self.x), self.freedom))
+            limit = float(len(self.x) * fdtri(len(self.x), self.freedom, CONFIDENCE))
         usable = minima.converged & np.isfinite(minima.chi_square) & np.isfinite(minima.covariance).all(axis=(1, 2))
         order = np.flatnonzero(usable)[np.argsort(minima.chi_square[usable], kind="stable")]
         found: list[Minimum] = []

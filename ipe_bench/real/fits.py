@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2, norm
-from scipy.stats import f as fisher
-from scipy.stats import t as student
+from scipy.special import chdtri, fdtri, ndtri, stdtr, stdtrit
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
@@ -134,7 +132,7 @@ class Fit:
         """Half the width of a confidence interval in standard errors: of the normal distribution, or of Student's t
         where the level of the noise is estimated."""
         tail = (1.0 - confidence) / 2.0
-        return float(norm.isf(tail) if self.level is None else student.isf(tail, self.degrees_of_freedom))
+        return -float(ndtri(tail) if self.level is None else stdtrit(self.degrees_of_freedom, tail))
 
     def interval(self, confidence: float = 0.95) -> tuple[Array, Array]:
         """Confidence intervals (n,), (n,) from the standard errors; inside of its bounds where a parameter has some."""
@@ -147,8 +145,8 @@ class Fit:
         """The squared distance, in standard errors, to the edge of a joint region of so many parameters: chi-square, or
         F where the level of the noise is estimated."""
         if self.level is None:
-            return float(chi2.ppf(confidence, parameters))
-        return float(parameters * fisher.ppf(confidence, parameters, self.degrees_of_freedom))
+            return float(chdtri(parameters, 1 - confidence))
+        return float(parameters * fdtri(parameters, self.degrees_of_freedom, confidence))
 
     @property
     def outlier_limit(self) -> float:
@@ -194,9 +192,9 @@ def _compared(fits: list[Fit]) -> list[Fit]:
     n, free = len(fits[0].x), fits[0].degrees_of_freedom
     least = min((value for value in sums if np.isfinite(value)), default=np.nan)
     if fits[0].level is None:
-        limit = least + float(chi2.isf(FIT_LEVEL, n))
+        limit = least + float(chdtri(n, FIT_LEVEL))
     else:
-        limit = least * (1 + n / free * float(fisher.isf(FIT_LEVEL, n, free))) if free > 0 else np.inf
+        limit = least * (1 + n / free * float(fdtri(n, free, 1 - FIT_LEVEL))) if free > 0 else np.inf
     return [replace(one, beaten=not value <= limit) for one, value in zip(fits, sums, strict=True)]
 
 
@@ -241,7 +239,7 @@ def _with_level(found: Fit, factor: float, level: float) -> Fit:
     with np.errstate(all="ignore"):
         r = found.normalised / factor
         t = r * np.sqrt((free - 1) / np.maximum(free - r**2, 0.0))
-        deviates = np.sign(r) * norm.isf(student.sf(np.abs(t), free - 1)) if free > 1 else np.full(len(r), np.nan)
+        deviates = -np.sign(r) * ndtri(stdtr(free - 1, -np.abs(t))) if free > 1 else np.full(len(r), np.nan)
         # So improbable that it underflows: a deviate beyond every limit.
         deviates = np.where(np.isinf(deviates), np.sign(r) * _FARTHEST, deviates)
         return replace(

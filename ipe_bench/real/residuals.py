@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
-from scipy.stats import norm
+from scipy.special import chdtrc, ndtri
 
 from ipe_bench.basics.linalg import Array, Covariance
 
@@ -69,7 +68,7 @@ def normalised(w: Array, Q: Array, R: Covariance) -> Array:
 def outlier_limit(m: int, level: float = OUTLIER_LEVEL) -> float:
     """Normalised residuals beyond this are outliers: by chance, one among m readings with probability `level` at most
     (Bonferroni)."""
-    return float(norm.isf(level / (2 * max(m, 1))))
+    return -float(ndtri(level / (2 * max(m, 1))))
 
 
 def whiteness(w: Array, Q: Array, series: NDArray[np.intp], draws: int = DRAWS) -> Whiteness:

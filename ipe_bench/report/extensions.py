@@ -19,8 +19,9 @@ from ipe_bench.plugins.discovery import Option, blame
 from ipe_bench.plugins.extensions import records
 from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import FRAMES, View
+from ipe_bench.report.latex import latex
 from ipe_bench.report.sections import Section, Written
-from ipe_bench.report.tables import Table, latex, markdown
+from ipe_bench.report.tables import Table, markdown
 from ipe_bench.statistics.analysis import Analysis
 
 T = TypeVar("T")

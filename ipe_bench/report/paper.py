@@ -13,7 +13,8 @@ from pathlib import Path
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.files import write_text
-from ipe_bench.report.tables import LONG, SIGNS, Cell, Column, Table, all_tables, set_numbers
+from ipe_bench.report.latex import LONG, escaped, row, table_rows
+from ipe_bench.report.tables import Column, Table, all_tables
 from ipe_bench.statistics.analysis import Analysis
 
 COLUMN, PAGE = 3.5, 7.16
@@ -22,11 +23,6 @@ _NARROWEST, _WIDEST = 2.0, 20.0
 POINTS_A_LETTER = 4.0
 """Mean width of a letter of 8 points."""
 _COLUMN_GAP = 3.0
-_ESCAPED = {c: f"\\{c}" for c in "&%$#_{}"} | {
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "\\": r"\textbackslash{}",
-}
 
 
 @dataclass(frozen=True)
@@ -103,7 +99,7 @@ def chosen_columns(table: Table, names: Sequence[str]) -> Table:
 def latex_table(table: Table, width: float) -> str:
     """A floating environment with the caption, or where rows are many a longtable."""
     long = len(table) > LONG
-    body = [_head(table), *(" & ".join(map(_cell, row, table.columns)) + r" \\" for row in table.rows)]
+    body = [_head(table), *table_rows(table)]
     shape = "@{}" + "".join("r" if c.numeric else "l" for c in table.columns) + "@{}"
     caption = rf"\caption{{{escaped(table.title)}. {escaped(table.caption)}}}\label{{tab:{table.name}}}"
     rules = [r"\toprule", body[0], r"\midrule", *([r"\endhead"] if long else []), *body[1:], r"\bottomrule"]
@@ -127,7 +123,7 @@ def _head(table: Table) -> str:
         lines = [escaped(line) for line in _lines(column.title, letters)]
         stacked = r"\\".join(lines)
         heads.append(rf"\shortstack[{side}]{{{stacked}}}" if len(lines) > 1 else stacked)
-    return " & ".join(heads) + r" \\"
+    return row(heads)
 
 
 def _lines(title: str, letters: int) -> list[str]:
@@ -145,19 +141,6 @@ def _letters(column: Column) -> int:
     """Of the widest cell, or of the title's longest word."""
     cells = max((len(cell.text) for cell in column.cells), default=0)
     return max([cells, *map(len, column.title.split())])
-
-
-def _cell(cell: Cell, column: Column) -> str:
-    text = set_numbers(escaped(cell.text)) if column.numeric else escaped(cell.text)
-    return rf"\textbf{{{text}}}" if cell.best else text
-
-
-def escaped(text: str) -> str:
-    """Plain text as LaTeX has it; a sign that pdflatex may lack by its number."""
-    return "".join(
-        _ESCAPED.get(c) or SIGNS.get(c) or (c if c.isascii() and c.isprintable() else f"\\texttt{{U+{ord(c):04X}}}")
-        for c in " ".join(text.split())
-    )
 
 
 def inches(table: Table) -> float:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import pandas as pd
 
 from ipe_bench.basics.files import write_text
+from ipe_bench.report.latex import latex
 from ipe_bench.report.words import limits, p_value, percent, plain, reported, short, shower, shown
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.comparisons import ALPHA
@@ -376,60 +376,6 @@ def markdown(table: Table) -> str:
         texts = [f"**{cell(c.text)}**" if c.best else cell(c.text) for c in row]
         lines += ["| " + " | ".join(texts) + " |"]
     return "\n".join(lines) + "\n"
-
-
-LONG = 45
-"""Rows from which on a LaTeX table runs over pages."""
-SIGNS = {
-    "µ": r"\ensuremath{\mu}",
-    "σ": r"\ensuremath{\sigma}",
-    "√": r"\ensuremath{\surd}",
-    "×": r"\ensuremath{\times}",
-    "²": r"\textsuperscript{2}",
-    "–": "--",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    "|": r"\textbar{}",
-    '"': r"\textquotedbl{}",
-}
-_NUMBER = re.compile(r"-?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
-
-
-def latex(table: Table) -> str:
-    """Booktabs and siunitx, written by pandas; to be read into a document with `\\input`."""
-    # Two columns may share a title, but pandas tells columns apart by it: blanks at the end differ.
-    titles = [column.title + " " * i for i, column in enumerate(table.columns)]
-    texts = [[cell.text for cell in column.cells] for column in table.columns]
-    cells = pd.DataFrame(dict(zip(titles, texts, strict=True)), dtype=object)
-    bold = [["textbf:--rwrap;" if cell.best else "" for cell in column.cells] for column in table.columns]
-    style = cells.style.hide(axis="index").format_index(_show_signs, axis=1, escape="latex")
-    for title, column in zip(titles, table.columns, strict=True):
-        style = style.format(_show_numbers if column.numeric else _show_signs, subset=[title], escape="latex")
-    style = style.apply(lambda _: pd.DataFrame(dict(zip(titles, bold, strict=True)), index=cells.index), axis=None)
-    shape = "".join("r" if c.numeric else "l" for c in table.columns)
-    text = style.to_latex(
-        hrules=True, environment="longtable" if len(table) > LONG else None, column_format=f"@{{}}{shape}@{{}}"
-    )
-    needs = "\\usepackage{booktabs, longtable, siunitx, amsmath} and \\usepackage[T1]{fontenc}"
-    return f"% {' '.join(table.title.split())}. Needs {needs}.\n{text}"
-
-
-def _show_signs(escaped: object) -> str:
-    """What pandas' escaping leaves: signs beyond ASCII, those that pdflatex may lack by their number."""
-    return "".join(
-        SIGNS.get(char, char if char.isascii() and char.isprintable() else f"\\texttt{{U+{ord(char):04X}}}")
-        for char in " ".join(str(escaped).split())
-    )
-
-
-def _show_numbers(escaped: object) -> str:
-    return set_numbers(_show_signs(escaped))
-
-
-def set_numbers(escaped: str) -> str:
-    """The numbers of a cell set by siunitx, which groups digits by its own rules."""
-    text = _NUMBER.sub(lambda m: f"\\num{{{m.group().replace(',', '')}}}", escaped)
-    return text.replace(r"} \%", r"}\,\%")
 
 
 def write_tables(analysis: Analysis, tables: Sequence[Table], folder: Path) -> tuple[Path, ...]:

@@ -183,12 +183,21 @@ class _Rows:
 
 
 def _joined(parts: Sequence[dict[str, Any]], columns: Sequence[str]) -> pd.DataFrame:
-    """Frames one after another, each given by its columns."""
+    """Frames one after another, each given by its columns; what is not an array is the same in all its rows."""
     import pandas as pd
 
     if not parts:
         return pd.DataFrame(columns=["scenario", "estimator", *columns])
-    return pd.concat([pd.DataFrame(part) for part in parts], ignore_index=True)
+    lengths = [next(len(value) for value in part.values() if isinstance(value, np.ndarray)) for part in parts]
+    joined: dict[str, Any] = {}
+    for name in dict.fromkeys(name for part in parts for name in part):
+        values: list[Any] = [part.get(name) for part in parts]
+        if any(isinstance(value, np.ndarray) for value in values):
+            pieces = [np.broadcast_to(value, (n,)) for value, n in zip(values, lengths, strict=True)]
+            joined[name] = np.concatenate(pieces)
+        else:
+            joined[name] = pd.Series(values).repeat(lengths).array
+    return pd.DataFrame(joined)
 
 
 _Compared = tuple[dict[str, Any], dict[str, Outcomes]]

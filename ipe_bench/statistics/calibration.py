@@ -88,6 +88,7 @@ def pointwise_tail(trials: int, level: float = LEVEL) -> float:
     return float(low)
 
 
+@lru_cache(maxsize=64)
 def band(trials: int, level: float = LEVEL) -> tuple[Array, Array]:
     """Ends (points,) of the band of the difference, which uniform draws leave anywhere in 1 - level of cases."""
     low, high = _allowed(trials, np.array([pointwise_tail(trials, level)]))

@@ -9,9 +9,9 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
+from scipy.special import bdtr, ndtr
 
 from ipe_bench.basics.linalg import Array
 
@@ -133,21 +133,27 @@ def signed_rank(d: Array) -> float:
 
 
 def _p_of_ranks(ranks: Array) -> float:
-    """Exact or nearly so where ranks are few; else by the normal law, with the variance that ties leave."""
-    count = len(ranks)
-    if count == 0:
+    """Exact where ranks are few; else by the normal law, with the variance that ties leave."""
+    if len(ranks) == 0:
         return 1.0
-    if count <= _MANY:
-        from scipy.stats import wilcoxon  # late, as below: it takes longer to load than a small run to compute
-
-        # The test sees ranks alone, so it may be given those.
-        result: Any = wilcoxon(ranks)
-        return float(result.pvalue)
-    from scipy.special import ndtr
-
+    if len(ranks) <= _MANY:
+        return _exact_p_of_ranks(ranks)
     # The sum of squared mean ranks is n (n + 1) (2 n + 1) / 6 less what ties take; the sum of signed ranks has it as
     # its variance.
     return float(2 * ndtr(-abs(ranks.sum()) / np.sqrt(np.sum(ranks**2))))
+
+
+def _exact_p_of_ranks(ranks: Array) -> float:
+    """All signs being equally likely, whatever ranks are tied; `scipy.stats` takes longer to load than a small run."""
+    halves = np.rint(2 * np.abs(ranks)).astype(int)
+    # The law of the sum of the positive ranks, in halves as mean ranks are, one rank after another.
+    law = np.zeros(halves.sum() + 1)
+    law[0] = 1.0
+    for rank in halves:
+        law[rank:] += law[:-rank]
+        law /= 2
+    positive = halves[ranks > 0].sum()
+    return min(1.0, 2 * float(law[: min(positive, len(law) - 1 - positive) + 1].sum()))
 
 
 def signed_ranks(d: Array) -> Array:
@@ -169,9 +175,7 @@ def mcnemar(only_first: int, only_second: int) -> float:
     """Two-sided p of McNemar's exact test (Psychometrika 12, 1947): discordant trials are fair coin tosses."""
     if only_first + only_second == 0:
         return 1.0
-    from scipy.stats import binomtest
-
-    return float(binomtest(only_first, only_first + only_second, 0.5).pvalue)
+    return min(1.0, 2 * float(bdtr(min(only_first, only_second), only_first + only_second, 0.5)))
 
 
 def holm(p: Sequence[float]) -> Array:
@@ -218,7 +222,7 @@ def rank_over_replicates(scores: Sequence[Mapping[str, float]]) -> Ranking | Non
     k, count = len(everywhere), len(scores)
     if k < 2 or count < REPLICATES:
         return None
-    from scipy.stats import friedmanchisquare, studentized_range
+    from scipy.stats import friedmanchisquare, studentized_range  # late: takes longer to load than all else here
 
     ranks = np.array([tied_ranks(np.array([s[label] for label in everywhere])) for s in scores])
     if np.ptp(ranks, axis=1).max() == 0:

@@ -10,7 +10,6 @@ from ipe_bench.measurements import LotkaVolterra, OdeMeasurement, Parameter, Pol
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode import tableau
 from ipe_bench.measurements.ode.coarse import contraction
-from ipe_bench.measurements.ode.kernel import load
 from ipe_bench.measurements.ode.levels import coarser, ladder
 from ipe_bench.runs import provenance
 
@@ -215,16 +214,6 @@ def test_what_generates_machine_code_is_part_of_the_source_that_results_depend_o
     read, changed = provenance._digest_of, "ipe_bench.measurements.ode.machine_code"
     monkeypatch.setattr(provenance, "_digest_of", lambda module: read(module) + "#" * (module == changed))
     assert provenance.fingerprint([LotkaVolterra()])["source"] != before
-
-
-def test_a_first_compilation_says_so_once(tmp_path, monkeypatch, caplog):
-    monkeypatch.setenv("IPE_BENCH_CACHE", str(tmp_path))
-    with caplog.at_level("INFO"):
-        assert load("answer = 42  # of a first compilation\n").answer == 42
-        assert load.__wrapped__("answer = 42  # of a first compilation\n").answer == 42
-    assert [record.message for record in caplog.records] == [
-        f"compiling an integrator, once per machine: it is kept in {tmp_path}"
-    ]
 
 
 @dataclass(frozen=True)

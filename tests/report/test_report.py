@@ -25,8 +25,9 @@ from ipe_bench.report.figures import correlation, distributions, error_scale, ne
 from ipe_bench.report.figures.ranks import cliques
 from ipe_bench.report.figures.views import views
 from ipe_bench.report.headline import headline
+from ipe_bench.report.latex import latex
 from ipe_bench.report.style import house_style, looks
-from ipe_bench.report.tables import Table, all_tables, interval, latex, markdown, words
+from ipe_bench.report.tables import Table, all_tables, interval, markdown, words
 from ipe_bench.report.terminal import render
 from ipe_bench.report.words import compact, duration, percent, short
 from ipe_bench.statistics import analyse

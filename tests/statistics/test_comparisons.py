@@ -1,5 +1,7 @@
 """Tests between estimators give the values of their textbooks, and no difference where there is none."""
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -56,6 +58,31 @@ def test_signed_rank_of_five_positive_differences_is_one_sixteenth():
     assert signed_rank(np.array([1.0, 2.0, 3.0, 4.0, 5.0])) == pytest.approx(2 / 32)
     assert signed_rank(np.array([1.0, 2.0, 3.0, 4.0, np.inf, 0.0, 0.0])) == pytest.approx(2 / 32)
     assert signed_rank(np.zeros(10)) == 1.0
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 30, 50])
+def test_signed_rank_is_that_of_scipy_where_that_is_exact(count):
+    d = np.random.default_rng(count).normal(0.3, 1.0, count)
+    assert signed_rank(d) == pytest.approx(stats.wilcoxon(d, method="exact").pvalue, rel=1e-12)
+
+
+def test_signed_rank_counts_every_choice_of_signs_where_ranks_are_tied():
+    d = np.array([1.0, 1.0, -1.0, 2.0, 2.0, 3.0, -0.5, np.inf, np.inf])
+    ranks = stats.rankdata(np.abs(d))
+    sums = [ranks @ (np.array(signs) > 0) for signs in itertools.product([-1, 1], repeat=len(d))]
+    seen = ranks @ (d > 0)
+    tail = min(np.mean(np.array(sums) <= seen), np.mean(np.array(sums) >= seen))
+    assert signed_rank(d) == pytest.approx(2 * tail, rel=1e-12)
+
+
+def test_signed_rank_by_the_normal_law_goes_on_from_the_exact_one():
+    d = np.random.default_rng(0).normal(0.1, 1.0, 201)
+    assert signed_rank(d) == pytest.approx(stats.wilcoxon(d, method="exact").pvalue, rel=0.01)
+
+
+@pytest.mark.parametrize("pair", [(1, 0), (4, 9), (9, 4), (6, 6), (40, 11)])
+def test_mcnemar_is_the_binomial_test_of_scipy(pair):
+    assert mcnemar(*pair) == pytest.approx(stats.binomtest(pair[0], sum(pair), 0.5).pvalue, rel=1e-12)
 
 
 def test_mcnemar_is_the_sign_test_of_discordant_trials():

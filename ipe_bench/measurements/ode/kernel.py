@@ -8,27 +8,20 @@ What is compiled is written by `source`; which steps a trial takes is left to `l
 from __future__ import annotations
 
 import functools
-import hashlib
-import importlib.util
 import itertools
-import logging
 import os
-import sys
-import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.files import cache_folder
+from ipe_bench.basics.compiled import load
 from ipe_bench.basics.machine import cores
 from ipe_bench.measurements.ode.source import Equations, Source
 from ipe_bench.measurements.ode.tableau import Tableau
-
-_LOG = logging.getLogger(__name__)
 
 WIDTH = 8
 """Lanes that advance together: one register of AVX-512."""
@@ -36,25 +29,6 @@ NARROW = 4
 """The same for what is left over, and for small batches."""
 _WORTH_THREADS = 40_000
 """Steps times lanes times states from which a second thread gains more than it costs, some 150 microseconds."""
-
-
-@functools.cache
-def load(source: str) -> ModuleType:
-    """The module of a generated source, compiled at most once per machine."""
-    name = f"ipe_bench_kernel_{hashlib.sha256(source.encode()).hexdigest()[:16]}"
-    path = cache_folder() / f"{name}.py"
-    if not path.exists():
-        _LOG.info("compiling an integrator, once per machine: it is kept in %s", path.parent)
-        with tempfile.NamedTemporaryFile("w", dir=path.parent, suffix=".tmp", delete=False) as file:
-            file.write(source)
-        os.replace(file.name, path)
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 def threads() -> int:
@@ -87,11 +61,11 @@ class Kernel:
 
     @functools.cached_property
     def _wide(self) -> Callable[..., None]:
-        return load(self._source.text).integrate
+        return _with_room(self._source, WIDTH)
 
     @functools.cached_property
     def _narrow(self) -> Callable[..., None]:
-        return load(self.source(self.equations, self.tableau, NARROW).text).integrate
+        return _with_room(self.source(self.equations, self.tableau, NARROW), NARROW)
 
     def run(
         self,
@@ -134,3 +108,13 @@ class Kernel:
         work_on()
         for other in others:
             other.result()
+
+
+def _with_room(source: Source, width: int) -> Callable[..., None]:
+    """What a source integrates, given the room that it needs."""
+    integrate = load(source.text)
+
+    def function(*arguments: Any) -> None:
+        integrate(*arguments, np.empty(source.work), np.empty(2 * width, np.int64))
+
+    return function

@@ -10,22 +10,22 @@ import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from types import ModuleType
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics.compiled import Function, load
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Input, Measurement
 from ipe_bench.measurements.ode import sampling
 from ipe_bench.measurements.ode.coarse import CONTRACTION, MOST_RK4, Coarseness, contraction
-from ipe_bench.measurements.ode.kernel import Kernel, load
+from ipe_bench.measurements.ode.kernel import Kernel
 from ipe_bench.measurements.ode.levels import Found, Indices, Remembered, Search, grouped, ladder
 from ipe_bench.measurements.ode.source import Equations, Variation, jacobian_source, rate_source, simulation_source
 from ipe_bench.measurements.ode.tableau import DOP853, RK4
 
-_STAYS = ("_readings_kernel", "_rk4_kernel", "_rate_module", "_jacobian_kernel", "_equations", "_remembered")
+_STAYS = ("_readings_kernel", "_rk4_kernel", "_rate_function", "_jacobian_kernel", "_equations", "_remembered")
 _ANGLE_AT_START = 0.7
 """Radians over which the first step that is tried lets the solution turn."""
 
@@ -154,7 +154,7 @@ class OdeMeasurement(Measurement):
     @property
     def _guessed(self) -> bool:
         """Whether the rate says with which steps to integrate."""
-        return self.step is None and self.trusted_angle > 0 and self._rate_module is not None
+        return self.step is None and self.trusted_angle > 0 and self._rate_function is not None
 
     def _guess(self, x: Array) -> Indices:
         """The level of each trial by its rate alone."""
@@ -239,10 +239,10 @@ class OdeMeasurement(Measurement):
     def _rates(self, x: Array) -> tuple[Array, float]:
         """The rate of each trial, and the fastest of all; not a number where nothing is known."""
         rates = np.full(len(x), np.nan)
-        return rates, self._rate_module.rates(x, self._si_sizes, rates) if self._rate_module else np.inf
+        return rates, self._rate_function(x, self._si_sizes, rates) if self._rate_function else np.inf
 
     @cached_property
-    def _rate_module(self) -> ModuleType | None:
+    def _rate_function(self) -> Function | None:
         return load(rate_source(self._equations)) if self._equations.rate else None
 
     @cached_property
@@ -253,7 +253,7 @@ class OdeMeasurement(Measurement):
     def _first_guess(self, x: Array) -> Indices:
         """Where on the ladder the search begins: steps of half a radian, or what the nominal parameters need."""
         top = len(self._ladder) - 1
-        if self._rate_module is None:
+        if self._rate_function is None:
             return np.where(np.isfinite(x).all(axis=1), self._nominal_place, top)
         wanted = np.nan_to_num(self._rates(x)[0] * self._longest / _ANGLE_AT_START, nan=np.inf)
         return np.clip(np.searchsorted(self._ladder, wanted), 1, top)

@@ -134,6 +134,8 @@ class Source:
 
     text: str
     operations: int
+    work: int
+    """Numbers that it needs room for, which its caller gives it; and two whole numbers for each lane."""
 
 
 def _operations(program: Program, tableau: Tableau, states: int) -> int:
@@ -163,12 +165,11 @@ step = machine_code.stepper({width}, formula, {step!r}, places, {step_timed})
 read = machine_code.reader({width}, {read!r}, places, places.out, {read_timed})
 
 
-@njit("{_SIMULATE}", nogil=True, cache=True, error_model="numpy")
-def integrate(x, si, cases, rows, first, last, times, steps, offset, out):
-    raw = np.empty({size + 8})
-    b = raw[(-raw.ctypes.data // 8) % 8:]
-    place = np.empty({width}, np.int64)
-    shift = np.empty({width}, np.int64)
+@njit("{_SIMULATE}", error_model="numpy")
+def integrate(x, si, cases, rows, first, last, times, steps, offset, out, work, lanes):
+    b = work[(-work.ctypes.data // 8) % 8:]
+    place = lanes[:{width}]
+    shift = lanes[{width}:]
     per_case = times.shape[0] * {no}
     for group in range(first, last, {width}):
         for lane in range({width}):
@@ -196,7 +197,7 @@ def integrate(x, si, cases, rows, first, last, times, steps, offset, out):
                 place[lane] += {no}
                 shift[lane] += {no}
 '''
-    return Source(text, operations)
+    return Source(text, operations, size + 8)
 
 
 def jacobian_source(equations: Equations, tableau: Tableau, width: int) -> Source:
@@ -249,11 +250,10 @@ step_tangent = machine_code.tangent_stepper({width}, formula, motion, places, so
 read_tangent = machine_code.tangent_reader({width}, {reading.program(fixed)!r}, places, reading_sources.shape[1])
 
 
-@njit("{_DIFFERENTIATE}", nogil=True, cache=True, error_model="numpy")
-def integrate(x, si, cases, rows, first, last, times, steps, out):
-    raw = np.empty({size + 8})
-    b = raw[(-raw.ctypes.data // 8) % 8:]
-    place = np.empty({width}, np.int64)
+@njit("{_DIFFERENTIATE}", error_model="numpy")
+def integrate(x, si, cases, rows, first, last, times, steps, out, work, lanes):
+    b = work[(-work.ctypes.data // 8) % 8:]
+    place = lanes[:{width}]
     per_case = times.shape[0] * {no * n}
     for group in range(first, last, {width}):
         for lane in range({width}):
@@ -286,7 +286,7 @@ def integrate(x, si, cases, rows, first, last, times, steps, out):
             for lane in range({width}):
                 place[lane] += {no * n}
 '''
-    return Source(text, operations)
+    return Source(text, operations, size + 8)
 
 
 def rate_source(equations: Equations) -> str:
@@ -298,7 +298,7 @@ def rate_source(equations: Equations) -> str:
 value = machine_code.scalar({program!r}, {equations.parameters})
 
 
-@njit("float64(float64[:, ::1], float64[::1], float64[::1])", nogil=True, cache=True, error_model="numpy")
+@njit("float64(float64[:, ::1], float64[::1], float64[::1])", error_model="numpy")
 def rates(x, si, out):
     fastest = 0.0
     for i in range(x.shape[0]):
@@ -311,8 +311,9 @@ def rates(x, si, out):
 
 
 _ROWS = "float64[:, ::1], float64[::1], float64[:, ::1], int64[::1], int64, int64, float64[::1], int64[::1]"
-_SIMULATE = f"void({_ROWS}, float64[::1], float64[::1])"
-_DIFFERENTIATE = f"void({_ROWS}, float64[::1])"
+_WORK = "float64[::1], int64[::1]"
+_SIMULATE = f"void({_ROWS}, float64[::1], float64[::1], {_WORK})"
+_DIFFERENTIATE = f"void({_ROWS}, float64[::1], {_WORK})"
 
 
 def _tangents(tape: _Tape) -> tuple[Any, Any, list[Expression], list[Expression], list[list[Expression]]]:

@@ -7,7 +7,7 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
@@ -128,7 +128,7 @@ def ellipse(P: Array, level: float = LEVEL, points: int = 181, edge: float | Non
     d = np.sqrt(np.diagonal(P))
     values, vectors = np.linalg.eigh(P / np.outer(d, d))
     turn = np.linspace(0.0, 2 * np.pi, points)
-    circle = np.sqrt(chi2.ppf(level, 2) if edge is None else edge) * np.column_stack([np.cos(turn), np.sin(turn)])
+    circle = np.sqrt(chdtri(2, 1 - level) if edge is None else edge) * np.column_stack([np.cos(turn), np.sin(turn)])
     return (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T * d
 
 
