@@ -134,11 +134,11 @@ MEDDLING = {
     "statistic": "from ipe_bench.statistics.records import Statistic\n"
     "def f(s):\n    s.error *= 0\n    return 1.0\nSTATISTIC = Statistic('bad_statistic', 'bad', 'all trials', '', f)\n",
     "figure": "from ipe_bench.report.figures.drawing import Figure\n"
-    "def f(view):\n    view['summary']['rmse'] = 0.0\n    view['scores']['cost_median'] = 1.0\n"
+    "def f(view):\n    view['summary'][['rmse', 'success']] = 0.0\n    view['scores']['cost_median'] = 1.0\n"
     "    yield from ()\nFIGURE = Figure(f, ('summary', 'scores'), together=True, main=True)\n",
-    "table": "def table(analysis):\n    analysis.summary['rmse'] = 0.0\n",
+    "table": "def table(analysis):\n    analysis.summary[['rmse', 'success']] = 0.0\n",
     "section": "from ipe_bench.report.sections import Section\n"
-    "def f(analysis):\n    analysis.summary['rmse'] = 0.0\n    yield 'Done.'\nSECTION = Section('Bad', f)\n",
+    "def f(analysis):\n    analysis.summary[['rmse', 'success']] = 0.0\n    yield 'Done.'\nSECTION = Section('Bad', f)\n",
 }
 
 

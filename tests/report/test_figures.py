@@ -489,6 +489,7 @@ def test_two_processes_draw_the_same_bytes(once_drawn, kinds, tmp_path, monkeypa
 def test_a_helper_that_dies_costs_nothing_but_time(once_drawn, few, tmp_path, monkeypatch):
     analysis, folder = once_drawn[0], tmp_path / "figures"
     monkeypatch.setattr(gallery, "WORTH_HELP", 1)
+    monkeypatch.setattr(gallery, "claim", lambda *_: False)  # it has taken everything
     started = []
     popen = gallery.subprocess.Popen
     monkeypatch.setattr(gallery.subprocess, "Popen", lambda *a, **b: started.append(popen(*a, **b)) or started[-1])
