@@ -1,7 +1,8 @@
 """What may stand at the end of a command line: commands, flags, groups and their options, keys and their values.
 
-Read from configs and from the source of classes, not from the classes: a shell asks at every press of a key. How a
-shell is answered is left to `completion`.
+Read from configs and from the source of classes, not from the classes: a shell asks at every press of a key. Names of
+parameters alone are asked of the model itself, since its options may decide them. How a shell is answered is left to
+`completion`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ipe_bench.cli.chosen import SINGLE, Chosen
+from ipe_bench.cli.chosen import NIST, SINGLE, Chosen, datasets
 from ipe_bench.cli.parser import KINDS, Parser, parsers
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.annotations import Stated, choices, stated
@@ -30,7 +31,7 @@ _KEYS_OF = {
 _BUNDLE = ".zip"
 _KEYS = "ipe_bench.cli.config.Schema"
 _KNOWN = "ipe_bench.measurements.known.Known"
-_FILES = re.compile(r"^(?:readings|write_readings|output|(?:truth_)?measurement\.file)$")
+_FILES = re.compile(r"^(?:readings|write_readings|output|prior_covariance|(?:truth_)?measurement\.file)$")
 _HYDRA = {
     "hydra/launcher": ("basic", "joblib", "submitit_local", "submitit_slurm"),
     "hydra/sweeper": ("basic", "optuna"),
@@ -183,6 +184,8 @@ class _Overrides:
     def _keys_inside(self, head: str, sign: str) -> Iterator[Candidate]:
         if head == "estimators":
             yield from (Candidate(f"{sign}estimators.{label}.", whole=False) for label in self.chosen.estimators())
+        elif head == "parameters":
+            yield from (Candidate(f"{sign}parameters.{name}.", unit, whole=False) for name, unit in self._parameters())
         elif re.fullmatch(r"parameters\.\w+", head):
             fields = (field for field in stated(_KNOWN).values() if field.name != "name")
             yield from (Candidate(f"{sign}{head}.{field.name}=", field.meaning, whole=False) for field in fields)
@@ -191,6 +194,19 @@ class _Overrides:
                 if key not in ("_target_", "defaults"):
                     yield Candidate(f"{sign}{head}.{key}=", _meaning(option, key), whole=False)
 
+    def _parameters(self) -> list[tuple[str, str]]:
+        """The parameters of the chosen model and their units; this loads NumPy and the model."""
+        option = self._component("measurement")
+        if option is None:
+            return []
+        from ipe_bench.plugins.construct import construct
+
+        try:
+            model = construct(plugins.composed(option) | self.chosen.options("measurement"), "measurement")
+            return [(p.name, p.unit) for p in model.natural_parameters]
+        except Exception:  # a plugin's may raise anything: no names are offered then
+            return []
+
     # Values
 
     def _values(self, key: str, value: str) -> Iterator[Candidate]:
@@ -198,6 +214,8 @@ class _Overrides:
         group = "measurement" if key == "truth_measurement" else group
         if group in plugins.ESTIMATOR_GROUPS and not place:
             yield from _lists(value, _usable(group))
+        elif group == "measurement" and not place and value.rpartition(",")[2].startswith(NIST):
+            yield from _swept(value, ((f"{NIST}{name.lower()}", "") for name in datasets()))
         elif group in (*SINGLE, *plugins.ESTIMATOR_GROUPS, "experiment"):
             yield from _swept(value, ((option.name, option.summary) for option in _usable(group)))
         elif key in _HYDRA:

@@ -8,8 +8,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from ipe_bench.plugins import discovery as plugins
+import yaml
 
+from ipe_bench.plugins import discovery as plugins
+from ipe_bench.plugins.annotations import choices, stated
+
+NIST = "nist/"
+"""Before the name of a data set: measurement=nist/misra1a."""
 SINGLE = ("measurement", "noise", "prior", "execution")
 """Groups of which one option is chosen."""
 
@@ -44,6 +49,26 @@ class Chosen:
             found |= {option.label: [option] for option in options if option is not None}
         return found
 
+    def options(self, place: str) -> dict[str, Any]:
+        """What the words say of the options at that place: PLACE.KEY=VALUE, PLACE.file=FILE, measurement=nist/NAME.
+
+        Raises:
+            OSError, ValueError, YAMLError: the file cannot be read.
+        """
+        found: dict[str, Any] = {}
+        for key, value in self._pairs():
+            if key == place and value.startswith(NIST):
+                found["dataset"] = next((n for n in datasets() if n.lower() == value[len(NIST) :].lower()), None)
+            elif key == f"{place}.file":
+                found |= plugins.read_yaml(Path(value).read_text(encoding="utf-8"))
+            elif key.startswith(f"{place}."):
+                *heads, last = key.split(".")[1:]
+                inner = found
+                for head in heads:
+                    inner = inner.setdefault(head, {})
+                inner[last] = _plain(value)
+        return found
+
     @functools.cached_property
     def certain(self) -> bool:
         """Whether nothing else chooses: an experiment that is not known here, or one that is made of others."""
@@ -74,6 +99,20 @@ class Chosen:
             option = option_of("experiment", value) if name == "experiment" else None
             chosen |= {} if option is None else _defaults_of(option.path)
         return chosen
+
+
+def _plain(value: str) -> Any:
+    """A value as its text means it; a formula is a text."""
+    try:
+        return plugins.read_yaml(value)
+    except yaml.YAMLError:
+        return value
+
+
+def datasets() -> list[str]:
+    """The names that may stand behind measurement=nist/, in NIST's spelling."""
+    option = option_of("measurement", "nist")
+    return [] if option is None or option.target is None else choices(stated(option.target)["dataset"])
 
 
 def option_of(group: str, name: str) -> plugins.Option | None:

@@ -51,7 +51,8 @@ def main(arguments: Sequence[str]) -> int:
     fits = fit(problem, z, job.estimators, job.scenario.noise)
     left_out = _left_out(config).said
     answer = Answer(single.measurement, job.scenario.measurement, z, fits, examinations(problem, z, fits), left_out)
-    files = write_fits(folder, answer, command, {"measurement": single.measurement, **_provenance(config, job)})
+    written = {"measurement": single.measurement, **_provenance(config, job)}
+    files = write_fits(folder, answer, command, written, which=job.figures)
     out = console()
     out.print(render(answer, out.width))
     out.print(f"\nIn {folder}:", markup=False, soft_wrap=True)

@@ -39,6 +39,7 @@ ignore_rows=[3,7]   rows to leave out, by their numbers; ignore_columns=[NAME] l
 parameters.NAME.fixed=X, .lower=X, .upper=X   what is known of a parameter; parameters=FILE.yaml has that of many.
 error_scale=X       how far the parameters may lie from the nominal point: the prior of filters and map_lm.
 prior_covariance=F  the same in the parameters' own units: a CSV file of the covariance, headed by their names.
+figures=none        draws nothing.
 output=DIR          where the files go: outputs/estimate-MODEL unless given, or outputs/estimate-MODEL-2 and so on
                     where another command has written there. Nothing of another command is overwritten.
 

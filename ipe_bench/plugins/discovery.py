@@ -46,6 +46,11 @@ _Loader.add_implicit_resolver(
 )
 
 
+def read_yaml(text: str) -> Any:
+    """YAML as plain data, with numbers as Hydra reads them."""
+    return yaml.load(text, _Loader)
+
+
 @dataclass(frozen=True)
 class Source:
     """Where options come from: ipe-bench itself or a plugin."""
@@ -86,7 +91,7 @@ class Option:
     @property
     def config(self) -> Any:
         """What the file says, as plain data."""
-        return yaml.load(self.path.read_text(encoding="utf-8"), _Loader)
+        return read_yaml(self.path.read_text(encoding="utf-8"))
 
     @property
     def package(self) -> str | None:
@@ -179,6 +184,7 @@ def _shown(folder: Path) -> Path:
     return folder.relative_to(here) if folder.is_relative_to(here) else folder
 
 
+@functools.lru_cache(maxsize=1024)
 def _yaml_fault(path: Path, text: str) -> str | None:
     try:
         node = yaml.compose(text, Loader=yaml.SafeLoader)
@@ -346,8 +352,10 @@ def _make_importable(folder: Path) -> None:
 def options(group: str | None = None) -> list[Option]:
     """All options of a group, or of all groups; those that cannot be used have a `fault`."""
     found: dict[tuple[str, str], Option] = {}
+    # Those of a group may have rivals in the groups that share its labels, and nowhere else.
+    related = ("",) if group is None else ESTIMATOR_GROUPS if group in ESTIMATOR_GROUPS else (group,)
     for source in sources():
-        for path in sorted(source.conf.rglob("*.yaml")):
+        for path in sorted(path for name in related for path in (source.conf / name).rglob("*.yaml")):
             relative = path.relative_to(source.conf).with_suffix("")
             if len(relative.parts) < 2:
                 continue

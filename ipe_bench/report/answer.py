@@ -22,6 +22,7 @@ from ipe_bench.real.examination import Examination
 from ipe_bench.real.fits import Fit
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report import examined
+from ipe_bench.report.choice import Which
 from ipe_bench.report.words import p_value
 from ipe_bench.trials.fit_test import DRAWS
 from ipe_bench.trials.thresholds import FIT_LEVEL
@@ -154,8 +155,12 @@ class Answer:
         return fragment(self)
 
 
-def write_fits(folder: Path, answer: Answer, command: Any, provenance: Mapping[str, Any]) -> list[Path]:
+def write_fits(
+    folder: Path, answer: Answer, command: Any, provenance: Mapping[str, Any], *, which: Which = "all"
+) -> list[Path]:
     """Writes an answer; each file appears whole or not at all. Returns the files.
+
+    All its figures are main ones: `which` is all, main or none.
 
     `command` tells one command from another (see `claim`); `provenance` is added to the JSON file and overrides what
     stands there of the same name.
@@ -176,7 +181,11 @@ def write_fits(folder: Path, answer: Answer, command: Any, provenance: Mapping[s
 
     write_atomically(table, write_table)
     files, figures = [result, table], []
-    for drawing in (*draw_fits(model, fits), *(likelihood.draw(found) if found is not None else ())):
+    if which != "none":
+        drawings = [*draw_fits(model, fits), *(likelihood.draw(found) if found is not None else ())]
+    else:
+        drawings = []
+    for drawing in drawings:
         written = drawing.save(folder)
         files += written
         figures.append((drawing.title, drawing.caption, written[0].read_bytes()))

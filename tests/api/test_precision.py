@@ -58,11 +58,11 @@ def test_it_goes_on_from_what_is_stored_and_leaves_one_record_that_is_complete(t
 
 
 def test_a_share_of_one_takes_a_few_blocks_and_one_in_between_many():
-    easy = stop_of(ib.run(BENCH, {"newton": ib.solvers.Newton()}, precision=0.03, block_size=50))
+    easy = stop_of(ib.run(BENCH, {"newton": ib.solvers.Newton()}, precision=0.05, block_size=50))
     hard = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=1.2)
-    table = ib.run(hard, {"linear": ib.baselines.LinearLSE()}, precision=0.03, block_size=50)
+    table = ib.run(hard, {"linear": ib.baselines.LinearLSE()}, precision=0.05, block_size=50)
     assert 0.1 < table["success"].iloc[0] < 0.9
-    assert easy["trials"] <= 300 < 1000 < stop_of(table)["trials"]
+    assert easy["trials"] <= 300 < 800 < stop_of(table)["trials"]
 
 
 def test_the_root_mean_square_is_known_as_well_as_is_asked(tmp_path):
@@ -74,7 +74,7 @@ def test_the_root_mean_square_is_known_as_well_as_is_asked(tmp_path):
 
 def test_scenarios_stop_by_themselves():
     other = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=1.2)
-    table = ib.run([BENCH, other], {"linear": LinearLSE()}, 2000, precision=0.04, block_size=50)
+    table = ib.run([BENCH, other], {"linear": LinearLSE()}, 2000, precision=0.06, block_size=50)
     stops = {stop["error_scale"]: stop["trials"] for stop in table.attrs["stops"]}
     rows = table[table["parameter"] == "all"].set_index("error_scale")
     assert stops == rows["trials"].to_dict()

@@ -74,19 +74,21 @@ def readings(tmp_path_factory) -> Path:
     return folder / "trial.csv"
 
 
-def test_a_sweep_leaves_tables_figures_and_a_report(tmp_path):
-    result = ipe_bench("run", "-m", "error_scale=1,10", "trials=20", "figures=main", folder=tmp_path)
+def test_a_sweep_leaves_tables_figures_and_a_report(tmp_path, here):
+    result = here("run", "-m", "error_scale=1,10", "trials=20", "figures=main", folder=tmp_path)
     assert result.returncode == 0, result.stderr
-    assert (tmp_path / "outputs/gins-error_scale=1,10/summary.csv").is_file()
+    folder = tmp_path / "outputs/gins-error_scale=1,10"
+    assert {path.name for path in folder.iterdir()} >= {"summary.csv", "report.html", "tables"}
+    assert len(list((folder / "figures").glob("*.png"))) == len(list((folder / "figures").glob("*.pdf"))) == 4
     assert "fixed_point" in result.stdout
-    again = ipe_bench("run", "-m", "error_scale=1,10", "trials=20", "figures=main", folder=tmp_path)
+    again = here("run", "-m", "error_scale=1,10", "trials=20", "figures=main", folder=tmp_path)
     assert again.stderr.count("nothing left to compute") == 2
 
 
 def test_estimates_from_a_file_find_the_parameters_that_made_it(readings, here):
     import re
 
-    result = here("estimate", f"readings={readings}", "error_scale=10", folder=readings.parent)
+    result = here("estimate", f"readings={readings}", "error_scale=10", "figures=none", folder=readings.parent)
     assert result.returncode == 0, result.stderr
     truth = {
         name: float(value)
@@ -195,7 +197,7 @@ def test_a_missing_reading_is_an_empty_cell(readings, tmp_path, here):
     lines = readings.read_text().splitlines()
     path = tmp_path / "missing.csv"
     path.write_text("\n".join([*lines[:5], "1,9.0,vx,", *lines[6:]]))
-    result = here("estimate", f"readings={path}", "error_scale=10", folder=tmp_path)
+    result = here("estimate", f"readings={path}", "error_scale=10", "figures=none", folder=tmp_path)
     assert result.returncode == 0, result.stderr
     assert " 228 " in result.stdout
 
@@ -231,21 +233,21 @@ def test_a_data_set_may_be_written_as_an_option_of_its_own(overrides, expected):
 
 
 def test_data_sets_are_swept_by_either_spelling(tmp_path, here):
-    certified = ("noise=certified", "trials=1", "measurement.start=1,2", "figures=none")
+    certified = ("noise=certified", "trials=1", "figures=none")
     first = here("run", "-m", "measurement=nist/misra1a,nist/boxbod", *certified, folder=tmp_path)
     assert first.returncode == 0, first.stderr
     assert "nist BoxBOD" in first.stderr
     again = here("run", "-m", "measurement=nist", "measurement.dataset=Misra1a,BoxBOD", *certified, folder=tmp_path)
-    assert again.stderr.count("nothing left to compute") == 4
+    assert again.stderr.count("nothing left to compute") == 2
 
 
-def test_hydras_own_flags_work_after_run(tmp_path):
-    assert "error_scale: 5.0" in ipe_bench("run", "error_scale=5", "--cfg", "job", folder=tmp_path).stdout
+def test_hydras_own_flags_work_after_run(tmp_path, here, monkeypatch):
+    assert "error_scale: 5.0" in here("run", "error_scale=5", "--cfg", "job", folder=tmp_path).stdout
+    # Which sets up logging for the whole of its process.
     assert ipe_bench("run", "--info", "searchpath", folder=tmp_path).returncode == 0
-    completed = ipe_bench(
-        "-sc", "query=bash", folder=tmp_path, COMP_LINE="ipe-bench run measurement=gi", COMP_POINT="28"
-    )
-    assert "measurement=gins" in completed.stdout
+    monkeypatch.setenv("COMP_LINE", "ipe-bench run measurement=gi")
+    monkeypatch.setenv("COMP_POINT", "28")
+    assert "measurement=gins" in here("-sc", "query=bash", folder=tmp_path).stdout
 
 
 LOADED = """
@@ -298,16 +300,16 @@ def test_estimate_leaves_numbers_residuals_and_figures_from_csv_and_parquet_alik
 
     as_parquet(readings, tmp_path / "trial.parquet")
     results = []
-    for file in (readings, tmp_path / "trial.parquet", readings):
-        ran = here("estimate", f"readings={file}", "error_scale=10", folder=tmp_path)
+    for file, drawn in ((readings, "none"), (tmp_path / "trial.parquet", "none"), (readings, "all")):
+        ran = here("estimate", f"readings={file}", "error_scale=10", f"figures={drawn}", folder=tmp_path)
         assert ran.returncode == 0, ran.stderr
         assert all(len(line) <= 120 for line in ran.stdout.splitlines())
     # The second file is another command, and the third run is the first command again.
     folders = sorted(path.name for path in (tmp_path / "outputs").iterdir())
     assert folders == ["estimate-gins", "estimate-gins-2"]
+    files = {path.name for path in (tmp_path / "outputs" / folders[0]).iterdir()}
+    assert files >= {f"{name}.{kind}" for name in ("residuals", "ellipses") for kind in ("png", "pdf")}
     for folder in folders:
-        files = {path.name for path in (tmp_path / "outputs" / folder).iterdir()}
-        assert files >= {f"{name}.{kind}" for name in ("residuals", "ellipses") for kind in ("png", "pdf")}
         results.append(json.loads((tmp_path / "outputs" / folder / "estimate.json").read_text()))
         table = pd.read_csv(tmp_path / "outputs" / folder / "residuals.csv")
         assert len(table) == 3 * 240
@@ -318,6 +320,16 @@ def test_estimate_leaves_numbers_residuals_and_figures_from_csv_and_parquet_alik
     assert len(found["correlation"]) == 11
     assert not results[0]["estimators"]["linear_lse"]["fits"]
     assert {"numpy", "scipy"} <= set(results[0]["libraries"])
+
+
+def test_an_estimate_draws_nothing_where_no_figures_are_asked_for(tmp_path, here):
+    words = ("estimate", "measurement=nist/misra1a", "solver=[]", "baseline=[levenberg_marquardt]", "output=out")
+    assert here(*words, folder=tmp_path).returncode == 0
+    drawn = {path.name for path in (tmp_path / "out").iterdir() if path.suffix in (".png", ".pdf")}
+    assert {"residuals.png", "residuals.pdf"} <= drawn
+    assert here(*words, "figures=none", folder=tmp_path).returncode == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"estimate.json", "residuals.csv", "estimate.html"}
+    assert "<img" not in (tmp_path / "out" / "estimate.html").read_text(encoding="utf-8")
 
 
 def test_estimate_overwrites_no_other_command(readings, tmp_path, in_process):

@@ -23,6 +23,9 @@ from ipe_bench.plugins.construct import find_class
 
 pty = pytest.importorskip("pty")  # Windows has no such terminals, and none of these shells
 OURS = [o for o in discovery.options() if o.source.name == "ipe-bench" and o.group in discovery.COMPONENT_GROUPS]
+BS = ("boxbod", "bennett5")
+NAMED = "measurement.dataset="
+FORMULA = "'measurement.expression=a*exp(b*t)' measurement.start.a=1 measurement.start.b=-1e-1"
 
 
 def texts(line: str) -> list[str]:
@@ -46,6 +49,10 @@ def texts(line: str) -> list[str]:
         ("ipe-bench run measurement=ranging measurement.ro", ["measurement.rounds="]),
         ("ipe-bench run +experiment=triad measurement.fi", ["measurement.field="]),
         ("ipe-bench run truth_measurement=gins_tilted truth_measurement.la", ["truth_measurement.latitude_deg="]),
+        ("ipe-bench run measurement=nist/mgh", [f"measurement=nist/mgh{v}" for v in ("17", "09", "10")]),
+        ("ipe-bench run -m measurement=nist/misra1a,nist/b", [f"measurement=nist/misra1a,nist/{v}" for v in BS]),
+        ("ipe-bench run measurement=nist measurement.dataset=Gauss1,Ra", [f"{NAMED}Gauss1,Rat4{v}" for v in "23"]),
+        ("ipe-bench run measurement=mgh measurement.function=wo", ["measurement.function=wood"]),
         ("ipe-bench run noise=gaussian noise.", ["noise.deviation="]),
         ("ipe-bench run solver=", ["solver=[anderson", "solver=[auto"]),
         ("ipe-bench run solver=ne", ["solver=newton"]),
@@ -67,6 +74,10 @@ def texts(line: str) -> list[str]:
         ("ipe-bench run error", ["error_scale="]),
         ("ipe-bench run hydra/sweeper=o", ["hydra/sweeper=optuna"]),
         ("ipe-bench estimate parameters.bx.fi", ["parameters.bx.fixed="]),
+        ("ipe-bench estimate parameters.b", ["parameters.bx.", "parameters.by."]),
+        ("ipe-bench run measurement=nist/gauss1 parameters.", [f"parameters.b{i}." for i in range(1, 9)]),
+        ("ipe-bench run measurement=polynomial measurement.degree=many parameters.", []),
+        (f"ipe-bench estimate measurement=formula {FORMULA} parameters.", ["parameters.a.", "parameters.b."]),
         ("ipe-bench design --crit", ["--criterion"]),
         ("ipe-bench design --criterion ", ["A", "D"]),
         ("cd x && ipe-bench completion ", ["bash", "zsh", "fish"]),
@@ -104,6 +115,16 @@ def test_files_are_offered_where_a_file_is_wanted(tmp_path, monkeypatch):
     assert texts("ipe-bench compare b") == ["both.zip"]
     assert texts("ipe-bench bundle output=b") == ["output=both.zip"]
     assert texts("ipe-bench report c") == ["columns="]
+    assert texts("ipe-bench run prior_covariance=m") == ["prior_covariance=my.csv"]
+
+
+def test_parameters_of_a_model_in_a_file_are_offered(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    model = "rates: {v: -k*v}\noutputs: {v: v}\ninitial: {v: v0}\nstart: {v0: 1, k: 0.1}\n"
+    (tmp_path / "decay.yaml").write_text(model)
+    line = "ipe-bench estimate measurement=ode measurement.file={} parameters."
+    assert texts(line.format("decay.yaml")) == ["parameters.v0.", "parameters.k."]
+    assert texts(line.format("absent.yaml")) == []
 
 
 def test_options_of_plugins_are_offered_and_broken_ones_are_not(tmp_path, monkeypatch, capsys):

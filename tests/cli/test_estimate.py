@@ -25,12 +25,15 @@ LM = ("solver=[]", "baseline=[levenberg_marquardt]")
 
 @pytest.fixture
 def estimate(tmp_path, monkeypatch, capsys):
-    """Runs `estimate` in an empty folder; the exit code, what it printed, and its JSON file where it left one."""
+    """Runs `estimate` in an empty folder; the exit code, what it printed, and its JSON file where it left one.
+
+    Figures are drawn where the command says so.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["ipe-bench"])
 
     def run(*words: str) -> tuple[int, str, dict]:
-        code = main(["estimate", *words])
+        code = main(["estimate", *([] if "figures=all" in words else ["figures=none"]), *words])
         printed = capsys.readouterr()
         found = Path(tmp_path / "outputs")
         files = sorted(found.rglob("estimate.json"), key=lambda path: path.stat().st_mtime_ns) if found.is_dir() else []
@@ -61,7 +64,7 @@ def curve(t, b1, b2):
 def test_a_formula_and_a_file_are_enough_where_nobody_knows_the_noise(estimate, misra):
     """Certified values and standard deviations, without a word about noise, and three estimators unless others are
     chosen."""
-    code, printed, answer = estimate(*SATURATION, "readings=my.csv")
+    code, printed, answer = estimate(*SATURATION, "readings=my.csv", "figures=all")
     assert code == 0, printed
     assert list(answer["estimators"]) == ["auto", "linear_lse", "levenberg_marquardt"]
     assert "The level of the noise is estimated from the residuals" in printed
@@ -190,7 +193,7 @@ def test_an_epidemic_has_the_noise_of_its_counts_and_not_that_of_a_platform(esti
     boys = (26, 75, 228, 293, 277, 268, 190, 126, 65, 28, 12, 5)
     rows = [f"1,{day},infected,{count}" for day, count in enumerate(boys, 3)]
     (tmp_path / "s.csv").write_text("\n".join(["case,time [day],output,reading [people]", *rows]))
-    code, printed, answer = estimate("measurement=sir", *LM, "readings=s.csv")
+    code, printed, answer = estimate("measurement=sir", *LM, "readings=s.csv", "figures=all")
     assert code == 0, printed
     assert 0.02 < of(answer, "standard_errors")["ln_beta"] < 0.2
 
@@ -220,7 +223,9 @@ def test_equations_in_a_file_are_a_model(estimate, tmp_path):
     y = 8 * np.exp(-0.4 * t) + 0.01 * np.array([1, -2, 1, 2, -1])
     rows = [f"{a!r},{b!r}" for a, b in zip(t.tolist(), y.tolist(), strict=True)]
     (tmp_path / "d.csv").write_text("\n".join(["time,reading", *rows]))
-    code, printed, answer = estimate("measurement=ode", "measurement.file=decay.yaml", *LM, "readings=d.csv")
+    code, printed, answer = estimate(
+        "measurement=ode", "measurement.file=decay.yaml", *LM, "readings=d.csv", "figures=all"
+    )
     assert code == 0, printed
     x, _ = curve_fit(lambda t, k, y0: y0 * np.exp(-k * t), t, y, (0.5, 5), ftol=1e-14, xtol=1e-14, gtol=1e-14)
     assert list(of(answer, "estimates").values()) == pytest.approx(x, rel=1e-6)

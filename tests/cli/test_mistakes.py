@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -238,13 +240,12 @@ def test_there_are_four_hundred_wrong_command_lines():
     assert len(LINES) >= 400
 
 
-QUICK = 7
-"""Of so many command lines, one is tried by the quick tests."""
+def one_in(count: int, cases: Iterable[str], rest: pytest.MarkDecorator) -> list[Any]:
+    """The cases, of which the quick tests try one of so many."""
+    return [pytest.param(case, marks=() if i % count == 0 else rest) for i, case in enumerate(cases)]
 
 
-@pytest.mark.parametrize(
-    "line", [pytest.param(line, marks=() if i % QUICK == 0 else pytest.mark.campaign) for i, line in enumerate(LINES)]
-)
+@pytest.mark.parametrize("line", one_in(7, LINES, pytest.mark.campaign))
 def test_a_wrong_command_line_is_answered_in_one_line(answer, tmp_path, line):
     code, error = answer(*LINES[line])
     assert code == 2
@@ -409,7 +410,7 @@ def test_there_are_sixty_broken_plugins():
     assert len(BROKEN) >= 60
 
 
-@pytest.mark.parametrize("kind", BROKEN)
+@pytest.mark.parametrize("kind", one_in(4, BROKEN, pytest.mark.slow))
 def test_a_broken_plugin_is_named_where_it_is_chosen(answer, plugin, tmp_path, kind):
     plugin(**BROKEN[kind])
     code, error = answer("run", "solver=[bad]", *SMALL)
@@ -419,14 +420,14 @@ def test_a_broken_plugin_is_named_where_it_is_chosen(answer, plugin, tmp_path, k
     assert stored(tmp_path) == []
 
 
-@pytest.mark.parametrize("kind", BROKEN)
+@pytest.mark.parametrize("kind", one_in(4, BROKEN, pytest.mark.slow))
 def test_a_broken_plugin_stops_nobody_who_does_not_use_it(answer, plugin, capsys, kind):
     plugin(**BROKEN[kind])
     assert answer("run", "solver=[newton]", *SMALL, "--cfg", "job")[0] == 0
     assert answer("list", "solver")[0] == 0
 
 
-@pytest.mark.parametrize("kind", BROKEN)
+@pytest.mark.parametrize("kind", one_in(4, BROKEN, pytest.mark.slow))
 def test_check_fails_a_broken_plugin(answer, plugin, kind):
     folder = plugin(**BROKEN[kind])
     code, error = answer("check", str(folder))

@@ -75,7 +75,7 @@ def assert_same(first: Path, second: Path) -> None:
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("undisturbed")
-    assert compute([scenario()], OTHERS, 20, folder, execution=Serial(), block_size=10) == ()
+    assert compute([scenario()], OTHERS, 8, folder, execution=Serial(), block_size=4) == ()
     return folder
 
 
@@ -100,7 +100,7 @@ def test_one_vandal_changes_no_bit_of_the_others(tmp_path, undisturbed, surround
     if isinstance(execution, Dask):
         pytest.importorskip("distributed")
     estimators = {"vandal": Vandal(fault), **OTHERS}
-    assert compute([scenario()], estimators, 20, tmp_path, execution=execution, block_size=10) == ()
+    assert compute([scenario()], estimators, 8, tmp_path, execution=execution, block_size=4) == ()
     assert_same(undisturbed, tmp_path)
     vandal = rows(tmp_path, "vandal")
     if fault in MESSAGES:
@@ -115,13 +115,13 @@ def test_a_wrong_R_concerns_its_own_scenario(tmp_path, undisturbed, surroundings
     if isinstance(execution, Dask):
         pytest.importorskip("distributed")
     scenarios = [scenario(WrongR(0.1)), scenario()]
-    assert compute(scenarios, OTHERS, 20, tmp_path, execution=execution, block_size=10) == ()
+    assert compute(scenarios, OTHERS, 8, tmp_path, execution=execution, block_size=4) == ()
     assert_same(undisturbed, tmp_path)
 
 
 def test_all_vandals_at_once_in_processes(tmp_path, undisturbed):
     estimators = {**{fault: Vandal(fault) for fault in FAULTS}, **OTHERS}
-    assert compute([scenario()], estimators, 20, tmp_path, execution=Processes(1), block_size=10) == ()
+    assert compute([scenario()], estimators, 8, tmp_path, execution=Processes(1), block_size=4) == ()
     assert_same(undisturbed, tmp_path)
 
 

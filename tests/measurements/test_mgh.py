@@ -12,6 +12,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Mgh
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.mgh import functions, score
+from ipe_bench.measurements.mgh.problems import PROBLEMS
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.plugins.conformance import check_component
 
@@ -89,6 +90,7 @@ def finite_minima():
 
 def test_23_functions_have_the_dimensions_of_the_paper():
     assert {f: (Mgh(f).m, Mgh(f).n) for f in functions()} == SIZES
+    assert functions() == tuple(PROBLEMS)
     assert len(SIZES) == 23
 
 

@@ -7,6 +7,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Nist
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.nist import datasets, digits, score
+from ipe_bench.measurements.nist.formulas import FORMULAS
 
 # What NIST's headers say: observations and parameters.
 SIZES = {
@@ -28,6 +29,7 @@ def least_squares_deviations(model, x):
 def test_all_27_problems_are_there_with_their_sizes():
     assert {name: (Nist(name).m, Nist(name).n) for name in datasets()} == SIZES
     assert len(SIZES) == 27
+    assert datasets() == tuple(FORMULAS)
 
 
 @pytest.mark.parametrize("dataset", datasets())

@@ -45,7 +45,7 @@ def test_p_is_uniform_for_every_noise_that_states_its_law(noise):
     assert kstest(p_values(Polynomial(strength=0.01), noise, 1.0, GaussNewton()), "uniform").pvalue > 0.01
 
 
-@pytest.mark.parametrize("estimator", [MapLM(), MapLM(prior_inflation=3.0), EKF()], ids=repr)
+@pytest.mark.parametrize("estimator", [MapLM(), MapLM(prior_inflation=3.0), EKF(engine="batched")], ids=repr)
 def test_p_is_uniform_for_estimators_with_a_prior(estimator):
     """The prior is as good as the readings here: m - n degrees are 3 too few of 40."""
     p = p_values(Polynomial(strength=0.001), Gaussian(1.0), 0.2, estimator)

@@ -39,7 +39,15 @@ def complaints(component) -> str:
     return "; ".join(f.complaint for f in check_component("mine", component) if f.complaint)
 
 
-@pytest.mark.parametrize("option", OURS, ids=lambda o: f"{o.group}={o.name}")
+DEAR = ("enkf", "ukf_wide", "iplf", "recursive_update", "lm_iekf")
+"""Ensembles and iterations for every reading take seconds; ukf_wide is of the same class as another option."""
+
+
+@pytest.mark.parametrize(
+    "option",
+    [pytest.param(o, marks=pytest.mark.slow if o.name in DEAR else ()) for o in OURS],
+    ids=lambda o: f"{o.group}={o.name}",
+)
 def test_every_option_of_ours_keeps_its_promises(option):
     assert not complaints(component(option))
 

@@ -20,18 +20,22 @@ from ipe_bench.noise import Gaussian
 from ipe_bench.plugins import discovery
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.priors import GaussianPrior, Prior
+from ipe_bench.report import figures
 from ipe_bench.runs.execution import Event, Execution
 from ipe_bench.statistics.records import add_statistics
 from ipe_bench.trials.posterior import reference
 
 SMALL = ("measurement=polynomial", "noise=gaussian", "trials=8", "execution=serial", "output=out")
 MAIN = "figures=main"
+OURS = ("success",)
+"""Of our figures, one is enough to see whether it stays as it is."""
 
 
 @pytest.fixture(autouse=True)
 def place(tmp_path, monkeypatch):
     """A working folder of its own, whose plugins are forgotten afterwards."""
     before = dict(sys.modules)
+    monkeypatch.setattr(figures, "FIGURES", OURS)
     path = list(sys.path)
     monkeypatch.setenv("PYTHONPATH", "")
     monkeypatch.chdir(tmp_path)
@@ -47,13 +51,14 @@ def place(tmp_path, monkeypatch):
     add_statistics([])
 
 
-def write(kind: str, name: str, source: str) -> None:
-    """A plugin of one record, whose module is the source."""
-    package = Path("plugins") / name / f"ipe_bench_{name}"
-    (package / "conf" / kind).mkdir(parents=True)
+def write(kind: str, name: str, source: str, plugin: str | None = None) -> None:
+    """A record whose module is the source, in that plugin or in one of its own."""
+    plugin = plugin or name
+    package = Path("plugins") / plugin / f"ipe_bench_{plugin}"
+    (package / "conf" / kind).mkdir(parents=True, exist_ok=True)
     (package / "__init__.py").write_text("")
     (package / f"{name}.py").write_text(source)
-    target = f"ipe_bench_{name}.{name}.{RECORDS[kind]}"
+    target = f"{package.name}.{name}.{RECORDS[kind]}"
     (package / "conf" / kind / f"{name}.yaml").write_text(f"# One.\n_target_: {target}\n")
     discovery.sources.cache_clear()
 
@@ -118,7 +123,7 @@ def test_a_report_has_what_plugins_add_beside_all_that_is_ours(ours, capsys):
 
 RAISING = {
     "statistic": "from ipe_bench.statistics.records import Statistic\n"
-    "def f(s):\n    raise ValueError('broken')\nSTATISTIC = Statistic('bad', 'bad', 'all trials', 'Bad.', f)\n",
+    "def f(s):\n    raise ValueError('broken')\nSTATISTIC = Statistic('bad_statistic', 'bad', 'all trials', '', f)\n",
     "figure": "from ipe_bench.report.figures.drawing import Figure\n"
     "def f(view):\n    raise ValueError('broken')\n    yield\nFIGURE = Figure(f, ('summary',), main=True)\n",
     "table": "def table(analysis):\n    raise ValueError('broken')\n",
@@ -127,13 +132,13 @@ RAISING = {
 }
 MEDDLING = {
     "statistic": "from ipe_bench.statistics.records import Statistic\n"
-    "def f(s):\n    s.error *= 0\n    return 1.0\nSTATISTIC = Statistic('bad', 'bad', 'all trials', 'Bad.', f)\n",
+    "def f(s):\n    s.error *= 0\n    return 1.0\nSTATISTIC = Statistic('bad_statistic', 'bad', 'all trials', '', f)\n",
     "figure": "from ipe_bench.report.figures.drawing import Figure\n"
-    "def f(view):\n    view['summary']['rmse'] = 0.0\n    view['scores']['cost_median'] = 1.0\n"
+    "def f(view):\n    view['summary'][['rmse', 'success']] = 0.0\n    view['scores']['cost_median'] = 1.0\n"
     "    yield from ()\nFIGURE = Figure(f, ('summary', 'scores'), together=True, main=True)\n",
-    "table": "def table(analysis):\n    analysis.summary['rmse'] = 0.0\n",
+    "table": "def table(analysis):\n    analysis.summary[['rmse', 'success']] = 0.0\n",
     "section": "from ipe_bench.report.sections import Section\n"
-    "def f(analysis):\n    analysis.summary['rmse'] = 0.0\n    yield 'Done.'\nSECTION = Section('Bad', f)\n",
+    "def f(analysis):\n    analysis.summary[['rmse', 'success']] = 0.0\n    yield 'Done.'\nSECTION = Section('Bad', f)\n",
 }
 
 
@@ -143,6 +148,7 @@ def reported(tmp_path_factory) -> Path:
     place = tmp_path_factory.mktemp("reported")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
+        patch.setattr(figures, "FIGURES", OURS)
         discovery.sources.cache_clear()
         assert main(["run", *SMALL, MAIN]) == 0
     discovery.sources.cache_clear()
@@ -156,31 +162,34 @@ def ours(reported) -> dict[str, str]:
     return files("out")
 
 
-@pytest.mark.parametrize("kind", RECORDS)
-def test_one_that_raises_is_named_and_the_rest_is_whole(kind, ours, capsys):
-    write(kind, "bad", RAISING[kind])
+def test_those_that_raise_are_named_and_the_rest_is_whole(ours, capsys):
+    for kind in RECORDS:
+        write(kind, f"bad_{kind}", RAISING[kind], plugin="bad")
     for _ in range(2):
         capsys.readouterr()
         assert main(["report", "out", MAIN]) == 1
-        (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith(f"ipe-bench: {kind}=bad: ")
-        assert "broken" in line
+        lines = capsys.readouterr().err.splitlines()
+        assert {line.partition(": ")[2].partition(": ")[0] for line in lines} == {f"{k}=bad_{k}" for k in RECORDS}
+        assert len(lines) == len(RECORDS)
+        assert all(line.startswith("ipe-bench: ") and "broken" in line for line in lines)
     after = files("out")
-    for name in ("overview.md", "parameters.csv") if kind == "statistic" else ():
+    # The statistic has a column in one table, and a row in those of all statistics.
+    for name in ("overview.md", "parameters.csv"):
         ours.pop(name), after.pop(name)
-    same = {name for name in ours if after.get(name) == ours[name]}
-    assert {name for name in ours if name not in same} <= (
-        {"overview.csv", "costs.csv"} if kind == "statistic" else set()
-    )
+    assert {name for name in ours if after.get(name) != ours[name]} <= {"overview.csv", "costs.csv"}
     assert set(after) == set(ours)
-    assert main(["check", "plugins/bad"]) == 1
+    complaints = {finding.component for finding in check("plugins/bad") if "broken" in finding.complaint}
+    assert complaints == {f"{kind}=bad_{kind}" for kind in RECORDS}
 
 
-@pytest.mark.parametrize("kind", RECORDS)
-def test_one_that_writes_into_what_it_is_given_changes_nothing_of_ours(kind, ours):
+def test_those_that_write_into_what_they_are_given_change_nothing_of_ours(ours, capsys):
     before = pd.read_csv("out/summary.csv")
-    write(kind, "bad", MEDDLING[kind])
-    assert main(["report", "out", MAIN]) == (1 if kind == "statistic" else 0)
+    for kind in RECORDS:
+        write(kind, f"bad_{kind}", MEDDLING[kind])
+    capsys.readouterr()
+    assert main(["report", "out", MAIN]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("ipe-bench: statistic=bad_statistic: ")
     after = pd.read_csv("out/summary.csv")
     pd.testing.assert_frame_equal(after[before.columns], before)
     figures = {name: digest for name, digest in files("out").items() if name.endswith(".png")}
@@ -202,29 +211,33 @@ STATISTIC = Statistic({!r}, "mine", "all trials", "Mine.", lambda s: {}{})
 """
 
 
-@pytest.mark.parametrize(
-    ("source", "complaint"),
-    [
-        (STATISTIC.format("rmse", "1.0", ""), "is called rmse; give file and record one name"),
-        (STATISTIC.format("bad", "'one'", ""), "a value is a str; return a float"),
-        (STATISTIC.format("bad", "1.0", ", lambda s: s.sizes[:-1]"), "has 3 values for 4 parameters"),
-        (STATISTIC.format("bad", "1.0", ", kind='colour'"), "kind=colour: choose from"),
-        (STATISTIC.format("bad", "1.0", ", where=('nowhere',)"), "where=nowhere: choose from"),
-        (STATISTIC.format("bad", "3.0", ", limits=lambda s: (1.0, 2.0)"), "3 of linear_lse is not within its interval"),
-        (
-            "import numpy\n" + STATISTIC.format("bad", "numpy.random.default_rng().random()", ""),
-            "is another value each time",
-        ),
-        ("STATISTIC = 3\n", "is a int and not a Statistic"),
-        ("import nothing_like_it\n", "nothing_like_it"),
-        ("def f(:\n", "SyntaxError"),
-    ],
-)
-def test_a_faulty_statistic_is_found(source, complaint):
-    write("statistic", "bad", source)
-    complaints = [finding.complaint for finding in check("plugins/bad") if finding.complaint]
-    assert len(complaints) == 1
-    assert complaint in complaints[0]
+FAULTY = {
+    "other": (STATISTIC.format("rmse", "1.0", ""), "is called rmse; give file and record one name"),
+    "text": (STATISTIC.format("text", "'one'", ""), "a value is a str; return a float"),
+    "short": (STATISTIC.format("short", "1.0", ", lambda s: s.sizes[:-1]"), "has 3 values for 4 parameters"),
+    "colour": (STATISTIC.format("colour", "1.0", ", kind='colour'"), "kind=colour: choose from"),
+    "nowhere": (STATISTIC.format("nowhere", "1.0", ", where=('nowhere',)"), "where=nowhere: choose from"),
+    "outside": (
+        STATISTIC.format("outside", "3.0", ", limits=lambda s: (1.0, 2.0)"),
+        "3 of linear_lse is not within its interval",
+    ),
+    "random": (
+        "import numpy\n" + STATISTIC.format("random", "numpy.random.default_rng().random()", ""),
+        "is another value each time",
+    ),
+    "number": ("STATISTIC = 3\n", "is a int and not a Statistic"),
+    "library": ("import nothing_like_it\n", "nothing_like_it"),
+    "syntax": ("def f(:\n", "SyntaxError"),
+}
+
+
+def test_faulty_statistics_are_found():
+    for name, (source, _) in FAULTY.items():
+        write("statistic", name, source, plugin="bad")
+    complaints = [(finding.component, finding.complaint) for finding in check("plugins/bad") if finding.complaint]
+    assert sorted(name for name, _ in complaints) == sorted(f"statistic={name}" for name in FAULTY)
+    for component, complaint in complaints:
+        assert FAULTY[component.removeprefix("statistic=")][1] in complaint
 
 
 def test_a_statistic_under_the_name_of_ours_is_refused(capsys):
@@ -335,9 +348,9 @@ def test_a_plugin_without_its_library_stops_no_run_and_says_what_to_install(caps
     remedy = "needs no-such-library, not installed here; pip install plugins/mine"
     assert written.err.splitlines() == [f"ipe-bench: solver=mine: {remedy}"]
     assert "newton" in written.out
-    assert main(["run", *SMALL, "solver=[newton]"]) == 0
+    assert main(["run", *SMALL, "figures=none", "solver=[newton]"]) == 0
     assert "mine" not in capsys.readouterr().err
-    assert main(["run", *SMALL, "solver=[mine]"]) == 2
+    assert main(["run", *SMALL, "figures=none", "solver=[mine]"]) == 2
     assert capsys.readouterr().err.splitlines() == [f"ipe-bench: solver=mine: {remedy}"]
     assert main(["check", "plugins/mine"]) == 1
     assert remedy in capsys.readouterr().out

@@ -86,6 +86,7 @@ def coverage(found, truth) -> tuple[np.ndarray, np.ndarray]:
     return np.mean(profile, axis=0), np.mean(wald, axis=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unknown", [False, True])
 def test_profile_intervals_cover_the_truth_as_often_as_they_say(unknown):
     """In 1,000 simulated sets of six readings, .95 ± .02 for every parameter, where standard errors give less."""

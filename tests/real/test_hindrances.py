@@ -27,7 +27,8 @@ def ipe_bench(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["ipe-bench"])
 
     def run(*words: str) -> tuple[int, str]:
-        code = main(list(words))
+        drawn = ["figures=none"] if words[0] == "estimate" else []
+        code = main([*words, *drawn])
         printed = capsys.readouterr()
         return code, printed.out + printed.err
 

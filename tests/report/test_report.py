@@ -21,7 +21,7 @@ from synthetic_store import Seeker, Synthetic
 from ipe_bench.noise import Quantization
 from ipe_bench.report import write_report
 from ipe_bench.report.definitions import DEFINITIONS
-from ipe_bench.report.figures import correlation, distributions, nees
+from ipe_bench.report.figures import correlation, distributions, error_scale, nees, success
 from ipe_bench.report.figures.ranks import cliques
 from ipe_bench.report.figures.views import views
 from ipe_bench.report.headline import headline
@@ -150,14 +150,15 @@ def test_the_table_in_the_terminal_fits_100_columns(synthetic):
     assert text.count("levenberg_marquardt") == 3
 
 
-def test_hostile_names_are_shown_and_not_run(synthetic):
+@pytest.mark.parametrize("figures", ["main", pytest.param("all", marks=pytest.mark.slow)])
+def test_hostile_names_are_shown_and_not_run(synthetic, figures):
     fill(
         synthetic,
         labels=("linear_lse", HOSTILE, "$x_1$ & \\frac{a}{b} | *b*"),
         names=(HOSTILE, "_b%", "c#~^\u03b1"),
         scales=(1.0, 10.0),
     )
-    result = write_report([synthetic.directory], synthetic.directory / "out")
+    result = write_report([synthetic.directory], synthetic.directory / "out", figures=figures)
     page = result.report.read_text(encoding="utf-8")
     assert HOSTILE not in page
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
@@ -316,11 +317,13 @@ def test_settings_that_differ_have_figures_of_their_own(synthetic, tmp_path):
     for scenario in (*gaussian, *quantized):
         for label in ("linear_lse", "one"):
             synthetic.add(scenario, label, 0.1 * rng.normal(size=(40, 3)))
-    result = write_report([synthetic.directory], tmp_path / "out", figures="main")
-    names = {p.stem for p in result.figures}
+    result = write_report([synthetic.directory], tmp_path / "out", figures="none")
+    modules = (error_scale, success, distributions, correlation, nees)
     with house_style():
-        for view in views(analyse([synthetic.directory]))[0]:
-            names |= {d.name for module in (distributions, correlation, nees) for d in module.draw(view)}
+        parts, _ = views(analyse([synthetic.directory]))
+        drawn = [drawing for view in parts for module in modules for drawing in module.draw(view)]
+    names = {drawing.name for drawing in drawn}
+    assert not [drawing.name for drawing in drawn if re.search(r"\bnan\b", drawing.caption)]
     settings = ("gaussian-0.2", "gaussian-0.4", "quantization")
     for kind in ("figure_2", "success_against_scale", "error_distributions", "correlation", "consistency"):
         assert {n for n in names if n.startswith(f"{kind}_")} == {f"{kind}_{s}" for s in settings}

@@ -50,7 +50,7 @@ def test_what_is_far_is_left_to_progressive():
 
 def test_residuals_that_do_not_fit_are_no_answer_of_the_first_stage():
     scenario = Scenario(Polynomial(strength=0.02), Gaussian(0.1), error_scale=1.0)
-    z = scenario.draw(0, 4).z
+    z = scenario.draw(0, 2).z
     strict = Problem(scenario.measurement, Covariance(np.full(scenario.measurement.m, 1e-4)))
     assert (Auto().estimate(scenario.problem, z).extras["stage"] == CHORDS).all()
     assert (Auto().estimate(strict, z).extras["stage"] == PROGRESSIVE).all()

@@ -77,7 +77,7 @@ def test_a_report_on_ones_own_and_a_bundle(bundle, tmp_path, capsys):
     mine.add(mine.scenario(error_scale=3.0), "one", np.full((20, 3), 0.1))
     mine.record(20)
     out = tmp_path / "out"
-    words = ["report", str(mine.directory), str(bundle.path), f"output={out}"]
+    words = ["report", str(mine.directory), str(bundle.path), f"output={out}", "figures=none"]
     assert main(words) == 0
     summary = pd.read_csv(out / "summary.csv")
     assert set(summary["error_scale"]) == {1.0, 3.0}

@@ -100,11 +100,14 @@ class Gallery:
         self.problems = problems
         self.parts, whole = views(analysis)
         """The settings one by one."""
-        self.tasks = {task.digest: task for task in _tasks(analysis, self.parts, whole, problems)}
+        self.old = _read_index(folder)
+        tasks = _tasks(analysis, self.parts, whole, problems)
+        if which == "none" and not self.old:
+            tasks = _nothing(problems)
+        self.tasks = {task.digest: task for task in tasks}
         self.wanted = [
             d for d, t in self.tasks.items() if which == "all" or (which == "main" and _figure(t.figure).main)
         ]
-        self.old = _read_index(folder)
         self.entries = {d: _intact(self.old[d], folder) for d in self.tasks if d in self.old}
         self.missing: dict[str, Job] = {}
         for digest in self.wanted:
@@ -158,6 +161,14 @@ class Gallery:
             for d in self.wanted
             for e in entries.get(d, ())
         ]
+
+
+def _nothing(problems: list[str]) -> Iterator[Task]:
+    """Where nothing is drawn and nothing was: plugins that cannot be used are told of all the same."""
+    from ipe_bench.report import extensions
+
+    deque(extensions.figures(problems), maxlen=0)
+    return iter(())
 
 
 def _in_order(kinds: Iterable[str]) -> list[str]:

@@ -39,7 +39,7 @@ def test_swings_little_as_a_damped_oscillator():
 
 def test_many_swings_are_too_many_for_gauss_newton_but_not_for_progressive():
     bench = ib.Scenario(Pendulum(), Gaussian(0.01), error_scale=10.0)
-    drawn = bench.draw(0, 20)
+    drawn = bench.draw(0, 8)
     errors = {}
     for name, estimator in {"gn": ib.baselines.GaussNewton(), "progressive": Progressive()}.items():
         with np.errstate(all="ignore"):  # Gauss-Newton runs away to where numbers end
