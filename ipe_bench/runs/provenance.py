@@ -122,10 +122,20 @@ def _imports(module: str) -> tuple[str, ...]:
 
 @functools.cache
 def _is_module(name: str) -> bool:
+    parent = name.rpartition(".")[0]
     try:
+        # To look for something in a module would import the module; and only a package has modules in it.
+        if parent and not _is_package(parent):
+            return False
         return importlib.util.find_spec(name) is not None
     except (ValueError, ImportError):
         return False
+
+
+@functools.cache
+def _is_package(name: str) -> bool:
+    spec = importlib.util.find_spec(name)
+    return spec is not None and spec.submodule_search_locations is not None
 
 
 @functools.cache
