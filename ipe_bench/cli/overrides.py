@@ -153,7 +153,7 @@ def _check_key(word: _Word) -> None:
     for value in word.values():
         if word.group in ("name", "output") and str(value).strip() in ("", ".", ".."):
             raise word.error("name a folder")
-        if word.group == "trials" and value is None:
+        if word.group in ("trials", "block_size") and value is None:
             raise word.error("cannot be null; give a whole number, or leave it out")
         if word.group == "estimators":
             raise word.error("choose with solver= and baseline=, and set options by estimators.LABEL.KEY=VALUE")
