@@ -38,6 +38,7 @@ from ipe_bench.plugins import discovery as plugins
 from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
 from ipe_bench.report.helper import Helper, drawing_help
 from ipe_bench.runs.execution import Execution, Serial
+from ipe_bench.runs.execution.processes import end_idle
 from ipe_bench.runs.schedule import Watcher
 from ipe_bench.runs.store import describe_names, digest
 
@@ -221,6 +222,7 @@ def _conclude() -> int:
     if _outcome.dry is not None and not _outcome.mistakes:
         print(_outcome.dry.summary())
         return code
+    end_idle()  # a report on many trials has use for their memory
     for output, cells in _outcome.outputs.items():
         if (output / "trials").is_dir():
             # Of jobs in other processes nothing is known but the folder.

@@ -259,7 +259,8 @@ def _warm_up(workers: int, memory_limit_gb: float | None, module: str) -> None:
 
 
 @atexit.register
-def _end_idle() -> None:
+def end_idle() -> None:
+    """Ends the workers that wait for another run, and gives back their memory."""
     for worker in [w for (pid, _), kept in _idle.items() if pid == os.getpid() for w in kept]:
         worker.end()
     _idle.clear()
