@@ -328,9 +328,7 @@ class OdeMeasurement(Measurement):
         if level > 2 or self._coarseness.rk4 is None:
             return self._jacobian_kernel, self._coarseness.level(level)
         # The formula of fourth order loses more by what a trial turns faster than the nominal one: 2^4 and 3^4 in hand.
-        # Not at level 1 of GINS, where the worst of 1,600 draws to a scale of 3000 leaves 8e-3 without.
-        tried = place < 0 or (level == 1 and self.trusted_angle > 0)
-        return self._rk4_kernel, self._coarseness.rk4 * (1 if tried else level + 1)
+        return self._rk4_kernel, self._coarseness.rk4 * (1 if place < 0 else level + 1)
 
     @cached_property
     def _coarseness(self) -> Coarseness:
