@@ -138,7 +138,7 @@ MEDDLING = {
     "    yield from ()\nFIGURE = Figure(f, ('summary', 'scores'), together=True, main=True)\n",
     "table": "def table(analysis):\n    analysis.summary[['rmse', 'success']] = 0.0\n",
     "section": "from ipe_bench.report.sections import Section\n"
-    "def f(analysis):\n    analysis.summary[['rmse', 'success']] = 0.0\n    yield 'Done.'\nSECTION = Section('Bad', f)\n",
+    "def f(analysis):\n    analysis.summary[['rmse', 'success']] = 0.0\n    yield ''\nSECTION = Section('Bad', f)\n",
 }
 
 
