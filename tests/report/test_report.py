@@ -55,10 +55,13 @@ def fill(
 def result(tmp_path_factory):
     store = Synthetic(tmp_path_factory.mktemp("report") / "store")
     fill(store, scales=(1.0, 10.0), seeds=5)
-    return write_report([store.directory], store.directory, formats="pdf")
+    return write_report([store.directory], store.directory, figures="main", formats="pdf")
 
 
-def test_everything_is_written(result):
+@pytest.mark.slow
+def test_everything_is_written(synthetic):
+    fill(synthetic, scales=(1.0, 10.0), seeds=5)
+    result = write_report([synthetic.directory], synthetic.directory, formats="pdf")
     assert result.problems == ()
     stored = pd.read_csv(result.summary_path)
     pd.testing.assert_frame_equal(stored, result.summary, check_exact=False, rtol=1e-12)
@@ -66,6 +69,17 @@ def test_everything_is_written(result):
     expected = ("figure_2", "error_against_scale", "success_against_scale", "error_distributions", "consistency")
     for name in (*expected, "cost_against_accuracy", "profiles", "critical_difference", "correlation"):
         assert {f"{name}.png", f"{name}.pdf"} <= names
+    assert {p.name for p in result.tables} >= {"overview.csv", "overview.md", "overview.tex", "comparisons.tex"}
+    for path in (*result.figures, *result.tables, result.report):
+        assert path.stat().st_size > 100
+    assert not list(result.report.parent.rglob("*.tmp"))
+
+
+def test_what_is_written_is_whole(result):
+    assert result.problems == ()
+    stored = pd.read_csv(result.summary_path)
+    pd.testing.assert_frame_equal(stored, result.summary, check_exact=False, rtol=1e-12)
+    assert {p.name for p in result.figures} >= {f"success_against_scale.{kind}" for kind in ("png", "pdf")}
     assert {p.name for p in result.tables} >= {"overview.csv", "overview.md", "overview.tex", "comparisons.tex"}
     for path in (*result.figures, *result.tables, result.report):
         assert path.stat().st_size > 100
