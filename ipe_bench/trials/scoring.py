@@ -270,7 +270,8 @@ def nees(error: Array, P: Array) -> Array:
     C = np.where(usable[:, None, None], C, np.eye(error.shape[1]))
     e = np.where(usable[:, None], e, 0.0)
     _, inverse_U, definite = definite_factor(C)
-    squared = np.sum(multiply(inverse_U.swapaxes(1, 2), e) ** 2, axis=1)
+    with np.errstate(all="ignore"):
+        squared = np.sum(multiply(inverse_U.swapaxes(1, 2), e) ** 2, axis=1)
     if not definite.all():
         squared[~definite] = _nees_of_any(e[~definite], C[~definite])
     return np.where(reported, np.where(usable, squared, np.inf), np.nan)
