@@ -66,6 +66,7 @@ _WITHOUT_USE = (
     "time_limit",
     "seed",
     "block_size",
+    "formats",
     "execution",
     "truth_measurement",
     "write_readings",

@@ -74,7 +74,7 @@ FLAGS = {
         "-c job -p",
     ),
     "estimate": (
-        "-m", "--cfg job", "-x", "--dry-run", "trials=5", "seed=1", "block_size=5", "execution=serial",
+        "-m", "--cfg job", "-x", "--dry-run", "trials=5", "seed=1", "block_size=5", "formats=pdf", "execution=serial",
         "truth_measurement=gins", "write_readings=x.csv", "readings=absent.csv", f"readings={LONG}", "readings=/",
         "",
     ),
