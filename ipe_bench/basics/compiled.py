@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ipe_bench.basics.errors import StorageError
-from ipe_bench.basics.files import BLANK_SEAL, cache_folder, is_sealed, seal, write_atomically
+from ipe_bench.basics.files import BLANK_SEAL, cache_folder, is_sealed, seal, write_bytes
 from ipe_bench.basics.machine import ARRAY_DATA, ARRAY_DIMENSIONS
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def load(source: str, what: str = "an integrator") -> Function:
         header = {"symbol": found.symbol, "arguments": found.arguments, "result": found.result, "needs": found.needs}
         content = seal(json.dumps(header | {"seal": BLANK_SEAL}).encode() + b"\n" + found.code)
         with contextlib.suppress(StorageError):
-            write_atomically(path, lambda temporary: temporary.write_bytes(content))
+            write_bytes(path, content)
     head, _, code = content.partition(b"\n")
     return _linked(json.loads(head), code)
 

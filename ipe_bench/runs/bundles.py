@@ -21,7 +21,7 @@ from typing import Any
 
 from ipe_bench import __version__
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.files import BLANK_SEAL, is_sealed, seal, write_atomically
+from ipe_bench.basics.files import BLANK_SEAL, is_sealed, seal, write_atomically, write_bytes
 from ipe_bench.runs.results import Results, require_results
 from ipe_bench.runs.store import Store
 
@@ -166,7 +166,7 @@ def _checked(path: Path, manifest: bytes, names: Sequence[str]) -> dict[str, Any
 
 def _write(path: Path, content: bytes) -> None:
     if not path.is_file() or path.read_bytes() != content:
-        write_atomically(path, lambda temporary: temporary.write_bytes(content))
+        write_bytes(path, content)
 
 
 @contextlib.contextmanager

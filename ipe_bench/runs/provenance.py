@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ipe_bench.basics.errors import StorageError
-from ipe_bench.basics.files import BLANK_SEAL, cache_folder, is_sealed, seal, write_atomically
+from ipe_bench.basics.files import BLANK_SEAL, cache_folder, is_sealed, seal, write_bytes
 from ipe_bench.basics.options import component_classes
 
 TARGET = "_target_"
@@ -189,7 +189,7 @@ class _Sources:
         self.stored = set(self.found)
         text = json.dumps({"found": self.found, "seal": BLANK_SEAL})
         with contextlib.suppress(StorageError):
-            write_atomically(self.path, lambda temporary: temporary.write_bytes(seal(text.encode())))
+            write_bytes(self.path, seal(text.encode()))
 
 
 @functools.cache

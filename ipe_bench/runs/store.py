@@ -26,7 +26,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ipe_bench.basics.errors import StorageError, UserError
-from ipe_bench.basics.files import BLANK_SEAL, seal, write_atomically
+from ipe_bench.basics.files import BLANK_SEAL, seal, write_bytes
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import library_versions
 from ipe_bench.estimators.base import Estimator
@@ -210,7 +210,7 @@ class Store:
         for fault in faults(rows, rules, start):
             raise ValueError(f"{describe_names(cell.names)}: what is to be stored {fault}")
         content = encode(rows, cell.footer)
-        write_atomically(path, lambda temporary: temporary.write_bytes(content))
+        write_bytes(path, content)
 
     def write_run(self, identifier: str, record: Mapping[str, Any]) -> Path:
         """States, before any work, what a run is going to compute."""
@@ -236,7 +236,7 @@ class Store:
     def _write_json(self, path: Path, record: Mapping[str, Any]) -> Path:
         text = json.dumps({"schema": SCHEMA, **record, "seal": BLANK_SEAL}, indent=1, default=str)
         content = seal(text.encode())
-        write_atomically(path, lambda temporary: temporary.write_bytes(content))
+        write_bytes(path, content)
         return path
 
 

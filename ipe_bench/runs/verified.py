@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ipe_bench.basics.errors import StorageError
-from ipe_bench.basics.files import BLANK_SEAL, is_sealed, seal, write_atomically
+from ipe_bench.basics.files import BLANK_SEAL, is_sealed, seal, write_bytes
 from ipe_bench.runs.store import SCHEMA
 
 NAME = ".verified.json"
@@ -77,7 +77,7 @@ class Verified:
         known = {"schema": SCHEMA, "files": self._files, "footers": footers, "seal": BLANK_SEAL}
         content = seal(json.dumps(known, separators=(",", ":")).encode())
         with contextlib.suppress(StorageError):
-            write_atomically(self.path, lambda temporary: temporary.write_bytes(content))
+            write_bytes(self.path, content)
 
     def _name(self, path: Path) -> str:
         return f"{path.parent.name}/{path.name}"

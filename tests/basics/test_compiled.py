@@ -13,6 +13,7 @@ import pytest
 from ipe_bench.basics.compiled import load
 from ipe_bench.measurements import LotkaVolterra
 from ipe_bench.runs import provenance
+from ipe_bench.solvers import FixedPoint
 
 SOURCE = """
 import numpy as np
@@ -108,10 +109,20 @@ print("numba" in sys.modules)
     assert [run.stdout.strip() for run in said] == ["True", "False"]
 
 
-def test_the_compiler_is_part_of_the_source_that_results_depend_on(monkeypatch):
-    before = provenance.fingerprint([LotkaVolterra()])["source"]
-    read = provenance._digest_of
-    for changed in ("compiled", "compiler"):
-        module = f"ipe_bench.basics.{changed}"
-        monkeypatch.setattr(provenance, "_digest_of", lambda m, module=module: read(m) + "#" * (m == module))
-        assert provenance.fingerprint([LotkaVolterra()])["source"] != before
+@pytest.mark.parametrize(
+    ("module", "part"),
+    [
+        ("basics.compiled", LotkaVolterra()),
+        ("basics.compiler", LotkaVolterra()),
+        ("measurements.ode.machine_code", LotkaVolterra()),
+        ("basics.definite", FixedPoint()),
+        ("basics.normal", FixedPoint()),
+    ],
+)
+def test_what_machine_code_comes_from_is_part_of_the_source_that_results_depend_on(monkeypatch, module, part):
+    """It is handed over as text, or imported where something is compiled alone, and yet a change to it makes stored
+    results those of other code."""
+    before = provenance.fingerprint([part])["source"]
+    read, changed = provenance._digest_of, f"ipe_bench.{module}"
+    monkeypatch.setattr(provenance, "_digest_of", lambda name: read(name) + "#" * (name == changed))
+    assert provenance.fingerprint([part])["source"] != before
