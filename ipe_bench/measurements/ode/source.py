@@ -180,7 +180,7 @@ def integrate(x, si, cases, rows, first, last, times, steps, offset, out, work, 
             place[lane] = (trial * cases.shape[0] + case) * per_case
             shift[lane] = case * (offset.shape[0] // cases.shape[0])
         t = 0.0
-        h = 0.0
+        h = np.nan
         for k in range(times.shape[0]):
             before = h
             h = (times[k] - t) / steps[k]
@@ -263,7 +263,7 @@ def integrate(x, si, cases, rows, first, last, times, steps, out, work, lanes):
             begin(b, lane, x, trial, si, cases, case)
             place[lane] = (trial * cases.shape[0] + case) * per_case
         t = 0.0
-        h = 0.0
+        h = np.nan
         for k in range(times.shape[0]):
             before = h
             h = (times[k] - t) / steps[k]
