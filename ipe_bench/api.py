@@ -3,37 +3,26 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import datetime
-import functools
-import platform
-import subprocess
 import tempfile
-import time
-import uuid
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ipe_bench.basics.errors import StorageError, UserError, unknown
+from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
-from ipe_bench.basics.machine import cores, library_versions
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
-from ipe_bench.runs.compaction import tidy
-from ipe_bench.runs.execution import Execution, Serial
-from ipe_bench.runs.provenance import describe, fingerprint
+from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.results import Results, require_results
-from ipe_bench.runs.schedule import BLOCK_SIZE, RunLog, Watcher, block_size_for, perform, plan, work_through
-from ipe_bench.runs.store import TRUTH, Cell, Store, describe_names
-from ipe_bench.trials.bounds import linear_bound
+from ipe_bench.runs.run import TRIALS, compute, unmet_needs, validate
+from ipe_bench.runs.schedule import Watcher
 from ipe_bench.trials.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -44,19 +33,10 @@ if TYPE_CHECKING:
     from ipe_bench.report import ReportResult
     from ipe_bench.report.answer import Answer
     from ipe_bench.report.choice import Which
-    from ipe_bench.statistics.sequences import Precision, Reach
     from ipe_bench.trials.design import Criterion, Design
     from ipe_bench.trials.posterior import Reference
 
-TRIALS = 1000
-"""Where neither a number nor a precision is asked for."""
-MOST_TRIALS = 100_000
-"""With a precision, where no number is given."""
 Directories = Path | str | Sequence[Path | str]
-MOST_BLOCKS = 1_000_000
-_FEW = 4
-LARGEST = 1e100
-"""Beyond it, or below its inverse, squares and products of squares are no numbers any more."""
 
 
 def run(
@@ -100,6 +80,7 @@ def run(
     """
     from ipe_bench.plugins.extensions import use_statistics
     from ipe_bench.statistics import summarize
+    from ipe_bench.statistics.stopping import Stop, check_time_limit, compute_until
 
     scenarios = [scenarios] if isinstance(scenarios, Scenario) else list(scenarios)
     with contextlib.ExitStack() as stack:
@@ -107,7 +88,7 @@ def run(
         options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
         stops: tuple[Stop, ...] = ()
         if precision is None:
-            _refuse_time_limit(time_limit)
+            check_time_limit(time_limit)
             failures = compute(scenarios, estimators, TRIALS if trials is None else trials, folder, **options)
         else:
             options |= {"precision": precision, "time_limit": time_limit}
@@ -370,7 +351,7 @@ def estimate(
         found = open_together([Path(path) for path in paths], model, left_out)
     known = noise_of(found, noise) or ModelNoise().of(found.model) or Unknown()
     problem = _real_problem(found.model, known, prior, error_scale)
-    if lacking := _needs(problem, estimators):
+    if lacking := unmet_needs(problem, estimators):
         remedy = "; give error_scale" if error_scale is None and prior is None else ""
         raise UserError("; ".join(lacking) + remedy)
     fits = fit(problem, found.z, estimators, known)
@@ -502,183 +483,6 @@ def _paths(directories: Directories) -> list[Path]:
     return [Path(d) for d in ([directories] if isinstance(directories, Path | str) else directories)]
 
 
-def compute(
-    scenarios: Sequence[Scenario],
-    estimators: Mapping[str, Estimator],
-    trials: int,
-    output: Path | str,
-    *,
-    execution: Execution | None = None,
-    block_size: int | None = None,
-    watch: Watcher | None = None,
-    record_as: str | None = None,
-    further: Mapping[str, Any] | None = None,
-    command: str | None = None,
-) -> tuple[str, ...]:
-    """Computes and stores what is missing under `output`; returns the messages of what failed.
-
-    Trials are computed `block_size` at once, which changes no number: where it is None, so many as are quickest.
-
-    The run is recorded under a new name, or under `record_as`, in place of what is there; with `further` facts, and the
-    `command` as it was typed.
-
-    Raises:
-        UserError: what was asked for cannot be computed, or the folder cannot be written to; nothing is computed then.
-        StorageError: nothing can be stored any more.
-    """
-    # What is stored of a scenario shows that its numbers can be computed with, without drawing any.
-    stored = [any(Path(output).glob(f"trials/{Cell(scenario).key}-*.parquet")) for scenario in scenarios]
-    untried = [scenario for scenario, known in zip(scenarios, stored, strict=True) if not known]
-    execution = execution or Serial()
-    block_size = block_size_for(trials) if block_size is None else block_size
-    if block_size > 0:
-        # Workers start while this process looks at what is asked for.
-        execution.warm_up(perform, len(untried) * -(-trials // block_size))
-    validate(scenarios, estimators, trials, block_size, untried=untried)
-    # Absolute: workers may have another working folder.
-    store = Store(Path(output).absolute())
-    store.prepare()
-    cells = [cells_of(scenario, estimators) for scenario in scenarios]
-    results = Results.read([store.directory], keys={cell.key for part in cells for cell in part})
-    aside = results.set_aside()
-    tasks = [task for part in cells for task in plan(store.directory, part, results, trials, block_size)]
-    execution.warm_up(perform, len(tasks))
-    record = _record(scenarios, estimators, trials) | dict(further or {})
-    known = None if tasks or aside else store.same_run(record)
-    typed = {"command": command, "blocks": len(tasks)}
-    identifier = known or _write_record(store, record | typed, record_as or new_name())
-    with RunLog(store.directory / "log" / f"{identifier}.log") as log:
-        for line in aside:
-            log.warning(line)
-        failures = work_through(tasks, execution, store, watch or (lambda progress: None), log)
-        store.require()
-        gone, hindrances = tidy(store, {cell.key for part in cells for cell in part}, execution)
-        for line in [f"{gone} small files were merged into larger ones"] * bool(gone) + hindrances:
-            log.info(line)
-    if not (store.runs / f"{identifier}.json").is_file():
-        raise StorageError(f"{store.directory}: lost the record of this run; the same command computes what is missing")
-    return failures
-
-
-NARROW = "every interval is narrow enough"
-"""Why a scenario stops that has come to the precision that was asked for."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Stop:
-    """How many trials a scenario took until its intervals were narrow enough, or why it took no more."""
-
-    scenario: Scenario
-    trials: int
-    reason: str
-    widest: str
-    """The statistic that is farthest from the precision that was asked for, or was nearest to it last."""
-
-    @property
-    def reached(self) -> bool:
-        """Whether the precision that was asked for is there."""
-        return self.reason == NARROW
-
-    @property
-    def row(self) -> dict[str, Any]:
-        """What it says, by name."""
-        names = {k: v for k, v in Cell(self.scenario).names.items() if k != "estimator"}
-        return names | {"trials": self.trials, "reason": self.reason, "widest": self.widest}
-
-
-def compute_until(
-    scenarios: Sequence[Scenario],
-    estimators: Mapping[str, Estimator],
-    most: int | None,
-    output: Path | str,
-    *,
-    precision: float | Mapping[str, float],
-    time_limit: float | None = None,
-    execution: Execution | None = None,
-    block_size: int | None = None,
-    watch: Watcher | None = None,
-    command: str | None = None,
-) -> tuple[tuple[str, ...], tuple[Stop, ...]]:
-    """Adds blocks to what is stored under `output` until every interval is narrow enough, there are `most` trials
-    (`MOST_TRIALS` where None), or `time_limit` seconds are over, which is looked at between rounds of blocks.
-
-    Returns the messages of what failed, and why each scenario stopped.
-
-    Raises:
-        UserError: what was asked for cannot be computed; nothing is computed then.
-        StorageError: nothing can be stored any more.
-    """
-    from ipe_bench.statistics.sequences import Precision, next_trials
-
-    wanted, budget, began = Precision.of(precision), MOST_TRIALS if most is None else most, time.monotonic()
-    _refuse_time_limit(time_limit, wanted)
-    if any(scenario.noise.real for scenario in scenarios):
-        raise UserError(f"precision={precision}: certified readings are one trial; leave it out")
-    validate(scenarios, estimators, budget, block_size)
-    block_size = BLOCK_SIZE if block_size is None else block_size
-    options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
-    options |= {"further": {"precision": dataclasses.asdict(wanted)}, "command": command}
-    at = [_first_trials(s, estimators, Path(output), block_size, budget) for s in scenarios]
-    names, failures = [new_name() for _ in scenarios], []
-    stops: dict[int, Stop] = {}
-    while len(stops) < len(scenarios):
-        for i, scenario in enumerate(scenarios):
-            if i in stops:
-                continue
-            failed = compute([scenario], estimators, at[i], output, record_as=names[i], **options)
-            reached = _reached(scenario, estimators, Path(output), wanted)
-            widest = max(reached, key=lambda r: r.ratio, default=None)
-            late = time_limit is not None and time.monotonic() - began >= time_limit
-            reason = _reason_to_stop(bool(failed) or widest is None, widest, at[i] >= budget, late)
-            if reason:
-                failures += failed
-                stops[i] = Stop(scenario, at[i], reason, str(widest or ""))
-            else:
-                assert widest is not None
-                at[i] = next_trials(at[i], widest.ratio, block_size, budget)
-    return tuple(failures), tuple(stops[i] for i in range(len(scenarios)))
-
-
-def _reason_to_stop(failed: bool, widest: Reach | None, spent: bool, late: bool) -> str:
-    """Empty where there is none."""
-    if failed:
-        return "some blocks failed"
-    if widest is not None and widest.ratio <= 1:
-        return NARROW
-    if spent:
-        return "there are as many trials as there may be"
-    return "the time is over" if late else ""
-
-
-def _first_trials(
-    scenario: Scenario, estimators: Mapping[str, Estimator], output: Path, block_size: int, most: int
-) -> int:
-    """Where to begin: with what is stored of every estimator, or one block."""
-    cells = cells_of(scenario, estimators)
-    results = Results.read([output] if output.is_dir() else [], keys={cell.key for cell in cells})
-    whole = [results.missing(cell.key, most) for cell in cells]
-    stored = min(gaps[0][0] if gaps else most for gaps in whole)
-    return min(most, max(stored, block_size))
-
-
-def _reached(scenario: Scenario, estimators: Mapping[str, Estimator], output: Path, wanted: Precision) -> list[Reach]:
-    """How near every statistic of every estimator has come."""
-    from ipe_bench.statistics.collect import collect
-    from ipe_bench.statistics.sample import Sample, Shared
-
-    collection = collect([output], {cell.key for cell in cells_of(scenario, estimators)})
-    shared = Shared.among(collection, collection.groups)
-    samples = [Sample.load(collection, group, shared) for group in collection.groups]
-    return [reach for sample in samples if len(sample) for reach in wanted.reached(sample)]
-
-
-def _refuse_time_limit(time_limit: float | None, precision: Precision | None = None) -> None:
-    if time_limit is not None and precision is None:
-        raise UserError(f"time_limit={time_limit}: goes with precision; give that, or leave it out")
-    if time_limit is not None and not time_limit > 0:
-        raise UserError(f"time_limit={time_limit}: give a number of seconds above 0")
-
-
 def objective_columns() -> list[str]:
     """The columns whose value over all parameters is a number: those of the summary, and those of the scores."""
     from ipe_bench.plugins.extensions import use_statistics
@@ -686,148 +490,3 @@ def objective_columns() -> list[str]:
 
     use_statistics()
     return list(frame_columns([s for s in (*all_statistics(), *SCORES) if s.kind != "word"]))
-
-
-def objective(
-    scenario: Scenario, estimators: Mapping[str, Estimator], label: str, column: str, output: Path | str
-) -> float:
-    """What is known of an estimator by one number: a column of its row over all parameters, of all stored trials.
-
-    Columns that compare estimators, such as capped_error, are over the trials that all of these estimators have.
-
-    Raises:
-        UserError: nothing is stored, or the number is not known.
-    """
-    from ipe_bench.statistics.collect import collect
-    from ipe_bench.statistics.records import SCORES, rows_of, summary_columns_of
-    from ipe_bench.statistics.sample import Sample, Shared
-
-    collection = collect([output], {cell.key for cell in cells_of(scenario, estimators)})
-    shared = Shared.among(collection, collection.groups)
-    for group in collection.groups:
-        sample = Sample.load(collection, group, shared) if group.label == label else ()
-        if isinstance(sample, Sample) and len(sample):
-            value = float((summary_columns_of(sample)[-1] | rows_of(SCORES, sample)[-1])[column])
-            if np.isnan(value):
-                raise UserError(
-                    f"objective={label}.{column}: is not known of {describe_names(group.cells[0][0].names)}"
-                )
-            return value
-    raise UserError(f"objective={label}.{column}: no trials of {label} are stored")
-
-
-def validate(
-    scenarios: Sequence[Scenario],
-    estimators: Mapping[str, Estimator],
-    trials: int,
-    block_size: int | None = None,
-    *,
-    untried: Sequence[Scenario] | None = None,
-    estimating: bool = False,
-) -> None:
-    """Raises one UserError with everything that stands in the way of this run, or of `estimating` from real readings.
-
-    Trials are drawn of the scenarios `untried` (all where it is None), to see whether numbers hold what is asked for;
-    none are where readings are real.
-    """
-    mistakes = []
-    if trials < 1:
-        mistakes.append(f"trials={trials}: give a whole number above 0")
-    size = block_size_for(trials) if block_size is None else block_size
-    if size < 1:
-        mistakes.append(f"block_size={size}: give a whole number above 0")
-    elif trials > MOST_BLOCKS * size:
-        mistakes.append(f"trials={trials}: are more than {MOST_BLOCKS} blocks of block_size={size}")
-    if not scenarios:
-        mistakes.append("there is no scenario; give at least one")
-    if TRUTH in estimators:
-        mistakes.append(f"estimators.{TRUTH}: is what the truth itself is stored under; choose another label")
-    if not estimators:
-        mistakes.append("there is no estimator; choose with solver= and baseline=")
-    for scenario in scenarios:
-        if scenario.noise.estimated and not estimating:
-            mistakes.append("noise=unknown: has no level to simulate with; choose another noise, or use `estimate`")
-        if scenario.noise.real and trials != 1:
-            mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
-        if not estimating and not scenario.noise.estimated and (untried is None or scenario in untried):
-            mistakes += _beyond_numbers(scenario)
-        mistakes += _needs(scenario.problem, estimators)
-    if mistakes:
-        raise UserError("; ".join(dict.fromkeys(mistakes)))
-
-
-def _needs(problem: Problem, estimators: Mapping[str, Estimator]) -> list[str]:
-    """A line for everything that an estimator needs and the problem does not have."""
-    return [
-        f"estimators.{label}: needs {need}, which measurement={problem.measurement.name} does not have; leave it out"
-        for label, estimator in estimators.items()
-        for need in estimator.missing(problem)
-    ]
-
-
-def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
-    """Scales at which every statistic would be infinite or 0, as no number holds their squares."""
-    if scenario.error_scale > LARGEST:
-        yield f"error_scale={scenario.error_scale:g}: its square overflows; give a number up to {LARGEST:g}"
-        return
-    model = scenario.measurement
-    with np.errstate(all="ignore"):
-        bound = linear_bound(scenario.problem)
-        try:
-            few = scenario.draw(0, 1 if scenario.noise.real else _FEW)
-        except UserError:
-            raise
-        except Exception:  # what cannot be drawn is a failure of its blocks, and told of there
-            return
-    if not scenario.noise.real and not np.isfinite(few.z).all(axis=1).any():
-        yield f"measurement={model.name}: none of the first {_FEW} trials has finite readings; choose smaller scales"
-    for parameter, deviation in zip(model.parameters, bound, strict=True):
-        if scenario.noise.real and np.isnan(deviation):
-            return  # J lacks rank at the start, or is not finite there: that is a hard start, and no mistake
-        if not 1 / LARGEST <= deviation <= LARGEST and deviation != 0:
-            yield (
-                f"noise={scenario.noise.name}: {parameter.name} has a linear bound of {deviation:g} of its size, "
-                "whose square is beyond numbers; choose another scale of the noise"
-            )
-            return
-
-
-def cells_of(scenario: Scenario, estimators: Mapping[str, Estimator]) -> list[Cell]:
-    """What a run stores of one scenario: its truth, and each estimator."""
-    return [Cell(scenario), *(Cell(scenario, label, estimator) for label, estimator in estimators.items())]
-
-
-def new_name() -> str:
-    """A name for the record of a run."""
-    return f"{datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}"
-
-
-def _write_record(store: Store, record: Mapping[str, Any], identifier: str) -> str:
-    """States what is going to be computed, so that what is missing later is known to be missing; returns its name."""
-    now = datetime.datetime.now(datetime.UTC)
-    store.write_run(identifier, {"started": now.isoformat(timespec="microseconds"), **record})
-    return identifier
-
-
-def _record(scenarios: Sequence[Scenario], estimators: Mapping[str, Estimator], trials: int) -> dict[str, Any]:
-    cells = [cell for scenario in scenarios for cell in cells_of(scenario, estimators)]
-    return {
-        "trials": trials,
-        "scenarios": [describe(s) for s in scenarios],
-        "estimators": {label: describe(e) for label, e in estimators.items()},
-        "cells": [{"key": c.key, "identity_key": c.identity_key, "names": c.names} for c in cells],
-        "libraries": library_versions(),
-        "machine": {"host": platform.node(), "system": platform.platform(), "cores": cores()},
-        "git_commit": _git_commit(Path.cwd()),
-        **fingerprint([*scenarios, *estimators.values()]),
-    }
-
-
-@functools.cache
-def _git_commit(folder: Path) -> str | None:
-    """The commit of the folder, where it is in a repository; asked once per process, as a sweep records it per job."""
-    command = ["git", "rev-parse", "HEAD"]
-    try:
-        return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return None

@@ -19,7 +19,7 @@ from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
-from ipe_bench.runs.store import FOOTER, Cell, Store, encode
+from ipe_bench.runs.store import FOOTER, ResultKey, Store, encode
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.thresholds import GATE
 
@@ -91,7 +91,7 @@ class Synthetic:
     def __init__(self, directory: Path) -> None:
         self.directory = directory
         self.store = Store(directory)
-        self.cells: dict[str, Cell] = {}
+        self.cells: dict[str, ResultKey] = {}
 
     @staticmethod
     def scenario(error_scale: float = 1.0, seed: int = 0, sigma: float = 0.2, **model: Any) -> Scenario:
@@ -112,7 +112,7 @@ class Synthetic:
         block: int | None = None,
         estimator: Estimator | None = None,
         **columns: Any,
-    ) -> Cell:
+    ) -> ResultKey:
         """Rows with these errors (trials, n), in multiples of sizes; further columns replace the defaults."""
         trials, n = error.shape
         names = [p.name for p in scenario.measurement.parameters]
@@ -136,8 +136,8 @@ class Synthetic:
             "success": distance <= chi2.isf(GATE, n),
         }
         rows |= {key: np.broadcast_to(np.asarray(value), trials) for key, value in columns.items()}
-        cell = Cell(scenario, label, estimator or Pretender())
-        truth = Cell(scenario)
+        cell = ResultKey(scenario, label, estimator or Pretender())
+        truth = ResultKey(scenario)
         facts: dict[str, Any] = {"trial": rows["trial"]}
         for kind in ("x", "crlb", "bayes"):
             facts |= {f"{kind}_{name}": np.full(trials, bound[i]) for i, name in enumerate(names)}

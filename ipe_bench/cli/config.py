@@ -21,7 +21,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ipe_bench.api import MOST_TRIALS, TRIALS, objective_columns
+from ipe_bench.api import objective_columns
 from ipe_bench.basics.errors import UserError, describe_exception, unknown
 from ipe_bench.cli.search_path import extend
 from ipe_bench.estimators.base import Estimator
@@ -37,6 +37,7 @@ from ipe_bench.real.sources import Readings
 from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.provenance import TARGET, canonical_json, describe
+from ipe_bench.runs.run import MOST_TRIALS, TRIALS
 from ipe_bench.trials.scenario import Scenario
 
 CONFIG_ERRORS = (HydraException, OmegaConfBaseException)

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ipe_bench.api import cells_of, validate
 from ipe_bench.basics.machine import cores
 from ipe_bench.cli.config import Job
 from ipe_bench.runs.results import Results
+from ipe_bench.runs.run import result_keys, validate
 from ipe_bench.runs.schedule import plan
-from ipe_bench.runs.store import Cell
+from ipe_bench.runs.store import ResultKey
 from ipe_bench.trials.scoring import Block
 
 _TRIED = 4
@@ -37,7 +37,7 @@ class DryRun:
     def add(self, job: Job, title: str) -> str:
         """Notes what a job lacks; a line for people."""
         validate([job.scenario], job.estimators, job.trials, job.block_size)
-        cells = cells_of(job.scenario, job.estimators)
+        cells = result_keys(job.scenario, job.estimators)
         output = Path(job.output)
         results = Results.read([output] if output.is_dir() else [], keys={cell.key for cell in cells})
         lacking = {cell.key: 0 for cell in cells}
@@ -56,7 +56,7 @@ class DryRun:
             f", {most}{missing} are missing (on one core {duration(seconds)})" if missing else ""
         )
 
-    def _per_trial(self, cell: Cell, results: Results) -> float:
+    def _per_trial(self, cell: ResultKey, results: Results) -> float:
         """Seconds: those of the trials that are stored, else of some that are tried here."""
         known = results.stored.get(cell.key)
         if known is not None:

@@ -11,7 +11,6 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from ipe_bench.api import validate
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import library_versions
@@ -24,6 +23,7 @@ from ipe_bench.real.examination import examinations
 from ipe_bench.real.fits import fit
 from ipe_bench.real.sources import LeftOut, Readings, noise_of, open_together, require_enough
 from ipe_bench.runs.provenance import describe, fingerprint
+from ipe_bench.runs.run import validate
 
 STANDARD_ESTIMATORS = ("solver=[auto]", "baseline=[linear_lse,levenberg_marquardt]")
 """Unless others are chosen: the one that chooses its way by itself, and two that it can be held against."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ipe_bench.api import validate
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console
 from ipe_bench.cli.single import NOT_OF_ONE_SCENARIO, compose_single, first_of
 from ipe_bench.runs.provenance import describe
+from ipe_bench.runs.run import validate
 from ipe_bench.trials.posterior import reference
 
 _TRIALS = 3

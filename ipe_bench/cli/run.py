@@ -21,7 +21,6 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from ipe_bench.api import cells_of, compute, compute_until, objective
 from ipe_bench.basics.errors import StorageError, UserError, shortened
 from ipe_bench.cli import console, interrupts
 from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, assemble, explain, prepare, rewrite
@@ -39,6 +38,7 @@ from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
 from ipe_bench.report.helper import Helper, drawing_help
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.execution.processes import end_idle
+from ipe_bench.runs.run import compute, result_keys
 from ipe_bench.runs.schedule import Watcher
 from ipe_bench.runs.store import describe_names, digest
 
@@ -312,12 +312,14 @@ def task(config: DictConfig) -> float | None:
         _outcome.failures += failures
         _outcome.figures, _outcome.formats = job.figures, job.formats
         own = _outcome.outputs.setdefault(Path(job.output), {})
-        own.update((cell.key, describe_names(cell.names)) for cell in cells_of(job.scenario, job.estimators))
+        own.update((cell.key, describe_names(cell.names)) for cell in result_keys(job.scenario, job.estimators))
         return value
     return None
 
 
 def _objective(job: Job) -> float:
+    from ipe_bench.statistics.stopping import objective
+
     assert job.objective is not None
     value = objective(job.scenario, job.estimators, *job.objective, job.output)
     words = [word for word in HydraConfig.get().overrides.task if not word.startswith("objective=")]
@@ -331,6 +333,8 @@ def _compute(job: Job, execution: Execution, watch: Watcher) -> tuple[str, ...]:
     options["command"] = _outcome.command
     if job.precision is None:
         return compute([job.scenario], job.estimators, job.trials, job.output, **options)
+    from ipe_bench.statistics.stopping import compute_until
+
     options |= {"precision": job.precision, "time_limit": job.time_limit}
     failures, (stop,) = compute_until([job.scenario], job.estimators, job.trials, job.output, **options)
     verdict = "" if stop.reached else "the precision is not reached: "

@@ -24,7 +24,7 @@ from ipe_bench.basics.files import write_atomically
 from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.columns import as_array
 from ipe_bench.runs.execution.base import Execution
-from ipe_bench.runs.pieces import Piece, Unusable
+from ipe_bench.runs.pieces import Part, Unusable
 from ipe_bench.runs.store import Store, encode
 
 MANY = 64
@@ -38,7 +38,7 @@ TRIALS = 50_000
 class Merge:
     """A task: files of one cell without a gap between them, the longer of two that begin alike first."""
 
-    pieces: tuple[Piece, ...]
+    pieces: tuple[Part, ...]
 
     @property
     def trusted(self) -> bool:
@@ -69,7 +69,7 @@ def perform(task: Merge) -> Iterator[int]:
     pa.default_memory_pool().release_unused()
 
 
-def tidy(
+def compact(
     store: Store, keys: Keys[str], execution: Execution, *, many: int = MANY, trials: int = TRIALS
 ) -> tuple[int, list[str]]:
     """Merges the small files of these cells; how many are gone, and what stood in the way: then they stay as they are,
@@ -85,19 +85,19 @@ def tidy(
     return gone, hindrances
 
 
-def _by_key(store: Store, keys: Keys[str]) -> dict[str, list[Piece]]:
-    found: dict[str, list[Piece]] = {}
+def _by_key(store: Store, keys: Keys[str]) -> dict[str, list[Part]]:
+    found: dict[str, list[Part]] = {}
     for path in sorted(store.trials.glob("[!.]*.parquet")):
         with contextlib.suppress(Unusable):
-            piece = Piece.parse(path)
+            piece = Part.parse(path)
             if piece.key in keys:
                 found.setdefault(piece.key, []).append(piece)
     return found
 
 
-def _runs(pieces: Iterable[Piece], trials: int) -> Iterator[list[Piece]]:
+def _runs(pieces: Iterable[Part], trials: int) -> Iterator[list[Part]]:
     """Two or more pieces without a gap between them, which begin between the same multiples of `trials`."""
-    run: list[Piece] = []
+    run: list[Part] = []
     reached = 0
     for piece in sorted(pieces, key=lambda p: (p.start, -p.stop)):
         within = run and piece.stop <= reached
@@ -113,7 +113,7 @@ def _runs(pieces: Iterable[Piece], trials: int) -> Iterator[list[Piece]]:
 class _Part:
     """What is merged of one piece."""
 
-    piece: Piece
+    piece: Part
     footer: Mapping[str, Any]
     table: pa.Table
 
@@ -122,7 +122,7 @@ class _Part:
         return self.footer, self.table.schema
 
 
-def _alike(run: Sequence[Piece]) -> Iterator[list[_Part]]:
+def _alike(run: Sequence[Part]) -> Iterator[list[_Part]]:
     """The parts of a run that can be one file: whole ones in succession with the same footer and the same columns."""
     parts: list[_Part | None] = []
     for piece in run:
@@ -156,7 +156,7 @@ def _replace(group: Sequence[_Part]) -> int:
         if part.piece.stop > reached:
             tables.append(part.table.slice(reached - part.piece.start))
             reached = part.piece.stop
-    merged = Piece(_named(first.piece, reached), first.piece.key, first.piece.start, reached)
+    merged = Part(_named(first.piece, reached), first.piece.key, first.piece.start, reached)
     columns = _columns(pa.concat_tables(tables))
     if all(part.piece != merged for part in group):
         content = encode(columns, first.footer)
@@ -170,7 +170,7 @@ def _replace(group: Sequence[_Part]) -> int:
     return len(others)
 
 
-def _named(piece: Piece, stop: int) -> Path:
+def _named(piece: Part, stop: int) -> Path:
     return piece.path.with_name(f"{piece.key}-{piece.start}-{stop}.parquet")
 
 
@@ -178,7 +178,7 @@ def _columns(table: pa.Table) -> dict[str, Array]:
     return {name: as_array(table[name]) for name in table.column_names}
 
 
-def _require_same(piece: Piece, footer: Mapping[str, Any], columns: Mapping[str, Array]) -> None:
+def _require_same(piece: Part, footer: Mapping[str, Any], columns: Mapping[str, Array]) -> None:
     """Raises StorageError unless the disk gives back exactly these rows."""
     try:
         kept, table = piece.read()

@@ -140,7 +140,7 @@ def _parameters(footer: Mapping[str, Any]) -> Sequence[str]:
 
 
 @dataclass(frozen=True)
-class Piece:
+class Part:
     """One stored file: trials start to stop of the cell with that key."""
 
     path: Path
@@ -149,7 +149,7 @@ class Piece:
     stop: int
 
     @classmethod
-    def parse(cls, path: Path) -> Piece:
+    def parse(cls, path: Path) -> Part:
         """The piece that a file name states.
 
         Raises:

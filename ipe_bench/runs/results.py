@@ -24,7 +24,7 @@ import pyarrow as pa
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.columns import as_array
-from ipe_bench.runs.pieces import Failed, Foreign, Gone, Outdated, Piece, Run, Unusable, read_history
+from ipe_bench.runs.pieces import Failed, Foreign, Gone, Outdated, Part, Run, Unusable, read_history
 from ipe_bench.runs.provenance import canonical_json
 from ipe_bench.runs.store import TRUTH, Store, describe_names, gaps, title
 from ipe_bench.runs.verified import Verified, signature
@@ -42,7 +42,7 @@ class StoredCell:
     """One scenario (one seed) under one estimator, or its truth, with all its pieces from all directories."""
 
     footer: Mapping[str, Any]
-    pieces: tuple[Piece, ...]
+    pieces: tuple[Part, ...]
 
     @property
     def key(self) -> str:
@@ -161,7 +161,7 @@ class Results:
     def _read_directory(self, store: Store, keys: Keys[str] | None) -> None:
         verified = Verified(store.directory)
         trials, runs = self._files(store.trials, ".parquet", keys), self._files(store.runs, ".json")
-        found: dict[str, list[Piece]] = {}
+        found: dict[str, list[Part]] = {}
         footers: dict[str, Mapping[str, Any]] = {}
         listed: set[Path] = set()
         while trials:
@@ -193,11 +193,11 @@ class Results:
         verified.save()
 
     def _read_piece(
-        self, path: Path, verified: Verified, found: dict[str, list[Piece]], footers: dict[str, Mapping[str, Any]]
+        self, path: Path, verified: Verified, found: dict[str, list[Part]], footers: dict[str, Mapping[str, Any]]
     ) -> bool:
         """Adds the piece to what is found, if it is whole; False where it is not there any more."""
         with self.naming(path):
-            piece = Piece.parse(path)
+            piece = Part.parse(path)
             footer = verified.footer(path, piece.key)
             if footer is None:
                 before = signature(path)
@@ -427,7 +427,7 @@ class Results:
                 shown = table.column_names if names is None else [n for n in names if n in table.column_names]
                 yield {name: as_array(table[name])[skipped:] for name in shown}
 
-    def _rows(self, piece: Piece, columns: Sequence[str] | None, names: Keys[str] | None) -> pa.Table:
+    def _rows(self, piece: Part, columns: Sequence[str] | None, names: Keys[str] | None) -> pa.Table:
         """The columns `names` of a piece that are there, all where it is None; it must have the `columns`."""
         table = self._kept.get(piece.path)
         if table is None:
@@ -456,14 +456,14 @@ class Results:
         return None
 
 
-def _reading_order(piece: Piece) -> tuple[int, int, str]:
+def _reading_order(piece: Part) -> tuple[int, int, str]:
     """Of two that begin with the same trial, the longer one first: what lies within it need not be read."""
     return piece.start, -piece.stop, str(piece.path)
 
 
-def _pieces_beside(gone: Piece) -> list[Piece]:
+def _pieces_beside(gone: Part) -> list[Part]:
     """The pieces of the same cell in its folder that hold some of its trials."""
-    found = [Piece.parse(path) for path in gone.path.parent.glob(f"{gone.key}-*-*.parquet")]
+    found = [Part.parse(path) for path in gone.path.parent.glob(f"{gone.key}-*-*.parquet")]
     return [piece for piece in found if piece.start < gone.stop and piece.stop > gone.start]
 
 

@@ -26,7 +26,7 @@ from ipe_bench.basics.containment import contained
 from ipe_bench.runs.execution.base import FATAL, Execution, Failure
 from ipe_bench.runs.provenance import class_modules, fingerprint
 from ipe_bench.runs.results import Results
-from ipe_bench.runs.store import Cell, Store, describe_names
+from ipe_bench.runs.store import ResultKey, Store, describe_names
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import HISTORIES, Block
 
@@ -43,7 +43,7 @@ class Task:
     """The unit of work: the cells of one scenario that are missing in one block."""
 
     directory: Path
-    cells: tuple[Cell, ...]
+    cells: tuple[ResultKey, ...]
     start: int
     stop: int
 
@@ -95,11 +95,11 @@ def block_size_for(trials: int) -> int:
 
 
 def plan(
-    directory: Path, cells: Sequence[Cell], results: Results, trials: int, block_size: int | None = None
+    directory: Path, cells: Sequence[ResultKey], results: Results, trials: int, block_size: int | None = None
 ) -> list[Task]:
     """Blocks on a fixed grid, each with the cells of one scenario that lack some of its trials."""
     block_size = block_size_for(trials) if block_size is None else block_size
-    lacking: dict[tuple[int, int], list[Cell]] = {}
+    lacking: dict[tuple[int, int], list[ResultKey]] = {}
     for cell in cells:
         for start, stop in results.missing(cell.key, trials):
             edges = [start, *range((start // block_size + 1) * block_size, stop, block_size), stop]
@@ -108,7 +108,7 @@ def plan(
     return [Task(directory, tuple(cells), *edge) for edge, cells in sorted(lacking.items())]
 
 
-def perform(task: Task) -> Iterator[Done | str]:
+def run_task(task: Task) -> Iterator[Done | str]:
     """Computes one task and stores each cell's rows as soon as they are there. Runs wherever the execution has it run.
 
     An exception in one cell fails that cell alone.
@@ -135,11 +135,11 @@ def perform(task: Task) -> Iterator[Done | str]:
         yield Done(index, time.perf_counter() - began, failure)
 
 
-_recent: dict[str, Cell] = {}
+_recent: dict[str, ResultKey] = {}
 _MOST_RECENT = 64
 
 
-def _recalled(task: Task) -> tuple[Cell, ...]:
+def _recalled(task: Task) -> tuple[ResultKey, ...]:
     """The cells of a task as this process had them before, with all that they have worked out meanwhile: to trace a
     model and to describe what is constructed takes as long as some ten trials. Those of this package alone: what code
     of others leaves in an object stays in its block."""
@@ -160,7 +160,7 @@ def _blas() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def _compute_cell(store: Store, block: Block, cell: Cell) -> None:
+def _compute_cell(store: Store, block: Block, cell: ResultKey) -> None:
     start, stop = block.trials.start, block.trials.stop
     if cell.estimator is None:
         columns = block.truth_columns()
@@ -174,7 +174,7 @@ def _compute_cell(store: Store, block: Block, cell: Cell) -> None:
     store.write(cell, start, stop, columns)
 
 
-def _check_source(cells: Sequence[Cell]) -> None:
+def _check_source(cells: Sequence[ResultKey]) -> None:
     """Refuses to compute under a key that stands for other source than is installed here."""
     for cell in cells:
         parts = [cell.scenario] if cell.estimator is None else [cell.scenario, cell.estimator]
@@ -219,7 +219,7 @@ class RunLog:
         log.warning(text)
 
 
-class Ledger:
+class RunProgress:
     """What has become of the cells of a run's tasks."""
 
     def __init__(self, store: Store, tasks: Sequence[Task], watch: Watcher, log: RunLog) -> None:
@@ -233,7 +233,7 @@ class Ledger:
         self.failures: list[str] = []
         self.tell()
 
-    def close(self, task: Task, cell: Cell, failure: Failure | None, seconds: float | None = None) -> None:
+    def close(self, task: Task, cell: ResultKey, failure: Failure | None, seconds: float | None = None) -> None:
         """Notes that a cell of a task is stored, or has failed for good."""
         self.left[id(cell.scenario), task.start, task.stop] -= 1
         self.done += self.left[id(cell.scenario), task.start, task.stop] == 0
@@ -251,7 +251,7 @@ class Ledger:
         self.watch(Progress(self.done, len(self.left), self.trials, self.total, tuple(self.failures)))
 
 
-def work_through(
+def run_tasks(
     tasks: Sequence[Task], execution: Execution, store: Store, watch: Watcher, log: RunLog
 ) -> tuple[str, ...]:
     """Runs tasks until each of their cells is stored or has failed; returns the messages of those that failed.
@@ -260,17 +260,17 @@ def work_through(
         StorageError: nothing can be stored any more.
     """
     log.info(f"{len(tasks)} blocks to compute with execution {execution}")
-    ledger = Ledger(store, tasks, watch, log)
+    progress = RunProgress(store, tasks, watch, log)
     tries: Counter[tuple[str, int, int]] = Counter()
     while tasks:
         closed: list[set[int]] = [set() for _ in tasks]
         prepared: set[int] = set()
         again: list[Task] = []
-        for event in execution.run(perform, tasks):
+        for event in execution.run(run_task, tasks):
             task = tasks[event.index]
             if isinstance(event.step, Done):
                 closed[event.index].add(event.step.cell)
-                ledger.close(task, task.cells[event.step.cell], event.step.failure, event.step.seconds)
+                progress.close(task, task.cells[event.step.cell], event.step.failure, event.step.seconds)
             elif event.step == PREPARED:
                 prepared.add(event.index)
             if not event.ended or event.failure is None:
@@ -280,13 +280,13 @@ def work_through(
                 if i in closed[event.index]:
                     continue
                 if store.has(cell, task.start, task.stop):  # stored, and the news of it was lost
-                    ledger.close(task, cell, None)
+                    progress.close(task, cell, None)
                 else:
                     left.append(cell)
             if event.failure.status == "error" or (event.failure.status == "timeout" and event.index not in prepared):
                 # What all of them need failed.
                 for cell in left:
-                    ledger.close(task, cell, event.failure)
+                    progress.close(task, cell, event.failure)
                 continue
             if not left:
                 continue
@@ -298,13 +298,13 @@ def work_through(
                 log.warning(f"{where}: {event.failure.message}; trying it again")
                 again.append(Task(task.directory, (culprit,), task.start, task.stop))
             else:
-                ledger.close(task, culprit, event.failure)
+                progress.close(task, culprit, event.failure)
             if rest:
                 again.append(Task(task.directory, tuple(rest), task.start, task.stop))
         tasks = again
-    log.info(f"done, {len(ledger.failures)} failed")
-    return tuple(ledger.failures)
+    log.info(f"done, {len(progress.failures)} failed")
+    return tuple(progress.failures)
 
 
-def _weight(task: Task, cell: Cell) -> int:
+def _weight(task: Task, cell: ResultKey) -> int:
     return 0 if cell.estimator is None else task.stop - task.start

@@ -45,7 +45,7 @@ _ABANDONED_S = 3600.0
 
 
 @dataclass(frozen=True)
-class Cell:
+class ResultKey:
     """One scenario under one estimator, or its truth: what a stored file belongs to."""
 
     scenario: Scenario
@@ -120,7 +120,7 @@ def digest(value: Any) -> str:
 
 
 def key_of(identity: Mapping[str, Any], source: str) -> str:
-    """The key of a cell; see `Cell.key`."""
+    """The key of a cell; see `ResultKey.key`."""
     return digest({"schema": SCHEMA, "identity": identity, "source": source})
 
 
@@ -164,7 +164,7 @@ class Store:
         if not self.trials.is_dir():
             raise StorageError(f"{self.directory}: went away while it was being filled; the same command starts anew")
 
-    def write(self, cell: Cell, start: int, stop: int, columns: Mapping[str, Array]) -> Path:
+    def write(self, cell: ResultKey, start: int, stop: int, columns: Mapping[str, Array]) -> Path:
         """Stores the rows of trials start to stop.
 
         Raises:
@@ -176,11 +176,11 @@ class Store:
             (self.failed / f"{cell.key}-{start}-{stop}.json").unlink()
         return path
 
-    def has(self, cell: Cell, start: int, stop: int) -> bool:
+    def has(self, cell: ResultKey, start: int, stop: int) -> bool:
         """Whether exactly this block of this cell is stored."""
         return (self.trials / f"{cell.key}-{start}-{stop}.parquet").is_file()
 
-    def write_failure(self, cell: Cell, start: int, stop: int, failure: Failure) -> Path:
+    def write_failure(self, cell: ResultKey, start: int, stop: int, failure: Failure) -> Path:
         """States that these trials could not be computed, and why; the next run tries them again."""
         record = {
             "key": cell.key,
@@ -197,14 +197,19 @@ class Store:
         path = self.failed / f"{cell.key}-{start}-{stop}.json"
         return self._write_json(path, record)
 
-    def write_history(self, cell: Cell, columns: Mapping[str, Array]) -> Path:
+    def write_history(self, cell: ResultKey, columns: Mapping[str, Array]) -> Path:
         """Stores the iterates of the first trials."""
         path = self.histories / f"{cell.key}.parquet"
         self._write(path, cell, columns, history_rules(cell.parameters))
         return path
 
     def _write(
-        self, path: Path, cell: Cell, columns: Mapping[str, Array], rules: Mapping[str, Rule], start: int | None = None
+        self,
+        path: Path,
+        cell: ResultKey,
+        columns: Mapping[str, Array],
+        rules: Mapping[str, Rule],
+        start: int | None = None,
     ) -> None:
         rows = cast(columns, rules)
         for fault in faults(rows, rules, start):

@@ -17,13 +17,13 @@ from rogues import Rogue
 from small_models import Bent
 
 from ipe_bench import Scenario, run
-from ipe_bench.api import compute
 from ipe_bench.baselines import LinearLSE
 from ipe_bench.basics.errors import StorageError, UserError  # noqa: F401
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.runs.execution import Auto, Dask, Event, Failure, Processes, Serial
 from ipe_bench.runs.results import Results
+from ipe_bench.runs.run import compute
 from ipe_bench.solvers import Newton
 
 GOOD = {"linear_lse": LinearLSE(), "newton": Newton()}

@@ -12,13 +12,13 @@ from small_models import Bent
 
 import ipe_bench.runs.provenance
 from ipe_bench import Scenario
-from ipe_bench.api import compute
 from ipe_bench.baselines import LinearLSE
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli.status import main as status
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.runs.results import Results, require_results
+from ipe_bench.runs.run import compute
 from ipe_bench.runs.store import gaps
 
 SCENARIO = Scenario(Bent(0.02), Gaussian(0.1), GaussianPrior(), 1.0)

@@ -16,7 +16,6 @@ import pytest
 from vandals import Bystander, Classy, Vandal, WrongR
 
 from ipe_bench import Scenario
-from ipe_bench.api import compute
 from ipe_bench.baselines import EnKF, LinearLSE
 from ipe_bench.basics.containment import contained
 from ipe_bench.basics.statuses import Status
@@ -25,6 +24,7 @@ from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.runs.execution import Dask, Processes, Serial
 from ipe_bench.runs.results import Results
+from ipe_bench.runs.run import compute
 from ipe_bench.solvers import Newton
 
 OTHERS = {"linear_lse": LinearLSE(), "newton": Newton(), "enkf": EnKF(members=20), "bystander": Bystander()}
@@ -140,7 +140,7 @@ import sys
 sys.path[:0] = {path!r}
 from test_vandals import scenario
 from vandals import Stopped
-from ipe_bench.api import compute
+from ipe_bench.runs.run import compute
 
 try:
     compute([scenario()], {{"stopped": Stopped({swallows})}}, 20, {folder!r})

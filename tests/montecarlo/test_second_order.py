@@ -10,13 +10,13 @@ import pytest
 from small_models import Bent
 
 import ipe_bench as ib
-from ipe_bench.api import compute
 from ipe_bench.basics.linalg import Array, Covariance, information
 from ipe_bench.measurements import Gins, Measurement, Parameter, RicherGins
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.report.figures import theory
 from ipe_bench.report.figures.views import views
 from ipe_bench.report.tables import all_tables
+from ipe_bench.runs.run import compute
 from ipe_bench.statistics import analyse
 from ipe_bench.trials.misspecified import misspecified
 from ipe_bench.trials.roots import least_squares_root

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import ipe_bench as ib
-from ipe_bench.api import compute
 from ipe_bench.baselines import LevenbergMarquardt, Multistart
 from ipe_bench.measurements import Triad
 from ipe_bench.noise import Gaussian
 from ipe_bench.report.tables import all_tables
+from ipe_bench.runs.run import compute
 from ipe_bench.solvers import Auto
 from ipe_bench.statistics import analyse
 from ipe_bench.trials.scenario import Scenario

@@ -5,7 +5,6 @@ import pytest
 import yaml
 from rich.console import Console
 
-from ipe_bench.api import compute, validate
 from ipe_bench.baselines import LeastSquares, LevenbergMarquardt
 from ipe_bench.measurements import Mgh
 from ipe_bench.measurements.mgh import functions
@@ -14,6 +13,7 @@ from ipe_bench.plugins import discovery
 from ipe_bench.report import write_report
 from ipe_bench.report.certified_tables import attained_tables
 from ipe_bench.report.terminal import render
+from ipe_bench.runs.run import compute, validate
 from ipe_bench.solvers import Auto, Progressive
 from ipe_bench.statistics.attained import attained_table, attained_totals, data_profile
 from ipe_bench.statistics.collect import collect

@@ -19,7 +19,7 @@ from ipe_bench.cli.main import main
 from ipe_bench.noise import Correlated, Gaussian
 from ipe_bench.report.tables import overview
 from ipe_bench.report.terminal import render
-from ipe_bench.runs.store import Cell
+from ipe_bench.runs.store import ResultKey
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.collect import collect
 
@@ -117,8 +117,8 @@ def test_a_setting_of_zero_is_in_every_heading(tmp_path):
 def test_equal_numbers_of_another_type_are_one_experiment():
     scenario = ib.Scenario(Repeated(), Gaussian(1.0), error_scale=2.0)
     same = ib.Scenario(Repeated(sizes_given=(1, 10, 0.1)), Gaussian(1), error_scale=2, seed=np.int64(0))
-    assert Cell(scenario, "one", Pretender()).key == Cell(same, "one", Pretender()).key
-    assert Cell(scenario).key != Cell(replace(scenario, error_scale=2.5)).key
+    assert ResultKey(scenario, "one", Pretender()).key == ResultKey(same, "one", Pretender()).key
+    assert ResultKey(scenario).key != ResultKey(replace(scenario, error_scale=2.5)).key
 
 
 def test_seeds_are_pooled_and_nothing_else(synthetic):

@@ -14,7 +14,7 @@ from synthetic_store import Pretender, Seeker, Synthetic
 
 import ipe_bench as ib
 from ipe_bench.runs.results import CHUNK
-from ipe_bench.runs.store import Cell
+from ipe_bench.runs.store import ResultKey
 from ipe_bench.statistics import analyse, summarize
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.running import Bins, Mean, Scatter, Squares
@@ -111,7 +111,7 @@ def fill(folder: Path, blocks: tuple[int, int, int]) -> Synthetic:
             more["nees"] = ((error / deviation) ** 2).sum(axis=1)
             more["success"] = np.nan_to_num(more["crlb_distance"], nan=1e9) < 16
             synthetic.add(scenario, label, error, block=blocks[j], estimator=estimator, **more)
-        truth = Cell(scenario)
+        truth = ResultKey(scenario)
         for path in synthetic.store.trials.glob(f"{truth.key}-*"):
             path.unlink()
         drawn = rng.uniform(0.5, 1.5, (4, TRIALS, 3))

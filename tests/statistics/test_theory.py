@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from small_models import Bent
 
-from ipe_bench.api import compute
 from ipe_bench.baselines import LinearLSE
 from ipe_bench.basics.linalg import Covariance, information, inverse, pseudo_inverse
 from ipe_bench.basics.statuses import Status
@@ -16,6 +15,7 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.report.tables import all_tables
+from ipe_bench.runs.run import compute
 from ipe_bench.solvers import FixedPoint, Newton
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.histories import fixed_point_bound, observed_constant, orders_of

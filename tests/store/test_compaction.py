@@ -15,15 +15,15 @@ from small_models import Bent
 from synthetic_store import Synthetic, forge
 
 from ipe_bench import Scenario, report
-from ipe_bench.api import compute
 from ipe_bench.baselines import LinearLSE
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.runs import compaction
-from ipe_bench.runs.compaction import MANY, tidy
+from ipe_bench.runs.compaction import MANY, compact
 from ipe_bench.runs.execution.processes import Processes
 from ipe_bench.runs.execution.serial import Serial
 from ipe_bench.runs.results import Results
+from ipe_bench.runs.run import compute
 from ipe_bench.runs.store import Store
 from ipe_bench.statistics import summarize
 
@@ -64,7 +64,7 @@ def assert_same(found, expected) -> None:
 
 def merge(folder: Path, execution=None, many: int = 2) -> int:
     keys = set(Results.read([folder]).stored)
-    gone, hindrances = tidy(Store(folder), keys, execution or Serial(), many=many, trials=WINDOW)
+    gone, hindrances = compact(Store(folder), keys, execution or Serial(), many=many, trials=WINDOW)
     assert hindrances == []
     return gone
 
@@ -95,7 +95,7 @@ def test_a_file_that_the_disk_does_not_give_back_stands_for_none(tmp_path, monke
     filled(tmp_path)
     before = names(tmp_path)
     monkeypatch.setattr(compaction, "_write_to_disk", lambda path, content: path.write_bytes(content[:-20] + 20 * b"x"))
-    gone, (line,) = tidy(Store(tmp_path), set(Results.read([tmp_path]).stored), Serial(), many=2, trials=WINDOW)
+    gone, (line,) = compact(Store(tmp_path), set(Results.read([tmp_path]).stored), Serial(), many=2, trials=WINDOW)
     assert gone == 0
     assert "does not match its digest just after it was written" in line
     assert set(before) < set(names(tmp_path))
@@ -105,7 +105,7 @@ def test_nothing_is_merged_of_a_few_files_or_of_other_cells(tmp_path):
     filled(tmp_path)
     before = names(tmp_path)
     assert merge(tmp_path, many=35) == 0
-    assert tidy(Store(tmp_path), {"0" * 16}, Serial(), many=2, trials=WINDOW) == (0, [])
+    assert compact(Store(tmp_path), {"0" * 16}, Serial(), many=2, trials=WINDOW) == (0, [])
     assert names(tmp_path) == before
 
 
@@ -117,7 +117,7 @@ def test_a_gap_a_damaged_file_and_one_by_other_libraries_stay_as_they_are(tmp_pa
     damaged = path["18-21"].read_bytes()[:-9] + b"x" * 9
     path["18-21"].write_bytes(damaged)
     forge(path["27-30"], lambda rows, footer: footer.update(libraries={"numpy": "0.1"}))
-    tidy(Store(tmp_path), {cell.key}, Serial(), many=2, trials=WINDOW)
+    compact(Store(tmp_path), {cell.key}, Serial(), many=2, trials=WINDOW)
     mine = sorted(p.name.partition("-")[2] for p in (tmp_path / "trials").glob(f"{cell.key}-*"))
     ranges = ["0-9", "12-18", "18-21", "21-27", "27-30", "30-42", "42-81", "81-100"]
     assert mine == sorted(f"{r}.parquet" for r in ranges)
@@ -154,7 +154,7 @@ def test_ranges_that_overlap_are_read_and_merged_once(tmp_path):
 
 KILLED = """
 import os, signal, sys
-from ipe_bench.runs.compaction import tidy
+from ipe_bench.runs.compaction import compact
 from ipe_bench.runs.execution.serial import Serial
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.store import Store
@@ -174,7 +174,7 @@ os.fsync, os.replace = deadly(os.fsync), deadly(os.replace)
 os.unlink = deadly(os.unlink)
 import pathlib
 pathlib.os.unlink = os.unlink
-tidy(Store(folder), keys, Serial(), many=2, trials=40)
+compact(Store(folder), keys, Serial(), many=2, trials=40)
 print(count)
 """
 

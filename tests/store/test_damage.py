@@ -21,7 +21,6 @@ from small_models import Bent
 from synthetic_store import forge
 
 from ipe_bench import Scenario
-from ipe_bench.api import compute
 from ipe_bench.baselines import LinearLSE
 from ipe_bench.basics.errors import StorageError
 from ipe_bench.basics.files import BLANK_SEAL, is_sealed, seal
@@ -33,6 +32,7 @@ from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.runs import verified
 from ipe_bench.runs.results import Results
+from ipe_bench.runs.run import compute
 from ipe_bench.runs.store import FOOTER, Store, key_of
 from ipe_bench.solvers import Newton
 from ipe_bench.statistics import summarize

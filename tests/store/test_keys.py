@@ -18,10 +18,10 @@ from ipe_bench.runs.provenance import numerical_code
 
 KEYS = """
 import ipe_bench as ib
-from ipe_bench.runs.store import Cell
+from ipe_bench.runs.store import ResultKey
 bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
 for name, estimator in {"ukf": ib.baselines.UKF(), "newton": ib.solvers.Newton(), "truth": None}.items():
-    print(name, Cell(bench, name, estimator).key)
+    print(name, ResultKey(bench, name, estimator).key)
 """
 
 

@@ -16,14 +16,14 @@ import pytest
 from small_models import Bent
 
 from ipe_bench import Scenario, run
-from ipe_bench.api import compute
 from ipe_bench.baselines import LinearLSE
 from ipe_bench.measurements import Polynomial
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.runs.results import Results
+from ipe_bench.runs.run import compute
 from ipe_bench.runs.schedule import Task, _recalled, block_size_for
-from ipe_bench.runs.store import Cell, Store
+from ipe_bench.runs.store import ResultKey, Store
 from ipe_bench.solvers import FixedPoint, Newton
 
 
@@ -31,7 +31,7 @@ def scenario(**changes) -> Scenario:
     return Scenario(Bent(0.02), Gaussian(0.1), GaussianPrior(), **{"error_scale": 1.0, **changes})
 
 
-def rows(store: Store, cell: Cell) -> dict:
+def rows(store: Store, cell: ResultKey) -> dict:
     results = Results.read([store.directory])
     found = results.load(results.stored[cell.key], None)
     return {name: values for name, values in found.items() if name != "time_s"}
@@ -74,7 +74,7 @@ def test_trials_are_the_same_bits_for_any_block_size(tmp_path, block_size):
     estimators = {"newton": Newton()}
     compute([scenario()], estimators, 23, tmp_path / "whole", block_size=23)
     compute([scenario()], estimators, 23, tmp_path / "cut", block_size=block_size)
-    cell = Cell(scenario(), "newton", Newton())
+    cell = ResultKey(scenario(), "newton", Newton())
     whole, cut = (rows(Store(tmp_path / name), cell) for name in ("whole", "cut"))
     for name in whole:
         np.testing.assert_array_equal(whole[name], cut[name])
@@ -89,7 +89,7 @@ def test_a_process_keeps_what_it_found_out_of_our_models_and_of_no_others(tmp_pa
     """Tasks come as copies; what one of them has traced serves the next, but code of others may have left its marks."""
     ours = Scenario(Polynomial(), Gaussian(0.1), GaussianPrior(), 1.0)
     for chosen, kept in ((ours, True), (scenario(), False)):
-        task = Task(tmp_path, (Cell(chosen), Cell(chosen, "newton", Newton())), 0, 10)
+        task = Task(tmp_path, (ResultKey(chosen), ResultKey(chosen, "newton", Newton())), 0, 10)
         first, second = (_recalled(pickle.loads(pickle.dumps(task))) for _ in range(2))
         assert [a is b for a, b in zip(first, second, strict=True)] == [kept, kept]
         assert [cell.key for cell in second] == [cell.key for cell in task.cells]
@@ -97,7 +97,7 @@ def test_a_process_keeps_what_it_found_out_of_our_models_and_of_no_others(tmp_pa
 
 def test_the_key_follows_every_constant(tmp_path):
     keys = {
-        Cell(s, "newton", e).key
+        ResultKey(s, "newton", e).key
         for s in (
             scenario(),
             scenario(error_scale=2.0),
@@ -107,7 +107,7 @@ def test_the_key_follows_every_constant(tmp_path):
         for e in (Newton(), Newton(tolerance=1e-7))
     }
     assert len(keys) == 8
-    assert Cell(scenario(), "newton", Newton()).key == Cell(scenario(), "newton", Newton()).key
+    assert ResultKey(scenario(), "newton", Newton()).key == ResultKey(scenario(), "newton", Newton()).key
 
 
 def test_a_changed_source_makes_another_key(tmp_path):
@@ -137,7 +137,7 @@ class Mine(FixedPoint):
 def test_a_damaged_file_is_set_aside_and_computed_again(tmp_path, damage):
     estimators = {"linear_lse": LinearLSE()}
     compute([scenario()], estimators, 10, tmp_path)
-    cell = Cell(scenario(), "linear_lse", LinearLSE())
+    cell = ResultKey(scenario(), "linear_lse", LinearLSE())
     path = next((tmp_path / "trials").glob(f"{cell.key}-*.parquet"))
     whole = rows(Store(tmp_path), cell)
     data = path.read_bytes()

@@ -1,0 +1,162 @@
+"""Runs that end when a precision is reached, and one number of what they stored for those who optimise."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.estimators.base import Estimator
+from ipe_bench.runs.execution import Execution
+from ipe_bench.runs.results import Results
+from ipe_bench.runs.run import MOST_TRIALS, compute, new_name, result_keys, validate
+from ipe_bench.runs.schedule import BLOCK_SIZE, Watcher
+from ipe_bench.runs.store import ResultKey, describe_names
+from ipe_bench.statistics.collect import collect
+from ipe_bench.statistics.records import SCORES, rows_of, summary_columns_of
+from ipe_bench.statistics.sample import Sample, Shared
+from ipe_bench.statistics.sequences import Precision, Reach, next_trials
+from ipe_bench.trials.scenario import Scenario
+
+NARROW = "every interval is narrow enough"
+"""Why a scenario stops that has come to the precision that was asked for."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Stop:
+    """How many trials a scenario took until its intervals were narrow enough, or why it took no more."""
+
+    scenario: Scenario
+    trials: int
+    reason: str
+    widest: str
+    """The statistic that is farthest from the precision that was asked for, or was nearest to it last."""
+
+    @property
+    def reached(self) -> bool:
+        """Whether the precision that was asked for is there."""
+        return self.reason == NARROW
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """What it says, by name."""
+        names = {k: v for k, v in ResultKey(self.scenario).names.items() if k != "estimator"}
+        return names | {"trials": self.trials, "reason": self.reason, "widest": self.widest}
+
+
+def compute_until(
+    scenarios: Sequence[Scenario],
+    estimators: Mapping[str, Estimator],
+    most: int | None,
+    output: Path | str,
+    *,
+    precision: float | Mapping[str, float],
+    time_limit: float | None = None,
+    execution: Execution | None = None,
+    block_size: int | None = None,
+    watch: Watcher | None = None,
+    command: str | None = None,
+) -> tuple[tuple[str, ...], tuple[Stop, ...]]:
+    """Adds blocks to what is stored under `output` until every interval is narrow enough, there are `most` trials
+    (`MOST_TRIALS` where None), or `time_limit` seconds are over, which is looked at between rounds of blocks.
+
+    Returns the messages of what failed, and why each scenario stopped.
+
+    Raises:
+        UserError: what was asked for cannot be computed; nothing is computed then.
+        StorageError: nothing can be stored any more.
+    """
+    wanted, budget, began = Precision.of(precision), MOST_TRIALS if most is None else most, time.monotonic()
+    check_time_limit(time_limit, wanted)
+    if any(scenario.noise.real for scenario in scenarios):
+        raise UserError(f"precision={precision}: certified readings are one trial; leave it out")
+    validate(scenarios, estimators, budget, block_size)
+    block_size = BLOCK_SIZE if block_size is None else block_size
+    options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
+    options |= {"further": {"precision": dataclasses.asdict(wanted)}, "command": command}
+    at = [_first_trials(s, estimators, Path(output), block_size, budget) for s in scenarios]
+    names, failures = [new_name() for _ in scenarios], []
+    stops: dict[int, Stop] = {}
+    while len(stops) < len(scenarios):
+        for i, scenario in enumerate(scenarios):
+            if i in stops:
+                continue
+            failed = compute([scenario], estimators, at[i], output, record_as=names[i], **options)
+            reached = _reached(scenario, estimators, Path(output), wanted)
+            widest = max(reached, key=lambda r: r.ratio, default=None)
+            late = time_limit is not None and time.monotonic() - began >= time_limit
+            reason = _reason_to_stop(bool(failed) or widest is None, widest, at[i] >= budget, late)
+            if reason:
+                failures += failed
+                stops[i] = Stop(scenario, at[i], reason, str(widest or ""))
+            else:
+                assert widest is not None
+                at[i] = next_trials(at[i], widest.ratio, block_size, budget)
+    return tuple(failures), tuple(stops[i] for i in range(len(scenarios)))
+
+
+def _reason_to_stop(failed: bool, widest: Reach | None, spent: bool, late: bool) -> str:
+    """Empty where there is none."""
+    if failed:
+        return "some blocks failed"
+    if widest is not None and widest.ratio <= 1:
+        return NARROW
+    if spent:
+        return "there are as many trials as there may be"
+    return "the time is over" if late else ""
+
+
+def _first_trials(
+    scenario: Scenario, estimators: Mapping[str, Estimator], output: Path, block_size: int, most: int
+) -> int:
+    """Where to begin: with what is stored of every estimator, or one block."""
+    cells = result_keys(scenario, estimators)
+    results = Results.read([output] if output.is_dir() else [], keys={cell.key for cell in cells})
+    whole = [results.missing(cell.key, most) for cell in cells]
+    stored = min(gaps[0][0] if gaps else most for gaps in whole)
+    return min(most, max(stored, block_size))
+
+
+def _reached(scenario: Scenario, estimators: Mapping[str, Estimator], output: Path, wanted: Precision) -> list[Reach]:
+    """How near every statistic of every estimator has come."""
+    collection = collect([output], {cell.key for cell in result_keys(scenario, estimators)})
+    shared = Shared.among(collection, collection.groups)
+    samples = [Sample.load(collection, group, shared) for group in collection.groups]
+    return [reach for sample in samples if len(sample) for reach in wanted.reached(sample)]
+
+
+def check_time_limit(time_limit: float | None, precision: Precision | None = None) -> None:
+    """Raises UserError if a time limit is not above 0, or comes without a precision."""
+    if time_limit is not None and precision is None:
+        raise UserError(f"time_limit={time_limit}: goes with precision; give that, or leave it out")
+    if time_limit is not None and not time_limit > 0:
+        raise UserError(f"time_limit={time_limit}: give a number of seconds above 0")
+
+
+def objective(
+    scenario: Scenario, estimators: Mapping[str, Estimator], label: str, column: str, output: Path | str
+) -> float:
+    """What is known of an estimator by one number: a column of its row over all parameters, of all stored trials.
+
+    Columns that compare estimators, such as capped_error, are over the trials that all of these estimators have.
+
+    Raises:
+        UserError: nothing is stored, or the number is not known.
+    """
+    collection = collect([output], {cell.key for cell in result_keys(scenario, estimators)})
+    shared = Shared.among(collection, collection.groups)
+    for group in collection.groups:
+        sample = Sample.load(collection, group, shared) if group.label == label else ()
+        if isinstance(sample, Sample) and len(sample):
+            value = float((summary_columns_of(sample)[-1] | rows_of(SCORES, sample)[-1])[column])
+            if np.isnan(value):
+                raise UserError(
+                    f"objective={label}.{column}: is not known of {describe_names(group.cells[0][0].names)}"
+                )
+            return value
+    raise UserError(f"objective={label}.{column}: no trials of {label} are stored")
