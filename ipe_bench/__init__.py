@@ -12,7 +12,7 @@ Importing it costs nothing: each name is loaded when it is first used.
 
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from ipe_bench import baselines, measurements, noise, priors, solvers
