@@ -7,7 +7,7 @@ from typing import Any
 
 import pandas as pd
 
-from ipe_bench.report.tables import Column, Table, column, words
+from ipe_bench.report.table import Column, Table, column, words
 from ipe_bench.report.words import plain, short
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.attained import BUDGETS, attained_table, attained_totals

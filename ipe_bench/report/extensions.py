@@ -19,9 +19,8 @@ from ipe_bench.plugins.discovery import Option, blame
 from ipe_bench.plugins.extensions import records
 from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import FRAMES, View
-from ipe_bench.report.latex import latex
 from ipe_bench.report.sections import Section, Written
-from ipe_bench.report.tables import Table, markdown
+from ipe_bench.report.table import Table, comma_separated, latex, markdown
 from ipe_bench.statistics.analysis import Analysis
 
 T = TypeVar("T")
@@ -132,7 +131,7 @@ def _require_table(table: Any, taken: Iterable[str]) -> None:
         raise UserError(f"there is a table {table.name} already; choose another name")
     if not table.columns:
         raise UserError(f"the table {table.name} has no columns; return None where there is nothing to show")
-    guarded(lambda: (markdown(table), latex(table), table.data.to_csv(index=False)))
+    guarded(lambda: (markdown(table), latex(table), comma_separated(table)))
 
 
 def sections(analysis: Analysis, taken: Iterable[str], problems: list[str]) -> list[Written]:

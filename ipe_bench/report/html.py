@@ -16,15 +16,11 @@ from ipe_bench.report.definitions import definitions
 from ipe_bench.report.figures.gallery import Drawn
 from ipe_bench.report.headline import headline
 from ipe_bench.report.sections import Written
-from ipe_bench.report.tables import Table
+from ipe_bench.report.table import Table, environment
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.collect import Run
 
-MOST_ROWS = 2000
-"""Rows of one table on the page; its CSV file has all."""
 MOST_RUNS = 20
-_NAMES = ("estimator", "first", "data set", "function")
-"""Titles of the column that names a row, which stays in sight while a table is scrolled."""
 MOST_COMMANDS = 3
 """At the head of the page; all stand with the provenance."""
 _SECTIONS = (
@@ -46,41 +42,40 @@ def render_page(
     charts: Sequence[Chart] = (),
 ) -> str:
     """The page as text; what plugins have written stands behind our tables."""
-    from jinja2 import Environment, StrictUndefined
     from markupsafe import Markup
 
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     collection = analysis.collection
     script, style = _template("report.js"), _template("report.css")
     runs = _runs(collection.runs)
     pictures = _pictures(figures, charts)
     commands = [run["command"] for run in runs if run["command"] not in (_PYTHON, _UNKNOWN)]
-    return environment.from_string(_template("report.html.j2")).render(
-        version=__version__,
-        script=Markup(script),
-        style=Markup(style),
-        policy=_policy(script, style),
-        headline=headline(analysis),
-        directories=[str(d) for d in collection.directories],
-        expected=collection.expected,
-        complete=collection.complete,
-        problems=[*collection.problems, *collection.stale],
-        title=", ".join(d.resolve().name or str(d) for d in collection.directories),
-        computed=collection.runs[-1].started[:16].replace("T", " ") if collection.runs else "",
-        commands=list(dict.fromkeys(commands))[:MOST_COMMANDS],
-        sections=_contents(tables, written, pictures),
-        tables=[_table(t) for t in tables if not t.appendix],
-        written=[
-            {"name": s.name, "title": s.title, "parts": [p if isinstance(p, str) else _table(p) for p in s.parts]}
-            for s in written
-        ],
-        theory=[_table(t) for t in tables if t.appendix],
-        figures=pictures,
-        nothing_failed=analysis.endings.empty and not analysis.summary.empty,
-        runs=runs[:MOST_RUNS],
-        older_runs=max(0, len(runs) - MOST_RUNS),
-        citation=CITATION,
-        definitions=definitions(),
+    return (
+        environment()
+        .get_template("report.html.j2")
+        .render(
+            version=__version__,
+            script=Markup(script),
+            style=Markup(style),
+            policy=_policy(script, style),
+            headline=headline(analysis),
+            directories=[str(d) for d in collection.directories],
+            expected=collection.expected,
+            complete=collection.complete,
+            problems=[*collection.problems, *collection.stale],
+            title=", ".join(d.resolve().name or str(d) for d in collection.directories),
+            computed=collection.runs[-1].started[:16].replace("T", " ") if collection.runs else "",
+            commands=list(dict.fromkeys(commands))[:MOST_COMMANDS],
+            sections=_contents(tables, written, pictures),
+            tables=[t for t in tables if not t.appendix],
+            written=written,
+            theory=[t for t in tables if t.appendix],
+            figures=pictures,
+            nothing_failed=analysis.endings.empty and not analysis.summary.empty,
+            runs=runs[:MOST_RUNS],
+            older_runs=max(0, len(runs) - MOST_RUNS),
+            citation=CITATION,
+            definitions=definitions(),
+        )
     )
 
 
@@ -121,19 +116,6 @@ def _contents(tables: Sequence[Table], written: Sequence[Written], pictures: Seq
     own = [(name, title) for name, title in _SECTIONS if there.get(name, True)]
     split = next(i for i, (name, _) in enumerate(own) if name in ("theory", "provenance"))
     return [*own[:split], *((f"section-{s.name}", s.title) for s in written), *own[split:]]
-
-
-def _table(table: Table) -> dict[str, Any]:
-    rows = list(table.rows)
-    return {
-        "name": table.name,
-        "title": table.title,
-        "caption": table.caption,
-        "columns": table.columns,
-        "frozen": next((i for i, c in enumerate(table.columns) if c.title in _NAMES), 0),
-        "rows": rows[:MOST_ROWS],
-        "cut": max(0, len(rows) - MOST_ROWS),
-    }
 
 
 def _runs(runs: Sequence[Run]) -> list[dict[str, Any]]:

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.files import write_text
-from ipe_bench.report.latex import LONG, escaped, row, table_rows
-from ipe_bench.report.tables import Column, Table, all_tables
+from ipe_bench.report.table import LONG, Column, Table, escaped, latex_row, latex_rows
+from ipe_bench.report.tables import all_tables
 from ipe_bench.statistics.analysis import Analysis
 
 COLUMN, PAGE = 3.5, 7.16
@@ -99,7 +99,7 @@ def chosen_columns(table: Table, names: Sequence[str]) -> Table:
 def latex_table(table: Table, width: float) -> str:
     """A floating environment with the caption, or where rows are many a longtable."""
     long = len(table) > LONG
-    body = [_head(table), *table_rows(table)]
+    body = [_head(table), *latex_rows(table)]
     shape = "@{}" + "".join("r" if c.numeric else "l" for c in table.columns) + "@{}"
     caption = rf"\caption{{{escaped(table.title)}. {escaped(table.caption)}}}\label{{tab:{table.name}}}"
     rules = [r"\toprule", body[0], r"\midrule", *([r"\endhead"] if long else []), *body[1:], r"\bottomrule"]
@@ -123,7 +123,7 @@ def _head(table: Table) -> str:
         lines = [escaped(line) for line in _lines(column.title, letters)]
         stacked = r"\\".join(lines)
         heads.append(rf"\shortstack[{side}]{{{stacked}}}" if len(lines) > 1 else stacked)
-    return row(heads)
+    return latex_row(heads)
 
 
 def _lines(title: str, letters: int) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-from ipe_bench.report.tables import Table
+from ipe_bench.report.table import Table
 from ipe_bench.statistics.analysis import Analysis
 
 

@@ -1,83 +1,20 @@
-"""Tables for papers and mails: the same cells as Markdown, LaTeX and HTML, the whole numbers as CSV."""
+"""The tables of a report: which columns they have, and what their captions say."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
 from ipe_bench.basics.files import write_text
-from ipe_bench.report.latex import latex
+from ipe_bench.report.table import Cell, Column, Table, column, interval, sort_key, words, write_table
 from ipe_bench.report.words import limits, p_value, percent, plain, reported, short, shower, shown
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.comparisons import ALPHA
-from ipe_bench.statistics.records import SCORES, Kind, Statistic, Where, all_statistics
+from ipe_bench.statistics.records import SCORES, Statistic, Where, all_statistics
 from ipe_bench.statistics.summary import ALL
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One cell as a reader sees it, and what it is sorted by."""
-
-    text: str
-    key: Any = None
-    best: bool = False
-
-
-@dataclass(frozen=True)
-class Column:
-    title: str
-    cells: Sequence[Cell]
-    numeric: bool = True
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table with its file name, title and caption; `data` are the numbers behind it."""
-
-    name: str
-    title: str
-    caption: str
-    columns: Sequence[Column]
-    data: pd.DataFrame
-    appendix: bool = False
-    """Whether it stands behind the figures: theory beside what happened."""
-
-    @property
-    def rows(self) -> Iterator[tuple[Cell, ...]]:
-        return zip(*(c.cells for c in self.columns), strict=True)
-
-    def __len__(self) -> int:
-        return len(self.columns[0].cells)
-
-
-def column(title: str, values: Iterable[Any], show: Callable[[Any], str], best: Sequence[bool] | None = None) -> Column:
-    values = list(values)
-    marks = [False] * len(values) if best is None else list(best)
-    return Column(title, [Cell(show(v), _key(v), m) for v, m in zip(values, marks, strict=True)])
-
-
-def words(title: str, values: Iterable[Any], best: Sequence[bool] | None = None) -> Column:
-    values = [str(v) for v in values]
-    marks = [False] * len(values) if best is None else list(best)
-    return Column(title, [Cell(v, None, m) for v, m in zip(values, marks, strict=True)], numeric=False)
-
-
-def interval(title: str, low: Iterable[float], high: Iterable[float], show: Callable[[float], str]) -> Column:
-    pairs = zip(low, high, strict=True)
-    return Column(title, [Cell(f"{show(a)} to {show(b)}" if math.isfinite(a) else "-", _key(a)) for a, b in pairs])
-
-
-def _key(value: Any, kind: Kind = "number") -> Any:
-    """A number to sort by: what is not a number goes last. Words are sorted as they stand."""
-    if kind == "word":
-        return None
-    number = float(value)
-    return "1e999" if math.isnan(number) or number == math.inf else repr(number)
 
 
 def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]:
@@ -125,7 +62,10 @@ def statistics(where: Where, records: Sequence[Statistic], rows: pd.DataFrame) -
         if where not in record.where or not reported(record, told):
             continue
         title = record.titles.get(where, record.title)
-        cells = [Cell(shown(record, where, row), _key(row[record.name], record.kind)) for row in told]
+        cells = [
+            Cell(shown(record, where, row), None if record.kind == "word" else sort_key(row[record.name]))
+            for row in told
+        ]
         columns.append(Column(title, cells, numeric=record.kind != "word"))
         if where in record.limits_titles:
             ends = [limits(record, where, row) for row in told]
@@ -359,25 +299,6 @@ def endings(analysis: Analysis) -> Table | None:
     return Table("endings", "Trials that did not converge", caption, columns, rows)
 
 
-# Formats -------------------------------------------------------------------------------------------------------------
-
-
-def markdown(table: Table) -> str:
-    """A GitHub table; names cannot break it."""
-
-    def cell(value: str) -> str:
-        value = value.replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
-        return " ".join(value.split())
-
-    lines = [f"**{table.title}.** {cell(table.caption)}", ""]
-    lines.append("| " + " | ".join(cell(c.title) for c in table.columns) + " |")
-    lines.append("|" + "|".join("---:" if c.numeric else ":---" for c in table.columns) + "|")
-    for row in table.rows:
-        texts = [f"**{cell(c.text)}**" if c.best else cell(c.text) for c in row]
-        lines += ["| " + " | ".join(texts) + " |"]
-    return "\n".join(lines) + "\n"
-
-
 def write_tables(analysis: Analysis, tables: Sequence[Table], folder: Path) -> tuple[Path, ...]:
     """Writes each table as CSV (all columns, full precision), Markdown and LaTeX, and the profiles as CSV."""
     paths = [path for table in tables for path in write_table(table, folder)]
@@ -386,11 +307,3 @@ def write_tables(analysis: Analysis, tables: Sequence[Table], folder: Path) -> t
         write_text(path, analysis.profiles.to_csv(index=False))
         paths.append(path)
     return tuple(paths)
-
-
-def write_table(table: Table, folder: Path) -> list[Path]:
-    """Writes one table in each format."""
-    texts = {".csv": table.data.to_csv(index=False), ".md": markdown(table), ".tex": latex(table)}
-    for suffix, text in texts.items():
-        write_text(folder / f"{table.name}{suffix}", text)
-    return [folder / f"{table.name}{suffix}" for suffix in texts]

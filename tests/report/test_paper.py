@@ -12,7 +12,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.cli.main import main
 from ipe_bench.report import figures
 from ipe_bench.report.paper import COLUMN, PAGE, export, inches, latex_table
-from ipe_bench.report.tables import Table, interval, words
+from ipe_bench.report.table import Table, interval, words
 from ipe_bench.report.words import percent
 from ipe_bench.statistics import analyse
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import re
 import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -25,9 +27,21 @@ from ipe_bench.report.figures import correlation, distributions, error_scale, ne
 from ipe_bench.report.figures.ranks import cliques
 from ipe_bench.report.figures.views import views
 from ipe_bench.report.headline import headline
-from ipe_bench.report.latex import latex
 from ipe_bench.report.style import house_style, looks
-from ipe_bench.report.tables import Table, all_tables, interval, markdown, words
+from ipe_bench.report.table import (
+    Strong,
+    Table,
+    column,
+    comma_separated,
+    html,
+    interval,
+    latex,
+    markdown,
+    terminal,
+    texts,
+    words,
+)
+from ipe_bench.report.tables import all_tables
 from ipe_bench.report.terminal import render
 from ipe_bench.report.words import compact, duration, percent, short
 from ipe_bench.statistics import analyse
@@ -343,3 +357,47 @@ def test_settings_that_differ_have_figures_of_their_own(synthetic, tmp_path):
         assert {n for n in names if n.startswith(f"{kind}_")} == {f"{kind}_{s}" for s in settings}
     page = re.sub(r'base64,[^"]*', "", result.report.read_text(encoding="utf-8"))
     assert not re.search(r"\bnan\b", page)
+
+
+def shown_at(width: int, *parts) -> list[str]:
+    """The lines of tables and sentences in a terminal."""
+    out = io.StringIO()
+    Console(file=out, width=width).print(terminal(parts, width))
+    return [line.rstrip() for line in out.getvalue().splitlines()]
+
+
+def test_every_renderer_has_every_cell():
+    """Cells that the CSV file has stand in the same order in every other form of a table."""
+    columns = [words("name", ["a_b", "c & d", HOSTILE]), column("value", [1.5, 2.0, 3.25], short, [False, True, False])]
+    table = Table("t", "Title", "Caption.", columns, notes=["Note."])
+    rows = [["a_b", "1.500"], ["c & d", "2"], [HOSTILE, "3.250"]]
+    assert list(csv.reader(io.StringIO(comma_separated(table)))) == [["name", "value"], *rows]
+    lines = shown_at(80, table)
+    places = [next(i for i, line in enumerate(lines) if line.split() == " ".join(row).split()) for row in rows]
+    assert places == sorted(places)
+    page = html([table, Strong("Stands out"), "does not"])
+    assert [unescape(text) for text in re.findall(r"<td[^>]*>(?:<b>)?(.*?)(?:</b>)?</td>", page)] == [
+        *rows[0],
+        *rows[1],
+        *rows[2],
+    ]
+    assert HOSTILE not in page
+    assert "<b>2</b>" in page
+    assert "<b>Stands out</b>" in page
+    assert re.findall(r"^\| (\S.*?) \| (\S*?) \|$", markdown(table), re.MULTILINE)[2] == ("c & d", "**2**")
+    assert r"c \& d & \textbf{\num{2}} \\" in latex(table)
+    for text in (page, markdown(table), "\n".join(lines)):
+        assert "Note." in text
+
+
+def test_what_a_terminal_has_no_room_for_is_named_with_its_file_or_goes_below():
+    columns = [words("estimator", ["one", "one", "two"]), *(texts(f"value {i}", ["1234567890"] * 3) for i in range(9))]
+    left = shown_at(60, replace(Table("t", "T", "", columns), grouped=1, whole="all.csv"))
+    named = re.search(r"Too narrow for: (.*); all.csv has them.", " ".join(left))[1].split(", ")
+    head = next(line for line in left if "estimator" in line)
+    assert re.findall(r"value \d", head) + named == [f"value {i}" for i in range(9)]
+    assert sum(line.split()[:1] == ["one"] for line in left) == 1  # once a group
+    below = shown_at(60, replace(Table("t", "T", "", columns), repeated=1))
+    assert sum("estimator" in line for line in below) > 1
+    assert re.findall(r"value \d", " ".join(below)) == [f"value {i}" for i in range(9)]
+    assert max(map(len, left + below)) <= 60
