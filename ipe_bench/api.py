@@ -141,7 +141,7 @@ def report(
     directories: Directories,
     output: Path | str | None = None,
     *,
-    figures: Which = "all",
+    figures: Which = "main",
     formats: str | Sequence[str] = "png",
 ) -> ReportResult:
     """Writes summary.csv, tables/, figures/ and report.html from what is stored, into `output` or the first directory.

@@ -63,7 +63,7 @@ class Schema:
     enough trials."""
     time_limit: float | None = None
     """Seconds after which, with a precision, no more blocks are begun."""
-    figures: str = "all"
+    figures: str = "main"
     """Which to draw: all, main (the few that answer the question), or none."""
     formats: Any = "png"
     """Of the figures' files: png, and what is named of pdf and svg as well."""
@@ -115,7 +115,7 @@ class Job:
     """The label of an estimator and a column of its row over all parameters."""
     readings: Readings | None = None
     """Of the files, for an estimate from them."""
-    figures: Which = "all"
+    figures: Which = "main"
     formats: tuple[str, ...] = (PAGE,)
 
 

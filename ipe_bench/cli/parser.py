@@ -85,7 +85,7 @@ paper=NAMES          tables and figures for a paper instead, into DIR/paper: LaT
 columns=NAMES        those of the tables, in this order; a name that is not there is answered with those that are
 width=INCHES         of a figure or table: 3.5 for one column, 7.16 for two
 
-figures=all          which to draw: all, main (the few that answer the question) or none
+figures=all          which to draw: all, main (the few that answer the question; unless told otherwise) or none
 formats=pdf,svg      as these as well; figures are PNG files, and others are written when they are asked for
 """
 

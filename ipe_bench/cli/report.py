@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -17,7 +16,6 @@ from ipe_bench.runs.results import require_results
 from ipe_bench.runs.store import TRUTH
 
 if TYPE_CHECKING:
-    from ipe_bench.report.stamp import Made
     from ipe_bench.statistics.analysis import Begun
     from ipe_bench.statistics.collect import Collection
 
@@ -48,7 +46,7 @@ def _report(arguments: Sequence[str]) -> int:
     asked = [a.removeprefix("figures=") for a in arguments if a.startswith("figures=")]
     named = [a.removeprefix("formats=") for a in arguments if a.startswith("formats=")]
     directories = [Path(a) for a in arguments if not a.startswith(("output=", "figures=", "formats="))]
-    figures = which_figures(asked[-1] if asked else "all")
+    figures = which_figures(asked[-1] if asked else "main")
     formats = file_formats(named[-1] if named else PAGE)
     if not directories:
         raise UserError("report: name at least one directory of results, such as outputs/paper")
@@ -57,52 +55,36 @@ def _report(arguments: Sequence[str]) -> int:
     if len(directories) > 1 and not outputs:
         raise UserError("report: several directories need output=DIR, as the report on all is not that of the first")
     require_results(directories)
-    from ipe_bench.report.stamp import made_from, note
+    from ipe_bench.report.stamp import made_from
 
     output = Path(outputs[0]) if outputs else directories[0]
-    made, view = made_from(directories, output, figures, formats), _view("everything")
-    if _show_again(output, made, view):
-        return 0
-    with _drawing_help(output, made, figures):
-        begun = _begin(directories)
-        table = _print_table(begun.summary, begun.collection)
-        collection = _write(begun, output, made, figures)
+    made = made_from(directories, output, figures, formats)
+    begun = _begin(directories)
+    _print_table(begun.summary, begun.collection)
+    collection = _write(begun, output, made, figures, formats)
     for problem in (*collection.problems, *collection.stale):
         print(f"ipe-bench: {problem}", file=sys.stderr)
     _print_places(output)
-    note(output, made, view, [table, ""])
     return 1 if collection.problems else 0
 
 
-@contextlib.contextmanager
-def _drawing_help(output: Path, made: Made, figures: Which) -> Iterator[None]:
-    """A second process that is there when there are figures to draw, where any may be."""
-    from ipe_bench.report.helper import drawing_help
-    from ipe_bench.report.stamp import is_out_of_date
-
-    with drawing_help() as helper:
-        if figures != "none" and is_out_of_date(output, made):
-            helper.start()
-        yield
-
-
 def show_command(
-    output: Path, cells: Mapping[str, str], figures: Which = "all", formats: tuple[str, ...] = (PAGE,)
+    output: Path, cells: Mapping[str, str], figures: Which = "main", formats: tuple[str, ...] = (PAGE,)
 ) -> int:
     """Writes the report on all that the folder holds, and prints what belongs to these cells; the exit code.
 
     `cells` has a line for people by key.
     """
-    from ipe_bench.report.stamp import made_from, note
+    from ipe_bench.report.stamp import made_from
 
-    made, view = made_from([output], output, figures, formats), _view(" ".join(sorted(cells)))
-    if _show_again(output, made, view):
-        return 0
-    with _drawing_help(output, made, figures):
-        begun = _begin([output])
-        others = sum(cell.key not in cells and cell.label != TRUTH for cell in begun.collection.current)
-        table = _print_own_table(output, cells) if others else _print_table(begun.summary, begun.collection)
-        problems = _write(begun, output, made, figures).problems
+    made = made_from([output], output, figures, formats)
+    begun = _begin([output])
+    others = sum(cell.key not in cells and cell.label != TRUTH for cell in begun.collection.current)
+    if others:
+        _print_own_table(output, cells)
+    else:
+        _print_table(begun.summary, begun.collection)
+    problems = _write(begun, output, made, figures, formats).problems
     # What is wrong with a file or a folder may concern anybody; what other commands lack does not.
     of_cells = [p for p in problems if p.startswith(("missing: ", "failed: "))]
     elsewhere = [p for p in of_cells if not any(line in p for line in cells.values())]
@@ -114,38 +96,16 @@ def show_command(
     _print_places(output)
     more = f"Here too  {_counted(others, 'result')} of other commands; `ipe-bench report {output}` shows all\n"
     print(more if others else "", end="")
-    note(output, made, view, [table, more if others else ""])
     return 1 if problems else 0
 
 
-def _print_own_table(output: Path, cells: Mapping[str, str]) -> str:
-    """Prints the table of these cells alone; returns what was written."""
+def _print_own_table(output: Path, cells: Mapping[str, str]) -> None:
+    """Prints the table of these cells alone."""
     from ipe_bench.statistics.collect import collect
     from ipe_bench.statistics.summary import rows_of_all
 
     own = collect([output], cells.keys())
-    return _print_table(rows_of_all(own), own)
-
-
-def _view(of: str) -> str:
-    """What is shown of a report, and how: of which cells, how wide and in which colours."""
-    out = console()
-    how = f"{out.width} {out.is_terminal} {out.color_system} {out.encoding} {out.legacy_windows}"
-    return hashlib.sha256(f"{of}; {how}".encode()).hexdigest()[:16]
-
-
-def _show_again(output: Path, made: Made, view: str) -> bool:
-    """Prints what was printed of this report before, where nothing has changed since; nothing is computed for it."""
-    from ipe_bench.report.stamp import shown
-
-    known = shown(output, made, view)
-    if known is None:
-        return False
-    table, more = known
-    print(table, end="")
-    _print_places(output)
-    print(more, end="")
-    return True
+    _print_table(rows_of_all(own), own)
 
 
 def _begin(directories: Sequence[Path]) -> Begun:
@@ -159,7 +119,7 @@ def _begin(directories: Sequence[Path]) -> Begun:
     return begun
 
 
-def _write(begun: Begun, output: Path, made: Made, figures: Which) -> Collection:
+def _write(begun: Begun, output: Path, made: str, figures: Which, formats: tuple[str, ...]) -> Collection:
     """Writes the report unless it is there already; returns what it is on, with all problems."""
     from ipe_bench.report.stamp import is_current, leave
 
@@ -167,13 +127,12 @@ def _write(begun: Begun, output: Path, made: Made, figures: Which) -> Collection
     if not is_current(output, made, [*collection.problems, *collection.stale]):
         from ipe_bench.report import write_analysis
 
-        result = write_analysis(begun, output, figures, made.formats)
+        result = write_analysis(begun, output, figures, formats)
         leave(output, made, [*collection.problems, *collection.stale], result.files)
     return collection
 
 
-def _print_table(rows: Sequence[Mapping[str, Any]], collection: Collection) -> str:
-    """Prints the table; returns what was written."""
+def _print_table(rows: Sequence[Mapping[str, Any]], collection: Collection) -> None:
     from ipe_bench.report.terminal import render
 
     certified = attained = None
@@ -182,10 +141,7 @@ def _print_table(rows: Sequence[Mapping[str, Any]], collection: Collection) -> s
 
         certified, attained = certified_tables(collection)[1], attained_tables(collection)[1]
     out = console()
-    with out.capture() as written:
-        out.print(render(rows, certified, out.width, attained))
-    print(written.get(), end="", flush=True)
-    return written.get()
+    out.print(render(rows, certified, out.width, attained))
 
 
 def _print_places(output: Path) -> None:

@@ -35,7 +35,6 @@ from ipe_bench.cli.typed import check_options
 from ipe_bench.measurements import Nist
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
-from ipe_bench.report.helper import Helper, drawing_help
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.execution.processes import end_idle
 from ipe_bench.runs.run import compute, result_keys
@@ -60,10 +59,8 @@ class Outcome:
         self.jobs = 0
         self.outputs: dict[Path, dict[str, str]] = {}
         """The folders that were filled, and by key a line for each cell that was asked for."""
-        self.figures: Which = "all"
+        self.figures: Which = "main"
         self.formats: tuple[str, ...] = (PAGE,)
-        self.helper = Helper()
-        """What draws while this process computes."""
         self.failures: list[str] = []
         self.stops: list[str] = []
         """How many trials each job with a precision took, and why no more."""
@@ -135,7 +132,6 @@ def main(arguments: Sequence[str]) -> int:
             flags.append("--multirun")
         words = [*words, f"default_name='{name}'"]
     with contextlib.ExitStack() as stack:
-        _outcome.helper = stack.enter_context(drawing_help())
         if "--dry-run" in flags:
             _outcome.dry = DryRun()
             flags.remove("--dry-run")
@@ -292,10 +288,6 @@ def task(config: DictConfig) -> float | None:
             return None
         interrupts.begin_work()
         with shown_progress(_title(job)) as watch:
-            if job.figures != "none" and not _launched_elsewhere():
-                watch = _outcome.helper.start_when_there_is_work(watch)
-                if not (Path(job.output) / "trials").exists():
-                    _outcome.helper.start()
             failures = _compute(job, Serial() if _launched_elsewhere() else job.execution, watch)
         value = None if job.objective is None else _objective(job)
     except (UserError, StorageError, *CONFIG_ERRORS) as error:

@@ -45,7 +45,7 @@ def write_report(
     directories: Path | str | Sequence[Path | str],
     output: Path | str | None = None,
     *,
-    figures: Which = "all",
+    figures: Which = "main",
     formats: str | Sequence[str] = PAGE,
 ) -> ReportResult:
     """Writes summary.csv, tables/, figures/ and report.html from what is stored, under `output` or the first directory.
@@ -66,13 +66,14 @@ def write_report(
     return write_analysis(begun, Path(directories[0] if output is None else output), figures, kinds)
 
 
-def write_analysis(begun: Begun, output: Path, which: Which = "all", formats: Sequence[str] = (PAGE,)) -> ReportResult:
+def write_analysis(begun: Begun, output: Path, which: Which = "main", formats: Sequence[str] = (PAGE,)) -> ReportResult:
     """Finishes an analysis and writes the report on it under `output`, with these figures in these formats."""
     from ipe_bench.basics.files import write_text
     from ipe_bench.report import extensions
     from ipe_bench.report.certified_tables import attained_tables, certified_tables, without_certified
     from ipe_bench.report.charts import charts
-    from ipe_bench.report.figures import Gallery
+    from ipe_bench.report.figures import draw_all
+    from ipe_bench.report.figures.views import views
     from ipe_bench.report.html import render_page
     from ipe_bench.report.tables import all_tables, write_tables
 
@@ -82,15 +83,13 @@ def write_analysis(begun: Begun, output: Path, which: Which = "all", formats: Se
     certified_shown, certified = certified_tables(analysis.collection)
     simulated = without_certified(analysis)
     problems = analysis.collection.further
-    # A second process draws while this one writes tables.
-    with Gallery.open(simulated, output / "figures", which, formats, problems) as gallery:
-        tables = [*certified_shown, *attained_tables(analysis.collection)[0], *all_tables(simulated, analysis)]
-        tables += extensions.tables(analysis, [table.name for table in tables], problems)
-        sections = extensions.sections(analysis, [table.name for table in tables], problems)
-        further = [table for section in sections for table in section.tables]
-        table_paths = write_tables(analysis, [*tables, *further], output / "tables")
-        drawn = gallery.drawn()
-    page = render_page(analysis, tables, drawn, sections, list(charts(gallery.parts)))
+    tables = [*certified_shown, *attained_tables(analysis.collection)[0], *all_tables(simulated, analysis)]
+    tables += extensions.tables(analysis, [table.name for table in tables], problems)
+    sections = extensions.sections(analysis, [table.name for table in tables], problems)
+    further = [table for section in sections for table in section.tables]
+    table_paths = write_tables(analysis, [*tables, *further], output / "tables")
+    drawn = draw_all(simulated, output / "figures", which=which, formats=formats, problems=problems)
+    page = render_page(analysis, tables, drawn, sections, list(charts(views(simulated)[0])))
     report = output / "report.html"
     write_text(report, page)
     return ReportResult(
@@ -113,7 +112,7 @@ class _Callable(types.ModuleType):
         directories: Path | str | Sequence[Path | str],
         output: Path | str | None = None,
         *,
-        figures: Which = "all",
+        figures: Which = "main",
         formats: str | Sequence[str] = PAGE,
     ) -> ReportResult:
         return write_report(directories, output, figures=figures, formats=formats)

@@ -15,7 +15,6 @@ import ipe_bench.cli
 from ipe_bench.cli.main import main
 from ipe_bench.report import figures
 from ipe_bench.report.answer import render
-from ipe_bench.report.helper import Helper
 
 WIDTHS = (80, 100, 120)
 SHORT = ("linear_lse", "fixed_point", "levenberg_marquardt", "scipy_least_squares")
@@ -42,8 +41,7 @@ def folders(tmp_path_factory):
 def screen(request, monkeypatch, capsys):
     """Runs a command on a screen of that width: its lines but for those that are left to the terminal to fold."""
     monkeypatch.setattr(ipe_bench.cli, "_WIDTH_WITHOUT_TERMINAL", request.param)
-    monkeypatch.setattr(figures.gallery, "_tasks", lambda *_: iter(()))
-    monkeypatch.setattr(Helper, "start", lambda self: None)
+    monkeypatch.setattr(figures, "FIGURES", ())
 
     def run(*words: str) -> list[str]:
         main(list(words))

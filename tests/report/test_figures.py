@@ -4,9 +4,6 @@
 # (matplotlib's collections are not typed)
 from __future__ import annotations
 
-import io
-import json
-import shutil
 from dataclasses import replace
 from importlib import import_module
 from itertools import combinations, pairwise
@@ -15,13 +12,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from synthetic_store import Pretender, Synthetic
 
 from ipe_bench.report import figures
-from ipe_bench.report import helper as helper_module
 from ipe_bench.report.figures import (
     FIGURES,
-    Gallery,
     common,
     convergence,
     correlation,
@@ -34,10 +30,8 @@ from ipe_bench.report.figures import (
 )
 from ipe_bench.report.figures import settings as settings_figure
 from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.figures.layout import PanelLayout
 from ipe_bench.report.figures.views import View, views
-from ipe_bench.report.helper import drawing_help
-from ipe_bench.report.style import COLORS, REFERENCE, Look, house_style, looks
+from ipe_bench.report.style import COLORS, REFERENCE, house_style, looks
 from ipe_bench.statistics import analyse
 
 SCALES = (1.0, 10.0, 100.0)
@@ -329,29 +323,9 @@ def test_long_settings_have_file_names_of_their_own(synthetic):
     assert set(suffixes) <= {part.suffix for part in parts}
 
 
-def test_a_figure_sees_what_it_declares_and_its_digest_knows_all_of_it(synthetic):
-    fill(synthetic)
-    view = only_view(synthetic)
-    narrow = view.only(("summary",))
-    with pytest.raises(KeyError):
-        narrow["scores"]
-    assert narrow.digest() == only_view(synthetic).only(("summary",)).digest()
-    frame = view["summary"].copy()
-    frame.loc[frame.index[0], "rmse"] *= 1 + 1e-15
-    assert replace(narrow, frames={"summary": frame}).digest() != narrow.digest()
-    for changed in ({"label": "other"}, {"look": {"two": Look("#000000", "o")}}, {"equations": {}}):
-        assert replace(narrow, **changed).digest() != narrow.digest()
-
-
 def test_every_module_with_a_figure_is_in_the_list():
     folder = Path(gallery.__file__).parent
     assert {p.stem for p in folder.glob("*.py") if "\nFIGURE = " in p.read_text(encoding="utf-8")} == set(FIGURES)
-
-
-@pytest.fixture
-def stored(synthetic, tmp_path):
-    fill(synthetic)
-    return analyse([synthetic.directory]), tmp_path / "figures"
 
 
 @pytest.fixture(scope="module")
@@ -361,7 +335,7 @@ def once_drawn(tmp_path_factory):
     store = Synthetic(place / "store")
     fill(store, labels=(REFERENCE, "fixed_point"), scales=(1.0, 10.0), names=("a", "b"))
     analysis = analyse([store.directory])
-    return analysis, draw_all(analysis, place / "figures", formats=("png",), processes=1), place / "figures"
+    return analysis, draw_all(analysis, place / "figures", formats=("png",), which="all"), place / "figures"
 
 
 @pytest.fixture
@@ -370,87 +344,18 @@ def few(monkeypatch):
     monkeypatch.setattr(figures, "FIGURES", ("success", "cost"))
 
 
-@pytest.fixture
-def all_drawn(once_drawn, tmp_path):
-    """The analysis, and a copy of the folder to spoil."""
-    analysis, _, folder = once_drawn
-    shutil.copytree(folder, tmp_path / "copy")
-    return analysis, tmp_path / "copy"
-
-
-def times(folder: Path) -> dict[str, int]:
-    return {p.name: p.stat().st_mtime_ns for p in folder.iterdir()}
-
-
-def test_what_has_not_changed_is_not_drawn_again(once_drawn, monkeypatch):
-    analysis, first, folder = once_drawn
-    before = times(folder)
-    monkeypatch.setattr(gallery, "draw_task", lambda *_: pytest.fail("drawn again"))
-    second = draw_all(analysis, folder, formats=("png",), processes=1)
-    assert second == first
-    assert times(folder) == before
-
-
-def test_only_what_shows_the_change_is_drawn_again(all_drawn):
-    analysis, folder = all_drawn
-    before = times(folder)
-    scores = analysis.scores.assign(cost_median=analysis.scores["cost_median"] * 2)
-    draw_all(replace(analysis, scores=scores), folder, formats=("png",), processes=1)
-    changed = {name for name, time in times(folder).items() if before.get(name) != time}
-    assert {"cost_against_accuracy.png", "index.json"} <= changed
-    assert not {"success_against_scale.png", "error_against_scale.png", "profiles.png"} & changed
-
-
-def test_other_code_draws_again(all_drawn, few, monkeypatch):
-    analysis, folder = all_drawn
-    before = times(folder)
-    monkeypatch.setattr(gallery, "_drawn_with", lambda: "other code")
-    found = draw_all(analysis, folder, formats=("png",), processes=1)
-    names = {path.name for drawn in found for path in drawn.files}
-    assert {"success_against_scale.png", "cost_against_accuracy.png"} <= names
-    assert all(times(folder)[name] != before[name] for name in names)
-
-
-@pytest.mark.parametrize("damage", ["cut", "edited", "removed", "index"])
-def test_damaged_figures_are_drawn_again(all_drawn, few, damage):
-    analysis, folder = all_drawn
-    path = folder / "success_against_scale.png"
-    whole = path.read_bytes()
-    if damage == "cut":
-        path.write_bytes(whole[:100])
-    elif damage == "edited":
-        path.write_bytes(whole[:-40] + bytes([whole[-40] ^ 1]) + whole[-39:])
-    elif damage == "removed":
-        path.unlink()
-    else:
-        (folder / "index.json").write_text('{"schema": 1, "drawn": [7]}')
-    draw_all(analysis, folder, which="main", formats=("png",), processes=1)
-    assert path.read_bytes() == whole
-
-
 def test_stale_figures_go_and_foreign_files_stay(synthetic, few, tmp_path):
     folder = tmp_path / "figures"
     small = {"labels": (REFERENCE, "fixed_point"), "scales": (1.0, 10.0), "names": ("a",)}
     fill(synthetic, **small)
-    draw_all(analyse([synthetic.directory]), folder, which="main", formats=("png",), processes=1)
+    draw_all(analyse([synthetic.directory]), folder, which="main")
     (folder / "mine.png").write_bytes(b"of the user")
     assert (folder / "success_against_scale.png").exists()
     fill(synthetic, sigma=0.4, **small)
-    draw_all(analyse([synthetic.directory]), folder, which="main", formats=("png",), processes=1)
+    draw_all(analyse([synthetic.directory]), folder, which="main")
     assert not (folder / "success_against_scale.png").exists()
     assert len(list(folder.glob("success_against_scale_*.png"))) == 2
     assert (folder / "mine.png").read_bytes() == b"of the user"
-
-
-def test_an_index_cannot_remove_files_elsewhere(stored):
-    analysis, folder = stored
-    folder.mkdir()
-    victim = folder.parent / "victim.png"
-    victim.write_bytes(b"precious")
-    entry = {"name": "../victim", "title": "", "caption": "", "digests": {"png": "0"}}
-    (folder / "index.json").write_text(json.dumps({"schema": 1, "drawn": {"0": [entry]}}))
-    draw_all(analysis, folder, which="none")
-    assert victim.exists()
 
 
 def test_the_main_figures_are_four(once_drawn):
@@ -460,59 +365,15 @@ def test_the_main_figures_are_four(once_drawn):
     assert {name for name, module in modules.items() if module.FIGURE.main} == {"error_scale", "success"}
 
 
-def test_main_none_and_formats(once_drawn, tmp_path):
-    analysis, folder = once_drawn[0], tmp_path / "figures"
-    assert draw_all(analysis, folder, which="none") == []
-    assert not folder.exists()
-    main = draw_all(analysis, folder, which="main", formats=("png",), processes=1)
-    assert {d.name for d in main} == {"figure_2", "figure_3", "error_against_scale", "success_against_scale"}
-    assert {p.suffix for p in folder.iterdir()} == {".png", ".json"}
-    before = times(folder)
-    both = draw_all(analysis, folder, which="main", formats=("png", "pdf"), processes=1)
-    assert [{path.suffix for path in d.files} for d in both] == [{".png", ".pdf"}] * len(main)
-    # What is asked for later is drawn, and nothing else.
-    assert {name for name, time in times(folder).items() if before.get(name) != time} == {
-        "index.json", *(f"{d.name}.pdf" for d in main)
-    }  # fmt: skip
-    # What is there and right is named whatever is asked for, and what is not there is not.
-    (folder / "figure_2.pdf").unlink()
-    named = {path.name for d in draw_all(analysis, folder, which="main", processes=1) for path in d.files}
-    assert named == {p.name for p in folder.iterdir()} - {"index.json"}
-    # A PDF that is still right stays where none is asked for, and goes where it is no more.
-    draw_all(analysis, folder, which="none")
-    assert len(list(folder.glob("*.pdf"))) == len(main) - 1
-    other = replace(analysis, summary=analysis.summary.assign(success=0.5))
-    draw_all(other, folder, which="none")
-    assert not list(folder.glob("*.p*"))
-
-
-def test_a_picture_is_the_pixels_that_were_drawn(synthetic):
-    fill(synthetic, labels=(REFERENCE, "two"))
-    with house_style():
-        drawing = next(iter(success.draw(only_view(synthetic))))
-        content = drawing.rendered(("pdf", "svg", "png"))
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from PIL import Image
-
-    canvas = FigureCanvasAgg(drawing.figure)
-    canvas.draw()
-    with Image.open(io.BytesIO(content["png"])) as image:
-        image.load()
-        assert image.mode == "RGB"
-        assert image.info["dpi"] == pytest.approx((150, 150), abs=0.02)
-        assert np.array_equal(np.asarray(image), np.asarray(canvas.buffer_rgba())[:, :, :3])
-    assert content["pdf"].startswith(b"%PDF-")
-    assert content["svg"].startswith(b"<?xml")
-
-
 def test_labels_run_into_nothing(synthetic):
     """Nothing of a panel leaves the figure or enters another panel; long names of groups and settings included."""
     fill(synthetic, names=("a" * 30, "b"))
     view = only_view(synthetic)
     for module in (error_scale, success, nees, cost):
         for drawing in drawn(module, view).values():
-            drawing.rendered(("png",))
             fig = drawing.figure
+            FigureCanvasAgg(fig)
+            fig.draw_without_rendering()
             renderer = fig.canvas.get_renderer()
             panels = [ax for ax in fig.axes if ax.axison]
             legend = fig.legends[0].get_window_extent(renderer)
@@ -523,30 +384,6 @@ def test_labels_run_into_nothing(synthetic):
                 assert legend.y1 <= box.y0 < box.y1 <= fig.bbox.y1
                 assert ax.bbox.width > 100
                 assert not any(box.overlaps(other.bbox) for other in panels if other is not ax)
-
-
-def test_the_panels_stand_where_constrained_layout_puts_them(synthetic):
-    fill(synthetic)
-    view = only_view(synthetic)
-    places = []
-    for layout in (PanelLayout, "constrained"):
-        (drawing,) = drawn(success, view).values()
-        drawing.figure.set_layout_engine(layout if isinstance(layout, str) else layout())
-        drawing.rendered(("png",))
-        places.append(np.array([ax.get_position().extents for ax in drawing.figure.axes]))
-    np.testing.assert_allclose(*places, atol=2e-3)
-
-
-def test_what_is_not_a_plain_grid_has_room_as_well():
-    with house_style():
-        fig, (ax, _) = common.panels(2)
-        mesh = ax.pcolormesh([[0.0, 1.0], [2.0, 3.0]])
-        bar = fig.colorbar(mesh, ax=ax, label="height")
-        Drawing("own", "Own", "A caption.", fig).rendered(("png",))
-    renderer = fig.canvas.get_renderer()
-    inside = [one.get_tightbbox(renderer) for one in (ax, bar.ax)]
-    assert not inside[0].overlaps(inside[1])
-    assert all(0 <= box.x0 < box.x1 <= fig.bbox.x1 for box in inside)
 
 
 def test_powers_of_ten_are_written_plainly():
@@ -564,67 +401,3 @@ def test_the_house_style_is_seaborns_white_grid_but_for_what_it_says_itself():
         for name in expected.keys() - ours:
             value = expected[name]
             assert mpl.rcParams[name] == (pytest.approx(value) if isinstance(value, float) else value), name
-
-
-def test_two_processes_draw_the_same_bytes(once_drawn, tmp_path):
-    analysis, alone, _ = once_drawn
-    with drawing_help() as helper:
-        helper.start()
-        with Gallery.open(analysis, tmp_path / "two") as gallery:
-            # The helper gets everything: this process waits.
-            gallery.work.thread.join()
-            assert gallery.work.done.keys() == gallery.missing.keys()
-            helped = gallery.drawn()
-        assert helper.ask(eval, "'seaborn' in __import__('sys').modules") is False
-    assert [(d.name, d.caption) for d in helped] == [(d.name, d.caption) for d in alone]
-    for a, b in zip(alone, helped, strict=True):
-        assert a.files[0].read_bytes() == b.files[0].read_bytes()
-
-
-def test_a_helper_that_dies_costs_nothing_but_time(once_drawn, few, tmp_path, monkeypatch):
-    analysis, folder = once_drawn[0], tmp_path / "figures"
-    monkeypatch.setattr(helper_module.sys, "executable", shutil.which("false") or "/nonexistent")
-    with drawing_help() as helper:
-        helper.start()
-        found = draw_all(analysis, folder, which="main")
-    assert all(path.exists() for d in found for path in d.files)
-
-
-def test_what_the_helper_cannot_draw_is_drawn_here(once_drawn, tmp_path, monkeypatch):
-    analysis, alone, _ = once_drawn
-
-    def ask(self, function, *arguments):
-        raise ConnectionError("killed in the middle")
-
-    monkeypatch.setattr(helper_module.Helper, "ask", ask)
-    with drawing_help() as helper:
-        helper.start()
-        found = draw_all(analysis, tmp_path / "figures", which="main")
-    whole = {d.name: d.files[0].read_bytes() for d in alone}
-    assert [d.files[0].read_bytes() for d in found] == [whole[d.name] for d in found]
-
-
-def test_nobody_helps_where_there_is_nothing_to_draw_or_one_process_alone(once_drawn, tmp_path, monkeypatch):
-    analysis, _, folder = once_drawn
-    monkeypatch.setattr(helper_module.Helper, "start", lambda self: pytest.fail("started"))
-    draw_all(analysis, folder)
-    draw_all(analysis, tmp_path / "none", which="none")
-    draw_all(analysis, tmp_path / "one", which="main", processes=1)
-
-
-def test_what_fails_while_figures_are_drawn_leaves_no_helper(once_drawn, tmp_path):
-    analysis = once_drawn[0]
-    seen = []
-
-    def fail():
-        with drawing_help() as helper:
-            helper.start()
-            seen.append(helper._process)
-            with Gallery.open(analysis, tmp_path / "figures"):
-                raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        fail()
-    (process,) = seen
-    assert process.returncode is not None
-    assert not (tmp_path / "figures").exists()

@@ -46,6 +46,5 @@ def _page(option: discovery.Option, folder: Path, results: Path, trials: int) ->
 
 def _pictures(folder: Path) -> list[tuple[Path, str]]:
     """The first pictures of a report, each with what it shows."""
-    index = json.loads((folder / INDEX).read_text(encoding="utf-8"))
-    drawn = [entry for entries in index["drawn"].values() for entry in entries]
+    drawn = json.loads((folder / INDEX).read_text(encoding="utf-8"))
     return [(folder / f"{entry['name']}.png", entry["caption"]) for entry in drawn[:FIGURES]]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from ipe_bench.report.figures.drawing import FORMATS, Drawing, Figure
-from ipe_bench.report.figures.gallery import Drawn, Gallery, draw_all
+from ipe_bench.report.figures.gallery import Drawn, draw_all
 
-__all__ = ["FIGURES", "FORMATS", "Drawing", "Drawn", "Figure", "Gallery", "draw_all"]
+__all__ = ["FIGURES", "FORMATS", "Drawing", "Drawn", "Figure", "draw_all"]
 
 FIGURES = (
     "error_scale",

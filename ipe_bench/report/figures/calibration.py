@@ -106,4 +106,4 @@ def _axes(ax: Axes, rows: pd.DataFrame) -> None:
     ax.axhline(0, color=BOUND_COLOR, linewidth=0.6, zorder=1)
 
 
-FIGURE = Figure(draw, ("calibration", "summary"), weight=2.0)
+FIGURE = Figure(draw, ("calibration", "summary"))

@@ -62,14 +62,12 @@ def column_width(inches: float) -> Iterator[None]:
 def figure(width: float, height: float) -> Figure:
     from matplotlib.figure import Figure
 
-    from ipe_bench.report.figures.layout import PanelLayout
-
     column = _column.get()
     if column is None or width == column:
         size = width, height
     else:
         size = column, max(1.8, height * column / width)
-    return Figure(figsize=size, layout=PanelLayout())
+    return Figure(figsize=size, layout="constrained")
 
 
 def mark_scale() -> float:

@@ -212,4 +212,4 @@ def _at_scales(totals: pd.DataFrame, column: str) -> str:
     return "; ".join(f"{v:.3g} at scale {plain(s)}" for s, v in pairs if np.isfinite(v)) or "no scale"
 
 
-FIGURE = Figure(draw, ("summary", "by_group"), main=True, weight=3.0)
+FIGURE = Figure(draw, ("summary", "by_group"), main=True)
