@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import BarColumn, ProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, ProgressColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
 from rich.progress import Task as BarTask
 from rich.table import Column
@@ -54,26 +54,14 @@ class _Title(ProgressColumn):
         return Text(task.description, no_wrap=True, overflow="ellipsis")
 
 
-class _Rate(ProgressColumn):
-    def get_table_column(self) -> Column:
-        return Column(no_wrap=True)
-
-    def render(self, task: BarTask) -> Text:
-        speed = task.finished_speed or task.speed
-        return Text("" if speed is None else f"{_rounded(speed)} estimates/s")
-
-
 def _bar(console: Console) -> Bar:
     columns = (
         _Title(),
         BarColumn(bar_width=10, table_column=Column(no_wrap=True)),
-        TextColumn("{task.fields[state]}"),
-        _Rate(),
+        TextColumn("{task.fields[state]}", table_column=Column(no_wrap=True)),
         TimeElapsedColumn(table_column=Column(no_wrap=True)),
-        TextColumn("left"),
-        TimeRemainingColumn(table_column=Column(no_wrap=True)),
     )
-    return Bar(*columns, console=console, speed_estimate_period=60.0)
+    return Bar(*columns, console=console)
 
 
 def _bar_watcher(bar: Bar, title: str) -> Watcher:
@@ -83,6 +71,7 @@ def _bar_watcher(bar: Bar, title: str) -> Watcher:
         state = f"block {progress.done}/{progress.tasks}"
         if progress.failures:
             state += f", {len(progress.failures)} failed"
+        state += _told(progress)
         if not progress.tasks:
             state = "nothing left to compute"
         # A job without estimators to run still has its truth to store: then blocks stand in for trials.
@@ -90,6 +79,14 @@ def _bar_watcher(bar: Bar, title: str) -> Watcher:
         bar.update(line, total=total or 1, completed=done if total else 1, state=state)
 
     return watch
+
+
+def _told(progress: Progress) -> str:
+    """The rate and the forecast, once there are any."""
+    if progress.preparing:
+        return ", compiling, once"
+    rate = f", {_rounded(progress.rate)} estimates/s" if progress.rate else ""
+    return rate + ("" if progress.seconds_left is None else f", {_duration(progress.seconds_left)} left")
 
 
 def _line_watcher(console: Console, title: str) -> Watcher:
@@ -105,14 +102,11 @@ def _line_watcher(console: Console, title: str) -> Watcher:
             say("nothing left to compute")
         elif progress.done == progress.tasks:
             failed = f", {len(progress.failures)} failed" if progress.failures else ""
-            rate = progress.total / max(now - began, 1e-9)
             blocks = "1 block" if progress.tasks == 1 else f"{progress.tasks} blocks"
-            say(f"{blocks}{failed} in {_duration(now - began)}, {_rounded(rate)} estimates/s")
-        elif now - spoken >= LINE_EVERY_S and progress.trials:
+            say(f"{blocks}{failed} in {_duration(now - began)}{_told(progress)}")
+        elif now - spoken >= LINE_EVERY_S:
             spoken = now
-            rate = progress.trials / (now - began)
-            left = _duration((progress.total - progress.trials) / rate)
-            say(f"block {progress.done}/{progress.tasks}, {_rounded(rate)} estimates/s, {left} left")
+            say(f"block {progress.done}/{progress.tasks}{_told(progress)}")
 
     return watch
 

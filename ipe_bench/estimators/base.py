@@ -181,9 +181,25 @@ def _estimate(estimator: Estimator, problem: Problem, z: Array, history: bool) -
         if len(z) == 1:
             return Estimates.failed(1, problem.measurement.n, describe_exception(error))
         return Estimates.join([_estimate(estimator, problem, row[None], history) for row in z])
+    _require_shapes(estimator, estimates, len(z), problem.measurement.n)
     if not estimates.seconds.any():
         estimates.seconds = np.full(len(z), (time.perf_counter() - began) / max(1, len(z)))
     return estimates
+
+
+def _require_shapes(estimator: Estimator, estimates: Any, trials: int, n: int) -> None:
+    """Raises ValueError unless an estimator returned what is asked for: nothing is broadcast over trials."""
+    name = f"{type(estimator).__name__}.estimate"
+    if not isinstance(estimates, Estimates):
+        raise ValueError(f"{name} returns {type(estimates).__name__}, where Estimates are asked for")
+    shapes = {"x": (trials, n), "covariance": (trials, n, n)}
+    shapes |= dict.fromkeys(("status", "iterations", "simulations", "jacobians", "seconds"), (trials,))
+    found = {part: getattr(estimates, part) for part in shapes} | estimates.extras
+    for part, values in found.items():
+        shape, kind = np.shape(values), np.asarray(values).dtype.kind
+        if values is not None and (shape != shapes.get(part, (trials,)) or kind not in "fiub"):
+            what = f"of shape {shape}" if kind in "fiub" else f"of type {np.asarray(values).dtype}"
+            raise ValueError(f"{name} returns {part} {what}, where numbers {shapes.get(part, (trials,))} belong")
 
 
 def one_by_one(trials: Iterable[Any], estimate: Any, n: int) -> Estimates:

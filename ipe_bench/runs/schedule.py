@@ -11,6 +11,7 @@ import datetime
 import functools
 import itertools
 import logging
+import os
 import signal
 import time
 from collections import Counter
@@ -23,10 +24,11 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from ipe_bench.basics.containment import contained
+from ipe_bench.estimators.base import estimate_safely
 from ipe_bench.runs.execution.base import FATAL, Execution, Failure
-from ipe_bench.runs.provenance import class_modules, fingerprint
+from ipe_bench.runs.provenance import class_modules, describe, fingerprint
 from ipe_bench.runs.results import Results
-from ipe_bench.runs.store import ResultKey, Store, describe_names
+from ipe_bench.runs.store import ResultKey, Store, describe_names, digest
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import HISTORIES, Block
 
@@ -64,7 +66,7 @@ class Done:
 
 
 PREPARED = "prepared"
-"""The step of a task after which its cells begin."""
+"""The step of a task after which an estimator begins: what is imported and compiled once is there."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,17 @@ class Progress:
     total: int
     """Trials times estimators that were missing when the run began."""
     failures: tuple[str, ...]
+    preparing: bool = False
+    """Whether nothing has been estimated yet, as code is imported and compiled first."""
+    seconds: float = 0.0
+    """Time since the first estimator began, after imports and compilation."""
+    seconds_left: float | None = None
+    """Forecast from what each estimator took per trial; None before a task has ended, and where one has taken none."""
+
+    @property
+    def rate(self) -> float:
+        """Estimates per second since the first estimator began."""
+        return self.trials / self.seconds if self.seconds else 0.0
 
 
 Watcher = Callable[[Progress], None]
@@ -111,21 +124,25 @@ def plan(
 def run_task(task: Task) -> Iterator[Done | str]:
     """Computes one task and stores each cell's rows as soon as they are there. Runs wherever the execution has it run.
 
-    An exception in one cell fails that cell alone.
+    An exception in one cell fails that cell alone. What an estimator does for the first time in a process, such as to
+    import a library or to compile a model, it does before its time is taken.
     """
-    store, cells = Store(task.directory), _recalled(task)
+    store, cells, process = Store(task.directory), _recalled(task), os.getpid()
     _check_source(cells)
     with _alone(), contained():
         block = Block.draw(cells[0].scenario, task.start, task.stop)
-        # What all cells share, and the loading of compiled code, is not to be charged to the first of them.
+        # What all cells share is not to be charged to the first of them.
         _ = block.crlb_information
-    yield PREPARED
     for index, cell in enumerate(cells):
+        with contextlib.suppress(Exception, SystemExit), _alone(), contained():  # what it raises, it raises again
+            _prepare(block, cell)
+        _end_if_forked(process)
+        yield PREPARED
         began = time.perf_counter()
         failure = None
         try:
             with _alone(), contained():
-                _compute_cell(store, block, cell)
+                _compute_cell(store, block, cell, process)
         except FATAL:
             raise
         except BaseException as error:  # an estimator may raise anything, sys.exit() and KeyboardInterrupt too
@@ -150,6 +167,27 @@ def _recalled(task: Task) -> tuple[ResultKey, ...]:
     return tuple(_recent.setdefault(cell.key, cell) for cell in task.cells)
 
 
+_prepared: set[str] = set()
+
+
+def _prepare(block: Block, cell: ResultKey) -> None:
+    """Has an estimator make a first estimate of a first trial, unless it has made one of this model in this process."""
+    if cell.estimator is None:
+        return
+    model = cell.scenario.measurement
+    compiled = describe(model) if model.by_differential_equations else type(model).__qualname__
+    what = digest([describe(cell.estimator), compiled])
+    if what not in _prepared:
+        _prepared.add(what)
+        estimate_safely(cell.estimator, block.problem, block.trials.z[:1])
+
+
+def _end_if_forked(process: int) -> None:
+    """Ends the copy of this process that an estimator made and returned in: it would tell and store the same again."""
+    if os.getpid() != process:
+        os._exit(0)
+
+
 def _alone() -> Any:
     """One thread in BLAS, whatever the part before has asked for."""
     return _blas().limit(limits=1, user_api="blas")
@@ -160,14 +198,17 @@ def _blas() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def _compute_cell(store: Store, block: Block, cell: ResultKey) -> None:
+def _compute_cell(store: Store, block: Block, cell: ResultKey, process: int) -> None:
     start, stop = block.trials.start, block.trials.stop
     if cell.estimator is None:
         columns = block.truth_columns()
         store.require()
         store.write(cell, start, stop, columns)
         return
-    estimates, columns = block.estimate(cell.estimator)
+    try:
+        estimates, columns = block.estimate(cell.estimator)
+    finally:
+        _end_if_forked(process)
     store.require()
     if start == 0 and estimates.history is not None:
         store.write_history(cell, _history_columns(cell.scenario, estimates.history[:HISTORIES]))
@@ -231,13 +272,31 @@ class RunProgress:
         self.done = 0
         self.trials = 0
         self.failures: list[str] = []
+        self.began: float | None = None
+        """When the first estimator did."""
+        self.ahead: Counter[str] = Counter()
+        """Trials that are left, by what is computed of them."""
+        for task in tasks:
+            self.ahead.update(dict.fromkeys([cell.key for cell in task.cells], task.stop - task.start))
+        self.taken: dict[str, tuple[float, int]] = {}
+        """Seconds and trials of what is done."""
         self.tell()
+
+    def begin(self) -> None:
+        """Notes that an estimator begins."""
+        if self.began is None:
+            self.began = time.monotonic()
+            self.tell()
 
     def close(self, task: Task, cell: ResultKey, failure: Failure | None, seconds: float | None = None) -> None:
         """Notes that a cell of a task is stored, or has failed for good."""
         self.left[id(cell.scenario), task.start, task.stop] -= 1
         self.done += self.left[id(cell.scenario), task.start, task.stop] == 0
         self.trials += _weight(task, cell)
+        self.ahead[cell.key] -= task.stop - task.start
+        if seconds is not None:
+            before = self.taken.get(cell.key, (0.0, 0))
+            self.taken[cell.key] = before[0] + seconds, before[1] + task.stop - task.start
         what = f"{describe_names(cell.names)}, trials {task.start} to {task.stop}"
         if failure is None:
             self.log.info(f"{what}: stored" + ("" if seconds is None else f" after {seconds:.3g} s"))
@@ -248,7 +307,24 @@ class RunProgress:
         self.tell()
 
     def tell(self) -> None:
-        self.watch(Progress(self.done, len(self.left), self.trials, self.total, tuple(self.failures)))
+        seconds = 0.0 if self.began is None else time.monotonic() - self.began
+        preparing = self.began is None and bool(self.left)
+        self.watch(
+            Progress(
+                *(self.done, len(self.left), self.trials, self.total, tuple(self.failures), preparing, seconds),
+                self._seconds_left(seconds),
+            )
+        )
+
+    def _seconds_left(self, seconds: float) -> float | None:
+        """The time that has passed, in proportion to the computing time that is ahead."""
+        spent = sum(taken for taken, _ in self.taken.values())
+        if not self.done or not spent:
+            return None
+        ahead = [(key, trials) for key, trials in self.ahead.items() if trials]
+        if any(key not in self.taken for key, _ in ahead):
+            return None
+        return seconds / spent * sum(trials * self.taken[key][0] / self.taken[key][1] for key, trials in ahead)
 
 
 def run_tasks(
@@ -270,9 +346,13 @@ def run_tasks(
             task = tasks[event.index]
             if isinstance(event.step, Done):
                 closed[event.index].add(event.step.cell)
-                progress.close(task, task.cells[event.step.cell], event.step.failure, event.step.seconds)
+                cell, failure = task.cells[event.step.cell], event.step.failure
+                if failure is None and not store.has(cell, task.start, task.stop):
+                    failure = Failure("died", "was said to be stored and is not; run the same command again")
+                progress.close(task, cell, failure, event.step.seconds)
             elif event.step == PREPARED:
                 prepared.add(event.index)
+                progress.begin()
             if not event.ended or event.failure is None:
                 continue
             left = []

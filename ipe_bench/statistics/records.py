@@ -854,7 +854,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "time_median_s",
         "time",
         "all trials",
-        "Median wall clock of a trial, a batch's shared evenly.",
+        "Median over trials of the mean wall clock per trial of the block that a trial was computed in.",
         lambda s: quantile(s.scalars["time_s"], 0.5),
         kind="seconds",
         where=("costs", "terminal"),

@@ -14,12 +14,14 @@ import numpy as np
 
 from ipe_bench.estimators.base import Estimates, Estimator
 
+_begun: set[int] = set()
+
 
 @dataclass(frozen=True)
 class Rogue(Estimator):
     """Estimates nothing but zeros, or does what it says; `until` names a file from whose existence on it behaves."""
 
-    does: Literal["behave", "sleep", "exit", "sys_exit", "kill", "memory", "raise", "shape"]
+    does: Literal["behave", "sleep", "exit", "sys_exit", "kill", "memory", "raise", "shape", "row", "fork", "once"]
     until: str = ""
 
     def estimate(self, problem, z, *, history=False):
@@ -30,6 +32,8 @@ class Rogue(Estimator):
             self.misbehave()
             if self.does == "shape":
                 n += 1
+            if self.does == "row":
+                return Estimates(np.zeros(n), np.zeros(len(z), dtype=np.int8))
         return Estimates(np.zeros((len(z), n)), np.zeros(len(z), dtype=np.int8))
 
     def misbehave(self):
@@ -46,6 +50,12 @@ class Rogue(Estimator):
                 hog = []
                 while True:
                     hog.append(np.ones(1_000_000))
+            case "fork":
+                os.fork()
+            case "once":
+                if os.getpid() not in _begun:
+                    _begun.add(os.getpid())
+                    time.sleep(0.5)
             case "raise":
                 raise ArithmeticError("rogue")
 

@@ -24,6 +24,7 @@ from ipe_bench.priors import GaussianPrior
 from ipe_bench.runs.execution import Auto, Dask, Event, Failure, Processes, Serial
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import compute
+from ipe_bench.runs.store import Store
 from ipe_bench.solvers import Newton
 
 GOOD = {"linear_lse": LinearLSE(), "newton": Newton()}
@@ -103,8 +104,9 @@ def test_a_run_completes_when_a_worker_is_killed(tmp_path, reference, execution)
         ("exit", {}, "exit code 7"),
         ("sys_exit", {}, "SystemExit: 3"),
         pytest.param("kill", {}, "SIGKILL", marks=pytest.mark.slow),
-        ("shape", {}, "ValueError"),
-        ("sleep", {"block_timeout_s": 0.5}, "block_timeout_s=0.5"),
+        ("shape", {}, "x of shape (10, 4)"),
+        ("row", {}, "x of shape (3,)"),
+        ("sleep", {"block_timeout_s": 3.0}, "block_timeout_s=3"),
         pytest.param(
             *("memory", {"memory_limit_gb": 1.0}, "MemoryError"),
             marks=pytest.mark.skipif(sys.platform != "linux", reason="limits memory on Linux only"),
@@ -127,6 +129,41 @@ def test_an_exception_in_an_estimator_is_a_status_and_no_failure(tmp_path):
     rows = results.load(next(cell for cell in results.stored.values() if cell.label == "rogue"), None)
     assert set(rows["status"]) == {"error"}
     assert set(rows["message"]) == {"ArithmeticError: rogue"}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="forks")
+def test_a_part_that_forks_and_returns_in_both_processes_loses_no_row(tmp_path, reference):
+    estimators = {"rogue": Rogue("fork"), **GOOD}
+    assert compute([scenario()], estimators, 40, tmp_path, execution=Processes(1), block_size=10) == ()
+    there = stored(tmp_path)
+    assert_same({name: there[name] for name in reference}, reference)
+    assert Results.read([tmp_path]).problems == []
+
+
+def test_what_is_said_to_be_stored_and_is_not_is_a_failure(tmp_path, monkeypatch):
+    monkeypatch.setattr(Store, "write", lambda *arguments: None)
+    failures = compute([scenario()], GOOD, 10, tmp_path, execution=Serial())
+    assert len(failures) == 3
+    assert all("is not" in failure for failure in failures)
+
+
+@pytest.mark.parametrize("execution", [Serial(), Processes(1)], ids=repr)
+def test_what_a_process_does_first_is_not_booked_as_time_of_estimation(tmp_path, execution):
+    """As an import or a compilation, of half a second here: in 10 trials, 0.05 s for each of them."""
+    rogues._begun.clear()
+    compute([scenario()], {"once": Rogue("once")}, 20, tmp_path, execution=execution, block_size=10)
+    results = Results.read([tmp_path])
+    rows = results.load(next(cell for cell in results.stored.values() if cell.label == "once"), None)
+    assert rows["time_s"].max() < 0.03
+
+
+def test_no_forecast_is_made_before_a_block_is_done(tmp_path):
+    told = []
+    compute([scenario()], GOOD, 30, tmp_path, execution=Serial(), block_size=10, watch=told.append)
+    assert [p.preparing for p in told] == [True] + [False] * (len(told) - 1)
+    assert all((p.seconds_left is None) == (p.done == 0) for p in told)
+    assert told[-1].seconds_left == 0
+    assert told[-1].rate == pytest.approx(60 / told[-1].seconds)
 
 
 def test_what_failed_is_tried_again_by_the_next_run(tmp_path):
