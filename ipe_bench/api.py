@@ -15,13 +15,12 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
-from ipe_bench.priors import GaussianPrior, Prior
+from ipe_bench.priors import Prior
 from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.results import Results, require_results
-from ipe_bench.runs.run import TRIALS, compute, unmet_needs, validate
+from ipe_bench.runs.run import TRIALS, compute, validate
 from ipe_bench.runs.schedule import Watcher
 from ipe_bench.trials.scenario import Scenario
 
@@ -291,7 +290,7 @@ def status(directories: Directories) -> pd.DataFrame:
 
 def estimate(
     model: Measurement,
-    readings: Path | str | Sequence[Path | str] | Array,
+    readings: Path | str | Sequence[Path | str] | Array | None = None,
     estimators: Mapping[str, Estimator] | None = None,
     *,
     noise: Noise | None = None,
@@ -303,15 +302,15 @@ def estimate(
     """Parameters from real readings, by every estimator: estimates, standard errors, residuals and a test of the fit.
 
     `readings` is a CSV file (see `ipe_bench.real.readings`), several that share parameters, or an array z (m,) in the
-    model's order and unit; NaN is missing. Without `estimators`: `linear_lse`, `levenberg_marquardt` and `auto`, as in
-    the command. `noise` states R. Without it R is what the file says in its column sigma, or the model of its own
-    noise; where neither does, the readings are taken for independent and equally noisy, and the level is estimated from
-    the residuals (`Unknown`): then their size cannot test the fit. Filters and `map_lm` need to know how far from the
-    model's nominal point the parameters may be: `error_scale` is the standard deviation of each in multiples of its
-    size, and `prior` widens or narrows some, or makes them depend on each other (`ipe_bench.priors.prior_of` makes one
-    of a covariance). `ignore_rows` and `ignore_columns` of the files are left out (see `LeftOut`). `x` and `covariance`
-    of a fit are in the parameters' own units. The answer is the sequence of the fits; it shows itself in a notebook,
-    and `table()` is a frame.
+    model's order and unit; NaN is missing. None: those that come with the model. Without `estimators`: `linear_lse`,
+    `levenberg_marquardt` and `auto`, as in the command. `noise` states R. Without it R is what the file says in its
+    column sigma, or the model of its own noise; where neither does, the readings are taken for independent and equally
+    noisy, and the level is estimated from the residuals (`Unknown`): then their size cannot test the fit. Filters and
+    `map_lm` need to know how far from the model's nominal point the parameters may be: `error_scale` is the standard
+    deviation of each in multiples of its size, and `prior` widens or narrows some, or makes them depend on each other
+    (`ipe_bench.priors.prior_of` makes one of a covariance). `ignore_rows` and `ignore_columns` of the files are left
+    out (see `LeftOut`). `x` and `covariance` of a fit are in the parameters' own units. The answer is the sequence of
+    the fits; it shows itself in a notebook, and `table()` is a frame.
 
     >>> import ipe_bench as ib
     >>> model = ib.measurements.Polynomial()
@@ -327,43 +326,19 @@ def estimate(
             what is not given.
     """
     from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
-    from ipe_bench.noise.own import ModelNoise, Unknown
-    from ipe_bench.real.examination import examinations
-    from ipe_bench.real.fits import fit
-    from ipe_bench.real.sources import LeftOut, Readings, noise_of, open_together
+    from ipe_bench.real.estimation import Question
+    from ipe_bench.real.sources import LeftOut
     from ipe_bench.report.answer import Answer
     from ipe_bench.solvers import Auto
 
     if estimators is None:
         estimators = {"linear_lse": LinearLSE(), "levenberg_marquardt": LevenbergMarquardt(), "auto": Auto()}
+    if isinstance(readings, str | Path):
+        readings = [readings]
+    given = readings if readings is None or isinstance(readings, np.ndarray) else tuple(map(Path, readings))
     left_out = LeftOut(tuple(ignore_columns), tuple(ignore_rows))
-    if isinstance(readings, np.ndarray):
-        if left_out:
-            raise UserError("ignore_rows, ignore_columns: are of files; set readings to NaN in an array")
-        z = np.array(readings, dtype=float)
-        if z.shape != (model.m,):
-            raise UserError(
-                f"readings: has shape {z.shape}; give the {model.m} readings of {model.name}, NaN where missing"
-            )
-        found = Readings(model, z)
-    else:
-        paths = [readings] if isinstance(readings, str | Path) else readings
-        found = open_together([Path(path) for path in paths], model, left_out)
-    known = noise_of(found, noise) or ModelNoise().of(found.model) or Unknown()
-    problem = _real_problem(found.model, known, prior, error_scale)
-    if lacking := unmet_needs(problem, estimators):
-        remedy = "; give error_scale" if error_scale is None and prior is None else ""
-        raise UserError("; ".join(lacking) + remedy)
-    fits = fit(problem, found.z, estimators, known)
-    return Answer(found.model.name, found.model, found.z, fits, examinations(problem, found.z, fits), left_out.said)
-
-
-def _real_problem(model: Measurement, noise: Noise, prior: Prior | None, error_scale: float | None) -> Problem:
-    """What estimators are told where readings are real: a prior only where somebody states one."""
-    known = prior is not None or error_scale is not None
-    scale = 1.0 if error_scale is None else error_scale
-    problem = Scenario(model, noise, prior or GaussianPrior(), scale).problem
-    return problem if known else problem.without_prior()
+    stated: dict[str, Any] = {"noise": noise, "prior": prior, "error_scale": error_scale, "left_out": left_out}
+    return Answer.to(Question(model=model, readings=given, estimators=estimators, **stated).opened())
 
 
 def design(

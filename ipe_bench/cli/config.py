@@ -6,117 +6,27 @@ import fnmatch
 import json
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from typing import Any
 
-import cloudpickle
 import yaml
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from ipe_bench.api import objective_columns
 from ipe_bench.basics.errors import UserError, describe_exception, unknown
 from ipe_bench.cli.search_path import extend
-from ipe_bench.estimators.base import Estimator
-from ipe_bench.measurements.base import Measurement
-from ipe_bench.measurements.known import Informed, Known, informed
+from ipe_bench.cli.spec import DEFAULTS, KEYS, Spec, spec
 from ipe_bench.measurements.nist import datasets
-from ipe_bench.noise import ModelNoise, Noise, Unknown
 from ipe_bench.plugins import discovery as plugins
-from ipe_bench.plugins.construct import construct
-from ipe_bench.priors import GaussianPrior, Prior, prior_of
-from ipe_bench.real.covariances import read_covariance
-from ipe_bench.real.sources import Readings
-from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
-from ipe_bench.runs.execution import Execution
-from ipe_bench.runs.provenance import TARGET, canonical_json, describe
-from ipe_bench.runs.run import MOST_TRIALS, TRIALS
-from ipe_bench.trials.scenario import Scenario
+from ipe_bench.runs.provenance import TARGET
 
 CONFIG_ERRORS = (HydraException, OmegaConfBaseException)
-Opened: TypeAlias = Callable[[DictConfig, Measurement], Readings | None]
-
-
-@dataclass
-class Schema:
-    """The keys of a run besides the groups, with their types."""
-
-    default_name: str = "gins"
-    """What the command was, in short: names the output folder where nothing else does."""
-    name: str = "${default_name}"
-    """Names the output folder."""
-    output: str = MISSING
-    error_scale: float = 1.0
-    """Standard deviation of the true parameters, in multiples of their units."""
-    seed: int = 0
-    trials: int | None = None
-    """1000 unless given; with a precision, the most there may be."""
-    precision: Any = None
-    """How near to what is found success shares have to be (0.01), or {success: 0.01, rmse: 0.05}: then there are just
-    enough trials."""
-    time_limit: float | None = None
-    """Seconds after which, with a precision, no more blocks are begun."""
-    figures: str = "main"
-    """Which to draw: all, main (the few that answer the question), or none."""
-    formats: Any = "png"
-    """Of the figures' files: png, and what is named of pdf and svg as well."""
-    block_size: int | None = None
-    """Trials per unit of work; changes no number. 250 unless given, and up to 1000 of a hundred thousand trials."""
-    readings: Any = None
-    """A file of real readings, for `estimate`, or a list of files that are estimated together."""
-    ignore_rows: Any = None
-    """Rows of the file to leave out, by their numbers: their readings are missing. Of several files FILE:NUMBER."""
-    ignore_columns: Any = None
-    """Columns of the file to leave out."""
-    write_readings: str | None = None
-    """Write the simulated readings of one trial to this file instead of running."""
-    write_readings_trial: int = 0
-    measurement: Any = MISSING
-    truth_measurement: Any = None
-    """What simulates the readings, where it differs from what the estimators assume."""
-    noise: Any = MISSING
-    prior: Any = MISSING
-    parameters: Any = None
-    """What is known of the parameters: parameters.NAME.fixed=, .nominal=, .deviation=, .lower=, .upper=, .positive=; or
-    a YAML file of that, parameters=FILE."""
-    prior_covariance: Any = None
-    """P0 of the parameters in their own units, at error scale 1: a matrix in their order, or a CSV file with their
-    names in its header."""
-    execution: Any = MISSING
-    objective: str | None = None
-    """LABEL.COLUMN, such as newton.capped_error: a number of each job, which sweepers that optimise make small."""
-    estimators: dict[str, Any] = field(default_factory=dict)
-
-
-KEYS = tuple(Schema.__dataclass_fields__)
-
-
-@dataclass(frozen=True)
-class Job:
-    """One composed config, constructed."""
-
-    scenario: Scenario
-    estimators: Mapping[str, Estimator]
-    execution: Execution
-    trials: int
-    """Or the most there may be, where there is a precision."""
-    block_size: int | None
-    output: str
-    precision: Any = None
-    time_limit: float | None = None
-    objective: tuple[str, str] | None = None
-    """The label of an estimator and a column of its row over all parameters."""
-    readings: Readings | None = None
-    """Of the files, for an estimate from them."""
-    figures: Which = "main"
-    formats: tuple[str, ...] = (PAGE,)
 
 
 class PluginConfigs(SearchPathPlugin):
@@ -130,7 +40,7 @@ def prepare() -> None:
     """Makes the schema and the plugins known to Hydra."""
     for problem in plugins.take_problems():
         print(f"ipe-bench: {problem}", file=sys.stderr)
-    ConfigStore.instance().store("schema", node=Schema, provider="ipe-bench")
+    ConfigStore.instance().store("schema", node=DEFAULTS, provider="ipe-bench")
     registry = Plugins.instance()
     if PluginConfigs not in registry.discover(SearchPathPlugin):
         registry.register(PluginConfigs)
@@ -198,7 +108,7 @@ def _from_file(override: str) -> list[str]:
     group = key.removesuffix(".file").lstrip("+")
     said = override if group != "parameters" else f"{group}={name}"
     try:
-        content = yaml.safe_load(Path(name).read_text(encoding="utf-8"))
+        content = plugins.read_yaml(Path(name).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{said}: cannot be read ({error.__class__.__name__}); name a YAML file") from None
     except yaml.YAMLError as error:
@@ -233,162 +143,11 @@ def _in_hydras_words(override: str) -> str:
     return f"++{override}" if _OPEN.match(override) else override
 
 
-def assemble(config: DictConfig, opened: Opened | None = None) -> Job:
-    """The scenario, the estimators and the execution that a composed config describes; UserError by key.
-
-    `opened` estimates from real readings: it opens the files that the config names. The level of their noise need not
-    be known.
-    """
+def assemble(config: DictConfig) -> Spec:
+    """The checked job of a composed config; UserError by key."""
     plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     assert isinstance(plain, dict)
-    for key in plain:
-        if key not in KEYS:
-            raise UserError(f"{key}: {unknown(str(key), KEYS, 'key')}")
-    for key in KEYS:
-        if key not in plain:
-            raise UserError(f"{key}: is left out; give it a value")
-    for key in ("name", "output"):
-        if not Path(plain[key]).name:
-            raise UserError(f"{key}={plain[key]}: name a folder")
-    truth = plain["truth_measurement"]
-    measurement, noise = _part(plain, "measurement", Measurement), _part(plain, "noise", Noise)
-    truth = None if truth is None else _part(plain, "truth_measurement", Measurement)
-    prior = _part(plain, "prior", Prior)
-    readings = opened(config, measurement) if opened is not None else None
-    if readings is not None:
-        measurement = readings.model
-    if opened is not None and isinstance(noise, ModelNoise):
-        noise = noise.of(measurement) or Unknown()
-    known = _known(plain["parameters"])
-    if known:
-        measurement = informed(measurement, known)
-        truth = None if truth is None else informed(truth, known)
-    if readings is not None:
-        readings = replace(readings, model=measurement)
-    prior = _prior(prior, measurement, plain["prior_covariance"])
-    scenario = Scenario(measurement, noise, prior, plain["error_scale"], plain["seed"], truth)
-    execution = _part(plain, "execution", Execution)
-    estimators: dict[str, Estimator] = {}
-    for label, options in (plain["estimators"] or {}).items():
-        if not isinstance(options, Mapping):
-            raise UserError(f"estimators.{label}={options}: set its options, such as estimators.{label}.KEY=VALUE")
-        if TARGET not in options:
-            keys = ", ".join(f"estimators.{label}.{key}" for key in options) or f"estimators.{label}"
-            raise UserError(
-                f"{keys}: is set, but {label} is not chosen; add it to solver= or baseline=, or leave it out"
-            )
-        _refuse_false_name(str(label), options[TARGET])
-        estimators[str(label)] = _checked(construct(options, f"estimators.{label}"), f"estimators.{label}", Estimator)
-    precision, time_limit = plain["precision"], plain["time_limit"]
-    if time_limit is not None and precision is None:
-        raise UserError(f"time_limit={time_limit}: goes with precision=; give that, or leave it out")
-    unless = TRIALS if precision is None else MOST_TRIALS
-    trials = unless if plain["trials"] is None else plain["trials"]
-    block_size, output = plain["block_size"], plain["output"]
-    objective = _objective(plain["objective"], list(estimators))
-    figures = which_figures(plain["figures"])
-    return Job(
-        *(scenario, estimators, execution, trials, block_size, output, precision, time_limit, objective),
-        readings=readings,
-        figures=figures,
-        formats=file_formats(plain["formats"]),
-    )
-
-
-def _objective(given: str | None, labels: Sequence[str]) -> tuple[str, str] | None:
-    """The label and the column that objective=LABEL.COLUMN names."""
-    if given is None:
-        return None
-    label, dot, column = given.rpartition(".")
-    if not dot or label not in labels:
-        what = unknown(label, labels, "estimator") if dot else "write LABEL.COLUMN, such as newton.capped_error"
-        raise UserError(f"objective={given}: {what}")
-    columns = objective_columns()
-    if column not in columns:
-        raise UserError(f"objective={given}: {unknown(column, columns, 'column')}")
-    return label, column
-
-
-def _known(given: Any) -> tuple[Known, ...]:
-    """What the key `parameters` says of each."""
-    if given is None:
-        return ()
-    if not isinstance(given, Mapping):
-        raise UserError("parameters: give each what is known of it, such as parameters.NAME.fixed=0.1")
-    found = []
-    for name, options in given.items():
-        where = f"parameters.{name}"
-        if not isinstance(options, Mapping):
-            raise UserError(f"{where}={options}: say what that is, such as {where}.fixed={options}")
-        target = f"{Known.__module__}.{Known.__qualname__}"
-        found.append(construct({TARGET: target, "name": str(name), **options}, where))
-    return tuple(found)
-
-
-def _prior(prior: Prior, model: Measurement, covariance: Any) -> Prior:
-    """The prior with what is known of single parameters, or of all together."""
-    deviating = isinstance(model, Informed) and any(one.deviation is not None for one in model.known)
-    if covariance is not None:
-        if not isinstance(prior, GaussianPrior):
-            raise UserError(f"prior_covariance: is for prior=gaussian; with prior={prior.name}, leave it out")
-        if deviating or prior != GaussianPrior():
-            other = "parameters.NAME.deviation" if deviating else "prior.deviations or prior.correlations"
-            raise UserError(f"prior_covariance: says all of the prior; leave out {other}")
-        return prior_of(model, read_covariance(covariance, [p.name for p in model.natural_parameters]))
-    return prior if not isinstance(model, Informed) else _informed_prior(prior, model)
-
-
-def _informed_prior(prior: Prior, model: Informed) -> GaussianPrior:
-    """The prior with the deviations that are known of single parameters."""
-    if not isinstance(prior, GaussianPrior):
-        raise UserError(f"parameters: goes with prior=gaussian, which is told of each; prior={prior.name} is not")
-    if prior.deviations is None:
-        return replace(prior, deviations=model.prior_deviations)
-    names = [p.name for p in model.whole.parameters]
-    if len(prior.deviations) != len(names):
-        raise UserError(
-            f"prior.deviations: has {len(prior.deviations)} numbers; give one for each of {len(names)} parameters"
-        )
-    general = dict(zip(names, prior.deviations, strict=True))
-    own = {one.name for one in model.known if one.deviation is not None}
-    known = zip(model.natural_parameters, model.prior_deviations, strict=True)
-    return replace(prior, deviations=tuple(d if p.name in own else general[p.name] for p, d in known))
-
-
-Part = TypeVar("Part")
-
-
-def _part(plain: Mapping[Any, Any], key: str, kind: type) -> Any:
-    config = plain[key]
-    if not isinstance(config, Mapping) or TARGET not in config:
-        raise UserError(f"{key}={config}: is not a part that can be used; choose one, see `ipe-bench list`")
-    return _checked(construct(config, key), key, kind)
-
-
-def _checked(part: Any, key: str, kind: type[Part]) -> Part:
-    """The part, where it is of the kind that belongs there and can be stored and sent to other processes."""
-    if not isinstance(part, kind):
-        name = type(part).__name__
-        raise UserError(f"{key}: {name} is not a {kind.__name__.lower()}; choose one, see `ipe-bench list`")
-    try:
-        canonical_json(describe(part))
-        cloudpickle.dumps(part)
-    except Exception as error:  # whatever a field's own methods raise
-        raise UserError(
-            f"{key}: a field of {type(part).__name__} can be neither stored nor sent to a worker "
-            f"({describe_exception(error)}); use numbers, texts, lists and components"
-        ) from None
-    return part
-
-
-def _refuse_false_name(label: str, target: Any) -> None:
-    """Refuses to table one estimator under the name of another."""
-    for group in plugins.ESTIMATOR_GROUPS:
-        for option in plugins.options(group):
-            if option.label == label and option.target != str(target):
-                raise UserError(
-                    f"estimators.{label}: is {target}, under the name of {group}={label}; choose another label"
-                )
+    return spec(plain)
 
 
 def explain(error: BaseException) -> UserError:

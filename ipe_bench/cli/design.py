@@ -8,8 +8,8 @@ from typing import Any
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console
-from ipe_bench.cli.config import Job
 from ipe_bench.cli.single import NOT_OF_ONE_SCENARIO, compose_single, first_of
+from ipe_bench.cli.spec import Spec
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
@@ -58,7 +58,7 @@ def _refuse_keys_without_use(words: Sequence[str]) -> None:
         raise UserError(f"{key}: is for `ipe-bench run`, and nothing in a design; leave it out{remedy}")
 
 
-def _errors(job: Job) -> list[Measurement]:
+def _errors(job: Spec) -> list[Measurement]:
     """The truth that was asked for; else every richer version of the model that there is an option of."""
     if job.scenario.truth is not None:
         if not job.scenario.truth.nuisance_deviation.any():

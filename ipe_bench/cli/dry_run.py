@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ipe_bench.basics.machine import cores
-from ipe_bench.cli.config import Job
+from ipe_bench.cli.spec import Spec
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import result_keys, validate
 from ipe_bench.runs.schedule import plan
@@ -34,25 +34,25 @@ class DryRun:
     _tried: dict[tuple[str, str, float], float] = field(default_factory=dict)
     """Seconds per trial, by what they depend on most."""
 
-    def add(self, job: Job, title: str) -> str:
+    def add(self, job: Spec, title: str) -> str:
         """Notes what a job lacks; a line for people."""
-        validate([job.scenario], job.estimators, job.trials, job.block_size)
+        validate([job.scenario], job.estimators, job.count, job.block_size)
         cells = result_keys(job.scenario, job.estimators)
         output = Path(job.output)
         results = Results.read([output] if output.is_dir() else [], keys={cell.key for cell in cells})
         lacking = {cell.key: 0 for cell in cells}
-        for task in plan(output, cells, results, job.trials, job.block_size):
+        for task in plan(output, cells, results, job.count, job.block_size):
             for cell in task.cells:
                 lacking[cell.key] += task.stop - task.start
         estimates = [cell for cell in cells if cell.estimator is not None]
         missing = sum(lacking[cell.key] for cell in estimates)
-        stored = job.trials * len(estimates) - missing
+        stored = job.count * len(estimates) - missing
         seconds = sum(lacking[c.key] * self._per_trial(c, results) for c in estimates if lacking[c.key])
         self.stored, self.missing, self.seconds = self.stored + stored, self.missing + missing, self.seconds + seconds
         most = "" if job.precision is None else "at most "
         self.most = self.most or most
         self.workers = getattr(job.execution, "workers", None) or cores()
-        return f"{title}: {stored} of {job.trials * len(estimates)} estimates are stored" + (
+        return f"{title}: {stored} of {job.count * len(estimates)} estimates are stored" + (
             f", {most}{missing} are missing (on one core {duration(seconds)})" if missing else ""
         )
 

@@ -19,7 +19,7 @@ def main(arguments: Sequence[str], particles: int) -> int:
     """Samples, prints a table and writes files; exit code 1 where the populations of a trial do not agree."""
     single = compose_single("posterior", arguments, _refuse_keys_without_use)
     job, name = single.job, single.measurement
-    trials = job.trials if any(w.lstrip("+").startswith("trials=") for w in single.words) else _TRIALS
+    trials = job.count if any(w.lstrip("+").startswith("trials=") for w in single.words) else _TRIALS
     if trials > _MOST_TRIALS:
         raise UserError(f"trials={trials}: each takes up to a minute; give at most {_MOST_TRIALS}")
     if job.scenario.noise.real:

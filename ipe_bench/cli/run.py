@@ -23,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from ipe_bench.basics.errors import StorageError, UserError, shortened
 from ipe_bench.cli import console, interrupts
-from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, assemble, explain, prepare, rewrite
+from ipe_bench.cli.config import CONFIG_ERRORS, assemble, explain, prepare, rewrite
 from ipe_bench.cli.dry_run import DryRun
 from ipe_bench.cli.flags import flags_of_hydra
 from ipe_bench.cli.overrides import default_name, known_options, read
@@ -31,6 +31,7 @@ from ipe_bench.cli.parser import INFO_TOPICS, parsers
 from ipe_bench.cli.progress import shown_progress
 from ipe_bench.cli.report import main as report
 from ipe_bench.cli.report import show_command
+from ipe_bench.cli.spec import KEYS, Spec
 from ipe_bench.cli.typed import check_options
 from ipe_bench.measurements import Nist
 from ipe_bench.plugins import discovery as plugins
@@ -309,26 +310,26 @@ def task(config: DictConfig) -> float | None:
     return None
 
 
-def _objective(job: Job) -> float:
+def _objective(job: Spec) -> float:
     from ipe_bench.statistics.stopping import objective
 
     assert job.objective is not None
-    value = objective(job.scenario, job.estimators, *job.objective, job.output)
+    value = objective(job.scenario, job.estimators, *job.aim, job.output)
     words = [word for word in HydraConfig.get().overrides.task if not word.startswith("objective=")]
     _outcome.objectives.append((value, words))
     return value
 
 
-def _compute(job: Job, execution: Execution, watch: Watcher) -> tuple[str, ...]:
+def _compute(job: Spec, execution: Execution, watch: Watcher) -> tuple[str, ...]:
     """Computes the trials that are asked for, or just enough; returns the messages of what failed."""
     options: dict[str, Any] = {"execution": execution, "block_size": job.block_size, "watch": watch}
     options["command"] = _outcome.command
     if job.precision is None:
-        return compute([job.scenario], job.estimators, job.trials, job.output, **options)
+        return compute([job.scenario], job.estimators, job.count, job.output, **options)
     from ipe_bench.statistics.stopping import compute_until
 
     options |= {"precision": job.precision, "time_limit": job.time_limit}
-    failures, (stop,) = compute_until([job.scenario], job.estimators, job.trials, job.output, **options)
+    failures, (stop,) = compute_until([job.scenario], job.estimators, job.count, job.output, **options)
     verdict = "" if stop.reached else "the precision is not reached: "
     line = f"{_title(job)}: {stop.trials} trials; {verdict}{stop.reason} ({stop.widest})"
     _outcome.short |= not stop.reached
@@ -380,7 +381,7 @@ _NOT_IN_TITLES = {
 }
 
 
-def _title(job: Job) -> str:
+def _title(job: Spec) -> str:
     """What a job is about, for its progress bar: everything that may tell it from other jobs of a sweep."""
     scenario, chosen = job.scenario, HydraConfig.get().runtime.choices
     model = scenario.measurement
@@ -397,7 +398,7 @@ def _title(job: Job) -> str:
     return ", ".join(parts)
 
 
-def write_trial(job: Job, path: Path, trial: int) -> None:
+def write_trial(job: Spec, path: Path, trial: int) -> None:
     """Writes the simulated readings of one trial, and its true parameters beside them."""
     from ipe_bench.real.readings import write_readings, write_truth
 

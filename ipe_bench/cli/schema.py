@@ -4,29 +4,15 @@ from __future__ import annotations
 
 import json
 import sys
-import typing
 from typing import Any
 
-from ipe_bench.basics.options import Count, NonNegative, Positive, Whole
-from ipe_bench.cli.config import Schema as Keys
+from ipe_bench.cli.spec import DEFAULTS, KINDS, Spec
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.description import meanings
 from ipe_bench.plugins.schema import DIALECT, Schema, components, name_of, option_schema
 from ipe_bench.runs.provenance import TARGET
 
 _DEFINED = "#/$defs/"
-
-
-class _Limited:
-    """What is checked of these keys behind Hydra, which knows no limits."""
-
-    error_scale: Positive
-    seed: Whole
-    trials: Count | None
-    time_limit: NonNegative | None
-    block_size: Count | None
-    write_readings_trial: Whole
-    readings: str | tuple[str, ...] | None
 
 
 def main() -> int:
@@ -88,12 +74,9 @@ def _of_experiments(known: list[plugins.Option], options: list[plugins.Option]) 
 
 
 def _keys() -> dict[str, Schema]:
-    hints = typing.get_type_hints(Keys) | typing.get_type_hints(_Limited, include_extras=True)
-    texts = meanings(Keys)
-    fields = {name: field for name, field in Keys.__dataclass_fields__.items() if name != "estimators"}
+    texts = meanings(Spec)
     found = {
-        name: option_schema(hints[name], name, texts.get(name, ""), **_default(field.default))
-        for name, field in fields.items()
+        name: option_schema(kind, name, texts.get(name, ""), **_default(DEFAULTS[name])) for name, kind in KINDS.items()
     }
     return {**found, "estimators": {"title": "estimators", "type": "object"}}
 

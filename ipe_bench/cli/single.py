@@ -10,9 +10,11 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from ipe_bench.cli.config import CONFIG_ERRORS, KEYS, Job, Opened, assemble, explain, prepare, rewrite
+from ipe_bench.cli.config import CONFIG_ERRORS, assemble, explain, prepare, rewrite
 from ipe_bench.cli.overrides import read
+from ipe_bench.cli.spec import KEYS, Spec
 from ipe_bench.cli.typed import check_options
+from ipe_bench.measurements import Nist
 from ipe_bench.plugins import discovery as plugins
 
 NOT_OF_ONE_SCENARIO = (
@@ -37,10 +39,12 @@ def first_of(keys: Sequence[str], words: Sequence[str]) -> str | None:
     return next((key for key in named if key.split(".")[0].split("@")[0] in keys), None)
 
 
-def chosen_measurement(arguments: Sequence[str], job: Job) -> str:
-    """The option that was chosen, which says more than the class."""
+def chosen_measurement(arguments: Sequence[str], job: Spec) -> str:
+    """The option that was chosen, which says more than the class; of NIST's data sets nist/NAME."""
+    if isinstance(job.measurement, Nist):
+        return f"nist/{job.measurement.dataset.lower()}"
     chosen = [a.partition("=")[2] for a in arguments if a.startswith("measurement=")]
-    return chosen[-1] if chosen else job.scenario.measurement.name
+    return chosen[-1] if chosen else job.measurement.name
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class Single:
     words: Sequence[str]
     """The overrides in Hydra's own words."""
     config: DictConfig
-    job: Job
+    job: Spec
     measurement: str
     """The model, as it was asked for."""
     named: bool
@@ -68,8 +72,6 @@ def compose_single(
     refuse: Callable[[Sequence[str]], Any],
     *,
     standard: Sequence[str] = (),
-    measurement: Callable[[Sequence[str], Job], str] = chosen_measurement,
-    opened: Opened | None = None,
 ) -> Single:
     """Composes and constructs what the arguments of a command ask for.
 
@@ -90,8 +92,8 @@ def compose_single(
         raise explain(error) from error
     named = any(a.lstrip("+").startswith(("name=", "output=")) for a in arguments)
     try:
-        job = assemble(config, opened)
-        name = measurement(arguments, job)
+        job = assemble(config)
+        name = chosen_measurement(arguments, job)
         if not named:
             config.name = f"{command}-{name.replace('/', '-')}"
     except CONFIG_ERRORS as error:

@@ -36,7 +36,7 @@ def construct(config: Any, where: str) -> Any:
             return {str(k): construct(v, f"{where}.{k}") for k, v in config.items()}
         cls = find_class(config[TARGET], where)
         options = {str(k): construct(v, f"{where}.{k}") for k, v in config.items() if k != TARGET}
-        return _instantiate(cls, options, where)
+        return instantiate(cls, options, where)
     if isinstance(config, list | tuple):
         return tuple(construct(v, f"{where}[{i}]") for i, v in enumerate(config))
     return config
@@ -80,11 +80,13 @@ def find_object(target: Any, where: str) -> Any:
         raise UserError(f"{where}: its module cannot be imported: {place_of(error)}") from None
 
 
-def _instantiate(cls: type, options: dict[str, Any], where: str) -> Any:
+def instantiate(cls: type, options: Mapping[str, Any], where: str) -> Any:
+    """A dataclass with these options; the key `where` stands before their names in messages, unless it is empty."""
+    prefix = f"{where}." if where else ""
     fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
     for name in options:
         if name not in fields:
-            raise UserError(f"{where}.{name}: {unknown(name, fields, 'option')}")
+            raise UserError(f"{prefix}{name}: {unknown(name, fields, 'option')}")
     required = [f.name for f in fields.values() if f.default is f.default_factory and f.name not in options]
     try:
         # A class of a plugin need not be a `Component`, nor call its `__post_init__`.
@@ -94,7 +96,7 @@ def _instantiate(cls: type, options: dict[str, Any], where: str) -> Any:
             raise UserError(f"{required[0]}: is not given; give it a value")
         return cls(**options)
     except UserError as error:
-        raise UserError(f"{where}.{error}") from None
+        raise UserError(f"{prefix}{error}") from None
     except KeyboardInterrupt:
         raise
     except BaseException as error:

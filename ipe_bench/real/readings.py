@@ -9,11 +9,12 @@ Nothing is guessed: what is not plainly a number, or not part of the table, is r
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import math
 import re
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,8 @@ class Table:
     decimal: str = "."
     key: str = "readings"
     """The key of the config that names the file."""
+    digest: str = ""
+    """SHA-256 of the bytes that were read."""
 
     def error(self, text: str) -> UserError:
         return UserError(f"{self.key}={self.path}: {text}")
@@ -183,7 +186,9 @@ def read_table(path: Path, *, key: str = "readings", without: Collection[int] = 
     """
     if not path.is_file():
         raise UserError(f"{key}={path}: there is no such file")
-    table = _read_parquet(path, key) if path.suffix == ".parquet" else _read_text(path, key)
+    data = path.read_bytes()
+    table = (_read_parquet if path.suffix == ".parquet" else _read_text)(path, key, data)
+    table = replace(table, digest=hashlib.sha256(data).hexdigest())
     for name in table.heading:
         if table.heading.count(name) > 1:
             what = f"column {name} stands there" if name else "columns without a name stand there"
@@ -194,12 +199,12 @@ def read_table(path: Path, *, key: str = "readings", without: Collection[int] = 
     return table
 
 
-def _read_parquet(path: Path, key: str) -> Table:
+def _read_parquet(path: Path, key: str, data: bytes) -> Table:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        table = pq.read_table(path)
+        table = pq.read_table(pa.BufferReader(data))
     except (pa.ArrowException, OSError) as error:
         raise UserError(f"{key}={path}: is not a readable Parquet file") from error
     names = [name for name in table.column_names if not name.startswith("__index_level_")]  # pandas' own row numbers
@@ -208,8 +213,8 @@ def _read_parquet(path: Path, key: str) -> Table:
     return Table(path, table.column_names, list(enumerate(map(list, zip(*columns, strict=True)), 1)), key=key)
 
 
-def _read_text(path: Path, key: str) -> Table:
-    text = _text_of(path, key)
+def _read_text(path: Path, key: str, data: bytes) -> Table:
+    text = _text_of(path, key, data)
     first = next((line for line in text.splitlines() if line.strip()), "")
     separator = next((sign for sign in ";\t" if sign in first), ",")
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
@@ -226,8 +231,7 @@ def _read_text(path: Path, key: str) -> Table:
     return Table(path, [name.strip() for name in lines[0][1]], rows, "," if comma else ".", key)
 
 
-def _text_of(path: Path, key: str) -> str:
-    data = path.read_bytes()
+def _text_of(path: Path, key: str, data: bytes) -> str:
     try:
         return data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError as error:

@@ -38,6 +38,8 @@ class Readings:
     """(m,): standard deviations where the file has them; NaN where the reading is missing."""
     columns: tuple[str, ...] = ()
     """The columns that were read, as the file calls them."""
+    files: tuple[tuple[str, str], ...] = ()
+    """Each file with the SHA-256 of the bytes that were read."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,7 @@ def open_together(
                 for path, table in zip(paths, tables, strict=True)
             ],
         )
+        found = replace(found, files=tuple((str(table.path), table.digest) for table in tables))
     if enough:
         require_enough(paths, found)
     return found

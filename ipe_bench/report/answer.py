@@ -18,6 +18,7 @@ from ipe_bench.basics.files import write_atomically, write_text
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement
+from ipe_bench.real.estimation import Opened
 from ipe_bench.real.examination import Examination
 from ipe_bench.real.fits import Fit
 from ipe_bench.real.residuals import LEAST_P
@@ -108,6 +109,12 @@ class Answer:
     estimator found any."""
     left_out: str = ""
     """What of the files was left out on purpose."""
+
+    @classmethod
+    def to(cls, opened: Opened, name: str = "") -> Answer:
+        """The answer to a question; `name` is what the model is called, where that is not its own name."""
+        model, fits_and_examinations = opened.scenario.measurement, opened.fitted()
+        return cls(name or model.name, model, opened.readings.z, *fits_and_examinations, opened.question.left_out.said)
 
     @property
     def examination(self) -> Examination | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import sys
 from pathlib import Path
@@ -10,8 +11,11 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
+import ipe_bench as ib
 from ipe_bench.cli.main import main
 from ipe_bench.measurements import Nist
+from ipe_bench.real.estimation import Opened
+from ipe_bench.real.readings import write_readings
 
 MISRA = Nist("Misra1a")
 SATURATION = (
@@ -281,3 +285,45 @@ def test_mistakes_are_one_line_with_the_key(estimate, misra, case):
     assert code == 2
     assert expected in printed
     assert len(printed.strip().splitlines()) == 1
+
+
+@pytest.fixture
+def ranges(tmp_path):
+    """A file of ranges whose truth was drawn at error scale 3, and its readings."""
+    scenario = ib.Scenario(ib.measurements.Ranging(), ib.noise.Gaussian(0.1), error_scale=3.0)
+    z = scenario.draw(0, 1).z[0]
+    write_readings(tmp_path / "ranges.csv", scenario.measurement, z)
+    return z
+
+
+@pytest.mark.parametrize("label", ["ekf", "map_lm"])
+def test_a_prior_that_nobody_states_is_refused_by_command_and_python_alike(estimate, ranges, tmp_path, label):
+    estimator = {"ekf": ib.baselines.EKF(), "map_lm": ib.baselines.MapLM()}[label]
+    words = ("measurement=ranging", "readings=ranges.csv", "solver=[]", f"baseline=[{label}]", "noise.deviation=0.1")
+    code, printed, _ = estimate(*words)
+    assert code == 2
+    with pytest.raises(ib.UserError) as refused:
+        ib.estimate(ib.measurements.Ranging(), "ranges.csv", {label: estimator}, noise=ib.noise.Gaussian(0.1))
+    assert printed.strip() == f"ipe-bench: {refused.value}"
+    assert "give error_scale=X" in printed
+    assert "leave it out" not in printed
+    code, printed, answer = estimate(*words, "error_scale=3")
+    assert code in (0, 1), printed
+    options = {"noise": ib.noise.Gaussian(0.1), "error_scale": 3.0}
+    (fit,) = ib.estimate(ib.measurements.Ranging(), "ranges.csv", {label: estimator}, **options)
+    assert list(of(answer, "estimates", label).values()) == fit.x.tolist()
+
+
+def test_the_digest_is_of_the_bytes_that_were_estimated(estimate, misra, tmp_path, monkeypatch):
+    """A file that changes while the estimators are at work is not what they saw."""
+    before = hashlib.sha256((tmp_path / "my.csv").read_bytes()).hexdigest()
+    fitted = Opened.fitted
+
+    def changed(self):
+        (tmp_path / "my.csv").write_text("t,y\n1,2\n")
+        return fitted(self)
+
+    monkeypatch.setattr(Opened, "fitted", changed)
+    code, printed, answer = estimate(*SATURATION, *LM, "readings=my.csv")
+    assert code == 0, printed
+    assert answer["readings"] == [{"file": "my.csv", "sha256": before}]

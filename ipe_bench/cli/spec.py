@@ -1,0 +1,239 @@
+"""All that a command is told, as typed plain data that is read once: the keys of the config besides Hydra's own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+
+from ipe_bench.basics.errors import UserError, describe_exception, unknown
+from ipe_bench.basics.options import Component, Count, Positive, Whole, option_types
+from ipe_bench.estimators.base import Estimator
+from ipe_bench.measurements.base import Measurement
+from ipe_bench.measurements.known import Known, informed
+from ipe_bench.noise import ModelNoise, Noise
+from ipe_bench.plugins import discovery as plugins
+from ipe_bench.plugins.construct import construct, instantiate
+from ipe_bench.priors import GaussianPrior, Prior
+from ipe_bench.real.estimation import Question, prior_stated
+from ipe_bench.real.sources import LeftOut
+from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
+from ipe_bench.runs.execution import Execution
+from ipe_bench.runs.provenance import TARGET, canonical_json, describe
+from ipe_bench.runs.run import MOST_TRIALS, TRIALS
+from ipe_bench.trials.scenario import Scenario
+
+PARTS: dict[str, type] = {
+    "measurement": Measurement,
+    "truth_measurement": Measurement,
+    "noise": Noise,
+    "prior": Prior,
+    "execution": Execution,
+}
+"""Keys that hold a component, with its kind."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spec(Component):
+    """One job."""
+
+    measurement: Measurement
+    noise: Noise
+    prior: Prior
+    execution: Execution
+    estimators: Mapping[str, Any]
+    """By label."""
+    output: str
+    """The folder of the results."""
+    name: str = "${default_name}"
+    """Names the output folder."""
+    default_name: str = "gins"
+    """What the command asks for, in short: names the output folder where nothing else does."""
+    truth_measurement: Measurement | None = None
+    """What simulates the readings, where it differs from what the estimators assume."""
+    error_scale: Positive = 1.0
+    """Standard deviation of the true parameters, in multiples of their units."""
+    seed: Whole = 0
+    """Of all random draws."""
+    trials: Count | None = None
+    """1000 unless given; with a precision, the most there may be."""
+    precision: Any = None
+    """Half-width that success shares are to be known to (0.01), or {success: 0.01, rmse: 0.05}: just enough trials."""
+    time_limit: Positive | None = None
+    """Seconds after which, with a precision, no more blocks are begun."""
+    figures: Which = "main"
+    """Which to draw: all, main (the few that answer the question), or none."""
+    formats: Any = PAGE
+    """Of the figures' files: png, and what is named of pdf and svg as well."""
+    block_size: Count | None = None
+    """Trials per unit of work; changes no number. 250 unless given, and up to 1000 of a hundred thousand trials."""
+    readings: str | tuple[str, ...] | None = None
+    """A file of real readings, for `estimate`, or a list of files that are estimated together."""
+    ignore_rows: Any = None
+    """Rows of the file to leave out, by their numbers: their readings are missing. Of several files FILE:NUMBER."""
+    ignore_columns: Any = None
+    """Columns of the file to leave out."""
+    write_readings: str | None = None
+    """Write the simulated readings of one trial to this file instead of running."""
+    write_readings_trial: Whole = 0
+    """The number of that trial."""
+    parameters: Mapping[str, Any] | None = None
+    """What is known of the parameters: parameters.NAME.fixed=, .nominal=, .deviation=, .lower=, .upper=, .positive=; or
+    a YAML file of that, parameters=FILE."""
+    prior_covariance: Any = None
+    """P0 of the parameters in their own units, at error scale 1: a matrix in their order, or a CSV file with their
+    names in its header."""
+    objective: str | None = None
+    """LABEL.COLUMN, such as newton.capped_error: a number of each job, which sweepers that optimise make small."""
+
+    def __post_init__(self) -> None:
+        which_figures(self.figures)
+        super().__post_init__()
+        object.__setattr__(self, "formats", file_formats(self.formats))
+        for key in ("name", "output"):
+            if not Path(getattr(self, key)).name:
+                raise UserError(f"{key}={getattr(self, key)}: name a folder")
+        if "://" in self.output or self.output.startswith("file:"):
+            raise UserError(f"output={self.output}: is an address; name a folder of this machine")
+        if self.time_limit is not None and self.precision is None:
+            raise UserError(f"time_limit={self.time_limit:g}: goes with precision=; give that, or leave it out")
+        if self.objective is not None:
+            self._check_objective(*self.aim)
+
+    def _check_objective(self, label: str, column: str) -> None:
+        dot = "." in str(self.objective)
+        if label not in self.estimators:
+            form = "write LABEL.COLUMN, such as newton.capped_error"
+            what = unknown(label, self.estimators, "estimator") if dot else form
+            raise UserError(f"objective={self.objective}: {what}")
+        from ipe_bench.api import objective_columns
+
+        columns = objective_columns()
+        if column not in columns:
+            raise UserError(f"objective={self.objective}: {unknown(column, columns, 'column')}")
+
+    @property
+    def aim(self) -> tuple[str, str]:
+        """The label and the column of the objective."""
+        label, _, column = str(self.objective).rpartition(".")
+        return label, column
+
+    @property
+    def count(self) -> int:
+        """The trials, or the most there may be where there is a precision."""
+        unless = TRIALS if self.precision is None else MOST_TRIALS
+        return unless if self.trials is None else self.trials
+
+    @cached_property
+    def known(self) -> tuple[Known, ...]:
+        """What is known of each parameter."""
+        found = []
+        for name, options in (self.parameters or {}).items():
+            where = f"parameters.{name}"
+            if not isinstance(options, Mapping):
+                raise UserError(f"{where}={options}: say what that is, such as {where}.fixed={options}")
+            found.append(instantiate(Known, {"name": str(name), **options}, where))
+        return tuple(found)
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """The trials that are simulated."""
+        measurement, truth = (m and informed(m, self.known) for m in (self.measurement, self.truth_measurement))
+        assert measurement is not None
+        prior = prior_stated(self.prior, measurement, self.prior_covariance)
+        return Scenario(measurement, self.noise, prior, self.error_scale, self.seed, truth)
+
+    def question(self, *, scaled: bool) -> Question:
+        """What is asked of real readings; a part that stands there by default is stated by nobody.
+
+        `scaled`: the error scale is stated.
+        """
+        given = (self.readings,) if isinstance(self.readings, str) else self.readings
+        if given == ():
+            raise UserError("readings=[]: name a file, or several as readings=[a.csv,b.csv]")
+        return Question(
+            model=self.measurement,
+            readings=None if given is None else tuple(map(Path, given)),
+            estimators=self.estimators,
+            noise=None if self.noise == ModelNoise() else self.noise,
+            prior=None if self.prior == GaussianPrior() else self.prior,
+            error_scale=self.error_scale if scaled else None,
+            known=self.known,
+            covariance=self.prior_covariance,
+            left_out=LeftOut(self._names("ignore_columns", str), self._names("ignore_rows", int, str)),
+        )
+
+    def _names(self, key: str, *kinds: type) -> tuple[Any, ...]:
+        given = getattr(self, key)
+        names = given if isinstance(given, tuple) else () if given is None else (given,)
+        for name in names:
+            if not isinstance(name, kinds) or isinstance(name, bool):
+                raise UserError(f"{key}={name}: give names of columns, or numbers of rows, as in {key}=[3,4]")
+        return names
+
+
+KEYS = tuple(field.name for field in fields(Spec))
+KINDS = option_types(Spec)
+DEFAULTS = {field.name: "???" if field.default is MISSING else field.default for field in fields(Spec)}
+DEFAULTS["estimators"] = {}
+
+
+def spec(plain: Mapping[Any, Any]) -> Spec:
+    """The job that a composed config describes, its components constructed.
+
+    Raises:
+        UserError: the first mistake, by its key.
+    """
+    for key in plain:
+        if key not in KEYS:
+            raise UserError(f"{key}: {unknown(str(key), KEYS, 'key')}")
+    for key in KEYS:
+        if key not in plain:
+            raise UserError(f"{key}: is left out; give it a value")
+    made = {key: construct(value, key) for key, value in plain.items() if key not in ("estimators", *PARTS)}
+    for key, kind in PARTS.items():
+        config = plain[key]
+        if key == "truth_measurement" and config is None:
+            made[key] = None
+        elif not isinstance(config, Mapping) or TARGET not in config:
+            raise UserError(f"{key}={config}: is not a part that can be used; choose one, see `ipe-bench list`")
+        else:
+            made[key] = _of_kind(construct(config, key), key, kind)
+    made["estimators"] = {str(label): _estimator(str(label), one) for label, one in (plain["estimators"] or {}).items()}
+    return instantiate(Spec, made, "")
+
+
+def _estimator(label: str, options: Any) -> Estimator:
+    where = f"estimators.{label}"
+    if not isinstance(options, Mapping):
+        raise UserError(f"{where}={options}: set its options, such as {where}.KEY=VALUE")
+    if TARGET not in options:
+        keys = ", ".join(f"{where}.{key}" for key in options) or where
+        raise UserError(f"{keys}: is set, but {label} is not chosen; add it to solver= or baseline=, or leave it out")
+    for group in plugins.ESTIMATOR_GROUPS:
+        for option in plugins.options(group):
+            if option.label == label and option.target != str(options[TARGET]):
+                # One estimator would be tabled under the name of another.
+                name = f"{group}={label}"
+                raise UserError(f"{where}: is {options[TARGET]}, under the name of {name}; choose another label")
+    return _of_kind(construct(options, where), where, Estimator)
+
+
+def _of_kind(part: Any, key: str, kind: type) -> Any:
+    """The part, where it is of the kind that belongs there and can be stored and sent to other processes."""
+    if not isinstance(part, kind):
+        name = type(part).__name__
+        raise UserError(f"{key}: {name} is not a {kind.__name__.lower()}; choose one, see `ipe-bench list`")
+    try:
+        canonical_json(describe(part))
+        cloudpickle.dumps(part)
+    except Exception as error:  # whatever a field's own methods raise
+        raise UserError(
+            f"{key}: a field of {type(part).__name__} can be neither stored nor sent to a worker "
+            f"({describe_exception(error)}); use numbers, texts, lists and components"
+        ) from None
+    return part

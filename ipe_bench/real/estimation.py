@@ -1,0 +1,165 @@
+"""Parameters from real readings, by one path: question -> readings -> model -> noise and prior -> problem -> fits.
+
+The order follows the data: the inputs in a file complete the model, what is known of parameters constrains it, its
+noise and prior make the problem, and only the problem tells whether an estimator has all that it needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
+from ipe_bench.estimators.base import Estimator
+from ipe_bench.measurements.base import Measurement
+from ipe_bench.measurements.known import Informed, Known, informed
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.noise import Certified, ModelNoise, Noise, Unknown
+from ipe_bench.priors import GaussianPrior, Prior, prior_of
+from ipe_bench.real.covariances import read_covariance
+from ipe_bench.real.examination import Examination, examinations
+from ipe_bench.real.fits import Fit, fit
+from ipe_bench.real.sources import LeftOut, Readings, noise_of, open_together, require_enough
+from ipe_bench.trials.scenario import Scenario
+
+
+@dataclass(frozen=True, kw_only=True)
+class Question:
+    """All that is stated about an estimate from real readings; None where nothing is."""
+
+    model: Measurement
+    readings: tuple[Path, ...] | Array | None
+    """Files, or an array z (m,); None: those that come with the model."""
+    estimators: Mapping[str, Estimator]
+    noise: Noise | None = None
+    prior: Prior | None = None
+    error_scale: float | None = None
+    known: tuple[Known, ...] = ()
+    covariance: Any = None
+    """P0 in the parameters' own units: rows of numbers, or the name of a CSV file."""
+    left_out: LeftOut = field(default_factory=LeftOut)
+
+    def opened(self) -> Opened:
+        """The readings, with the scenario and the problem that estimators are told.
+
+        Raises:
+            UserError: a file does not hold the model's readings, or an estimator needs what is not stated.
+        """
+        found = self._readings()
+        model = informed(found.model, self.known)
+        found = replace(found, model=model)
+        if isinstance(self.readings, tuple):
+            require_enough(self.readings, found)
+        prior = prior_stated(self.prior or GaussianPrior(), model, self.covariance)
+        scale = 1.0 if self.error_scale is None else self.error_scale
+        opened = Opened(self, found, Scenario(model, self._noise(found), prior, scale))
+        opened.require(self.estimators)
+        return opened
+
+    @property
+    def has_prior(self) -> bool:
+        """Whether anything says how far the parameters may lie from the nominal point."""
+        deviating = any(one.deviation is not None for one in self.known)
+        return deviating or any(x is not None for x in (self.prior, self.error_scale, self.covariance))
+
+    def _readings(self) -> Readings:
+        model, given = self.model, self.readings
+        if self.left_out and not isinstance(given, tuple):
+            remedy = "give readings=FILE, or leave them out" if given is None else "set readings to NaN in an array"
+            raise UserError(f"ignore_rows, ignore_columns: are of files; {remedy}")
+        if given is None:
+            if model.recorded is None:
+                raise UserError("readings: is not given; write readings=FILE (see `ipe-bench list measurement -v`)")
+            return Readings(model, model.recorded.z)
+        if isinstance(given, tuple):
+            names = [str(path) for path in given]
+            if len(set(names)) < len(names):
+                raise UserError(f"readings=[{','.join(names)}]: names a file twice, and would count its readings twice")
+            return open_together(given, model, self.left_out, enough=False)
+        if given.shape != (model.m,):
+            raise UserError(
+                f"readings: has shape {given.shape}; give the {model.m} readings of {model.name}, NaN where missing"
+            )
+        return Readings(model, np.array(given, dtype=float))
+
+    def _noise(self, found: Readings) -> Noise:
+        """What is stated, or a file's column of standard deviations, or the model's own; else its level is unknown."""
+        stated = self.noise.of(found.model) if isinstance(self.noise, ModelNoise) else self.noise
+        if self.readings is None and stated is None:
+            return Certified()
+        return noise_of(found, stated) or ModelNoise().of(found.model) or Unknown()
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A question with its readings."""
+
+    question: Question
+    readings: Readings
+    """Their model has the inputs of the files, and what is known of parameters."""
+    scenario: Scenario
+
+    @property
+    def problem(self) -> Problem:
+        """What estimators are told: a prior only where one is stated."""
+        return self.scenario.problem if self.question.has_prior else self.scenario.problem.without_prior()
+
+    def require(self, estimators: Mapping[str, Estimator]) -> None:
+        """Refuses estimators that need what the problem lacks, each with its remedy."""
+        if not estimators:
+            raise UserError("there is no estimator; choose with solver= and baseline=")
+        name = self.scenario.measurement.name
+        unstated = (
+            "is not stated; give error_scale=X, the standard deviation of the parameters in multiples of their sizes"
+        )
+        lacking = [
+            f"estimators.{label}: needs {need}, which {unstated}"
+            if need == "prior" and not self.scenario.noise.real
+            else f"estimators.{label}: needs {need}, which measurement={name} does not have; leave it out"
+            for label, estimator in estimators.items()
+            for need in estimator.missing(self.problem)
+        ]
+        if lacking:
+            raise UserError("; ".join(lacking))
+
+    def fitted(self) -> tuple[list[Fit], tuple[Examination, ...]]:
+        """A fit by every estimator, and what is to be said of the least minimum."""
+        z = self.readings.z
+        fits = fit(self.problem, z, self.question.estimators, self.scenario.noise)
+        return fits, examinations(self.problem, z, fits)
+
+
+def prior_stated(prior: Prior, model: Measurement, covariance: Any = None) -> Prior:
+    """The prior with the standard deviations that are known of single parameters, or with all of a covariance.
+
+    Raises:
+        UserError: it cannot be told of single parameters, or two of these say the same.
+    """
+    deviating = isinstance(model, Informed) and any(one.deviation is not None for one in model.known)
+    if covariance is not None:
+        if not isinstance(prior, GaussianPrior):
+            raise UserError(f"prior_covariance: is for prior=gaussian; with prior={prior.name}, leave it out")
+        if deviating or prior != GaussianPrior():
+            other = "parameters.NAME.deviation" if deviating else "prior.deviations or prior.correlations"
+            raise UserError(f"prior_covariance: says all of the prior; leave out {other}")
+        return prior_of(model, read_covariance(covariance, [p.name for p in model.natural_parameters]))
+    if not isinstance(model, Informed):
+        return prior
+    if not isinstance(prior, GaussianPrior):
+        raise UserError(f"parameters: goes with prior=gaussian, which is told of each; prior={prior.name} is not")
+    if prior.deviations is None:
+        return replace(prior, deviations=model.prior_deviations)
+    names = [p.name for p in model.whole.parameters]
+    if len(prior.deviations) != len(names):
+        raise UserError(
+            f"prior.deviations: has {len(prior.deviations)} numbers; give one for each of {len(names)} parameters"
+        )
+    general = dict(zip(names, prior.deviations, strict=True))
+    own = {one.name for one in model.known if one.deviation is not None}
+    known = zip(model.natural_parameters, model.prior_deviations, strict=True)
+    return replace(prior, deviations=tuple(d if p.name in own else general[p.name] for p, d in known))
