@@ -110,8 +110,8 @@ MISTAKES = {
     "unknown measurement": (["run", "measurement=gims"], "did you mean gins?"),
     "unknown key": (["run", "eror_scale=1"], "did you mean error_scale?"),
     "unknown option": (["run", "estimators.fixed_point.tolerence=1"], "estimators.fixed_point.tolerence"),
-    "negative scale": (["run", "error_scale=-1"], "error_scale=-1: give a number above 0"),
-    "zero scale": (["run", "error_scale=0"], "error_scale=0: give a number above 0"),
+    "negative scale": (["run", "error_scale=-1"], "error_scale=-1.0: give a number above 0"),
+    "zero scale": (["run", "error_scale=0"], "error_scale=0.0: give a number above 0"),
     "infinite scale": (["run", "error_scale=inf"], "error_scale=inf: give a number above 0"),
     "huge seed": (["run", "seed=99999999999999999999"], "seed=99999999999999999999: give a whole number from 0 to"),
     "negative noise": (["run", "noise.step=-1"], "noise.step=-1.0: give a number above 0"),
@@ -245,7 +245,7 @@ def test_data_sets_are_swept_by_either_spelling(tmp_path, here):
 
 
 def test_hydras_own_flags_work_after_run(tmp_path, here, monkeypatch):
-    assert "error_scale: 5.0" in here("run", "error_scale=5", "--cfg", "job", folder=tmp_path).stdout
+    assert "error_scale: 5\n" in here("run", "error_scale=5", "--cfg", "job", folder=tmp_path).stdout
     # Which sets up logging for the whole of its process.
     assert ipe_bench("run", "--info", "searchpath", folder=tmp_path).returncode == 0
     monkeypatch.setenv("COMP_LINE", "ipe-bench run measurement=gi")
