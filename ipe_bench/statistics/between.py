@@ -17,7 +17,7 @@ from ipe_bench.runs.provenance import canonical_json
 from ipe_bench.statistics.analysis import outcomes_of
 from ipe_bench.statistics.collect import Collection, Group, config_leaves, differing, shown_leaf
 from ipe_bench.statistics.comparisons import ALPHA, Outcomes, differences, holm
-from ipe_bench.statistics.paired import Effect, fair_coin, no_drift, ratio_effect, success_effect
+from ipe_bench.statistics.paired import Effect, no_drift, no_lean, ratio_effect, success_effect
 from ipe_bench.statistics.records import gate_radius
 from ipe_bench.statistics.sample import Sample, Shared
 
@@ -191,13 +191,14 @@ def _effects(first: _Columns, second: _Columns, n: int, alpha: float) -> dict[st
     radius = gate_radius(n)
     a, b = np.minimum(first.distance, radius), np.minimum(second.distance, radius)
     d = differences(b, a)
-    cheaper, dearer = int((second.cost < first.cost).sum()), int((second.cost > first.cost).sum())
+    # The first trial's cost is the unit: whoever looks later divides by the same.
+    unit = float(first.cost[0] + second.cost[0]) or 1.0
     medians = float(np.median(first.seconds)), float(np.median(second.seconds))
     time = medians[1] / medians[0] if medians[0] > 0 else np.nan
     return {
         "success": success_effect(first.success, second.success, alpha),
-        "error": ratio_effect(a, a + d, alpha, no_drift(d, radius)),
-        "cost": ratio_effect(first.cost, second.cost, alpha, fair_coin(cheaper, dearer)),
+        "error": ratio_effect(a, a + d, alpha, no_drift(d, radius), radius),
+        "cost": ratio_effect(first.cost, second.cost, alpha, no_lean(second.cost - first.cost, unit)),
         "time": Effect(*medians, time, np.nan, np.nan, np.nan, np.nan),
     }
 

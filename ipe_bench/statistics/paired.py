@@ -14,6 +14,7 @@ from scipy.special import betaln, ndtri
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.comparisons import ALPHA, mcnemar
+from ipe_bench.statistics.consistency import clopper_pearson
 
 FLIPS = 4999
 """Random assignments of signs."""
@@ -22,6 +23,10 @@ LARGEST_SAMPLE = 1000
 _STEPS = 50
 _BETS = np.concatenate([-(2.0 ** -np.arange(9)), 2.0 ** -np.arange(9)]) * 0.99
 """Shares of the stake, on either side."""
+_TILTS = 2.0 ** np.arange(-12, 5)
+"""Multiples of the inverse unit by which differences are tilted."""
+RARE = 10
+"""Number of trials from which a sample shows well enough what an unusual trial is like."""
 
 
 @dataclass(frozen=True)
@@ -75,18 +80,25 @@ def _tango(losses: int, gains: int, trials: int, alpha: float) -> float:
     return high
 
 
-def ratio_effect(first: Array, second: Array, alpha: float = ALPHA, evidence: float = np.nan) -> Effect:
+def ratio_effect(
+    first: Array, second: Array, alpha: float = ALPHA, evidence: float = np.nan, largest: float | None = None
+) -> Effect:
     """Ratio of the means of two columns (trials,) of finite numbers that are not negative, second over first.
 
     Where neither is larger by nature, each trial's difference is as likely to have the other sign: the p is the share
     of random signs whose sum is as far from 0 (Fisher, The Design of Experiments, 1935, sec. 21), the interval holds
-    the ratios r that the same test does not reject for second less r times first.
+    the ratios r that the same test does not reject for second less r times first. An end that no ratio reaches is 0 or
+    infinite.
+
+    Where nearly all trials have one ratio, signs say nothing of the others, which are rare and perhaps unseen: the
+    interval is widened by the share of trials that may differ beyond those that did (the upper limit of Clopper and
+    Pearson), each by `largest`, the largest difference there can be; None: the largest number seen. It is never widened
+    over a ratio of 1 that the test rejects.
     """
     a, b = _grouped(first), _grouped(second)
     signs = _signs(len(a))
     flipped_a, flipped_b = signs @ a, signs @ b
     total_a, total_b = float(a.sum()), float(b.sum())
-    value = total_b / total_a if total_a > 0 else np.nan
 
     def p(ratio: float) -> float:
         return _extreme(b - ratio * a, flipped_b - ratio * flipped_a, total_b + ratio * total_a)
@@ -94,11 +106,30 @@ def ratio_effect(first: Array, second: Array, alpha: float = ALPHA, evidence: fl
     def p_inverse(ratio: float) -> float:
         return _extreme(a - ratio * b, flipped_a - ratio * flipped_b, total_a + ratio * total_b)
 
+    means, p_equal = (float(first.mean()), float(second.mean())), p(1.0)
     if not total_a > 0 or not total_b > 0:
-        low = high = np.nan
-    else:
-        low, high = _end(p, value, alpha), 1 / _end(p_inverse, 1 / value, alpha)
-    return Effect(float(first.mean()), float(second.mean()), value, low, high, p(1.0), evidence)
+        return Effect(*means, total_b / total_a if total_a > 0 else np.nan, np.nan, np.nan, p_equal, evidence)
+    value = total_b / total_a
+    low, least = _end(p, value, alpha), _end(p_inverse, 1 / value, alpha)
+    high = 1 / least if least > 0 else np.inf
+    if unseen := _unseen(first, second, alpha):
+        reach = unseen * (max(first.max(), second.max()) if largest is None else largest) / means[0]
+        sure = p_equal < alpha
+        low = min(low, max(low - reach, 1.0 if sure and value > 1 else 0.0))
+        high = max(high, min(high + reach, 1.0 if sure and value < 1 else np.inf))
+    return Effect(*means, value, low, high, p_equal, evidence)
+
+
+def _unseen(first: Array, second: Array, alpha: float) -> float:
+    """The share of trials that may have another ratio than the commonest one, beyond those that have been seen to; 0
+    where enough have been seen."""
+    with np.errstate(all="ignore"):
+        # Round-off makes no ratio another one.
+        _, counts = np.unique((second / first).astype(np.float32), return_counts=True, equal_nan=True)
+    others, trials = len(first) - int(counts.max()), len(first)
+    if others >= min(RARE, trials / 2):
+        return 0.0
+    return clopper_pearson(others, trials, 1 - alpha)[1] - others / trials
 
 
 def _grouped(values: Array) -> Array:
@@ -148,6 +179,16 @@ def no_drift(differences: Array, largest: float) -> float:
     """Evidence against a mean of 0 of differences (trials,) that are never beyond `largest`: the mean fortune of those
     who bet a fixed share on either sign (Waudby-Smith and Ramdas, J. R. Stat. Soc. B 86, 2024)."""
     fortunes = np.log1p(_BETS[:, None] * (differences / largest)[None, :]).sum(axis=1)
+    top = float(fortunes.max())
+    return _exp(top + float(np.log(np.mean(np.exp(fortunes - top)))))
+
+
+def no_lean(differences: Array, unit: float) -> float:
+    """Evidence against differences (trials,) that are as likely to have the other sign, of any size: the mean of
+    exp(t d) / cosh(t d) over both signs of t, which is a martingale under such signs (de la Peña, Ann. Probab. 27,
+    1999). It exceeds 1 only on the side of their sum. `unit` is about what differences are of, and knows no signs."""
+    tilts = np.concatenate([-_TILTS, _TILTS])[:, None] * (differences / unit)[None, :]
+    fortunes = (tilts - np.logaddexp(tilts, -tilts) + np.log(2)).sum(axis=1)
     top = float(fortunes.max())
     return _exp(top + float(np.log(np.mean(np.exp(fortunes - top)))))
 

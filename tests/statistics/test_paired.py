@@ -7,9 +7,9 @@ import itertools
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
-from scipy.stats import norm
+from scipy.stats import chi, norm
 
-from ipe_bench.statistics.paired import fair_coin, no_drift, ratio_effect, success_effect
+from ipe_bench.statistics.paired import fair_coin, no_drift, no_lean, ratio_effect, success_effect
 
 
 def successes(both: int, only_first: int, only_second: int, neither: int):
@@ -68,7 +68,70 @@ def test_a_few_trials_that_differ_are_no_finding_however_far():
 
 def test_sure_differences_have_a_p_beyond_the_number_of_signs():
     """Hoeffding's bound: 2 exp(-n / 2) for n equal differences."""
-    assert ratio_effect(np.full(200, 3.0), np.full(200, 4.0)).p == pytest.approx(2 * np.exp(-100.0))
+    assert ratio_effect(np.full(200, 3.0), np.full(200, 4.0)).p == pytest.approx(2 * np.exp(-100.0), abs=0)
+
+
+@pytest.mark.parametrize("trials", [1, 2, 3, 5])
+def test_so_few_trials_leave_the_interval_open(trials):
+    """All signs of five differences are alike in a share of 2 / 2^5 > .05: no ratio is rejected."""
+    a = np.arange(1.0, trials + 1)
+    effect = ratio_effect(a, 2 * a)
+    assert (effect.change, effect.low, effect.high) == (pytest.approx(2.0), 0.0, np.inf)
+    assert effect.p == pytest.approx(2 / 2**trials, abs=0.03)
+
+
+def rarely_worse(q: float, trials: int, studies: int) -> tuple[float, float]:
+    """Coverage and median width of the ratio of mean errors, each at most 6, where the second is the first but for a
+    share q of trials in which it is 6."""
+    rng = np.random.default_rng(trials)
+    true, held, widths = (1 - q) + q * 6 / chi(3).mean(), 0, []
+    for _ in range(studies):
+        a = np.minimum(chi(3).rvs(trials, random_state=rng), 6.0)
+        effect = ratio_effect(a, np.where(rng.random(trials) < q, 6.0, a), largest=6.0)
+        held += effect.low <= true <= effect.high
+        widths.append(effect.high - effect.low)
+    return held / studies, float(np.median(widths))
+
+
+@pytest.mark.parametrize(("q", "trials"), [(0.02, 20), (0.02, 50), (0.01, 100), (0.01, 200)])
+def test_intervals_count_the_failures_that_may_be_unseen(q, trials):
+    """Random signs alone cover .35, .61, .65 and .75: where both agree in every trial seen, their interval is a point.
+    Widths are finite: the rule of three, 3.7 / N failures of 6 on top of a mean of 1.6, to either side."""
+    covered, width = rarely_worse(q, trials, 40)
+    assert covered >= 0.93
+    assert width < 2.2 * 2 * 3.7 / trials * 6 / 1.6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("q", "trials"), [(0.02, 20), (0.02, 50), (0.01, 100), (0.01, 200), (0.05, 100), (0.05, 200), (0.1, 200)]
+)
+def test_1000_studies_of_rare_failures_are_covered(q, trials):
+    covered, width = rarely_worse(q, trials, 1000)
+    print(f"q {q}, {trials} trials: covered {covered:.3f}, median width {width:.3f}")
+    assert covered >= 0.93
+
+
+def test_an_interval_is_widened_only_where_nearly_all_trials_agree():
+    """Where all trials differ it is that of random signs, 2 x 1.96 standard errors of the ratio wide."""
+    rng = np.random.default_rng(0)
+    a = rng.normal(5, 1, 200)
+    b = a + rng.normal(0, 0.5, 200)
+    effect = ratio_effect(a, b, largest=1e6)
+    assert effect.high - effect.low == pytest.approx(2 * 1.96 * 0.5 / 5 / np.sqrt(200), rel=0.15)
+    same = ratio_effect(a, a, largest=6.0)
+    assert 1 - same.low == pytest.approx(same.high - 1)
+    assert same.high - 1 == pytest.approx((1 - 0.025 ** (1 / 200)) * 6.0 / a.mean())
+
+
+def test_a_widened_interval_says_what_the_test_says():
+    """Eight of 400 trials are larger: a p of 2 / 2^8, so that 1 is outside of the interval, however wide it is."""
+    a = np.ones(400)
+    b = a.copy()
+    b[:8] = 1.5
+    effect = ratio_effect(a, b, largest=6.0)
+    assert effect.p < 0.05
+    assert 1.0 <= effect.low < effect.change < 1 + 8 / 400 * 5 < effect.high
 
 
 def test_success_is_mcnemar_s_test():
@@ -121,6 +184,21 @@ def test_evidence_is_1_on_average_where_there_is_nothing():
     sizes = np.array([0.1, 0.7, 1.0, 2.0, 0.4, 3.0])
     signs = np.array(list(itertools.product([-1.0, 1.0], repeat=6)))
     assert np.mean([no_drift(s * sizes, 3.0) for s in signs]) == pytest.approx(1.0)
+    assert np.mean([no_lean(s * sizes, 0.4) for s in signs]) == pytest.approx(1.0)
+
+
+def test_evidence_of_either_kind_is_for_the_side_of_the_sum():
+    """90 % of 400 trials are cheaper and 10 % so much dearer that the means are as good as equal: a sign test has
+    e = 3e62 for the side that the means deny. Beyond 1, evidence speaks for the sign of the sum."""
+    d = np.where(np.arange(400) % 10 > 0, -50.0, 460.0)
+    assert no_lean(d, 150.0) < 1
+    rng = np.random.default_rng(3)
+    for _ in range(200):
+        d = rng.normal(0, 1, 60) * rng.choice([1.0, 30.0], 60)
+        balanced = d - d.mean()
+        assert no_lean(balanced, 1.0) <= 1
+        assert no_drift(balanced, 200.0) <= 1
+    assert no_lean(np.full(400, -50.0), 150.0) > 1e60
 
 
 def test_who_looks_after_every_trial_is_misled_no_more_often_than_promised():
@@ -130,8 +208,9 @@ def test_who_looks_after_every_trial_is_misled_no_more_often_than_promised():
     ever = [max(fair_coin(h, i + 1 - h) for i, h in enumerate(row)) >= 10 for row in heads.tolist()]
     assert np.mean(ever) < 0.1 + 3 * np.sqrt(0.1 * 0.9 / 300)
     steps = (2 * tosses - 1) * np.random.default_rng(1).uniform(size=(300, 400))
-    drift = [max(no_drift(row[:k], 1.0) for k in range(10, 401, 10)) >= 10 for row in steps]
-    assert np.mean(drift) < 0.1 + 3 * np.sqrt(0.1 * 0.9 / 300)
+    for evidence in (no_drift, no_lean):
+        misled = [max(evidence(row[:k], 1.0) for k in range(10, 401, 10)) >= 10 for row in steps]
+        assert np.mean(misled) < 0.1 + 3 * np.sqrt(0.1 * 0.9 / 300)
 
 
 def test_evidence_grows_where_there_is_something():
