@@ -10,6 +10,7 @@ import pandas as pd
 
 from ipe_bench.basics.files import write_text
 from ipe_bench.report.table import Cell, Column, Table, column, interval, sort_key, words, write_table
+from ipe_bench.report.terminal import LEGEND, leading, overview_columns
 from ipe_bench.report.words import limits, p_value, percent, plain, reported, short, shower, shown
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.comparisons import ALPHA
@@ -24,7 +25,14 @@ def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]
         return [table for table in [endings(whole or analysis)] if table is not None]
     tables = [overview(analysis), costs(analysis), portfolio(analysis), comparisons(analysis), ranks(analysis)]
     tables += [parameters(analysis), calibration(analysis), endings(whole or analysis)]
-    tables += [contraction(analysis), covariances(analysis), theory(analysis), iterations(analysis)]
+    tables += [
+        all_trials(analysis),
+        solved_trials(analysis),
+        contraction(analysis),
+        covariances(analysis),
+        theory(analysis),
+        iterations(analysis),
+    ]
     return [t for t in tables if t is not None]
 
 
@@ -36,22 +44,52 @@ def head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
 
 
 def overview(analysis: Analysis) -> Table:
-    """Who solves how much, how well, and how honestly."""
-    rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
-    scores = analysis.scores
-    best = list(scores["leads"])
-    columns = [*head(analysis, rows), words("estimator", rows["estimator"], best)]
+    """How each estimator does over all trials: one population for everybody."""
+    rows = _all_rows(analysis)
+    told = [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]
+    columns = [
+        *head(analysis, rows),
+        *overview_columns(told, leading(told, [*analysis.setting_columns, "error_scale"])),
+    ]
     columns += statistics("overview", all_statistics(), rows)
-    columns += statistics("overview", SCORES, scores)
+    return Table("overview", "Overview", "", columns, rows, notes=LEGEND, grouped=len(columns) - 8)
+
+
+def all_trials(analysis: Analysis) -> Table:
+    """What else is known of all trials."""
+    rows, scores = _all_rows(analysis), analysis.scores
+    columns = [*head(analysis, rows), words("estimator", rows["estimator"])]
+    columns += [*statistics("all_trials", all_statistics(), rows), *statistics("all_trials", SCORES, scores)]
     caption = (
-        "Shares are of all trials. Efficiency is the bound that applies over the root mean square error: over the"
-        " trials that the estimator solved, whose number stands in brackets where it is not all, and over all trials."
-        " Filters and the linear estimate solve nothing, so for them there are all trials only. rmse, common: on the"
-        " trials that every estimator solved. misfit: trials whose residuals fail the test of fit at 0.1 %. ambiguous:"
-        " trials in which several minima fit, as far as the estimator has looked. Bold: the"
-        " estimators than which none is significantly closer to the truth (Wilcoxon, Holm, 5 %), where any is beaten."
+        "Over all trials. misfit: residuals fail the test of fit at 0.1 %. ambiguous: several minima fit, as far as the"
+        " estimator has looked. Root mean squares and efficiency here are not capped: one trial may decide them."
     )
-    return Table("overview", "Overview", caption, columns, rows)
+    names = [*analysis.setting_columns, "error_scale", "estimator"]
+    data = [rows[_stored("all_trials", all_statistics())], scores[_stored("all_trials", SCORES)]]
+    data = pd.concat([rows[names], *data], axis=1)
+    return Table("all_trials", "All trials", caption, columns, data, appendix=True)
+
+
+def solved_trials(analysis: Analysis) -> Table | None:
+    """A diagnostic of iterations: what the trials that found their root came to."""
+    rows = _all_rows(analysis)
+    rows = rows[rows["equation"] != "-"]
+    if rows.empty:
+        return None
+    columns = [*head(analysis, rows), words("estimator", rows["estimator"])]
+    columns += statistics("solved_trials", all_statistics(), rows)
+    caption = (
+        "A diagnostic of estimators that solve an equation, and no comparison with others: each over the trials in"
+        " which it found the root that belongs to the truth, which nobody knows who has readings alone. Their number"
+        " stands in brackets where it is not all. rmse, common: on the trials that every estimator solved. False root:"
+        " it converged to another one."
+    )
+    data = rows[[*analysis.setting_columns, "error_scale", "estimator", *_stored("solved_trials", all_statistics())]]
+    return Table("solved_trials", "Solved trials", caption, columns, data, appendix=True)
+
+
+def _all_rows(analysis: Analysis) -> pd.DataFrame:
+    return analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
 
 
 def statistics(where: Where, records: Sequence[Statistic], rows: pd.DataFrame) -> list[Column]:

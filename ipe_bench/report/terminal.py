@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from ipe_bench.report.table import Column, Table, column, terminal, texts, words
-from ipe_bench.report.words import compact, limits, plain, reported, shown
-from ipe_bench.statistics.records import Statistic, all_statistics
-from ipe_bench.statistics.summary import ALL
+from ipe_bench.report.table import Cell, Column, Table, column, sort_key, terminal, texts, words
+from ipe_bench.report.words import brief, compact, duration, limits, plain, points, reported, shown
+from ipe_bench.statistics.records import CAP, Statistic, all_statistics
+from ipe_bench.statistics.summary import ALL, BEST
 from ipe_bench.statistics.summary import columns as summary_columns
 
 if TYPE_CHECKING:
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from rich.console import Group
 
 WIDE = 120
+_WIDE_ENOUGH = 100
+"""Letters of a screen that has room for failures, and for verdicts in words."""
 
 
 def render(
@@ -35,11 +37,11 @@ def render(
     tables = [] if certified is None or certified.empty else [_digits(certified)]
     tables += [] if attained is None or attained.empty else [_attained(attained)]
     listed: list[Any] = list(summary) if isinstance(summary, Sequence) else [*summary.to_dict("records")]
-    tables += _settings([row for row in listed if row["parameter"] == ALL and row["noise"] != "certified"])
+    tables += _settings([row for row in listed if row["parameter"] == ALL and row["noise"] != "certified"], width)
     return terminal(tables or ["nothing is stored yet"], width)
 
 
-def _settings(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
+def _settings(rows: Sequence[Mapping[str, Any]], width: int) -> list[Table]:
     """A table for each setting; what its columns mean stands below the last."""
     known = {*summary_columns(), "parameter", "unit", "estimator", "error_scale"}
     columns = dict.fromkeys(c for row in rows for c in row if c not in known and not c.startswith("estimator."))
@@ -50,37 +52,79 @@ def _settings(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
             str(v) if k in ("measurement", "noise") else f"{k}={plain(v)}" for k, v in named.items() if _says(v)
         )
         settings.setdefault(title, []).append(row)
-    tables = [_setting(title, part) for title, part in settings.items()]
+    tables = [_setting(title, part, width) for title, part in settings.items()]
     if tables:
-        tables[-1] = replace(tables[-1], notes=[_legend(rows)])
+        tables[-1] = replace(tables[-1], notes=LEGEND)
     return tables
 
 
-def _legend(rows: Sequence[Mapping[str, Any]]) -> str:
-    return (
-        "efficiency: the bound that applies over the root mean square error, 1 at best, with its 95 % bootstrap"
-        " interval: of the solved trials (their number in brackets where it is not all), and of all. Filters and the"
-        " linear estimate solve no equation. NEES: 1 where the reported covariance is right. misfit: trials whose"
-        " residuals fail the test of fit at 0.1 %. "
-        + ("ambiguous: several minima fit. " if any(math.isfinite(row["ambiguous"]) for row in rows) else "")
-        + "sims, time: medians per trial, a Jacobian counting what it costs."
-    )
+LEGEND = (
+    "success: of all trials, in per cent, with its 95 % interval; bold: may be the best, since no rival surely succeeds"
+    " more often. failed (on wide screens): known / silently, by whether the status or the test of fit says so.",
+    "error: median / 95 % quantile of all trials, in multiples of the bound at the truth, 1 at best; efficiency: one"
+    f" over its root mean square, a trial counting at most {CAP:g}.",
+    "NEES: squared error over the variance that the estimator claims (median), 1 if honest; optimistic (+): it claims"
+    " too much, pessimistic (-): too little, diverged (!): it is lost and does not know. cost: simulations.",
+)
+"""What the columns of the overview mean."""
+_VERDICTS = {"consistent": ("", ""), "optimistic": ("optimistic", "+"), "pessimistic": ("pessimistic", "-")}
+_VERDICTS |= {"diverged but confident": ("diverged", "!"), "-": ("", "")}
 
 
-def _setting(title: str, part: Sequence[Mapping[str, Any]]) -> Table:
+def leading(rows: Sequence[Mapping[str, Any]], scenario: Sequence[str]) -> list[bool]:
+    """Whether each row's estimator may be the best of its scenario, where another is surely beaten."""
+    keys = [tuple(str(row[name]) for name in scenario) for row in rows]
+    beaten = {key for key, row in zip(keys, rows, strict=True) if not row[BEST]}
+    return [bool(row[BEST]) and key in beaten for key, row in zip(keys, rows, strict=True)]
+
+
+def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *, narrow: bool = False) -> list[Column]:
+    """What everybody is judged by, over all trials; a narrow screen lacks the failures and has signs for verdicts."""
+
+    def cells(title: str, key: str, show: Callable[[Mapping[str, Any]], str], best: Sequence[bool] = ()) -> Column:
+        marks = best or [False] * len(rows)
+        return Column(title, [Cell(show(r), sort_key(r[key]), mark) for r, mark in zip(rows, marks, strict=True)])
+
+    def success(row: Mapping[str, Any]) -> str:
+        low, high = 100 * row["success_low"], 100 * row["success_high"]
+        return f"{points(row['success'])} ({low:.0f}-{high:.0f})"
+
+    def efficiency(row: Mapping[str, Any]) -> str:
+        # Where half of the trials are capped, it is a limit and no value.
+        return f"{'<' * (row['error_median'] > CAP)}{row['efficiency_capped']:.2f}"
+
+    def nees(row: Mapping[str, Any]) -> str:
+        return f"{brief(row['nees_median'])} {_VERDICTS.get(row['verdict'], (row['verdict'], '?'))[narrow]}".strip()
+
+    def failed(row: Mapping[str, Any]) -> str:
+        return f"{points(row['failed_known'])} / {points(row['failed_silent'])}"
+
+    slash = "/" if narrow else " / "
+    found = [
+        words("estimator", [row["estimator"] for row in rows], best),
+        cells("success", "success", success, best),
+        cells("failed", "failed_silent", failed),
+        cells("error", "error_median", lambda r: f"{brief(r['error_median'])}{slash}{brief(r['error_q95'])}"),
+        cells("eff." if narrow else "efficiency", "efficiency_capped", efficiency),
+        cells("NEES", "nees_median", nees),
+        cells("cost", "simulations_median", lambda r: brief(r["simulations_median"])),
+        cells("time", "time_median_s", lambda r: duration(r["time_median_s"], 2)),
+    ]
+    return [column for column in found if not (narrow and column.title == "failed")]
+
+
+def _setting(title: str, part: Sequence[Mapping[str, Any]], width: int) -> Table:
     """The table of one setting."""
     # The number of trials stands in the title where it is the same for all.
-    counts = list({row["trials"] for row in part})
-    alike = len(counts) == 1
-    records = [record for record in all_statistics() if "terminal" in record.where]
-    columns = [
-        column("scale", [row["error_scale"] for row in part], lambda v: f"{v:g}"),
-        words("estimator", [row["estimator"] for row in part]),
-    ]
-    for record in records:
-        if not (alike and record.name == "trials") and reported(record, part):
+    counts = sorted({row["trials"] for row in part})
+    scales = column("scale", [row["error_scale"] for row in part], lambda v: f"{v:g}")
+    columns = [scales, *overview_columns(part, leading(part, ["error_scale"]), narrow=width < _WIDE_ENOUGH)]
+    if len(counts) > 1:
+        columns.append(column("trials", [row["trials"] for row in part], str))
+    for record in all_statistics():
+        if "terminal" in record.where and reported(record, part):
             columns += _statistic(record, part)
-    title = f"{title}: {counts[0]} trial{'s' * (counts[0] != 1)} per row" if alike else title
+    title = f"{title}: {counts[0]} trial{'s' * (counts[0] != 1)} per row" if len(counts) == 1 else title
     return Table("summary", title, "", columns, grouped=1, whole="summary.csv")
 
 

@@ -26,6 +26,22 @@ def percent(share: float) -> str:
     return f"{value:.0f} %" if value in (0, 100) else f"{value:.1f} %"
 
 
+def points(share: float) -> str:
+    """A share in per cent without the sign; 100 and 0 only where it is all or none."""
+    return percent(share).removesuffix(" %")
+
+
+def brief(value: float) -> str:
+    """Two decimals below ten, three figures above, in at most five characters."""
+    if not math.isfinite(value):
+        return "inf" if value == math.inf else "-"
+    if value == int(value) and value < 1000:
+        return str(int(value))
+    if value >= 999.5e6:
+        return f"{value:.0e}".replace("e+0", "e").replace("e+", "e")
+    return compact(value) if value >= 9.995 else f"{value:.2f}"
+
+
 def enumerate_few(items: Sequence[str], most: int = 6) -> str:
     """'a, b and 3 others'."""
     items = list(items)

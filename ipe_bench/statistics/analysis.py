@@ -20,16 +20,15 @@ from ipe_bench.statistics.comparisons import (
     Ranking,
     compare_pairs,
     corrected,
-    leaders,
     rank_over_replicates,
 )
 from ipe_bench.statistics.histories import History, trial_label
 from ipe_bench.statistics.intervals import quantile, quantiles
 from ipe_bench.statistics.portfolio import pooled, portfolio_row
 from ipe_bench.statistics.profiles import Profiles
-from ipe_bench.statistics.records import SCORES, capped_error, gate_radius, rows_of
+from ipe_bench.statistics.records import SCORES, capped_error, rows_of
 from ipe_bench.statistics.sample import Sample, Shared
-from ipe_bench.statistics.summary import ALL, summary_rows, to_frame
+from ipe_bench.statistics.summary import ALL, mark_best, outcomes_of, summary_rows, to_frame
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -52,7 +51,7 @@ class Analysis:
     pairs: pd.DataFrame
     """Every pair of estimators on every scenario; see `comparisons.Pair`."""
     scores: pd.DataFrame
-    """Per scenario and estimator: capped mean error, whether it leads significantly, and median costs."""
+    """Per scenario and estimator: capped mean error, and median costs."""
     ranking: Ranking | None
     profiles: pd.DataFrame
     """Estimator, profile (performance or data), `at` (cost ratio or budget) and share, over all scenarios."""
@@ -148,7 +147,7 @@ def _analysis(collection: Collection, rows: _Rows, everywhere: set[str]) -> Anal
         by_group=pd.DataFrame(rows.by_group),
         endings=pd.DataFrame(rows.endings),
         pairs=_pair_frame(rows.pairs),
-        scores=_with_leaders(pd.DataFrame(rows.scores), rows.pairs),
+        scores=pd.DataFrame(rows.scores),
         ranking=_ranking(rows.replicates, everywhere),
         profiles=rows.profiles.frame(),
         distributions=_joined(rows.distributions, ("probability", "distance")),
@@ -208,6 +207,7 @@ def _add_scenario(rows: _Rows, collection: Collection, number: int, groups: Sequ
     outcomes: dict[str, Outcomes] = {}
     scores: list[dict[str, Any]] = []
     rows.contraction += _contraction_rows(collection, groups[0])
+    first = len(rows.summary)
     for group in groups:
         sample = Sample.load(collection, group, shared)
         if len(sample) == 0:
@@ -227,6 +227,7 @@ def _add_scenario(rows: _Rows, collection: Collection, number: int, groups: Sequ
         rows.calibration += _calibration_rows(where, sample)
         rows.convergence += [_convergence_rows(where, history) for history in sample.histories]
     rows.scores += scores
+    mark_best(rows.summary[first:], outcomes)
     return dict(groups[0].columns) | {"scenario": number}, outcomes
 
 
@@ -257,19 +258,6 @@ def _pair_frame(pairs: Sequence[tuple[dict[str, Any], Pair]]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _with_leaders(scores: pd.DataFrame, pairs: Sequence[tuple[dict[str, Any], Pair]]) -> pd.DataFrame:
-    import pandas as pd
-
-    by_scenario: dict[int, list[Pair]] = {}
-    for (where, _), pair in zip(pairs, corrected([pair for _, pair in pairs]), strict=True):
-        by_scenario.setdefault(where["scenario"], []).append(pair)
-    leads = pd.Series(False, index=scores.index)
-    for number, rows in scores.groupby("scenario") if len(scores) else ():
-        ahead = leaders(rows["estimator"], by_scenario.get(int(str(number)), []))
-        leads[rows.index] = rows["estimator"].isin(ahead)
-    return scores.assign(leads=leads)
-
-
 def _ranking(replicates: Sequence[tuple[int, int, str, float]], everywhere: set[str]) -> Ranking | None:
     """Ranks of the estimators that every scenario has, over seeds: by the mean capped error over the scenarios that all
     seeds have."""
@@ -292,16 +280,6 @@ def head(group: Group) -> dict[str, Any]:
 def numbered(group: Group, number: int) -> dict[str, Any]:
     """The columns that a frame of one scenario and estimator starts with."""
     return dict(group.columns) | {"scenario": number, "estimator": group.estimator}
-
-
-def outcomes_of(sample: Sample) -> Outcomes:
-    """What comparisons and profiles need of a sample, by ascending seed and trial."""
-    success = sample.distance <= gate_radius(sample.n)
-    values = (sample.number, sample.distance, success, sample.cost)
-    if np.all(sample.number[1:] > sample.number[:-1]):
-        return Outcomes(*values)
-    order = np.argsort(sample.number, kind="stable")
-    return Outcomes(*(v[order] for v in values))
 
 
 def _group_rows(sample: Sample) -> list[dict[str, Any]]:

@@ -7,7 +7,7 @@ Cramér-Rao bound: about sqrt(n) for an efficient estimator. An estimate that is
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -188,11 +188,17 @@ def holm(p: Sequence[float]) -> Array:
     return corrected
 
 
-def leaders(labels: Iterable[str], pairs: Sequence[Pair]) -> set[str]:
-    """The estimators of a scenario than which none is significantly closer; empty where that is everyone, because then
-    nobody leads. It goes by the same verdicts as the pairs, so the two cannot disagree."""
-    beaten = {({pair.first, pair.second} - {pair.closer}).pop() for pair in pairs if pair.closer}
-    return set(labels) - beaten if beaten else set()
+def may_be_best(success: Array, level: float = ALPHA) -> Array:
+    """Which of k estimators no rival surely succeeds more often than, by their success (trials, k) in the same trials.
+
+    McNemar's exact one-sided test against every rival at `level` / (k - 1): an estimator that is truly a best one is
+    left out with a probability of at most `level` (multiple comparisons with the best: Hsu, Ann. Statist. 9, 1981).
+    """
+    k = success.shape[1]
+    won = success.astype(float).T @ (~success).astype(float)
+    discordant = (won + won.T).astype(int)
+    p = np.where(discordant > 0, bdtr(won, np.maximum(discordant, 1), 0.5), 1.0)
+    return p.min(axis=1, initial=1.0) > level / max(k - 1, 1)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 import numpy as np
-from scipy.special import chdtri, gammaincinv
+from scipy.special import betaincinv, chdtri, gammaincinv
 
 from ipe_bench.basics.containment import contained
 from ipe_bench.basics.errors import UserError, place_of
@@ -20,15 +20,27 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.calibration import overall_p, overall_words, shared_level
 from ipe_bench.statistics.consistency import clopper_pearson, mean_limits, verdict
 from ipe_bench.statistics.histories import CLOSE, FixedPointBound, fixed_point_bound, observed_constant, orders_of
-from ipe_bench.statistics.intervals import LARGEST_SAMPLE, RESAMPLES, quantile
+from ipe_bench.statistics.intervals import LARGEST_SAMPLE, RESAMPLES, quantile, rms_interval
 from ipe_bench.statistics.sample import AMBIGUOUS, FIT, NIS, QUANTILES, Sample
 from ipe_bench.statistics.sequences import rms_sequence_of, share_sequence
 from ipe_bench.trials.thresholds import EXPECTED, FEW, FIT_LEVEL, GATE, SAME_ROOT
 
 Kind = Literal["count", "share", "number", "physical", "seconds", "probability", "word"]
 """How a value is written; `report.words` knows each."""
-Where = Literal["overview", "costs", "parameters", "terminal", "covariances", "iterations", "theory", "calibration"]
-"""A table; its columns are in the order of the records."""
+Where = Literal[
+    "overview",
+    "terminal",
+    "all_trials",
+    "solved_trials",
+    "costs",
+    "parameters",
+    "covariances",
+    "iterations",
+    "theory",
+    "calibration",
+]
+"""A table; its columns are in the order of the records. The overview and the terminal's table show those of plugins
+behind their own."""
 Limits = tuple[Any, Any]
 
 
@@ -334,6 +346,47 @@ def _calibration_each(s: Sample) -> Array:
     return np.array([part.words(level) for part in s.calibrations[:-1]] or ["-"] * s.n, dtype=object)
 
 
+def _over_bound(s: Sample) -> Array:
+    """Mahalanobis errors (trials,) over √n: about 1 where the estimate is efficient."""
+    return s.distance / np.sqrt(s.n)
+
+
+def _capped(s: Sample) -> Array:
+    return np.minimum(_over_bound(s), CAP)
+
+
+def _efficiency_capped(s: Sample) -> float:
+    return float(_ratio(1.0, _rms(_capped(s))))
+
+
+def _efficiency_capped_limits(s: Sample) -> Limits:
+    low, high = rms_interval(_capped(s)[:, None] ** 2, np.ones(len(s), dtype=bool))
+    return float(_ratio(1.0, high[0])), float(_ratio(1.0, low[0]))
+
+
+def _nees_median(s: Sample) -> float:
+    return quantile(s.scalars["nees"], 0.5) / (2 * gammaincinv(s.n / 2, 0.5)) if s.reports_covariance else np.nan
+
+
+def _nees_median_limits(s: Sample) -> Limits:
+    """The median of N independent values lies at a beta-distributed probability of their law."""
+    if not s.reports_covariance:
+        return np.nan, np.nan
+    middle = (len(s) + 1) / 2
+    low, high = 2 * gammaincinv(s.n / 2, betaincinv(middle, middle, np.array([0.025, 0.975])))
+    return tuple(np.array([low, high]) / (2 * gammaincinv(s.n / 2, 0.5)))
+
+
+def _failed(s: Sample, *, known: bool) -> float:
+    """Share that fails, by whether the estimator itself gives notice of it."""
+    noticed = ~s.converged
+    if FIT in s.scalars and np.isfinite(s.scalars[FIT]).any():
+        noticed = noticed | ~(s.scalars[FIT] >= FIT_LEVEL)
+    if AMBIGUOUS in s.scalars:
+        noticed = noticed | (s.scalars[AMBIGUOUS] > 0)
+    return _share(~s.scalars["success"] & (noticed == known))
+
+
 def _false_root_distance(s: Sample) -> float:
     wrong = s.converged & ~s.solved
     known = "root_distance" in s.scalars and wrong.any()
@@ -378,11 +431,13 @@ def _mean_nis(s: Sample) -> float:
     return float(np.mean(values[np.isfinite(values)])) if np.isfinite(values).any() else np.nan
 
 
-_EVERYWHERE: tuple[Where, ...] = ("overview", "terminal")
+CAP = 5.0
+"""What a trial's error over the bound counts as at most in `efficiency_capped`: an efficient estimate lies beyond it
+in fewer than one trial in a million."""
 _MEDIAN, _Q95 = _error_quantile(0.5), _error_quantile(0.95)
 
 STATISTICS: tuple[Statistic, ...] = (
-    Statistic("trials", "trials", "all trials", "Their number.", len, kind="count", where=_EVERYWHERE),
+    Statistic("trials", "trials", "all trials", "Their number.", len, kind="count", where=("all_trials",)),
     Statistic(
         "converged",
         "converged",
@@ -391,7 +446,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " messages.",
         lambda s: _share(s.converged),
         kind="share",
-        where=("overview",),
+        where=("all_trials",),
     ),
     Statistic(
         "solved",
@@ -402,7 +457,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " they finished.",
         lambda s: _share(s.solved),
         kind="share",
-        where=_EVERYWHERE,
+        where=("solved_trials",),
     ),
     Statistic(
         "success",
@@ -414,8 +469,6 @@ STATISTICS: tuple[Statistic, ...] = (
         lambda s: int(s.scalars["success"].sum()) / len(s),
         limits=_success_limits,
         kind="share",
-        where=_EVERYWHERE,
-        limits_titles={"overview": "95 % of success"},
     ),
     Statistic(
         "success_anytime",
@@ -429,12 +482,70 @@ STATISTICS: tuple[Statistic, ...] = (
         kind="share",
     ),
     Statistic(
+        "failed_known",
+        "failed and known",
+        "all trials",
+        "Share without success of which the estimator itself gives notice: it did not converge, its residuals fail the"
+        " test of fit, or several minima fit.",
+        lambda s: _failed(s, known=True),
+        kind="share",
+        where=("all_trials",),
+    ),
+    Statistic(
+        "failed_silent",
+        "failed silently",
+        "all trials",
+        "Share without success that converged to residuals that fit: wrong answers that look right.",
+        lambda s: _failed(s, known=False),
+        kind="share",
+        where=("all_trials",),
+    ),
+    Statistic(
+        "error_median",
+        "median error",
+        "all trials",
+        "Median of the error over the bound, sqrt(e' J' R⁻¹ J e / n) at the truth: about 1 where an estimate attains"
+        " the Cramér-Rao bound, which is that of estimators with a prior too. What is not finite counts as infinite.",
+        lambda s: quantile(_over_bound(s), 0.5),
+    ),
+    Statistic(
+        "error_q95",
+        "95 % error",
+        "all trials",
+        "95 % quantile of the same.",
+        lambda s: quantile(_over_bound(s), 0.95),
+    ),
+    Statistic(
+        "efficiency_capped",
+        "efficiency",
+        "all trials",
+        f"One over the root mean square of the same, each trial counting at most {CAP:g}, so that no single trial"
+        f" decides; {1 / CAP:g} where all count that. Interval: as that of rmse.",
+        _efficiency_capped,
+        limits=_efficiency_capped_limits,
+        where=("all_trials",),
+        limits_titles={"all_trials": "95 % of efficiency"},
+    ),
+    Statistic(
+        "nees_median",
+        "NEES",
+        "all trials",
+        "Median of e' P⁻¹ e with the covariance P that the estimator reports, over the median of chi-square with n"
+        " degrees: 1 where the covariance is right. What is not finite counts as infinite. Limits: where the median of"
+        " as many trials lies in 95 % of cases if it is right.",
+        _nees_median,
+        limits=_nees_median_limits,
+        where=("calibration",),
+        limits_titles={"calibration": "NEES limits"},
+    ),
+    Statistic(
         "solved_trials",
         "solved trials",
         "all trials",
         "Number that is solved: what bias, std, rmse, bounds, efficiency and NEES are over.",
         lambda s: int(s.solved.sum()),
         kind="count",
+        where=("solved_trials",),
     ),
     Statistic(
         "common_trials",
@@ -460,7 +571,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "Share that converged and is not solved: another root of the same equation.",
         lambda s: _share(s.converged & ~s.solved),
         kind="share",
-        where=("overview", "covariances"),
+        where=("solved_trials", "covariances"),
     ),
     Statistic(
         "false_root_distance",
@@ -531,7 +642,7 @@ STATISTICS: tuple[Statistic, ...] = (
         _over_linear_bound(_rmse_common),
         _in_units(_rmse_common),
         given="common",
-        where=("overview",),
+        where=("solved_trials",),
     ),
     Statistic(
         "linear_bound",
@@ -658,7 +769,7 @@ STATISTICS: tuple[Statistic, ...] = (
     ),
     Statistic(
         "efficiency",
-        "efficiency",
+        "efficiency, solved",
         "solved trials",
         "Bound over rmse, as standard deviations: 1 for an efficient estimator. The bound is the one at the truth,"
         " Cramér and Rao's or, for estimators that use a prior, the Bayesian one. Interval: from that of rmse.",
@@ -667,8 +778,9 @@ STATISTICS: tuple[Statistic, ...] = (
         limits=_efficiency_limits,
         each_limits=_efficiency_limits_each,
         given="solved",
-        where=("overview", "parameters", "terminal"),
-        limits_titles={"overview": "95 % of efficiency", "terminal": "95 %"},
+        where=("solved_trials", "parameters"),
+        titles={"solved_trials": "efficiency"},
+        limits_titles={"solved_trials": "95 % of efficiency"},
     ),
     Statistic(
         "rmse_all",
@@ -678,8 +790,8 @@ STATISTICS: tuple[Statistic, ...] = (
         _over_linear_bound(_rmse_all),
         _in_units(_rmse_all),
         kind="physical",
-        where=("overview", "parameters"),
-        titles={"overview": "rmse / linear bound, all"},
+        where=("all_trials", "parameters"),
+        titles={"all_trials": "rmse / linear bound"},
     ),
     Statistic(
         "efficiency_all",
@@ -689,8 +801,8 @@ STATISTICS: tuple[Statistic, ...] = (
         " estimators that solve an equation with those that do not.",
         lambda s: float(_ratio(_over_linear_bound(_bound_all)(s), _over_linear_bound(_rmse_all)(s))),
         lambda s: _ratio(_bound_all(s), _rmse_all(s)),
-        where=("overview", "parameters", "terminal"),
-        titles={"terminal": "all"},
+        where=("all_trials", "parameters"),
+        titles={"all_trials": "efficiency, uncapped"},
     ),
     Statistic(
         "median_abs_error",
@@ -713,7 +825,7 @@ STATISTICS: tuple[Statistic, ...] = (
     ),
     Statistic(
         "nees",
-        "NEES / n",
+        "NEES / n, solved",
         "solved trials",
         "Mean of e' P⁻¹ e / n with the covariance P that the estimator reports: 1 where it is right; per parameter, of"
         " squared error over reported variance. Limits: 95 % chi-square (Bar-Shalom, Li and Kirubarajan, Estimation"
@@ -723,9 +835,9 @@ STATISTICS: tuple[Statistic, ...] = (
         limits=_nees_limits,
         each_limits=_nees_limits_each,
         given="solved",
-        where=("overview", "parameters", "terminal"),
-        titles={"parameters": "NEES", "terminal": "NEES"},
-        limits_titles={"overview": "NEES limits"},
+        where=("solved_trials", "parameters"),
+        titles={"parameters": "NEES", "solved_trials": "NEES / n"},
+        limits_titles={"solved_trials": "NEES limits"},
     ),
     Statistic(
         "coverage95",
@@ -736,7 +848,7 @@ STATISTICS: tuple[Statistic, ...] = (
         _coverage,
         _coverage_each,
         kind="share",
-        where=("overview", "parameters"),
+        where=("calibration", "parameters"),
     ),
     Statistic(
         "verdict",
@@ -747,7 +859,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " its 95 % limits.",
         lambda s: verdict(s.scalars["nees"][s.converged], s.n),
         kind="word",
-        where=("overview",),
+        where=("calibration",),
     ),
     Statistic(
         "claims",
@@ -803,7 +915,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " leave, m less the trace of their influence. It needs no truth, so it is known for real readings too.",
         _misfit,
         kind="share",
-        where=_EVERYWHERE,
+        where=("all_trials",),
     ),
     Statistic(
         "ambiguous",
@@ -812,7 +924,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "Share in which several distinct minima fit the readings, so that no residual can tell which is the truth.",
         _ambiguous,
         kind="share",
-        where=_EVERYWHERE,
+        where=("all_trials",),
         rare=True,
     ),
     Statistic(
@@ -822,7 +934,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "Share that is flagged as ambiguous.",
         _failures_flagged,
         kind="share",
-        where=("overview",),
+        where=("all_trials",),
         rare=True,
     ),
     Statistic(
@@ -847,8 +959,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "all trials",
         "Median cost of a trial. A Jacobian counts as many simulations as the model says that it costs.",
         lambda s: quantile(s.cost, 0.5),
-        where=("costs", "terminal"),
-        titles={"terminal": "sims"},
+        where=("costs",),
     ),
     Statistic(
         "time_median_s",
@@ -857,7 +968,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "Median over trials of the mean wall clock per trial of the block that a trial was computed in.",
         lambda s: quantile(s.scalars["time_s"], 0.5),
         kind="seconds",
-        where=("costs", "terminal"),
+        where=("costs",),
     ),
 )
 """The columns of `summary.csv`, in order."""
@@ -871,7 +982,7 @@ SCORES: tuple[Statistic, ...] = (
         " when efficient; each trial's counts at most the radius of the gate of success, so that failing badly is"
         " failing once.",
         capped_error,
-        where=("overview",),
+        where=("all_trials",),
     ),
     Statistic("cost_median", "cost", "all trials", "Median cost of a trial.", lambda s: quantile(s.cost, 0.5)),
     Statistic(

@@ -7,8 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ipe_bench.statistics.collect import ALWAYS_COLUMNS, Collection, collect
-from ipe_bench.statistics.records import STATISTICS, all_statistics, frame_columns, summary_columns_of
+from ipe_bench.statistics.comparisons import Outcomes, common, may_be_best
+from ipe_bench.statistics.records import STATISTICS, all_statistics, frame_columns, gate_radius, summary_columns_of
 from ipe_bench.statistics.sample import Sample, Shared
 
 if TYPE_CHECKING:
@@ -16,13 +19,15 @@ if TYPE_CHECKING:
 
 ALL = "all"
 """The row over all parameters."""
-COLUMNS = frame_columns(STATISTICS)
-"""Those of our own statistics."""
+BEST = "may_be_best"
+"""Whether no rival surely succeeds more often in the same trials; see `comparisons.may_be_best`."""
+COLUMNS = (*frame_columns(STATISTICS), BEST)
+"""The columns of our own statistics."""
 
 
 def columns() -> tuple[str, ...]:
     """The columns of the statistics."""
-    return frame_columns(all_statistics())
+    return (*frame_columns(all_statistics()), BEST)
 
 
 def summarize(directories: Sequence[Path | str]) -> pd.DataFrame:
@@ -40,9 +45,36 @@ def rows_of_all(collection: Collection) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for groups in collection.scenarios.values():
         shared = Shared.among(collection, groups)
+        own: list[dict[str, Any]] = []
+        outcomes: dict[str, Outcomes] = {}
         for group in groups:
-            rows += summary_rows(Sample.load(collection, group, shared))
+            sample = Sample.load(collection, group, shared)
+            own += summary_rows(sample)
+            outcomes[group.estimator] = outcomes_of(sample)
+        mark_best(own, outcomes)
+        rows += own
     return rows
+
+
+def outcomes_of(sample: Sample) -> Outcomes:
+    """What comparisons and profiles need of a sample, by ascending seed and trial."""
+    success = sample.distance <= gate_radius(sample.n)
+    values = (sample.number, sample.distance, success, sample.cost)
+    if np.all(sample.number[1:] > sample.number[:-1]):
+        return Outcomes(*values)
+    order = np.argsort(sample.number, kind="stable")
+    return Outcomes(*(v[order] for v in values))
+
+
+def mark_best(rows: Sequence[dict[str, Any]], outcomes: Mapping[str, Outcomes]) -> None:
+    """Adds the column `BEST` to the rows of one scenario, over the trials that all its estimators have."""
+    paired = common({label: outcome for label, outcome in outcomes.items() if len(outcome.ids)})
+    if not paired:
+        return
+    best = may_be_best(np.column_stack([outcome.success for outcome in paired.values()]))
+    marks = dict(zip(paired, best.tolist(), strict=True))
+    for row in rows:
+        row[BEST] = marks[row["estimator"]]
 
 
 def summary_rows(sample: Sample) -> list[dict[str, Any]]:

@@ -44,8 +44,8 @@ def test_the_summary_counts_the_flags_that_are_stored(folders):
 
 def test_tables_have_the_columns_only_where_somebody_looks(folders):
     for folder, there in zip(folders, (True, False), strict=True):
-        overview = next(t for t in all_tables(analyse([folder])) if t.name == "overview")
-        titles = {c.title for c in overview.columns}
+        table = next(t for t in all_tables(analyse([folder])) if t.name == "all_trials")
+        titles = {c.title for c in table.columns}
         assert ({"ambiguous", "failures flagged"} <= titles) == there
         assert "misfit" in titles
 

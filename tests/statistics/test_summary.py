@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import chi2
 from synthetic_store import Filter, Pretender, Repeated, Synthetic, forge
 
 from ipe_bench.statistics import analyse, summarize
@@ -227,6 +228,61 @@ def test_errors_of_all_trials_let_nobody_off(synthetic):
     assert far["rmse_all"] == pytest.approx(1e4 / np.sqrt(100), rel=1e-3)
     assert gone["rmse_all"] == np.inf
     assert gone["efficiency_all"] == 0.0
+
+
+def test_one_runaway_does_not_decide(synthetic):
+    e = errors(200, bias=(0, 0, 0))
+    e[0] = 1e9
+    synthetic.add(synthetic.scenario(), "one", e)
+    total = row(summarize([synthetic.directory]), "one")
+    assert total["efficiency_all"] < 1e-6
+    squares = np.minimum((e**2).sum(axis=1) / 0.1**2 / 3, 25.0)
+    assert total["efficiency_capped"] == pytest.approx(1 / np.sqrt(squares.mean()))
+    assert 0.9 < total["efficiency_capped"] < 0.97
+    assert total["error_median"] == pytest.approx(np.median(np.sqrt((e**2).sum(axis=1) / 0.1**2 / 3)))
+    assert total["error_q95"] == pytest.approx(np.quantile(np.sqrt((e**2).sum(axis=1) / 0.1**2 / 3), 0.95))
+
+
+def test_everybody_is_judged_by_the_same_trials(synthetic):
+    """A filter, an estimator that seeks a root and fails in half of the trials, one that returns nothing at all."""
+    e = errors(100, bias=(0, 0, 0))
+    half = np.arange(100) < 50
+    ended = np.where(half, "converged", "nonfinite")
+    synthetic.add(synthetic.scenario(), "filter", 2 * e, estimator=Filter())
+    lost = {"nees": np.where(half, 3.0, np.nan), "status": ended, "solved": half}
+    synthetic.add(synthetic.scenario(), "half", np.where(half[:, None], e, np.nan), **lost)
+    synthetic.add(synthetic.scenario(), "nothing", e * np.nan, solved=False, status="nonfinite")
+    frame = summarize([synthetic.directory])
+    filtered, half, nothing = (row(frame, label) for label in ("filter", "half", "nothing"))
+    assert filtered["efficiency_capped"] == pytest.approx(0.5)
+    assert filtered["nees_median"] == pytest.approx(np.median((2 * e / 0.1) ** 2 @ np.ones(3)) / chi2.median(3))
+    assert half["efficiency_capped"] == pytest.approx(1 / np.sqrt((25 + 1) / 2), rel=0.1)
+    assert half["error_q95"] == np.inf
+    assert nothing["efficiency_capped"] == pytest.approx(0.2)
+    assert nothing["error_median"] == nothing["nees_median"] == np.inf
+
+
+def test_the_median_of_honest_nees_lies_within_its_limits_in_95_per_cent_of_runs(synthetic):
+    synthetic.add(synthetic.scenario(), "one", errors(40))
+    total = row(summarize([synthetic.directory]), "one")
+    medians = np.median(chi2.rvs(3, size=(4000, 40), random_state=1), axis=1) / chi2.median(3)
+    inside = np.mean((total["nees_median_low"] <= medians) & (medians <= total["nees_median_high"]))
+    # The median of an even number is the mean of two values, which scatters a little less than one.
+    assert 0.94 < inside < 0.975
+
+
+def test_a_failure_is_known_or_silent(synthetic):
+    """Four wrong of ten: one did not converge, one does not fit, one is flagged as ambiguous, and one looks right."""
+    right = np.arange(10) >= 4
+    e = np.where(right[:, None], 0.0, 5.0) + np.zeros(3)
+    status = np.array(["max_iterations"] + ["converged"] * 9, dtype=object)
+    fit = np.array([0.5, 1e-5] + [0.5] * 8)
+    ambiguous = np.array([0.0, 0.0, 1.0] + [0.0] * 7)
+    synthetic.add(synthetic.scenario(), "one", e, status=status, solved=right, fit_p=fit, extra_ambiguous=ambiguous)
+    synthetic.add(synthetic.scenario(), "untested", e, status=status, solved=right)
+    frame = summarize([synthetic.directory])
+    assert tuple(row(frame, "one")[["success", "failed_known", "failed_silent"]]) == (0.6, 0.3, 0.1)
+    assert tuple(row(frame, "untested")[["failed_known", "failed_silent"]]) == (0.1, 0.3)
 
 
 def test_a_jacobian_counts_what_the_model_says_it_costs(synthetic):
