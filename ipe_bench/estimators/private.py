@@ -37,6 +37,7 @@ class Private:
             Covariance(problem.R.factor.copy()),
             None if prior is None else prior.copy(),
             None if correlation is None else correlation.copy(),
+            problem.doubted,
         )
         self.z = z.copy()
         self.z.flags.writeable = False

@@ -32,6 +32,8 @@ _SAME_LEVEL = 1e-3
 _SMALLEST_LEVEL = 1e-8
 """As a share of the readings, the level that estimators are told at least."""
 _FARTHEST = 40.0
+_DOUBTED = 0.05
+"""Where the test of the fit gives less, estimators that can look for a better fit: there is but one set of readings."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +178,9 @@ def fit(
     present = np.flatnonzero(~np.isnan(z))
     given = problem if len(present) == len(z) else _restricted(problem, present)
     where = present, len(z), _succession(problem.measurement, present)
-    if noise.estimated if level_unknown is None else level_unknown:
+    unknown = noise.estimated if level_unknown is None else level_unknown
+    given = replace(given, doubted=1.0 if unknown else _DOUBTED)
+    if unknown:
         found = [_fit_with_level(label, one, given, z[present], *where) for label, one in estimators.items()]
     else:
         found = [_fit_one(label, one, given, z[present], *where, noise=noise) for label, one in estimators.items()]
@@ -294,7 +298,8 @@ def holding(problem: Problem, values: Mapping[int, float]) -> Problem:
     deviation, correlation = problem.prior_deviation, problem.prior_correlation
     deviation = None if deviation is None else deviation[kept]
     correlation = None if correlation is None else correlation[np.ix_(kept, kept)]
-    return Problem(problem.measurement.holding(values), problem.R, deviation, correlation)
+    held = problem.measurement.holding(values)
+    return replace(problem, measurement=held, prior_deviation=deviation, prior_correlation=correlation)
 
 
 def _is_minimum(problem: Problem, held: Fit, near: Mapping[int, float], z: Array) -> bool:

@@ -71,7 +71,7 @@ class Auto(Estimator):
         best, contracts = Chords(objective, problem.H, self.tolerance, self.budget, history).minima()
         fitting = Fitting.none(len(z), z.shape[1], self.fit_level)
         fits = fitting.note(best, np.arange(len(z)))
-        answered = accepted(best, z.shape[1], self.fit_level)
+        answered = accepted(best, z.shape[1], max(self.fit_level, problem.doubted))
         tally = Tally(tally.simulations, tally.jacobians - answered, np.zeros(len(z), dtype=bool))
         left = np.flatnonzero(~answered)
         if len(left):

@@ -1,7 +1,6 @@
 """Progressive IPE: the least-squares estimate, reached from far away by windows that grow as a filter sees the data.
 
-What an attempt is, is left to `windows` where readings arrive in epochs, and to `stages` where their order says
-nothing; here is the judge, and when to stop.
+The attempts are those of `attempts`; here is the judge, and when to stop.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge, Gt, Lt
+from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array, Mask, finite
@@ -20,8 +20,7 @@ from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.least_squares import Minima
 from ipe_bench.measurements.counted import Tally
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.solvers.stages import Stages
-from ipe_bench.solvers.windows import GIVEN_UP, Windows
+from ipe_bench.solvers.attempts import Limits, Stages, Windows
 
 _SAME_FIT = 1e-6
 """Two minima whose chi-squares differ by less than this share are one."""
@@ -29,6 +28,10 @@ _BULK = 1.0
 """Where half of the residuals are within so many deviations, for .67 where all is right, and there are at least"""
 _READINGS = 4
 """so many readings for each parameter, the minimum is right and it is R that is wrong for a few of them."""
+_TRUSTED = 1e-3
+"""A level of the test of fit from which on a large bulk of residuals is asked for no longer: R is known, or unknown."""
+_WORTH = 20.0
+"""What a search for a better fit may cost, in costs of the first fit."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +45,11 @@ class Progressive(Estimator):
 
     The test of the residuals is the estimator's own verdict, extras `fit_p`. A trial that fails it, and whose bulk of
     residuals is large too, is tried again: carefully from the nominal point (windows that grow slowly, damping by the
-    residual, steps bent along the curvature), then from 16, 32, ... draws of the prior, which the first windows keep
-    apart and the later ones thin out to those that fit best. An attempt that leads to the same minimum again ends the
-    search, unless its residuals are beyond any use; the best fit counts.
+    residual, steps bent along the curvature), by Levenberg-Marquardt on all data, and from 16, 32, ... draws of the
+    prior, which the first windows keep apart and the later ones thin out to those that fit best. The best fit counts.
+    A minimum that independent draws lead to again ends the search, for nothing says of readings that do not fit
+    whether a better fit exists; so does 20 times the cost of the first fit, once draws were tried. The message of such
+    a trial says how far the search went.
 
     Growing windows that start one another are the incremental single shooting of Michalik, Hannemann and Marquardt
     (Comput. Chem. Eng. 33, 2009) and, with a prior, the recursive iterative batch smoother of Stepanov et al. (Sensors
@@ -59,18 +64,14 @@ class Progressive(Estimator):
     use_prior: bool = True
     prior_inflation: Positive = 1.0
     """Times the prior's standard deviations."""
-    damping: Positive = 1.0
-    """lambda at the start of every window."""
     window_tolerance: Positive = 0.1
     """Where a window's fit is good enough: the Gauss-Newton step in standard deviations."""
-    window_iterations: Count = 10
-    """Of the first attempt."""
     max_iterations: Count = 60
     """Steps of the last pass."""
     tolerance: Positive = 1e-6
     """Of the last pass: the Gauss-Newton step in standard deviations of the local bound."""
     restarts: Whole | None = None
-    """Further attempts at a trial that fails the test; None: six with windows, eleven without."""
+    """Further attempts at a trial that fails the test; None: eight with windows, fifteen without."""
     fit_level: Annotated[float, Ge(0), Lt(1)] = 1e-6
     """Residuals less probable than this are taken for those of a wrong minimum."""
     budget: Positive | None = None
@@ -86,45 +87,80 @@ class Progressive(Estimator):
         self, problem: Problem, z: Array, *, before: Minima | None = None, history: bool = False
     ) -> tuple[Minima, Tally]:
         """The best minimum of each trial, and what it has cost to find it. `before`: what is known already, minima
-        that do not fit, or none; where one of them is found again the search ends, as with its own."""
+        that do not fit, or none."""
         kind = Stages if problem.measurement.epochs is None else Windows
-        search = kind(self, problem, z, Tally.zeros(len(z)), history)
-        best = search.attempt(0, np.arange(len(z)), None)
-        repeated = np.zeros(len(z), dtype=np.int64)
+        limits = Limits(
+            self.tolerance, self.max_iterations, self.budget, self.growth, self.window_tolerance, self.restarts
+        )
+        prior = problem.prior_used(self.prior_inflation) if self.use_prior else None
+        attempts = kind(limits, problem, prior, z, Tally.zeros(len(z)), history)
+        level = max(self.fit_level, problem.doubted)
+        best = attempts.attempt(0, np.arange(len(z)), None)
         if before is not None:
-            repeated += _found_again(best, before, z.shape[1])
             worse = before.converged & ~_is_better(best, before)
             best = put(best, worse, take(before, worse))
-        for k in range(1, search.last + 1):
-            suspect = np.flatnonzero(self._suspect(problem, best, search.tally, z) & (repeated < kind.enough))
+        account = _Account.of(len(z))
+        for k in range(1, attempts.last + 1):
+            cost = attempts.tally.cost(best.x.shape[1])
+            account.first = np.where(best.converged, np.minimum(account.first, cost), np.inf)
+            going = ~accepted(best, z.shape[1], level) & finite(z) & ~attempts.tally.failed(np.arange(len(z)))
+            going &= (cost < _WORTH * account.first) | (account.draws == 0)
+            going &= cost < (np.inf if self.budget is None else self.budget)
+            going &= account.repeats < attempts.repeats
+            suspect = np.flatnonzero(going)
             if not len(suspect):
                 break
             known = take(best, suspect)
-            again = search.attempt(k, suspect, known)
-            repeated[suspect] += _found_again(again, known, z.shape[1])
+            again = attempts.attempt(k, suspect, known)
+            account.note(suspect, again, known, attempts.draws(k))
             better = _is_better(again, known)
             best = put(best, suspect[better], take(again, better))
-        raised = search.tally.failed(np.arange(len(z))) & ~best.converged
-        return replace(best, status=np.where(raised, Status.ERROR, best.status).astype(np.int8)), search.tally
+        raised = attempts.tally.failed(np.arange(len(z))) & ~best.converged
+        for i in np.flatnonzero(best.converged & ~accepted(best, z.shape[1], level) & (account.attempts > 0)):
+            attempts.tally.messages[int(i)] = account.words(int(i))
+        return replace(best, status=np.where(raised, Status.ERROR, best.status).astype(np.int8)), attempts.tally
 
-    def _suspect(self, problem: Problem, best: Minima, tally: Tally, z: Array) -> Mask:
-        """The trials that another attempt may help: (trials,)."""
-        hopeless = ~finite(z) | tally.failed(np.arange(len(z)))
-        affordable = tally.cost(best.x.shape[1]) < (np.inf if self.budget is None else self.budget)
-        return ~accepted(best, z.shape[1], self.fit_level) & ~hopeless & affordable
+
+@dataclass
+class _Account:
+    """What the search for a better fit has tried in each trial; every field is (trials,)."""
+
+    first: Array
+    """What the first fit had cost; infinite before there is one."""
+    attempts: NDArray[np.int64]
+    """Attempts after the first one."""
+    draws: NDArray[np.int64]
+    """Independent draws among their starts."""
+    repeats: NDArray[np.int64]
+    """Attempts from independent draws that have led to the best minimum again."""
+
+    @classmethod
+    def of(cls, trials: int) -> _Account:
+        return cls(np.full(trials, np.inf), *np.zeros((3, trials), np.int64))
+
+    def note(self, rows: NDArray[np.intp], again: Minima, known: Minima, draws: int) -> None:
+        """Books an attempt from so many draws at the trials `rows`, of which `known` were the best minima."""
+        with np.errstate(invalid="ignore"):  # two infinite fits are not one minimum
+            near = _SAME_FIT * np.maximum(again.chi_square, known.chi_square)
+            same = again.converged & known.converged & (np.abs(again.chi_square - known.chi_square) <= near)
+        lower = _is_better(again, known) & ~same
+        self.attempts[rows] += 1
+        self.draws[rows] += draws
+        self.repeats[rows] = np.where(lower, 0, self.repeats[rows] + (same & (draws > 0)))
+
+    def words(self, i: int) -> str:
+        """What was tried in trial i."""
+        count = f"{self.attempts[i]} more attempt{'' if self.attempts[i] == 1 else 's'}"
+        drawn = f", from {self.draws[i]} independent draws in all" if self.draws[i] else ""
+        led = f"{self.repeats[i]} of them led to this minimum again" if self.repeats[i] else "none found one"
+        return f"a better fit was looked for by {count}{drawn}: {led}"
 
 
 def accepted(minima: Minima, readings: int, level: float) -> Mask:
     """Which minima (trials,) are taken for the least: those that fit, and those whose bulk of residuals does."""
     gross_errors_only = (minima.bulk <= _BULK) & (readings >= _READINGS * minima.x.shape[1])
-    return minima.converged & ((minima.fit_probability(readings) >= level) | gross_errors_only)
-
-
-def _found_again(new: Minima, old: Minima, readings: int) -> Mask:
-    """Where an attempt led to the known minimum, and that may be the least one of a model that does not quite hold."""
-    with np.errstate(invalid="ignore"):  # two infinite fits are not one minimum
-        same = np.abs(new.chi_square - old.chi_square) <= _SAME_FIT * np.maximum(new.chi_square, old.chi_square)
-    return new.converged & old.converged & same & (new.chi_square <= GIVEN_UP * readings)
+    fits = minima.fit_probability(readings) >= level
+    return minima.converged & (fits | (gross_errors_only & (level < _TRUSTED)))
 
 
 def _is_better(new: Minima, old: Minima) -> Mask:

@@ -22,7 +22,7 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Certified, Gaussian, Quantization
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.solvers import FixedPoint, Newton, Progressive, Relinearized
-from ipe_bench.solvers.windows import window_stops
+from ipe_bench.solvers.attempts import window_stops
 from ipe_bench.trials.roots import least_squares_root
 from ipe_bench.trials.scenario import Scenario
 
