@@ -12,12 +12,17 @@ import numpy as np
 from scipy.special import betaincinv, chdtri
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.trials.thresholds import GATE
+from ipe_bench.statistics.intervals import few_carry, rms_interval
+from ipe_bench.statistics.running import Squares
+from ipe_bench.trials.thresholds import FEW, GATE
 
 TOLERATED = 0.01
 """Share of trials outside their own gate above which an estimator is named diverged but confident."""
 
-Verdict = Literal["consistent", "pessimistic", "optimistic", "diverged but confident", "-"]
+_BETS = 0.99 * 2.0 ** -np.arange(9)
+"""Shares of the stake."""
+
+Verdict = Literal["consistent", "pessimistic", "optimistic", "undecided", "diverged but confident", "-"]
 
 
 def mean_limits(degrees: float, trials: int, level: float = 0.95) -> tuple[float, float]:
@@ -48,19 +53,31 @@ def clopper_pearson(count: int, trials: int, level: float = 0.95) -> tuple[float
 
 def verdict(nees: Array, n: int, level: float = 0.95) -> Verdict:
     """In one word, what an estimator's own covariance is worth: by the NEES (trials,) of the trials that it calls
-    converged, as `scoring.nees` returns them, for n parameters.
+    converged, as `scoring.nees` returns them, for n parameters; none of fewer than `FEW`.
 
     Diverged but confident: surely more than `TOLERATED` of the trials lie where the estimator says that a share of
-    `GATE` should. A trial whose NEES is NaN made no claim and is left out.
+    `GATE` should. Optimistic, pessimistic: the mean of NEES / n surely lies above or below 1, by the interval that
+    root mean squares have, whatever the law of the errors. Where few trials carry that mean there is no such interval:
+    it may still surely lie above 1, and is undecided otherwise. A trial whose NEES is NaN made no claim and is left
+    out.
     """
     claims = nees[~np.isnan(nees)]
-    if not len(claims):
+    if len(claims) < FEW:
         return "-"
     outside = int(np.sum(claims > chdtri(n, GATE)))
     if clopper_pearson(outside, len(claims), level)[0] > TOLERATED:
         return "diverged but confident"
-    low, high = mean_limits(n, len(claims), level)
-    mean = claims.mean() / n
-    if mean > high:
-        return "optimistic"
-    return "pessimistic" if mean < low else "consistent"
+    x = np.minimum(claims / n, 1e150)
+    squares = Squares(1)
+    squares.add(x[None])
+    if few_carry(squares, np.array([n]))[0]:
+        return "optimistic" if _above_1(x) >= 2 / (1 - level) else "undecided"
+    low, high = rms_interval(x[:, None], np.ones(len(x), dtype=bool), level)
+    return "optimistic" if low[0] > 1 else "pessimistic" if high[0] < 1 else "consistent"
+
+
+def _above_1(x: Array) -> float:
+    """Evidence that the mean of numbers (trials,) that are not negative is above 1, whatever their law: the mean
+    fortune of those who bet fixed shares on it, which exceeds c with a probability of at most 1 / c otherwise."""
+    fortunes = np.log1p(_BETS[:, None] * (x - 1)[None, :]).sum(axis=1)
+    return float(np.mean(np.exp(np.minimum(fortunes, 600.0))))

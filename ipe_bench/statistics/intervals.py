@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from functools import lru_cache
+from math import prod
 
 import numpy as np
+from scipy.special import ndtri
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.statistics.running import Bins
+from ipe_bench.statistics.running import Bins, Squares
 from ipe_bench.trials.thresholds import FEW
 
 LEVEL = 0.95
 RESAMPLES = 2000
 LARGEST_SAMPLE = 2000
 """Above this many trials, groups of consecutive trials are resampled in their place."""
+HEAVY = 0.01
+"""Share of samples of normal errors that are taken for heavy-tailed ones."""
+_ONE_TRIAL = 0.05
+"""Share of one trial in the sum of squared squares above which their scatter is not known either."""
 
 
 def rms_interval(squares: Array, used: Array, level: float = LEVEL) -> tuple[Array, Array]:
@@ -71,6 +78,49 @@ def _draws(size: int) -> Array:
     """How often each of `size` things is drawn in each resample: (RESAMPLES, size)."""
     rng = np.random.Generator(np.random.Philox(size))
     return rng.multinomial(size, np.full(size, 1 / size), size=RESAMPLES).astype(float)
+
+
+def few_carry(squares: Squares, degrees: Array) -> Array:
+    """Whether few trials carry the sum of squares (k,), so that no interval made of the trials can be relied on.
+
+    `degrees` (k,) are those of the chi-square law that a square has for normal errors. The sum of squared shares of
+    the trials is beyond what such errors exceed in a share `HEAVY` of cases, and one trial makes up a twentieth of it.
+    Errors larger than those of three trials in their number, such as one outlier among 20 trials in 50, may be in none
+    of the trials: then nothing in them can tell.
+    """
+    with np.errstate(all="ignore"):
+        total = squares.count * squares.mean
+        fourth = squares.deviations + squares.count * squares.mean**2
+        shares, largest = fourth / total**2, 1 / fourth
+    limits = np.array([_heaviest(squares.count, int(d)) for d in degrees])
+    return (shares > limits) & (largest > _ONE_TRIAL)
+
+
+@lru_cache(maxsize=1024)
+def _heaviest(trials: int, degrees: int) -> float:
+    """What the sum of squared shares of so many independent chi-square numbers in their sum exceeds in a share `HEAVY`
+    of cases: that of the shifted lognormal law with its mean, variance and skewness, which are those of Dirichlet's."""
+    if trials < 3:
+        return np.inf
+    a = Fraction(degrees, 2)
+
+    def moment(*powers: int) -> Fraction:
+        return prod((_rising(a, k) for k in powers), start=Fraction(1)) / _rising(trials * a, sum(powers))
+
+    pairs = trials * (trials - 1)
+    mean = trials * moment(2)
+    square = trials * moment(4) + pairs * moment(2, 2)
+    cube = trials * moment(6) + 3 * pairs * moment(4, 2) + pairs * (trials - 2) * moment(2, 2, 2)
+    deviation = float(square - mean**2) ** 0.5
+    skewness = float(cube - 3 * mean * square + 2 * mean**3) / deviation**3
+    root = (1 + skewness**2 / 2 + skewness * (1 + skewness**2 / 4) ** 0.5) ** (1 / 3)
+    w = root + 1 / root - 1
+    beyond = np.exp(-ndtri(HEAVY) * np.log(w) ** 0.5) - w**0.5
+    return float(mean) + deviation * float(beyond) / (w * (w - 1)) ** 0.5
+
+
+def _rising(x: Fraction, k: int) -> Fraction:
+    return prod((x + i for i in range(k)), start=Fraction(1))
 
 
 def quantile(values: Array, q: float) -> float:

@@ -20,9 +20,9 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.calibration import overall_p, overall_words, shared_level
 from ipe_bench.statistics.consistency import clopper_pearson, mean_limits, verdict
 from ipe_bench.statistics.histories import CLOSE, FixedPointBound, fixed_point_bound, observed_constant, orders_of
-from ipe_bench.statistics.intervals import LARGEST_SAMPLE, RESAMPLES, quantile, rms_interval
+from ipe_bench.statistics.intervals import HEAVY, LARGEST_SAMPLE, RESAMPLES, quantile, rms_interval
 from ipe_bench.statistics.sample import AMBIGUOUS, FIT, NIS, QUANTILES, Sample
-from ipe_bench.statistics.sequences import rms_sequence_of, share_sequence
+from ipe_bench.statistics.sequences import FIRST, share_sequence
 from ipe_bench.trials.thresholds import EXPECTED, FEW, FIT_LEVEL, GATE, SAME_ROOT
 
 Kind = Literal["count", "share", "number", "physical", "seconds", "probability", "word"]
@@ -131,13 +131,13 @@ def _success_sequence(s: Sample) -> Limits:
 
 
 def _rmse_sequence(s: Sample) -> Limits:
-    low, high = rms_sequence_of(s.sums.squares)
-    return float(low[-1]), float(high[-1])
+    low, high = s.rmse_sequence
+    return float(low[s.n]), float(high[s.n])
 
 
 def _rmse_sequence_each(s: Sample) -> Limits:
-    low, high = rms_sequence_of(s.sums.squares)
-    return low[:-1] * s.sizes, high[:-1] * s.sizes
+    low, high = s.rmse_sequence
+    return low[: s.n] * s.sizes, high[: s.n] * s.sizes
 
 
 def _misfit(s: Sample) -> float:
@@ -611,7 +611,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "Root mean square error. Interval: 95 %, by the studentised bootstrap of its logarithm over trials (Efron and"
         f" Tibshirani, An Introduction to the Bootstrap, 1993, ch. 12), {RESAMPLES} resamples, the same for every"
         f" estimator; above {LARGEST_SAMPLE} trials, groups of consecutive trials are resampled. None for fewer than"
-        f" {FEW} trials.",
+        f" {FEW} trials, and none where a few trials carry the sum of squares: where its effective number of trials is"
+        f" less than that of normal errors in all but {100 * HEAVY:g} % of cases.",
         _over_linear_bound(_rmse),
         _in_units(_rmse),
         limits=_rmse_limits,
@@ -626,13 +627,26 @@ STATISTICS: tuple[Statistic, ...] = (
         "rmse, any time",
         "solved trials",
         "The same root mean square error, with an asymptotic interval of 95 % that stays valid however often one looks"
-        " and whenever one stops (Waudby-Smith et al., Ann. Statist. 52, 2024).",
+        f" and whenever one stops (Waudby-Smith et al., Ann. Statist. 52, 2024); none for fewer than {FIRST} trials,"
+        " nor where a few trials carry the sum of squares.",
         _over_linear_bound(_rmse),
         _in_units(_rmse),
         limits=_rmse_sequence,
         each_limits=_rmse_sequence_each,
         given="solved",
         kind="physical",
+    ),
+    Statistic(
+        "effective_trials",
+        "effective trials",
+        "solved trials",
+        "How many equal ones would share the sum of squared errors as evenly as the trials do, (Σ e²)² / Σ e⁴ (Kish,"
+        " Survey Sampling, 1965): a third of the trials for normal errors of one parameter, one where a single trial"
+        " carries all.",
+        lambda s: float(s.effective_trials[s.n]),
+        lambda s: s.effective_trials[: s.n],
+        given="solved",
+        where=("parameters",),
     ),
     Statistic(
         "rmse_common",
@@ -828,8 +842,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "NEES / n, solved",
         "solved trials",
         "Mean of e' P⁻¹ e / n with the covariance P that the estimator reports: 1 where it is right; per parameter, of"
-        " squared error over reported variance. Limits: 95 % chi-square (Bar-Shalom, Li and Kirubarajan, Estimation"
-        " with Applications to Tracking and Navigation, 2001, sec. 5.4).",
+        " squared error over reported variance. Limits: 95 % chi-square, which honest errors keep within if they are"
+        " normal (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, sec."
+        " 5.4).",
         _nees,
         _nees_each,
         limits=_nees_limits,
@@ -855,8 +870,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "verdict",
         "converged trials with a reported covariance",
         "Whether the reported covariance is honest. Diverged but confident: surely more than 1 % of the trials lie"
-        f" where it says that a share of {GATE:g} should; optimistic, pessimistic: the mean NEES lies above or below"
-        " its 95 % limits.",
+        f" where it says that a share of {GATE:g} should; optimistic, pessimistic: the mean NEES lies surely (95 %, for"
+        " errors of any law, by the interval that rmse has) above or below n; undecided: a few trials carry that mean."
+        f" None for fewer than {FEW} trials.",
         lambda s: verdict(s.scalars["nees"][s.converged], s.n),
         kind="word",
         where=("calibration",),

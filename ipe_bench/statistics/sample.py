@@ -21,7 +21,8 @@ from ipe_bench.runs.results import StoredCell
 from ipe_bench.statistics.calibration import Calibration, Claims
 from ipe_bench.statistics.collect import Collection, Group
 from ipe_bench.statistics.histories import History, distances_to_limit, trial_label
-from ipe_bench.statistics.intervals import quantiles, rms_interval_of
+from ipe_bench.statistics.intervals import few_carry, quantiles, rms_interval_of
+from ipe_bench.statistics.sequences import rms_sequence_of
 from ipe_bench.statistics.sums import Beside, Rows, Sums
 
 FIT = "fit_p"
@@ -372,8 +373,36 @@ class Sample:
     @cached_property
     def rmse_limits(self) -> tuple[Array, Array]:
         """Ends of the intervals of rmse: per parameter (n), of all over the linear bound, and so of each group of
-        parameters."""
-        return rms_interval_of(self.sums.binned.sums, self.sums.counts.sums)
+        parameters; NaN where few trials carry it, see `intervals.few_carry`."""
+        low, high = rms_interval_of(self.sums.binned.sums, self.sums.counts.sums)
+        few = few_carry(self.sums.squares, self.degrees)
+        return np.where(few, np.nan, low), np.where(few, np.nan, high)
+
+    @property
+    def effective_trials(self) -> Array:
+        """Of the same squares, (sum of squares)² over the sum of their squares."""
+        squares = self.sums.squares
+        with np.errstate(all="ignore"):
+            total = squares.count * squares.mean
+            return total**2 / (squares.deviations + total * squares.mean)
+
+    @cached_property
+    def rmse_sequence(self) -> tuple[Array, Array]:
+        """Such ends that are valid at all numbers of trials."""
+        return rms_sequence_of(self.sums.squares, self.degrees)
+
+    @cached_property
+    def degrees(self) -> Array:
+        """Degrees of freedom of the squares that `rmse_limits` are of, if errors are normal: 1 of each parameter and
+        group, the least there can be; of all parameters what matches the variance (Satterthwaite, Biometrics 2, 1946).
+        """
+        products = self.sums.errors.products * np.outer(self.sums.unit, self.sums.unit)
+        with np.errstate(all="ignore"):
+            normalised = products / np.outer(self.linear_bound, self.linear_bound)
+            together = np.trace(normalised) ** 2 / np.sum(normalised**2)
+        found = np.ones(self.n + 1 + len(self.members))
+        found[self.n] = np.floor(together + 1e-9) if 1 <= together <= self.n + 1e-6 else 1.0
+        return found
 
     # How iterations went ----------------------------------------------------------------------------------------------
 

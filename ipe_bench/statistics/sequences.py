@@ -16,8 +16,8 @@ from scipy.special import betaln
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
+from ipe_bench.statistics.intervals import few_carry
 from ipe_bench.statistics.running import Squares
-from ipe_bench.trials.thresholds import FEW
 
 if TYPE_CHECKING:
     from ipe_bench.statistics.sample import Sample
@@ -28,6 +28,8 @@ TIGHTEST = 1000
 _WEIGHT = TIGHTEST / (2 * math.log(20) + math.log(2 * math.log(20)) + 1)
 """Of the mixtures, in trials: what makes those of 95 % tightest there (Waudby-Smith et al., 2024, appendix)."""
 _STEPS = 60
+FIRST = 100
+"""Trials from which an asymptotic sequence begins; one that begins earlier misses errors with rare large ones."""
 
 
 def share_sequence(count: int, trials: int, level: float = LEVEL) -> tuple[float, float]:
@@ -74,21 +76,24 @@ def mean_sequence(deviation: Array, count: int, level: float = LEVEL) -> Array:
 
 
 def rms_sequence(squares: Array, level: float = LEVEL) -> tuple[Array, Array]:
-    """Root mean square (k,) of squares (trials, k): the sequence of the logarithm of their mean; NaN below `FEW`."""
+    """Root mean square (k,) of squares (trials, k): the sequence of the logarithm of their mean; NaN below `FIRST`, and
+    where few trials carry the sum, as those of one degree of freedom; see `few_carry`."""
     running = Squares(squares.shape[1])
     running.add(squares.T)
-    return rms_sequence_of(running, level)
+    return rms_sequence_of(running, np.ones(squares.shape[1]), level)
 
 
-def rms_sequence_of(squares: Squares, level: float = LEVEL) -> tuple[Array, Array]:
+def rms_sequence_of(squares: Squares, degrees: Array, level: float = LEVEL) -> tuple[Array, Array]:
     """The same from running sums of them; see `rms_sequence`."""
     size, mean = squares.size, squares.mean
-    if squares.count < FEW:
+    if squares.count < FIRST:
         return np.full(len(size), np.nan), np.full(len(size), np.nan)
     with np.errstate(all="ignore"):
         reach = mean_sequence(squares.deviation / mean, squares.count, level) / 2
         root = np.sqrt(size * mean)
-        return np.where(size > 0, root * np.exp(-reach), 0.0), np.where(size > 0, root * np.exp(reach), 0.0)
+        ends = [np.where(size > 0, root * np.exp(side * reach), 0.0) for side in (-1, 1)]
+    few = few_carry(squares, degrees)
+    return np.where(few, np.nan, ends[0]), np.where(few, np.nan, ends[1])
 
 
 # When to stop --------------------------------------------------------------------------------------------------------
@@ -132,7 +137,7 @@ class Precision:
             share = float(sample.scalars["success"].mean())
             found.append(Reach(sample.group.estimator, "success", max(high - share, share - low), self.success))
         if self.rmse is not None:
-            low, high = (float(end[-1]) for end in rms_sequence_of(sample.sums.squares))
+            low, high = (float(end[sample.n]) for end in sample.rmse_sequence)
             half = float(np.sqrt(high / low)) - 1 if low > 0 else np.inf
             found.append(Reach(sample.group.estimator, "rmse", half if np.isfinite(half) else np.inf, self.rmse))
         return found
@@ -153,8 +158,9 @@ class Reach:
         return self.width / self.wanted
 
     def __str__(self) -> str:
-        shown = f"{100 * self.width:.2g} %" if math.isfinite(self.width) else "anything"
-        return f"{self.estimator}: {self.statistic} ± {shown}"
+        if math.isfinite(self.width):
+            return f"{self.estimator}: {self.statistic} ± {100 * self.width:.2g} %"
+        return f"{self.estimator}: {self.statistic} ± anything, since a few trials carry it or there are too few"
 
 
 def next_trials(trials: int, ratio: float, block: int, most: int) -> int:

@@ -54,10 +54,10 @@ class Sums:
         self.crlb, self.bayes, self.crlb_all, self.bayes_all, self.van_trees = (Mean(n) for _ in range(5))
         self.reported, self.compensation, self.nees, self.covered = (Mean(n) for _ in range(4))
         self.wrong, self.wrong_mse, self.box, self.box_square = (Mean(n) for _ in range(4))
-        self.squares = Squares(n + 1)
-        """Of the errors of solved trials; the last of all parameters together, over the linear bound."""
+        self.squares = Squares(n + 1 + len(self.groups))
+        """Of the errors of solved trials; then of all parameters together, and of each group, over the linear bound."""
         self.binned = Bins(n + 1 + len(self.groups), trials, LARGEST_SAMPLE)
-        """The same as sums over trials in succession, and those of each group of parameters."""
+        """The same as sums over trials in succession."""
         self.counts = Bins(1, trials, LARGEST_SAMPLE)
         self.together = np.full(trials, np.nan)
         """(trials,), root mean square over parameters of error over linear bound, solved or not."""
@@ -82,9 +82,9 @@ class Sums:
         self.mse.add(square, r.solved)
         self.mse_common.add(square, r.common)
         self.mse_all.add(np.where(np.isfinite(r.error), square, np.inf))
-        self.squares.add(np.vstack([square, together]), r.solved)
-        by_group = [normalised[members].mean(axis=0) for members in self.groups]
-        self.binned.add(np.where(r.solved, np.vstack([square, together, *by_group]), 0.0))
+        squares = np.vstack([square, together, *(normalised[members].mean(axis=0) for members in self.groups)])
+        self.squares.add(squares, r.solved)
+        self.binned.add(np.where(r.solved, squares, 0.0))
         self.counts.add(r.solved[None].astype(float))
         self._add_bounds(r)
         self._add_reported(r)

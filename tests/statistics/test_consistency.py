@@ -62,7 +62,7 @@ def test_divergences_that_may_be_one_in_a_hundred_are_not_named_so():
 
 
 def test_what_is_no_covariance_or_no_estimate():
-    error, P = draw(6)
+    error, P = draw(20)
     P[0] = np.nan
     P[1] = -P[1]
     P[2] = np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -71,10 +71,80 @@ def test_what_is_no_covariance_or_no_estimate():
     values = nees(error, P)
     assert np.isnan(values[0])
     assert np.isinf(values[1:5]).all()
-    assert np.isfinite(values[5])
-    # One made no claim, and of five claims four are beyond any gate.
-    assert verdict(values, 3) == "diverged but confident"
+    assert np.isfinite(values[5:]).all()
+    assert verdict(values, 3) == "-"  # one made no claim, and 19 are too few to judge
+    # Of 20 claims four are beyond any gate.
+    assert verdict(np.append(values, values[5]), 3) == "diverged but confident"
 
 
 def test_nothing_claimed_nothing_judged():
     assert verdict(np.full(5, np.nan), 3) == "-"
+
+
+# Errors of other laws ------------------------------------------------------------------------------------------------
+
+
+def normal(rng, shape):
+    return rng.standard_normal(shape)
+
+
+def student(rng, shape):
+    """Five degrees of freedom, of variance 1."""
+    return rng.standard_t(5, shape) * np.sqrt(3 / 5)
+
+
+def contaminated(rng, shape):
+    """One error in twenty is ten times larger; of variance 1."""
+    return np.where(rng.random(shape) < 0.05, 10.0, 1.0) * rng.standard_normal(shape) / np.sqrt(0.95 + 5)
+
+
+def verdicts(noise, n: int, m: int, trials: int, studies: int, claimed: float = 1.0) -> dict[str, float]:
+    """How often each verdict is given on n parameters estimated from m readings with errors of that law, when the
+    reported standard deviations are `claimed` times the true ones."""
+    rng = np.random.default_rng([n, m, trials])
+    found = []
+    for _ in range(studies):
+        Q, _ = np.linalg.qr(rng.standard_normal((m, n)))
+        values = np.sum((noise(rng, (trials, m)) @ Q) ** 2, axis=1) / claimed**2
+        found.append(verdict(values, n))
+    return {word: found.count(word) / studies for word in set(found)}
+
+
+def false_alarms(found: dict[str, float]) -> float:
+    return sum(found.get(word, 0.0) for word in ("optimistic", "pessimistic", "diverged but confident"))
+
+
+@pytest.mark.parametrize("noise", [normal, student, contaminated])
+def test_an_honest_covariance_is_seldom_called_otherwise_whatever_the_law_of_the_noise(noise):
+    """Chi-square limits, which are of normal errors, alarm in .40 of these where the noise has outliers."""
+    found = verdicts(noise, 1, 6, 100, 150)
+    assert false_alarms(found) <= 0.07 + 2 * np.sqrt(0.07 * 0.93 / 150)
+
+
+@pytest.mark.parametrize(("claimed", "word"), [(0.7, "optimistic"), (1 / 0.7, "pessimistic")])
+def test_a_deviation_30_per_cent_off_is_found_with_100_trials(claimed, word):
+    assert verdicts(normal, 3, 6, 100, 40, claimed)[word] >= 0.9
+
+
+def test_where_few_trials_carry_the_mean_only_too_large_a_mean_is_sure():
+    """Markov: numbers of mean 1 exceed 40 with a probability of at most 1 / 40, whatever else they are."""
+    few = np.full(200, 0.5)
+    few[0] = 200 * 1.0 - 99.5  # the mean is 1
+    assert verdict(few, 1) == "undecided"
+    few[0] = 3.0
+    assert verdict(few, 1) == "pessimistic"
+    error, P = draw(200)
+    error[:2] *= 40
+    assert verdict(nees(error, P), 3) == "optimistic"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("trials", [20, 50, 100, 400])
+@pytest.mark.parametrize(("n", "m"), [(1, 6), (3, 20), (11, 40)])
+@pytest.mark.parametrize("noise", [normal, student, contaminated])
+def test_1000_honest_studies_have_few_false_alarms(noise, n, m, trials):
+    found, low = (verdicts(noise, n, m, trials, 1000 if claimed == 1 else 300, claimed) for claimed in (1.0, 0.7))
+    print(f"{noise.__name__}, n {n}, m {m}, {trials} trials: {found}; 30 % too small: {low}")
+    assert false_alarms(found) <= 0.07 + 2 * np.sqrt(0.07 * 0.93 / 1000)
+    if trials >= 100:
+        assert low.get("optimistic", 0) + low.get("diverged but confident", 0) >= 0.9

@@ -100,7 +100,7 @@ def fill(folder: Path, blocks: tuple[int, int, int]) -> Synthetic:
         bound = synthetic.bound(scenario)
         rng = RNG(seed)
         for j, (label, estimator) in enumerate({"root": Seeker(), "plain": Pretender(1)}.items()):
-            error = 1.1 * bound * rng.standard_t(5, (TRIALS, 3)) + 0.1 * bound
+            error = 1.1 * bound * rng.standard_normal((TRIALS, 3)) + 0.1 * bound
             lost = np.arange(TRIALS) % 25 == j
             error[lost] = np.nan
             status = np.where(lost, "nonfinite", "converged").astype(object)

@@ -8,7 +8,8 @@ from scipy.stats import binom
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.statistics.consistency import clopper_pearson
-from ipe_bench.statistics.sequences import Precision, next_trials, rms_sequence, share_sequence
+from ipe_bench.statistics.running import Squares
+from ipe_bench.statistics.sequences import Precision, next_trials, rms_sequence, rms_sequence_of, share_sequence
 
 
 def ever_missed(p: float, step: int, looks: int) -> float:
@@ -67,8 +68,8 @@ def test_a_root_mean_square_scales_with_its_errors_and_narrows_with_trials():
     assert rms_sequence(squares * 1e12)[0] == pytest.approx(1e6 * low)
     few = rms_sequence(squares[:250])
     assert np.all(high - low < few[1] - few[0])
-    assert np.isnan(rms_sequence(squares[:19])[0]).all()
-    assert rms_sequence(np.zeros((50, 1)))[1] == 0
+    assert np.isnan(rms_sequence(squares[:99])[0]).all()
+    assert rms_sequence(np.zeros((100, 1)))[1] == 0
 
 
 def test_the_next_number_of_trials():
@@ -135,19 +136,48 @@ def test_2000_studies_that_look_after_every_block_are_covered(p):
     assert np.mean(stopped) >= 0.95
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize("law", ["normal, 11 parameters", "normal, 1 parameter", "Student 5, 3 parameters"])
-def test_2000_studies_of_a_root_mean_square_are_covered(law):
-    """20 looks at blocks of 250, from the first on: an asymptotic promise, so up to 3 deviations below 95 %."""
+LAWS = {
+    "normal": (1, lambda rng, shape: rng.normal(size=shape), 1.0),
+    "normal, 11 parameters": (11, lambda rng, shape: rng.normal(size=shape), 1.0),
+    "Student's t, 5 degrees": (1, lambda rng, shape: rng.standard_t(5, shape), 5 / 3),
+    "Student's t, 3 degrees, 4 parameters": (4, lambda rng, shape: rng.standard_t(3, shape), 3.0),
+    "5 % ten times larger": (
+        1,
+        lambda rng, shape: np.where(rng.random(shape) < 0.05, 10.0, 1.0) * rng.normal(size=shape),
+        5.95,
+    ),
+}
+
+
+def ever_missing(law: str, studies: int) -> tuple[float, float]:
+    """The share of studies of 4000 trials with 40 looks in which an interval that is given ever misses, and that of the
+    last looks at which none is given."""
+    n, draw, mean_square = LAWS[law]
     rng = np.random.default_rng(2)
-    missed = 0
-    for _ in range(2000):
-        if law.startswith("Student"):
-            squares, true = np.mean(rng.standard_t(5, (5000, 3)) ** 2, axis=1), np.sqrt(5 / 3)
-        else:
-            n = 11 if "11" in law else 1
-            squares, true = rng.chisquare(n, 5000) / n, 1.0
-        ends = (rms_sequence(squares[:stop, None]) for stop in range(250, 5001, 250))
-        missed += any(not low[0] <= true <= high[0] for low, high in ends)
-    print(f"{law}: covered at all times {1 - missed / 2000:.4f}")
-    assert 1 - missed / 2000 > 0.95 - 3 * np.sqrt(0.05 * 0.95 / 2000)
+    looks = np.unique(np.geomspace(20, 4000, 40).astype(int))
+    miss, none = np.zeros(studies, dtype=bool), 0
+    for k in range(0, studies, 50):
+        squares = np.mean(draw(rng, (4000, 50, n)) ** 2, axis=2)
+        running, at = Squares(50), 0
+        for look in looks.tolist():
+            running.add(squares[at:look].T)
+            at = look
+            low, high = rms_sequence_of(running, np.full(50, n))
+            miss[k : k + 50] |= (low > np.sqrt(mean_square)) | (high < np.sqrt(mean_square))
+        none += int(np.isnan(low).sum())
+    return float(miss.mean()), none / studies
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law", LAWS)
+def test_1000_studies_of_a_root_mean_square_are_covered_however_often_one_looks(law):
+    """An asymptotic promise of 95 %; .12 to .44 of the last three are missed without the rule, from 20 trials on."""
+    miss, none = ever_missing(law, 1000)
+    print(f"{law}: ever missed {miss:.3f}, none given at 4000 trials {none:.3f}")
+    assert miss <= 0.07 + 2 * np.sqrt(0.07 * 0.93 / 1000)
+
+
+def test_squares_without_a_variance_have_no_sequence_to_miss_with():
+    miss, none = ever_missing("Student's t, 3 degrees, 4 parameters", 50)
+    assert miss <= 0.1
+    assert none > 0.8
