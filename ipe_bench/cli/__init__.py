@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from ipe_bench.basics.errors import UserError, unknown
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from ipe_bench.report.table import Part
 
 _WIDTH_WITHOUT_TERMINAL = 120
 
@@ -19,6 +21,14 @@ def console() -> Console:
 
     shown = Console(highlight=False)
     return shown if shown.is_terminal else Console(highlight=False, width=_WIDTH_WITHOUT_TERMINAL)
+
+
+def show(parts: Iterable[Part]) -> None:
+    """Prints tables and sentences."""
+    from ipe_bench.report.table import terminal
+
+    out = console()
+    out.print(terminal(parts, out.width))
 
 
 def given_keys(command: str, words: Sequence[str], keys: Collection[str]) -> dict[str, str]:

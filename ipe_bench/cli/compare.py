@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import console, given_keys
+from ipe_bench.cli import console, given_keys, show
 
 KEYS = ("first", "second", "alpha", "anytime", "fail_on", "output")
 
@@ -20,11 +20,11 @@ def main(arguments: Sequence[str]) -> int:
     if not 1 <= len(folders) <= 2:
         raise UserError("compare: name one or two folders of results, such as outputs/before outputs/after")
     from ipe_bench.api import compare
-    from ipe_bench.report.comparison import render
+    from ipe_bench.report.comparison import contents
 
     frame = compare(*folders, **keys)
+    show(contents(frame, keys.get("alpha", 0.05)))
     out = console()
-    out.print(render(frame, keys.get("alpha", 0.05)))
     sys.stdout.flush()
     for line in (*frame.attrs["problems"], *frame.attrs["stale"], *frame.attrs["notes"]):
         print(f"ipe-bench: {line}", file=sys.stderr)

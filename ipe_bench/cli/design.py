@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import console
+from ipe_bench.cli import console, show
 from ipe_bench.cli.single import NOT_OF_ONE_SCENARIO, compose_single, first_of
 from ipe_bench.cli.spec import Spec
 from ipe_bench.measurements.base import Measurement
@@ -33,8 +33,8 @@ def main(
     errors = _errors(single.job)
     found = design(scenario, by=by, readings=readings, criterion=criterion, errors=errors)
 
-    from ipe_bench.report.answer import claim
-    from ipe_bench.report.designs import FILES, RESULT, render, write_design
+    from ipe_bench.report.designs import FILES, RESULT, contents, write_design
+    from ipe_bench.report.folders import claim
 
     asked = {
         "scenario": describe(scenario),
@@ -45,9 +45,8 @@ def main(
     }
     folder = claim(single.folder, asked, elsewhere=not single.named, result=RESULT, files=FILES)
     files = write_design(folder, found, asked, {"measurement": single.measurement})
-    out = console()
-    out.print(render(single.measurement, found))
-    out.print(f"In {folder}: {', '.join(path.name for path in files)}", markup=False, soft_wrap=True)
+    show(contents(single.measurement, found))
+    console().print(f"In {folder}: {', '.join(path.name for path in files)}", markup=False, soft_wrap=True)
     return 0 if found.observability.observable else 1
 
 

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.machine import library_versions
-from ipe_bench.cli import console
+from ipe_bench.cli import console, show
 from ipe_bench.cli.single import compose_single
 from ipe_bench.real.estimation import Opened
 from ipe_bench.runs.provenance import describe, fingerprint
@@ -25,16 +25,17 @@ def main(arguments: Sequence[str]) -> int:
     scaled = any(word.lstrip("+").startswith("error_scale=") for word in single.words)
     opened = single.job.question(scaled=scaled).opened()
 
-    from ipe_bench.report.answer import Answer, claim, render, write_fits
+    from ipe_bench.report.answer import FILES, RESULT, Answer, contents, write_fits
+    from ipe_bench.report.folders import claim
 
     command = _command(opened)
-    folder = claim(single.folder, command, elsewhere=not single.named)
+    folder = claim(single.folder, command, elsewhere=not single.named, result=RESULT, files=FILES)
     answer = Answer.to(opened, single.measurement)
     config = OmegaConf.to_container(single.config, resolve=True)
     written = {"measurement": single.measurement, "config": config, **_provenance(opened)}
     files = write_fits(folder, answer, command, written, which=single.job.figures)
+    show(contents(answer))
     out = console()
-    out.print(render(answer, out.width))
     out.print(f"\nIn {folder}:", markup=False, soft_wrap=True)
     out.print(", ".join(path.name for path in files), markup=False)
     return 0 if answer.passes else 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import console
+from ipe_bench.cli import console, show
 from ipe_bench.cli.single import NOT_OF_ONE_SCENARIO, compose_single, first_of
 from ipe_bench.runs.provenance import describe
 from ipe_bench.runs.run import validate
@@ -26,8 +26,8 @@ def main(arguments: Sequence[str], particles: int) -> int:
         raise UserError("noise=certified: has no prior to begin with; choose another noise and an error_scale")
     validate([job.scenario], job.estimators, trials)
 
-    from ipe_bench.report.answer import claim
-    from ipe_bench.report.posteriors import RESULT, render, write_posteriors
+    from ipe_bench.report.folders import claim
+    from ipe_bench.report.posteriors import RESULT, contents, write_posteriors
 
     command = {
         "scenario": describe(job.scenario),
@@ -40,9 +40,8 @@ def main(arguments: Sequence[str], particles: int) -> int:
     found = [reference(job.scenario, job.estimators, trial, particles) for trial in range(trials)]
     files = write_posteriors(folder, job.scenario.measurement, found, command, {"measurement": name})
     scenario = f"{name}, {job.scenario.noise.name}, error scale {job.scenario.error_scale:g}"
-    out = console()
-    out.print(render(scenario, found))
-    out.print(f"\nIn {folder}: {', '.join(path.name for path in files)}", markup=False, soft_wrap=True)
+    show(contents(scenario, found))
+    console().print(f"\nIn {folder}: {', '.join(path.name for path in files)}", markup=False, soft_wrap=True)
     return 0 if all(one.posterior.settled for one in found) else 1
 
 

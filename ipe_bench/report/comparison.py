@@ -1,9 +1,10 @@
-"""What `compare` found: a table for the terminal, a CSV file, and a figure of all changes with their intervals."""
+"""What `compare` found: tables, a CSV file, and a figure of all changes with their intervals."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,12 +15,12 @@ from ipe_bench.basics.files import make_folder, write_text
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, house_style
+from ipe_bench.report.table import Table, texts, words
 from ipe_bench.report.words import compact, duration, p_value, percent, plain
 from ipe_bench.statistics.between import NOT_SETTINGS, described
 
 if TYPE_CHECKING:
     import pandas as pd
-    from rich.console import Group
 
 _HEADINGS = ("", "first", "second", "change", "95 %", "p", "e", "second is")
 _NAMES = {"success": "success", "error": "error", "cost": "cost", "time": "time"}
@@ -33,23 +34,18 @@ _PANELS = (
 )
 
 
-def render(frame: pd.DataFrame, alpha: float) -> Group:
-    """One table per comparison, within 80 columns."""
-    from rich import box
-    from rich.console import Group
-    from rich.table import Table
-    from rich.text import Text
-
-    parts: list[Any] = []
+def contents(frame: pd.DataFrame, alpha: float) -> list[Table]:
+    """A table per comparison, within 80 columns; what the columns mean stands below the last."""
+    tables = []
     for title, rows in _comparisons(frame):
-        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-        for heading in _HEADINGS:
-            shown = heading if heading != "95 %" else _level(alpha)
-            table.add_column(shown, justify="left" if heading in ("", "second is") else "right", no_wrap=True)
-        for row in rows:
-            table.add_row(*map(Text, _cells(row)))
-        parts += [Text(title, style="bold"), table]
-    return Group(*parts, Text(_note(frame), style="dim"))
+        cells = list(zip(*map(_cells, rows), strict=True))
+        titles = [each if each != "95 %" else _level(alpha) for each in _HEADINGS]
+        columns = [
+            (words if each in ("", "second is") else texts)(each, column)
+            for each, column in zip(titles, cells, strict=True)
+        ]
+        tables.append(Table("comparison", title, "", columns, repeated=1))
+    return [*tables[:-1], *(replace(last, notes=[_note(frame)]) for last in tables[-1:])]
 
 
 def _level(alpha: float) -> str:

@@ -1,23 +1,19 @@
-"""Posteriors of a few trials beside the estimators' Gaussians, as a table in the terminal and as files."""
+"""Posteriors of a few trials beside the estimators' Gaussians: a table, and files."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.files import write_atomically
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.report.examined import numbers
+from ipe_bench.report.folders import draw_into, numbers, write_json
+from ipe_bench.report.table import Table, texts, words
 from ipe_bench.report.words import compact, percent
 from ipe_bench.trials.posterior import Divergence, Posterior, Reference
-
-if TYPE_CHECKING:
-    from rich.console import Group
 
 SCHEMA = 1
 RESULT = "posterior.json"
@@ -25,7 +21,58 @@ HONEST = 0.1
 """Nats below which a Gaussian may stand for another: a deviation 40 % too large in one direction, or a mean that is
 half a deviation off, are about a tenth."""
 ALIKE = 0.05
-"""The energy distance up to which draws may come from one law: of Gaussians in few dimensions, some tenths of a nat."""
+"""Energy distance up to which draws may come from one law: of Gaussians in few dimensions, some tenths of a nat."""
+
+
+def contents(name: str, found: Sequence[Reference]) -> list[Table]:
+    """A row per trial and estimator; `name` is what the scenario is called in the title."""
+    rows = [(one, label, d) for one in found for label, d in one.divergences.items()]
+    columns = [
+        texts("trial", [str(one.trial) for one, *_ in rows]),
+        texts("modes", [str(len(one.posterior.modes)) for one, *_ in rows]),
+        texts("noise", [compact(one.posterior.noise) for one, *_ in rows]),
+        words("estimator", [label for _, label, _ in rows]),
+        words("status", [_status(one, label) for one, label, _ in rows]),
+        words("honest", [honesty(d, one.posterior) for one, _, d in rows]),
+        texts("diverg.", [compact(d.kl) for *_, d in rows]),
+        texts("shift", [compact(d.shift) for *_, d in rows]),
+        texts("width", [compact(d.width) for *_, d in rows]),
+        texts("energy", [compact(d.energy) for *_, d in rows]),
+    ]
+    title = f"{name}: estimators beside the posterior"
+    return [Table("posterior", title, "", columns, notes=list(_notes(found)), grouped=3, repeated=4)]
+
+
+def _status(one: Reference, label: str) -> str:
+    return Status(int(one.estimates[label].status[0])).label
+
+
+def _notes(found: Sequence[Reference]) -> Iterator[str]:
+    yield (
+        "diverg.: divergence of the estimator's Gaussian from the posterior's moments, in nats; noise: the same of two"
+        " populations of particles, so what is not above it is chance. shift: of the mean, in the posterior's"
+        " deviations per root of the number of parameters. width: deviations over the posterior's, geometric mean."
+        f" energy: distance of draws. honest: a single mode, divergence at most {HONEST:g} or twice the noise, and"
+        f" energy at most {ALIKE:g}."
+    )
+    for one in found:
+        if not one.posterior.settled:
+            yield (
+                f"Trial {one.trial}: the populations differ by {one.posterior.apart:.2g} deviations, so its posterior"
+                " is not to be believed; give more --particles."
+            )
+    for one in found:
+        if len(one.posterior.modes) > 1:
+            shares = ", ".join(percent(float(share)) for share in one.posterior.shares)
+            yield f"Trial {one.trial}: {len(one.posterior.modes)} modes, with {shares} of the draws."
+
+
+def honesty(d: Divergence, sampled: Posterior) -> str:
+    """Whether a Gaussian can be taken for the posterior; a wide one over two modes has the moments and is not."""
+    if not np.isfinite(d.kl):
+        return "-"
+    near = d.kl <= max(HONEST, 2 * sampled.noise) and d.energy <= ALIKE
+    return "yes" if near and len(sampled.modes) == 1 else "NO"
 
 
 def write_posteriors(
@@ -34,14 +81,8 @@ def write_posteriors(
     """Writes posterior.json and a corner picture of each trial; returns the files."""
     from ipe_bench.report.figures.corner import draw_corners
 
-    result = folder / RESULT
-    trials = [_described(model, one) for one in found]
-    text = json.dumps({"schema": SCHEMA, "command": command, "trials": trials, **provenance}, indent=1)
-    write_atomically(result, lambda path: path.write_text(text + "\n", encoding="utf-8"))
-    files = [result]
-    for drawing in draw_corners(model, found):
-        files += drawing.save(folder)
-    return files
+    content = {"trials": [_described(model, one) for one in found], **provenance}
+    return [write_json(folder / RESULT, SCHEMA, command, content), *draw_into(folder, draw_corners(model, found), ())]
 
 
 def _described(model: Measurement, one: Reference) -> dict[str, Any]:
@@ -66,65 +107,9 @@ def _described(model: Measurement, one: Reference) -> dict[str, Any]:
         "simulations": sampled.simulations,
         "estimators": {
             label: {
-                "status": Status(int(one.estimates[label].status[0])).label,
-                "kl": numbers(d.kl),
-                "shift": numbers(d.shift),
-                "width": numbers(d.width),
-                "energy": numbers(d.energy),
+                "status": _status(one, label),
+                **{name: numbers(getattr(d, name)) for name in ("kl", "shift", "width", "energy")},
             }
             for label, d in one.divergences.items()
         },
     }
-
-
-def render(name: str, found: Sequence[Reference]) -> Group:
-    """A row per trial and estimator; `name` is what the scenario is called in the title."""
-    from rich.console import Group
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(box=None, pad_edge=False, collapse_padding=True)
-    for heading in ("trial", "modes", "noise", "estimator", "status"):
-        words = heading in ("estimator", "status")
-        table.add_column(heading, justify="left" if words else "right", overflow="fold", no_wrap=not words)
-    for heading in ("diverg.", "shift", "width", "energy", "honest"):
-        table.add_column(heading, justify="left" if heading == "honest" else "right", no_wrap=True)
-    for one in found:
-        for i, (label, d) in enumerate(one.divergences.items()):
-            sampled = one.posterior
-            head = [str(one.trial), str(len(sampled.modes)), compact(sampled.noise)] if i == 0 else ["", "", ""]
-            status = Status(int(one.estimates[label].status[0])).label
-            figures = [compact(value) for value in (d.kl, d.shift, d.width, d.energy)]
-            table.add_row(*head, *(Text(cell) for cell in (label, status, *figures, honesty(d, sampled))))
-    lines = [
-        "diverg.: divergence of the estimator's Gaussian from the posterior's moments, in nats; noise: the same of two"
-        " populations of particles, so what is not above it is chance. shift: of the mean, in the posterior's"
-        " deviations per root of the number of parameters. width: deviations over the posterior's, geometric mean."
-        f" energy: distance of draws. honest: a single mode, divergence at most {HONEST:g} or twice the noise, and"
-        f" energy at most {ALIKE:g}.",
-        *(_unsettled(one) for one in found if not one.posterior.settled),
-        *(_modes(one) for one in found if len(one.posterior.modes) > 1),
-    ]
-    return Group(
-        Text(f"{name}: estimators beside the posterior", style="bold"), table, Text("\n".join(lines), style="dim")
-    )
-
-
-def honesty(d: Divergence, sampled: Posterior) -> str:
-    """Whether a Gaussian can be taken for the posterior; a wide one over two modes has the moments and is not."""
-    if not np.isfinite(d.kl):
-        return "-"
-    near = d.kl <= max(HONEST, 2 * sampled.noise) and d.energy <= ALIKE
-    return "yes" if near and len(sampled.modes) == 1 else "NO"
-
-
-def _unsettled(one: Reference) -> str:
-    return (
-        f"Trial {one.trial}: the populations differ by {one.posterior.apart:.2g} deviations, so its posterior is not to"
-        " be believed; give more --particles."
-    )
-
-
-def _modes(one: Reference) -> str:
-    shares = ", ".join(percent(float(share)) for share in one.posterior.shares)
-    return f"Trial {one.trial}: {len(one.posterior.modes)} modes, with {shares} of the draws."

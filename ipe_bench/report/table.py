@@ -152,6 +152,9 @@ def terminal(parts: Iterable[Part], width: int) -> Group:
             tell()
         for piece in _pieces(part, width):
             fitting, room = _fitting(piece, width)
+            if piece.title:
+                blank = [Text()] if shown and isinstance(shown[-1], Text) else []
+                shown += [*blank, Text(piece.title, style="bold")]
             shown.append(_rich(replace(piece, columns=piece.columns[:fitting]), room))
             for left_out in piece.columns[fitting:]:
                 absent.setdefault(part.whole, {})[left_out.title] = None
@@ -171,17 +174,14 @@ def _pieces(table: Table, width: int) -> Iterator[Table]:
     title = table.title
     while rest:
         count = 1
-        while count < len(rest) and _taken(map(_wanted, [*head, *rest[: count + 1]])) <= width:
+        while count < len(rest) and _fits(replace(table, columns=[*head, *rest[: count + 1]]), width):
             count += 1
         yield replace(table, title=title, columns=[*head, *rest[:count]])
         rest, title = rest[count:], ""
 
 
-def _wanted(column: Column) -> int:
-    """The letters of a column's widest text."""
-    from rich.cells import cell_len
-
-    return max(cell_len(text) for text in (column.title, *(cell.text for cell in column.cells)))
+def _fits(table: Table, width: int) -> bool:
+    return _taken(_needed(table, folded=False)) <= width
 
 
 def _needed(table: Table, *, folded: bool) -> list[int]:
@@ -190,7 +190,9 @@ def _needed(table: Table, *, folded: bool) -> list[int]:
 
     found = []
     for i, each in enumerate(table.columns):
-        title = max(map(cell_len, _words_of(each.title))) if folded else cell_len(each.title)
+        title = cell_len(each.title)
+        if folded:
+            title = min(max(map(cell_len, _words_of(each.title))), _WHOLE_NAME)
         longest = max((cell_len(cell.text) for cell in each.cells), default=0)
         if not each.numeric:
             longest = min(longest, _WHOLE_NAME if i == table.naming else _WHOLE_WORD)
@@ -201,7 +203,7 @@ def _needed(table: Table, *, folded: bool) -> list[int]:
 def _fitting(table: Table, width: int) -> tuple[int, list[int]]:
     """How many columns fit, counted from the left, and the letters that each takes at least; titles are folded where
     more columns fit then."""
-    least = max(2, table.naming + 1)
+    least = max(2, table.naming + 1, table.repeated + 1)
 
     def count(needed: Sequence[int]) -> int:
         fitting = len(needed)
@@ -221,8 +223,7 @@ def _words_of(title: str) -> list[str]:
 
 def _taken(widths: Iterable[int]) -> int:
     """The width of a table of such columns, with the space between them."""
-    widths = list(widths)
-    return 2 + sum(widths) + _PADDING * len(widths)
+    return 2 + sum(width + _PADDING for width in widths)
 
 
 def _rich(table: Table, room: Sequence[int]) -> Any:
@@ -231,16 +232,13 @@ def _rich(table: Table, room: Sequence[int]) -> Any:
     from rich.text import Text
 
     shown = RichTable(
-        title=Text(table.title) if table.title else None,
-        title_justify="left",
-        title_style="bold",
         box=box.SIMPLE_HEAD,
         padding=(0, 1),
         pad_edge=False,
         collapse_padding=True,
     )
     for each, letters in zip(table.columns, room, strict=True):
-        folded = textwrap.fill(" ".join(_words_of(each.title)), max(letters, 1), break_long_words=False)
+        folded = textwrap.fill(" ".join(_words_of(each.title)), max(letters, 1))
         title = Text(folded.replace("\u00a0", " "))
         if each.numeric:
             shown.add_column(title, justify="right", no_wrap=True)

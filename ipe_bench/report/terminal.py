@@ -165,7 +165,7 @@ def _digits(averages: pd.DataFrame) -> Table:
         "Certified readings",
         "",
         columns,
-        notes=[note, ""],
+        notes=[note],
         whole="tables/certified_averages.csv",
     )
 
@@ -180,4 +180,4 @@ def _attained(totals: pd.DataFrame) -> Table:
         " says so; elsewhere: converged and not solved. median cost: simulations, infinite where unsolved. in 10:"
         " solved within 10 (n + 1) simulations."
     )
-    return Table("attained", "Known minima", "", columns, notes=[note, ""], whole="tables/attained.csv")
+    return Table("attained", "Known minima", "", columns, notes=[note], whole="tables/attained.csv")

@@ -39,7 +39,7 @@ def test_tables_and_files_say_the_same(command, tmp_path):
 def test_every_richer_version_of_the_model_is_suspected(command):
     code, out, _ = command("measurement=gins", "error_scale=33", "--by", "axis", "output=here")
     assert code == 0
-    rows = {line.split("  ")[0]: line for line in out.splitlines()}
+    rows = {line.strip().split("  ")[0]: line for line in out.splitlines()}
     for name in ("tilt x", "tilt y", "gyro random walk", "misalignment xy", "quadratic x"):
         assert name in rows
     assert "yes" in rows["tilt y"]

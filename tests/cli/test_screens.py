@@ -14,7 +14,8 @@ import ipe_bench as ib
 import ipe_bench.cli
 from ipe_bench.cli.main import main
 from ipe_bench.report import figures
-from ipe_bench.report.answer import render
+from ipe_bench.report.answer import contents
+from ipe_bench.report.table import terminal
 
 WIDTHS = (80, 100, 120)
 SHORT = ("linear_lse", "fixed_point", "levenberg_marquardt", "scipy_least_squares")
@@ -98,7 +99,7 @@ def answer():
 @pytest.mark.parametrize("width", WIDTHS)
 def test_an_answer_names_every_estimator(answer, width):
     out = io.StringIO()
-    Console(file=out, width=width).print(render(answer, width))
+    Console(file=out, width=width).print(terminal(contents(answer), width))
     lines = out.getvalue().splitlines()
     assert max(map(len, lines)) <= width
     assert not re.search(r"\w…", out.getvalue())  # a range has blanks around it

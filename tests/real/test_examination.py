@@ -13,7 +13,7 @@ from ipe_bench.noise import Gaussian, Unknown
 from ipe_bench.real.examination import examine
 from ipe_bench.real.fits import fit
 from ipe_bench.real.profiles import profiles, profiles_of_sets
-from ipe_bench.report.examined import remarks
+from ipe_bench.report.answer import remarks
 from ipe_bench.trials.scenario import Scenario
 
 LM = {"lm": LevenbergMarquardt(tolerance=1e-9, max_iterations=500)}
