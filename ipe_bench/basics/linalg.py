@@ -102,16 +102,6 @@ def deviations(P: Array) -> Array:
     return np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
 
 
-def inverse_deviations(information: Array) -> Array:
-    """Standard deviations (trials, n) of the covariances whose inverses are given (trials, n, n); NaN where there are
-    none."""
-    _, inverse_U, well = definite_factor(information)
-    deviation = np.sqrt(np.sum(inverse_U**2, axis=2))
-    if not well.all():
-        deviation[~well] = deviations(inverse(information[~well])[0])
-    return deviation
-
-
 def quadratic_form(P_inverse: Array, e: Array) -> Array:
     """e' P^-1 e for each trial: P_inverse (..., n, n), e (trials, n) -> (trials,)."""
     return np.einsum("...i,...i->...", e, multiply(P_inverse, e))

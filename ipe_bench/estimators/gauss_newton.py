@@ -4,26 +4,43 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from ipe_bench.basics.linalg import Array
+import numpy as np
+
+from ipe_bench.basics.linalg import Array, finite, multiply
 from ipe_bench.estimators.driver import Solver, Standing
 from ipe_bench.estimators.least_squares import Descent, Residuals, slope_at, squared
+
+_SMALL = 1e-10
+"""Singular values of J below this share of the largest are taken for zero where J lacks rank."""
 
 
 @dataclass(frozen=True)
 class GaussNewtonMethod(Solver[Descent]):
-    """x <- x - (J' R^-1 J)^-1 J' R^-1 (h(x) - z), undamped."""
+    """x <- x - (J' R^-1 J)^-1 J' R^-1 (h(x) - z), undamped; where J lacks rank, the shortest of all such steps."""
 
     def begin(self, objective: Residuals, x: Array) -> Descent:
         return Descent.at(objective, x)
 
     def step(self, objective: Residuals, state: Descent) -> Descent:
-        x = state.x + state.slope.newton
+        step = _shortest(state) if state.rankless.any() else state.slope.newton
+        x = state.x + step
         r = objective.residual(x)
         near = state.nearly(objective)
         slope, exact = slope_at(objective, x, r, near)
-        moved = state.reach(state.slope.newton)
-        return replace(state, x=x, r=r, cost=squared(r), slope=slope, moved=moved, exact=exact, near=near)
+        moved = state.reach(step)
+        regular = state.regular | np.isfinite(slope.size)
+        return replace(
+            state, x=x, r=r, cost=squared(r), slope=slope, moved=moved, regular=regular, exact=exact, near=near
+        )
 
     def standing(self, objective: Residuals, before: Descent | None, state: Descent) -> Standing:
-        """Where J lacks rank there is no step."""
-        return state.standing(objective, stuck=state.rankless)
+        """Where J lacks rank and no step leads on, the trial ends as singular."""
+        return state.standing(objective, stuck=state.rankless & (state.moved == 0))
+
+
+def _shortest(state: Descent) -> Array:
+    """The step (trials, n) of least length, in multiples of the parameters' sizes, that minimises |r + J s|."""
+    slope, lost = state.slope, state.rankless & finite(state.slope.U) & finite(state.slope.gradient)
+    step = slope.newton.copy()
+    step[lost] = -multiply(np.linalg.pinv(slope.U[lost], rcond=_SMALL), slope.gradient[lost])
+    return step

@@ -178,13 +178,10 @@ def begin(problem: Problem, z: Array, start: Start) -> tuple[Array, FrozenSystem
 def starting_points(problem: Problem, z: Array, start: Start, tally: Tally) -> Array:
     """Where least squares begins (trials, n); what that costs goes to the tally.
 
-    Where H has not full column rank at the nominal point there is no linear LSE to choose, and `best` is the nominal
-    point: that the parameters cannot be told apart there says nothing of other points.
-
-    Raises:
-        UserError: linear_lse is asked for, and there is none.
+    Where H has not full column rank at the nominal point there is no linear LSE, and it begins at the nominal point:
+    that the parameters cannot be told apart there says nothing of other points.
     """
-    if start == "nominal" or (start == "best" and problem.rankless):
+    if start == "nominal" or problem.rankless:
         return np.repeat(problem.x0[None], len(z), axis=0)
     x, system = begin(problem, z, start)
     tally.simulations += system.model.tally.simulations

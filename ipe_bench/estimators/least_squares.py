@@ -217,6 +217,11 @@ def _by_orthogonal_factor(J: Array, r: Array) -> tuple[Array, Array, Array, Arra
     return Q[:, :m], U, inverse_U, gradient
 
 
+def inverse_factor(J: Array) -> Array:
+    """U^-1 (trials, n, n) of J = Q U (trials, m, n), so that (J'J)^-1 = U^-1 U^-T; NaN where J has not full rank."""
+    return _by_orthogonal_factor(J, np.zeros(J.shape[:2]))[2]
+
+
 def slope_at(objective: Residuals, x: Array, r: Array, exact: Mask, *, keep_Q: bool = False) -> tuple[Slope, Mask]:
     """The slope at x, where the residuals are r, and where it is that of an exact Jacobian: where `exact` (trials,)
     says so, and where a coarse one has not full rank."""

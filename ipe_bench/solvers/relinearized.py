@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, Mask, finite, information, inverse
+from ipe_bench.basics.linalg import Array, Mask, finite
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import Solver, Standing, iterate
 from ipe_bench.estimators.ipe import IPE, FrozenSystem, Start, State, begin, frozen_covariance, root_standing
+from ipe_bench.estimators.least_squares import inverse_factor
 from ipe_bench.measurements.counted import Counted
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers.fixed_point import FixedPoint
@@ -134,4 +135,5 @@ def _bound(problem: Problem, state: Round) -> Array:
     if usable.any():
         model = Counted.uncounted(problem.measurement, len(P))
         J[usable] = model.jacobian(state.x[usable], np.flatnonzero(usable))
-    return put(P, lost, inverse(information(J[lost], problem.R))[0])
+    inverse_U = inverse_factor(problem.R.whiten_jacobian(J[lost]))
+    return put(P, lost, np.matmul(inverse_U, inverse_U.swapaxes(1, 2)))

@@ -19,7 +19,6 @@ from ipe_bench.basics.linalg import (
     deviations,
     finite,
     information,
-    inverse_deviations,
     multiply,
     quadratic_form,
     read_only,
@@ -29,6 +28,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Equation, Estimates, Estimator, estimate_safely
 from ipe_bench.measurements.counted import Counted
 from ipe_bench.measurements.problem import Problem
+from ipe_bench.trials.bounds import bound_deviations
 from ipe_bench.trials.contraction import contraction_of, curvature
 from ipe_bench.trials.fit_test import Spread, fit_probability, inflation_of, spread_of
 from ipe_bench.trials.misspecified import misspecified
@@ -89,21 +89,33 @@ class Block:
     def crlb_deviation(self) -> Array:
         """Standard deviations (trials, n) of the Cramér-Rao bound at the truth."""
         with np.errstate(all="ignore"):
-            return inverse_deviations(self.crlb_information)
+            return bound_deviations(self.crlb_information, self._white)
+
+    @cached_property
+    def bayes_deviation(self) -> Array:
+        """Standard deviations (trials, n) of the Bayesian bound at the truth."""
+        prior = self.problem.prior_covariance()
+        if prior is None:
+            return self.crlb_deviation
+        root = prior.whiten_jacobian(np.eye(self.trials.x.shape[1]))
+        with np.errstate(all="ignore"):
+            return bound_deviations(self.bayes_information, lambda ill: _below(self._white(ill), root))
+
+    def _white(self, kept: Mask) -> Array:
+        """R^-1/2 J of some of the trials."""
+        return self.problem.R.whiten_jacobian(self.jacobian[kept])
 
     def truth_columns(self) -> Columns:
         """The truth and its bounds, in multiples of the parameters' units, what the noise alone makes of the linear
         estimate, and what the paper's theorems ask of the model there."""
         names = [p.name for p in self.problem.measurement.parameters]
-        with np.errstate(all="ignore"):
-            bayes = inverse_deviations(self.bayes_information)
         H_plus = self.problem.H_plus[None]
         contracts = contraction_of(np.matmul(H_plus, self.jacobian))
         return {
             "trial": np.arange(self.trials.start, self.trials.stop),
             **_by_parameter("x", names, self.trials.x),
             **_by_parameter("crlb", names, self.crlb_deviation),
-            **_by_parameter("bayes", names, bayes),
+            **_by_parameter("bayes", names, self.bayes_deviation),
             **_by_parameter("van_trees", names, self._van_trees()),
             **_by_parameter("linear_error", names, multiply(H_plus, self.trials.z - self.readings)),
             "contraction_K": contracts.K,
@@ -122,8 +134,11 @@ class Block:
         if self.trials.start == 0 and len(bound) and prior is not None and not self.scenario.noise.real:
             x = self.scenario.truths(0, EXPECTED)
             with np.errstate(all="ignore"):
-                expected = information(self.problem.measurement.jacobian(x), self.problem.R).mean(axis=0)
-                bound[0] = inverse_deviations((expected + prior.inverse())[None])[0]
+                J, R = self.problem.measurement.jacobian(x), self.problem.R
+                expected = (information(J, R).mean(axis=0) + prior.inverse())[None]
+                rows = R.whiten_jacobian(J).reshape(1, -1, x.shape[1]) / np.sqrt(len(x))
+                root = prior.whiten_jacobian(np.eye(x.shape[1]))
+                bound[0] = bound_deviations(expected, lambda ill: _below(rows[ill], root))[0]
         return bound
 
     def readings_at(self, x: Array) -> Array:
@@ -252,6 +267,11 @@ class Block:
             "success": np.isfinite(distance) & (distance <= chdtri(model.n, GATE)),
             **{f"extra_{name}": values for name, values in estimates.extras.items()},
         }
+
+
+def _below(rows: Array, more: Array) -> Array:
+    """The rows (trials, k, n) of each trial, and below them those (n, n) of all."""
+    return np.concatenate([rows, np.broadcast_to(more, (len(rows), *more.shape))], axis=1)
 
 
 def nees(error: Array, P: Array) -> Array:

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from ipe_bench.basics.linalg import Array, deviations, information, inverse
+from ipe_bench.basics.linalg import Array, deviations, information
+from ipe_bench.estimators.least_squares import inverse_factor
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.trials.roots import least_squares_root
 from ipe_bench.trials.scenario import Scenario
@@ -58,7 +59,7 @@ def threshold(scenario: Scenario) -> Threshold | None:
     with np.errstate(all="ignore"):
         J = problem.measurement.jacobian(u)
         expected = information(J, problem.R).mean(axis=0)
-        bound = deviations(inverse(information(J[:_TRUTHS], problem.R))[0])
+        bound = np.sqrt(np.sum(inverse_factor(problem.R.whiten_jacobian(J[:_TRUTHS])) ** 2, axis=2))
         offsets, apart = false_roots(problem, x, starts, bound)
         local, whole = (weiss_weinstein(problem, expected, c, u) for c in (offsets[:0], offsets))
     nearest = float(apart[0]) if len(apart) else np.inf

@@ -15,6 +15,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import information, inverse
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
+from ipe_bench.measurements import Bock
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.trials.scoring import Block
@@ -50,6 +51,22 @@ class Indefinite(Estimator):
 def test_a_matrix_that_is_no_covariance_covers_nothing():
     _, columns = Block.draw(SCENARIO, 0, 5).estimate(Indefinite())
     assert np.isinf(columns["nees"]).all()
+
+
+@pytest.mark.parametrize("mu", [2.0, 20.0])
+def test_bounds_of_ill_conditioned_models_are_those_of_their_singular_values(mu):
+    """Bock's equations at mu = 20: singular values from 1e10 to .2, of which J'J keeps the largest alone."""
+    block = Block.draw(Scenario(Bock(mu=mu, initial=True), Gaussian(0.05)), 0, 5)
+    J, columns = block.problem.R.whiten_jacobian(block.jacobian), block.truth_columns()
+    prior = np.diag(1 / np.asarray(block.problem.prior_deviation))
+    below = np.concatenate([J, np.broadcast_to(prior, (5, 3, 3))], axis=1)
+    for bound, A in (("crlb", J), ("bayes", below)):
+        _, s, right = np.linalg.svd(A, full_matrices=False)
+        deviation = np.sqrt(np.sum((right / s[:, :, None]) ** 2, axis=1))
+        found = np.stack([columns[f"{bound}_{p.name}"] for p in block.problem.measurement.parameters], axis=1)
+        np.testing.assert_allclose(found, deviation, rtol=1e-9)
+    expected = [columns[f"van_trees_{p.name}"][0] for p in block.problem.measurement.parameters]
+    assert (np.array(expected) > 0).all()
 
 
 def test_the_test_of_the_fit_is_uniform_where_the_model_is_right():
