@@ -20,9 +20,17 @@ from ipe_bench.estimators.least_squares import Minima, Objective, minimize
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.real.fits import Fit, holding, present_part
+from ipe_bench.real.fits import Fit, falls_beyond, holding, present_part
 from ipe_bench.real.penalised import penalised
-from ipe_bench.real.profiles import Profile, Released, end_within, half_width, profiles, profiles_within
+from ipe_bench.real.profiles import (
+    Profile,
+    Released,
+    end_within,
+    half_width,
+    profiles,
+    profiles_within,
+    wald,
+)
 
 CONFIDENCE = 0.95
 BOOTSTRAPS = 500
@@ -279,7 +287,6 @@ class _Least:
         model, x, m = self.model, self.x[None], whole.R.m
         q = half_width(CONFIDENCE, self.freedom)
         deviation = np.sqrt(np.diag(self.P))
-        ends = np.sort(model.natural(np.stack([self.x - q * deviation, self.x + q * deviation])), axis=0)
         h, raw = whole.measurement.simulate(x)[0], whole.measurement.jacobian(x)[0]
         errors = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", raw, self.P, raw), 0.0))
         known = self.problem.R.deviations[: self.readings]
@@ -293,7 +300,7 @@ class _Least:
             model,
             model.natural(x)[0],
             deviation * np.abs(model.natural_slope(x)[0]),
-            (ends[0], ends[1]),
+            wald(model, self.x, q * deviation),
             profiles(self.problem, self.z, self.x, self.P, confidence=CONFIDENCE, freedom=self.freedom),
             self.bootstrap(bootstraps),
             self.direction(),
@@ -345,7 +352,8 @@ class _Least:
         h = self.model.simulate(self.x[None])[0]
         z = h + (e * factor if factor.ndim == 1 else e @ factor.T)
         minima = _minimise(self.problem, z, np.repeat(self.x[None], draws, axis=0))
-        values = self.model.natural(minima.x[minima.converged])
+        values, answered = _within_bounds(self.problem, z, minima)
+        values = values[answered]
         tail = (1 - CONFIDENCE) / 2
         n, estimate = len(self.x), self.model.natural(self.x[None])[0]
         if len(values) < draws / 2:
@@ -353,7 +361,7 @@ class _Least:
             return Bootstrap(unknown, unknown, unknown, len(values), draws)
         low, high = np.quantile(values, [tail, 1 - tail], axis=0)
         # Bias grows with the square of the level: this is that of the level that was estimated.
-        bias = ((values - estimate) / level[minima.converged, None] ** 2).mean(axis=0)
+        bias = ((values - estimate) / level[answered, None] ** 2).mean(axis=0)
         return Bootstrap(low, high, bias, len(values), draws)
 
     def minima(self) -> list[Minimum]:
@@ -402,6 +410,29 @@ def _minimise(problem: Problem, z: Array, x: Array) -> Minima:
     with np.errstate(all="ignore"):
         objective = Objective.of(problem, z, prior=False)
         return minimize(objective, LevenbergMarquardtMethod(1e-3), x, tolerance=_TOLERANCE, max_iterations=_MOST_STEPS)
+
+
+def _within_bounds(problem: Problem, z: Array, minima: Minima) -> tuple[Array, Array]:
+    """The minima (sets, n) of readings z (sets, m) in the parameters' own units, on bounds where the sum of squares
+    falls on beyond them, and which sets have one."""
+    model, n = problem.measurement, problem.measurement.n
+    values, answered = model.natural(minima.x), minima.converged.copy()
+    near: dict[tuple[tuple[int, float], ...], list[int]] = {}
+    for i in np.flatnonzero(~answered & ~np.isnan(minima.x).any(axis=1)).tolist():
+        near.setdefault(tuple(model.near_bounds(minima.x[i]).items()), []).append(i)
+    for bounds, members in near.items():
+        places = [k for k, _ in bounds]
+        if not 0 < len(places) < n:
+            continue
+        rows, kept = np.array(members), np.setdiff1d(np.arange(n), places)
+        held = holding(problem, dict(bounds))
+        again = _minimise(held, z[rows], minima.x[np.ix_(rows, kept)])
+        falls = again.converged.copy()
+        falls[falls] = falls_beyond(problem, dict(bounds), again.x[falls], z[rows[falls]])
+        values[np.ix_(rows[falls], kept)] = held.measurement.natural(again.x[falls])
+        values[np.ix_(rows[falls], places)] = [bound for _, bound in bounds]
+        answered[rows[falls]] = True
+    return values, answered
 
 
 def _at(rows: Array, values: Array, m: int) -> Array:

@@ -19,6 +19,7 @@ from ipe_bench.measurements.counted import cost
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.gaussian import Gaussian
+from ipe_bench.real.profiles import wald
 from ipe_bench.real.residuals import Whiteness, explained, normalised, outlier_limit, whiteness
 from ipe_bench.trials.fit_test import fit_probability, inflation_of, spread_of
 from ipe_bench.trials.thresholds import FIT_LEVEL
@@ -140,8 +141,7 @@ class Fit:
         """Confidence intervals (n,), (n,) from the standard errors; inside of its bounds where a parameter has some."""
         with np.errstate(invalid="ignore"):
             half = self.half_width(confidence) * np.sqrt(np.diagonal(self.inner_covariance))
-        ends = self.model.natural(np.stack([self.inner - half, self.inner + half]))
-        return ends.min(axis=0), ends.max(axis=0)
+        return wald(self.model, self.inner, half)
 
     def region(self, parameters: int, confidence: float = 0.95) -> float:
         """The squared distance, in standard errors, to the edge of a joint region of so many parameters: chi-square, or
@@ -289,7 +289,9 @@ def _fit_one(label: str, estimator: Estimator, problem: Problem, z: Array, *wher
     if not 0 < len(near) < len(found.x):
         return found
     held = _fit_inside(label, estimator, holding(problem, near), z, *where, noise=noise)
-    return _on_bounds(found, held, near) if _is_minimum(problem, held, near, z) else found
+    if held.status is not Status.CONVERGED or not falls_beyond(problem, near, held.inner[None], z[None])[0]:
+        return found
+    return _on_bounds(found, held, near)
 
 
 def holding(problem: Problem, values: Mapping[int, float]) -> Problem:
@@ -302,20 +304,20 @@ def holding(problem: Problem, values: Mapping[int, float]) -> Problem:
     return replace(problem, measurement=held, prior_deviation=deviation, prior_correlation=correlation)
 
 
-def _is_minimum(problem: Problem, held: Fit, near: Mapping[int, float], z: Array) -> bool:
-    """Whether the sum of squares falls on beyond every bound, so that its minimum within them is on them (Nocedal and
-    Wright, Numerical Optimization, 2nd ed., 2006, theorem 12.1)."""
-    if held.status is not Status.CONVERGED:
-        return False
+def falls_beyond(problem: Problem, near: Mapping[int, float], x: Array, z: Array) -> Array:
+    """Whether the sum of squares of readings z (sets, m) falls on beyond every bound, so that its minimum within them
+    is on them (Nocedal and Wright, Numerical Optimization, 2nd ed., 2006, theorem 12.1); x (sets, n - bounds) are the
+    minima with those parameters held there."""
     model, places = problem.measurement.released(near), list(near)
-    x = np.array(model.nominal, dtype=float)
-    x[[k for k in range(model.n) if k not in near]] = held.inner
+    whole = np.repeat(np.array(model.nominal, dtype=float)[None], len(x), axis=0)
+    whole[:, [k for k in range(model.n) if k not in near]] = x
     with np.errstate(all="ignore"):
-        r = problem.R.whiten(z - model.simulate(x[None])[0])
-        downhill = problem.R.whiten_jacobian(model.jacobian(x[None]))[0][:, places].T @ r
+        r = problem.R.whiten(z - model.simulate(whole))
+        J = problem.R.whiten_jacobian(model.jacobian(whole))[:, :, places]
+        downhill = np.einsum("tmk,tm->tk", J, r)
     start = problem.measurement.natural(problem.measurement.nominal[None])[0]
     outward = np.sign(np.array(list(near.values())) - start[places])
-    return bool((downhill * outward > 0).all())
+    return (downhill * outward > 0).all(axis=1)
 
 
 def _on_bounds(found: Fit, held: Fit, near: Mapping[int, float]) -> Fit:

@@ -18,6 +18,7 @@ from scipy.special import stdtrit
 from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.estimators.least_squares import Objective, minimize, squared
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
+from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.counted import Counted, Tally
 from ipe_bench.measurements.problem import Problem
 
@@ -87,6 +88,43 @@ class Pinned(Counted):
         return full
 
 
+_ON_BOUND = 1e-9
+"""Share of the start's distance from a bound within which a value is on it: round-off of what is a logarithm."""
+
+
+def natural(model: Measurement, x: Array) -> Array:
+    """Values (points, n) in the parameters' own units, exactly on a bound where they are as good as there."""
+    ends = _limits(model)
+    values, start = model.natural(x), model.natural(model.nominal[None])
+    for bound in ends:
+        near = np.isfinite(bound) & (np.abs(values - bound) <= _ON_BOUND * np.abs(start - bound))
+        values = np.where(near, bound, values)
+    return values
+
+
+def _limits(model: Measurement) -> Array:
+    """The lower and the upper bound (2, n) of each parameter, in its own unit; infinite where there is none."""
+    return np.sort(model.natural(np.stack([np.full(model.n, -np.inf), np.full(model.n, np.inf)])), axis=0)
+
+
+def wald(model: Measurement, x: Array, half: Array) -> tuple[Array, Array]:
+    """Ends (n,), (n,) of the intervals x +- half in the parameters' own units.
+
+    They are those of the logarithm of a bounded parameter's distance from its bound, in which its errors are more
+    nearly normal, unless the bound is within the interval that is symmetric in its own unit: then they are those of
+    that interval, which ends on the bound, because the logarithm of what may be 0 has no normal errors.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        ends = np.sort(natural(model, np.stack([x - half, x + half])), axis=0)
+        values, slope = model.natural(x[None])[0], model.natural_slope(x[None])[0]
+        low, high = values - half * np.abs(slope), values + half * np.abs(slope)
+        bounds = _limits(model)
+        reached = (low <= bounds[0]) & np.isfinite(bounds[0]) | (high >= bounds[1]) & np.isfinite(bounds[1])
+        symmetric = np.clip(np.stack([low, high]), *bounds)
+    found = np.where(reached, symmetric, ends)
+    return found[0], found[1]
+
+
 def half_width(level: float, freedom: int | None) -> float:
     """The quantile that a rise of root chi-square is compared with: normal, or Student's t where the level of the noise
     is estimated from `freedom` degrees of freedom."""
@@ -153,7 +191,7 @@ def end_within(
     if looked.lower:
         return np.nan
     end = looked.centre + sign * looked.end(sign)
-    return float(looked._natural(np.array([end]))[0])
+    return float(looked.natural(np.array([end]))[0])
 
 
 @dataclass(frozen=True)
@@ -283,19 +321,21 @@ class _Looked:
         values = np.array(sorted(self.seen))
         zeta = np.array([self.seen[v][0] for v in values])
         centre, half = self.centre, self.q * self.deviation
-        ends = [centre - self.end(-1), centre + self.end(1), centre - half, centre + half]
         with np.errstate(invalid="ignore"):
-            natural = self._natural(np.concatenate([ends, values]))
-        low, high = sorted(natural[:2])
-        wald = tuple(sorted(natural[2:4]))
-        order = np.argsort(natural[4:])
-        zeta = zeta if natural[5] >= natural[4] else -zeta
-        return Profile(natural[4:][order], zeta[order], float(low), float(high), wald, self.lower)  # type: ignore[arg-type]
+            own = self.natural(np.concatenate([[centre - self.end(-1), centre + self.end(1)], values]))
+        low, high = sorted(own[:2])
+        widths = np.zeros(len(self.whole.x))
+        widths[self.place] = half
+        ends = [float(end[self.place]) for end in wald(self.whole.problem.measurement, self.whole.x, widths)]
+        order = np.argsort(own[2:])
+        zeta = zeta if own[3] >= own[2] else -zeta
+        return Profile(own[2:][order], zeta[order], float(low), float(high), (ends[0], ends[1]), self.lower)
 
-    def _natural(self, values: Array) -> Array:
+    def natural(self, values: Array) -> Array:
+        """Values of the parameter in its own unit."""
         points = np.repeat(self.whole.x[None], len(values), axis=0)
         points[:, self.place] = values
-        return self.whole.problem.measurement.natural(points)[:, self.place]
+        return natural(self.whole.problem.measurement, points)[:, self.place]
 
 
 _Asked: TypeAlias = "list[tuple[_Looked, float]]"

@@ -96,7 +96,7 @@ def test_bounds_move_neither_a_minimum_inside_of_them_nor_its_standard_errors(tm
     assert result.x == pytest.approx(x, rel=1e-8)
     assert result.standard_errors == pytest.approx(deviations, rel=1e-8)
     for one, low, high in zip(known, *result.interval(0.999999), strict=True):
-        assert one.bounds[0] < low < high < one.bounds[1]
+        assert one.bounds[0] <= low < high <= one.bounds[1]
 
 
 @pytest.mark.parametrize("unknown", [False, True])

@@ -187,6 +187,78 @@ def test_an_interval_ends_at_the_other_bound_where_the_readings_say_nothing():
     assert (found.on_bounds[0].bound, found.on_bounds[0].other) == (1.0, 0.0)
 
 
+TIMES = np.linspace(0, 6, 25)
+
+
+def decay_above_zero(c: float, seed: int, bootstraps: int = 500):
+    """A decay to c, which cannot be negative, read 25 times with errors of .05."""
+    model = Formula("a*exp(-b*t)+c", {"a": 1.0, "b": 0.5, "c": 0.1}, {"t": tuple(TIMES)})
+    problem = Scenario(Informed(model, (Known("c", lower=0.0),)), Gaussian(0.05)).problem
+    z = 2 * np.exp(-0.7 * TIMES) + c + 0.05 * np.random.default_rng(seed).standard_normal(25)
+    fits = fit(problem, z, LM)
+    return fits[0], examine(problem, z, fits, bootstraps=bootstraps)
+
+
+def test_a_simulated_set_whose_minimum_is_on_a_bound_has_an_answer():
+    """All 500 sets that are drawn, each minimised once more by SciPy within the bounds; half of them are on the bound,
+    and without those 0 would not be in the interval."""
+    one, found = decay_above_zero(0.0, 0)
+    assert found is not None
+    assert found.bootstrap.converged == found.bootstrap.drawn == 500
+
+    def curve(p):
+        return p[0] * np.exp(-p[1] * TIMES) + p[2]
+
+    sets = curve(one.x) + 0.05 * np.random.Generator(np.random.Philox(0)).standard_normal((500, 25))
+    bounds = ([-np.inf, -np.inf, 0.0], np.inf)
+    x = np.array([least_squares(lambda p, z=z: curve(p) - z, one.x, bounds=bounds, xtol=1e-10).x for z in sets])
+    assert 100 < (x[:, 2] < 1e-6).sum() < 400
+    assert found.bootstrap.low == pytest.approx(np.quantile(x, 0.025, axis=0), abs=1e-4)
+    assert found.bootstrap.high == pytest.approx(np.quantile(x, 0.975, axis=0), abs=1e-4)
+    assert found.bootstrap.low[2] == 0.0
+    assert found.bootstrap.bias == pytest.approx(x.mean(axis=0) - one.x, abs=1e-4)
+
+
+def test_intervals_end_on_the_bound_that_they_reach():
+    """The estimate is .005, a tenth of a standard error above the bound. In the logarithm of c its standard errors
+    reach from 1e-12 to millions; in c they end on the bound, as the profile does."""
+    one, found = decay_above_zero(0.0, 0)
+    assert found is not None
+    assert 0 < one.x[2] < 0.01
+    profile = found.profiles[2]
+    assert profile.low == 0.0
+    reach = one.x[2] + Q * one.standard_errors[2]
+    assert profile.wald == pytest.approx((0.0, reach))
+    assert [end[2] for end in one.interval()] == pytest.approx([0.0, reach])
+    assert profile.high == pytest.approx(reach, rel=0.1)
+
+
+def test_standard_errors_of_what_is_far_from_its_bound_are_of_its_logarithm():
+    one, _ = decay_above_zero(1.0, 1)
+    (c, s), (low, high) = (one.x[2], one.standard_errors[2]), (end[2] for end in one.interval())
+    assert np.log([low / c, high / c]) == pytest.approx([-Q * s / c, Q * s / c])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("c", [0.0, 0.02])
+def test_1000_truths_on_and_near_a_bound_are_in_every_interval(c):
+    """Profile, standard error and bootstrap each hold c at least as often as .93; beside it their median widths."""
+    inside, widths = np.zeros(3), []
+    for seed in range(1000):
+        one, found = decay_above_zero(c, seed, bootstraps=100)
+        assert found is not None
+        if one.held_at:
+            (bound,) = found.on_bounds
+            ends = [(bound.bound, bound.other)] * 3
+        else:
+            ends = [(p.low, p.high) for p in (found.profiles[2],)] + [found.profiles[2].wald]
+            ends.append((float(found.bootstrap.low[2]), float(found.bootstrap.high[2])))
+        inside += [low <= c <= high for low, high in ends]
+        widths.append([high - low for low, high in ends])
+    print(f"c = {c}: covered {inside / 1000} (profile, standard error, bootstrap), widths {np.median(widths, axis=0)}")
+    assert (inside >= 930).all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [0.0, 0.02, 0.04])
 def test_truths_near_a_bound_are_in_the_intervals_at_least_as_often_as_they_say(rate):
