@@ -1,12 +1,7 @@
-"""Functions that Numba compiles, kept as machine code: what was compiled once is called without Numba, which takes
-longer to load than a small run to compute.
+"""Machine code for this processor, made from LLVM's intermediate representation and kept in files between processes.
 
-A source is the text of a module in which one function is decorated with its signature:
-
-    @njit("void(float64[:, ::1], int64[::1], int64)", error_model="numpy")
-
-It takes C-contiguous arrays that may be written into, and whole numbers, and returns nothing or a number. It allocates
-nothing and raises nothing. A call lets other threads run.
+A function takes pointers and whole numbers and returns nothing; a call lets other threads run. Where no machine code
+can be made, `available` says so, and callers compute the same with NumPy.
 """
 
 from __future__ import annotations
@@ -16,10 +11,10 @@ import ctypes
 import functools
 import hashlib
 import importlib.metadata
-import json
 import logging
+import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable
 from ctypes.util import find_library
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,113 +22,162 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ipe_bench.basics.errors import StorageError
-from ipe_bench.basics.files import BLANK_SEAL, cache_folder, is_sealed, seal, write_bytes
-from ipe_bench.basics.machine import ARRAY_DATA, ARRAY_DIMENSIONS
+from ipe_bench.basics.files import cache_folder, write_atomically
 
 if TYPE_CHECKING:
     # Imported where something is compiled, and here so that results are known to depend on it.
-    from ipe_bench.basics import compiler as compiler
+    from ipe_bench.basics import vectors as vectors
 
 _LOG = logging.getLogger(__name__)
 
-_RESULTS = {"none": None, "float64": ctypes.c_double}
+_CALLED = ("sin", "cos", "tan", "atan", "exp", "log", "sinh", "cosh", "tanh", "pow", "fma", "memset", "memcpy")
+"""Functions of the C library that machine code may call: those of recorded programs, and those LLVM puts in place of
+an instruction that the processor lacks or of a loop."""
+_DIGEST = 32
+
+POINTER, INTEGER = ctypes.c_void_p, ctypes.c_int64
 
 
 @functools.cache
-def load(source: str, what: str = "an integrator") -> Function:
-    """The one function of a source that is decorated with its signature, compiled at most once per machine."""
-    name = f"ipe_bench_{hashlib.sha256(f'{source}{_machine()}'.encode()).hexdigest()[:16]}"
-    path = cache_folder() / f"{name}.o"
-    content = path.read_bytes() if path.is_file() else b""
-    if not is_sealed(content):
-        from ipe_bench.basics.compiler import compiled
-
-        _LOG.info("compiling %s, once per machine: it is kept in %s", what, path.parent)
-        found = compiled(source, name)
-        header = {"symbol": found.symbol, "arguments": found.arguments, "result": found.result, "needs": found.needs}
-        content = seal(json.dumps(header | {"seal": BLANK_SEAL}).encode() + b"\n" + found.code)
-        with contextlib.suppress(StorageError):
-            write_bytes(path, content)
-    head, _, code = content.partition(b"\n")
-    return _linked(json.loads(head), code)
-
-
-class Function:
-    """A compiled function."""
-
-    def __init__(self, engine: Any, symbol: str, arguments: Sequence[tuple[str, int]], result: str) -> None:
-        self._engine = engine  # which its code lives as long as
-        self._kinds = [(np.dtype(name), ndim) if ndim else None for name, ndim in arguments]
-        words = [ctypes.c_void_p if ndim else ctypes.c_int64 for _, ndim in arguments]
-        self._call = ctypes.CFUNCTYPE(_RESULTS[result], *words)(engine.get_function_address(symbol))
-
-    def __call__(self, *arguments: Any) -> Any:
-        return self._call(*[_word(a, kind) for a, kind in zip(arguments, self._kinds, strict=True)])
-
-
-def _word(argument: Any, kind: tuple[np.dtype[Any], int] | None) -> int:
-    """What is handed over: a number itself, an array by the address of its object."""
-    if kind is None:
-        return argument
-    if argument.dtype != kind[0] or argument.ndim != kind[1] or not argument.flags.carray:
-        raise TypeError(
-            f"an array of {argument.ndim} dimensions of {argument.dtype}, where one of {kind[1]} of {kind[0]} is taken "
-            "that is C-contiguous and may be written into"
-        )
-    return id(argument)
-
-
-def _linked(header: Mapping[str, Any], code: bytes) -> Function:
-    import llvmlite.binding as llvm
-
-    _prepare()
-    for name, address in _addresses(header["needs"]):
-        llvm.add_symbol(name, address)
-    # An engine owns its target, and names need not differ between engines.
-    target = llvm.Target.from_default_triple().create_target_machine(jit=True)
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target)
-    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
-    engine.finalize_object()
-    return Function(engine, header["symbol"], header["arguments"], header["result"])
-
-
-def _addresses(names: Iterable[str]) -> Iterator[tuple[str, int]]:
-    """Where the functions are that compiled code calls: those of the C library. What Numba would call where something
-    is raised or freed, which nothing is, ends the process."""
-    library = ctypes.CDLL(None if sys.platform != "win32" else "ucrtbase")
-    mathematics = ctypes.CDLL(find_library("m")) if sys.platform.startswith("linux") else library
-    for name in names:
-        function = next((f for lib in (mathematics, library) if (f := getattr(lib, name, None))), library.abort)
-        address = ctypes.cast(function, ctypes.c_void_p).value
-        assert address is not None
-        yield name, address
+def available() -> bool:
+    """Whether machine code can be made here."""
+    try:
+        _target()
+        _addresses()
+    except (ImportError, OSError, RuntimeError) as error:
+        _LOG.warning("models run in NumPy, tens of times slower: no machine code can be made here (%s)", error)
+        return False
+    return True
 
 
 @functools.cache
-def _prepare() -> None:
+def _target() -> Any:
+    """LLVM's description of this processor."""
     import llvmlite.binding as llvm
 
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
+    cpu, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    target = llvm.Target.from_default_triple()
+    return target.create_target_machine(cpu=cpu, features=features, opt=1, reloc="pic", jit=True)
 
 
 @functools.cache
-def _machine() -> str:
-    """What machine code depends on besides its source: the processor, the compiler and how NumPy and Python lay out
-    arrays."""
+def _addresses() -> dict[str, int]:
+    """Where the functions of the C library are."""
+    library = ctypes.CDLL(None if sys.platform != "win32" else "ucrtbase")
+    mathematics = ctypes.CDLL(find_library("m")) if sys.platform.startswith("linux") else library
+    found = {}
+    for name in _CALLED:
+        function = getattr(mathematics, name, None) or getattr(library, name, None)
+        if function is None:
+            raise OSError(f"the C library has no function {name}")
+        found[name] = ctypes.cast(function, ctypes.c_void_p).value or 0
+    return found
+
+
+@functools.cache
+def width() -> int:
+    """Numbers in a vector register."""
     import llvmlite.binding as llvm
 
-    _check_layout()
-    here = Path(__file__)
-    code = b"".join(here.with_name(name).read_bytes() for name in (here.name, "compiler.py"))
-    versions = [importlib.metadata.version(name) for name in ("llvmlite", "numba")]
-    processor = (llvm.get_process_triple(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten())
-    return repr((hashlib.sha256(code).hexdigest(), versions, processor, ARRAY_DATA))
+    return 8 if llvm.get_host_cpu_features().get("avx512f") else 4
 
 
-def _check_layout() -> None:
-    probe = np.zeros((2, 3))
-    data = ctypes.c_void_p.from_address(id(probe) + ARRAY_DATA).value
-    dimensions = ctypes.c_void_p.from_address(id(probe) + ARRAY_DIMENSIONS).value
-    if data != probe.ctypes.data or (ctypes.c_int64 * 2).from_address(dimensions or 0)[:] != [2, 3]:
-        raise RuntimeError("NumPy's arrays lie otherwise in memory than compiled code takes them to")
+@functools.cache
+def load(
+    key: str, write: Callable[[], str], name: str, arguments: tuple[Any, ...], what: str = "an integrator"
+) -> Callable[..., None]:
+    """The function `name` of the module that `write` writes and `key` stands for, compiled once per machine.
+
+    What is kept is used only if it was made of this key for this processor, is whole, and nobody else may have put it
+    there.
+    """
+    import llvmlite.binding as llvm
+
+    made_of = hashlib.sha256(repr((name, key, _machine())).encode()).digest()
+    path = cache_folder() / f"{made_of.hex()[:32]}.o"
+    content = _own_bytes(path)
+    code = content[2 * _DIGEST :]
+    if content[: 2 * _DIGEST] != made_of + hashlib.sha256(code).digest():
+        _LOG.info("compiling %s, once per machine: it is kept in %s", what, path.parent)
+        code = _object_code(write())
+        _keep(path, made_of + hashlib.sha256(code).digest() + code)
+    library = llvm.JITLibraryBuilder().add_object_img(code).export_symbol(name)
+    for called, address in _addresses().items():
+        library.import_symbol(called, address)
+    engine = llvm.create_lljit_compiler(_target())
+    tracker = library.link(engine, made_of.hex())
+    function = ctypes.CFUNCTYPE(None, *arguments)(tracker[name])
+    function.keeps = engine, tracker  # type: ignore[attr-defined]
+    return function
+
+
+def _keep(path: Path, content: bytes) -> None:
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(content)
+        temporary.chmod(0o600)
+
+    with contextlib.suppress(StorageError):
+        write_atomically(path, write)
+
+
+def _own_bytes(path: Path) -> bytes:
+    """What a file holds that this user or the system has written and nobody else can write to; else nothing."""
+    if not path.is_file():
+        return b""
+    with path.open("rb") as file:
+        about = os.fstat(file.fileno())
+        foreign = os.name == "posix" and (about.st_uid not in (0, os.geteuid()) or about.st_mode & 0o022)
+        return b"" if foreign else file.read()
+
+
+def _object_code(text: str) -> bytes:
+    import llvmlite.binding as llvm
+
+    module = llvm.parse_assembly(text)
+    module.triple, module.data_layout = _target().triple, str(_target().target_data)
+    options = llvm.create_pipeline_tuning_options(speed_level=2)
+    options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = False  # vectors are explicit
+    builder = llvm.create_pass_builder(_target(), options)
+    builder.getModulePassManager().run(module, builder)
+    return _target().emit_object(module)
+
+
+@functools.cache
+def _machine() -> tuple[str, ...]:
+    """What machine code depends on besides its source."""
+    import llvmlite.binding as llvm
+
+    version = importlib.metadata.version("llvmlite")
+    return version, _target().triple, llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+
+
+@functools.cache
+def digest_of(file: Path) -> str:
+    """Stands for the code of a module that writes intermediate representation, and of those it writes with: what they
+    compiled before a change is not used after it."""
+    files = [file, Path(__file__), Path(__file__).with_name("vectors.py")]
+    return hashlib.sha256(b"".join(each.read_bytes() for each in files)).hexdigest()
+
+
+_NOTHING = ctypes.c_char * 0
+
+
+def at(a: Any, kind: Any = np.float64) -> int:
+    """Where the numbers of an array lie; a third of the time that `a.ctypes.data` takes.
+
+    Raises:
+        TypeError: the numbers are of another kind, not C-contiguous, or not to be written to.
+    """
+    if a.dtype != kind:
+        raise TypeError(f"an array of {a.dtype}, where one of {np.dtype(kind)} is taken")
+    if not a.size:
+        return 0
+    return ctypes.addressof(_NOTHING.from_buffer(a))
+
+
+def aligned(numbers: int) -> tuple[np.ndarray[Any, Any], int]:
+    """Room for so many numbers, and where it begins: at the border of a cache line."""
+    memory = np.empty(numbers + 8)
+    return memory, -(-at(memory) // 64) * 64

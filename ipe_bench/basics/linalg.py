@@ -14,18 +14,20 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics import compiled
 from ipe_bench.basics.machine import keep_freed_memory
 
 if TYPE_CHECKING:
-    # Compiled from their text, and here so that results are known to depend on them.
-    from ipe_bench.basics import definite as definite
-    from ipe_bench.basics import normal as normal
+    # Imported where something is compiled, and here so that results are known to depend on it.
+    from ipe_bench.basics import small_matrices as small_matrices
 
 Array: TypeAlias = NDArray[Any]
 Mask: TypeAlias = NDArray[Any]
 
 keep_freed_memory()
 
+_MOST_IN_REGISTERS = 16
+"""Parameters up to which the normal equations are computed by machine code that keeps them in registers."""
 _WELL_CONDITIONED = 1e3
 """The condition of J, its columns scaled, up to which J' J has enough of its digits: nine or more."""
 
@@ -182,8 +184,12 @@ def normal_equations(J: Array, r: Array, deviation: Array | None = None) -> tupl
     trials, m, n = J.shape
     with np.errstate(all="ignore"):
         weights = np.ones(m) if deviation is None else 1.0 / deviation
+        if not _small(n):
+            A = J * weights[:, None]
+            return np.matmul(A.swapaxes(1, 2), A), multiply(A.swapaxes(1, 2), r)
         G, gradient = np.empty((trials, n, n)), np.empty((trials, n))
-        _compiled("normal")(own(J), weights, own(r), G, gradient, np.empty((n, m)))
+        at, J, r = compiled.at, own(J), own(r)
+        _compiled("normal", n, 5, 2)(at(J), at(weights), at(r), at(G), at(gradient), trials, m)
         return G, gradient
 
 
@@ -194,18 +200,40 @@ def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
     The columns of J are scaled first; what is lost of U is n eps times the condition squared (Higham, Accuracy and
     Stability of Numerical Algorithms, 2002, section 20.4).
     """
-    n = G.shape[1]
-    U, inverse_U, size = np.zeros(G.shape), np.zeros(G.shape), np.empty(len(G))
-    _compiled("definite")(own(G), U, inverse_U, size, np.empty((3, n, n)))
-    return U, inverse_U, size * np.sqrt(n) <= _WELL_CONDITIONED
+    trials, n = G.shape[:2]
+    with np.errstate(all="ignore"):
+        if _small(n):
+            at, G = compiled.at, own(G)
+            U, inverse_U, norm = np.zeros(G.shape), np.zeros(G.shape), np.empty(trials)
+            _compiled("factor", n, 4, 1)(at(G), at(U), at(inverse_U), at(norm), trials)
+            return U, inverse_U, norm * np.sqrt(n) <= _WELL_CONDITIONED
+        size = np.sqrt(np.diagonal(G, axis1=1, axis2=2))
+        scaled = G / (size[:, :, None] * size[:, None, :])
+        usable = finite(scaled)
+        U = cholesky(np.where(usable[:, None, None], scaled, np.eye(n)))
+        usable &= finite(U)
+        inverse_U = np.triu(np.linalg.inv(np.where(usable[:, None, None], U, np.eye(n))))
+        well = usable & (np.linalg.norm(inverse_U, axis=(1, 2)) * np.sqrt(n) <= _WELL_CONDITIONED)
+        return U * size[:, None, :], inverse_U / size[:, :, None], well
+
+
+def _small(n: int) -> bool:
+    """Whether problems of n parameters are computed by machine code."""
+    return n <= _MOST_IN_REGISTERS and compiled.available()
 
 
 @functools.cache
-def _compiled(name: str) -> Any:
-    """The function of a module of this room."""
-    from ipe_bench.basics.compiled import load
+def _compiled(name: str, n: int, pointers: int, numbers: int) -> Any:
+    """A function of `small_matrices` for n parameters."""
 
-    return load(Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8"), "linear algebra")
+    def write() -> str:
+        from ipe_bench.basics import small_matrices
+
+        return getattr(small_matrices, name)(n)
+
+    arguments = (*[compiled.POINTER] * pointers, *[compiled.INTEGER] * numbers)
+    key = f"{n} {compiled.digest_of(Path(__file__).with_name('small_matrices.py'))}"
+    return compiled.load(key, write, name, arguments, "linear algebra")
 
 
 def pseudo_inverse(H: Array, R: Covariance) -> tuple[Array, Mask]:

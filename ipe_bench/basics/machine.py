@@ -10,7 +10,6 @@ import platform
 _LIBRARIES = (
     "numpy",
     "scipy",
-    "numba",
     "llvmlite",
     "filterpy",
     "hydra-core",
@@ -19,10 +18,6 @@ _LIBRARIES = (
     "seaborn",
     "matplotlib",
 )
-ARRAY_DATA = object.__basicsize__
-ARRAY_DIMENSIONS = ARRAY_DATA + 16
-"""Where NumPy's array objects keep the pointers to their numbers and to their shape, as every extension module that was
-compiled for NumPy has it: PyArray_DATA and PyArray_DIMS of its C API."""
 
 
 def cores() -> int:

@@ -19,7 +19,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite, Positive
 from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise
 from ipe_bench.measurements.ode.model import OdeMeasurement
-from ipe_bench.measurements.ode.source import Variation
+from ipe_bench.measurements.ode.plan import Variation
 from ipe_bench.measurements.ode.trace import tangent
 
 FOOT = 0.3048

@@ -15,7 +15,7 @@ import pytest
 import ipe_bench as ib
 from ipe_bench import api
 
-HEAVY = ("pandas", "matplotlib", "seaborn", "hydra", "omegaconf", "filterpy", "numba", "rich")
+HEAVY = ("pandas", "matplotlib", "seaborn", "hydra", "omegaconf", "filterpy", "llvmlite", "rich")
 FUNCTIONS = ("check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status")
 
 

@@ -1,8 +1,7 @@
-"""What was compiled once is called without a compiler, and nothing but what it takes reaches it."""
+"""Machine code is kept between processes, and only what was made here of the same source is run."""
 
 from __future__ import annotations
 
-import ctypes
 import os
 import subprocess
 import sys
@@ -10,96 +9,119 @@ import sys
 import numpy as np
 import pytest
 
-from ipe_bench.basics.compiled import load
+from ipe_bench.basics import compiled
+from ipe_bench.basics.compiled import POINTER, at
 from ipe_bench.measurements import LotkaVolterra
 from ipe_bench.runs import provenance
 from ipe_bench.solvers import FixedPoint
 
-SOURCE = """
-import numpy as np
-from numba import njit
 
+def times(factor, name="scale"):
+    """out[0] = factor x[0], loaded from its file or compiled."""
 
-@njit("float64(float64[:, ::1], int64[::1], int64, float64[::1])", error_model="numpy")
-def sines(x, rows, columns, sums):
-    largest = -np.inf
-    for i in range(rows.shape[0]):
-        sums[i] = 0.0
-        for j in range(columns):
-            sums[i] += np.sin(x[rows[i] // 2, j]) / x.shape[0]
-        largest = max(largest, sums[i])
-    return largest
-"""
+    def write():
+        return f"""
+            define void @{name}(ptr %x, ptr %out) {{
+              %v = load double, ptr %x
+              %w = fmul double %v, {factor!r}
+              store double %w, ptr %out
+              ret void
+            }}"""
+
+    out = np.empty(1)
+    compiled.load.__wrapped__(f"times {factor}", write, name, (POINTER, POINTER))(at(np.array([3.0])), at(out))
+    return out[0]
 
 
 @pytest.fixture
-def arguments():
-    rng = np.random.default_rng(0)
-    return rng.normal(size=(4, 3)), np.array([6, 1, 4]), 3, np.empty(3)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("IPE_BENCH_CACHE", str(tmp_path))
+    return tmp_path
 
 
-def test_a_function_computes_with_the_arrays_that_it_is_given(arguments):
-    x, rows, _, sums = arguments
-    assert load(SOURCE)(*arguments) == sums.max()
-    np.testing.assert_allclose(sums, np.sin(x[rows // 2]).sum(axis=1) / 4, rtol=1e-15)
+def test_a_first_compilation_says_so_once(folder, caplog):
+    with caplog.at_level("INFO"):
+        assert times(2.5) == 7.5
+        assert times(2.5) == 7.5
+    expected = [f"compiling an integrator, once per machine: it is kept in {folder}"]
+    assert [record.message for record in caplog.records] == expected
+
+
+def test_damaged_machine_code_is_compiled_again_and_not_run(folder):
+    times(2.5)
+    (file,) = folder.glob("*.o")
+    whole = file.read_bytes()
+    for place in range(0, len(whole), len(whole) // 20):
+        file.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        assert times(2.5) == 7.5
+        assert file.read_bytes() == whole
+    for damage in (whole[:-1], b"", whole + b"\0"):
+        file.write_bytes(damage)
+        assert times(2.5) == 7.5
+
+
+def test_machine_code_of_another_source_or_name_is_not_run(folder):
+    assert times(2.0) == 6.0
+    (first,) = folder.glob("*.o")
+    assert times(4.0) == 12.0
+    (second,) = set(folder.glob("*.o")) - {first}
+    one, other = first.read_bytes(), second.read_bytes()
+    first.write_bytes(other)
+    second.write_bytes(one)
+    assert times(2.0) == 6.0
+    assert times(4.0) == 12.0
+    assert times(4.0, name="other") == 12.0
+
+
+@pytest.mark.skipif(os.name != "posix", reason="files have owners otherwise there")
+def test_machine_code_that_others_may_have_written_is_not_run(folder, caplog):
+    times(2.0)
+    (file,) = folder.glob("*.o")
+    assert file.stat().st_mode & 0o077 == 0
+    file.chmod(0o622)
+    with caplog.at_level("INFO"):
+        times(2.0)
+        assert "compiling" in caplog.text
+        assert file.stat().st_mode & 0o022 == 0
+        if os.geteuid() == 0:
+            os.chown(file, 12345, -1)
+            caplog.clear()
+            times(2.0)
+            assert "compiling" in caplog.text
+
+
+def test_a_folder_in_place_of_the_file_is_no_trouble(folder):
+    times(2.0)
+    (file,) = folder.glob("*.o")
+    file.unlink()
+    file.mkdir()
+    assert times(2.0) == 6.0
+
+
+def test_a_function_that_the_library_lacks_is_named(monkeypatch, caplog):
+    monkeypatch.setattr(compiled, "_CALLED", ("sin", "sine_of_nothing"))
+    monkeypatch.setattr(compiled, "_addresses", compiled._addresses.__wrapped__)
+    with caplog.at_level("WARNING"):
+        assert not compiled.available.__wrapped__()
+    assert "no machine code can be made here (the C library has no function sine_of_nothing)" in caplog.text
 
 
 @pytest.mark.parametrize(
-    ("place", "value"),
-    [
-        (0, np.zeros((4, 6))[:, ::2]),
-        (0, np.zeros(4)),
-        (0, np.zeros((4, 3), np.float32)),
-        (1, np.zeros(3)),
-        (2, 0.5),
-        (3, np.broadcast_to(0.0, 3)),
-    ],
+    "wrong", [np.zeros((4, 6))[:, ::2], np.zeros(3, np.float32), np.zeros(3, int), np.broadcast_to(0.0, 3)]
 )
-def test_other_arguments_are_refused(arguments, place, value):
-    wrong = list(arguments)
-    wrong[place] = value
-    with pytest.raises((TypeError, ctypes.ArgumentError)):
-        load(SOURCE)(*wrong)
-
-
-def test_more_or_fewer_arguments_are_refused(arguments):
-    with pytest.raises(ValueError, match="zip"):
-        load(SOURCE)(*arguments[:-1])
-    with pytest.raises(ValueError, match="zip"):
-        load(SOURCE)(*arguments, 1)
-
-
-def test_a_first_compilation_says_so_once(tmp_path, monkeypatch, caplog):
-    monkeypatch.setenv("IPE_BENCH_CACHE", str(tmp_path))
-    source = SOURCE + "# of a first compilation\n"
-    with caplog.at_level("INFO"):
-        load(source)
-        load.__wrapped__(source)
-    assert [record.message for record in caplog.records] == [
-        f"compiling an integrator, once per machine: it is kept in {tmp_path}"
-    ]
-
-
-def test_damaged_machine_code_is_compiled_again_and_not_run(tmp_path, monkeypatch, arguments):
-    monkeypatch.setenv("IPE_BENCH_CACHE", str(tmp_path))
-    load.__wrapped__(SOURCE)
-    (file,) = tmp_path.glob("*.o")
-    whole = file.read_bytes()
-    for damage in (whole[:-10], whole[:-200] + bytes(100) + whole[-100:], b""):
-        file.write_bytes(damage)
-        assert load.__wrapped__(SOURCE)(*arguments) == arguments[-1].max()
-        # The compiler names its functions by its own count, so the code need not be the same to the last bit.
-        assert len(file.read_bytes()) > len(whole) - 200
+def test_arrays_that_compiled_code_cannot_take_are_refused(wrong):
+    with pytest.raises((TypeError, BufferError, ValueError)):
+        at(wrong)
 
 
 def test_what_is_compiled_already_needs_no_compiler(tmp_path):
-    script = f"""
+    script = """
 import sys
-import numpy as np
-from ipe_bench.basics.compiled import load
+from ipe_bench.measurements import LotkaVolterra
 
-load({SOURCE!r})(np.zeros((1, 1)), np.zeros(1, np.int64), 1, np.zeros(1))
-print("numba" in sys.modules)
+model = LotkaVolterra()
+model.jacobian(model.nominal[None])
+print("ipe_bench.basics.vectors" in sys.modules)
 """
     environment = os.environ | {"IPE_BENCH_CACHE": str(tmp_path)}
     said = [
@@ -113,15 +135,14 @@ print("numba" in sys.modules)
     ("module", "part"),
     [
         ("basics.compiled", LotkaVolterra()),
-        ("basics.compiler", LotkaVolterra()),
-        ("measurements.ode.machine_code", LotkaVolterra()),
-        ("basics.definite", FixedPoint()),
-        ("basics.normal", FixedPoint()),
+        ("basics.vectors", LotkaVolterra()),
+        ("measurements.ode.emit", LotkaVolterra()),
+        ("basics.small_matrices", FixedPoint()),
     ],
 )
 def test_what_machine_code_comes_from_is_part_of_the_source_that_results_depend_on(monkeypatch, module, part):
-    """It is handed over as text, or imported where something is compiled alone, and yet a change to it makes stored
-    results those of other code."""
+    """It is imported only where something is compiled, and yet a change to it makes stored results those of other
+    code."""
     before = provenance.fingerprint([part])["source"]
     read, changed = provenance._digest_of, f"ipe_bench.{module}"
     monkeypatch.setattr(provenance, "_digest_of", lambda name: read(name) + "#" * (name == changed))

@@ -30,7 +30,7 @@ ROUNDS = 3
 HERE = Path(__file__).resolve().parents[2]
 BENCH = [sys.executable, "-c", "import sys; from ipe_bench.cli.main import main; sys.exit(main())"]
 RUN = ("run", "-m", "error_scale=10,100", "trials=200", "solver=[newton,mine]", "baseline=[linear_lse]", "output=loop")
-LIBRARIES = [sys.executable, "-c", "import numpy, scipy.linalg, numba, pyarrow, hydra"]
+LIBRARIES = [sys.executable, "-c", "import numpy, scipy.linalg, llvmlite.binding, pyarrow, hydra"]
 Seconds = tuple[float, float]
 """By the clock, and of the processors."""
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.ode.model import OdeMeasurement
-from ipe_bench.measurements.ode.source import _Tape
+from ipe_bench.measurements.ode.plan import _Tape
 from ipe_bench.measurements.ode.tableau import DOP853
 from ipe_bench.measurements.ode.trace import Program
 from ipe_bench.measurements.problem import Problem

@@ -34,7 +34,7 @@ from ipe_bench.trials.scoring import Block
 
 STEP_S = 180.0
 BATCH = 250
-LIBRARIES = "import pandas, matplotlib.pyplot, scipy.stats, numba"
+LIBRARIES = "import pandas, matplotlib.pyplot, scipy.stats"
 
 
 @dataclass(frozen=True)

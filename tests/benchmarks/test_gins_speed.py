@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from ipe_bench.measurements import Gins
-from ipe_bench.measurements.ode.kernel import threads
+from ipe_bench.measurements.ode.integrator import threads
 
 TRIALS = 4000
 

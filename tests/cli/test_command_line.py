@@ -258,7 +258,7 @@ import sys
 from ipe_bench.cli.main import COMMANDS, main
 main(["--help"])
 main(["list", "--help"])
-print(sorted(m for m in ("pandas", "seaborn", "filterpy", "numba", "hydra", "numpy", "rich") if m in sys.modules))
+print(sorted(m for m in ("pandas", "seaborn", "filterpy", "llvmlite", "hydra", "numpy", "rich") if m in sys.modules))
 """
 
 

@@ -97,7 +97,7 @@ def test_all_commands_are_offered():
 
 def test_an_answer_waits_for_no_library_of_numbers(tmp_path):
     code = "import sys; from ipe_bench.cli.main import main; main(['completion', 'bash', '--query']); "
-    code += "print([name for name in ('numpy', 'scipy', 'pandas', 'hydra', 'numba') if name in sys.modules])"
+    code += "print([name for name in ('numpy', 'scipy', 'pandas', 'hydra', 'llvmlite') if name in sys.modules])"
     variables = os.environ | {"COMP_LINE": "ipe-bench run solver=[newton] estimators.newton.start=n"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=variables, cwd=tmp_path)
     assert done.stdout.splitlines() == ["nominal ", "[]"]

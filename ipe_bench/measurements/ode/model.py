@@ -1,7 +1,7 @@
 """Measurement models whose readings are taken from the solution of ordinary differential equations.
 
 The author writes the right-hand side once, in plain arithmetic; the batched compiled integrator and the exact Jacobian
-come from it. Recording and compilation are in `trace`, `source` and `kernel`, the choice of steps in `levels`.
+come from it. Recording is in `trace` and `plan`, integration in `integrator`, the choice of steps in `levels`.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.compiled import Function, load
 from ipe_bench.basics.linalg import Array, own
 from ipe_bench.measurements.base import Input, Measurement
 from ipe_bench.measurements.ode import sampling
 from ipe_bench.measurements.ode.coarse import CONTRACTION, MOST_RK4, Coarseness, contraction
-from ipe_bench.measurements.ode.kernel import Kernel
+from ipe_bench.measurements.ode.integrator import Kernel, Rates
 from ipe_bench.measurements.ode.levels import Found, Indices, Remembered, Search, grouped, ladder
-from ipe_bench.measurements.ode.source import Equations, Variation, jacobian_source, rate_source, simulation_source
+from ipe_bench.measurements.ode.plan import Equations, Variation, jacobian, simulation
 from ipe_bench.measurements.ode.tableau import DOP853, RK4
+from ipe_bench.measurements.ode.trace import Graph, Program
 
 _STAYS = ("_readings_kernel", "_rk4_kernel", "_rate_function", "_jacobian_kernel", "_equations", "_remembered")
 _ANGLE_AT_START = 0.7
@@ -239,16 +239,22 @@ class OdeMeasurement(Measurement):
     def _rates(self, x: Array) -> tuple[Array, float]:
         """The rate of each trial, and the fastest of all; not a number where nothing is known."""
         rates = np.full(len(x), np.nan)
-        return rates, self._rate_function(x, self._si_sizes, rates) if self._rate_function else np.inf
+        if self._rate_function is None:
+            return rates, np.inf
+        self._rate_function(x, self._si_sizes, rates)
+        return rates, float(rates.max(initial=0.0))
 
     @cached_property
-    def _rate_function(self) -> Function | None:
-        return load(rate_source(self._equations)) if self._equations.rate else None
+    def _rate_function(self) -> Rates | None:
+        if self.rate is None:
+            return None
+        p = Graph().inputs("p", self.n)
+        return Rates(Program.of([self.rate(p)], p))
 
     @cached_property
     def _longest(self) -> float:
         """The longest step of the coarsest level."""
-        return float(np.max(np.diff(self.times, prepend=0.0) / self._parts))
+        return float(np.max(np.diff(self.times, prepend=0.0) / np.maximum(self._parts, 1)))
 
     def _first_guess(self, x: Array) -> Indices:
         """Where on the ladder the search begins: steps of half a radian, or what the nominal parameters need."""
@@ -268,14 +274,18 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def _parts(self) -> NDArray[np.int64]:
-        """Steps to each time at level 1: one, and more where the interval is longer than usual."""
-        intervals = np.diff(self.times, prepend=0.0)
-        return np.maximum(np.ceil(intervals / np.median(intervals) - 1e-9), 1).astype(np.int64)
+        """Steps to each time at level 1: one, more over an interval longer than usual, none over none."""
+        return _steps(self.times, self._usual_interval)
+
+    @cached_property
+    def _usual_interval(self) -> float:
+        """The median interval between readings, but for a few that are read one right after another."""
+        span = float(self.times[-1])
+        return max(float(np.median(np.diff(self.times, prepend=0.0))), span / (8 * len(self.times))) if span else 1.0
 
     @cached_property
     def _ladder(self) -> NDArray[np.int64]:
-        usual = float(np.median(np.diff(self.times, prepend=0.0)))
-        finest = 1024.0 if self.shortest_step <= 0 else usual / self.shortest_step
+        finest = 1024.0 if self.shortest_step <= 0 else self._usual_interval / self.shortest_step
         return ladder(min(finest + 1e-9, 1024.0))
 
     @cached_property
@@ -292,8 +302,7 @@ class OdeMeasurement(Measurement):
     @cached_property
     def _fixed_steps(self) -> NDArray[np.int64]:
         assert self.step is not None
-        intervals = np.diff(self.times, prepend=0.0)
-        return np.maximum(np.ceil(intervals / self.step - 1e-9), 1).astype(np.int64)
+        return _steps(self.times, self.step)
 
     def jacobian(self, x: Array) -> Array:
         return self.jacobian_until(x, len(self.times))
@@ -339,6 +348,8 @@ class OdeMeasurement(Measurement):
             (k for k in range(1, MOST_RK4 + 1) if level <= 2 and self._contraction(x, k, J) <= CONTRACTION), None
         )
         # Half the level; where that is half a step, every second reading.
+        if level == 1 and len(self._times) == 1:
+            return Coarseness(rk4, np.inf)
         every = slice(None) if level > 1 else slice(1, None, 2)
         rows = np.arange(self.m).reshape(len(self._cases), everything, -1)[:, every].ravel()
         times, steps = self._times[every], max(1, level // 2) * self._parts[every]
@@ -367,7 +378,7 @@ class OdeMeasurement(Measurement):
     @cached_property
     def jacobian_cost(self) -> float:  # type: ignore[override]
         """Arithmetic operations of a step with all tangents, over those of a simulation's step."""
-        return self._jacobian_kernel.operations / self._readings_kernel.operations
+        return self._jacobian_kernel.plan.operations / self._readings_kernel.plan.operations
 
     @cached_property
     def coarse_jacobian_cost(self) -> float:  # type: ignore[override]
@@ -377,7 +388,7 @@ class OdeMeasurement(Measurement):
         place = int(self._search(own(self.nominal[None]), self._zeros).places[0])
         trusted = self._trusted(own(self.nominal[None]))[0] == 0
         kernel, level = self._coarsened(-1 if trusted else place)
-        return kernel.operations * level / (self._readings_kernel.operations * int(self._ladder[place]))
+        return kernel.plan.operations * level / (self._readings_kernel.plan.operations * int(self._ladder[place]))
 
     def _grouped_by_steps(self, x: Array) -> list[tuple[Indices, NDArray[np.int64]]]:
         """The trials that share a level, and its steps."""
@@ -393,19 +404,23 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def _readings_kernel(self) -> Kernel:
-        return Kernel(simulation_source, self._equations, DOP853)
+        return Kernel(simulation, self._equations, DOP853)
 
     @cached_property
     def _jacobian_kernel(self) -> Kernel:
-        return Kernel(jacobian_source, self._equations, DOP853)
+        return Kernel(jacobian, self._equations, DOP853)
 
     @cached_property
     def _rk4_kernel(self) -> Kernel:
-        return Kernel(jacobian_source, self._equations, RK4)
+        return Kernel(jacobian, self._equations, RK4)
 
     @cached_property
     def _equations(self) -> Equations:
         constants, outputs = self.cases.shape[1], len(self.outputs)
-        return Equations(
-            self.states, self.n, constants, outputs, self.start, self.rhs, self.read, self.variation, self.rate
-        )
+        return Equations(self.states, self.n, constants, outputs, self.start, self.rhs, self.read, self.variation)
+
+
+def _steps(times: Array, longest: float) -> NDArray[np.int64]:
+    """The equal steps (times,) from each time to the next, none longer than that."""
+    intervals = np.diff(times, prepend=0.0)
+    return np.where(intervals > 0.0, np.maximum(np.ceil(intervals / longest - 1e-9), 1), 0).astype(np.int64)

@@ -2,7 +2,7 @@
 
 A right-hand side written once in ordinary Python arithmetic is called with `Expression` objects instead of numbers.
 What comes back knows every operation, so it can be listed as a straight-line program (`Program`) or differentiated
-exactly in forward mode (`tangent`). Turning programs into machine code is left to `machine_code`.
+exactly in forward mode (`tangent`). Turning programs into machine code is left to `integrator`.
 """
 
 from __future__ import annotations

@@ -1,0 +1,243 @@
+"""Runs plans: in machine code on every core, or step by step in NumPy where no machine code can be made.
+
+One lane is one initial value problem, a trial in a case; the lanes of a vector register advance together. The bits of a
+lane depend on its own numbers alone: neither on its neighbours, nor on how many threads. Which steps a trial takes is
+left to `levels`.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.basics import compiled
+from ipe_bench.basics.compiled import INTEGER, POINTER, aligned, at
+from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.machine import cores
+from ipe_bench.measurements.ode.plan import Equations, Plan
+from ipe_bench.measurements.ode.tableau import Tableau
+from ipe_bench.measurements.ode.trace import Program
+
+if TYPE_CHECKING:
+    # Imported where something is compiled, and here so that results are known to depend on it.
+    from ipe_bench.measurements.ode import emit as emit
+
+_WORTH_THREADS = 40_000
+"""Steps times lanes times states from which a second thread gains more than it costs, some 150 microseconds."""
+_EMIT = Path(__file__).with_name("emit.py")
+_ARGUMENTS = tuple(INTEGER if i in (3, 5, 6, 9, 11) else POINTER for i in range(14))
+
+
+def threads() -> int:
+    """Threads that one integration may use: `IPE_BENCH_THREADS`, else every core of this process."""
+    chosen = os.environ.get("IPE_BENCH_THREADS")
+    return max(1, int(chosen)) if chosen else cores()
+
+
+@functools.cache
+def _pool(workers: int, process: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(workers, thread_name_prefix="ode")
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """One kind of integration of some equations by one formula."""
+
+    kind: Callable[[Equations, Tableau], Plan]
+    equations: Equations
+    tableau: Tableau
+
+    @functools.cached_property
+    def plan(self) -> Plan:
+        return self.kind(self.equations, self.tableau)
+
+    @functools.cached_property
+    def _machine_code(self) -> tuple[Callable[..., None], int]:
+        """The function, and the numbers that it needs room for."""
+        plan, width = self.plan, compiled.width()
+        weights = -(-sum(map(len, plan.tableau.weights)) // width)
+
+        def write() -> str:
+            from ipe_bench.measurements.ode import emit
+
+            return emit.module(plan, width)
+
+        key = f"{plan} {width} {compiled.digest_of(_EMIT)}"
+        return compiled.load(key, write, "integrate", _ARGUMENTS), (plan.size + weights) * width
+
+    def run(
+        self,
+        x: Array,
+        si: Array,
+        cases: Array,
+        rows: NDArray[np.int64],
+        times: Array,
+        steps: NDArray[np.int64],
+        *more: Array,
+    ) -> None:
+        """Integrates the trials in these rows of x (trials, n) from time 0, in every case, `steps[k]` equal steps to
+        `times[k]`. The last of `more` takes the results, C-contiguous, in the same rows; before it, for simulations,
+        what is subtracted from the readings."""
+        lanes = len(rows) * len(cases)
+        *offset, out = more
+        if bool(offset) != (self.plan.moving is None):
+            raise TypeError("simulations take an offset, Jacobians take none")
+        if not lanes:
+            return
+        if not compiled.available():
+            interpret(self.plan, x, si, cases, rows, times, steps, *more)
+            return
+        function, size = self._machine_code
+        given = (at(x), at(si), at(cases), len(cases), at(rows, np.int64))
+        stride = len(offset[0]) // len(cases) if offset else 0
+        taken = (at(times), at(steps, np.int64), len(times), at(offset[0]) if offset else None, stride, at(out))
+
+        def work_on(pieces: Sequence[tuple[int, int]] | Any) -> None:
+            memory, frame = aligned(size)
+            for first, last in pieces:
+                function(*given, first, last, *taken, frame)
+            del memory
+
+        width = compiled.width()
+        work = lanes * int(steps[: len(times)].sum()) * self.equations.states * (1 if offset else x.shape[1])
+        workers = min(threads(), lanes // width) if work >= _WORTH_THREADS else 1
+        if workers <= 1:
+            work_on([(0, lanes)])
+            return
+        # More pieces than threads, so that a core slowed by other work does not hold up the rest.
+        count = min(lanes // width, workers * min(4, max(1, work // _WORTH_THREADS)))
+        bounds = [width * (i * (lanes // width) // count) for i in range(count)] + [lanes]
+        pieces = iter(list(itertools.pairwise(bounds)))
+        others = [_pool(workers - 1, os.getpid()).submit(work_on, pieces) for _ in range(workers - 1)]
+        work_on(pieces)
+        for other in others:
+            other.result()
+
+
+def interpret(
+    plan: Plan,
+    x: Array,
+    si: Array,
+    cases: Array,
+    rows: NDArray[np.int64],
+    times: Array,
+    steps: NDArray[np.int64],
+    *more: Array,
+) -> None:
+    """`Kernel.run` operation by operation in NumPy, all lanes at once; products are rounded before they are added."""
+    trial, case = np.repeat(rows, len(cases)), np.tile(np.arange(len(cases)), len(rows))
+    lanes, no, move = len(trial), len(plan.shown), plan.moving
+    frame: list[Any] = [np.zeros(lanes)] * plan.size
+    out = more[-1].reshape(len(x), len(cases), len(times), no, -1)
+
+    def load(places: Any, beyond: int = 0) -> list[Any]:
+        return [frame[i + beyond] for i in places]
+
+    def store(values: Sequence[Any], places: Any) -> None:
+        for value, i in zip(values, places, strict=True):
+            frame[i] = value
+
+    def advance(y: Sequence[Any], h: float, slope: Callable[[int, list[Any]], list[Any]]) -> list[Any]:
+        slopes: list[list[Any]] = []
+        end = list(y)
+        for s, row in enumerate(plan.tableau.weights):
+            end = list(y)
+            for j, weight in row:
+                end = [e + h * weight * k for e, k in zip(end, slopes[j], strict=True)]
+            if s < plan.tableau.stages:
+                slopes.append(slope(s, end))
+        return end
+
+    with np.errstate(all="ignore"):
+        store([x[trial, j] * si[j] for j in range(len(plan.x))], plan.x)
+        store([cases[case, j] for j in range(len(plan.constants))], plan.constants)
+        store(evaluate(plan.begin, load([*plan.x, *plan.constants])), plan.begun)
+        t = 0.0
+        for k, to in enumerate(times.tolist()):
+            for s in range(int(steps[k]) if to != t else 0):
+                h = (to - t) / int(steps[k])
+                since, ny = t + s * h, len(plan.y)
+
+                def slope(stage: int, y: list[Any], since: float = since, h: float = h, ny: int = ny) -> list[Any]:
+                    time = [since + plan.tableau.C[stage] * h] if plan.step_timed else []
+                    result = evaluate(plan.step, [*time, *y, *load(plan.fixed)])
+                    store(result[ny:], plan.kept[stage])
+                    return result[:ny]
+
+                store(advance(load(plan.y), h, slope), plan.y)
+                for lie, sources in zip(move.lie, move.sources, strict=True) if move else ():
+
+                    def moving(stage: int, d: list[Any], sources: Any = sources, move: Any = move) -> list[Any]:
+                        beyond = stage * move.stage_size
+                        given = [*d, *load(sources, beyond), *load(move.saved, beyond), *load(plan.fixed)]
+                        return evaluate(move.slope, given)
+
+                    store(advance(load(lie), h, moving), lie)
+            t = to
+            store(evaluate(plan.read, [*([t] if plan.read_timed else []), *load([*plan.y, *plan.fixed])]), plan.noted)
+            if move is None:
+                less = more[0].reshape(len(cases), -1, no)[case, k]
+                for i, value in enumerate(load(plan.shown)):
+                    out[trial, case, k, i, 0] = value - less[:, i]
+            for j, (lie, sources) in enumerate(zip(move.lie, move.show_sources, strict=True) if move else ()):
+                given = [*load(lie), *load(sources), *load(move.show_saved), *load(plan.fixed)] if move else []
+                for i, value in enumerate(evaluate(move.show, given) if move else ()):
+                    out[trial, case, k, i, j] = value * si[j]
+
+
+_OPERATIONS: dict[str, Callable[..., Any]] = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": np.divide,
+    "neg": np.negative,
+    "pow": np.power,
+    "fma": lambda a, b, c: a * b + c,
+    "fms": lambda a, b, c: a * b - c,
+    "fnma": lambda a, b, c: c - a * b,
+}
+
+
+def evaluate(program: Program, inputs: Sequence[Any]) -> list[Any]:
+    """What a program computes, in NumPy."""
+    values = list(inputs)
+    for name, *numbers in program.operations:
+        if name == "constant":
+            values.append(np.float64(numbers[0]))
+        else:
+            values.append((_OPERATIONS.get(name) or getattr(np, name))(*[values[i] for i in numbers]))
+    return [values[i] for i in program.outputs]
+
+
+@dataclass(frozen=True)
+class Rates:
+    """One number of each trial's parameters, as a recorded program computes it."""
+
+    program: Program
+
+    @functools.cached_property
+    def _machine_code(self) -> Callable[..., None]:
+        def write() -> str:
+            from ipe_bench.measurements.ode import emit
+
+            return emit.rates(self.program)
+
+        key = f"{self.program} {compiled.digest_of(_EMIT)}"
+        return compiled.load(key, write, "rates", (POINTER, POINTER, POINTER, INTEGER))
+
+    def __call__(self, x: Array, si: Array, out: Array) -> None:
+        """Of the parameters x (trials, n) times si."""
+        if compiled.available():
+            self._machine_code(at(x), at(si), at(out), len(x))
+        else:
+            with np.errstate(all="ignore"):
+                out[:] = evaluate(self.program, list((x * si).T))[0]

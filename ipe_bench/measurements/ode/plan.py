@@ -1,0 +1,248 @@
+"""What an integrator of recorded equations computes: programs, and where their numbers lie.
+
+What is recorded is said by `Equations`; a `Plan` is run by `integrator`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ipe_bench.measurements.ode.tableau import Tableau
+from ipe_bench.measurements.ode.trace import (
+    Expression,
+    Graph,
+    Program,
+    border,
+    dependent,
+    in_order,
+    separate,
+    substitute,
+    tangent,
+)
+
+Arithmetic = Callable[..., Sequence[Any]]
+
+
+@dataclass(frozen=True)
+class Variation:
+    """The equations of small deviations, where fewer numbers than the state has describe them."""
+
+    freedoms: int
+    slope: Arithmetic
+    """(t, y, p, c, d, dp): the time derivative of a deviation d (freedoms,) along the direction dp (n,)."""
+    moved: Arithmetic
+    """(y, d): by how much the state (states,) deviates, linear in d."""
+
+
+@dataclass(frozen=True)
+class Equations:
+    """What is integrated: functions that can be recorded, and the numbers of their arguments and results."""
+
+    states: int
+    parameters: int
+    constants: int
+    outputs: int
+    start: Arithmetic
+    rhs: Arithmetic
+    read: Arithmetic
+    variation: Variation | None = None
+
+
+class _Tape:
+    """The equations as expressions."""
+
+    def __init__(self, equations: Equations) -> None:
+        self.equations = equations
+        graph = self.graph = Graph()
+        self.t = graph.input("t")
+        self.y, self.p = graph.inputs("y", equations.states), graph.inputs("p", equations.parameters)
+        self.c = graph.inputs("c", equations.constants)
+        self.start = self._values(equations.start(self.p, self.c), equations.states, "start")
+        self.slope = self._values(equations.rhs(self.t, self.y, self.p, self.c), equations.states, "rhs")
+        self.shown = self._values(equations.read(self.t, self.y, self.p, self.c), equations.outputs, "read")
+
+    def _values(self, result: Iterable[Any], count: int, name: str) -> list[Expression]:
+        values = [self.graph.apply("add", v, 0.0) for v in result]
+        if len(values) != count:
+            raise ValueError(f"{name} returns {len(values)} values where {count} are declared")
+        return values
+
+    def fixed(self, *outputs: Expression) -> list[Expression]:
+        """What is computed once for each lane: it depends on the parameters and the case alone."""
+        return border(outputs, dependent(outputs, (self.t, *self.y)))
+
+    def along_the_way(self, outputs: Sequence[Expression], fixed: Sequence[Expression]) -> tuple[Program, bool]:
+        """The program that computes the outputs from the state, and whether it needs the time."""
+        timed = self.t in in_order(outputs, fixed)
+        return Program.of(outputs, [*([self.t] if timed else []), *self.y, *fixed]), timed
+
+    def beginning(self, outputs: Sequence[Expression]) -> Program:
+        return Program.of(outputs, [*self.p, *self.c])
+
+
+class _Linear:
+    """Tangents of some outputs: their program, what it needs of the state, and the sources of each direction."""
+
+    def __init__(self, tape: _Tape, tangents: Sequence[Expression], d: Sequence[Expression], dp: Sequence[Expression]):
+        outputs, sources = separate(tangents, d, dp)
+        names = [tape.graph.input(f"source{i}") for i in range(len(sources))]
+        one, zero = tape.graph.constant(1.0), tape.graph.constant(0.0)
+        self.sources = [
+            [substitute(s, {e: one if i == k else zero for i, e in enumerate(dp)}) for s in sources]
+            for k in range(len(dp))
+        ]
+        """The value (n, sources) of each source along each parameter."""
+        needed = border(outputs, dependent(outputs, (*d, *names)))
+        values = [e for row in self.sources for e in row]
+        varying = dependent([*needed, *values], (tape.t, *tape.y))
+        self.fixed = [e for e in needed if e not in varying]
+        self.saved = [e for e in needed if e in varying]
+        self.driving = _distinct(e for e in values if e in varying and e not in self.saved)
+        self.constant = _distinct(e for e in values if e not in varying)
+        self.inputs, self.outputs = [*d, *names, *self.saved], outputs
+
+    def program(self, fixed: Sequence[Expression]) -> Program:
+        return Program.of(self.outputs, [*self.inputs, *fixed])
+
+    def places(self, begin: int) -> tuple[tuple[int, ...], ...]:
+        """Where each direction finds its sources in what is saved from `begin` on."""
+        order = {e: i for i, e in enumerate([*self.saved, *self.driving, *self.constant])}
+        return tuple(tuple(begin + order[e] for e in row) for row in self.sources)
+
+
+def _distinct(expressions: Iterable[Expression]) -> list[Expression]:
+    return list(dict.fromkeys(expressions))
+
+
+@dataclass
+class _Frame:
+    """The vectors that one group of lanes works on."""
+
+    size: int = 0
+
+    def room(self, count: int) -> range:
+        self.size += count
+        return range(self.size - count, self.size)
+
+
+@dataclass(frozen=True)
+class Moving:
+    """Tangents: where they lie, and their slope from (tangent, sources, saved, fixed)."""
+
+    lie: tuple[range, ...]
+    slope: Program
+    sources: tuple[tuple[int, ...], ...]
+    """The places (n, sources) of what drives each, in the first stage."""
+    saved: range
+    stage_size: int
+    show: Program
+    show_sources: tuple[tuple[int, ...], ...]
+    show_saved: range
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Programs, and the places of their inputs and outputs in a frame."""
+
+    tableau: Tableau
+    x: range
+    constants: range
+    begin: Program
+    begun: tuple[int, ...]
+    """Where the results of `begin` lie: state, what is fixed, and for Jacobians tangents and constant sources."""
+    y: range
+    fixed: range
+    step: Program
+    """From (t, y, fixed): the slope, and what tangents need of a stage."""
+    step_timed: bool
+    kept: tuple[range, ...]
+    """Where each stage keeps what tangents need."""
+    read: Program
+    read_timed: bool
+    noted: range
+    """Where the results of `read` lie: the readings, or what their tangents need."""
+    shown: range
+    size: int
+    moving: Moving | None = None
+
+    @property
+    def operations(self) -> int:
+        """Arithmetic operations of a step of one lane: what it costs, whatever the machine."""
+        moving = 0
+        if self.moving is not None:
+            moving = len(self.moving.lie) * self._operations(self.moving.slope, len(self.moving.lie[0]))
+        return self._operations(self.step, len(self.y)) + moving
+
+    def _operations(self, program: Program, numbers: int) -> int:
+        """Of the program in every stage, and of the weighted sums between them."""
+        counted = sum(name not in ("constant", "neg") for name, *_ in program.operations)
+        return self.tableau.stages * counted + numbers * sum(map(len, self.tableau.weights))
+
+
+def simulation(equations: Equations, tableau: Tableau) -> Plan:
+    """How readings are computed."""
+    tape, frame = _Tape(equations), _Frame()
+    fixed = tape.fixed(*tape.slope, *tape.shown)
+    (step, step_timed), (read, read_timed) = (tape.along_the_way(e, fixed) for e in (tape.slope, tape.shown))
+    x, constants = frame.room(equations.parameters), frame.room(equations.constants)
+    y, fixed_at, shown = (frame.room(k) for k in (equations.states, len(fixed), equations.outputs))
+    return Plan(
+        tableau, x, constants, tape.beginning([*tape.start, *fixed]), (*y, *fixed_at), y, fixed_at, step, step_timed,
+        tuple(range(0) for _ in tableau.B), read, read_timed, shown, shown, frame.size,
+    )  # fmt: skip
+
+
+def jacobian(equations: Equations, tableau: Tableau) -> Plan:
+    """How Jacobians are computed: the state once, and beside it one tangent for each parameter.
+
+    The variational equations go through the stages of the state's own steps, so the derivative is that of the
+    numerical solution, exact to round-off; or of the model's own equations of small deviations, to the tolerance.
+    """
+    tape, frame = _Tape(equations), _Frame()
+    d, dp, slopes, shown, starts = _tangents(tape)
+    motion, reading = _Linear(tape, slopes, d, dp), _Linear(tape, shown, d, dp)
+    saved, noted = [*motion.saved, *motion.driving], [*reading.saved, *reading.driving]
+    fixed = _distinct([*tape.fixed(*tape.slope, *saved, *noted), *motion.fixed, *reading.fixed])
+    step, step_timed = tape.along_the_way([*tape.slope, *saved], fixed)
+    note, note_timed = tape.along_the_way(noted, fixed)
+    x, constants = frame.room(equations.parameters), frame.room(equations.constants)
+    y, fixed_at = frame.room(equations.states), frame.room(len(fixed))
+    lie = tuple(frame.room(len(d)) for _ in dp)
+    stages = [frame.room(len(saved) + len(motion.constant)) for _ in tableau.B]
+    at_reading, out = frame.room(len(noted) + len(reading.constant)), frame.room(equations.outputs)
+    k, r = len(saved), len(noted)
+    begun = [*y, *fixed_at, *(i for place in lie for i in place)]
+    begun += [*(i for stage in stages for i in stage[k:]), *at_reading[r:]]
+    started = [*tape.start, *fixed, *(e for row in starts for e in row)]
+    started += [*motion.constant * tableau.stages, *reading.constant]
+    moving = Moving(
+        lie, motion.program(fixed), motion.places(stages[0].start), stages[0][: len(motion.saved)], len(stages[0]),
+        reading.program(fixed), reading.places(at_reading.start), at_reading[: len(reading.saved)],
+    )  # fmt: skip
+    return Plan(
+        tableau, x, constants, tape.beginning(started), tuple(begun), y, fixed_at, step, step_timed,
+        tuple(stage[:k] for stage in stages), note, note_timed, at_reading[:r], out, frame.size, moving,
+    )  # fmt: skip
+
+
+def _tangents(tape: _Tape) -> tuple[Any, Any, list[Expression], list[Expression], list[list[Expression]]]:
+    """Deviations, direction, the tangents of slope and readings in them, and where those of each parameter start."""
+    graph, variation = tape.graph, tape.equations.variation
+    dp = graph.inputs("dp", tape.equations.parameters)
+    begins = tangent(tape.start, dict(zip(tape.p, dp, strict=True)))
+    one, zero = graph.constant(1.0), graph.constant(0.0)
+    starts = [[substitute(e, {b: one if b is a else zero for b in dp}) for e in begins] for a in dp]
+    if variation is None:
+        dy = d = graph.inputs("d", tape.equations.states)
+        slopes = tangent(tape.slope, dict(zip(tape.y + tape.p, (*dy, *dp), strict=True)))
+    else:
+        d = graph.inputs("d", variation.freedoms)
+        if any(e is not zero for row in starts for e in row):
+            raise ValueError("equations of small deviations need a start that does not depend on the parameters")
+        dy = variation.moved(tape.y, d)
+        slopes = [graph.apply("add", v, 0.0) for v in variation.slope(tape.t, tape.y, tape.p, tape.c, d, dp)]
+        starts = [[zero] * variation.freedoms for _ in dp]
+    along = dict(zip(tape.y + tape.p, (*(graph.apply("add", v, 0.0) for v in dy), *dp), strict=True))
+    return d, dp, slopes, tangent(tape.shown, along), starts
