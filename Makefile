@@ -5,7 +5,7 @@ BIN := .venv/bin
 .PHONY: run test slow cluster campaigns plugins mutants lint bench docs clean
 
 run: .venv/ready
-	$(BIN)/ipe-bench run +experiment=paper
+	$(BIN)/ipe-bench run +experiment=headline
 
 test: .venv/ready
 	$(BIN)/pytest -n auto --dist worksteal

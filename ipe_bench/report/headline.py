@@ -1,31 +1,38 @@
-"""The headline: what the data say, in a sentence or two that are computed from them."""
+"""The headline: what the data say, in a few sentences that are computed from them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from ipe_bench.report.certified_tables import without_certified
-from ipe_bench.report.style import REFERENCE
-from ipe_bench.report.words import enumerate_few, percent, plain, short
+from ipe_bench.report.words import brief, duration, enumerate_few, percent, plain, short
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.attained import attained_totals
+from ipe_bench.statistics.collect import Group
 from ipe_bench.statistics.digits import certified_averages, certified_table
-from ipe_bench.statistics.summary import ALL
+from ipe_bench.statistics.summary import ALL, BEST
 
 NEAR = 0.005
 """Capped errors within this part of the smallest count as equally good."""
+ALIKE = 0.05
+"""Efficiencies within this part of each other count as equal."""
+BROKEN = 0.9
+"""Share of success that an estimator holds as long as it is not surely below."""
 
 
-def headline(analysis: Analysis) -> str:
-    """Who solves most on certified readings and on problems of known minimum, and who is best on simulated ones."""
+def headline(analysis: Analysis) -> list[str]:
+    """Who solves most on certified readings and on problems of known minimum; on simulated ones, who agrees with whom,
+    who is honest, who breaks where, and what that costs."""
     simulated = without_certified(analysis)
-    sentences = [*_certified(analysis), *_attained(analysis)]
+    found = [*_certified(analysis), *_attained(analysis)]
     if not simulated.summary.empty:
-        sentences.append(_simulated(simulated))
-    return " ".join(sentences) or "Nothing is stored yet, so there is nothing to find."
+        found += _simulated(simulated)
+    # A number and its sign stay on one line.
+    return [s.replace(" %", "\u00a0%") for s in found] or ["Nothing is stored yet, so there is nothing to find."]
 
 
 def _certified(analysis: Analysis) -> Iterator[str]:
@@ -54,56 +61,147 @@ def _attained(analysis: Analysis) -> Iterator[str]:
     )
 
 
-def _simulated(analysis: Analysis) -> str:
-    """Who is best over all scenarios, how far that holds, and how the linear estimate fares where it is worst."""
+def _simulated(analysis: Analysis) -> Iterator[str]:
+    """What a sweep over error scales says of one setting; of several, or of one scale, who succeeds how often."""
     rows = analysis.summary[analysis.summary["parameter"] == ALL]
-    best = best_estimator(analysis)
-    own = rows[rows["estimator"] == best].sort_values("error_scale")
-    trials = int(own["trials"].sum())
-    success = float((own["success"] * own["trials"]).sum() / trials)
-    scales = sorted(own["error_scale"].unique())
+    scales = sorted(rows["error_scale"].unique())
+    several = rows.groupby(["error_scale", "estimator"]).size().max() > 1
+    if several or len(scales) < 2 or rows["estimator"].nunique() < 2:
+        yield _ranked(analysis, rows)
+        return
+    kinds = {group.estimator: _kind(group) for group in analysis.collection.groups}
+    yield from _agreement(rows, scales, kinds)
+    yield from _honesty(rows)
+    yield from _reach(rows, scales)
+    yield _costs(rows, scales)
+
+
+def _kind(group: Group) -> str:
+    """IPE solves its own equation, filters take epoch after epoch; what else there is has no name here."""
+    if group.footer.get("sequential"):
+        return "filters"
+    target = str((group.footer["identity"]["estimator"] or {}).get("_target_", ""))
+    return "IPE" if ".solvers." in target or group.footer.get("equation") == "frozen" else ""
+
+
+def _agreement(rows: pd.DataFrame, scales: Sequence[float], kinds: Mapping[str, str]) -> Iterator[str]:
+    """Up to which scale IPE and filters attain the same."""
+    compared = rows[rows["estimator"].map(kinds).isin(["IPE", "filters"])]
+    named = {kind: [e for e, k in kinds.items() if k == kind] for kind in ("IPE", "filters")}
+    if not all(named.values()):
+        return
+    who = ", ".join(f"{kind} ({enumerate_few(names)})" for kind, names in named.items()).replace("), ", ") and ", 1)
+    last = None
+    for scale in scales:
+        here = compared[compared["error_scale"] == scale]
+        efficiency = here["efficiency_capped"]
+        if not here[BEST].all() or efficiency.max() > efficiency.min() * (1 + ALIKE):
+            break
+        last = here
+    if last is None:
+        yield f"{who} differ already at error scale {plain(scales[0])}."
+        return
+    low, high = (f"{v:.2f}" for v in (last["efficiency_capped"].min(), last["efficiency_capped"].max()))
+    success = last["success"].min()
+    succeed = "all their trials succeed" if success == 1 else f"at least {percent(success)} of their trials succeed"
+    scale = last["error_scale"].iloc[0]
+    reach = "at every error scale" if scale == scales[-1] else f"up to error scale {plain(scale)}"
+    yield f"{who} agree {reach}: {succeed} there, with an efficiency of {low if low == high else f'{low} to {high}'}."
+
+
+def _from_scale(rows: pd.DataFrame, value: Callable[[Any], str]) -> list[str]:
+    """Who is in the rows, by the smallest scale at which it is, with a value in brackets."""
+    first = rows.sort_values("error_scale", kind="stable").drop_duplicates("estimator")
+    return [
+        f"{enumerate_few([_with(row, value(row)) for _, row in part.iterrows()])} from scale {plain(scale)}"
+        for scale, part in first.groupby("error_scale")
+    ]
+
+
+def _with(row: pd.Series, words: str) -> str:
+    return f"{row['estimator']} ({words})"
+
+
+def _honesty(rows: pd.DataFrame) -> Iterator[str]:
+    """From which scale on who claims smaller errors than it makes."""
+    claims = rows[rows["nees_median"].notna()]
+    sure = claims[claims["verdict"].isin(["optimistic", "diverged but confident"])]
+    parts = _from_scale(sure, lambda row: brief(row["nees_median"]))
+    honest = [label for label in dict.fromkeys(claims["estimator"]) if label not in set(sure["estimator"])]
+    parts += [f"{enumerate_few(honest)} never"] if honest else []
+    if len(claims):
+        yield f"Overconfident (NEES, 1 is honest): {'; '.join(parts)}."
+
+
+def _reach(rows: pd.DataFrame, scales: Sequence[float]) -> Iterator[str]:
+    """From which scale on who surely fails in more than a tenth of the trials, and who never does."""
+    broken = rows[rows["success_high"] < BROKEN]
+    parts = _from_scale(broken, lambda row: percent(row["success"]))
+    top = rows[(rows["error_scale"] == scales[-1]) & ~rows["estimator"].isin(broken["estimator"])]
+    holds = enumerate_few([_with(row, percent(row["success"])) for _, row in top.iterrows()])
+    parts += [f"{holds} hold{'s' * (len(top) == 1)} to {plain(scales[-1])}"] if len(top) else []
+    yield f"Success falls surely below {100 * BROKEN:.0f} %: {'; '.join(parts)}."
+    silent = rows.sort_values("failed_silent", kind="stable").iloc[-1]
+    if silent["failed_silent"] > 0:
+        worst = f"{silent['estimator']} at scale {plain(silent['error_scale'])}"
+        yield f"Failures that look right: at most {percent(silent['failed_silent'])} of the trials ({worst})."
+
+
+def _costs(rows: pd.DataFrame, scales: Sequence[float]) -> str:
+    """What a trial costs at the largest scale at which most hold, and at the largest for those that still do."""
+    holding = rows[rows["success_high"] >= BROKEN]
+    number = holding.groupby("error_scale")["estimator"].nunique()
+    most = number[number > rows["estimator"].nunique() / 2]
+    at = dict.fromkeys([most.index.max()] if len(most) else [])
+    at |= dict.fromkeys([number.index.max()] if len(number) else [scales[-1]])
+    parts = []
+    for scale in at:
+        part = (holding if len(number) else rows).query("error_scale == @scale")
+        listed = [
+            f"{row['estimator']} {brief(row['simulations_median'])} ({duration(row['time_median_s'], 2)})"
+            for _, row in part.sort_values("simulations_median", kind="stable").iterrows()
+        ]
+        parts.append(f"at scale {plain(scale)} {enumerate_few(listed)}")
+    return f"A trial costs, in simulations: {'; '.join(parts)}."
+
+
+def _ranked(analysis: Analysis, rows: pd.DataFrame) -> str:
+    """Who succeeds in how many of the trials, pooled over all scenarios, and who fails silently."""
+    rows = rows.assign(**{name: rows[name] * rows["trials"] for name in ("success", "failed_silent")})
+    sums = rows.groupby("estimator", sort=False)[["success", "failed_silent", "trials"]].sum()
+    sums = sums.assign(share=sums["success"] / sums["trials"]).sort_values("share", ascending=False, kind="stable")
+    listed = [f"{label} in {percent(row['share'])}" for label, row in sums.iterrows()]
+    scales = sorted(rows["error_scale"].unique())
     reach = f"error scale {plain(scales[0])}"
     if len(scales) > 1:
         reach = f"error scales {plain(scales[0])} to {plain(scales[-1])}"
-    scenarios = f" in {len(own)} scenarios" if len(own) > len(scales) else ""
-    sentence = f"At {reach}{scenarios}, {best} succeeds in {percent(success)} of {trials:,} trials"
-    worst = _least_efficient(own)
-    if worst is not None:
-        sentence += f", and where it does worst (scale {plain(worst['error_scale'])}) {_efficiency(worst)}"
-    sentences = [sentence + "."]
-    linear = rows[rows["estimator"] == REFERENCE]
-    if best != REFERENCE and len(linear):
-        at = linear.iloc[int(np.argmax(linear["error_scale"].to_numpy()))]
-        sentences.append(
-            f"At scale {plain(at['error_scale'])} the linear estimate has an efficiency of"
-            f" {short(at['efficiency_all'])}, and succeeds in {percent(at['success'])} of trials."
+    scenarios = len(set(analysis.scores["scenario"]))
+    number = f"{int(sums['trials'].max()):,} trials" + (f" in {scenarios} scenarios" if scenarios > 1 else "")
+    sentence = f"At {reach}, of {number} succeed: {enumerate_few(listed)}."
+    worst = sums.assign(silent=sums["failed_silent"] / sums["trials"]).sort_values("silent").iloc[-1]
+    if worst["silent"] > 0:
+        sentence += f" Failures that look right: {percent(worst['silent'])} at most ({worst.name})."
+    return sentence
+
+
+def about(analysis: Analysis) -> list[str]:
+    """What the model of each setting is: its readings and parameters, and what the error scale means."""
+    found: dict[str, str] = {}
+    for group in analysis.collection.groups:
+        footer, name = group.footer, str(group.columns["measurement"])
+        if name in found or group.columns["noise"] == "certified":
+            continue
+        groups: dict[str, Mapping[str, Any]] = {}
+        for parameter in footer["parameters"]:
+            groups.setdefault(parameter.get("group") or parameter["name"], parameter)
+        sizes = [f"{label} {short(p['size'])} {p['unit']}".strip() for label, p in groups.items()]
+        words = str(footer.get("about") or "").rstrip(".")
+        readings = f"{footer['readings']} readings" if "readings" in footer else "Its readings"
+        found[name] = (
+            f"{name}{': ' * bool(words)}{words}. {readings} determine {len(footer['parameters'])} parameters; at error"
+            f" scale s the true ones scatter about the nominal ones by s times {enumerate_few(sizes, 8)}."
         )
-    # A number and its sign stay on one line.
-    return " ".join(sentences).replace(" %", "\u00a0%")
-
-
-def _least_efficient(rows: pd.DataFrame) -> pd.Series | None:
-    """The scenario with the smallest efficiency over all trials, or where that tells nothing over solved ones."""
-    for name in ("efficiency_all", "efficiency"):
-        values = rows[name].to_numpy(dtype=float)
-        if np.isfinite(values).any():
-            return rows.iloc[int(np.nanargmin(values))]
-    return None
-
-
-def _efficiency(row: pd.Series) -> str:
-    """Efficiency against the bound that applies at that scale, and of which trials."""
-    text = f"its efficiency, the bound that applies over its error, is {short(row['efficiency_all'])}"
-    if row["solved_trials"] < row["trials"] and row["equation"] != "-":
-        text += f" over all trials, and {short(row['efficiency'])} over the {row['solved_trials']} that it solves"
-    if np.isfinite(row["efficiency_low"]):
-        text += f" (95 % interval {short(row['efficiency_low'])} to {short(row['efficiency_high'])})"
-    return text
-
-
-def best_estimator(analysis: Analysis) -> str:
-    """The estimator that `best_of` finds over all scenarios."""
-    return best_of(analysis.scores, analysis.summary)
+    return list(found.values())
 
 
 def best_of(scores: pd.DataFrame, summary: pd.DataFrame) -> str:

@@ -14,7 +14,7 @@ from ipe_bench.report.charts import Chart
 from ipe_bench.report.citation import CITATION
 from ipe_bench.report.definitions import definitions
 from ipe_bench.report.figures.gallery import Drawn
-from ipe_bench.report.headline import headline
+from ipe_bench.report.headline import about, headline
 from ipe_bench.report.sections import Written
 from ipe_bench.report.table import Table, environment
 from ipe_bench.statistics.analysis import Analysis
@@ -57,6 +57,7 @@ def render_page(
             script=Markup(script),
             style=Markup(style),
             policy=_policy(script, style),
+            about=about(analysis),
             headline=headline(analysis),
             directories=[str(d) for d in collection.directories],
             expected=collection.expected,

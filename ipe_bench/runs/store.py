@@ -110,8 +110,17 @@ class ResultKey:
             "sequential": self.estimator is not None and "epochs" in self.estimator.needs,
             "jacobian_cost": float(getattr(model, "jacobian_cost", model.n)),
             "parameters": [describe(p) for p in model.parameters],
+            "readings": model.m,
+            "about": first_sentence(model),
             "linear_bound": linear_bound(scenario.problem).tolist(),
         }
+
+
+def first_sentence(component: Any) -> str:
+    """The first sentence of the docstring of a component's class; empty where it has none of its own."""
+    kind = type(component)
+    words = " ".join((kind.__doc__ or "").split())
+    return "" if words.startswith(f"{kind.__name__}(") else words.partition(". ")[0].rstrip(".")
 
 
 def digest(value: Any) -> str:

@@ -69,7 +69,7 @@ def texts(line: str) -> list[str]:
         ("ipe-bench run +baseline@estimators.a=geodesic_lm estimators.a.geo", ["estimators.a.geodesic="]),
         ("ipe-bench run +baseline@estimators.a=geodesic_lm estimators.a.geodesic=t", ["estimators.a.geodesic=true"]),
         ("ipe-bench run -m noise=gaussian,quant", ["noise=gaussian,quantization"]),
-        ("ipe-bench run ~", ["~estimators.fixed_point", "~estimators.linear_lse"]),
+        ("ipe-bench run ~", [f"~estimators.{name}" for name in ("fixed_point", "linear_lse", "ekf", "ukf")]),
         ("ipe-bench run --cfg ", ["job", "hydra", "all"]),
         ("ipe-bench run error", ["error_scale="]),
         ("ipe-bench run hydra/sweeper=o", ["hydra/sweeper=optuna"]),

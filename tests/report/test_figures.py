@@ -360,9 +360,9 @@ def test_stale_figures_go_and_foreign_files_stay(synthetic, few, tmp_path):
 
 def test_the_main_figures_are_four(once_drawn):
     names = {drawn.name for drawn in once_drawn[1]}
-    assert {"figure_2", "figure_3", "error_against_scale", "success_against_scale"} < names
+    assert {"headline", "figure_2", "figure_3", "error_against_scale"} < names
     modules = {name: import_module(f"{figures.__name__}.{name}") for name in FIGURES}
-    assert {name for name, module in modules.items() if module.FIGURE.main} == {"error_scale", "success"}
+    assert {name for name, module in modules.items() if module.FIGURE.main} == {"headline", "error_scale"}
 
 
 def test_labels_run_into_nothing(synthetic):

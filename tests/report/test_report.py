@@ -18,7 +18,7 @@ import pandas as pd
 import pytest
 from markupsafe import escape
 from rich.console import Console
-from synthetic_store import Seeker, Synthetic
+from synthetic_store import Filter, Seeker, Synthetic
 
 from ipe_bench.noise import Quantization
 from ipe_bench.report import write_report
@@ -26,7 +26,7 @@ from ipe_bench.report.definitions import DEFINITIONS
 from ipe_bench.report.figures import correlation, distributions, error_scale, nees, success
 from ipe_bench.report.figures.ranks import cliques
 from ipe_bench.report.figures.views import views
-from ipe_bench.report.headline import headline
+from ipe_bench.report.headline import about, headline
 from ipe_bench.report.style import house_style, looks
 from ipe_bench.report.table import (
     Strong,
@@ -93,7 +93,7 @@ def test_what_is_written_is_whole(result):
     assert result.problems == ()
     stored = pd.read_csv(result.summary_path)
     pd.testing.assert_frame_equal(stored, result.summary, check_exact=False, rtol=1e-12)
-    assert {p.name for p in result.figures} >= {f"success_against_scale.{kind}" for kind in ("png", "pdf")}
+    assert {p.name for p in result.figures} >= {f"headline.{kind}" for kind in ("png", "pdf")}
     assert {p.name for p in result.tables} >= {"overview.csv", "overview.md", "overview.tex", "comparisons.tex"}
     for path in (*result.figures, *result.tables, result.report):
         assert path.stat().st_size > 100
@@ -109,20 +109,45 @@ def test_the_page_stands_alone_and_says_the_headline(result):
     # The name of SVG's namespace is no address that anything is fetched from.
     said = re.sub(r"base64,[^\"]*|http-equiv|http://www.w3.org/2000/svg", "", page)
     assert "http" not in said
-    sentence = headline(analyse([result.report.parent]))
-    assert sentence in page.replace("&#39;", "'")
+    shown = page.replace("&#39;", "'")
+    for sentence in (*headline(analyse([result.report.parent])), *about(analyse([result.report.parent]))):
+        assert sentence in shown
 
 
-def test_the_headline_is_computed_from_the_data(synthetic):
-    fill(synthetic)
-    rows = analyse([synthetic.directory])
-    total = rows.summary[rows.summary["parameter"] == "all"].set_index(["estimator", "error_scale"])
-    sentence = headline(rows).replace("\u00a0", " ")
-    assert "At error scales 1 to 100, one succeeds in" in sentence
-    worst = total.loc["one"].sort_values("efficiency_all").iloc[0]
-    assert f"its efficiency, the bound that applies over its error, is {short(worst['efficiency_all'])}" in sentence
-    linear = total.loc[("linear_lse", 100.0), "efficiency_all"]
-    assert f"At scale 100 the linear estimate has an efficiency of {short(linear)}" in sentence
+def test_the_headline_says_who_agrees_who_is_honest_who_breaks_and_what_it_costs(synthetic):
+    """A filter that is as good as its rival to scale 10, where it claims half its errors, and lost at 100."""
+    rng = np.random.default_rng(1)
+    for scale in (1.0, 10.0, 100.0):
+        e = 0.1 * rng.normal(size=(100, 3))
+        scenario = synthetic.scenario(error_scale=scale)
+        synthetic.add(scenario, "solver", e, estimator=Seeker(), simulations=4.0)
+        claimed = np.full(3, 0.1 if scale == 1 else 0.05)
+        wrong = e + (9.0 if scale == 100 else 0.0)
+        sure = {"deviation": claimed, "fit_p": np.where(np.arange(100) < 25, 0.5, 0.0) if scale == 100 else 0.5}
+        synthetic.add(scenario, "filter", wrong, estimator=Filter(), simulations=187.0, **sure)
+    analysis = analyse([synthetic.directory])
+    nees = analysis.summary.set_index(["error_scale", "estimator", "parameter"])["nees_median"][10.0, "filter", "all"]
+    agree, honest, reach, silent, costs = [s.replace("\u00a0", " ") for s in headline(analysis)]
+    assert "IPE (solver) and filters (filter) agree up to error scale 10: all their trials succeed there" in agree
+    assert honest == f"Overconfident (NEES, 1 is honest): filter ({nees:.2f}) from scale 10; solver never."
+    assert reach.endswith(": filter (0 %) from scale 100; solver (100 %) holds to 100.")
+    assert silent == "Failures that look right: at most 25.0 % of the trials (filter at scale 100)."
+    assert "at scale 10 solver 4 (1.0 ms), filter 187 (1.0 ms); at scale 100 solver 4" in costs
+    (model,) = about(analysis)
+    assert model.startswith("repeated: Each parameter read `repeats` times directly")
+    assert "12 readings determine 3 parameters" in model
+    assert "s times group 0 1 m, group 1 0.100 m" in model
+
+
+def test_one_scale_or_several_settings_are_ranked(synthetic):
+    e = 0.1 * np.random.default_rng(2).normal(size=(50, 3))
+    for sigma in (0.2, 0.4):
+        synthetic.add(synthetic.scenario(sigma=sigma), "good", e)
+        synthetic.add(synthetic.scenario(sigma=sigma), "bad", np.where(np.arange(50)[:, None] < 20, 50.0, e))
+    (sentence,) = headline(analyse([synthetic.directory]))
+    sentence = sentence.replace("\u00a0", " ")
+    assert sentence.startswith("At error scale 1, of 100 trials in 2 scenarios succeed: good in 100 %, bad in 60.0 %.")
+    assert sentence.endswith("Failures that look right: 40.0 % at most (bad).")
 
 
 def test_survivors_are_shown_as_survivors(synthetic):

@@ -8,6 +8,7 @@ from ipe_bench.report.figures.gallery import Drawn, draw_all
 __all__ = ["FIGURES", "FORMATS", "Drawing", "Drawn", "Figure", "draw_all"]
 
 FIGURES = (
+    "headline",
     "error_scale",
     "success",
     "settings",

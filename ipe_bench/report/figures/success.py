@@ -45,4 +45,4 @@ def draw(view: View) -> Iterator[Drawing]:
     yield Drawing(f"success_against_scale{view.suffix}", title, caption, fig)
 
 
-FIGURE = Figure(draw, ("summary",), main=True)
+FIGURE = Figure(draw, ("summary",))
