@@ -19,7 +19,8 @@ from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
-from ipe_bench.runs.store import FOOTER, ResultKey, Store, encode
+from ipe_bench.runs import parts
+from ipe_bench.runs.store import ResultKey, Store
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.thresholds import GATE
 
@@ -169,6 +170,6 @@ def forge(path: Path, change: Callable[[dict[str, Any], dict[str, Any]], Any]) -
     """Writes the rows and the footer of a stored file anew after `change(rows, footer)`, with a digest that fits."""
     table = pq.read_table(path)
     rows = {name: table[name].to_numpy() for name in table.column_names}
-    footer = json.loads(table.schema.metadata[FOOTER])
+    footer = json.loads(pq.ParquetFile(path).metadata.metadata[parts.FOOTER])
     change(rows, footer)
-    path.write_bytes(encode(rows, footer))
+    parts.write(path, parts.table_of(rows), footer)

@@ -103,7 +103,7 @@ def _line_watcher(console: Console, title: str) -> Watcher:
         elif progress.done == progress.tasks:
             failed = f", {len(progress.failures)} failed" if progress.failures else ""
             blocks = "1 block" if progress.tasks == 1 else f"{progress.tasks} blocks"
-            say(f"{blocks}{failed} in {_duration(now - began)}{_told(progress)}")
+            say(f"{blocks}{failed} in {_duration(now - began)}, {_rounded(progress.rate)} estimates/s")
         elif now - spoken >= LINE_EVERY_S:
             spoken = now
             say(f"block {progress.done}/{progress.tasks}{_told(progress)}")

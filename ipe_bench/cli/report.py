@@ -12,8 +12,8 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console, paper
 from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
 from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
+from ipe_bench.runs.parts import TRUTH
 from ipe_bench.runs.results import require_results
-from ipe_bench.runs.store import TRUTH
 
 if TYPE_CHECKING:
     from ipe_bench.statistics.analysis import Begun

@@ -38,9 +38,10 @@ from ipe_bench.plugins import discovery as plugins
 from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.execution.processes import end_idle
-from ipe_bench.runs.run import compute, result_keys
+from ipe_bench.runs.provenance import digest
+from ipe_bench.runs.run import accept, compute, record_refusal, result_keys
 from ipe_bench.runs.schedule import Watcher
-from ipe_bench.runs.store import describe_names, digest
+from ipe_bench.runs.store import describe_names
 
 _OWN_LAUNCHER = ".BasicLauncher"
 _KEPT_CONFIGS = 100
@@ -72,7 +73,10 @@ class Outcome:
         """What each job came to in the column that is asked for, and what was asked of it."""
         self.dry: DryRun | None = None
         """What would be done, where nothing is to be."""
-        self.mistakes: dict[str, None] = {}
+        self.mistakes: dict[str, list[str]] = {}
+        """Why jobs were refused, and which."""
+        self.refusals: list[tuple[Path, str, str, Spec | None]] = []
+        """What is noted of it in the folders of a sweep."""
         self.bug: Exception | None = None
         self.storage: StorageError | None = None
         """Nothing can be stored any more: the remaining jobs are not begun."""
@@ -220,6 +224,11 @@ def _conclude() -> int:
         print(_outcome.dry.summary())
         return code
     end_idle()  # a report on many trials has use for their memory
+    for output, words, reason, job in _outcome.refusals:
+        if job is None:
+            record_refusal(output, words, reason)
+        else:
+            record_refusal(output, words, reason, job.scenario, job.estimators, job.count)
     for output, cells in _outcome.outputs.items():
         if (output / "trials").is_dir():
             # Of jobs in other processes nothing is known but the folder.
@@ -232,7 +241,9 @@ def _conclude() -> int:
     for line in _outcome.stops:
         console().print(line, markup=False, soft_wrap=True)
     if _outcome.mistakes:
-        raise UserError("; ".join(_outcome.mistakes))
+        jobs = {r: w[0] + f" and {len(w) - 1} more" * (len(w) > 1) for r, w in _outcome.mistakes.items()}
+        told = _outcome.multirun and _outcome.jobs > 1
+        raise UserError("; ".join(f"{reason} (refused: {which})" if told else reason for reason, which in jobs.items()))
     return code
 
 
@@ -278,6 +289,7 @@ def task(config: DictConfig) -> float | None:
     are chosen by what this one comes to, which it returns."""
     if _outcome.storage is not None:
         return None
+    job = None
     try:
         job = assemble(config)
         _refuse_keys_without_use(config)
@@ -297,12 +309,16 @@ def task(config: DictConfig) -> float | None:
         if isinstance(error, StorageError):
             _outcome.storage = error
         else:
-            _outcome.mistakes[str(explain(error) if isinstance(error, CONFIG_ERRORS) else error)] = None
+            reason = str(explain(error) if isinstance(error, CONFIG_ERRORS) else error)
+            _outcome.mistakes.setdefault(reason, []).append(_job_words())
+            if _outcome.multirun and _outcome.dry is None and config.write_readings is None:
+                _outcome.refusals.append((Path(config.output), _job_words(), reason, job))
     except Exception as error:
         _outcome.bug = error
         raise
     else:
         _outcome.failures += failures
+        accept(job.output, _job_words())
         _outcome.figures, _outcome.formats = job.figures, job.formats
         own = _outcome.outputs.setdefault(Path(job.output), {})
         own.update((cell.key, describe_names(cell.names)) for cell in result_keys(job.scenario, job.estimators))
@@ -379,6 +395,13 @@ _NOT_IN_TITLES = {
     "solver",
     "baseline",
 }
+
+
+def _job_words() -> str:
+    """What tells a job of a sweep from the others: its words, as they were typed."""
+    keys = {word: word.lstrip("+~").partition("=")[0] for word in HydraConfig.get().overrides.task}
+    told = [word for word, key in keys.items() if key not in _NOT_IN_TITLES and not key.startswith("execution")]
+    return " ".join(told) or "the job"
 
 
 def _title(job: Spec) -> str:

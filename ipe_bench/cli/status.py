@@ -10,8 +10,8 @@ from rich.text import Text
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console
 from ipe_bench.runs.bundles import opened
+from ipe_bench.runs.parts import TRUTH
 from ipe_bench.runs.results import CellState, Results, require_results
-from ipe_bench.runs.store import TRUTH
 
 _COUNTS = ("missing", "failed", "stale")
 
@@ -39,6 +39,8 @@ def _show(directory: str, results: Results, verbose: bool) -> None:
         out.print(problem, markup=False, soft_wrap=True)
     verdict = "not complete; the same command as before computes what is missing, failed or damaged"
     estimates = [cell for cell in results.cells if cell.names["estimator"] != TRUTH]
+    for line in results.stale if not results.problems else ():
+        out.print(line, markup=False, soft_wrap=True)
     if not results.problems:
         trials = sum(cell.done for cell in estimates)
         verdict = f"complete: {len(estimates)} scenarios under an estimator, {trials} trials"

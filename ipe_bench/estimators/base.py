@@ -189,17 +189,18 @@ def _estimate(estimator: Estimator, problem: Problem, z: Array, history: bool) -
 
 def _require_shapes(estimator: Estimator, estimates: Any, trials: int, n: int) -> None:
     """Raises ValueError unless an estimator returned what is asked for: nothing is broadcast over trials."""
-    name = f"{type(estimator).__name__}.estimate"
+    name, costs = f"{type(estimator).__name__}.estimate", ("iterations", "simulations", "jacobians", "seconds")
     if not isinstance(estimates, Estimates):
         raise ValueError(f"{name} returns {type(estimates).__name__}, where Estimates are asked for")
-    shapes = {"x": (trials, n), "covariance": (trials, n, n)}
-    shapes |= dict.fromkeys(("status", "iterations", "simulations", "jacobians", "seconds"), (trials,))
-    found = {part: getattr(estimates, part) for part in shapes} | estimates.extras
-    for part, values in found.items():
-        shape, kind = np.shape(values), np.asarray(values).dtype.kind
-        if values is not None and (shape != shapes.get(part, (trials,)) or kind not in "fiub"):
-            what = f"of shape {shape}" if kind in "fiub" else f"of type {np.asarray(values).dtype}"
-            raise ValueError(f"{name} returns {part} {what}, where numbers {shapes.get(part, (trials,))} belong")
+    shapes = {"x": (trials, n), "covariance": (trials, n, n), "status": (trials,), **dict.fromkeys(costs, (trials,))}
+    for part, values in ({part: getattr(estimates, part) for part in shapes} | estimates.extras).items():
+        values, shape = np.asarray(0.0 if values is None else values), shapes.get(part, (trials,))
+        if values.dtype.kind not in "fiub":
+            raise ValueError(f"{name} returns {part} of type {values.dtype}, where numbers belong")
+        if values.shape != shape and getattr(estimates, part, values) is not None:
+            raise ValueError(f"{name} returns {part} of shape {values.shape}, where {shape} belongs")
+        if part in costs and not (np.isfinite(values) & (values >= 0)).all():
+            raise ValueError(f"{name} returns {part} that are not finite numbers from 0 up")
 
 
 def one_by_one(trials: Iterable[Any], estimate: Any, n: int) -> Estimates:

@@ -25,7 +25,7 @@ def made_from(directories: Sequence[Path], output: Path, *choices: object) -> st
     """
     sources = [p for p in Path(__file__).parents[1].rglob("*") if p.suffix in {".py", ".j2", ".css", ".js"}]
     stores = [Store(directory) for directory in directories]
-    stored = [p for s in stores for folder in (s.trials, s.histories, s.runs, s.failed) for p in folder.glob("*")]
+    stored = [p for s in stores for folder in (s.trials, s.runs, s.failed) for p in folder.glob("*")]
     libraries = [sys.version, *map(version, ("jinja2", "matplotlib", "numpy", "pandas", "scipy", "seaborn"))]
     names = [str(path.absolute()) for path in (output, *directories)]
     known = [names, choices, libraries, digest_of_all(), _digests(sources), _digests(stored)]

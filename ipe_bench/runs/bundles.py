@@ -25,15 +25,18 @@ from ipe_bench.basics.files import BLANK_SEAL, is_sealed, seal, write_atomically
 from ipe_bench.runs.results import Results, require_results
 from ipe_bench.runs.store import Store
 
-SCHEMA = 1
+SCHEMA = 2
 MANIFEST = "manifest.json"
 SUFFIX = ".zip"
 BUNDLES = "bundles"
 """Where bundles are unpacked below a report on them."""
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """The time of every entry, since times are no part of what is bundled."""
-_NAME = re.compile(r"[^/\\\x00-\x1f]{1,200}/(trials|histories|runs|failed)/[A-Za-z0-9][A-Za-z0-9._-]*")
-_BROKEN = (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, NotImplementedError, KeyError, ValueError)
+_NAME = re.compile(r"(?!\.\.?/)[^/\\\x00-\x1f]{1,200}/(trials|runs|failed)/[A-Za-z0-9][A-Za-z0-9._-]*")
+_LARGEST = 1 << 33
+"""Bytes that a bundle may unpack to."""
+_BROKEN = (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, NotImplementedError)
+_BROKEN += (KeyError, ValueError, TypeError, AttributeError)
 """What reading an archive may raise that is cut short, changed, encrypted or none at all."""
 
 
@@ -44,9 +47,13 @@ class Bundle:
     path: Path
     digest: str
     """Of the manifest, and so of everything in the bundle."""
-    folders: tuple[str, ...]
     files: Mapping[str, str]
     """SHA-256 by name."""
+
+    @property
+    def folders(self) -> tuple[str, ...]:
+        """The folders that results came from."""
+        return tuple(dict.fromkeys(name.partition("/")[0] for name in self.files))
 
     @property
     def size(self) -> int:
@@ -65,14 +72,18 @@ def write_bundle(directories: Sequence[Path | str], path: Path, further: Mapping
         UserError: a directory holds no results, two have one name, nothing is whole, or the archive is there and
             holds something else.
     """
-    folders = _folders(directories)
-    contents = {f"{name}/{file.parent.name}/{file.name}": file for name, d in folders.items() for file in _files(d)}
+    require_results(directories)
+    contents: dict[str, bytes] = {}
+    for directory in map(Path, directories):
+        name = directory.resolve().name
+        if any(known.startswith(f"{name}/") for known in contents):
+            raise UserError(f"{directory}: another folder has the name {name} too; bundle them apart, or rename one")
+        contents |= {f"{name}/{file}": content for file, content in _contents(directory).items()}
     if not contents:
         raise UserError(f"{', '.join(map(str, directories))}: holds no whole results to bundle; run something first")
-    digests = {name: _digest(contents[name].read_bytes()) for name in sorted(contents)}
-    facts = {"bundle": "ipe-bench", "schema": SCHEMA, "version": __version__, "folders": list(folders)}
-    record = {**facts, **(further or {}), "files": digests, "seal": BLANK_SEAL}
-    manifest = seal(json.dumps(record, indent=1, ensure_ascii=False).encode())
+    digests = {name: _digest(content) for name, content in sorted(contents.items())}
+    record = {"bundle": "ipe-bench", "schema": SCHEMA, "version": __version__, **(further or {}), "files": digests}
+    manifest = seal(json.dumps({**record, "seal": BLANK_SEAL}, indent=1, ensure_ascii=False).encode())
     if path.exists():
         found = read_bundle(path)
         if found.digest != _digest(manifest):
@@ -81,92 +92,71 @@ def write_bundle(directories: Sequence[Path | str], path: Path, further: Mapping
 
     def write(temporary: Path) -> None:
         with zipfile.ZipFile(temporary, "w") as archive:
-            _add(archive, MANIFEST, manifest)
-            for name in digests:
-                _add(archive, name, contents[name].read_bytes())
+            for name, content in {MANIFEST: manifest, **{name: contents[name] for name in digests}}.items():
+                entry = zipfile.ZipInfo(name, _EPOCH)
+                entry.external_attr, entry.create_system = 0o644 << 16, 3
+                # Tables are compressed already.
+                entry.compress_type = zipfile.ZIP_STORED if name.endswith(".parquet") else zipfile.ZIP_DEFLATED
+                archive.writestr(entry, content)
 
     write_atomically(path, write)
     return read_bundle(path)
 
 
-def _folders(directories: Sequence[Path | str]) -> dict[str, Path]:
-    """The directories by the names that they have in the bundle."""
-    require_results(directories)
-    found: dict[str, Path] = {}
-    for directory in map(Path, directories):
-        name = directory.resolve().name
-        if name in found:
-            raise UserError(f"{directory}: another folder has the name {name} too; bundle them apart, or rename one")
-        found[name] = directory
-    return found
+def _contents(directory: Path) -> dict[str, bytes]:
+    """What is whole below a directory, by name; listed again if a file was merged into another one meanwhile."""
+    store = Store(directory)
+    while True:
+        damaged = Results.read([directory]).damaged
+        files = [p for folder in (store.trials, store.runs, store.failed) for p in folder.glob("[!.]*.*")]
+        with contextlib.suppress(FileNotFoundError):
+            return {
+                f"{file.parent.name}/{file.name}": file.read_bytes()
+                for file in files
+                if file.suffix in (".parquet", ".json") and file not in damaged
+            }
 
 
-def _files(directory: Path) -> Iterator[Path]:
-    """What is whole, in order."""
-    results, store = Results.read([directory]), Store(directory)
-    for folder in (store.trials, store.histories, store.runs, store.failed):
-        for file in sorted(folder.glob("*")):
-            if file.suffix in (".parquet", ".json") and not file.name.startswith(".") and file not in results.damaged:
-                yield file
-
-
-def _add(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
-    entry = zipfile.ZipInfo(name, _EPOCH)
-    entry.external_attr = 0o644 << 16
-    entry.create_system = 3
-    # Tables are compressed already.
-    entry.compress_type = zipfile.ZIP_STORED if name.endswith(".parquet") else zipfile.ZIP_DEFLATED
-    archive.writestr(entry, content)
-
-
-def read_bundle(path: Path) -> Bundle:
-    """The bundle, all of whose files were read and are as its manifest says.
+def read_bundle(path: Path, into: Path | None = None) -> Bundle:
+    """The bundle, all of whose files were read and are as its manifest says; they are written below `into`, if given.
 
     Raises:
         UserError: it is none, or was damaged or changed.
     """
-    return _read(path, None)
-
-
-def _read(path: Path, into: Path | None) -> Bundle:
-    """Checks every file of a bundle, and writes it below `into`. What lies there already and is the same stays."""
     try:
         with zipfile.ZipFile(path) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > _LARGEST:
+                raise UserError(f"{path}: would unpack to more than {_LARGEST >> 30} GiB; nothing of it is read")
             manifest = archive.read(MANIFEST)
-            record = _checked(path, manifest, archive.namelist())
-            for name, digest in record["files"].items():
+            digests = _checked(path, manifest, archive.namelist())
+            for name, digest in digests.items():
                 content = archive.read(name)
                 if _digest(content) != digest:
                     raise UserError(
                         f"{path}: was damaged or changed: {name} is not what the manifest says; get it anew"
                     )
-                if into is not None:
-                    _write(into / name, content)
+                if into is not None and not ((into / name).is_file() and (into / name).read_bytes() == content):
+                    write_bytes(into / name, content)
     except _BROKEN as error:
         raise UserError(f"{path}: is not a whole bundle of ipe-bench ({error or type(error).__name__})") from None
-    return Bundle(path, _digest(manifest), tuple(record["folders"]), record["files"])
+    return Bundle(path, _digest(manifest), digests)
 
 
-def _checked(path: Path, manifest: bytes, names: Sequence[str]) -> dict[str, Any]:
-    """The manifest, where it is whole and lists exactly what is in the archive."""
+def _checked(path: Path, manifest: bytes, names: Sequence[str]) -> dict[str, str]:
+    """The digests by name, if the manifest is whole and lists exactly what is in the archive."""
     if not is_sealed(manifest):
         raise UserError(f"{path}: was damaged or changed: the manifest does not match its own digest; get it anew")
-    record: Any = json.loads(manifest)
-    if not isinstance(record, dict) or record.get("bundle") != "ipe-bench" or record.get("schema") != SCHEMA:
+    record = json.loads(manifest)
+    if record["bundle"] != "ipe-bench" or record["schema"] != SCHEMA:
         raise UserError(f"{path}: is a bundle of another version of ipe-bench; read it with that one")
-    if sorted(names) != sorted([MANIFEST, *record["files"]]):
-        odd = sorted({*names} ^ {MANIFEST, *record["files"]}) or ["a name that stands there twice"]
+    digests = dict(record["files"])
+    if sorted(names) != sorted([MANIFEST, *digests]):
+        odd = sorted({*names} ^ {MANIFEST, *digests}) or ["a name that stands there twice"]
         raise UserError(f"{path}: was damaged or changed: {odd[0]} is not in both manifest and archive; get it anew")
-    for name in record["files"]:
-        folder = name.partition("/")[0]
-        if not _NAME.fullmatch(name) or folder not in record["folders"] or folder in (".", ".."):
+    for name in digests:
+        if not _NAME.fullmatch(name):
             raise UserError(f"{path}: {name!r} is no name of a result; nothing of it is read")
-    return record
-
-
-def _write(path: Path, content: bytes) -> None:
-    if not path.is_file() or path.read_bytes() != content:
-        write_bytes(path, content)
+    return digests
 
 
 @contextlib.contextmanager
@@ -185,7 +175,7 @@ def opened(paths: Sequence[Path | str], into: Path | None = None) -> Iterator[li
             bundle = read_bundle(path)  # nothing is written of one that is not whole
             place = into or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ipe-bench-")))
             place = place / f"{path.name.removesuffix(SUFFIX)}-{bundle.digest[:8]}"
-            _read(path, place)
+            read_bundle(path, place)
             found += [place / folder for folder in bundle.folders]
         yield found
 

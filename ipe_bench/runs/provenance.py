@@ -61,6 +61,11 @@ def canonical_json(value: Any) -> str:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=True)
 
 
+def digest(value: Any) -> str:
+    """Sixteen hexadecimal digits that stand for plain data."""
+    return hashlib.sha256(canonical_json(value).encode()).hexdigest()[:16]
+
+
 def fingerprint(components: Iterable[Any]) -> dict[str, Any]:
     """The versions of the packages, and a digest of the numerical source, that components are made of.
 

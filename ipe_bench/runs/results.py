@@ -1,4 +1,4 @@
-"""What is stored under output folders: what is there, done, missing, failed, stale and damaged.
+"""What is stored under output folders: what is there, done, missing, failed, refused, stale and damaged.
 
 `run` asks it what to compute, `status` and `report` what to show, `load` for the rows, so they cannot disagree. A file
 is used, or named with what is wrong with it; nothing is guessed, mixed or deleted. What the numbers mean is left to
@@ -7,42 +7,40 @@ is used, or named with what is wrong with it; nothing is guessed, mixed or delet
 
 from __future__ import annotations
 
-import itertools
+import contextlib
+import json
 import os
-from collections import Counter, deque
+import uuid
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Collection as Keys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import pyarrow as pa
 
 from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.files import is_sealed
 from ipe_bench.basics.linalg import Array
-from ipe_bench.runs.columns import as_array
-from ipe_bench.runs.pieces import Failed, Foreign, Gone, Outdated, Part, Run, Unusable, read_history
+from ipe_bench.runs.parts import SCHEMA, TRUTH, Outdated, Part, Unusable, as_array, decoded_history
 from ipe_bench.runs.provenance import canonical_json
-from ipe_bench.runs.store import TRUTH, Store, describe_names, gaps, title
-from ipe_bench.runs.verified import Verified, signature
+from ipe_bench.runs.store import Store, describe_names, gaps, title
 
 CHUNK = 1 << 14
-"""Rows that are looked at together: few enough to stay in a processor's cache."""
-_KEPT_BYTES = 1 << 26
-"""Rows that are kept in memory after they were read, so that no file is read twice where memory allows."""
-_FEW_TRIALS = 50_000
-"""A cell of so many is read whole and kept; of a larger one, only the columns that are asked for are read."""
+"""Number of rows that are looked at together: few enough to stay in a processor's cache."""
+T = TypeVar("T")
+AGAIN = "run the same command again, which computes it anew"
 
 
 @dataclass(frozen=True)
 class StoredCell:
-    """One scenario (one seed) under one estimator, or its truth, with all its pieces from all directories."""
+    """One scenario (one seed) under one estimator, or its truth, with all its parts from all directories."""
 
     footer: Mapping[str, Any]
-    pieces: tuple[Part, ...]
+    parts: tuple[Part, ...]
 
     @property
     def key(self) -> str:
@@ -69,16 +67,11 @@ class StoredCell:
     @cached_property
     def covered(self) -> tuple[tuple[int, int], ...]:
         """The union of the trials that are there, as disjoint ranges in ascending order."""
-        return merge_ranges((p.start, p.stop) for p in self.pieces)
+        return merge_ranges((p.start, p.stop) for p in self.parts)
 
     @property
     def trials(self) -> int:
         return _count(self.covered)
-
-    @property
-    def written(self) -> int:
-        """When the youngest of its files was; 0 where they went away meanwhile."""
-        return max((found[1] for p in self.pieces if (found := signature(p.path)) is not None), default=0)
 
 
 @dataclass(frozen=True)
@@ -88,7 +81,7 @@ class CellState:
     names: Mapping[str, Any]
     """measurement, noise, prior, error_scale, seed, estimator (`truth` for the truth and its bounds)."""
     expected: int
-    """Trials that were asked for; 0 where no run in the directories asks for this cell."""
+    """Trials that were asked for; 0 if no run in the directories asks for this cell."""
     done: int
     failed: int
     missing: int
@@ -97,7 +90,9 @@ class CellState:
     messages: tuple[str, ...]
     """Why trials failed."""
     tag: str = ""
-    """The beginning of its key, where other cells have the same names."""
+    """The beginning of its key, if other cells have the same names."""
+    refused: str = ""
+    """Why the run that asked for it was refused, if it was."""
 
     @property
     def title(self) -> str:
@@ -115,7 +110,55 @@ class CellState:
         for line in self.messages if self.failed else ():
             yield f"failed: {who}: {self.failed} of {self.expected} expected trials: {line}"
         if self.missing:
-            yield f"missing: {who}: {self.done} of {self.expected} expected trials are there"
+            why = f" (refused: {self.refused})" if self.refused else ""
+            yield f"missing: {who}: {self.done} of {self.expected} expected trials are there{why}"
+
+
+@dataclass(frozen=True)
+class Run:
+    """One record of runs/: what was going to be computed, or was refused."""
+
+    path: Path
+    record: Mapping[str, Any]
+
+    @property
+    def started(self) -> str:
+        return str(self.record["started"])
+
+    @property
+    def refused(self) -> str:
+        """Why it was, or empty."""
+        return str(self.record.get("refused", ""))
+
+
+@dataclass(frozen=True)
+class Failed:
+    """One record of failed/: trials that could not be computed, and why."""
+
+    key: str
+    start: int
+    stop: int
+    reason: str
+
+
+def _read_record(path: Path) -> dict[str, Any]:
+    """A JSON record of which not one bit has changed.
+
+    Raises:
+        Unusable: it is damaged, or not one of ours.
+    """
+    try:
+        if not path.is_file() or path.is_symlink():
+            raise Unusable("damaged: is not a plain file")
+        content = path.read_bytes()
+        record = json.loads(content) if is_sealed(content) else {}
+    except (OSError, ValueError) as error:
+        raise Unusable(f"damaged: cannot be read ({error})") from None
+    if record.get("schema") in (1, 2):
+        raise Outdated("was written by an older version of ipe-bench")
+    if record.get("schema") != SCHEMA or record["file"] != path.stem:
+        raise Unusable("damaged: is not a whole record of ipe-bench, or that of another file")
+    return record
 
 
 @dataclass
@@ -130,14 +173,10 @@ class Results:
     """What could not be computed, whether or not it was since."""
     damaged: dict[Path, str] = field(default_factory=dict)
     """What is wrong with each file that is left out."""
-    foreign: set[Path] = field(default_factory=set)
-    """Those of them whose names are not ours."""
     outdated: list[Path] = field(default_factory=list)
     """Files in the format of an older version."""
     further: list[str] = field(default_factory=list)
     """Problems that are not one file's: a line for each."""
-    _kept: dict[Path, pa.Table] = field(default_factory=dict, repr=False)
-    _kept_bytes: int = 0
 
     @classmethod
     def read(cls, directories: Sequence[Path | str], keys: Keys[str] | None = None) -> Self:
@@ -154,90 +193,64 @@ class Results:
         for path in paths:
             results._read_directory(Store(path), keys)
         results.runs = tuple(sorted(results.runs, key=lambda r: (r.started, r.path.name)))
-        for key, cell in results.stored.items():
-            results.stored[key] = replace(cell, pieces=tuple(sorted(cell.pieces, key=_reading_order)))
         return results
 
     def _read_directory(self, store: Store, keys: Keys[str] | None) -> None:
-        verified = Verified(store.directory)
-        trials, runs = self._files(store.trials, ".parquet", keys), self._files(store.runs, ".json")
-        found: dict[str, list[Part]] = {}
-        footers: dict[str, Mapping[str, Any]] = {}
+        for folder in (store.trials, store.runs, store.failed):
+            if os.path.lexists(folder) and not (folder.is_dir() and os.access(folder, os.R_OK | os.X_OK)):
+                self.further.append(f"{folder}: cannot be listed; what is in it is left out")
+                return
         listed: set[Path] = set()
-        while trials:
-            listed.update(trials)
-            gone = [path for path in trials if not self._read_piece(path, verified, found, footers)]
-            # What went away meanwhile was merged into larger files, which were not there yet when these were listed.
-            trials = [p for p in self._files(store.trials, ".parquet", keys) if p not in listed] if gone else []
-        for path in self._files(store.histories, ".parquet", keys):
-            if not verified.knows(path):
-                with self.naming(path):
-                    before = signature(path)
-                    self._keep(path, read_history(path)[1])
-                    verified.note(path, before)
-        for path in runs:
-            # A run that only asks what it lacks need not know what others were to compute.
-            if keys is None or not verified.knows(path):
-                with self.naming(path):
-                    before = signature(path)
-                    self.runs += (Run.read(path),)
-                    verified.note(path, before)
-        for path in self._files(store.failed, ".json"):
-            with self.naming(path):
-                self.attempts += (Failed.read(path),)
-        for key, pieces in found.items():
-            before_these = self.stored[key].pieces if key in self.stored else ()
-            self.stored[key] = StoredCell(footers[key], (*before_these, *pieces))
-        if keys is None and not listed and not runs:
-            self.problem(f"{store.directory}: holds no results of ipe-bench")
-        verified.save()
+        gone = True
+        while gone:  # what went away meanwhile is in a larger file, which was not there yet when these were listed
+            gone = False
+            for key, several in store.parts(keys).items():
+                for part in [part for part in several if part.path not in listed]:
+                    listed.add(part.path)
+                    gone |= not self._add(key, part)
+        for path in self._records(store.runs):
+            with self._naming(path):
+                self.runs += (Run(path, _read_record(path)),)
+        for path in self._records(store.failed):
+            with self._naming(path):
+                r = _read_record(path)
+                reason = f"{r['status']}: {r['message']}"
+                self.attempts += (Failed(r["key"], r["start"], r["stop"], reason),)
+        if keys is None and not listed and not self.runs:
+            self.further.append(f"{store.directory}: holds no results of ipe-bench")
+        if self.outdated and not self.stored and keys is None:
+            self.further.append(f"{store.directory}: was written by an older version of ipe-bench; {AGAIN}")
 
-    def _read_piece(
-        self, path: Path, verified: Verified, found: dict[str, list[Part]], footers: dict[str, Mapping[str, Any]]
-    ) -> bool:
-        """Adds the piece to what is found, if it is whole; False where it is not there any more."""
-        with self.naming(path):
-            piece = Part.parse(path)
-            footer = verified.footer(path, piece.key)
-            if footer is None:
-                before = signature(path)
-                try:
-                    footer, table = piece.read()
-                except Gone:
-                    return False
-                self._keep(path, table)
-                verified.note(path, before, footer)
-            found.setdefault(piece.key, []).append(piece)
-            footers[piece.key] = footer
+    def _add(self, key: str, part: Part) -> bool:
+        """Adds a part to what is stored, if every byte of it is whole; False if it is not there any more."""
+        with self._naming(part.path):
+            try:
+                footer, _ = part.read()
+            except FileNotFoundError:
+                return False
+            before = self.stored[key].parts if key in self.stored else ()
+            self.stored[key] = StoredCell(footer, tuple(sorted([*before, part], key=lambda p: p.order)))
         return True
 
-    def _files(self, folder: Path, suffix: str, keys: Keys[str] | None = None) -> list[Path]:
-        """What lies in a folder under a name with that suffix; with `keys`, what belongs to their cells alone."""
-        try:
-            names = sorted(os.listdir(folder)) if os.path.lexists(folder) else []
-        except OSError as error:
-            self.problem(f"{folder}: cannot be listed ({error.strerror or error}); what is in it is left out")
-            names = []
-        ours = [n for n in names if n.endswith(suffix) and not n.startswith(".")]
-        return [folder / n for n in ours if keys is None or n.removesuffix(suffix).partition("-")[0] in keys]
+    def _records(self, folder: Path) -> list[Path]:
+        return sorted(path for path in folder.glob("*.json") if not path.name.startswith("."))
 
-    @contextmanager
-    def naming(self, path: Path) -> Iterator[None]:
-        """Where an `Unusable` becomes a line that names the file."""
+    @contextlib.contextmanager
+    def _naming(self, path: Path) -> Iterator[None]:
+        """Notes what is wrong with a file."""
         try:
             yield
         except Outdated:
             self.outdated.append(path)
         except Unusable as error:
             self.damaged[path] = str(error)
-            if isinstance(error, Foreign):
-                self.foreign.add(path)
 
     @property
     def problems(self) -> list[str]:
-        """A line for everything that is missing, failed, foreign or damaged."""
+        """A line for everything that is missing, failed, refused or damaged."""
         lines = [f"{path}: {reason}; left out" for path, reason in self.damaged.items()]
-        lines += [line for cell in self.cells for line in cell.problems]
+        lines += [f"refused: {run.record.get('job', run.path.stem)}: {run.refused}" for run in self.runs if run.refused]
+        lines += [line for cell in self.cells for line in cell.problems if not cell.refused]
         truths = {cell.scenario_id for cell in self.current if cell.label == TRUTH}
         lines += [
             f"missing: the truth of {describe_names(cell.names)}: no bound is shown"
@@ -248,7 +261,7 @@ class Results:
 
     @property
     def stale(self) -> list[str]:
-        """A line for what older code computed: left out, and no problem where the present code has computed it."""
+        """A line for what older code computed: left out, and no problem if the present code has computed it."""
         return [
             f"stale: {describe_names(cell.names)}: {cell.trials} trials were computed by other code"
             f" ({', '.join(f'{p} {v}' for p, v in cell.footer.get('versions', {}).items())},"
@@ -256,36 +269,36 @@ class Results:
             for _, stale in self._rivals.values()
             for cell in stale
         ] + [
-            f"stale: {folder}: {sum(path.parent == folder for path in self.outdated)} files were written by an older"
-            " version of ipe-bench; left out"
-            for folder in dict.fromkeys(path.parent for path in self.outdated)
+            f"stale: {folder}: {sum(path.is_relative_to(folder) for path in self.outdated)} files were written by an"
+            f" older version of ipe-bench; left out: {AGAIN}"
+            for folder in dict.fromkeys(path.parents[1] for path in self.outdated)
         ]
 
     @property
     def expected(self) -> int:
-        """Cells that the records of runs announce."""
-        return len(self._asked_for)
+        """Cells that the records of runs announce, and refused jobs that came to none."""
+        return len(self._asked_for) + sum(not run.record["cells"] for run in self.runs if run.refused)
 
     @property
     def complete(self) -> int:
         """Those of them with every trial."""
-        return sum(cell.complete for cell in self.cells[: self.expected])
+        return sum(cell.complete for cell in self.cells[: len(self._asked_for)])
 
     @cached_property
-    def _asked_for(self) -> dict[str, tuple[str, int, Mapping[str, Any]]]:
-        """By identity: the key that the newest run has for it, the number of trials, and the names."""
-        asked: dict[str, tuple[str, int, Mapping[str, Any]]] = {}
+    def _asked_for(self) -> dict[str, tuple[str, int, Mapping[str, Any], str]]:
+        """By identity: the key that the newest run has for it, the number of trials, the names, why it was refused."""
+        asked: dict[str, tuple[str, int, Mapping[str, Any], str]] = {}
         for run in self.runs:
             for cell in run.record["cells"]:
                 trials = int(cell.get("trials", run.record["trials"]))
-                key, before, _ = asked.get(cell["identity_key"], (cell["key"], 0, {}))
+                key, before, *_ = asked.get(cell["identity_key"], (cell["key"], 0))
                 trials = max(trials, before) if key == cell["key"] else trials
-                asked[cell["identity_key"]] = (cell["key"], trials, cell["names"])
+                asked[cell["identity_key"]] = (cell["key"], trials, cell["names"], run.refused)
         return asked
 
     @cached_property
     def _rivals(self) -> dict[str, tuple[StoredCell | None, list[StoredCell]]]:
-        """By identity: the stored cell that counts, where it is stored, and the stale ones.
+        """By identity: the stored cell that counts, if it is stored, and the stale ones.
 
         The one that counts is the one that the newest run expects, else the one that was written last.
         """
@@ -297,7 +310,7 @@ class Results:
             if identity in self._asked_for:
                 key = self._asked_for[identity][0]
             else:
-                key = max(cells, key=lambda c: c.written).key
+                key = max(cells, key=_written).key
             result[identity] = self.stored.get(key), [c for c in cells if c.key != key]
         return result
 
@@ -314,8 +327,8 @@ class Results:
     @cached_property
     def cells(self) -> tuple[CellState, ...]:
         """How far every cell is: those that runs asked for in their order, then others that are there."""
-        names = [*(n for _, _, n in self._asked_for.values())]
-        names += [c.names for i, (c, _) in self._rivals.items() if i not in self._asked_for and c is not None]
+        others = [(i, c, old) for i, (c, old) in self._rivals.items() if i not in self._asked_for and c is not None]
+        names = [n for _, _, n, _ in self._asked_for.values()] + [c.names for _, c, _ in others]
         alike = Counter(map(describe_names, names))
 
         def tag(key: str, names: Mapping[str, Any]) -> str:
@@ -325,41 +338,30 @@ class Results:
         for failure in self.failures:
             failures.setdefault(failure.key, []).append(failure)
         states = []
-        for identity, (key, trials, names) in self._asked_for.items():
+        for identity, (key, trials, names, refused) in self._asked_for.items():
             lacking, lost = self.missing(key, trials), failures.get(key, [])
             untried = [gap for start, stop in lacking for gap in gaps([(f.start, f.stop) for f in lost], start, stop)]
             done, missing = trials - _count(lacking), _count(untried)
             stale = sum(cell.trials for cell in self._rivals.get(identity, (None, []))[1])
             messages = tuple(dict.fromkeys(f.reason for f in lost))
             counts = trials, done, trials - done - missing, missing, stale
-            states.append(CellState(names, *counts, messages, tag(key, names)))
-        for identity, (cell, old) in self._rivals.items():
-            if identity not in self._asked_for and cell is not None:
-                counts = 0, cell.trials, 0, 0, sum(c.trials for c in old)
-                states.append(CellState(cell.names, *counts, (), tag(cell.key, cell.names)))
+            states.append(CellState(names, *counts, messages, tag(key, names), refused if missing else ""))
+        for _, cell, old in others:
+            counts = 0, cell.trials, 0, 0, sum(c.trials for c in old)
+            states.append(CellState(cell.names, *counts, (), tag(cell.key, cell.names)))
         return tuple(states)
 
     def set_aside(self) -> list[str]:
-        """Renames what is damaged, so that it is computed again under its own name; returns a line for each file.
-
-        Nothing is deleted, and what has a foreign name stays. Where the iterates of a cell are damaged, the block that
-        they belong to counts as missing from now on.
-        """
+        """Renames what is damaged, so that it is computed again under its own name; returns a line for each file."""
         lines = []
         for path, reason in self.damaged.items():
-            if path in self.foreign:
-                continue
-            aside = next(p for p in _names_aside(path) if not os.path.lexists(p))
-            with suppress(FileNotFoundError):  # another run may have done so at this moment
+            aside = path.with_name(f"{path.stem}.damaged-{uuid.uuid4().hex[:8]}")
+            with contextlib.suppress(FileNotFoundError):  # another run may have done so at this moment
                 try:
                     path.rename(aside)
+                    lines.append(f"{path}: {reason}; set aside as {aside.name} and computed again")
                 except OSError as error:
                     lines.append(f"{path}: {reason}; cannot be set aside ({error.strerror or error})")
-                    continue
-                lines.append(f"{path}: {reason}; set aside as {aside.name} and computed again")
-            if path.parent.name == "histories" and path.stem in self.stored:
-                cell = self.stored[path.stem]
-                self.stored[path.stem] = replace(cell, pieces=tuple(p for p in cell.pieces if p.start > 0))
         return lines
 
     def _covered(self, key: str) -> Sequence[tuple[int, int]]:
@@ -369,129 +371,74 @@ class Results:
         """The ranges of trials 0 to `trials` that no usable file of the cell with this key covers."""
         return gaps(self._covered(key), 0, trials)
 
-    def problem(self, line: str) -> None:
-        """Adds what a reader of the rows found wrong."""
-        self.further.append(line)
-
     def load(self, cell: StoredCell, columns: Sequence[str] | None, optional: Sequence[str] = ()) -> dict[str, Array]:
-        """The rows of a cell as arrays, by ascending trial, each trial once; all columns where `columns` is None.
+        """The rows of a cell as arrays, by ascending trial, each trial once; all columns if `columns` is None.
 
-        A piece that cannot be used any more, or lacks one of the `columns`, is named in `problems`, and left out.
+        A part that cannot be used any more, or lacks one of the `columns`, is named in `problems`, and left out. What
+        some parts lack of the `optional` columns is NaN or None there.
         """
-        parts = list(self._parts(cell, columns, optional))
-        if not parts:
+        names = None if columns is None else list(dict.fromkeys(["trial", *columns, *optional]))
+        tables = self._trying(cell, lambda parts: list(self._tables(parts, names, columns or ())))
+        if sum(map(len, tables)) < cell.trials and self.damaged.keys().isdisjoint(p.path for p in cell.parts):
+            self.further.append(f"missing: {describe_names(cell.names)}: trials went away while they were read")
+        if not tables:
             return {name: np.empty(0) for name in ("trial", *(columns or ()), *optional)}
-        return _joined(parts)
+        table = pa.concat_tables(tables, promote_options="default")
+        return {name: as_array(table[name]) for name in names or table.column_names if name in table.column_names}
+
+    def _trying(self, cell: StoredCell, read: Callable[[Sequence[Part]], T]) -> T:
+        """What `read` makes of the parts of a cell; of those that are there now, if some were merged meanwhile."""
+        parts: Sequence[Part] = cell.parts
+        while True:
+            try:
+                return read(parts)
+            except FileNotFoundError:
+                found = [part for d in self.directories for part in Store(d).parts({cell.key}).get(cell.key, ())]
+                parts = sorted((part for part in found if part.path not in self.damaged), key=lambda p: p.order)
+
+    def _tables(self, parts: Sequence[Part], names: Sequence[str] | None, needed: Sequence[str]) -> Iterator[pa.Table]:
+        """The rows of one part after another, without the trials that an earlier one had."""
+        reached = 0
+        for part in parts:
+            if part.stop > reached:
+                with self._naming(part.path):
+                    _, table = part.read(names)
+                    if lacking := [name for name in needed if name not in table.column_names]:
+                        raise Unusable(f"damaged: has no column {lacking[0]}")
+                    yield table.slice(max(0, reached - part.start))
+                    reached = part.stop
 
     def chunks(
         self, cell: StoredCell, columns: Sequence[str], optional: Sequence[str] = (), rows: int = CHUNK
     ) -> Iterator[dict[str, Array]]:
-        """The same some rows at a time, however they are cut into files: each chunk but the last has that many."""
-        held: list[dict[str, Array]] = []
-        count = 0
-        for part in self._parts(cell, columns, optional):
-            held.append(part)
-            count += len(part["trial"])
-            if count >= rows:
-                whole, cut = _joined(held), count - count % rows
-                for at in range(0, cut, rows):
-                    yield {name: values[at : at + rows] for name, values in whole.items()}
-                held = [{name: values[cut:] for name, values in whole.items()}]
-                count -= cut
-        if count:
-            yield _joined(held)
-
-    def _parts(
-        self, cell: StoredCell, columns: Sequence[str] | None, optional: Sequence[str] = ()
-    ) -> Iterator[dict[str, Array]]:
-        """The rows of one piece after another, without the trials that an earlier one had."""
-        names = None if columns is None else dict.fromkeys(["trial", *columns, *optional])
-        whole = names is None or cell.trials <= _FEW_TRIALS
-        waiting, known, reached = deque(cell.pieces), {piece.path for piece in cell.pieces}, 0
-        while waiting:
-            piece = waiting.popleft()
-            if piece.stop <= reached:
-                continue
-            with self.naming(piece.path):
-                try:
-                    table = self._rows(piece, columns, None if whole else names)
-                except Gone:
-                    merged = [p for p in _pieces_beside(piece) if p.path not in known]
-                    if not merged:
-                        raise
-                    known.update(p.path for p in merged)
-                    waiting = deque(sorted([*waiting, *merged], key=_reading_order))
-                    continue
-                skipped = max(0, reached - piece.start)
-                reached = piece.stop
-                shown = table.column_names if names is None else [n for n in names if n in table.column_names]
-                yield {name: as_array(table[name])[skipped:] for name in shown}
-
-    def _rows(self, piece: Part, columns: Sequence[str] | None, names: Keys[str] | None) -> pa.Table:
-        """The columns `names` of a piece that are there, all where it is None; it must have the `columns`."""
-        table = self._kept.get(piece.path)
-        if table is None:
-            table = piece.read(names)[1]
-            if names is None:
-                self._keep(piece.path, table)
-        if lacking := [name for name in columns or () if name not in table.column_names]:
-            raise Unusable(f"damaged: has no column {lacking[0]}")
-        return table
-
-    def _keep(self, path: Path, table: pa.Table) -> None:
-        self._kept[path] = table
-        self._kept_bytes += table.nbytes
-        while self._kept_bytes > _KEPT_BYTES:
-            self._kept_bytes -= self._kept.pop(next(iter(self._kept))).nbytes
+        """The same some rows at a time: each chunk but the last has that many."""
+        whole = self.load(cell, columns, optional)
+        for at in range(0, len(whole["trial"]), rows):
+            yield {name: values[at : at + rows] for name, values in whole.items()}
 
     def load_history(self, cell: StoredCell, columns: Sequence[str]) -> dict[str, Array] | None:
-        """The iterates of a cell's first trials in order; None where none are stored."""
-        for directory in self.directories:
-            path = Store(directory).histories / f"{cell.key}.parquet"
-            if path in self.damaged or not path.is_file():
-                continue
-            with self.naming(path):
-                table = self._kept[path] if path in self._kept else read_history(path)[1]
-                return {name: as_array(table[name]) for name in ("trial", *columns)}
-        return None
+        """The iterates of a cell's first trials in order; None if none are stored."""
+
+        def first(parts: Sequence[Part]) -> bytes | None:
+            for part in parts[:1]:
+                with self._naming(part.path):
+                    return part.history() if part.start == 0 else None
+            return None
+
+        history = self._trying(cell, first)
+        if history is None:
+            return None
+        found = decoded_history(history)
+        return {name: found[name] for name in ("trial", *columns)}
 
 
-def _reading_order(piece: Part) -> tuple[int, int, str]:
-    """Of two that begin with the same trial, the longer one first: what lies within it need not be read."""
-    return piece.start, -piece.stop, str(piece.path)
-
-
-def _pieces_beside(gone: Part) -> list[Part]:
-    """The pieces of the same cell in its folder that hold some of its trials."""
-    found = [Part.parse(path) for path in gone.path.parent.glob(f"{gone.key}-*-*.parquet")]
-    return [piece for piece in found if piece.start < gone.stop and piece.stop > gone.start]
-
-
-def _joined(parts: list[dict[str, Array]]) -> dict[str, Array]:
-    """Rows one after another; where some lack a column, it is NaN or None there. The parts are used up."""
-    if len(parts) == 1:
-        return parts[0]
-    lengths = [len(part["trial"]) for part in parts]
-    names = list(dict.fromkeys(name for part in parts for name in part))
-    return {
-        # Each column is copied: the first copy need not outlive the second.
-        name: _concatenated([part.pop(name, None) for part in parts], lengths)
-        for name in names
-    }
-
-
-def _concatenated(columns: Sequence[Array | None], lengths: Sequence[int]) -> Array:
-    kinds = {column.dtype.kind for column in columns if column is not None}
-    nothing = np.nan if kinds <= set("fiu") else None
-    return np.concatenate(
-        [np.full(n, nothing) if column is None else column for column, n in zip(columns, lengths, strict=True)]
-    )
-
-
-def _names_aside(path: Path) -> Iterator[Path]:
-    yield path.with_suffix(".damaged")
-    for number in itertools.count(2):
-        yield path.with_suffix(f".damaged-{number}")
+def _written(cell: StoredCell) -> float:
+    """When the youngest of its files was written; 0 if they went away meanwhile."""
+    times = [0.0]
+    for part in cell.parts:
+        with contextlib.suppress(OSError):
+            times.append(part.path.stat().st_mtime)
+    return max(times)
 
 
 def require_results(directories: Iterable[Path | str]) -> None:

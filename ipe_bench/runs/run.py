@@ -12,6 +12,7 @@ import subprocess
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -20,12 +21,12 @@ from ipe_bench.basics.errors import StorageError, UserError
 from ipe_bench.basics.machine import cores, library_versions
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.runs.compaction import compact
 from ipe_bench.runs.execution import Execution, Serial
-from ipe_bench.runs.provenance import describe, fingerprint
+from ipe_bench.runs.parts import TRUTH
+from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.schedule import RunLog, Watcher, block_size_for, plan, run_task, run_tasks
-from ipe_bench.runs.store import TRUTH, ResultKey, Store
+from ipe_bench.runs.store import ResultKey, Store, compact
 from ipe_bench.trials.bounds import linear_bound
 from ipe_bench.trials.scenario import Scenario
 
@@ -89,7 +90,7 @@ def compute(
             log.warning(line)
         failures = run_tasks(tasks, execution, store, watch or (lambda progress: None), log)
         store.require()
-        gone, hindrances = compact(store, {cell.key for part in cells for cell in part}, execution)
+        gone, hindrances = compact(store.directory, {cell.key for part in cells for cell in part}, execution)
         for line in [f"{gone} small files were merged into larger ones"] * bool(gone) + hindrances:
             log.info(line)
     if not (store.runs / f"{identifier}.json").is_file():
@@ -185,9 +186,41 @@ def new_name() -> str:
 
 def _write_record(store: Store, record: Mapping[str, Any], identifier: str) -> str:
     """States what is going to be computed, so that what is missing later is known to be missing; returns its name."""
-    now = datetime.datetime.now(datetime.UTC)
-    store.write_run(identifier, {"started": now.isoformat(timespec="microseconds"), **record})
+    store.write_run(identifier, {"started": _now(), **record})
     return identifier
+
+
+def record_refusal(
+    output: Path | str,
+    job: str,
+    reason: str,
+    scenario: Scenario | None = None,
+    estimators: Mapping[str, Estimator] = MappingProxyType({}),
+    trials: int = 1,
+) -> None:
+    """Notes in a folder that a job of a sweep was asked for and refused, if the folder holds results.
+
+    `job` tells it from the others; `accept` takes the note back. Scenario and estimators are given if the job came to
+    them.
+    """
+    store = Store(Path(output))
+    if store.trials.is_dir():
+        store.prepare()
+        record = {"started": _now(), **_record([scenario] if scenario else [], estimators, trials)}
+        store.write_run(_refusal(job), {**record, "job": job, "refused": reason})
+
+
+def accept(output: Path | str, job: str) -> None:
+    """Takes back what `record_refusal` noted of a job."""
+    (Store(Path(output)).runs / f"{_refusal(job)}.json").unlink(missing_ok=True)
+
+
+def _refusal(job: str) -> str:
+    return f"refused-{digest(job)}"
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="microseconds")
 
 
 def _record(scenarios: Sequence[Scenario], estimators: Mapping[str, Estimator], trials: int) -> dict[str, Any]:

@@ -26,9 +26,9 @@ from threadpoolctl import ThreadpoolController
 from ipe_bench.basics.containment import contained
 from ipe_bench.estimators.base import estimate_safely
 from ipe_bench.runs.execution.base import FATAL, Execution, Failure
-from ipe_bench.runs.provenance import class_modules, describe, fingerprint
+from ipe_bench.runs.provenance import class_modules, describe, digest, fingerprint
 from ipe_bench.runs.results import Results
-from ipe_bench.runs.store import ResultKey, Store, describe_names, digest
+from ipe_bench.runs.store import ResultKey, Store, describe_names
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import HISTORIES, Block
 
@@ -210,9 +210,10 @@ def _compute_cell(store: Store, block: Block, cell: ResultKey, process: int) -> 
     finally:
         _end_if_forked(process)
     store.require()
+    history = None
     if start == 0 and estimates.history is not None:
-        store.write_history(cell, _history_columns(cell.scenario, estimates.history[:HISTORIES]))
-    store.write(cell, start, stop, columns)
+        history = _history_columns(cell.scenario, estimates.history[:HISTORIES])
+    store.write(cell, start, stop, columns, history)
 
 
 def _check_source(cells: Sequence[ResultKey]) -> None:

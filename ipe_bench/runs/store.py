@@ -1,47 +1,47 @@
-"""Results are written here: one Parquet file per scenario, estimator and block, found again by what was computed.
+"""Results are written here: blocks of trials as they come, and one file per result made of them at the end of a run.
 
-A file's name is a digest of the constructed objects and of the numerical source; how many trials there are
-and how they were cut into blocks is not part of it, so the results of one key are a union of ranges. A file appears
-under its name complete or not at all. Reading is left to `runs.results`, to make few files of many to
-`runs.compaction`.
+    OUTPUT/trials/KEY-START-STOP.parquet   rows of trials START to STOP of a scenario under an estimator, or its truth
+    OUTPUT/runs/RUN.json                   what a run was asked for
+    OUTPUT/failed/KEY-START-STOP.json      trials that could not be computed, and why
+
+KEY is a digest of the constructed objects and of the numerical source, so how many trials there are and how they were
+cut into blocks changes nothing: the rows of one key are a union of ranges. Every file appears complete or not at all,
+and no locks are needed. What is there is said by `runs.results`.
 """
 
 from __future__ import annotations
 
 import contextlib
 import datetime
-import hashlib
 import json
+import os
 import socket
 import tempfile
 import time
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection as Keys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from ipe_bench.basics.errors import StorageError, UserError
 from ipe_bench.basics.files import BLANK_SEAL, seal, write_bytes
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import library_versions
 from ipe_bench.estimators.base import Estimator
-from ipe_bench.runs.execution.base import Failure
-from ipe_bench.runs.provenance import canonical_json, describe, fingerprint
-from ipe_bench.runs.rows import Rule, cast, faults, history_rules, trial_rules
+from ipe_bench.runs import parts
+from ipe_bench.runs.execution.base import Execution, Failure
+from ipe_bench.runs.parts import SCHEMA, TRUTH, Part, encoded_history, table_of
+from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.trials.bounds import linear_bound
 from ipe_bench.trials.scenario import Scenario
 
-SCHEMA = 2
-FOOTER = b"ipe_bench"
-TRUTH = "truth"
-"""Stands in place of an estimator's label in the files that hold the truth and its bounds."""
 _ABANDONED_S = 3600.0
-"""A file that somebody began to write so long ago will not be finished."""
+"""Age of a temporary file that nobody will finish."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class ResultKey:
 
         Not for the version: a release that changes no number leaves what is stored valid.
         """
-        return key_of(self.identity, self.made_by["source"])
+        return digest({"schema": SCHEMA, "identity": self.identity, "source": self.made_by["source"]})
 
     @cached_property
     def identity_key(self) -> str:
@@ -72,6 +72,7 @@ class ResultKey:
 
     @cached_property
     def made_by(self) -> dict[str, Any]:
+        """The versions of the packages and the digest of the numerical source."""
         return fingerprint([self.scenario] if self.estimator is None else [self.scenario, self.estimator])
 
     @property
@@ -87,11 +88,6 @@ class ResultKey:
             "seed": scenario.seed,
             "estimator": self.label,
         }
-
-    @property
-    def parameters(self) -> list[str]:
-        """The names of the parameters."""
-        return [p.name for p in self.scenario.measurement.parameters]
 
     @cached_property
     def footer(self) -> dict[str, Any]:
@@ -123,23 +119,12 @@ def first_sentence(component: Any) -> str:
     return "" if words.startswith(f"{kind.__name__}(") else words.partition(". ")[0].rstrip(".")
 
 
-def digest(value: Any) -> str:
-    """Sixteen hexadecimal digits that stand for plain data."""
-    return hashlib.sha256(canonical_json(value).encode()).hexdigest()[:16]
-
-
-def key_of(identity: Mapping[str, Any], source: str) -> str:
-    """The key of a cell; see `ResultKey.key`."""
-    return digest({"schema": SCHEMA, "identity": identity, "source": source})
-
-
 class Store:
     """The results under one output directory."""
 
     def __init__(self, directory: Path | str) -> None:
         self.directory = Path(directory)
         self.trials = self.directory / "trials"
-        self.histories = self.directory / "histories"
         self.runs = self.directory / "runs"
         self.failed = self.directory / "failed"
 
@@ -173,28 +158,50 @@ class Store:
         if not self.trials.is_dir():
             raise StorageError(f"{self.directory}: went away while it was being filled; the same command starts anew")
 
-    def write(self, cell: ResultKey, start: int, stop: int, columns: Mapping[str, Array]) -> Path:
-        """Stores the rows of trials start to stop.
+    def parts(self, keys: Keys[str] | None = None) -> dict[str, list[Part]]:
+        """The parts that lie here, or those of these keys, by key in the order of reading."""
+        found: dict[str, list[Part]] = {}
+        for name in os.listdir(self.trials) if self.trials.is_dir() else ():
+            part = Part.parse(self.trials / name)
+            if part is not None and (keys is None or part.key in keys):
+                found.setdefault(part.key, []).append(part)
+        return {key: sorted(several, key=lambda part: part.order) for key, several in sorted(found.items())}
+
+    def write(
+        self,
+        result: ResultKey,
+        start: int,
+        stop: int,
+        columns: Mapping[str, Array],
+        history: Mapping[str, Array] | None = None,
+    ) -> Path:
+        """Stores the rows of trials start to stop, with the iterates of the first trials of all if there are any.
 
         Raises:
-            ValueError: they are not what rows of trials are, and would be refused when they are read.
+            ValueError: the rows are not those of these trials.
         """
-        path = self.trials / f"{cell.key}-{start}-{stop}.parquet"
-        self._write(path, cell, columns, trial_rules(cell.parameters, truth=cell.estimator is None), start)
+        if not np.array_equal(columns["trial"], np.arange(start, stop)):
+            raise ValueError(f"{describe_names(result.names)}: its trials do not count from {start} to {stop}")
+        path = self._path(result, start, stop)
+        table = table_of({name: _typed(name, np.asarray(values)) for name, values in columns.items()})
+        parts.write(path, table, result.footer, None if history is None else encoded_history(history))
         with contextlib.suppress(OSError):
-            (self.failed / f"{cell.key}-{start}-{stop}.json").unlink()
+            self._failure(result, start, stop).unlink()
         return path
 
-    def has(self, cell: ResultKey, start: int, stop: int) -> bool:
-        """Whether exactly this block of this cell is stored."""
-        return (self.trials / f"{cell.key}-{start}-{stop}.parquet").is_file()
+    def _path(self, result: ResultKey, start: int, stop: int) -> Path:
+        return self.trials / f"{result.key}-{start}-{stop}.parquet"
 
-    def write_failure(self, cell: ResultKey, start: int, stop: int, failure: Failure) -> Path:
+    def has(self, result: ResultKey, start: int, stop: int) -> bool:
+        """Whether exactly this block is stored."""
+        return self._path(result, start, stop).is_file()
+
+    def write_failure(self, result: ResultKey, start: int, stop: int, failure: Failure) -> Path:
         """States that these trials could not be computed, and why; the next run tries them again."""
         record = {
-            "key": cell.key,
-            "identity_key": cell.identity_key,
-            "names": cell.names,
+            "key": result.key,
+            "identity_key": result.identity_key,
+            "names": result.names,
             "start": start,
             "stop": stop,
             "status": failure.status,
@@ -203,83 +210,116 @@ class Store:
             "when": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "host": socket.gethostname(),
         }
-        path = self.failed / f"{cell.key}-{start}-{stop}.json"
-        return self._write_json(path, record)
+        return _write_json(self._failure(result, start, stop), record)
 
-    def write_history(self, cell: ResultKey, columns: Mapping[str, Array]) -> Path:
-        """Stores the iterates of the first trials."""
-        path = self.histories / f"{cell.key}.parquet"
-        self._write(path, cell, columns, history_rules(cell.parameters))
-        return path
-
-    def _write(
-        self,
-        path: Path,
-        cell: ResultKey,
-        columns: Mapping[str, Array],
-        rules: Mapping[str, Rule],
-        start: int | None = None,
-    ) -> None:
-        rows = cast(columns, rules)
-        for fault in faults(rows, rules, start):
-            raise ValueError(f"{describe_names(cell.names)}: what is to be stored {fault}")
-        content = encode(rows, cell.footer)
-        write_bytes(path, content)
+    def _failure(self, result: ResultKey, start: int, stop: int) -> Path:
+        return self.failed / f"{result.key}-{start}-{stop}.json"
 
     def write_run(self, identifier: str, record: Mapping[str, Any]) -> Path:
         """States, before any work, what a run is going to compute."""
-        path = self.runs / f"{identifier}.json"
-        return self._write_json(path, {"run": identifier, **record})
+        return _write_json(self.runs / f"{identifier}.json", {"run": identifier, **record})
 
     def same_run(self, record: Mapping[str, Any]) -> str | None:
-        """The name of a stored record that says the same, and after which nothing else was asked of its cells; None
-        where there is none. A run that has nothing to compute needs no further record then."""
+        """The name of a stored record that says the same, and after which nothing else was asked of its results; None
+        if there is none. A run that has nothing to compute needs no other record then."""
         record = json.loads(json.dumps(record, default=str))
         keys = {cell["identity_key"]: cell["key"] for cell in record["cells"]}
         for path in sorted(self.runs.glob("*.json"), reverse=True):
-            try:
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
                 known = json.loads(path.read_text(encoding="utf-8"))
                 if all(known.get(name) == value for name, value in record.items()):
                     return path.stem
                 if any(keys.get(cell["identity_key"], cell["key"]) != cell["key"] for cell in known["cells"]):
                     return None
-            except (OSError, ValueError, KeyError, TypeError, AttributeError):
-                continue
         return None
 
-    def _write_json(self, path: Path, record: Mapping[str, Any]) -> Path:
-        text = json.dumps({"schema": SCHEMA, **record, "seal": BLANK_SEAL}, indent=1, default=str)
-        content = seal(text.encode())
-        write_bytes(path, content)
-        return path
+
+def _typed(name: str, values: Array) -> Array:
+    """A column in one type for all blocks: numbers that are no counts of trials and iterations are floats."""
+    if values.dtype.kind in "fiu" and name not in ("trial", "iterations"):
+        return values.astype(np.float64)
+    return values.astype(np.int64) if values.dtype.kind in "iu" else values
 
 
-def encode(columns: Mapping[str, Array], footer: Mapping[str, Any]) -> bytes:
-    """A Parquet file with these columns and this footer, and the digest of all of it."""
-    metadata = {FOOTER: canonical_json(footer).encode(), b"seal": BLANK_SEAL.encode()}
-    table = pa.Table.from_arrays([_arrow(v) for v in columns.values()], names=list(columns), metadata=metadata)
-    # Texts are few different ones, numbers are all different and alike in their first bytes.
-    texts = [field.name for field in table.schema if pa.types.is_string(field.type)]
-    floats = [field.name for field in table.schema if pa.types.is_floating(field.type)]
-    how: dict[str, Any] = {"compression": "lz4", "use_dictionary": texts, "use_byte_stream_split": floats}
-    buffer = pa.BufferOutputStream()
-    pq.write_table(table, buffer, write_statistics=False, **how)
-    return seal(buffer.getvalue().to_pybytes())
+def _write_json(path: Path, record: Mapping[str, Any]) -> Path:
+    text = json.dumps({"schema": SCHEMA, "file": path.stem, **record, "seal": BLANK_SEAL}, indent=1, default=str)
+    write_bytes(path, seal(text.encode()))
+    return path
 
 
-def _arrow(values: Array) -> pa.Array:
-    """A column as Arrow stores it. `pa.array` would import pandas, a second that a worker can do without."""
-    values = np.ascontiguousarray(values)
-    if values.dtype == object:
-        texts = [str(value).encode() for value in values]
-        ends = np.cumsum([0, *(len(text) for text in texts)], dtype=np.int32)
-        return pa.Array.from_buffers(
-            pa.string(), len(values), [None, pa.py_buffer(ends.tobytes()), pa.py_buffer(b"".join(texts))]
-        )
-    if values.dtype == bool:
-        bits = np.packbits(values, bitorder="little")
-        return pa.Array.from_buffers(pa.bool_(), len(values), [None, pa.py_buffer(bits.tobytes())])
-    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), len(values), [None, pa.py_buffer(values.tobytes())])
+@dataclass(frozen=True)
+class Merge:
+    """A task: the parts of one result, which become one part for each range without gaps."""
+
+    directory: Path
+    key: str
+
+    @property
+    def trusted(self) -> bool:
+        """Whether it runs code of this package alone: it does."""
+        return True
+
+
+def compact(directory: Path, keys: Keys[str], execution: Execution) -> tuple[int, list[str]]:
+    """Makes one part of the parts of each result; returns how many files are gone, and what stood in the way.
+
+    It may be stopped, or done twice, at any moment, while others read and write in the folder.
+    """
+    tasks = [Merge(directory, key) for key, several in Store(directory).parts(keys).items() if len(several) > 1]
+    gone, hindrances = 0, []
+    try:
+        for event in execution.run(merge, tasks) if tasks else ():
+            gone += 0 if event.ended else int(event.step)
+            if event.failure is not None:
+                hindrances.append(event.failure.message)
+    except StorageError as error:
+        hindrances.append(str(error))
+    return gone, hindrances
+
+
+def merge(task: Merge) -> Iterator[int]:
+    """Does one merge, and yields how many files are gone.
+
+    A part is on the disk and was read back before those go whose rows it holds, so that nothing is lost on the way;
+    until they do, a reader takes each trial once.
+
+    Raises:
+        Unusable: a part is damaged; all stay as they are.
+        StorageError: the folder cannot be written to any more; everything that was there is there.
+    """
+    gone = 0
+    group: list[Part] = []
+    tables: list[pa.Table] = []
+    reached, footer = 0, None
+    with contextlib.suppress(FileNotFoundError):  # another run merges the same
+        for part in Store(task.directory).parts({task.key}).get(task.key, []):
+            found, table = part.read()
+            if group and (part.start > reached or found != footer):
+                gone += _join(group, tables)
+                group, tables = [], []
+            fresh = table.slice(max(0, reached - part.start) if group else 0)
+            group.append(part)
+            tables.append(fresh)
+            reached, footer = max(reached, part.stop) if len(group) > 1 else part.stop, found
+        gone += _join(group, tables)
+    yield gone
+
+
+def _join(group: Sequence[Part], tables: Sequence[pa.Table]) -> int:
+    """Writes one part with the rows of a group, unless there is one, and removes the others; returns their number."""
+    if len(group) < 2:
+        return 0
+    first, stop = group[0], max(part.stop for part in group)
+    whole = replace(first, path=first.path.with_name(f"{first.key}-{first.start}-{stop}.parquet"), stop=stop)
+    if whole not in group:
+        table = pa.concat_tables(tables, promote_options="default")
+        parts.write(whole.path, table, first.read(())[0], first.history(), lasting=True)
+    whole.read()
+    others = [part.path for part in group if part != whole]
+    for path in others:
+        with contextlib.suppress(OSError):  # another run may have done so; what stays is read once all the same
+            path.unlink()
+    return len(others)
 
 
 def gaps(covered: Iterable[tuple[int, int]], start: int, stop: int) -> list[tuple[int, int]]:
@@ -295,19 +335,19 @@ def gaps(covered: Iterable[tuple[int, int]], start: int, stop: int) -> list[tupl
 
 
 def title(names: Mapping[str, Any]) -> str:
-    """The scenario of a cell in a line for people."""
+    """The scenario of a result in a line for people."""
     scale, truth = names.get("error_scale"), names.get("truth_measurement")
-    parts = [
+    words = [
         names.get("measurement"),
         None if truth is None else f"truth {truth}",
         names.get("noise"),
         None if scale is None else f"error scale {scale:g}",
         f"seed {names.get('seed')}",
     ]
-    return ", ".join(str(part) for part in parts if part is not None)
+    return ", ".join(str(word) for word in words if word is not None)
 
 
 def describe_names(names: Mapping[str, Any]) -> str:
-    """A cell in a line for people."""
+    """A result in a line for people."""
     estimator = "the truth" if names.get("estimator") == TRUTH else str(names.get("estimator"))
     return f"{estimator} on {title(names)}"

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ipe_bench.runs.provenance import TARGET, canonical_json
+from ipe_bench.runs.parts import TRUTH
+from ipe_bench.runs.provenance import TARGET, canonical_json, digest
 from ipe_bench.runs.results import Results, Run, StoredCell
-from ipe_bench.runs.store import TRUTH, digest
 
 if TYPE_CHECKING:
     import pandas as pd

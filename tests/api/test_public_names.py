@@ -141,7 +141,7 @@ def test_mistakes_in_an_estimate_are_one_line(polynomial, arguments, options, wo
 def test_status_and_report_agree_and_the_report_is_still_a_function_afterwards(tmp_path, polynomial):
     ib.run(polynomial, {"newton": ib.solvers.Newton()}, 10, output=tmp_path, block_size=5)
     assert ib.status(tmp_path).attrs["problems"] == []
-    next((tmp_path / "trials").glob("*-5-10.parquet")).unlink()
+    next((tmp_path / "trials").glob("*-0-10.parquet")).unlink()
     problems = ib.status(tmp_path).attrs["problems"]
     assert len(problems) == 1
     for _ in range(2):  # the second call finds the room `report` where the function was

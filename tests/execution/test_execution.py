@@ -38,11 +38,11 @@ def stored(directory: Path) -> dict[str, np.ndarray]:
     """Every number that a run stored, timings aside, by file and column."""
     numbers = {}
     for cell in Results.read([directory]).stored.values():
-        for piece in cell.pieces:
-            _, table = piece.read()
+        for part in cell.parts:
+            _, table = part.read()
             for name in table.column_names:
                 if name != "time_s":
-                    numbers[f"{piece.path.name}:{name}"] = table[name].to_numpy()
+                    numbers[f"{part.path.name}:{name}"] = table[name].to_numpy()
     return numbers
 
 

@@ -14,6 +14,7 @@ import ipe_bench.runs.provenance
 from ipe_bench import Scenario
 from ipe_bench.baselines import LinearLSE
 from ipe_bench.basics.errors import UserError
+from ipe_bench.cli.main import main
 from ipe_bench.cli.status import main as status
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
@@ -51,17 +52,17 @@ def test_a_complete_run_is_complete(tmp_path, capsys):
 
 def test_a_block_that_is_gone_is_missing_and_a_cut_one_is_damaged(tmp_path, capsys):
     compute([SCENARIO], ESTIMATORS, 30, tmp_path, block_size=10)
-    gone, cut, *_ = sorted((tmp_path / "trials").glob("*.parquet"))
+    gone, cut = sorted((tmp_path / "trials").glob("*.parquet"))
     gone.unlink()
     cut.write_bytes(cut.read_bytes()[:100])
     results = Results.read([tmp_path])
     assert list(results.damaged) == [cut]
-    assert sorted((c.done, c.missing, c.failed) for c in results.cells) == [(10, 20, 0), (30, 0, 0)]
+    assert [(c.done, c.missing, c.failed) for c in results.cells] == [(0, 30, 0)] * 2
     assert status([str(tmp_path)]) == 1
     assert "damaged" in capsys.readouterr().out
     compute([SCENARIO], ESTIMATORS, 30, tmp_path, block_size=10)
     assert Results.read([tmp_path]).problems == []
-    assert cut.with_suffix(".damaged").exists()
+    assert len(list(cut.parent.glob(f"{cut.stem}.damaged-*"))) == 1
 
 
 def test_results_of_other_source_are_stale_and_not_done(tmp_path, monkeypatch):
@@ -72,6 +73,23 @@ def test_results_of_other_source_are_stale_and_not_done(tmp_path, monkeypatch):
     monkeypatch.setattr("ipe_bench.runs.schedule.fingerprint", changed)
     compute([dataclasses.replace(SCENARIO)], ESTIMATORS, 10, tmp_path)
     assert [(c.expected, c.done, c.stale) for c in Results.read([tmp_path]).cells] == [(10, 10, 20), (10, 10, 20)]
+
+
+def test_a_refused_job_of_a_sweep_stays_in_the_books_until_it_is_accepted(tmp_path, capsys, monkeypatch):
+    output, sweep = f"output={tmp_path}", ["run", "-m", "measurement=polynomial", "noise=gaussian", "trials=5"]
+    sweep += ["solver=[]", "figures=none", "execution=serial", output]
+    job = "measurement=polynomial noise=gaussian noise.deviation=1e-102"
+    assert main([*sweep, "noise.deviation=0.02,1e-102"]) == 2
+    assert f"choose another scale of the noise (refused: {job})" in capsys.readouterr().err
+    assert main(["status", str(tmp_path)]) == 1
+    assert f"refused: {job}: noise=gaussian" in capsys.readouterr().out.replace("\n", "")
+    results = Results.read([tmp_path])
+    assert (results.complete, results.expected) == (2, 4)
+    assert f"refused: {job}" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    monkeypatch.setattr("ipe_bench.runs.run.LARGEST", 1e300)
+    assert main([*sweep, "noise.deviation=0.02,1e-102"]) == 0
+    results = Results.read([tmp_path])
+    assert (results.complete, results.expected, results.problems) == (4, 4, [])
 
 
 def test_a_folder_without_results_is_a_mistake(tmp_path):

@@ -5,14 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
 from ipe_bench.cli.main import main
 from ipe_bench.report import figures
-from ipe_bench.runs.columns import as_array
 
 
 def run(folder: Path, *more: str) -> int:
@@ -107,29 +103,3 @@ def test_a_damaged_file_is_named_however_often_the_report_was_made(
     for _ in range(2):
         assert main(["report", str(tmp_path), "figures=none"]) == 1
         assert "0123456789abcdef-0-4.parquet" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("cut", [slice(None), slice(3, 11), slice(0, 0)])
-def test_columns_are_read_as_arrow_reads_them(tmp_path: Path, cut: slice) -> None:
-    rng = np.random.default_rng(1)
-    columns = {
-        "number": pa.array(rng.normal(size=20)),
-        "count": pa.array(np.arange(20)),
-        "small": pa.array(np.arange(20, dtype=np.int8)),
-        "flag": pa.array(rng.random(20) < 0.5),
-        "text": pa.array([f"trial {i}" for i in range(20)]),
-        "gaps": pa.array([None if i % 3 == 0 else float(i) for i in range(20)]),
-        "rare": pa.array([None if i % 3 == 0 else str(i) for i in range(20)]),
-    }
-    table = pa.table(columns)
-    path = tmp_path / "columns.parquet"
-    pq.write_table(table, path)
-    read = pq.read_table(path).slice(cut.start or 0, len(range(20)[cut]))
-    joined = pa.concat_tables([read, read])
-    for name in columns:
-        for part in (read, joined):
-            expected, found = part[name].to_numpy(), as_array(part[name])
-            assert len(expected) == len(found)
-            if len(expected):
-                assert found.dtype == expected.dtype
-                np.testing.assert_array_equal(found, expected)

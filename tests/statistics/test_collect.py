@@ -1,6 +1,5 @@
 """Whatever lies in a directory is used or named, and nothing is touched."""
 
-import json
 import shutil
 
 import numpy as np
@@ -10,9 +9,10 @@ import pytest
 from synthetic_store import Pretender
 
 from ipe_bench.basics.errors import UserError
+from ipe_bench.runs import parts
 from ipe_bench.runs.execution.base import Failure
+from ipe_bench.runs.provenance import digest
 from ipe_bench.runs.results import merge_ranges
-from ipe_bench.runs.store import FOOTER, encode, key_of
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.collect import collect, config_leaves, differing
 
@@ -77,37 +77,33 @@ def test_damaged_data_behind_an_intact_footer_is_named(filled):
     assert any(str(path) in line and "damaged" in line for line in analysis.problems)
 
 
-def test_foreign_files_are_named_and_skipped(filled):
+def test_foreign_files_under_our_names_are_named_and_skipped(filled):
     trials = filled.store.trials
     pq.write_table(pa.table({"x": [1.0]}), trials / "weather.parquet")
     pq.write_table(pa.table({"x": [1.0]}), trials / "0123456789abcdef-0-1.parquet")
-    pq.write_table(
-        pa.table({"x": [1.0]}).replace_schema_metadata({FOOTER: b'{"a": 1}'}), trials / "0123456789abcdef-1-2.parquet"
-    )
+    parts.write(trials / "0123456789abcdef-1-2.parquet", pa.table({"trial": [1]}), {"key": "another"})
     shutil.copy(pieces(filled)[0], trials / "fedcba9876543210-0-20.parquet")
     (filled.store.runs / "note.json").write_text("[1, 2]")
     analysis = analyse([filled.directory])
-    assert sum("foreign" in line for line in analysis.problems) == 5
+    assert len(analysis.problems) == 4
     assert (analysis.summary["trials"] == 60).all()
     assert (trials / "weather.parquet").exists()
 
 
 def test_a_file_with_fewer_rows_than_its_name_says_is_damaged(filled):
     path = pieces(filled)[0]
-    table = pq.read_table(path).slice(0, 5)
-    rows = {name: table[name].to_numpy() for name in table.column_names}
-    path.write_bytes(encode(rows, json.loads(table.schema.metadata[FOOTER])))
-    assert any("has 5 of 20 rows" in line for line in collect([filled.directory]).problems)
+    footer, table = parts.Part.parse(path).read()
+    parts.write(path, table.slice(0, 5), footer)
+    assert any("does not count from 0 to 20" in line for line in collect([filled.directory]).problems)
 
 
 def test_stale_results_are_named_and_never_mixed_in(filled):
     # The same identity under the key of another source, as older code would have stored it.
     for path in pieces(filled):
-        table = pq.read_table(path)
-        footer = json.loads(table.schema.metadata[FOOTER])
-        footer |= {"key": key_of(footer["identity"], "old"), "source": "old"}
-        rows = {name: table[name].to_numpy() for name in table.column_names} | {"error_a": np.full(20, 1e9)}
-        path.with_name(path.name.replace(path.name[:16], footer["key"])).write_bytes(encode(rows, footer))
+        footer, table = parts.Part.parse(path).read()
+        footer = {**footer, "key": digest("of older code"), "source": "old"}
+        table = table.set_column(table.column_names.index("error_a"), "error_a", [np.full(20, 1e9)])
+        parts.write(path.with_name(path.name.replace(path.name[:16], footer["key"])), table, footer)
     analysis = analyse([filled.directory])
     assert not analysis.problems
     (line,) = analysis.stale

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from ipe_bench.runs.execution.base import Event, Task, Work
+from ipe_bench.runs.execution.base import Event, Limits, Task, Work
 from ipe_bench.runs.execution.processes import Processes
 from ipe_bench.runs.execution.serial import Serial
 
@@ -18,8 +18,7 @@ class Auto(Processes):
     """
 
     def run(self, work: Work, tasks: Sequence[Task]) -> Iterator[Event]:
-        limited = self.block_timeout_s is not None or self.memory_limit_gb is not None
-        if len(tasks) == 1 and not limited and tasks[0].trusted:
+        if len(tasks) == 1 and self.limits == Limits() and tasks[0].trusted:
             return Serial().run(work, tasks)
         return super().run(work, tasks)
 

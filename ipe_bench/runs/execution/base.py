@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -31,6 +32,28 @@ _LONGEST = 1e9
 """Seconds, and 1e9 bytes, beyond which no limit is meant: thirty years, and more memory than there is."""
 Limit = Annotated[float, Gt(0), Lt(_LONGEST), doc(f"a number above 0 and below {_LONGEST:g}")]
 """Of time or memory."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a task may use."""
+
+    seconds: float | None = None
+    """Time between two of its steps."""
+    memory_gb: float | None = None
+    """Memory of the process that it runs in, in 1e9 bytes; Linux only."""
+
+    def enforce(self) -> None:
+        """Has every allocation of this process beyond the limit end in a MemoryError."""
+        if sys.platform.startswith("linux"):
+            import resource
+
+            # Data, not address space: compiled code and thread pools reserve far more addresses than they use.
+            _, most = resource.getrlimit(resource.RLIMIT_DATA)
+            resource.setrlimit(
+                resource.RLIMIT_DATA, (most if self.memory_gb is None else int(self.memory_gb * 1e9), most)
+            )
+
 
 FATAL = (UserError, StorageError)
 """Exceptions that concern the whole run: they end it, where any other is a failure of one task."""

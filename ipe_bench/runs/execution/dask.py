@@ -20,7 +20,7 @@ import cloudpickle
 from ipe_bench.basics.errors import StorageError, UserError, describe_exception
 from ipe_bench.basics.machine import cores
 from ipe_bench.basics.options import Count
-from ipe_bench.runs.execution.base import FATAL, Event, Execution, Failure, Limit, Task, Work
+from ipe_bench.runs.execution.base import FATAL, Event, Execution, Failure, Limit, Limits, Task, Work
 from ipe_bench.runs.execution.processes import supervise
 
 log = logging.getLogger(__name__)
@@ -63,10 +63,10 @@ class Dask(Execution):
         client = self._client()
         from distributed import as_completed
 
-        limits = (self.block_timeout_s, self.memory_limit_gb)
+        limits = Limits(self.block_timeout_s, self.memory_limit_gb)
         # As bytes: what a Dask worker cannot unpickle, such as a plugin that it lacks, is then ours to name.
         payloads = [cloudpickle.dumps((work, task)) for task in tasks]
-        futures = {client.submit(_run_one, payload, *limits, pure=False): i for i, payload in enumerate(payloads)}
+        futures = {client.submit(_run_one, payload, limits, pure=False): i for i, payload in enumerate(payloads)}
         heard = threading.Event()
         threading.Thread(target=_say_when_nobody_works, args=(client, heard), daemon=True).start()
         try:
@@ -123,13 +123,13 @@ def _say_when_nobody_works(client: Any, heard: threading.Event) -> None:
                 log.warning(f"execution=dask: the scheduler at {address} has no workers yet; waiting for one")
 
 
-def _run_one(payload: bytes, step_timeout_s: float | None, memory_limit_gb: float | None) -> Any:
+def _run_one(payload: bytes, limits: Limits) -> Any:
     """On a Dask worker: the steps and the failure of one task, done in a process beside it."""
     try:
         work, task = pickle.loads(payload)
     except Exception as error:
         return [], Failure("died", f"{describe_exception(error)}, on {platform.node()}: install the same there")
-    events = list(supervise(work, [task], 1, 1, step_timeout_s, memory_limit_gb))
+    events = list(supervise(work, [task], 1, 1, limits))
     return [event.step for event in events if not event.ended], events[-1].failure
 
 

@@ -31,7 +31,7 @@ import cloudpickle
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.machine import cores
 from ipe_bench.basics.options import Count
-from ipe_bench.runs.execution.base import Event, Execution, Failure, Limit, Task, Work
+from ipe_bench.runs.execution.base import Event, Execution, Failure, Limit, Limits, Task, Work
 
 _THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
@@ -57,36 +57,34 @@ class Processes(Execution):
     block_timeout_s: Limit | None = None
     """Seconds that one estimator may take for one block; None: no limit."""
     memory_limit_gb: Limit | None = None
-    """Memory that one worker may use, in 1e9 bytes; None: no limit. Linux only; see `worker.enforce`."""
+    """Memory that one worker may use, in 1e9 bytes; None: no limit. Linux only."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.memory_limit_gb is not None and not sys.platform.startswith("linux"):
             raise UserError(f"memory_limit_gb={self.memory_limit_gb}: can be enforced on Linux only; give null")
 
+    @property
+    def limits(self) -> Limits:
+        """What one task may use."""
+        return Limits(self.block_timeout_s, self.memory_limit_gb)
+
     def run(self, work: Work, tasks: Sequence[Task]) -> Iterator[Event]:
         workers = min(self.workers or cores(), len(tasks))
         if workers == 0:
             return iter(())
         threads = 1 if self.workers else max(1, cores() // workers)
-        return supervise(work, tasks, workers, threads, self.block_timeout_s, self.memory_limit_gb)
+        return supervise(work, tasks, workers, threads, self.limits)
 
     def warm_up(self, work: Work, tasks: int) -> None:
-        _warm_up(min(self.workers or cores(), tasks), self.memory_limit_gb, work.__module__)
+        _warm_up(min(self.workers or cores(), tasks), work.__module__)
 
 
-def supervise(
-    work: Work,
-    tasks: Sequence[Task],
-    workers: int,
-    threads: int,
-    step_timeout_s: float | None,
-    memory_limit_gb: float | None,
-) -> Iterator[Event]:
+def supervise(work: Work, tasks: Sequence[Task], workers: int, threads: int, limits: Limits) -> Iterator[Event]:
     """Runs tasks in at most so many worker processes with so many threads each; see `Execution.run`.
 
-    `step_timeout_s` bounds the time between two steps of a task; beyond it, its worker is ended. The first step has
-    a minute in any case: a new worker has to load compiled code.
+    A worker whose task exceeds its time is ended. The first step has a minute in any case: a new worker has to load
+    compiled code.
     """
     waiting = deque(range(len(tasks)))
     busy: dict[Connection, _Worker] = {}
@@ -95,9 +93,9 @@ def supervise(
             while waiting and len(busy) < workers:
                 index = waiting.popleft()
                 payload = cloudpickle.dumps((work, tasks[index]))
-                worker = _take(memory_limit_gb)
-                while not worker.begin(index, threads, payload):  # an idle worker may have ended in the meantime
-                    worker = _take(memory_limit_gb)
+                worker = _take()
+                while not worker.begin(index, threads, limits, payload):  # an idle one may have ended in the meantime
+                    worker = _take()
                 busy[worker.connection] = worker
             deadline = min(worker.deadline for worker in busy.values())
             patience = None if deadline == math.inf else max(0.0, deadline - time.monotonic())
@@ -106,9 +104,9 @@ def supervise(
                 kind, value = worker.receive()
                 if kind == "started":
                     worker.started = True
-                    worker.extend(None if step_timeout_s is None else max(step_timeout_s, _PREPARATION_S))
+                    worker.extend(None if limits.seconds is None else max(limits.seconds, _PREPARATION_S))
                 elif kind == "step":
-                    worker.extend(step_timeout_s)
+                    worker.extend(limits.seconds)
                     yield Event(worker.index, value)
                 else:
                     del busy[worker.connection]
@@ -126,7 +124,7 @@ def supervise(
                     continue  # it answered in the last moment
                 del busy[worker.connection]
                 worker.end()
-                failure = Failure("timeout", f"exceeded block_timeout_s={step_timeout_s:g}")
+                failure = Failure("timeout", f"exceeded block_timeout_s={limits.seconds:g}")
                 yield Event(worker.index, ended=True, failure=failure)
     finally:
         for worker in busy.values():
@@ -136,13 +134,10 @@ def supervise(
 class _Worker:
     """One worker process, and what it is doing."""
 
-    def __init__(self, memory_limit_gb: float | None) -> None:
-        self.memory_limit_gb = memory_limit_gb
+    def __init__(self) -> None:
         self.connection, there = Pipe()
         handle = there.fileno()
         command = [sys.executable, "-P", "-m", "ipe_bench.runs.execution.worker", str(handle)]
-        if memory_limit_gb is not None:
-            command.append(str(memory_limit_gb))
         path = os.pathsep.join(p or os.getcwd() for p in sys.path)
         options: dict[str, Any] = {"pass_fds": (handle,)}
         if sys.platform == "win32":
@@ -164,13 +159,13 @@ class _Worker:
         self.started = False
         """Whether it has begun with this one."""
 
-    def begin(self, index: int, threads: int, payload: bytes) -> bool:
+    def begin(self, index: int, threads: int, limits: Limits, payload: bytes) -> bool:
         """Hands it a task; False where the process is no longer there."""
         self.index = index
         self.deadline = math.inf
         self.started = False
         try:
-            self.connection.send((sys.path, threads, payload))
+            self.connection.send((sys.path, threads, (limits, payload)))
         except OSError:
             self.end()
             return False
@@ -224,34 +219,34 @@ def _describe_exit(code: int) -> str:
     return f"was ended by {name}{hint}"
 
 
-_idle: dict[tuple[int, float | None], list[_Worker]] = {}
+_idle: dict[int, list[_Worker]] = {}
+"""By process: workers of another one, that this one was forked from, are not ours."""
 _lock = threading.Lock()
 
 
-def _take(memory_limit_gb: float | None) -> _Worker:
+def _take() -> _Worker:
     """An idle worker, else a new one."""
     with _lock:
-        # Workers of another process, that this one was forked from, are not ours.
-        kept = _idle.setdefault((os.getpid(), memory_limit_gb), [])
+        kept = _idle.setdefault(os.getpid(), [])
         while kept:
             worker = kept.pop()
             if worker.process.poll() is None:
                 return worker
             worker.end()
-    return _Worker(memory_limit_gb)
+    return _Worker()
 
 
 def _give_back(worker: _Worker) -> None:
     worker.served = True
     with _lock:
-        _idle.setdefault((os.getpid(), worker.memory_limit_gb), []).append(worker)
+        _idle.setdefault(os.getpid(), []).append(worker)
 
 
-def _warm_up(workers: int, memory_limit_gb: float | None, module: str) -> None:
+def _warm_up(workers: int, module: str) -> None:
     """Starts workers that are not there yet; they import the module while this process does other things."""
     with _lock:
-        kept = _idle.setdefault((os.getpid(), memory_limit_gb), [])
-        new = [_Worker(memory_limit_gb) for _ in range(workers - len(kept))]
+        kept = _idle.setdefault(os.getpid(), [])
+        new = [_Worker() for _ in range(workers - len(kept))]
         kept += new
     for worker in new:
         worker.preload(module)
@@ -260,6 +255,6 @@ def _warm_up(workers: int, memory_limit_gb: float | None, module: str) -> None:
 @atexit.register
 def end_idle() -> None:
     """Ends the workers that wait for another run, and gives back their memory."""
-    for worker in [w for (pid, _), kept in _idle.items() if pid == os.getpid() for w in kept]:
+    for worker in _idle.get(os.getpid(), ()):
         worker.end()
     _idle.clear()

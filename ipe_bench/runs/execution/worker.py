@@ -1,7 +1,7 @@
-"""The process that a task runs in: `python -m ipe_bench.runs.execution.worker FD [MEMORY_LIMIT_GB]`.
+"""The process that a task runs in: `python -m ipe_bench.runs.execution.worker FD`.
 
-It imports next to nothing before it listens, computes with one thread in BLAS, holds itself to
-`execution.memory_limit_gb`, and ends when its parent ends.
+It imports next to nothing before it listens, computes with one thread in BLAS, holds itself to the limits of a task,
+and ends when its parent ends.
 """
 
 from __future__ import annotations
@@ -16,19 +16,20 @@ import sys
 import threading
 import warnings
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ipe_bench.runs.execution.base import Limits
 
 IDLE_S = 300.0
 """A worker that nobody has used for so long ends by itself."""
 
 
-def main(handle: int, memory_limit_gb: float | None) -> None:
+def main(handle: int) -> None:
     # Ctrl-C is the parent's business: it ends its workers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # Where numbers overflow, the statuses of trials say so.
     warnings.filterwarnings("ignore", category=RuntimeWarning)
-    if memory_limit_gb is not None:
-        enforce(memory_limit_gb)
     connection = _connection(handle)
     messages: queue.SimpleQueue[Any] = queue.SimpleQueue()
     # Reading in a thread, so that the end of the parent is noticed in the middle of a task.
@@ -44,7 +45,7 @@ def main(handle: int, memory_limit_gb: float | None) -> None:
             with contextlib.suppress(Exception):
                 importlib.import_module(payload)
         else:
-            connection.send(_perform(connection, payload))
+            connection.send(_perform(connection, *payload))
 
 
 def _listen(connection: Connection, messages: queue.SimpleQueue[Any]) -> None:
@@ -62,11 +63,12 @@ def _end() -> None:
     os._exit(0)
 
 
-def _perform(connection: Connection, payload: bytes) -> tuple[str, Any]:
+def _perform(connection: Connection, limits: Limits, payload: bytes) -> tuple[str, Any]:
     """Does one task; the last message about it."""
     from ipe_bench.runs.execution.base import FATAL, Failure
 
     try:
+        limits.enforce()
         work, task = pickle.loads(payload)
         connection.send(("started", None))
         for step in work(task):
@@ -86,14 +88,5 @@ def _connection(handle: int) -> Connection:
     return Connection(handle)
 
 
-def enforce(memory_limit_gb: float) -> None:
-    """Has every allocation of this process beyond the limit, in 1e9 bytes, end in a MemoryError."""
-    import resource
-
-    # Data, not address space: compiled code and thread pools reserve far more addresses than they use.
-    limit = int(memory_limit_gb * 1e9)
-    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
-
-
 if __name__ == "__main__":
-    main(int(sys.argv[1]), float(sys.argv[2]) if len(sys.argv) > 2 else None)
+    main(int(sys.argv[1]))

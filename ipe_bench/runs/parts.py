@@ -1,0 +1,218 @@
+"""Stored files: Parquet whose pages carry checksums and whose footer carries a digest, so that each proves what it is.
+
+Parquet's own CRC-32 covers the pages and nothing else; the digest covers the footer, which says where the pages are,
+what they belong to and by what they were made. Which files there are is left to `runs.results`.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import functools
+import json
+import os
+import re
+import stat
+from collections.abc import Collection as Keys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from ipe_bench.basics.files import BLANK_SEAL, is_sealed, seal, write_atomically
+from ipe_bench.basics.linalg import Array
+from ipe_bench.runs.provenance import canonical_json
+
+SCHEMA = 3
+FOOTER, HISTORY = b"ipe_bench", b"history"
+TRUTH = "truth"
+"""Label of the files that hold the truth and its bounds, in place of an estimator's."""
+ROW_GROUP = 1 << 16
+"""Number of rows that are compressed together."""
+_TAIL = 8
+"""Bytes at the end of a Parquet file: the length of the footer, and a mark."""
+_NAME = re.compile(r"([0-9a-f]+)-(\d+)-(\d+)\.parquet")
+
+
+class Unusable(Exception):
+    """A file that does not hold what its name and place promise, with the reason in a line."""
+
+
+class Outdated(Unusable):
+    """A file that an older version wrote."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A stored file with the rows of trials start to stop of one result."""
+
+    path: Path
+    key: str
+    start: int
+    stop: int
+
+    @classmethod
+    def parse(cls, path: Path) -> Part | None:
+        """The part that a file name states; None if it states none."""
+        match = _NAME.fullmatch(path.name)
+        return None if match is None else cls(path, match[1], int(match[2]), int(match[3]))
+
+    @property
+    def order(self) -> tuple[int, int, str]:
+        """The order of reading: of two that begin with the same trial, the longer one first."""
+        return self.start, -self.stop, str(self.path)
+
+    def read(self, columns: Keys[str] | None = None) -> tuple[Mapping[str, Any], pa.Table]:
+        """What the rows belong to, and the rows, without metadata: all columns, or those of `columns` that are there.
+
+        Raises:
+            FileNotFoundError: there is no such file any more.
+            Unusable: the file is damaged, or not one of ours.
+        """
+        with _opened(self.path) as file:
+            footer = _parsed(file.metadata.metadata[FOOTER])
+            names = file.schema_arrow.names
+            table = file.read([n for n in names if columns is None or n in {"trial", *columns}], use_threads=False)
+            if footer["key"] != self.key:
+                raise Unusable(f"damaged: its content belongs to {footer['key']}")
+            if not np.array_equal(as_array(table["trial"]), np.arange(self.start, self.stop)):
+                raise Unusable(f"damaged: its column trial does not count from {self.start} to {self.stop}")
+        return footer, table.replace_schema_metadata(None)
+
+    def history(self) -> bytes | None:
+        """The iterates of its first trials, as `decoded_history` takes them; None if there are none.
+
+        Raises:
+            FileNotFoundError, Unusable: as `read`.
+        """
+        with _opened(self.path) as file:
+            return file.metadata.metadata.get(HISTORY)
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[pq.ParquetFile]:
+    """A file whose footer was held against its digest, and whose pages will be held against their checksums."""
+    try:
+        # A pipe would be waited for, and a link may lead anywhere.
+        if not stat.S_ISREG(os.lstat(path).st_mode):
+            raise Unusable("damaged: is not a plain file")
+        with pa.OSFile(str(path)) as source:
+            _require_sealed(source)
+            with pq.ParquetFile(source, page_checksum_verification=True) as file:
+                yield file
+    except FileNotFoundError:
+        raise
+    except (pa.ArrowException, OSError, KeyError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or type(error).__name__
+        raise Unusable(f"damaged: cannot be read ({reason})") from None
+
+
+def _require_sealed(source: pa.NativeFile) -> None:
+    """Raises Unusable unless the footer of a Parquet file is the one that was written."""
+    size = source.size()
+    source.seek(max(0, size - _TAIL))
+    tail = source.read(_TAIL)
+    length = int.from_bytes(tail[:4], "little") + _TAIL
+    if tail[4:] != b"PAR1" or length > size:
+        raise Unusable("damaged: is cut short, or no table")
+    source.seek(size - length)
+    footer = source.read(length)
+    if b'"schema":1,' in footer or b'"schema":2,' in footer:
+        raise Outdated("was written by an older version of ipe-bench")
+    if not is_sealed(footer):
+        raise Unusable("damaged: its footer does not match its digest")
+
+
+@functools.lru_cache(maxsize=4096)
+def _parsed(footer: bytes) -> Mapping[str, Any]:
+    """The footer that all files of one result share."""
+    return json.loads(footer)
+
+
+def write(
+    path: Path, table: pa.Table, footer: Mapping[str, Any], history: bytes | None = None, *, lasting: bool = False
+) -> None:
+    """Writes a file that appears complete or not at all; if `lasting`, not in a buffer of the system only.
+
+    Raises:
+        StorageError: the disk is full, or the folder cannot be written to any more.
+    """
+    # Texts are few different ones, numbers are all different and alike in their first bytes.
+    texts = [field.name for field in table.schema if pa.types.is_string(field.type)]
+    floats = [field.name for field in table.schema if pa.types.is_floating(field.type)]
+    how: dict[str, Any] = {"compression": "lz4", "use_dictionary": texts, "use_byte_stream_split": floats}
+    how |= {"write_page_checksum": True, "write_statistics": False, "store_schema": False}
+    metadata = {FOOTER: canonical_json(footer).encode(), b"seal": BLANK_SEAL.encode()}
+    metadata |= {} if history is None else {HISTORY: history}
+    buffer = pa.BufferOutputStream()
+    with pq.ParquetWriter(buffer, table.schema, **how) as writer:
+        writer.write_table(table, row_group_size=ROW_GROUP)
+        writer.add_key_value_metadata(metadata)
+    content = memoryview(buffer.getvalue())
+    end = len(content) - int.from_bytes(content[-_TAIL:-4], "little") - _TAIL
+
+    def written(temporary: Path) -> None:
+        with temporary.open("wb") as file:
+            file.write(content[:end])
+            file.write(seal(bytes(content[end:])))
+            file.flush()
+            if lasting:
+                os.fsync(file.fileno())
+
+    write_atomically(path, written)
+
+
+def encoded_history(columns: Mapping[str, Array]) -> bytes:
+    """Columns of numbers, all of one length, as text."""
+    rows = np.stack([np.asarray(values, dtype="<f8") for values in columns.values()])
+    return f"{','.join(columns)};{base64.b64encode(rows.tobytes()).decode()}".encode()
+
+
+def decoded_history(text: bytes) -> dict[str, Array]:
+    """The columns of `encoded_history`."""
+    names, _, rows = text.partition(b";")
+    columns = names.decode().split(",")
+    return dict(zip(columns, np.frombuffer(base64.b64decode(rows), "<f8").reshape(len(columns), -1), strict=True))
+
+
+def table_of(columns: Mapping[str, Array]) -> pa.Table:
+    """Columns as Arrow stores them: numbers, flags or texts."""
+    return pa.Table.from_arrays([_arrow(values) for values in columns.values()], names=list(columns))
+
+
+def _arrow(values: Array) -> pa.Array:
+    """A column. `pa.array` would import pandas, a second that a worker can do without."""
+    values = np.ascontiguousarray(values)
+    if values.dtype == object:
+        texts = [str(value).encode() for value in values]
+        ends = np.cumsum([0, *(len(text) for text in texts)], dtype=np.int32)
+        return pa.Array.from_buffers(
+            pa.string(), len(values), [None, pa.py_buffer(ends.tobytes()), pa.py_buffer(b"".join(texts))]
+        )
+    kind = pa.bool_() if values.dtype == bool else pa.from_numpy_dtype(values.dtype)
+    data = np.packbits(values, bitorder="little") if values.dtype == bool else values
+    return pa.Array.from_buffers(kind, len(values), [None, pa.py_buffer(data.tobytes())])
+
+
+def as_array(column: pa.ChunkedArray) -> Array:
+    """A column as an array. Arrow's own `to_numpy` would import pandas as well."""
+    chunks = [_of(chunk) for chunk in column.chunks]
+    return chunks[0] if len(chunks) == 1 else np.concatenate(chunks) if chunks else np.empty(0)
+
+
+def _of(chunk: pa.Array) -> Array:
+    kind, start, stop = chunk.type, chunk.offset, chunk.offset + len(chunk)
+    if pa.types.is_string(kind):
+        # A million words are few different ones, each kept once.
+        coded = chunk.dictionary_encode(null_encoding="encode")
+        return np.array(coded.dictionary.to_pylist(), dtype=object)[_of(coded.indices)]
+    if chunk.null_count or pa.types.is_null(kind):
+        return chunk.to_numpy(zero_copy_only=False)
+    data = chunk.buffers()[1]
+    if pa.types.is_boolean(kind):
+        return np.unpackbits(np.frombuffer(data, np.uint8), bitorder="little")[start:stop].astype(bool)
+    return np.frombuffer(data, dtype=kind.to_pandas_dtype())[start:stop]
