@@ -135,13 +135,13 @@ def _write(begun: Begun, output: Path, made: str, figures: Which, formats: tuple
 def _print_table(rows: Sequence[Mapping[str, Any]], collection: Collection) -> None:
     from ipe_bench.report.terminal import render
 
-    certified = attained = None
+    totals = []
     if any(row["noise"] == "certified" for row in rows):
-        from ipe_bench.report.certified_tables import attained_tables, certified_tables
+        from ipe_bench.report.certified_tables import certified_tables
 
-        certified, attained = certified_tables(collection)[1], attained_tables(collection)[1]
+        totals = [table for table in certified_tables(collection) if table.whole]
     out = console()
-    out.print(render(rows, certified, out.width, attained))
+    out.print(render(rows, totals, out.width))
 
 
 def _print_places(output: Path) -> None:

@@ -70,21 +70,20 @@ def write_analysis(begun: Begun, output: Path, which: Which = "main", formats: S
     """Finishes an analysis and writes the report on it under `output`, with these figures in these formats."""
     from ipe_bench.basics.files import write_text
     from ipe_bench.report import extensions
-    from ipe_bench.report.certified_tables import attained_tables, certified_tables, without_certified
+    from ipe_bench.report.certified_tables import without_certified
     from ipe_bench.report.charts import charts
     from ipe_bench.report.figures import draw_all
     from ipe_bench.report.figures.views import views
     from ipe_bench.report.html import render_page
-    from ipe_bench.report.tables import all_tables, write_tables
+    from ipe_bench.report.tables import write_tables
+    from ipe_bench.statistics.digits import certified_averages, certified_table
 
     analysis = begun.finish()
     summary_path = output / "summary.csv"
     write_text(summary_path, analysis.summary.to_csv(index=False))
-    certified_shown, certified = certified_tables(analysis.collection)
     simulated = without_certified(analysis)
     problems = analysis.collection.further
-    tables = [*certified_shown, *attained_tables(analysis.collection)[0], *all_tables(simulated, analysis)]
-    tables += extensions.tables(analysis, [table.name for table in tables], problems)
+    tables = extensions.report_tables(analysis)
     sections = extensions.sections(analysis, [table.name for table in tables], problems)
     further = [table for section in sections for table in section.tables]
     table_paths = write_tables(analysis, [*tables, *further], output / "tables")
@@ -100,7 +99,7 @@ def write_analysis(begun: Begun, output: Path, which: Which = "main", formats: S
         report,
         analysis.problems,
         analysis.stale,
-        certified,
+        certified_averages(certified_table(analysis.collection)),
     )
 
 

@@ -1,4 +1,4 @@
-"""Tables of runs on certified readings; such runs have one trial and no error scale, so figures leave them out."""
+"""Tables of runs on certified readings and on problems of known minimum, which have one trial and no error scale."""
 
 from __future__ import annotations
 
@@ -14,77 +14,11 @@ from ipe_bench.statistics.attained import BUDGETS, attained_table, attained_tota
 from ipe_bench.statistics.collect import Collection
 from ipe_bench.statistics.digits import certified_averages, certified_table
 
-
-def certified_tables(collection: Collection) -> tuple[list[Table], pd.DataFrame]:
-    """Digits per data set and their averages, as tables and as the averages alone; empty where no run had certified
-    readings."""
-    table = certified_table(collection)
-    averages = certified_averages(table)
-    if table.empty:
-        return [], averages
-    shown = [
-        Table("certified", "Certified readings", _DIGITS, _columns(table), table.round(2)),
-        Table("certified_averages", "Certified readings, averages", _AVERAGES, _columns(averages), averages.round(2)),
-    ]
-    return shown, averages
-
-
 _DIGITS = (
     "Log relative error against the certified answer, at most 11: the fewest over a data set's parameters, over their"
     " standard deviations, and of the residual sum of squares."
 )
 _AVERAGES = _DIGITS + " Averaged over the data sets; solved: four digits or more of every parameter."
-_TITLES = {
-    "dataset": "data set",
-    "lre_parameters": "digits",
-    "lre_deviations": "of deviations",
-    "lre_rss": "of residuals",
-    "datasets": "data sets",
-    "deviations_to_6_digits": "deviations to 6 digits",
-    "mean_lre_parameters": "digits",
-    "mean_lre_deviations": "of deviations",
-    "mean_lre_rss": "of residuals",
-}
-
-
-def attained_tables(collection: Collection) -> tuple[list[Table], pd.DataFrame]:
-    """Who attains known minima, in all and problem by problem, as tables and as the totals alone; empty where no run
-    had such problems."""
-    table = attained_table(collection)
-    totals = attained_totals(table)
-    if table.empty:
-        return [], totals
-    problems = table.sort_values(["function", "start"], kind="stable", ignore_index=True)
-    minima = ["-" if v is None or pd.isna(v) else f"{int(v) + 1}" for v in problems["minimum"]]
-    shown = [
-        words("function", problems["function"]),
-        column("start", problems["start"], plain),
-        words("estimator", problems["estimator"]),
-        words("solved", ["yes" if v else "no" for v in problems["solved"]]),
-        words("minimum", minima),
-        column("sum of squares", problems["sum_of_squares"], lambda v: f"{v:.6g}"),
-        words("status", problems["status"]),
-        column("cost", problems["cost"], short),
-    ]
-    return [
-        Table("attained", "Known minima", _ATTAINED, attained_columns(totals), totals),
-        Table("attained_problems", "Known minima, problem by problem", _PROBLEMS, shown, problems),
-    ], totals
-
-
-def attained_columns(totals: pd.DataFrame) -> list[Column]:
-    """The columns of the totals as they are shown."""
-    most = totals["solved"] == totals["solved"].max()
-    columns = [words("estimator", totals["estimator"], list(most)), column("problems", totals["problems"], str)]
-    columns.append(column("solved", totals["solved"], str, list(most)))
-    starts = [name for name in totals if str(name).startswith("solved_")]
-    columns += [column(f"{str(name).removeprefix('solved_')} x", totals[name], str) for name in starts]
-    columns.append(column("converged", totals["converged"], str))
-    columns.append(column("elsewhere", totals["elsewhere"], str))
-    columns.append(column("median cost", totals["cost_median"], short))
-    return [*columns, *(column(f"in {b}", totals[f"within_{b}"], str) for b in BUDGETS)]
-
-
 _ATTAINED = (
     "Problems whose least minimum the estimate attains: f at most f* (1 + 1e-6) + 1e-12. 1 x, 10 x: from these"
     " multiples of the standard start. Converged: solved, and the status says so. Elsewhere: unsolved, and the status"
@@ -96,18 +30,76 @@ _PROBLEMS = (
 )
 
 
-def _columns(table: pd.DataFrame) -> list[Column]:
-    """Texts as they are, counts in full, digits to two places."""
-    columns = []
-    for name in table.columns:
-        title, values = _TITLES.get(name, name), table[name]
-        if pd.api.types.is_float_dtype(values):
-            columns.append(column(title, values, lambda v: f"{v:.2f}"))
-        elif pd.api.types.is_integer_dtype(values):
-            columns.append(column(title, values, str))
-        else:
-            columns.append(words(title, values))
-    return columns
+def certified_tables(collection: Collection) -> list[Table]:
+    """Digits per data set and their averages, who attains known minima in all and problem by problem; those tables
+    that there are data for. What a terminal shows of them is what names the file that holds the whole."""
+    digits, minima = certified_table(collection), attained_table(collection)
+    shown = [] if digits.empty else [_digits(digits), averages_table(certified_averages(digits))]
+    return shown if minima.empty else [*shown, attained_totals_table(attained_totals(minima)), _problems(minima)]
+
+
+def _digits(table: pd.DataFrame) -> Table:
+    columns = [
+        words("data set", table["dataset"]),
+        column("start", table["start"], str),
+        words("estimator", table["estimator"]),
+        *_lre(table, ""),
+        words("status", table["status"]),
+    ]
+    return Table("certified", "Certified readings", _DIGITS, columns, table.round(2))
+
+
+def averages_table(averages: pd.DataFrame) -> Table:
+    """Mean digits of an estimator from each start, the most first."""
+    rows = averages.sort_values(["mean_lre_parameters", "start"], ascending=False)
+    columns = [
+        words("estimator", rows["estimator"]),
+        column("start", rows["start"], str),
+        column("data sets", rows["datasets"], str),
+        column("solved", rows["solved"], str),
+        *_lre(rows, "mean_"),
+        column("deviations to 6 digits", rows["deviations_to_6_digits"], str),
+    ]
+    name, title = "certified_averages", "Certified readings, averages"
+    return Table(name, title, _AVERAGES, columns, rows.round(2), whole=f"tables/{name}.csv")
+
+
+def _lre(rows: pd.DataFrame, prefix: str) -> list[Column]:
+    titles = {"parameters": "digits", "deviations": "of deviations", "rss": "of residuals"}
+    return [column(title, rows[f"{prefix}lre_{name}"], lambda v: f"{v:.2f}") for name, title in titles.items()]
+
+
+def attained_totals_table(totals: pd.DataFrame) -> Table:
+    """How many problems of known minimum each estimator solves, the most first."""
+    rows = totals.sort_values("solved", ascending=False, kind="stable", ignore_index=True)
+    most = list(rows["solved"] == rows["solved"].max())
+    starts = [str(name) for name in rows if str(name).startswith("solved_")]
+    columns = [
+        words("estimator", rows["estimator"], most),
+        column("problems", rows["problems"], str),
+        column("solved", rows["solved"], str, most),
+        *(column(f"{name.removeprefix('solved_')} x", rows[name], str) for name in starts),
+        column("converged", rows["converged"], str),
+        column("elsewhere", rows["elsewhere"], str),
+        column("median cost", rows["cost_median"], short),
+        *(column(f"in {b}", rows[f"within_{b}"], str) for b in BUDGETS),
+    ]
+    return Table("attained", "Known minima", _ATTAINED, columns, rows, whole="tables/attained.csv")
+
+
+def _problems(minima: pd.DataFrame) -> Table:
+    rows = minima.sort_values(["function", "start"], kind="stable", ignore_index=True)
+    columns = [
+        words("function", rows["function"]),
+        column("start", rows["start"], plain),
+        words("estimator", rows["estimator"]),
+        words("solved", ["yes" if v else "no" for v in rows["solved"]]),
+        words("minimum", ["-" if v is None or pd.isna(v) else f"{int(v) + 1}" for v in rows["minimum"]]),
+        column("sum of squares", rows["sum_of_squares"], lambda v: f"{v:.6g}"),
+        words("status", rows["status"]),
+        column("cost", rows["cost"], short),
+    ]
+    return Table("attained_problems", "Known minima, problem by problem", _PROBLEMS, columns, rows)
 
 
 def without_certified(analysis: Analysis) -> Analysis:

@@ -17,10 +17,12 @@ from ipe_bench.basics.containment import contained
 from ipe_bench.basics.errors import StorageError, UserError, place_of
 from ipe_bench.plugins.discovery import Option, blame
 from ipe_bench.plugins.extensions import records
+from ipe_bench.report.certified_tables import certified_tables, without_certified
 from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import FRAMES, View
 from ipe_bench.report.sections import Section, Written
 from ipe_bench.report.table import Table, comma_separated, latex, markdown
+from ipe_bench.report.tables import all_tables
 from ipe_bench.statistics.analysis import Analysis
 
 T = TypeVar("T")
@@ -92,6 +94,12 @@ def require_file_name(name: Any) -> None:
 
 
 # Tables and sections
+
+
+def report_tables(analysis: Analysis) -> list[Table]:
+    """Every table of the report: those on certified readings, ours on simulated trials, and those of plugins."""
+    shown = certified_tables(analysis.collection) + all_tables(without_certified(analysis), analysis)
+    return shown + tables(analysis, [table.name for table in shown], analysis.collection.further)
 
 
 def tables(analysis: Analysis, taken: Iterable[str], problems: list[str]) -> list[Table]:

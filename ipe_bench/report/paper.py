@@ -13,16 +13,13 @@ from pathlib import Path
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.files import write_text
-from ipe_bench.report.table import LONG, Column, Table, escaped, latex_row, latex_rows
-from ipe_bench.report.tables import all_tables
+from ipe_bench.report.extensions import report_tables
+from ipe_bench.report.table import COLUMN, COLUMN_GAP, PAGE, Table, latex, letters
 from ipe_bench.statistics.analysis import Analysis
 
-COLUMN, PAGE = 3.5, 7.16
-"""Inches of IEEE's one and two columns."""
 _NARROWEST, _WIDEST = 2.0, 20.0
 POINTS_A_LETTER = 4.0
 """Mean width of a letter of 8 points."""
-_COLUMN_GAP = 3.0
 
 
 @dataclass(frozen=True)
@@ -51,22 +48,12 @@ def export(
     files, captions = _figures(analysis, folder, [name for name in names if name not in tables], width, tables)
     for table in chosen:
         path = folder / f"{table.name}.tex"
-        write_text(path, latex_table(table, width))
+        write_text(path, latex(table, width))
         files.append(path)
     if captions:
         write_text(folder / "captions.md", "\n\n".join(captions) + "\n")
         files.append(folder / "captions.md")
     return Export(tuple(files), tuple(line for table in chosen for line in _excess(table, width)))
-
-
-def report_tables(analysis: Analysis) -> list[Table]:
-    """Every table of the report, those on certified readings first."""
-    from ipe_bench.report import extensions
-    from ipe_bench.report.certified_tables import attained_tables, certified_tables, without_certified
-
-    shown = [*certified_tables(analysis.collection)[0], *attained_tables(analysis.collection)[0]]
-    shown += all_tables(without_certified(analysis), analysis)
-    return shown + extensions.tables(analysis, [table.name for table in shown], analysis.collection.further)
 
 
 # Tables --------------------------------------------------------------------------------------------------------------
@@ -96,57 +83,10 @@ def chosen_columns(table: Table, names: Sequence[str]) -> Table:
     return replace(table, columns=[known[name] for name in names])
 
 
-def latex_table(table: Table, width: float) -> str:
-    """A floating environment with the caption, or where rows are many a longtable."""
-    long = len(table) > LONG
-    body = [_head(table), *latex_rows(table)]
-    shape = "@{}" + "".join("r" if c.numeric else "l" for c in table.columns) + "@{}"
-    caption = rf"\caption{{{escaped(table.title)}. {escaped(table.caption)}}}\label{{tab:{table.name}}}"
-    rules = [r"\toprule", body[0], r"\midrule", *([r"\endhead"] if long else []), *body[1:], r"\bottomrule"]
-    size = rf"\footnotesize\setlength{{\tabcolsep}}{{{_COLUMN_GAP:g}pt}}"
-    if long:
-        inside = ["{" + size, rf"\begin{{longtable}}{{{shape}}}", caption + r" \\", *rules, r"\end{longtable}", "}"]
-    else:
-        kind = "table" if width <= COLUMN else "table*"
-        inside = [rf"\begin{{{kind}}}[tb]", r"\centering", caption, size, rf"\begin{{tabular}}{{{shape}}}", *rules]
-        inside += [r"\end{tabular}", rf"\end{{{kind}}}"]
-    needs = "% Needs \\usepackage[T1]{fontenc} and \\usepackage{booktabs, longtable, siunitx, amsmath}."
-    needs += " A longtable stands where the text has one column." if long else ""
-    return "\n".join([needs, *inside]) + "\n"
-
-
-def _head(table: Table) -> str:
-    """Titles, stacked where they are longer than what stands below them."""
-    heads = []
-    for column, letters in zip(table.columns, map(_letters, table.columns), strict=True):
-        side = "r" if column.numeric else "l"
-        lines = [escaped(line) for line in _lines(column.title, letters)]
-        stacked = r"\\".join(lines)
-        heads.append(rf"\shortstack[{side}]{{{stacked}}}" if len(lines) > 1 else stacked)
-    return latex_row(heads)
-
-
-def _lines(title: str, letters: int) -> list[str]:
-    """A title in lines of at most so many letters, words being whole."""
-    lines: list[str] = []
-    for word in title.split():
-        if lines and len(lines[-1]) + 1 + len(word) <= letters:
-            lines[-1] += f" {word}"
-        else:
-            lines.append(word)
-    return lines or [""]
-
-
-def _letters(column: Column) -> int:
-    """Of the widest cell, or of the title's longest word."""
-    cells = max((len(cell.text) for cell in column.cells), default=0)
-    return max([cells, *map(len, column.title.split())])
-
-
 def inches(table: Table) -> float:
     """About how wide a table is."""
-    points = sum(POINTS_A_LETTER * _letters(column) for column in table.columns)
-    return (points + 2 * _COLUMN_GAP * (len(table.columns) - 1)) / 72
+    points = sum(POINTS_A_LETTER * letters(column) for column in table.columns)
+    return (points + 2 * COLUMN_GAP * (len(table.columns) - 1)) / 72
 
 
 def _excess(table: Table, width: float) -> Iterator[str]:

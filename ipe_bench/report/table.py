@@ -26,6 +26,10 @@ LONG = 45
 """Number of rows from which a LaTeX table runs over pages."""
 MOST_ROWS = 2000
 """Largest number of rows of a table on an HTML page."""
+COLUMN, PAGE = 3.5, 7.16
+"""Inches of IEEE's one and two columns."""
+COLUMN_GAP = 3.0
+"""Points between the edge of a column of a LaTeX table and its text."""
 _NAMES = ("estimator", "first", "data set", "function", "parameter", "error")
 """Titles of the column that names a row."""
 _WHOLE_NAME = 24
@@ -158,9 +162,10 @@ def terminal(parts: Iterable[Part], width: int) -> Group:
             shown.append(_rich(replace(piece, columns=piece.columns[:fitting]), room))
             for left_out in piece.columns[fitting:]:
                 absent.setdefault(part.whole, {})[left_out.title] = None
-        if part.notes:
+        notes = [text for text in (part.caption, *part.notes) if text]
+        if notes:
             tell()
-            shown += [Text(note, style="dim") for note in part.notes]
+            shown += [Text(note, style="dim") for note in notes]
     tell()
     return Group(*shown)
 
@@ -346,29 +351,52 @@ _SIGNS = {
 _NUMBER = re.compile(r"-?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
-def latex(table: Table) -> str:
-    """To be read into a document with `\\input`; a longtable where rows are many."""
+def latex(table: Table, width: float | None = None) -> str:
+    """To be read into a document with `\\input`: the bare table, or one that floats with its caption in a column of
+    that many inches; a longtable where rows are many."""
     shape = "".join("r" if each.numeric else "l" for each in table.columns)
-    head = [r"\toprule", latex_row(escaped(each.title) for each in table.columns), r"\midrule"]
-    rows = latex_rows(table)
+    titles = _latex_row(map(_latex_title, table.columns))
+    head, rows = (
+        [r"\toprule", titles, r"\midrule"],
+        [_latex_row(map(_latex_cell, r, table.columns)) for r in table.rows],
+    )
+    caption = (
+        rf"\caption{{{escaped(table.title)}. {escaped(table.caption)}}}\label{{tab:{table.name.replace('_', '-')}}}"
+    )
+    size = rf"\footnotesize\setlength{{\tabcolsep}}{{{COLUMN_GAP:g}pt}}"
+    needs = r"\usepackage{booktabs, longtable, siunitx, amsmath} and \usepackage[T1]{fontenc}"
+    comment = f"% {' '.join(table.title.split())}. Needs {needs}."
     if len(table) > LONG:
         more = rf"\multicolumn{{{len(shape)}}}{{r}}{{continued on the next page}} \\"
         foot = [r"\midrule", more, r"\endfoot", r"\bottomrule", r"\endlastfoot"]
-        kind, lines = "longtable", [*head, r"\endfirsthead", *head, r"\endhead", *foot, *rows]
+        named = [] if width is None else [rf"{caption} \\"]
+        lines = [*named, *head, r"\endfirsthead", *head, r"\endhead", *foot, *rows, r"\end{longtable}"]
+        lines = [rf"\begin{{longtable}}{{@{{}}{shape}@{{}}}}", *lines]
+        comment += " A longtable stands where the text has one column."
+        lines = lines if width is None else [f"{{{size}", *lines, "}"]
     else:
-        kind, lines = "tabular", [*head, *rows, r"\bottomrule"]
-    needs = r"\usepackage{booktabs, longtable, siunitx, amsmath} and \usepackage[T1]{fontenc}"
-    comment = f"% {' '.join(table.title.split())}. Needs {needs}."
-    return "\n".join([comment, rf"\begin{{{kind}}}{{@{{}}{shape}@{{}}}}", *lines, rf"\end{{{kind}}}", ""])
+        lines = [rf"\begin{{tabular}}{{@{{}}{shape}@{{}}}}", *head, *rows, r"\bottomrule", r"\end{tabular}"]
+        if width is not None:
+            kind = "table" if width <= COLUMN else "table*"
+            begin = [rf"\begin{{{kind}}}[tb]", r"\centering", caption, size]
+            lines = [*begin, *lines, rf"\end{{{kind}}}"]
+    return "\n".join([comment, *lines, ""])
 
 
-def latex_rows(table: Table) -> list[str]:
-    """A line for each row of a table."""
-    return [latex_row(map(_latex_cell, cells, table.columns)) for cells in table.rows]
-
-
-def latex_row(cells: Iterable[str]) -> str:
+def _latex_row(cells: Iterable[str]) -> str:
     return f"{' & '.join(cells)} \\\\"
+
+
+def _latex_title(column: Column) -> str:
+    """A title, stacked where it is longer than what stands below it."""
+    lines = [escaped(line) for line in textwrap.wrap(column.title, letters(column), break_on_hyphens=False)]
+    stacked = r"\\".join(lines)
+    return rf"\shortstack[{'r' if column.numeric else 'l'}]{{{stacked}}}" if len(lines) > 1 else stacked
+
+
+def letters(column: Column) -> int:
+    """The letters of the widest cell, or of the longest word of the title, which is no less."""
+    return max([1, *(len(cell.text) for cell in column.cells), *map(len, column.title.split())])
 
 
 def _latex_cell(cell: Cell, column: Column) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -23,19 +23,14 @@ _WIDE_ENOUGH = 100
 
 
 def render(
-    summary: pd.DataFrame | Sequence[Mapping[str, Any]],
-    certified: pd.DataFrame | None = None,
-    width: int = WIDE,
-    attained: pd.DataFrame | None = None,
+    summary: pd.DataFrame | Sequence[Mapping[str, Any]], totals: Iterable[Table] = (), width: int = WIDE
 ) -> Group:
     """One table per setting (measurement, noise, and every option that differs), a section per error scale.
 
     `summary` is the frame or its rows. Columns that do not fit the width are left out, and named below. Runs on
-    certified readings, whose mean digits are in `certified`, share one table instead, and so do those on problems of
-    known minimum, whose totals are in `attained`.
+    certified readings and on problems of known minimum are shown by their `totals` instead.
     """
-    tables = [] if certified is None or certified.empty else [_digits(certified)]
-    tables += [] if attained is None or attained.empty else [_attained(attained)]
+    tables = list(totals)
     listed: list[Any] = list(summary) if isinstance(summary, Sequence) else [*summary.to_dict("records")]
     tables += _settings([row for row in listed if row["parameter"] == ALL and row["noise"] != "certified"], width)
     return terminal(tables or ["nothing is stored yet"], width)
@@ -140,44 +135,3 @@ def _statistic(record: Statistic, part: Sequence[Mapping[str, Any]]) -> Iterator
 def _says(value: Any) -> bool:
     """Whether a setting is spoken of in a title: not where it is absent, as an option of another class is."""
     return value is not None and not (isinstance(value, float) and math.isnan(value))
-
-
-def _digits(averages: pd.DataFrame) -> Table:
-    """Mean correct digits on certified readings."""
-    rows = averages.sort_values(["mean_lre_parameters", "start"], ascending=False)
-    columns = [
-        words("estimator", rows["estimator"]),
-        *(
-            column(title, rows[name], str)
-            for name, title in (("start",) * 2, ("datasets", "data sets"), ("solved",) * 2)
-        ),
-        column("digits", rows["mean_lre_parameters"], lambda v: f"{v:.2f}"),
-        column("of deviations", rows["mean_lre_deviations"], lambda v: f"{v:.2f}"),
-        column("of residuals", rows["mean_lre_rss"], lambda v: f"{v:.2f}"),
-        column("deviations to 6 digits", rows["deviations_to_6_digits"], str),
-    ]
-    note = (
-        "digits: log relative error against the certified answer, the fewest over a data set's parameters, at most 11,"
-        " averaged over the data sets. solved: four digits or more."
-    )
-    return Table(
-        "certified_averages",
-        "Certified readings",
-        "",
-        columns,
-        notes=[note],
-        whole="tables/certified_averages.csv",
-    )
-
-
-def _attained(totals: pd.DataFrame) -> Table:
-    """Problems of known minimum that are solved."""
-    from ipe_bench.report.certified_tables import attained_columns
-
-    columns = attained_columns(totals.sort_values("solved", ascending=False, kind="stable", ignore_index=True))
-    note = (
-        "solved: the estimate's sum of squares is the least known one, to 1e-6; converged: of these, where the status"
-        " says so; elsewhere: converged and not solved. median cost: simulations, infinite where unsolved. in 10:"
-        " solved within 10 (n + 1) simulations."
-    )
-    return Table("attained", "Known minima", "", columns, notes=[note], whole="tables/attained.csv")

@@ -11,9 +11,9 @@ from test_report import HOSTILE, fill
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli.main import main
 from ipe_bench.report import figures
-from ipe_bench.report.paper import COLUMN, PAGE, export, inches, latex_table
-from ipe_bench.report.table import Table, interval, words
-from ipe_bench.report.words import percent
+from ipe_bench.report.paper import export, inches
+from ipe_bench.report.table import COLUMN, PAGE, Table, interval, latex, words
+from ipe_bench.report.words import percent, short
 from ipe_bench.statistics import analyse
 
 COMMANDS = {
@@ -68,7 +68,7 @@ def typeset(cell: str) -> str:
 
 
 def test_the_reader_refuses_what_latex_would():
-    good = latex_table(Table("t", "T", "C", [words("a", ["b"])], pd.DataFrame()), COLUMN)
+    good = latex(Table("t", "T", "C", [words("a", ["b"])], pd.DataFrame()), COLUMN)
     assert read(good) == [["a"], ["b"]]
     for bad in (good + "}", good.replace("b \\\\", "b & c \\\\"), good.replace("b \\\\", "b_1 \\\\"), good + "\\foo"):
         with pytest.raises(AssertionError):
@@ -77,23 +77,23 @@ def test_the_reader_refuses_what_latex_would():
 
 def test_intervals_read_as_they_are_meant():
     column = interval("95 % of it", [0.996, 1.0, float("nan")], [1.0, 1.0, 1.0], percent)
-    rows = read(latex_table(Table("t", "T", "C", [column], pd.DataFrame()), COLUMN))
+    rows = read(latex(Table("t", "T", "C", [column], pd.DataFrame()), COLUMN))
     assert rows == [["95 % of it"], ["99.6 % to 100 %"], ["100 % to 100 %"], ["-"]]
 
 
 def test_tables_say_what_the_report_says_whatever_the_names(synthetic, tmp_path):
     fill(synthetic, labels=("linear_lse", HOSTILE, "$x_1$ & \\frac{a}{b} 50 % ~ ^ # 中 µ"))
     analysis = analyse([synthetic.directory])
-    done = export(analysis, tmp_path, ["overview"], ["estimator", "success", "error_scale", "95_of_success"], PAGE)
-    assert [path.name for path in done.files] == ["overview.tex"]
+    names = ["estimator", "converged", "error_scale", "95_of_efficiency"]
+    done = export(analysis, tmp_path, ["all_trials"], names, PAGE)
+    assert [path.name for path in done.files] == ["all_trials.tex"]
     rows = read(done.files[0].read_text(encoding="utf-8"))
-    assert rows[0] == ["estimator", "success", "error scale", "95 % of success"]
+    assert rows[0] == ["estimator", "converged", "error scale", "95 % of efficiency"]
     assert len(rows) == 1 + 9
     own = analysis.summary[analysis.summary["parameter"] == "all"].reset_index(drop=True)
-    assert [row[1] for row in rows[1:]] == [percent(v) for v in own["success"]]
-    assert [row[3] for row in rows[1:]] == [
-        f"{percent(low)} to {percent(high)}" for low, high in zip(own["success_low"], own["success_high"], strict=True)
-    ]
+    assert [row[1] for row in rows[1:]] == [percent(v) for v in own["converged"]]
+    ends = zip(own["efficiency_capped_low"], own["efficiency_capped_high"], strict=True)
+    assert [row[3] for row in rows[1:]] == [f"{short(low)} to {short(high)}" for low, high in ends]
 
 
 def test_a_table_that_is_too_wide_is_said_to_be(synthetic, tmp_path, capsys):
@@ -129,9 +129,9 @@ def test_drawing_for_a_paper_leaves_the_report_as_it_is(synthetic, tmp_path, mon
     fill(synthetic)
     analysis = analyse([synthetic.directory])
     monkeypatch.setattr(figures, "FIGURES", ("success",))
-    before, *_ = figures.draw_all(analysis, tmp_path / "a", formats=("png",), processes=1)
+    before, *_ = figures.draw_all(analysis, tmp_path / "a", formats=("png",), which="all")
     export(analysis, tmp_path / "p", ["success_against_scale"])
-    after, *_ = figures.draw_all(analysis, tmp_path / "b", formats=("png",), processes=1)
+    after, *_ = figures.draw_all(analysis, tmp_path / "b", formats=("png",), which="all")
     assert before.files[0].read_bytes() == after.files[0].read_bytes()
 
 

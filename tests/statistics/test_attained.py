@@ -11,7 +11,7 @@ from ipe_bench.measurements.mgh import functions
 from ipe_bench.noise import Certified
 from ipe_bench.plugins import discovery
 from ipe_bench.report import write_report
-from ipe_bench.report.certified_tables import attained_tables
+from ipe_bench.report.certified_tables import certified_tables
 from ipe_bench.report.terminal import render
 from ipe_bench.runs.run import compute, validate
 from ipe_bench.solvers import Auto, Progressive
@@ -85,15 +85,15 @@ def test_the_terminal_and_the_report_show_them(folder):
     collection = collect([folder])
     console = Console(width=140, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     with console.file:
-        console.print(render([], None, 140, attained_tables(collection)[1]))
+        console.print(render([], certified_tables(collection), 140))
         shown = console.export_text()
     assert "Known minima" in shown
     assert "nothing is stored" not in shown
-    result = write_report([folder], folder)
+    result = write_report([folder], folder, figures="all")
     assert {p.name for p in result.tables} >= {"attained.csv", "attained_problems.csv"}
     assert [p.name for p in result.figures] == ["data_profile.png"]
     # All that solve the most are named.
-    totals = attained_tables(collection)[1]
+    totals = attained_totals(attained_table(collection))
     most = list(totals.loc[totals["solved"] == totals["solved"].max(), "estimator"])
     told = f"Most, {totals['solved'].max()}, are solved by {', '.join(most)}."
     page = result.report.read_text(encoding="utf-8")
