@@ -1,8 +1,4 @@
-"""Charts of the page: the numbers that its script draws, under names that a reader may choose as axes.
-
-They need no picture: where a static figure of the same name is there, the page shows it beside. How they look is left
-to `templates/report.js`.
-"""
+"""The chart of the page: the numbers that its script draws, over columns that a reader chooses as axes."""
 
 from __future__ import annotations
 
@@ -19,7 +15,7 @@ from ipe_bench.report.style import ON_DARK, Look
 from ipe_bench.trials.thresholds import FEW
 
 FIGURES = 5
-"""Significant figures of a number on the page: more than a point on it can show."""
+"""Number of significant figures of a number on the page."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +31,6 @@ class Axis:
     low: str = ""
     high: str = ""
     """The columns of its interval, where it has one."""
-    count: str = "trials"
-    """The column that says how many trials a value is over."""
     reference: float | None = None
     """Where a line says what is best, or honest."""
     reference_title: str = ""
@@ -44,7 +38,7 @@ class Axis:
 
 @dataclass(frozen=True)
 class Chart:
-    """One chart of one setting, named as the static figure that shows the same."""
+    """The chart of one setting."""
 
     name: str
     title: str
@@ -54,107 +48,47 @@ class Chart:
 
 
 _SCALE = Axis("error_scale", "error scale", log=True)
-_COST = Axis("cost_median", "simulations per trial (median)", log=True)
-_BOUND = {"log": True, "reference": 1.0, "reference_title": "linear bound"}
-_KINDS: tuple[tuple[str, str, tuple[Axis, ...]], ...] = (
-    (
-        "error_against_scale",
-        "Error",
-        (
-            Axis(
-                "rmse", "rms error / linear bound, solved", low="rmse_low", high="rmse_high", count="solved", **_BOUND
-            ),
-            Axis("rmse_all", "rms error / linear bound, all trials", **_BOUND),
-            Axis(
-                *("efficiency", "efficiency, solved"),
-                low="efficiency_low",
-                high="efficiency_high",
-                count="solved",
-                reference=1.0,
-                reference_title="the bound",
-            ),
-        ),
-    ),
-    (
-        "success_against_scale",
-        "Success",
-        (
-            Axis("success", "success: inside the gate", share=True, low="success_low", high="success_high"),
-            Axis("solved_share", "solved: the right root", share=True),
-        ),
-    ),
-    (
-        "consistency",
-        "Consistency",
-        (
-            Axis(
-                *("nees", "mean NEES / n, solved"),
-                log=True,
-                low="nees_from",
-                high="nees_to",
-                count="solved",
-                reference=1.0,
-                reference_title="honest covariance",
-            ),
-            Axis(
-                "coverage95",
-                "truth inside the 95 % ellipsoid",
-                share=True,
-                reference=0.95,
-                reference_title="honest covariance",
-            ),
-        ),
-    ),
+_COST = Axis("simulations_median", "simulations per trial (median)", log=True)
+_BOUND = {"log": True, "reference": 1.0, "reference_title": "the bound"}
+_AXES = (
+    Axis("success", "success", share=True, low="success_low", high="success_high"),
+    Axis("error_median", "median error / bound", **_BOUND),
+    Axis("error_q95", "95 % error / bound", **_BOUND),
+    Axis("efficiency_capped", "efficiency", low="efficiency_capped_low", high="efficiency_capped_high"),
+    Axis("nees_median", "NEES, median", log=True, reference=1.0, reference_title="honest covariance"),
+    Axis("coverage95", "truth in the 95 % ellipsoid", share=True, reference=0.95, reference_title="honest covariance"),
+    Axis("failed_silent", "failed silently", share=True),
 )
 
 
 def charts(views: Sequence[View]) -> Iterator[Chart]:
-    """The charts of each setting: error, success, and consistency where covariances are reported."""
-    for name, title, axes in _KINDS:
-        for view in views:
-            if not view.totals.empty:
-                yield from _chart(name, title, axes, view)
+    """The chart of each setting, over all trials."""
+    for view in views:
+        rows = view.totals
+        shown = [axis for axis in _AXES if len(rows) and rows[axis.column].map(math.isfinite).any()]
+        if not shown:
+            continue
+        # With one scale alone there is nothing to see against it.
+        across = (_SCALE, _COST) if len(view.scales) > 1 else (_COST, _SCALE)
+        columns = {
+            "trials",
+            *(name for axis in (*across, *shown) for name in (axis.column, axis.low, axis.high) if name),
+        }
+        data = {
+            "x": [asdict(axis) for axis in across],
+            "y": [asdict(axis) for axis in shown],
+            "few": FEW,
+            "series": [
+                _series(label, one, rows[rows["estimator"] == label], columns) for label, one in view.look.items()
+            ],
+        }
+        caption = f"{view.label}. Bars: 95 % intervals, where they are known. Hollow: fewer than {FEW} trials."
+        text = json.dumps(data, ensure_ascii=False, separators=(",", ":"))
+        yield Chart(f"explore{view.suffix}", "All trials, by any two columns", caption, text)
 
 
-def _chart(name: str, title: str, axes: Sequence[Axis], view: View) -> Iterator[Chart]:
-    rows = _rows(view)
-    shown = [axis for axis in axes if rows[axis.column].map(math.isfinite).any()]
-    if not shown:
-        return
-    # With one scale alone there is nothing to see against it.
-    across = (_SCALE, _COST) if len(view.scales) > 1 else (_COST, _SCALE)
-    against = "error scale" if len(view.scales) > 1 else "cost"
-    data = {
-        "x": [asdict(axis) for axis in across],
-        "y": [asdict(axis) for axis in shown],
-        "few": FEW,
-        "series": [_series(label, look, rows[rows["estimator"] == label], shown) for label, look in view.look.items()],
-    }
-    words = f"{title} against {against}"
-    caption = (
-        f"{view.label}. Bars: 95 % intervals, where they are known. Hollow: fewer than {FEW} trials. Where points"
-        " coincide, each marker lies smaller upon the one before it."
-    )
-    yield Chart(f"{name}{view.suffix}", words, caption, json.dumps(data, ensure_ascii=False, separators=(",", ":")))
-
-
-def _rows(view: View) -> pd.DataFrame:
-    """The rows over all parameters, ascending by scale, with the cost; the mean NEES with the interval that holds 1
-    where it lies within its limits."""
-    totals = view.totals.drop(columns="cost_median", errors="ignore")
-    cost = view["scores"][["error_scale", "estimator", "cost_median"]]
-    rows = totals.merge(cost, on=["error_scale", "estimator"], how="left")
-    return rows.assign(
-        solved_share=rows["solved"],
-        solved=rows["solved_trials"],
-        nees_from=rows["nees"] / rows["nees_high"],
-        nees_to=rows["nees"] / rows["nees_low"],
-    )
-
-
-def _series(label: str, look: Look, rows: pd.DataFrame, axes: Sequence[Axis]) -> dict[str, Any]:
-    columns = {"error_scale", "cost_median", "trials"}
-    columns |= {name for axis in axes for name in (axis.column, axis.low, axis.high, axis.count) if name}
+def _series(label: str, look: Look, rows: pd.DataFrame, columns: set[str]) -> dict[str, Any]:
+    rows = rows[rows["estimator"] == label]
     return {
         "name": label,
         "color": look.color,

@@ -24,12 +24,13 @@ MOST_RUNS = 20
 MOST_COMMANDS = 3
 """At the head of the page; all stand with the provenance."""
 _SECTIONS = (
+    ("explore", "Explore"),
     ("figures", "Figures"),
     ("tables", "Tables"),
-    ("theory", "Theory beside what happened"),
+    ("appendix", "Further tables"),
     ("provenance", "Configuration and provenance"),
-    ("cite", "How to cite"),
     ("definitions", "Definitions"),
+    ("cite", "How to cite"),
 )
 _PYTHON, _UNKNOWN = "from Python", "a command that was not recorded"
 
@@ -47,7 +48,7 @@ def render_page(
     collection = analysis.collection
     script, style = _template("report.js"), _template("report.css")
     runs = _runs(collection.runs)
-    pictures = _pictures(figures, charts)
+    nothing_failed = analysis.endings.empty and not analysis.summary.empty
     commands = [run["command"] for run in runs if run["command"] not in (_PYTHON, _UNKNOWN)]
     return (
         environment()
@@ -66,12 +67,13 @@ def render_page(
             title=", ".join(d.resolve().name or str(d) for d in collection.directories),
             computed=collection.runs[-1].started[:16].replace("T", " ") if collection.runs else "",
             commands=list(dict.fromkeys(commands))[:MOST_COMMANDS],
-            sections=_contents(tables, written, pictures),
+            sections=_contents(tables, written, figures, charts, nothing_failed),
             tables=[t for t in tables if not t.appendix],
             written=written,
-            theory=[t for t in tables if t.appendix],
-            figures=pictures,
-            nothing_failed=analysis.endings.empty and not analysis.summary.empty,
+            appendix=[t for t in tables if t.appendix],
+            figures=[_picture(figure) for figure in figures],
+            charts=charts,
+            nothing_failed=nothing_failed,
             runs=runs[:MOST_RUNS],
             older_runs=max(0, len(runs) - MOST_RUNS),
             citation=CITATION,
@@ -93,29 +95,32 @@ def _policy(script: str, style: str) -> str:
     )
 
 
-def _pictures(figures: Sequence[Drawn], charts: Sequence[Chart]) -> list[dict[str, Any]]:
-    """Charts first, each with the static figure of its name; then the other figures."""
-    static = {
-        one.name: {
-            "static_title": one.title,
-            "static_caption": one.caption,
-            "data": base64.b64encode(one.files[0].read_bytes()).decode(),
-            "files": [path.name for path in one.files],
-        }
-        for one in figures
+def _picture(figure: Drawn) -> dict[str, Any]:
+    return {
+        "name": figure.name,
+        "title": figure.title,
+        "caption": figure.caption,
+        "data": base64.b64encode(figure.files[0].read_bytes()).decode(),
+        "files": [path.name for path in figure.files],
     }
-    drawn = {
-        chart.name: {"title": chart.title, "caption": chart.caption, "chart": chart.data, "data": ""}
-        for chart in charts
-    }
-    return [{"name": name, "chart": "", **drawn.get(name, {}), **static.get(name, {})} for name in drawn | static]
 
 
-def _contents(tables: Sequence[Table], written: Sequence[Written], pictures: Sequence[Any]) -> list[tuple[str, str]]:
-    """The sections that there are, in order."""
-    there = {"figures": len(pictures) > 1, "tables": bool(tables), "theory": any(t.appendix for t in tables)}
+def _contents(
+    tables: Sequence[Table],
+    written: Sequence[Written],
+    figures: Sequence[Drawn],
+    charts: Sequence[Chart],
+    nothing_failed: bool,
+) -> list[tuple[str, str]]:
+    """The folded parts that there are, in order; those of plugins stand behind our tables."""
+    there = {
+        "explore": len(charts) > (not figures),
+        "figures": len(figures) > 1,
+        "tables": sum(not t.appendix for t in tables) > 1 or nothing_failed,
+        "appendix": any(t.appendix for t in tables),
+    }
     own = [(name, title) for name, title in _SECTIONS if there.get(name, True)]
-    split = next(i for i, (name, _) in enumerate(own) if name in ("theory", "provenance"))
+    split = next(i for i, (name, _) in enumerate(own) if name in ("appendix", "provenance"))
     return [*own[:split], *((f"section-{s.name}", s.title) for s in written), *own[split:]]
 
 

@@ -1,7 +1,14 @@
 "use strict";
 
-// Tables: sorted by a click on a heading, filtered by words.
+// A link to a folded part unfolds it.
+function unfold() {
+  const target = location.hash && document.getElementById(decodeURIComponent(location.hash.slice(1)));
+  const part = target && target.closest("details");
+  if (part) { part.open = true; target.scrollIntoView(); }
+}
+addEventListener("hashchange", unfold);
 
+// Tables: sorted by a click on a heading, filtered by words.
 document.querySelectorAll("table.sortable").forEach(function (table) {
   const body = table.tBodies[0];
   table.querySelectorAll("thead th").forEach(function (th, column) {
@@ -16,17 +23,16 @@ document.querySelectorAll("table.sortable").forEach(function (table) {
     });
     button.addEventListener("click", function () {
       const down = th.getAttribute("aria-sort") === "ascending";
-      table.querySelectorAll("th").forEach(function (other) { other.removeAttribute("aria-sort"); });
+      table.querySelectorAll("th").forEach((other) => other.removeAttribute("aria-sort"));
       th.setAttribute("aria-sort", down ? "descending" : "ascending");
-      const rows = Array.from(body.rows);
-      rows.sort(function (a, b) {
+      const rows = Array.from(body.rows).sort(function (a, b) {
         const x = a.cells[column], y = b.cells[column];
         const order = x.dataset.key === undefined || y.dataset.key === undefined
           ? x.textContent.localeCompare(y.textContent, "en", { numeric: true })
           : Math.sign(Number(x.dataset.key) - Number(y.dataset.key)) || 0;
         return down ? -order : order;
       });
-      rows.forEach(function (row) { body.appendChild(row); });
+      body.append(...rows);
     });
   });
 });
@@ -38,31 +44,19 @@ document.querySelectorAll(".tools input").forEach(function (input) {
     const words = input.value.toLowerCase().split(/\s+/).filter(Boolean);
     let shown = 0;
     rows.forEach(function (row) {
-      const cells = Array.from(row.cells, function (cell) { return cell.textContent.toLowerCase(); });
+      const cells = Array.from(row.cells, (cell) => cell.textContent.toLowerCase());
       // A number is looked for as a whole cell, a word anywhere: "1" does not find 100.
-      const hit = words.every(function (word) {
-        return cells.some(function (cell) { return isNaN(Number(word)) ? cell.includes(word) : cell === word; });
-      });
-      row.hidden = !hit;
-      shown += hit ? 1 : 0;
+      row.hidden = !words.every((word) => cells.some((cell) =>
+        isNaN(Number(word)) ? cell.includes(word) : cell === word));
+      shown += row.hidden ? 0 : 1;
     });
     count.textContent = words.length ? shown + " of " + rows.length + " rows" : rows.length + " rows";
   });
 });
 
-// Charts: each is drawn from the numbers that stand beside it, again whenever its width or an answer to one of its
-// controls changes. Nothing is fetched, and texts are set as texts.
-
+// Charts: each is drawn from the numbers that stand beside it, again whenever its width or one of its controls changes.
+// Nothing is fetched, and texts are set as texts.
 const MARGIN = { top: 10, right: 14, bottom: 44, left: 62 };
-const NEAR = 6;  // pixels within which markers lie upon each other
-
-function element(name, attributes, ...children) {
-  return filled(document.createElement(name), attributes, children);
-}
-
-function shape(name, attributes, ...children) {
-  return filled(document.createElementNS("http://www.w3.org/2000/svg", name), attributes, children);
-}
 
 function filled(node, attributes, children) {
   for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
@@ -70,50 +64,33 @@ function filled(node, attributes, children) {
   return node;
 }
 
+function element(name, attributes, ...children) { return filled(document.createElement(name), attributes, children); }
+
+function shape(name, attributes, ...children) {
+  return filled(document.createElementNS("http://www.w3.org/2000/svg", name), attributes, children);
+}
+
 function written(value, share) {
   if (value === null) return "-";
   if (share) return Number((100 * value).toFixed(1)) + " %";
   const size = Math.abs(value);
-  if (size >= 1e5 || (size > 0 && size < 1e-3)) return value.toExponential(2).replace("e+", "e");
+  if (size >= 1e5 || (size > 0 && size < 1e-3)) return value.toExponential(2).replace(/\.?0*e\+?/, "e");
   return String(Number(value.toPrecision(4)));
-}
-
-const RAISED = { "-": "\u207b", 0: "\u2070", 1: "\u00b9", 2: "\u00b2", 3: "\u00b3", 4: "\u2074", 5: "\u2075",
-  6: "\u2076", 7: "\u2077", 8: "\u2078", 9: "\u2079" };
-
-function tickText(value, share) {
-  const power = Math.log10(value);
-  if (share || !Number.isInteger(power) || Math.abs(power) < 5) return written(value, share);
-  return "10" + Array.from(String(power), (sign) => RAISED[sign]).join("");
 }
 
 // From values to pixels. `known` are values that deserve a tick of their own, as the error scales do.
 class Scale {
-  constructor(axis, log, values, ends, from, to, known) {
-    this.log = log;
-    this.from = from;
-    this.to = to;
-    const held = (list) => list.filter((value) => this.holds(value));
-    [this.low, this.high] = axis.share && !log ? [-0.03, 1.03] : this.limits(held(values), held(ends));
+  constructor(axis, log, values, from, to, known) {
+    Object.assign(this, { log, from, to });
+    const held = values.filter((value) => this.holds(value)).map((value) => (log ? Math.log10(value) : value));
+    const low = Math.min(...held), high = Math.max(...held), margin = 0.06 * (high - low) || 0.5;
+    const ends = axis.share && !log ? [-0.03, 1.03] : held.length ? [low - margin, high + margin] : [0, 1];
+    [this.low, this.high] = log ? ends.map((end) => Math.pow(10, end)) : ends;
     this.ticks = (known ? this.spread(known) : log ? this.decades() : this.steps()).filter(
       (value) => value >= this.low && value <= this.high);
   }
 
-  holds(value) { return value !== null && (!this.log || value > 0); }
-
-  // Around the values, with the ends of their intervals as far as these leave the values room.
-  limits(values, ends) {
-    if (!values.length) return this.log ? [0.1, 10] : [0, 1];
-    const way = this.log ? Math.log10 : Number, back = this.log ? (v) => Math.pow(10, v) : Number;
-    const low = way(Math.min(...values)), high = way(Math.max(...values));
-    const room = 0.3 * (high - low) || (this.log ? 0.1 : 0.1 * Math.abs(high) || 1);
-    const lowest = Math.max(low - room, Math.min(low, ...ends.map(way)));
-    const highest = Math.min(high + room, Math.max(high, ...ends.map(way)));
-    const margin = 0.05 * (highest - lowest) || room;
-    return [back(lowest - margin), back(highest + margin)];
-  }
-
-  within(value) { return Math.min(this.high, Math.max(this.low, value)); }
+  holds(value) { return value !== null && value !== undefined && (!this.log || value > 0); }
 
   place(value) {
     const way = this.log ? Math.log(value / this.low) / Math.log(this.high / this.low)
@@ -131,11 +108,11 @@ class Scale {
 
   decades() {
     const first = Math.floor(Math.log10(this.low)), last = Math.ceil(Math.log10(this.high));
-    const apart = Math.ceil((last - first) / 7);
-    const steps = last - first <= 3 ? [1, 2, 5] : [1];
     const ticks = [];
-    for (let power = first; power <= last; power += apart) {
-      for (const step of steps) ticks.push(Number((step * Math.pow(10, power)).toPrecision(1)));
+    for (let power = first; power <= last; power += Math.ceil((last - first) / 7)) {
+      for (const step of last - first <= 3 ? [1, 2, 5] : [1]) {
+        ticks.push(Number((step * Math.pow(10, power)).toPrecision(1)));
+      }
     }
     return ticks;
   }
@@ -157,13 +134,12 @@ function polygon(corners, turn) {
   });
 }
 
-const SQUARE = polygon(4, Math.PI / 4), DIAMOND = polygon(4, 0);
-const PLUS = [[-.35, -1], [.35, -1], [.35, -.35], [1, -.35], [1, .35], [.35, .35], [.35, 1], [-.35, 1], [-.35, .35],
-  [-1, .35], [-1, -.35], [-.35, -.35]];
+const DIAMOND = polygon(4, 0);
 const OUTLINES = {
-  "s": SQUARE, "D": DIAMOND, "d": DIAMOND.map(([x, y]) => [0.6 * x, y]), "^": polygon(3, 0), "v": polygon(3, Math.PI),
-  "<": polygon(3, -Math.PI / 2), ">": polygon(3, Math.PI / 2), "p": polygon(5, 0), "h": polygon(6, 0), "P": PLUS,
-  "X": PLUS.map(([x, y]) => [(x - y) * Math.SQRT1_2, (x + y) * Math.SQRT1_2]),
+  "s": polygon(4, Math.PI / 4), "D": DIAMOND, "d": DIAMOND.map(([x, y]) => [0.6 * x, y]), "^": polygon(3, 0),
+  "v": polygon(3, Math.PI), "<": polygon(3, -Math.PI / 2), ">": polygon(3, Math.PI / 2), "p": polygon(5, 0),
+  "h": polygon(6, 0), "P": polygon(8, 0).map(([x, y], k) => (k % 2 ? [0.4 * x, 0.4 * y] : [x, y])),
+  "X": polygon(8, Math.PI / 4).map(([x, y], k) => (k % 2 ? [0.4 * x, 0.4 * y] : [x, y])),
 };
 
 function marker(kind, x, y, radius) {
@@ -181,18 +157,13 @@ class Chart {
     this.place = place;
     this.plot = shape("svg", { tabindex: 0, role: "group", "aria-label": place.dataset.title +
       ". Arrow keys go from point to point: left and right along a curve, up and down between curves." });
-    this.note = element("div", { class: "note", role: "status" });
-    this.note.hidden = true;
+    this.note = element("div", { class: "note", role: "status", hidden: "" });
     place.append(this.controls(), element("div", { class: "plot" }, this.plot, this.note), this.legend());
-    this.plot.addEventListener("pointermove", (event) => this.point(event));
-    this.plot.addEventListener("pointerdown", (event) => this.point(event));
-    this.plot.addEventListener("pointerleave", () => this.tell(null));
-    this.plot.addEventListener("blur", () => this.tell(null));
+    for (const kind of ["pointermove", "pointerdown"]) this.plot.addEventListener(kind, (event) => this.point(event));
+    for (const kind of ["pointerleave", "blur"]) this.plot.addEventListener(kind, () => this.tell(null));
     this.plot.addEventListener("keydown", (event) => this.key(event));
     new ResizeObserver(() => { if (place.clientWidth !== this.width) this.draw(); }).observe(place);
   }
-
-  // Controls
 
   controls() {
     const bar = element("div", { class: "controls" });
@@ -200,10 +171,7 @@ class Chart {
       const axes = this.data[name];
       const choice = element("select", {}, ...axes.map((axis, k) => element("option", { value: k }, axis.title)));
       const log = element("input", { type: "checkbox" });
-      const choose = () => {
-        this[name] = axes[choice.value];
-        log.checked = this[name].log;
-      };
+      const choose = () => { this[name] = axes[choice.value]; log.checked = this[name].log; };
       choice.addEventListener("change", () => { choose(); this.draw(); });
       log.addEventListener("change", () => this.draw());
       this[name + "Log"] = log;
@@ -217,13 +185,10 @@ class Chart {
     return element("div", { class: "legend" }, ...this.data.series.map((series) => {
       const sample = shape("svg", { width: 30, height: 14, "aria-hidden": "true" }, this.line(series, "M1 7H29"),
         marker(series.marker, 15, 7, 5));
-      const button = element("button", { type: "button", "aria-pressed": "true" }, sample, series.name);
-      this.paint(button, series);
+      const button = this.paint(element("button", { type: "button", "aria-pressed": "true" }, sample, series.name), series);
       button.addEventListener("click", () => {
-        const show = this.hidden.has(series);
-        if (show) this.hidden.delete(series);
-        else this.hidden.add(series);
-        button.setAttribute("aria-pressed", String(show));
+        if (!this.hidden.delete(series)) this.hidden.add(series);
+        button.setAttribute("aria-pressed", String(!this.hidden.has(series)));
         this.draw();
       });
       return button;
@@ -234,13 +199,12 @@ class Chart {
     node.classList.add("series");
     node.style.setProperty("--on-light", series.color);
     node.style.setProperty("--on-dark", series.on_dark);
+    return node;
   }
 
   line(series, path) {
     return shape("path", { d: path, class: "line", "stroke-dasharray": series.dash.map((v) => v * 1.5).join(" ") });
   }
-
-  // Drawing
 
   get shown() { return this.data.series.filter((series) => !this.hidden.has(series)); }
 
@@ -248,14 +212,11 @@ class Chart {
     this.width = this.place.clientWidth;
     const width = Math.max(280, this.width), height = Math.round(Math.min(420, 180 + width * 0.28));
     const all = (axis, names) => this.shown.flatMap((series) => names.flatMap((name) => series.values[axis[name]] || []));
-    const reference = this.y.reference === null ? [] : [this.y.reference];
-    const scales = this.x.column === "error_scale" ? all(this.x, ["column"]) : null;
-    this.across = new Scale(this.x, this.xLog.checked, all(this.x, ["column"]), [], MARGIN.left, width - MARGIN.right,
-      scales);
-    this.up = new Scale(this.y, this.yLog.checked, [...all(this.y, ["column"]), ...reference],
-      all(this.y, ["low", "high"]), height - MARGIN.bottom, MARGIN.top, null);
+    const known = this.x.column === "error_scale" ? all(this.x, ["column"]) : null;
+    this.across = new Scale(this.x, this.xLog.checked, all(this.x, ["column"]), MARGIN.left, width - MARGIN.right, known);
+    this.up = new Scale(this.y, this.yLog.checked, [...all(this.y, ["column", "low", "high"]), this.y.reference],
+      height - MARGIN.bottom, MARGIN.top, null);
     this.points = this.shown.flatMap((series) => this.pointsOf(series));
-    this.points.forEach((point) => { point.depth = this.points.filter((other) => this.lies(other, point)).length; });
     this.plot.setAttribute("viewBox", "0 0 " + width + " " + height);
     this.plot.style.height = height + "px";
     this.plot.replaceChildren(this.frame(width, height), ...this.shown.map((series) => this.curve(series)));
@@ -263,71 +224,58 @@ class Chart {
   }
 
   pointsOf(series) {
-    const of = (axis) => series.values[axis.column];
-    return of(this.x).map((_, k) => k)
-      .filter((k) => this.across.holds(of(this.x)[k]) && this.up.holds(of(this.y)[k]))
-      .map((k) => ({ series, k, x: this.across.place(of(this.x)[k]), y: this.up.place(of(this.y)[k]) }));
-  }
-
-  lies(other, point) {
-    const later = this.data.series.indexOf(other.series) > this.data.series.indexOf(point.series);
-    return later && Math.abs(other.x - point.x) < NEAR && Math.abs(other.y - point.y) < NEAR;
+    const x = series.values[this.x.column], y = series.values[this.y.column];
+    return x.map((_, k) => k).filter((k) => this.across.holds(x[k]) && this.up.holds(y[k]))
+      .map((k) => ({ series, k, x: this.across.place(x[k]), y: this.up.place(y[k]) }));
   }
 
   frame(width, height) {
-    const left = MARGIN.left, right = width - MARGIN.right, bottom = height - MARGIN.bottom;
+    const left = MARGIN.left, right = width - MARGIN.right, bottom = height - MARGIN.bottom, top = MARGIN.top;
     const parts = shape("g", { class: "frame" });
     for (const tick of this.across.ticks) {
       const x = this.across.place(tick);
-      parts.append(shape("path", { d: "M" + x + " " + MARGIN.top + "V" + bottom, class: "grid" }),
-        shape("text", { x, y: bottom + 16, "text-anchor": "middle" }, tickText(tick, this.x.share)));
+      parts.append(shape("path", { d: `M${x} ${top}V${bottom}`, class: "grid" }),
+        shape("text", { x, y: bottom + 16, "text-anchor": "middle" }, written(tick, this.x.share)));
     }
     for (const tick of this.up.ticks) {
       const y = this.up.place(tick);
-      parts.append(shape("path", { d: "M" + left + " " + y + "H" + right, class: "grid" }),
-        shape("text", { x: left - 6, y: y + 4, "text-anchor": "end" }, tickText(tick, this.y.share)));
+      parts.append(shape("path", { d: `M${left} ${y}H${right}`, class: "grid" }),
+        shape("text", { x: left - 6, y: y + 4, "text-anchor": "end" }, written(tick, this.y.share)));
     }
     if (this.up.holds(this.y.reference)) {
       const y = this.up.place(this.y.reference);
-      parts.append(shape("path", { d: "M" + left + " " + y + "H" + right, class: "reference" }),
+      parts.append(shape("path", { d: `M${left} ${y}H${right}`, class: "reference" }),
         shape("text", { x: right - 4, y: y - 4, "text-anchor": "end", class: "says" }, this.y.reference_title));
     }
-    const middle = (MARGIN.top + bottom) / 2;
+    const turned = "translate(14 " + (top + bottom) / 2 + ") rotate(-90)";
     parts.append(
-      shape("path", { d: "M" + left + " " + MARGIN.top + "V" + bottom + "H" + right, class: "edge" }),
+      shape("path", { d: `M${left} ${top}V${bottom}H${right}`, class: "edge" }),
       shape("text", { x: (left + right) / 2, y: height - 8, "text-anchor": "middle", class: "name" }, this.x.title),
-      shape("text", { transform: "translate(14 " + middle + ") rotate(-90)", "text-anchor": "middle", class: "name" },
-        this.y.title));
+      shape("text", { transform: turned, "text-anchor": "middle", class: "name" }, this.y.title));
     return parts;
   }
 
   curve(series) {
-    const group = shape("g", {});
     const points = this.points.filter((point) => point.series === series);
     // The line breaks where a value is missing.
     const path = points.map((point, i) =>
       (i && points[i - 1].k === point.k - 1 ? "L" : "M") + point.x.toFixed(1) + " " + point.y.toFixed(1));
-    this.paint(group, series);
-    group.append(this.line(series, path.join("")));
+    const group = this.paint(shape("g", {}, this.line(series, path.join(""))), series);
     for (const point of points) {
-      const few = this.count(point) < this.data.few;
-      const low = this.value(point, "low"), high = this.value(point, "high");
-      if (!few && this.up.holds(low) && this.up.holds(high)) {
-        const [from, to] = [low, high].map((end) => this.up.place(this.up.within(end)));
-        group.append(shape("path", { d: "M" + point.x + " " + from + "V" + to, class: "bar" }));
+      const few = series.values.trials[point.k] < this.data.few;
+      const ends = ["low", "high"].map((end) => this.value(point, end));
+      if (!few && ends.every((end) => this.up.holds(end))) {
+        const [from, to] = ends.map((end) => this.up.place(end));
+        group.append(shape("path", { d: `M${point.x} ${from}V${to}`, class: "bar" }));
       }
-      point.mark = marker(series.marker, point.x, point.y, 4.5 + Math.min(1.6 * point.depth, 7));
+      point.mark = marker(series.marker, point.x, point.y, 4.5);
       if (few) point.mark.classList.add("hollow");
       group.append(point.mark);
     }
     return group;
   }
 
-  // What is pointed at
-
   value(point, name) { const values = point.series.values[this.y[name]]; return values ? values[point.k] : null; }
-
-  count(point) { return point.series.values[this.y.count][point.k]; }
 
   point(event) {
     const box = this.plot.getBoundingClientRect();
@@ -342,11 +290,10 @@ class Chart {
     if ((!along && !between) || !this.points.length) return;
     event.preventDefault();
     if (!this.at) { this.tell(this.points[0]); return; }
-    const own = this.points.filter((p) => p.series === this.at.series);
-    const others = this.shown.filter((series) => this.points.some((p) => p.series === series));
     const next = (list, item, step) => list[(list.indexOf(item) + step + list.length) % list.length];
-    if (along) { this.tell(next(own, this.at, along)); return; }
-    const there = this.points.filter((p) => p.series === next(others, this.at.series, between));
+    const of = (series) => this.points.filter((p) => p.series === series);
+    if (along) { this.tell(next(of(this.at.series), this.at, along)); return; }
+    const there = of(next(this.shown.filter((series) => of(series).length), this.at.series, between));
     this.tell(there.reduce((best, p) => (Math.abs(p.x - this.at.x) < Math.abs(best.x - this.at.x) ? p : best)));
   }
 
@@ -356,32 +303,16 @@ class Chart {
     this.note.hidden = !point;
     if (!point) return;
     point.mark.classList.add("told");
-    const says = (axis, name) => written(point.series.values[axis[name]][point.k], axis.share);
+    const says = (axis) => axis.title + ": " + written(point.series.values[axis.column][point.k], axis.share);
     const low = this.value(point, "low"), interval = low === null ? ""
       : " (" + written(low, this.y.share) + " to " + written(this.value(point, "high"), this.y.share) + ")";
-    const trials = point.series.values.trials[point.k], count = this.count(point);
-    this.note.replaceChildren(element("b", {}, point.series.name),
-      element("span", {}, this.y.title + ": " + says(this.y, "column") + interval),
-      ...this.data.x.map((axis) => element("span", {}, axis.title + ": " + says(axis, "column"))),
-      element("span", {}, (count < trials ? count + " of " + trials : trials) + " trials"));
-    const room = this.place.clientWidth - this.note.offsetWidth;
-    this.note.style.left = Math.max(0, Math.min(point.x + 12, room)) + "px";
+    this.note.replaceChildren(element("b", {}, point.series.name), element("span", {}, says(this.y) + interval),
+      ...this.data.x.map((axis) => element("span", {}, says(axis))),
+      element("span", {}, point.series.values.trials[point.k] + " trials"));
+    this.note.style.left = Math.max(0, Math.min(point.x + 12, this.place.clientWidth - this.note.offsetWidth)) + "px";
     this.note.style.top = point.y + (point.y > 130 ? -12 - this.note.offsetHeight : 14) + "px";
   }
 }
 
-document.querySelectorAll(".chart").forEach(function (place) {
-  new Chart(place);
-  place.parentElement.classList.add("answers");
-});
-document.querySelectorAll(".answers").forEach(function (figure) {
-  const picture = figure.querySelector(".static");
-  if (!picture) return;
-  const button = element("button", { type: "button", class: "plain", "aria-expanded": "false" }, "Show the static figure");
-  button.addEventListener("click", function () {
-    const open = figure.classList.toggle("with-static");
-    button.setAttribute("aria-expanded", String(open));
-    button.textContent = open ? "Hide the static figure" : "Show the static figure";
-  });
-  picture.before(button);
-});
+document.querySelectorAll(".chart").forEach((place) => new Chart(place));
+unfold();
