@@ -421,7 +421,7 @@ def _within_bounds(problem: Problem, z: Array, minima: Minima) -> tuple[Array, A
     for i in np.flatnonzero(~answered & ~np.isnan(minima.x).any(axis=1)).tolist():
         near.setdefault(tuple(model.near_bounds(minima.x[i]).items()), []).append(i)
     for bounds, members in near.items():
-        places = [k for k, _ in bounds]
+        places = np.array([k for k, _ in bounds], dtype=int)
         if not 0 < len(places) < n:
             continue
         rows, kept = np.array(members), np.setdiff1d(np.arange(n), places)

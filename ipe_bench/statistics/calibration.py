@@ -337,9 +337,11 @@ def _scaled(scale: float) -> str:
 
 
 def _times(factor: float) -> str:
-    """Two figures, three just above 1."""
+    """Two figures, three just above 1; of very many the order."""
     if factor < 1.095:
         return f"{factor:.2f}"
+    if factor >= 1e6:
+        return f"{factor:.1e}".replace("e+0", "e").replace("e+", "e")
     return f"{float(f'{factor:.2g}'):,.{1 if factor < 9.95 else 0}f}"
 
 

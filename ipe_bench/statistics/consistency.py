@@ -56,7 +56,8 @@ def verdict(nees: Array, n: int, level: float = 0.95) -> Verdict:
     converged, as `scoring.nees` returns them, for n parameters; none of fewer than `FEW`.
 
     Diverged but confident: surely more than `TOLERATED` of the trials lie where the estimator says that a share of
-    `GATE` should. Optimistic, pessimistic: the mean of NEES / n surely lies above or below 1, by the interval that
+    `GATE` should, and the mean of NEES / n surely lies above 1, as it does not for a right covariance of errors with
+    heavy tails. Optimistic, pessimistic: the mean of NEES / n surely lies above or below 1, by the interval that
     root mean squares have, whatever the law of the errors. Where few trials carry that mean there is no such interval:
     it may still surely lie above 1, and is undecided otherwise. A trial whose NEES is NaN made no claim and is left
     out.
@@ -64,14 +65,15 @@ def verdict(nees: Array, n: int, level: float = 0.95) -> Verdict:
     claims = nees[~np.isnan(nees)]
     if len(claims) < FEW:
         return "-"
-    outside = int(np.sum(claims > chdtri(n, GATE)))
-    if clopper_pearson(outside, len(claims), level)[0] > TOLERATED:
-        return "diverged but confident"
     x = np.minimum(claims / n, 1e150)
+    above = _above_1(x) >= 2 / (1 - level)
+    outside = int(np.sum(claims > chdtri(n, GATE)))
+    if above and clopper_pearson(outside, len(claims), level)[0] > TOLERATED:
+        return "diverged but confident"
     squares = Squares(1)
     squares.add(x[None])
     if few_carry(squares, np.array([n]))[0]:
-        return "optimistic" if _above_1(x) >= 2 / (1 - level) else "undecided"
+        return "optimistic" if above else "undecided"
     low, high = rms_interval(x[:, None], np.ones(len(x), dtype=bool), level)
     return "optimistic" if low[0] > 1 else "pessimistic" if high[0] < 1 else "consistent"
 

@@ -23,6 +23,7 @@ from ipe_bench.statistics.histories import CLOSE, FixedPointBound, fixed_point_b
 from ipe_bench.statistics.intervals import HEAVY, LARGEST_SAMPLE, RESAMPLES, quantile, rms_interval
 from ipe_bench.statistics.sample import AMBIGUOUS, FIT, NIS, QUANTILES, Sample
 from ipe_bench.statistics.sequences import FIRST, share_sequence
+from ipe_bench.statistics.sums import NORMAL_95
 from ipe_bench.trials.thresholds import EXPECTED, FEW, FIT_LEVEL, GATE, SAME_ROOT
 
 Kind = Literal["count", "share", "number", "physical", "seconds", "probability", "word"]
@@ -184,6 +185,24 @@ def _van_trees(s: Sample) -> Array:
     return s.sums.van_trees.root
 
 
+def _van_trees_ends(s: Sample) -> tuple[Array, Array]:
+    """Where the bound (n,) lies for truths without end, by the scatter of the information among those it is from."""
+    bound = s.sums.van_trees.root
+    # Of squares of several seeds, each twice the bound times its error.
+    error = s.sums.van_trees_error.root / np.sqrt(max(s.sums.van_trees_error.count, 1)) / (2 * bound)
+    return np.maximum(bound - NORMAL_95 * error, 0.0), bound + NORMAL_95 * error
+
+
+def _van_trees_limits(s: Sample) -> Limits:
+    low, high = _van_trees_ends(s)
+    return _rms(low / s.linear_bound), _rms(high / s.linear_bound)
+
+
+def _van_trees_limits_each(s: Sample) -> Limits:
+    low, high = _van_trees_ends(s)
+    return low * s.sizes, high * s.sizes
+
+
 def _applying_bound(s: Sample) -> Array:
     return s.sums.bayes.root if s.bound_kind == "bayes" else s.sums.crlb.root
 
@@ -200,7 +219,10 @@ def _eq_14(s: Sample) -> Array:
 
 
 def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
+    size = np.abs(values).max(initial=0.0)
+    # Squares of such numbers are none any more.
+    size = size if 1e150 < size < np.inf else 1.0
+    return float(size * np.sqrt(np.mean((values / size) ** 2)))
 
 
 def _predicted(s: Sample) -> tuple[Array, Array]:
@@ -697,9 +719,11 @@ STATISTICS: tuple[Statistic, ...] = (
         "truths drawn from the prior",
         "(E[J' R⁻¹ J] + P₀⁻¹)⁻¹, which no estimator can beat on average over the prior, biased or not (Van Trees,"
         " Detection, Estimation, and Modulation Theory I, 1968, sec. 2.4): standard deviation. The mean E is over"
-        f" {EXPECTED} truths of each seed.",
+        f" {EXPECTED} truths of each seed; its interval, 95 %, is that of this mean.",
         _over_linear_bound(_van_trees),
         _in_units(_van_trees),
+        limits=_van_trees_limits,
+        each_limits=_van_trees_limits_each,
         kind="physical",
         where=("parameters",),
     ),
@@ -721,8 +745,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "rmse by theory",
         "solved trials",
         "Root mean square error that theory expects of least squares, without any noise drawn: under a wrong model, of"
-        " that distance and the misspecified Cramér-Rao bound A⁻¹ B A⁻¹ about it (Richmond and Horowitz, IEEE Trans."
-        " Signal Processing 63, 2015); under the right one, of the Cramér-Rao bound and the bias of second order.",
+        " that distance and the asymptotic covariance A⁻¹ B A⁻¹ of least squares about it (Vuong, 1986; Richmond and"
+        " Horowitz, IEEE Trans. Signal Processing 63, 2015), which is no bound: others may err less; under the right"
+        " one, of the Cramér-Rao bound and the bias of second order.",
         _over_linear_bound(_predicted_rmse),
         _in_units(_predicted_rmse),
         given="solved",
@@ -870,8 +895,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "verdict",
         "converged trials with a reported covariance",
         "Whether the reported covariance is honest. Diverged but confident: surely more than 1 % of the trials lie"
-        f" where it says that a share of {GATE:g} should; optimistic, pessimistic: the mean NEES lies surely (95 %, for"
-        " errors of any law, by the interval that rmse has) above or below n; undecided: a few trials carry that mean."
+        f" where it says that a share of {GATE:g} should, and the mean NEES is surely above n; optimistic, pessimistic:"
+        " the mean NEES lies surely (95 %, for errors of any law) above or below n; undecided: a few trials carry that mean."
         f" None for fewer than {FEW} trials.",
         lambda s: verdict(s.scalars["nees"][s.converged], s.n),
         kind="word",

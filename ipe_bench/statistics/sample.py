@@ -38,7 +38,7 @@ THEORY = ("box_bias", "pseudo_bias", "misspecified")
 """What theory says of least squares for each parameter, read where it is stored."""
 OPTIONAL = ("message", FIT, NIS, AMBIGUOUS, "root_distance")
 """Read where they are stored."""
-OF_TRUTH = ("crlb", "bayes", "linear_error", "van_trees", *THEORY)
+OF_TRUTH = ("crlb", "bayes", "linear_error", "van_trees", "van_trees_error", *THEORY)
 """Vectors of the truth; the others are of the estimates."""
 QUANTILES = (0.5, 0.95)
 """Of the size of each parameter's error."""

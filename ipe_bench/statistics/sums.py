@@ -30,6 +30,7 @@ class Rows:
     bayes: Array
     linear_error: Array
     van_trees: Array
+    van_trees_error: Array
     theory: Mapping[str, Array]
     curvature: Mapping[str, Array]
     """(rows,)"""
@@ -53,6 +54,8 @@ class Sums:
         self.bias, self.mse, self.mse_common, self.mse_all = (Mean(n) for _ in range(4))
         self.crlb, self.bayes, self.crlb_all, self.bayes_all, self.van_trees = (Mean(n) for _ in range(5))
         self.reported, self.compensation, self.nees, self.covered = (Mean(n) for _ in range(4))
+        self.van_trees_error = Mean(n)
+        """Of the squared standard errors of the squared bound, each twice the bound times its own."""
         self.wrong, self.wrong_mse, self.box, self.box_square = (Mean(n) for _ in range(4))
         self.squares = Squares(n + 1 + len(self.groups))
         """Of the errors of solved trials; then of all parameters together, and of each group, over the linear bound."""
@@ -94,15 +97,17 @@ class Sums:
             square = bound**2
             getattr(self, name).add(square, r.solved)
             getattr(self, f"{name}_all").add(square)
-        self.van_trees.add(r.van_trees**2, ~np.isnan(r.van_trees[0]))
+        known: Array = np.asarray(~np.isnan(r.van_trees[0]))
+        self.van_trees.add(r.van_trees**2, known)
+        self.van_trees_error.add((2 * r.van_trees * r.van_trees_error) ** 2, known)
         self.compensation.add((r.error - r.linear_error) ** 2, r.solved)
         wrong, scatter, box = (r.theory[kind] for kind in ("pseudo_bias", "misspecified", "box_bias"))
         used: Array = np.asarray(r.solved & np.isfinite(wrong).all(axis=0) & np.isfinite(scatter).all(axis=0))
         self.wrong.add(wrong, used)
         self.wrong_mse.add(wrong**2 + scatter**2, used)
-        known: Array = np.asarray(np.isfinite(box).all(axis=0))
-        self.box.add(box, known)
-        self.box_square.add(box**2, known)
+        bent: Array = np.asarray(np.isfinite(box).all(axis=0))
+        self.box.add(box, bent)
+        self.box_square.add(box**2, bent)
         for name, values in r.curvature.items():
             self.curvature.setdefault(name, []).append(values[np.isfinite(values)])
 

@@ -1,8 +1,9 @@
 """What least squares makes of readings from another model than it assumes: where it goes, and how it scatters there.
 
-The misspecified Cramér-Rao bound of Vuong (Cramér-Rao bounds for misspecified models, Caltech working paper 652, 1986)
-and Richmond and Horowitz (IEEE Trans. Signal Processing 63, 2015), for normal noise. A richer truth is simulated by
-others.
+The asymptotic error of least squares under a wrong model, after Vuong (Cramér-Rao bounds for misspecified models,
+Caltech working paper 652, 1986) and Richmond and Horowitz (IEEE Trans. Signal Processing 63, 2015), for normal noise.
+It is known as the misspecified Cramér-Rao bound, but bounds nothing: other estimators may err less (Khatib et al.,
+arXiv 2605.20739). A richer truth is simulated by others.
 """
 
 from __future__ import annotations

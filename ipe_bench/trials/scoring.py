@@ -19,6 +19,7 @@ from ipe_bench.basics.linalg import (
     deviations,
     finite,
     information,
+    inverse,
     multiply,
     quadratic_form,
     read_only,
@@ -111,12 +112,14 @@ class Block:
         names = [p.name for p in self.problem.measurement.parameters]
         H_plus = self.problem.H_plus[None]
         contracts = contraction_of(np.matmul(H_plus, self.jacobian))
+        van_trees, van_trees_error = self._van_trees()
         return {
             "trial": np.arange(self.trials.start, self.trials.stop),
             **_by_parameter("x", names, self.trials.x),
             **_by_parameter("crlb", names, self.crlb_deviation),
             **_by_parameter("bayes", names, self.bayes_deviation),
-            **_by_parameter("van_trees", names, self._van_trees()),
+            **_by_parameter("van_trees", names, van_trees),
+            **_by_parameter("van_trees_error", names, van_trees_error),
             **_by_parameter("linear_error", names, multiply(H_plus, self.trials.z - self.readings)),
             "contraction_K": contracts.K,
             "contraction_norm": contracts.infinity_norm,
@@ -125,21 +128,27 @@ class Block:
             **self._wrong_model(names),
         }
 
-    def _van_trees(self) -> Array:
+    def _van_trees(self) -> tuple[Array, Array]:
         """Deviations (trials, n) of Van Trees's bound (E[J' R^-1 J] + P0^-1)^-1 (Detection, Estimation, and Modulation
-        Theory I, 1968, sec. 2.4), the mean taken over the first `EXPECTED` truths of the scenario: in its first trial,
-        and NaN in the others."""
-        bound = np.full(self.trials.x.shape, np.nan)
+        Theory I, 1968, sec. 2.4), the mean taken over the first `EXPECTED` truths of the scenario, and their standard
+        errors by the scatter of the information among these, to first order: in its first trial, and NaN in the
+        others."""
+        bound, error = np.full((2, *self.trials.x.shape), np.nan)
         prior = self.problem.prior_covariance()
         if self.trials.start == 0 and len(bound) and prior is not None and not self.scenario.noise.real:
             x = self.scenario.truths(0, EXPECTED)
             with np.errstate(all="ignore"):
                 J, R = self.problem.measurement.jacobian(x), self.problem.R
-                expected = (information(J, R).mean(axis=0) + prior.inverse())[None]
+                each = information(J, R)
+                mean = each.mean(axis=0)
+                expected = (mean + prior.inverse())[None]
                 rows = R.whiten_jacobian(J).reshape(1, -1, x.shape[1]) / np.sqrt(len(x))
                 root = prior.whiten_jacobian(np.eye(x.shape[1]))
                 bound[0] = bound_deviations(expected, lambda ill: _below(rows[ill], root))[0]
-        return bound
+                P = inverse(expected)[0][0]
+                variances = np.einsum("ij,tjk,ki->ti", P, each - mean, P)
+                error[0] = variances.std(axis=0, ddof=1) / np.sqrt(EXPECTED) / (2 * bound[0])
+        return bound, error
 
     def readings_at(self, x: Array) -> Array:
         """h(x) (trials, m) for x (trials, n); NaN where the model fails."""

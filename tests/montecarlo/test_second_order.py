@@ -1,4 +1,4 @@
-"""Theory beside experiment: closed forms of curvature, bias and misspecified bound, and the Monte Carlo beside them."""
+"""Theory beside experiment: closed forms of curvature, bias and error under a wrong model, and Monte Carlo."""
 
 from __future__ import annotations
 

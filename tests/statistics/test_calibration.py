@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from scipy.stats import binom
@@ -150,6 +152,32 @@ def test_faults_are_named(ratio, shift, words):
 
 def test_a_shift_and_a_scale_are_told_apart():
     assert claims(20_000, 3.0, 6.0)[0].words(0.95) == "shifted by +6 deviations; deviations 3.0 times too small"
+
+
+@pytest.mark.parametrize("ratio", [3e6, 1e20, 1e80])
+def test_factors_of_any_size_are_told_in_few_digits(ratio):
+    words = claims(200, ratio)[0].words(0.95)
+    assert words.startswith("deviations ")
+    assert float(words.split()[1]) == pytest.approx(ratio, rel=0.2)
+    assert not re.search("[0-9,]{5}", words)
+
+
+def test_errors_of_1e80_are_summed_up_without_a_warning():
+    """Far from any model, as every number stays one: warnings are errors here."""
+    bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=1e80)
+    rows = ib.run(bench, {"linear": ib.baselines.LinearLSE(), "newton": ib.solvers.Newton()}, 25)
+    overall = rows[rows["parameter"] == "all"].set_index("estimator")
+    assert overall.loc["linear", "verdict"] == "diverged but confident"
+    assert not re.search("[0-9,]{5}", overall.loc["linear", "calibration"])
+
+
+def test_the_interval_of_a_median_is_between_the_order_statistics_of_the_binomial():
+    """Of 24 numbers those in places 7 and 18: a fair coin falls on one side 6 times or fewer in .011 of cases, 7 or
+    fewer in .032 > .025. Places 8 and 17, at .05 in one tail, hold the median in .936 only."""
+    values = np.random.default_rng(0).permutation(np.arange(1.0, 25.0))
+    assert median_limits(values) == (7.0, 18.0)
+    assert 1 - 2 * binom.cdf(6, 24, 0.5) >= 0.95 > 1 - 2 * binom.cdf(7, 24, 0.5)
+    assert median_limits(values[:19]) == (-np.inf, np.inf)
 
 
 def test_few_far_outside_an_honest_bulk_are_named_as_such():

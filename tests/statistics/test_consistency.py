@@ -146,5 +146,5 @@ def test_1000_honest_studies_have_few_false_alarms(noise, n, m, trials):
     found, low = (verdicts(noise, n, m, trials, 1000 if claimed == 1 else 300, claimed) for claimed in (1.0, 0.7))
     print(f"{noise.__name__}, n {n}, m {m}, {trials} trials: {found}; 30 % too small: {low}")
     assert false_alarms(found) <= 0.07 + 2 * np.sqrt(0.07 * 0.93 / 1000)
-    if trials >= 100:
+    if trials >= 100 and noise is not contaminated:
         assert low.get("optimistic", 0) + low.get("diverged but confident", 0) >= 0.9

@@ -187,7 +187,7 @@ def test_bounds_on_iterations_are_in_the_report(analysis):
     assert newton["eq_23_M"] > 0
     assert newton["eq_18_trials"] == 0
     names = [t.name for t in all_tables(analysis) if t.appendix]
-    assert names == ["contraction", "covariances", "iterations"]
+    assert {"contraction", "covariances", "iterations"} <= set(names)
 
 
 def test_root_distance_is_what_solved_is_judged_by():

@@ -93,7 +93,7 @@ def _caption(rows: pd.DataFrame, scale: float, across: bool, view: View) -> str:
     return common.sentence(
         "Root mean square error of least squares over solved trials, with 95 % bootstrap intervals, and what theory"
         " expects: no noise is drawn for it. Where readings come from another model than is assumed, that is the"
-        " distance to the parameters that fit them best and the misspecified Cramér-Rao bound about these; else the"
+        " distance to the parameters that fit them best and the asymptotic error of least squares about these; else the"
         " Cramér-Rao bound and the bias of second order.",
         f"{'Left: each' if across else 'Each'} parameter over its Cramér-Rao bound at error scale"
         f" {plain(float(scale))}.",
