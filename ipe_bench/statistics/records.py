@@ -896,8 +896,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "converged trials with a reported covariance",
         "Whether the reported covariance is honest. Diverged but confident: surely more than 1 % of the trials lie"
         f" where it says that a share of {GATE:g} should, and the mean NEES is surely above n; optimistic, pessimistic:"
-        " the mean NEES lies surely (95 %, for errors of any law) above or below n; undecided: a few trials carry that mean."
-        f" None for fewer than {FEW} trials.",
+        " the mean NEES lies surely (95 %, for errors of any law) above or below n; undecided: a few trials carry that"
+        f" mean. None for fewer than {FEW} trials.",
         lambda s: verdict(s.scalars["nees"][s.converged], s.n),
         kind="word",
         where=("calibration",),
