@@ -84,7 +84,7 @@ def width() -> int:
     return 8 if llvm.get_host_cpu_features().get("avx512f") else 4
 
 
-@functools.cache
+@functools.lru_cache(maxsize=256)
 def load(
     key: str, write: Callable[[], str], name: str, arguments: tuple[Any, ...], what: str = "an integrator"
 ) -> Callable[..., None]:

@@ -7,6 +7,7 @@ handed to Python's own interpreter. What the names stand for is left to the mode
 from __future__ import annotations
 
 import math
+import operator
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -35,6 +36,8 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
 CONSTANTS = {"pi": math.pi}
 _LONGEST = 10_000
 _DEEPEST = 50
+_MOST_IN_A_ROW = 400
+"""Operations that build on one another, as in a sum of so many terms."""
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)|(?P<sign>\*\*|[-+*/^()]))", re.ASCII
 )
@@ -82,6 +85,9 @@ def read(text: str, where: str) -> Arithmetic:
     tree = parser.sum(0)
     if parser.token is not None:
         parser.refuse("an operator such as + - * / ** is missing")
+    if _height(tree) > _MOST_IN_A_ROW:
+        remedy = "group terms by parentheses, or write the model in Python (`ipe-bench new measurement`)"
+        raise UserError(f"{where}: has more than {_MOST_IN_A_ROW} operations one after another; {remedy}")
     names = dict.fromkeys(_names(tree))
     return Arithmetic(text, tree, tuple(name for name in names if name not in CONSTANTS))
 
@@ -139,6 +145,8 @@ class _Parser:
         base = self.atom(depth)
         if self.token in ("**", "^"):
             self.advance()
+            if depth > _DEEPEST:
+                self.refuse(f"powers are nested more than {_DEEPEST} deep")
             return ("**", base, self.signed(depth + 1))
         return base
 
@@ -165,31 +173,51 @@ class _Parser:
         return tree
 
 
+def _height(tree: Tree) -> int:
+    """The most operations that build on one another."""
+    level, height = [tree], 0
+    while level:
+        level, height = [part for node in level for part in node[1:] if isinstance(part, tuple)], height + 1
+    return height
+
+
 def _names(tree: Tree) -> list[str]:
-    if tree[0] == "name":
-        return [tree[1]]
-    return [name for part in tree[1:] if isinstance(part, tuple) for name in _names(part)]
+    found: list[str] = []
+    waiting = [tree]
+    while waiting:
+        operation, *operands = waiting.pop()
+        if operation == "name":
+            found.append(operands[0])
+        waiting.extend(part for part in reversed(operands) if isinstance(part, tuple))
+    return found
+
+
+_BINARY: dict[str, Callable[[Any, Any], Any]] = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": operator.truediv,
+    "**": operator.pow,
+}
 
 
 def _evaluate(tree: Tree, values: Mapping[str, Any]) -> Any:
-    operation, *operands = tree
+    row = []  # a sum of many terms is as many operations in a row, deeper than Python calls
+    while tree[0] in _BINARY:
+        row.append(tree)
+        tree = tree[1]
+    result = _simple(tree, values)
+    for operation, _, right in reversed(row):
+        result = _BINARY[operation](result, _evaluate(right, values))
+    return result
+
+
+def _simple(tree: Tree, values: Mapping[str, Any]) -> Any:
+    """A number, a name, a sign or a function."""
+    operation, operand = tree
     if operation == "number":
-        return operands[0]
+        return operand
     if operation == "name":
-        name = operands[0]
-        return values[name] if name in values else CONSTANTS[name]
-    a, *rest = (_evaluate(part, values) for part in operands)
-    match operation:
-        case "+":
-            return a + rest[0]
-        case "-":
-            return a - rest[0]
-        case "*":
-            return a * rest[0]
-        case "/":
-            return a / rest[0]
-        case "**":
-            return a ** rest[0]
-        case "negative":
-            return -a
-    return FUNCTIONS[operation](a)
+        return values[operand] if operand in values else CONSTANTS[operand]
+    value = _evaluate(operand, values)
+    return -value if operation == "negative" else FUNCTIONS[operation](value)

@@ -160,6 +160,10 @@ class Measurement(Component, Named, ABC):
         """Whether the readings are taken from a trajectory that can be entered anywhere: `OdeMeasurement`."""
         return False
 
+    def hindrance(self, x: Array) -> str:
+        """Why the readings at x (n,) are not to be had; empty where they are."""
+        return "" if np.isfinite(self.simulate(x[None])).all() else "the readings are not finite"
+
     @property
     def inputs(self) -> tuple[Input, ...]:
         """What the model takes from the columns of a readings file, where the file has them."""

@@ -19,6 +19,7 @@ from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.known import Informed, Known, informed
 from ipe_bench.measurements.problem import Problem
+from ipe_bench.measurements.repeatable import require_repeatable
 from ipe_bench.noise import Certified, ModelNoise, Noise, Unknown
 from ipe_bench.priors import GaussianPrior, Prior, prior_of
 from ipe_bench.real.covariances import read_covariance
@@ -57,6 +58,9 @@ class Question:
             require_enough(self.readings, found)
         prior = prior_stated(self.prior or GaussianPrior(), model, self.covariance)
         scale = 1.0 if self.error_scale is None else self.error_scale
+        require_repeatable(model)
+        if hindrance := model.hindrance(model.nominal):
+            raise UserError(f"measurement={model.name}: cannot be computed where estimation starts: {hindrance}")
         opened = Opened(self, found, Scenario(model, self._noise(found), prior, scale))
         opened.require(self.estimators)
         return opened

@@ -21,6 +21,7 @@ from ipe_bench.basics.errors import StorageError, UserError
 from ipe_bench.basics.machine import cores, library_versions
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.problem import Problem
+from ipe_bench.measurements.repeatable import require_repeatable
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.parts import TRUTH
 from ipe_bench.runs.provenance import describe, digest, fingerprint
@@ -133,6 +134,8 @@ def validate(
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
         if not estimating and not scenario.noise.estimated and (untried is None or scenario in untried):
             mistakes += _beyond_numbers(scenario)
+            require_repeatable(scenario.measurement)
+            require_repeatable(scenario.simulator)
         mistakes += unmet_needs(scenario.problem, estimators)
     if mistakes:
         raise UserError("; ".join(dict.fromkeys(mistakes)))
@@ -162,7 +165,9 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
         except Exception:  # what cannot be drawn is a failure of its blocks, and told of there
             return
     if not scenario.noise.real and not np.isfinite(few.z).all(axis=1).any():
-        yield f"measurement={model.name}: none of the first {_FEW} trials has finite readings; choose smaller scales"
+        reason = scenario.simulator.hindrance(few.x[0])
+        yield f"measurement={model.name}: none of the first {_FEW} trials has readings: {reason}; choose smaller scales"
+        return
     for parameter, deviation in zip(model.parameters, bound, strict=True):
         if scenario.noise.real and np.isnan(deviation):
             return  # J lacks rank at the start, or is not finite there: that is a hard start, and no mistake

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -163,3 +164,12 @@ def test_a_misspelt_column_is_named(tmp_path):
     with pytest.raises(UserError, match=r"column b2 is missing.*If b2 is a parameter.*measurement.start.b2=VALUE"):
         open_readings(path, Formula("b1*exp(b2*t)", {"b1": 1.0}))
     assert open_readings(path, Formula("b1*t", {"b1": 1.0})).z.tolist() == [1.0, 2.0, 4.0]
+
+
+def test_a_formula_is_evaluated_or_refused_however_long():
+    formula = read("+".join(["b1*t"] * 399), "expression")
+    assert formula({"b1": 2.0, "t": 0.5}) == 399.0
+    assert pickle.loads(pickle.dumps(formula)).names == ("b1", "t")
+    for text in ("+".join(["b1*t"] * 900), "b1" + "*t" * 2000, "b1" + "**b1" * 2000):
+        with pytest.raises(UserError, match=r"^expression: .*(one after another; group|nested more than 50 deep)"):
+            read(text, "expression")

@@ -211,6 +211,9 @@ class Ode(Measurement):
     def simulate(self, x: Array) -> Array:
         return self.engine.simulate(x)
 
+    def hindrance(self, x: Array) -> str:
+        return self.engine.hindrance(x)
+
     def jacobian(self, x: Array) -> Array:
         return self.engine.jacobian(x)
 

@@ -20,12 +20,25 @@ from ipe_bench.measurements.base import Input, Measurement
 from ipe_bench.measurements.ode import sampling
 from ipe_bench.measurements.ode.coarse import CONTRACTION, MOST_RK4, Coarseness, contraction
 from ipe_bench.measurements.ode.integrator import Kernel, Rates
-from ipe_bench.measurements.ode.levels import Found, Indices, Remembered, Search, grouped, ladder
+from ipe_bench.measurements.ode.levels import (
+    ORDER,
+    SAFETY,
+    Found,
+    Indices,
+    Remembered,
+    Search,
+    coarser,
+    grouped,
+    ladder,
+)
 from ipe_bench.measurements.ode.plan import Equations, Variation, jacobian, simulation
+from ipe_bench.measurements.ode.stiffness import diagnose
 from ipe_bench.measurements.ode.tableau import DOP853, RK4
 from ipe_bench.measurements.ode.trace import Graph, Program
 
 _STAYS = ("_readings_kernel", "_rk4_kernel", "_rate_function", "_jacobian_kernel", "_equations", "_remembered")
+_FAR = 1e3
+"""Tolerances by which readings with the shortest steps are off where the integrator cannot follow the equations."""
 _ANGLE_AT_START = 0.7
 """Radians over which the first step that is tried lets the solution turn."""
 
@@ -177,6 +190,20 @@ class OdeMeasurement(Measurement):
         for place, rows in grouped(found.places[others], others):
             self._simulate(x, rows, self._steps(place), offset, z)
         return z
+
+    def hindrance(self, x: Array) -> str:
+        x = own(x[None, : self.n])
+        if self.step is not None:
+            shortest, held = self.step, bool(np.isfinite(self.simulate(x)).all())
+        else:
+            top = len(self._ladder) - 1
+            z = np.empty((2, 1, self.m))
+            for place, readings in zip((top, coarser(top)), z, strict=True):
+                self._simulate(x, np.arange(1), self._steps(place), self._zeros, readings)
+            with np.errstate(all="ignore"):
+                left = SAFETY * np.abs(z[0] - z[1]) / (2.0**ORDER - 1.0)
+            shortest, held = self._usual_interval / self._ladder[top], bool((left <= _FAR * self._tolerances).all())
+        return "" if held else diagnose(self, x[0], float(shortest))
 
     def _common_steps(self, x: Array) -> NDArray[np.int64] | None:
         """The steps to each time that are the same for all trials, fixed or known to do; None where trials differ."""
