@@ -24,7 +24,7 @@ from ipe_bench.real.examination import CONFIDENCE, Examination
 from ipe_bench.real.fits import Fit
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.choice import Which
-from ipe_bench.report.folders import draw_into, numbers, plain_value, write_json, write_rows
+from ipe_bench.report.folders import draw_into, named, picked, plain, write_json, write_rows
 from ipe_bench.report.table import Part, Strong, Table, environment, html, terminal, texts, words
 from ipe_bench.report.words import enumerate_few, p_value
 from ipe_bench.trials.fit_test import DRAWS
@@ -284,9 +284,7 @@ def _where(label: Mapping[str, Any]) -> str:
 
 def _reading_labels(model: Measurement) -> list[dict[str, Any]]:
     columns = model.index
-    return [
-        {k: plain_value(v) for k, v in zip(columns, row, strict=True)} for row in zip(*columns.values(), strict=True)
-    ]
+    return [{k: plain(v) for k, v in zip(columns, row, strict=True)} for row in zip(*columns.values(), strict=True)]
 
 
 def intervals(found: Examination) -> Table:
@@ -438,87 +436,61 @@ def described(answer: Answer) -> dict[str, Any]:
         "passes": answer.passes,
         "examination": answer.examination and _examined(answer.examination, labels),
         "examination_with_prior": with_prior and _examined(with_prior, labels),
-        "parameters": [{"name": p.name, "unit": p.unit} for p in model.natural_parameters],
+        "parameters": [picked(p, "name", "unit") for p in model.natural_parameters],
         "estimators": {one.label: _fitted(one, labels) for one in answer.fits},
     }
 
 
 def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
-    names = [p.name for p in one.model.natural_parameters]
+    names, white = [p.name for p in one.model.natural_parameters], one.whiteness
+    outliers = np.flatnonzero(one.outliers)
     return {
         "status": one.status.label,
-        "message": one.message,
-        "estimates": _each(names, one.x),
-        "standard_errors": _each(names, one.standard_errors),
-        "intervals95": _each(names, np.transpose(one.interval())),
-        "correlation": numbers(one.correlation),
-        "chi_square": numbers(one.chi_square),
-        "degrees_of_freedom": one.degrees_of_freedom,
-        "p": numbers(one.p_value),
-        "fits": one.fits,
-        "passes": one.passes,
-        "with_prior": one.with_prior,
+        "estimates": named(names, one.x),
+        "standard_errors": named(names, one.standard_errors),
+        "intervals95": named(names, np.transpose(one.interval())),
+        "p": plain(one.p_value),
         "on_bounds": {names[k]: value for k, value in one.held_at.items()},
-        "noise_level_estimated": None if one.level is None else numbers(one.level),
-        "residual_deviation": numbers(one.residual_deviation),
+        "noise_level_estimated": plain(one.level),
         "whiteness": {
             "test": "Ljung-Box, p from simulated fits",
-            "statistic": numbers(one.whiteness.statistic),
-            "lags": one.whiteness.lags,
-            "p": numbers(one.whiteness.p_value),
+            "p": plain(white.p_value),
+            **picked(white, "statistic", "lags"),
         },
-        "outlier_limit": one.outlier_limit,
-        "outliers": [
-            {**labels[i], "normalised_residual": numbers(one.normalised[i])} for i in np.flatnonzero(one.outliers)
-        ],
-        "iterations": one.iterations,
-        "simulations": numbers(one.simulations),
+        "outliers": [{**labels[i], "normalised_residual": plain(one.normalised[i])} for i in outliers],
+        **picked(one, "message", "correlation", "chi_square", "degrees_of_freedom", "fits", "passes", "with_prior"),
+        **picked(one, "residual_deviation", "outlier_limit", "iterations", "simulations"),
     }
 
 
 def _examined(found: Examination, labels: list[dict[str, Any]]) -> dict[str, Any]:
     names, bootstrap = [p.name for p in found.model.natural_parameters], found.bootstrap
+    profiles = zip(names, found.profiles, strict=True)
     return {
         "estimator": found.label,
         "confidence": CONFIDENCE,
-        "estimates": _each(names, found.x),
-        "standard_errors": _each(names, found.standard_errors),
+        "estimates": named(names, found.x),
+        "standard_errors": named(names, found.standard_errors),
         "intervals": {
-            "standard_error": _each(names, np.transpose(found.wald)),
-            "profile": _each(names, [(p.low, p.high) for p in found.profiles]),
-            "bootstrap": _each(names, np.column_stack([bootstrap.low, bootstrap.high])),
+            "standard_error": named(names, np.transpose(found.wald)),
+            "profile": named(names, [(p.low, p.high) for p in found.profiles]),
+            "bootstrap": named(names, np.column_stack([bootstrap.low, bootstrap.high])),
         },
-        "profiles": {
-            n: {"values": numbers(p.values), "zeta": numbers(p.zeta), "bent": p.bent}
-            for n, p in zip(names, found.profiles, strict=True)
-        },
-        "bootstrap": {
-            "drawn": bootstrap.drawn,
-            "converged": bootstrap.converged,
-            "bias": _each(names, bootstrap.bias),
-        },
+        "profiles": {name: picked(p, "values", "zeta", "bent") for name, p in profiles},
+        "bootstrap": {**picked(bootstrap, "drawn", "converged"), "bias": named(names, bootstrap.bias)},
         "least_observable": {
-            "direction": _each(names, found.direction.weights),
-            "collinearity_index": numbers(found.direction.collinearity),
+            "direction": named(names, found.direction.weights),
+            "collinearity_index": plain(found.direction.collinearity),
         },
         "minima": [
-            {
-                "estimates": _each(names, one.x),
-                "chi_square": numbers(one.chi_square),
-                "starts": one.found,
-                "as_good": one.as_good,
-            }
+            {"estimates": named(names, one.x), "starts": one.found, **picked(one, "chi_square", "as_good")}
             for one in found.minima
         ],
         "is_least_minimum": found.least,
         "with_prior": found.with_prior,
-        "on_bounds": {one.parameter.name: numbers([one.bound, one.other]) for one in found.on_bounds},
+        "on_bounds": {one.parameter.name: plain([one.bound, one.other]) for one in found.on_bounds},
         "remarks": list(remarks(found, labels)),
     }
-
-
-def _each(names: Sequence[str], values: Any) -> dict[str, Any]:
-    return dict(zip(names, numbers(values), strict=True))
 
 
 def _residual_rows(answer: Answer) -> Iterator[list[Any]]:

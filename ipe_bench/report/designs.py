@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.report.folders import draw_into, numbers, plain_value, write_json, write_rows
+from ipe_bench.report.folders import draw_into, picked, plain, write_json, write_rows
 from ipe_bench.report.table import Part, Strong, Table, texts, words
 from ipe_bench.report.words import enumerate_few, percent
 from ipe_bench.runs.provenance import describe
@@ -183,7 +183,9 @@ def write_design(folder: Path, design: Design, command: Any, provenance: Mapping
 
 def described(design: Design) -> dict[str, Any]:
     """All of it as plain data; bounds in the parameters' own units."""
-    seen, sizes = design.observability, np.array([p.size for p in design.observability.parameters])
+    seen, limit = design.observability, design.threshold
+    sizes = np.array([p.size for p in seen.parameters])
+    each = zip(seen.parameters, seen.bound * sizes, seen.multiple_correlation, strict=True)
     return {
         "measurement": design.scenario.measurement.name,
         "error_scale": design.scenario.error_scale,
@@ -192,53 +194,37 @@ def described(design: Design) -> dict[str, Any]:
         "candidates": design.candidates.m,
         "observable": seen.observable,
         "least_observable_direction": seen.words,
-        "singular_values": numbers(np.median(seen.singular_values, axis=0)),
+        "singular_values": plain(np.median(seen.singular_values, axis=0)),
         "parameters": [
-            {"name": p.name, "unit": p.unit, "bound": numbers(b), "multiple_correlation": numbers(r)}
-            for p, b, r in zip(seen.parameters, seen.bound * sizes, seen.multiple_correlation, strict=True)
+            {**picked(p, "name", "unit"), "bound": plain(bound), "multiple_correlation": plain(r)}
+            for p, bound, r in each
         ],
-        "correlation": numbers(seen.correlation),
+        "correlation": plain(seen.correlation),
         "suspects": [
             {
-                "name": s.name,
-                "deviation": s.deviation,
-                "unit": s.unit,
-                "shift": numbers(s.shift * sizes),
-                "shift_in_bounds": numbers(s.bounds),
-                "parameter": s.parameter,
-                "visible": numbers(s.visible),
-                "noticed": numbers(s.noticed),
+                **picked(s, "name", "deviation", "unit", "parameter", "visible", "noticed"),
+                "shift": plain(s.shift * sizes),
+                "shift_in_bounds": plain(s.bounds),
                 "direction": s.words,
             }
             for s in design.suspects
         ],
-        "threshold": design.threshold
+        "threshold": limit
         and {
-            "van_trees": numbers(design.threshold.van_trees * sizes),
-            "weiss_weinstein": numbers(design.threshold.weiss_weinstein * sizes),
-            "false_roots": design.threshold.false_roots,
-            "runs": design.threshold.runs,
-            "nearest": numbers(design.threshold.nearest),
+            "van_trees": plain(limit.van_trees * sizes),
+            "weiss_weinstein": plain(limit.weiss_weinstein * sizes),
+            **picked(limit, "false_roots", "runs", "nearest"),
         },
         "ways": [
             {
                 "by": list(way.units.by),
                 "units": len(way.units.rows),
-                "curve": [{"readings": c.readings, "mean_bound": c.mean_bound} for c in way.curve],
+                "curve": [picked(c, "readings", "mean_bound") for c in way.curve],
                 **{name: choice and _chosen(design, way, choice) for name, choice in _choices(way)},
             }
             for way in design.ways
         ],
-        "effects": [
-            {
-                "column": e.column,
-                "entry": plain_value(e.entry),
-                "action": e.action,
-                "readings": e.readings,
-                "mean_bound": numbers(e.mean_bound),
-            }
-            for e in design.effects
-        ],
+        "effects": [picked(e, "column", "entry", "action", "readings", "mean_bound") for e in design.effects],
     }
 
 
@@ -252,10 +238,9 @@ def _chosen(design: Design, way: Way, choice: Choice) -> dict[str, Any]:
     before = describe(today)
     options = {name: value for name, value in describe(model).items() if value != before.get(name)}
     return {
-        "readings": choice.readings,
-        "mean_bound": choice.mean_bound,
+        **picked(choice, "readings", "mean_bound"),
         "no_design_below": choice.least,
-        "units": [[plain_value(value) for value in way.units.entries[u]] for u in choice.taken],
+        "units": [plain(way.units.entries[u]) for u in choice.taken],
         "options": options if type(model) is type(today) else None,
     }
 

@@ -80,14 +80,20 @@ def draw_into(folder: Path, drawings: Iterable[Drawing], names: Iterable[str]) -
     return files
 
 
-def numbers(value: Any) -> Any:
-    """Plain numbers for JSON, which knows neither NaN nor infinity: null in their place."""
-    if np.ndim(value):
-        return [numbers(v) for v in value]
-    number = float(value)
-    return number if math.isfinite(number) else None
+def plain(value: Any) -> Any:
+    """A value as JSON knows it, which has neither arrays nor NaN nor infinity: null in their place."""
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return [plain(v) for v in value] if isinstance(value, list | tuple) else value
 
 
-def plain_value(value: Any) -> Any:
-    """A NumPy scalar as the Python value that JSON knows."""
-    return value.item() if isinstance(value, np.generic) else value
+def picked(thing: Any, *names: str) -> dict[str, Any]:
+    """These attributes of a thing as JSON knows them, under their names."""
+    return {name: plain(getattr(thing, name)) for name in names}
+
+
+def named(names: Sequence[str], values: Any) -> dict[str, Any]:
+    """Values as JSON knows them, each under the name of its parameter."""
+    return dict(zip(names, plain(values), strict=True))

@@ -10,7 +10,7 @@ import numpy as np
 
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.report.folders import draw_into, numbers, write_json
+from ipe_bench.report.folders import draw_into, named, picked, plain, write_json
 from ipe_bench.report.table import Table, texts, words
 from ipe_bench.report.words import compact, percent
 from ipe_bench.trials.posterior import Divergence, Posterior, Reference
@@ -87,29 +87,20 @@ def write_posteriors(
 
 def _described(model: Measurement, one: Reference) -> dict[str, Any]:
     names, sizes, sampled = [p.name for p in model.parameters], model.sizes, one.posterior
+    modes = zip(sampled.modes, sampled.shares, strict=True)
     return {
         "trial": one.trial,
-        "parameters": [{"name": p.name, "unit": p.unit} for p in model.parameters],
-        "truth": dict(zip(names, numbers(one.truth * sizes), strict=True)),
-        "mean": dict(zip(names, numbers(sampled.mean * sizes), strict=True)),
-        "deviation": dict(zip(names, numbers(sampled.deviation * sizes), strict=True)),
-        "covariance": numbers(sampled.covariance * np.outer(sizes, sizes)),
-        "modes": [
-            {"share": numbers(share), "x": numbers(mode * sizes)}
-            for mode, share in zip(sampled.modes, sampled.shares, strict=True)
-        ],
-        "settled": sampled.settled,
-        "populations_apart": numbers(sampled.apart),
-        "noise": numbers(sampled.noise),
-        "evidence": numbers(sampled.evidence),
+        "parameters": [picked(p, "name", "unit") for p in model.parameters],
+        "truth": named(names, one.truth * sizes),
+        "mean": named(names, sampled.mean * sizes),
+        "deviation": named(names, sampled.deviation * sizes),
+        "covariance": plain(sampled.covariance * np.outer(sizes, sizes)),
+        "modes": [{"share": plain(share), "x": plain(mode * sizes)} for mode, share in modes],
+        "populations_apart": plain(sampled.apart),
         "draws": len(sampled.x),
-        "stages": sampled.stages,
-        "simulations": sampled.simulations,
+        **picked(sampled, "settled", "noise", "evidence", "stages", "simulations"),
         "estimators": {
-            label: {
-                "status": _status(one, label),
-                **{name: numbers(getattr(d, name)) for name in ("kl", "shift", "width", "energy")},
-            }
+            label: {"status": _status(one, label), **picked(d, "kl", "shift", "width", "energy")}
             for label, d in one.divergences.items()
         },
     }
