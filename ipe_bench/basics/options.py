@@ -116,7 +116,7 @@ def checked(value: Any, hint: Any, key: str) -> Any:
 
 
 def _refusal(value: Any, wanted: str, key: str) -> UserError:
-    text = " ".join(str(value).split())
+    text = " ".join(str(list(value) if isinstance(value, tuple) else value).split())
     return UserError(f"{key}={text if len(text) <= 60 else text[:57] + '...'}: give {wanted}")
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING
 
@@ -19,8 +21,25 @@ def console() -> Console:
     """Where tables are printed: as wide as the terminal, or wide enough for a table in a file."""
     from rich.console import Console
 
-    shown = Console(highlight=False)
-    return shown if shown.is_terminal else Console(highlight=False, width=_WIDTH_WITHOUT_TERMINAL)
+    class Shown(Console):
+        def on_broken_pipe(self) -> None:
+            discard_output()
+
+    shown = Shown(highlight=False)
+    return shown if shown.is_terminal else Shown(highlight=False, width=_WIDTH_WITHOUT_TERMINAL)
+
+
+def discard_output() -> None:
+    """Sends the rest of the output nowhere: its reader has closed the pipe, which is no mistake."""
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), sys.stdout.fileno())
+
+
+def print_problems(lines: Iterable[str]) -> None:
+    """Says on stderr what is wrong, a line each."""
+    sys.stdout.flush()
+    for line in lines:
+        print(f"ipe-bench: {line}", file=sys.stderr)
 
 
 def show(parts: Iterable[Part]) -> None:

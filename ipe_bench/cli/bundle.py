@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import console
+from ipe_bench.cli import console, print_problems
 from ipe_bench.runs.bundles import SUFFIX, Bundle, is_bundle, read_bundle, write_bundle
 from ipe_bench.runs.results import Results
 
@@ -30,8 +29,7 @@ def main(arguments: Sequence[str]) -> int:
 
     bundle = write_bundle(paths, path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX), {"citation": CITATION})
     problems = Results.read(paths).problems
-    for problem in problems:
-        print(f"ipe-bench: {problem}", file=sys.stderr)
+    print_problems(problems)
     _show(bundle, "Bundle")
     return 1 if problems else 0
 

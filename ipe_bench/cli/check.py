@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import redirect_stdout
@@ -11,7 +10,7 @@ from pathlib import Path
 
 from ipe_bench.api import check
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import console
+from ipe_bench.cli import console, print_problems
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.conformance import Finding
 
@@ -22,8 +21,7 @@ def main(folders: Sequence[str]) -> int:
         raise UserError("check: name the folder of a plugin, such as plugins/my_plugin")
     for folder in folders:
         plugins.options_in(Path(folder))  # a mistake in the second is said before the first is checked
-    for problem in plugins.take_problems():
-        print(f"ipe-bench: {problem}", file=sys.stderr)
+    print_problems(plugins.take_problems())
     return 1 if sum(_check_plugin(folder) for folder in folders) else 0
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import console, given_keys, show
+from ipe_bench.cli import console, given_keys, print_problems, show
 
 KEYS = ("first", "second", "alpha", "anytime", "fail_on", "output")
 
@@ -25,9 +24,7 @@ def main(arguments: Sequence[str]) -> int:
     frame = compare(*folders, **keys)
     show(contents(frame, keys.get("alpha", 0.05)))
     out = console()
-    sys.stdout.flush()
-    for line in (*frame.attrs["problems"], *frame.attrs["stale"], *frame.attrs["notes"]):
-        print(f"ipe-bench: {line}", file=sys.stderr)
+    print_problems([*frame.attrs["problems"], *frame.attrs["stale"], *frame.attrs["notes"]])
     if "output" in keys:
         out.print(f"\nTable   {Path(keys['output']) / 'comparison.csv'}", markup=False, soft_wrap=True)
         out.print(f"Figure  {Path(keys['output']) / 'comparison.png'}", markup=False, soft_wrap=True)

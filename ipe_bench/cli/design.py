@@ -6,17 +6,18 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from ipe_bench.api import design
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console, show
-from ipe_bench.cli.single import NOT_OF_ONE_SCENARIO, compose_single, first_of
+from ipe_bench.cli.single import OF_FILES, OF_MANY_TRIALS, single
 from ipe_bench.cli.spec import Spec
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
 from ipe_bench.runs.provenance import describe
-from ipe_bench.trials.design import Criterion, design
+from ipe_bench.trials.design import Criterion
 
-_WITHOUT_USE = (*NOT_OF_ONE_SCENARIO, "trials", "solver", "baseline", "estimators")
+_OF_RUNS = (*OF_MANY_TRIALS, "figures", "trials", "solver", "baseline", "estimators")
 
 
 def main(
@@ -26,35 +27,30 @@ def main(
     criterion: Criterion = "A",
 ) -> int:
     """Prints tables and writes files; exit code 1 where the readings do not determine every parameter."""
-    single = compose_single("design", arguments, _refuse_keys_without_use)
-    scenario = dataclasses.replace(single.job.scenario, truth=None)
+    if any(word.lstrip("+").startswith("readings=") for word in arguments):
+        raise UserError("readings: is for `ipe-bench estimate`; the number to choose is --readings NUMBER")
+    asked = single("design", arguments, run=_OF_RUNS, estimate=OF_FILES)
+    scenario = dataclasses.replace(asked.spec.scenario, truth=None)
     if scenario.noise.real:
         raise UserError("noise=certified: a design is of readings that are still to be taken; choose another noise")
-    errors = _errors(single.job)
+    errors = _errors(asked.spec)
     found = design(scenario, by=by, readings=readings, criterion=criterion, errors=errors)
 
     from ipe_bench.report.designs import FILES, RESULT, contents, write_design
     from ipe_bench.report.folders import claim
 
-    asked = {
+    command = {
         "scenario": describe(scenario),
         "errors": [describe(error) for error in errors],
         "by": None if by is None else list(by),
         "readings": readings,
         "criterion": criterion,
     }
-    folder = claim(single.folder, asked, elsewhere=not single.named, result=RESULT, files=FILES)
-    files = write_design(folder, found, asked, {"measurement": single.measurement})
-    show(contents(single.measurement, found))
+    folder = claim(asked.folder, command, elsewhere=not asked.named, result=RESULT, files=FILES)
+    files = write_design(folder, found, command, {"measurement": asked.measurement})
+    show(contents(asked.measurement, found))
     console().print(f"In {folder}: {', '.join(path.name for path in files)}", markup=False, soft_wrap=True)
     return 0 if found.observability.observable else 1
-
-
-def _refuse_keys_without_use(words: Sequence[str]) -> None:
-    key = first_of(_WITHOUT_USE, words)
-    if key is not None:
-        remedy = "; the number to choose is --readings NUMBER" if key == "readings" else ""
-        raise UserError(f"{key}: is for `ipe-bench run`, and nothing in a design; leave it out{remedy}")
 
 
 def _errors(job: Spec) -> list[Measurement]:

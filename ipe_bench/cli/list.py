@@ -10,11 +10,11 @@ from rich.table import Table
 from rich.text import Text
 
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.cli import console
+from ipe_bench.cli import console, print_problems
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
-from ipe_bench.plugins.description import described
+from ipe_bench.plugins.description import Described, described
 
 
 def main(names: Sequence[str], verbose: bool) -> int:
@@ -22,11 +22,15 @@ def main(names: Sequence[str], verbose: bool) -> int:
 
     Where verbose, groups come with all of that.
     """
-    for problem in plugins.take_problems():
-        print(f"ipe-bench: {problem}", file=sys.stderr)
+    print_problems(plugins.take_problems())
     known = plugins.groups()
     out = console()
     for name in names or known:
+        if name == "keys":
+            from ipe_bench.cli.spec import keys_of_a_run
+
+            _list_options(out, "keys", "", keys_of_a_run())
+            continue
         group, slash, _ = name.partition("/")
         if group not in known:
             homes = [f"{o.group}/{o.name}" for o in plugins.options() if o.name == name]
@@ -41,6 +45,13 @@ def main(names: Sequence[str], verbose: bool) -> int:
         if option.fault is not None and option.group in listed:
             print(f"ipe-bench: {option.group}={option.name}: {option.fault}", file=sys.stderr)
     return 0
+
+
+def _list_options(out: Console, title: str, prefix: str, rows: Sequence[Described]) -> None:
+    table = _table(title, "key", "value", "takes", "meaning")
+    for row in rows:
+        table.add_row(*map(Text, (f"{prefix}{row.name}", row.value, row.kind, row.meaning)))
+    out.print(table)
 
 
 def _find(name: str) -> plugins.Option:
@@ -75,16 +86,11 @@ def _table(title: str, *headings: str) -> Table:
 
 def _describe(out: Console, option: plugins.Option) -> None:
     """Every option of a component with its value, what may be given, and what it means."""
-    key = f"estimators.{option.label}" if option.group in plugins.ESTIMATOR_GROUPS else option.group
-    if option.group == "experiment":
-        key = ""
+    key = f"estimators.{option.label}." if option.group in plugins.ESTIMATOR_GROUPS else f"{option.group}."
     rows = described(option)
     out.print(Text(f"{option.group}={option.name}  {option.summary}"))
     if rows:
-        table = _table("", "key", "value", "takes", "meaning")
-        for row in rows:
-            table.add_row(*map(Text, (f"{key}.{row.name}".lstrip("."), row.value, row.kind, row.meaning)))
-        out.print(table)
+        _list_options(out, "", "" if option.group == "experiment" else key, rows)
     out.print()
     if option.group == "measurement":
         _describe_measurement(out, option)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import errno
 import importlib
+import io
 import os
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
-from ipe_bench.cli import interrupts
+from ipe_bench.cli import discard_output, interrupts
 
 COMMANDS = (
     "run",
@@ -24,14 +25,22 @@ COMMANDS = (
     "check",
     "new",
     "schema",
-    "completion",
 )
+GONE = {
+    "completion": 'eval "$(ipe-bench -sc install=bash)"'
+    " lets bash complete (install=zsh, install=fish likewise); "
+    "names inside of lists are no longer completed"
+}
+"""Commands of earlier versions, and what to use instead."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code."""
     interrupts.install()
     words = list(sys.argv[1:] if argv is None else argv)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # one that knows no Greek letters shows question marks
+            stream.reconfigure(errors="replace")
     # Batched linear algebra is small per trial: more BLAS threads only get in each other's way.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
@@ -42,10 +51,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             warnings.showwarning = _show_warning
             # Where numbers overflow, the statuses of trials say so.
             warnings.filterwarnings("ignore", category=RuntimeWarning)
-            return _dispatch(words)
+            code = _dispatch(words)
+            sys.stdout.flush()
+            return code
     except BrokenPipeError:
-        # Whoever read the output has closed it: not worth a traceback.
-        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+        discard_output()
         return 0
     except (Exception, KeyboardInterrupt) as error:
         code, line = _explain(error)
@@ -100,17 +110,14 @@ def _dispatch(words: list[str]) -> int:
         return 0
     if command in ("-sc", "--shell-completion"):  # asked of the bare program; only `run` has anything to complete
         command, rest = "run", words
+    if command in GONE:
+        raise UserError(f"{command}: is no command any more; {GONE[command]}")
     if command not in COMMANDS:
         known, noun = (("--help", "--version"), "flag") if command.startswith("-") else (COMMANDS, "command")
         raise UserError(f"{command}: {unknown(command, known, noun)}")
-    if command == "run":
-        return _entry(command)(rest)
     parser = parsers()[1][command]
     if any(word in ("-h", "--help") for word in rest):
         parser.print_help()
         return 0
-    return _entry(command)(**vars(parser.parse(rest)))
-
-
-def _entry(command: str) -> Callable[..., int]:
-    return importlib.import_module(f"ipe_bench.cli.{command}").main
+    main_of = importlib.import_module(f"ipe_bench.cli.{command}").main
+    return main_of(rest) if command == "run" else main_of(**vars(parser.parse(rest)))

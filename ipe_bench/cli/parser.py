@@ -1,4 +1,4 @@
-"""What each command may be given, and what `--help` says of it. What follows `run` is for Hydra, its help too."""
+"""What each command may be given, and what `--help` says of it."""
 
 from __future__ import annotations
 
@@ -127,13 +127,22 @@ Visual Studio Code with its YAML extension, in settings.json:
 Any editor with yaml-language-server, in a file: # yaml-language-server: $schema=ipe-bench.schema.json
 Options of plugins are in it as far as they are found from here; write it again after a new one.
 """
-_COMPLETION = """
-  eval "$(ipe-bench completion bash)"             in ~/.bashrc
-  eval "$(ipe-bench completion zsh)"              in ~/.zshrc, behind compinit
-  ipe-bench completion fish | source              in ~/.config/fish/config.fish
+_RUN = """
+  ipe-bench run error_scale=33 "solver=[fixed_point,newton]" "baseline=[linear_lse]"
+  ipe-bench run +experiment=paper                               an experiment, which may be a sweep
+  ipe-bench run -m error_scale=1,10,100 seed=1,2                a job for each combination
+  ipe-bench run +solver@estimators.second=newton estimators.second.tolerance=1e-3
 
-TAB then completes commands, flags, groups and their options (solver=[new), keys of options (measurement.la) and values.
+`ipe-bench list keys` has all keys, `ipe-bench list` the options of measurement=, noise=, solver= and the other groups.
 """
+_OWN_CONFIGS = "put options and experiments of your own into a folder and name it with --config-dir"
+_GONE = {
+    **dict.fromkeys(("-cp", "--config-path", "-cn", "--config-name"), _OWN_CONFIGS),
+    "--experimental-rerun": "runs/*.json in a folder of results has the command of each run",
+    "--hydra-help": "`ipe-bench run --help` has the flags",
+    **dict.fromkeys(("-r", "--run"), "leave it out"),
+}
+"""Flags of earlier versions, and what to use instead."""
 INFO_TOPICS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
 
@@ -162,9 +171,16 @@ class Parser(argparse.ArgumentParser):
         """
         values, surplus = self.parse_known_intermixed_args(words)
         for word in surplus:
+            if self.command == "run" and word.partition("=")[0] in _GONE:
+                raise UserError(f"run: {word}: is no flag any more; {_GONE[word.partition('=')[0]]}")
             if word.startswith("-") and "=" in word and not word.startswith("--config"):
                 raise UserError(
                     f"{self.command}: {word}: there is no such flag; keys have no dashes: {word.lstrip('-')}"
+                )
+            takes_keys = any(action.metavar == "KEY=VALUE" for action in self._actions)
+            if word.startswith("--") and takes_keys and word[2:].isidentifier() and not word.startswith("--config"):
+                raise UserError(
+                    f"{self.command}: {word}: there is no such flag; keys have no dashes: write {word[2:]}=VALUE"
                 )
             if word.startswith("-"):
                 flags = [flag for action in self._actions for flag in action.option_strings]
@@ -188,7 +204,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         found[name].summary = what
         return found[name]
 
-    _add_run(add("run", "simulate, estimate, store and report"))
+    _add_run(add("run", "simulate, estimate, store and report", "0 done; 1 done, but something failed", _RUN))
     estimate = add(
         "estimate",
         "parameters from real readings, and whether the model fits them",
@@ -244,7 +260,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     status.add_argument("-v", "--verbose", action="store_true", help="with what is complete, too")
     options = add("list", "what there is to choose from, and where it comes from")
     options.add_argument(
-        "names", metavar="GROUP", nargs="*", help="solver, measurement, ... or all; solver/newton: its options"
+        "names", metavar="GROUP", nargs="*", help="solver, measurement, ... or keys; solver/newton: its options"
     )
     options.add_argument(
         *("-v", "--verbose"),
@@ -265,28 +281,16 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     )
     check.add_argument("folders", metavar="DIR", nargs="*", help="folders of plugins, such as plugins/my_plugin")
     add("schema", "a JSON schema of config files, for editors that complete and check them", more=_SCHEMA)
-    completion = add("completion", "the script that lets a shell complete all of this", more=_COMPLETION)
-    completion.add_argument("shell", metavar="SHELL", choices=("bash", "zsh", "fish"), help="bash, zsh or fish")
-    completion.add_argument("--query", action="store_true", help=argparse.SUPPRESS)
     return program, found
 
 
 def _add_run(run: Parser) -> None:
-    """The flags of Hydra, and ours beside them. Hydra writes the help, with all options there are."""
-    run.add_argument("overrides", metavar="KEY=VALUE", nargs="*")
+    run.add_argument("overrides", metavar="KEY=VALUE", nargs="*", help="see `ipe-bench list keys` and `ipe-bench list`")
     run.add_argument("--dry-run", action="store_true", help="say what is stored, what is missing and how long it takes")
-    for names in (
-        ("--hydra-help",),
-        ("--resolve",),
-        ("-r", "--run"),
-        ("-m", "--multirun"),
-        ("-sc", "--shell-completion"),
-    ):
-        run.add_argument(*names, action="store_true")
-    run.add_argument("-c", "--cfg", choices=("job", "hydra", "all"))
-    run.add_argument("-i", "--info", choices=INFO_TOPICS)
-    run.add_argument("-p", "--package")
-    run.add_argument("-cp", "--config-path")
-    run.add_argument("-cn", "--config-name")
-    run.add_argument("-cd", "--config-dir")
-    run.add_argument("--experimental-rerun")
+    run.add_argument("-m", "--multirun", action="store_true", help="run all jobs of a sweep")
+    run.add_argument("-c", "--cfg", choices=("job", "hydra", "all"), help="print the config, and run nothing")
+    run.add_argument("-p", "--package", help="with --cfg: the part of the config to print")
+    run.add_argument("--resolve", action="store_true", help="with --cfg: replace interpolations")
+    run.add_argument("-i", "--info", nargs="?", const="all", choices=INFO_TOPICS, help="what Hydra finds where")
+    run.add_argument("-cd", "--config-dir", metavar="DIR", help="a folder with options and experiments of your own")
+    run.add_argument("-sc", "--shell-completion", action="store_true", help="install=SHELL or uninstall=SHELL")

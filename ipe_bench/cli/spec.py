@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import MISSING, dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -11,13 +11,14 @@ from typing import Any
 import cloudpickle
 
 from ipe_bench.basics.errors import UserError, describe_exception, unknown
-from ipe_bench.basics.options import Component, Count, Positive, Whole, option_types
+from ipe_bench.basics.options import Component, Count, Positive, Whole
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.known import Known, informed
 from ipe_bench.noise import ModelNoise, Noise
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct, instantiate
+from ipe_bench.plugins.description import Described, options_of
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.real.estimation import Question, prior_stated
 from ipe_bench.real.sources import LeftOut
@@ -147,11 +148,9 @@ class Spec(Component):
         prior = prior_stated(self.prior, measurement, self.prior_covariance)
         return Scenario(measurement, self.noise, prior, self.error_scale, self.seed, truth)
 
-    def question(self, *, scaled: bool) -> Question:
-        """What is asked of real readings; a part that stands there by default is stated by nobody.
-
-        `scaled`: the error scale is stated.
-        """
+    def question(self, stated: Collection[str]) -> Question:
+        """What is asked of real readings; `stated` are the keys that a user has given, and a part that stands there by
+        default is stated by nobody."""
         given = (self.readings,) if isinstance(self.readings, str) else self.readings
         if given == ():
             raise UserError("readings=[]: name a file, or several as readings=[a.csv,b.csv]")
@@ -160,8 +159,8 @@ class Spec(Component):
             readings=None if given is None else tuple(map(Path, given)),
             estimators=self.estimators,
             noise=None if self.noise == ModelNoise() else self.noise,
-            prior=None if self.prior == GaussianPrior() else self.prior,
-            error_scale=self.error_scale if scaled else None,
+            prior=None if self.prior == GaussianPrior() and "prior" not in stated else self.prior,
+            error_scale=self.error_scale if "error_scale" in stated else None,
             known=self.known,
             covariance=self.prior_covariance,
             left_out=LeftOut(self._names("ignore_columns", str), self._names("ignore_rows", int, str)),
@@ -177,9 +176,13 @@ class Spec(Component):
 
 
 KEYS = tuple(field.name for field in fields(Spec))
-KINDS = option_types(Spec)
 DEFAULTS = {field.name: "???" if field.default is MISSING else field.default for field in fields(Spec)}
 DEFAULTS["estimators"] = {}
+
+
+def keys_of_a_run() -> list[Described]:
+    """The keys besides the groups, with their types, defaults and meanings."""
+    return [one for one in options_of(Spec, DEFAULTS, {}) if one.name not in (*PARTS, "estimators")]
 
 
 def spec(plain: Mapping[Any, Any]) -> Spec:

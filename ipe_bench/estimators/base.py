@@ -11,12 +11,10 @@ from typing import Any, ClassVar, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.containment import contained
 from ipe_bench.basics.errors import describe_exception
 from ipe_bench.basics.linalg import Array, read_only
 from ipe_bench.basics.options import Component
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.private import Private, is_ours
 from ipe_bench.measurements.counted import Tally
 from ipe_bench.measurements.problem import Problem
 
@@ -158,22 +156,15 @@ class Estimator(Component, ABC):
 def estimate_safely(estimator: Estimator, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
     """`estimator.estimate`, timed, where an exception becomes the status of the trials that cause it.
 
-    A batch that raises is estimated again trial by trial. What an estimator does to global state is undone, and one
-    that is not of this package works on copies: if it changes them all the same, all its trials end as errors.
+    A batch that raises is estimated again trial by trial. Readings and problem are read-only.
     """
-    if is_ours(estimator):
-        return _estimate(estimator, problem, read_only(z), history)
-    private = Private(problem, z)
-    estimates = _estimate(estimator, private.problem, private.z, history)
-    if complaint := private.complaint():
-        return Estimates.failed(len(z), problem.measurement.n, complaint)
-    return estimates
+    return _estimate(estimator, problem, read_only(z), history)
 
 
 def _estimate(estimator: Estimator, problem: Problem, z: Array, history: bool) -> Estimates:
     began = time.perf_counter()
     try:
-        with contained():
+        with np.errstate(all="ignore"):
             estimates = estimator.estimate(problem, z, history=history)
     except MemoryError:
         raise  # says something of the machine, not of the trial: the block fails and is tried again another day

@@ -7,7 +7,7 @@ import dataclasses
 import inspect
 import textwrap
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass
 from typing import Any
 
 from ipe_bench.basics.options import describe_type, option_types
@@ -21,12 +21,22 @@ class Described:
     """One option of a component."""
 
     name: str
-    value: str
-    """What it is set to, as a config writes it; empty where it must be given."""
-    kind: str
-    """What may be given, in words."""
+    default: Any
+    """What it is set to; `MISSING` where it must be given."""
+    hint: Any
+    """Its type with its constraints; None where it is not known."""
     meaning: str
     """The docstring of its field, or the comment behind it in the config."""
+
+    @property
+    def value(self) -> str:
+        """The default as a config writes it."""
+        return "" if self.default is MISSING else written(self.default)
+
+    @property
+    def kind(self) -> str:
+        """What may be given, in words."""
+        return "" if self.hint in (None, Any) else describe_type(self.hint)
 
 
 def described(option: Option) -> list[Described]:
@@ -39,39 +49,40 @@ def described(option: Option) -> list[Described]:
     if option.group in RECORD_GROUPS:
         return []
     if option.target is None:
-        return [Described(str(key), _written(value), "", "") for key, value in config.items() if key != "defaults"]
-    cls = find_class(option.target, f"{option.group}.{option.name}")
-    kinds, texts, comments = option_types(cls), meanings(cls), option.comments
+        return [Described(str(key), value, None, "") for key, value in config.items() if key != "defaults"]
+    return options_of(find_class(option.target, f"{option.group}.{option.name}"), config, option.comments)
+
+
+def options_of(cls: type, config: Mapping[str, Any], comments: Mapping[str, str]) -> list[Described]:
+    """The options of a dataclass; what `config` says of one stands in place of its default, and `comments` say what is
+    meant where the class does not."""
+    kinds, texts = option_types(cls), meanings(cls)
     return [
         Described(
             field.name,
-            _value(field, config),
-            describe_type(kinds[field.name]),
+            config.get(field.name, _default(field)),
+            kinds[field.name],
             texts.get(field.name) or comments.get(field.name, ""),
         )
-        for field in dataclasses.fields(cls)
+        for field in dataclasses.fields(cls)  # type: ignore[arg-type]
         if field.init
     ]
 
 
-def _value(field: dataclasses.Field[Any], config: Mapping[str, Any]) -> str:
-    if field.name in config:
-        return _written(config[field.name])
-    if field.default is not dataclasses.MISSING:
-        return _written(field.default)
-    return "" if field.default_factory is dataclasses.MISSING else _written(field.default_factory())
+def _default(field: dataclasses.Field[Any]) -> Any:
+    return field.default if field.default_factory is MISSING else field.default_factory()
 
 
-def _written(value: Any) -> str:
+def written(value: Any) -> str:
     """A value as one writes it on the command line."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     if isinstance(value, float):
         return f"{value:g}" if float(f"{value:g}") == value else repr(value)
     if isinstance(value, tuple | list):
-        return f"[{','.join(map(_written, value))}]"
+        return f"[{','.join(map(written, value))}]"
     if isinstance(value, Mapping):
-        inner = ", ".join(f"{k}: {_written(v)}" for k, v in value.items() if k != TARGET)
+        inner = ", ".join(f"{k}: {written(v)}" for k, v in value.items() if k != TARGET)
         return f"{{{inner}}}"
     return "" if value == "???" else type(value).__name__ if dataclasses.is_dataclass(value) else str(value)
 

@@ -10,7 +10,6 @@ import dataclasses
 import functools
 import importlib.metadata
 import importlib.util
-import math
 import os
 import re
 import sys
@@ -31,14 +30,26 @@ COMPONENT_GROUPS = ("measurement", "noise", "prior", *ESTIMATOR_GROUPS, "executi
 RECORD_GROUPS = ("statistic", "figure", "table", "section")
 """What a report is made of."""
 CHECKED_GROUPS = (*COMPONENT_GROUPS, *RECORD_GROUPS, "experiment")
-_LARGEST = 100_000
-"""No option has more values than this."""
 _TARGET_LINE = re.compile(r"^_target_:\s*['\"]?([\w.]+)", re.MULTILINE)
 _PACKAGE_HEADER = re.compile(r"^#\s*@package\s+(\S+)", re.MULTILINE)
 
 
 class _Loader(yaml.SafeLoader):
-    """Takes 1e-6 for a number, as Hydra does; YAML 1.1 wants 1.0e-6."""
+    """Takes 1e-6 for a number, as Hydra does; YAML 1.1 wants 1.0e-6. Of a key that stands twice one value would be
+    lost, and an alias hides what a short file stands for: both are refused."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            mark = self.peek_event().start_mark
+            raise yaml.MarkedYAMLError(problem="an alias (*NAME); write out what is meant", problem_mark=mark)
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        keys = [key.value for key, _ in node.value]
+        for key, _ in node.value:
+            if isinstance(key.value, str) and keys.count(key.value) > 1:
+                raise yaml.MarkedYAMLError(problem=f"the key {key.value} is there twice", problem_mark=key.start_mark)
+        return super().construct_mapping(node, deep)
 
 
 _Loader.add_implicit_resolver(
@@ -47,8 +58,31 @@ _Loader.add_implicit_resolver(
 
 
 def read_yaml(text: str) -> Any:
-    """YAML as plain data, with numbers as Hydra reads them."""
-    return yaml.load(text, _Loader)
+    """YAML as plain data, with numbers as Hydra reads them.
+
+    Raises:
+        YAMLError: it is not YAML, a key stands there twice, or there is an alias.
+    """
+    try:
+        return yaml.load(text, _Loader)
+    except RecursionError:
+        raise yaml.YAMLError("it is nested too deeply") from None
+    except ValueError as error:  # a control character, or a number that is none
+        raise yaml.YAMLError(describe_exception(error)) from None
+
+
+def read_yaml_file(path: Path, key: str) -> Any:
+    """What a file of YAML says; `key` is the word of the command that names it.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    try:
+        return read_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{key}: cannot be read ({error.__class__.__name__}); name a YAML file") from None
+    except yaml.YAMLError as error:
+        raise UserError(f"{key}: {explain_yaml(error, path)}") from None
 
 
 @dataclass(frozen=True)
@@ -187,41 +221,10 @@ def _shown(folder: Path) -> Path:
 @functools.lru_cache(maxsize=1024)
 def _yaml_fault(path: Path, text: str) -> str | None:
     try:
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
+        content = read_yaml(text)
     except yaml.YAMLError as error:
         return explain_yaml(error, path)
-    except RecursionError:
-        return f"{path}: is nested too deeply"
-    if not isinstance(node, yaml.MappingNode):
-        return f"{path}: holds no keys; write KEY: VALUE lines"
-    try:
-        if _expanded(node, {}) > _LARGEST:
-            return f"{path}: its aliases (*NAME) stand for more than {_LARGEST} values; write out what is meant"
-    except yaml.YAMLError as error:
-        return explain_yaml(error, path)
-    return None
-
-
-def _expanded(node: Any, sizes: dict[int, float]) -> float:
-    """How many values a YAML node stands for, once its aliases are replaced by what they refer to.
-
-    Raises:
-        YAMLError: two values under one key, of which one would be lost, or a tag.
-    """
-    if id(node) in sizes:
-        return sizes[id(node)]
-    sizes[id(node)] = math.inf  # one that holds itself never ends
-    if not node.tag.startswith("tag:yaml.org,2002:") or "python" in node.tag:
-        raise yaml.MarkedYAMLError(problem=f"the tag {node.tag} is not known", problem_mark=node.start_mark)
-    parts: list[Any] = [] if isinstance(node, yaml.ScalarNode) else node.value
-    if isinstance(node, yaml.MappingNode):
-        keys = [key.value for key, _ in parts]
-        for key, _ in parts:
-            if isinstance(key.value, str) and keys.count(key.value) > 1:
-                raise yaml.MarkedYAMLError(problem=f"the key {key.value} is there twice", problem_mark=key.start_mark)
-        parts = [part for pair in parts for part in pair]
-    sizes[id(node)] = 1 + sum(_expanded(part, sizes) for part in parts)
-    return sizes[id(node)]
+    return None if isinstance(content, dict) else f"{path}: holds no keys; write KEY: VALUE lines"
 
 
 def explain_yaml(error: Any, path: Path | None = None) -> str:
@@ -333,7 +336,7 @@ def _in_folder(folder: Path) -> Iterator[Source]:
 
 
 def _register(package: str) -> None:
-    # Late: it loads NumPy, for which a shell that completes a word has no time.
+    # Late: it loads NumPy, for which `--help` has no time.
     from ipe_bench.plugins.construct import register_package
 
     register_package(package)

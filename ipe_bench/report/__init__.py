@@ -54,16 +54,59 @@ def write_report(
         UserError: a directory does not exist, or there is no such choice of `figures` (all, main or none) or of
             `formats` (png, pdf and svg).
     """
+    return begin_report(directories, output, figures=figures, formats=formats).written()
+
+
+@dataclass(frozen=True)
+class Pending:
+    """A report whose summary is known, and whose files are still to be written."""
+
+    begun: Begun
+    output: Path
+    figures: Which
+    formats: tuple[str, ...]
+    made: str
+    """A digest of what it is made from."""
+
+    def written(self) -> ReportResult:
+        """Writes all files."""
+        from ipe_bench.report.stamp import leave
+
+        result = write_analysis(self.begun, self.output, self.figures, self.formats)
+        leave(self.output, self.made, self._lines, result.files)
+        return result
+
+    def write_unless_current(self) -> None:
+        """Writes all files, unless they are there already."""
+        from ipe_bench.report.stamp import is_current
+
+        if not is_current(self.output, self.made, self._lines):
+            self.written()
+
+    @property
+    def _lines(self) -> list[str]:
+        return [*self.begun.collection.problems, *self.begun.collection.stale]
+
+
+def begin_report(
+    directories: Path | str | Sequence[Path | str],
+    output: Path | str | None = None,
+    *,
+    figures: Which = "main",
+    formats: str | Sequence[str] = PAGE,
+) -> Pending:
+    """Collects and summarises, with the statistics of plugins. Raises UserError as `write_report` does."""
     from ipe_bench.plugins.extensions import use_statistics
+    from ipe_bench.report.stamp import made_from
     from ipe_bench.statistics.analysis import begin
 
-    kinds = file_formats(formats)
-    which_figures(figures)
-    faults = use_statistics()
-    directories = [directories] if isinstance(directories, Path | str) else list(directories)
-    begun = begin(directories)
+    kinds, which = file_formats(formats), which_figures(figures)
+    folders = [Path(one) for one in ([directories] if isinstance(directories, Path | str) else directories)]
+    place = folders[0] if output is None else Path(output)
+    made, faults = made_from(folders, place, which, kinds), use_statistics()
+    begun = begin(folders)
     begun.collection.further += faults
-    return write_analysis(begun, Path(directories[0] if output is None else output), figures, kinds)
+    return Pending(begun, place, which, kinds, made)
 
 
 def write_analysis(begun: Begun, output: Path, which: Which = "main", formats: Sequence[str] = (PAGE,)) -> ReportResult:

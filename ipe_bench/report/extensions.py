@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 
 import pandas as pd
 
-from ipe_bench.basics.containment import contained
 from ipe_bench.basics.errors import StorageError, UserError, place_of
 from ipe_bench.plugins.discovery import Option, blame
 from ipe_bench.plugins.extensions import records
@@ -36,8 +35,7 @@ def guarded(make: Callable[[], T]) -> T:
         UserError: it raises, in a line that says where.
     """
     try:
-        with contained():
-            return make()
+        return make()
     except (UserError, StorageError):
         raise
     except (Exception, SystemExit) as error:

@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from ipe_bench.basics.containment import contained
 from ipe_bench.estimators.base import estimate_safely
 from ipe_bench.runs.execution.base import FATAL, Execution, Failure
 from ipe_bench.runs.provenance import class_modules, describe, digest, fingerprint
@@ -129,19 +128,24 @@ def run_task(task: Task) -> Iterator[Done | str]:
     """
     store, cells, process = Store(task.directory), _recalled(task), os.getpid()
     _check_source(cells)
-    with _alone(), contained():
+    with _alone(), np.errstate(all="ignore"):
         block = Block.draw(cells[0].scenario, task.start, task.stop)
         # What all cells share is not to be charged to the first of them.
         _ = block.crlb_information
     for index, cell in enumerate(cells):
-        with contextlib.suppress(Exception, SystemExit), _alone(), contained():  # what it raises, it raises again
-            _prepare(block, cell)
+        try:
+            with _alone(), np.errstate(all="ignore"):
+                _prepare(block, cell)
+        except KeyboardInterrupt:
+            raise
+        except BaseException:  # what it raises now, it raises again where that is its own failure
+            log.debug("%s: raised while it was prepared", describe_names(cell.names), exc_info=True)
         _end_if_forked(process)
         yield PREPARED
         began = time.perf_counter()
         failure = None
         try:
-            with _alone(), contained():
+            with _alone(), np.errstate(all="ignore"):
                 _compute_cell(store, block, cell, process)
         except FATAL:
             raise

@@ -14,7 +14,6 @@ from typing import Any, Literal, get_args
 import numpy as np
 from scipy.special import betaincinv, chdtri, gammaincinv
 
-from ipe_bench.basics.containment import contained
 from ipe_bench.basics.errors import UserError, place_of
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.calibration import overall_p, overall_words, shared_level
@@ -1190,7 +1189,7 @@ def columns_of_added(record: Statistic, sample: Sample) -> dict[str, list[Any]]:
         UserError: it raises, or gives something else than a value per parameter and one over all.
     """
     try:
-        with contained():
+        with np.errstate(all="ignore"):
             columns = record.columns_of(sample.protected())
     except Exception as error:
         raise UserError(place_of(error)) from error

@@ -103,10 +103,10 @@ def test_a_file_and_an_array_are_estimated_alike(tmp_path, polynomial):
 
 def test_without_estimators_they_are_those_of_the_command(polynomial):
     from ipe_bench.cli.estimate import STANDARD_ESTIMATORS
-    from ipe_bench.cli.single import compose_single
+    from ipe_bench.cli.single import single
 
     asked = ["measurement=polynomial", "readings=z.csv"]
-    command = compose_single("estimate", asked, lambda words: None, standard=STANDARD_ESTIMATORS).job.estimators
+    command = single("estimate", asked, STANDARD_ESTIMATORS).spec.estimators
     fits = ib.estimate(polynomial.measurement, polynomial.draw(0, 1).z[0], noise=polynomial.noise)
     assert {fit.label for fit in fits} == set(command)
 

@@ -145,10 +145,32 @@ MISTAKES = {
         ["run", "measurement=nist", "measurement.dataset=Iris"],
         "measurement.dataset=Iris: cho",
     ),
-    "data sets with others": (["run", "-m", "measurement=nist/boxbod,gins"], "run them one by one"),
+    "a solver among baselines": (
+        ["run", "baseline=[newton]"],
+        "newton is no baseline but a solver; write solver",
+    ),
+    "a baseline among solvers": (
+        ["run", "solver=[gauss_newton]"],
+        "is no solver but a baseline; write baseline",
+    ),
+    "capital letters": (["run", "measurement=GINS"], "measurement=GINS: there is no such option; did you mean gins?"),
+    "a group for a place": (["run", "baseline.ekf.process_noise=1"], "write estimators.ekf.process_noise=1"),
+    "not chosen": (
+        ["run", "estimators.newton.max_iterations=9"],
+        "newton is not chosen; add it to solver=",
+    ),
+    "an address": (["run", "output=s3://bucket/x"], "output=s3://bucket/x: is an address; name a folder"),
+    "an underscore": (["run", "error_scale=1_0"], "error_scale=1_0: has an underscore in a number"),
+    "a file for its key": (["estimate", "my.csv"], "my.csv: is not KEY=VALUE, without spaces"),
+    "a flag for a key": (["run", "--trials", "10"], "write trials=VALUE"),
+    "a command that is gone": (["completion", "bash"], "completion: is no command any more"),
+    "a flag that is gone": (["run", "--config-path", "x"], "name it with --config-dir"),
     "no readings": (["estimate"], "readings: is not given"),
     "absent readings": (["estimate", "readings=absent.csv"], "absent.csv: there is no such file"),
 }
+
+
+QUICK = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "trials=4", "execution=serial")
 
 
 @pytest.mark.parametrize("case", MISTAKES)
@@ -214,29 +236,24 @@ def test_nothing_is_overwritten(readings, here):
 
 
 @pytest.mark.parametrize(
-    ("overrides", "expected"),
+    ("words", "expected"),
     [
-        (["measurement=nist/boxbod"], ["measurement=nist", "measurement.dataset=BoxBOD"]),
-        (["measurement=nist/BoxBOD,nist/dan", "seed=1"], None),
-        (["measurement=nist/danwood, nist/enso"], ["measurement=nist", "measurement.dataset=DanWood,ENSO"]),
-        (["measurement=glob(nist/mgh1*)"], ["measurement=nist", "measurement.dataset=MGH17,MGH10"]),
-        (["truth_measurement=nist/enso"], ["measurement@truth_measurement=nist", "truth_measurement.dataset=ENSO"]),
-        (["measurement=nist", "measurement.dataset=ENSO"], ["measurement=nist", "measurement.dataset=ENSO"]),
+        (["measurement=nist/boxbod"], ["BoxBOD"]),
+        (["-m", "measurement=nist/danwood, nist/enso"], ["DanWood", "ENSO"]),
+        (["-m", "measurement=glob(nist/mgh1*)"], ["MGH17", "MGH10"]),
+        (["measurement=nist", "measurement.dataset=ENSO"], ["ENSO"]),
+        (["-m", "measurement=polynomial,nist/enso", "noise.deviation=1"], ["", "ENSO"]),
     ],
 )
-def test_a_data_set_may_be_written_as_an_option_of_its_own(overrides, expected):
-    from ipe_bench.basics.errors import UserError
-    from ipe_bench.cli.config import rewrite
-
-    if expected is None:
-        with pytest.raises(UserError, match="nist/dan: there is no such data set; did you mean danwood"):
-            rewrite(overrides)
-    else:
-        assert rewrite(overrides) == expected
+def test_a_data_set_may_be_written_as_an_option_of_its_own(words, expected, tmp_path, in_process, capsys):
+    noise = [] if "noise.deviation=1" in words else ["noise=certified"]
+    assert main(["run", *words, *noise, "trials=1", f"output={tmp_path}", "--dry-run"]) == 0
+    *lines, _ = capsys.readouterr().out.splitlines()
+    assert [re.split("[,:]", line.partition("nist ")[2])[0] for line in lines] == expected
 
 
 def test_data_sets_are_swept_by_either_spelling(tmp_path, here):
-    certified = ("noise=certified", "trials=1", "figures=none")
+    certified = ("noise=certified", "trials=1", "figures=none", "output=both")
     first = here("run", "-m", "measurement=nist/misra1a,nist/boxbod", *certified, folder=tmp_path)
     assert first.returncode == 0, first.stderr
     assert "nist BoxBOD" in first.stderr
@@ -399,3 +416,26 @@ def test_flags_stand_anywhere_among_the_words_of_a_command(tmp_path, monkeypatch
         assert main(["list", *words]) == 0
         texts.append(capsys.readouterr().out)
     assert texts[0] == texts[1] == texts[2] != ""
+
+
+def test_a_reader_that_closes_the_pipe_is_no_mistake(tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    for words in (["list", "measurement", "-v"], ["run", *QUICK, "figures=none", f"output={tmp_path / 'out'}"]):
+        command = [sys.executable, "-m", "ipe_bench", *words]
+        with subprocess.Popen(
+            command, env=environment, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        ) as process:
+            assert process.stdout is not None
+            assert process.stderr is not None
+            process.stdout.close()
+            assert not [line for line in process.stderr.read().decode().splitlines() if "block" not in line]
+        assert process.returncode == 0
+    assert (tmp_path / "out/summary.csv").is_file()
+
+
+def test_a_stream_that_knows_no_greek_letters_shows_question_marks(tmp_path):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "ascii"}
+    words = ["run", *QUICK, "figures=none", f"output={tmp_path / 'out'}"]
+    result = subprocess.run([sys.executable, "-m", "ipe_bench", *words], env=environment, capture_output=True)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.isascii()

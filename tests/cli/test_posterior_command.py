@@ -33,8 +33,8 @@ def test_a_table_and_files_for_each_trial(command, tmp_path):
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["readings=a.csv"], "readings: is for other commands"),
-        (["precision=0.1"], "precision: is for other commands"),
+        (["readings=a.csv"], "readings: is for `ipe-bench estimate`, and nothing in `ipe-bench posterior`"),
+        (["precision=0.1"], "precision: is for `ipe-bench run`, and nothing in `ipe-bench posterior`"),
         (["trials=1000"], "trials=1000: each takes up to a minute"),
         (["--particles", "20"], "particles=20: give at least 80"),
         (["--particles", "many"], "--particles: invalid int value"),

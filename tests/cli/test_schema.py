@@ -13,10 +13,10 @@ from jsonschema import Draft202012Validator
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.options import checked, option_types
 from ipe_bench.cli.main import main
-from ipe_bench.cli.schema import of_all
+from ipe_bench.cli.spec import keys_of_a_run
 from ipe_bench.plugins import discovery
 from ipe_bench.plugins.construct import find_class
-from ipe_bench.plugins.schema import name_of
+from ipe_bench.plugins.schema import name_of, schema_of
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = sorted([*(ROOT / "conf").rglob("*.yaml"), *(ROOT / "plugins").rglob("conf/**/*.yaml")])
@@ -26,7 +26,8 @@ EXPERIMENT = "defaults: [{override /measurement: gins}, {override /solver: [newt
 
 @pytest.fixture(scope="module")
 def schema() -> dict[str, Any]:
-    found, problems = of_all([option for option in discovery.options() if option.source.name == "ipe-bench"])
+    ours = [option for option in discovery.options() if option.source.name == "ipe-bench"]
+    found, problems = schema_of(ours, keys_of_a_run())
     assert not problems
     Draft202012Validator.check_schema(found)
     return found

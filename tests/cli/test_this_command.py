@@ -9,9 +9,8 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from ipe_bench.cli.config import KEYS, prepare, rewrite
 from ipe_bench.cli.main import main
-from ipe_bench.cli.overrides import default_name, read
+from ipe_bench.cli.words import default_name, read
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.report.certified_tables import attained_totals_table
 from ipe_bench.report.terminal import render
@@ -72,7 +71,7 @@ NAMES = {
     "noise.deviation=0.1 noise=gaussian measurement=ranging": "ranging-gaussian-noise.deviation=0.1",
     "solver=[newton,fixed_point] baseline=[ekf]": "gins-newton+fixed_point-ekf",
     "solver=[] baseline=[ekf]": "gins-no_solver-ekf",
-    "measurement=nist/misra1a noise=certified": "nist-Misra1a-certified",
+    "measurement=nist/misra1a noise=certified": "nist-misra1a-certified",
     "truth_measurement=gins_tilted": "gins-truth=gins_tilted",
     "estimators.fixed_point.tolerance=1e-9": "gins-fixed_point.tolerance=1e-9",
     "+solver@estimators.n2=newton": "gins-n2=newton",
@@ -83,13 +82,11 @@ NAMES = {
 
 @pytest.mark.parametrize("words", NAMES)
 def test_a_folder_is_named_after_what_was_asked(words):
-    prepare()
-    assert default_name(read(rewrite(words.split()), KEYS)) == NAMES[words]
+    assert default_name(read("run", words.split()).overrides) == NAMES[words]
 
 
 def test_a_long_name_is_cut_and_stays_one_of_a_kind():
-    prepare()
-    names = [default_name(read([f"prior.deviations=[{'1,' * 60}{last}]"], KEYS)) for last in (1, 2)]
+    names = [default_name(read("run", [f"prior.deviations=[{'1,' * 60}{last}]"]).overrides) for last in (1, 2)]
     assert names[0] != names[1]
     assert all(len(name) <= 80 for name in names)
 

@@ -1,23 +1,17 @@
-"""Whatever a plugin does to its readings, its problem or its process, the rows of all others have the same bits."""
+"""Whatever a plugin does to its readings and its problem, the rows of all others have the same bits."""
 
 from __future__ import annotations
 
-import os
-import random
-import signal
 import subprocess
 import sys
-import time
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
-from vandals import Bystander, Classy, Vandal, WrongR
+from vandals import Classy, Vandal, WrongR
 
 from ipe_bench import Scenario
 from ipe_bench.baselines import EnKF, LinearLSE
-from ipe_bench.basics.containment import contained
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import estimate_safely
 from ipe_bench.noise import Gaussian
@@ -27,23 +21,15 @@ from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import compute
 from ipe_bench.solvers import Newton
 
-OTHERS = {"linear_lse": LinearLSE(), "newton": Newton(), "enkf": EnKF(members=20), "bystander": Bystander()}
+OTHERS = {"linear_lse": LinearLSE(), "newton": Newton(), "enkf": EnKF(members=20)}
 MESSAGES = {
     "readings": "ValueError: output array is read-only",
-    "readings_by_force": "it writes into its readings",
     "linearization": "ValueError: assignment destination is read-only",
     "R": "ValueError: output array is read-only",
-    "R_by_force": "it writes into R",
-    "model": "it changes the model",
     "nominal": "ValueError: output array is read-only",
-    "nominal_by_force": "it changes the model",
-    "interrupt": "Escaped: KeyboardInterrupt: of its own",
-    "panic": "Escaped: Panic: of its own",
-    "generator_exit": "Escaped: GeneratorExit",
 }
 """Those that end as errors, and what is said of them."""
-QUIET = ("covariance", "seed", "folder", "floating_point", "handler")
-FAULTS = [*MESSAGES, *QUIET, "thread"]
+FAULTS = [*MESSAGES, "covariance"]
 EXECUTIONS = [
     Serial(),
     pytest.param(Processes(2), marks=pytest.mark.campaign),
@@ -79,24 +65,9 @@ def undisturbed(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture
-def surroundings(execution):
-    """Fails where something of this process is not what it was. Dask's own client draws from Python's random stream."""
-    if not isinstance(execution, Serial):
-        yield
-        return
-    before = (os.getcwd(), random.getstate(), list(warnings.filters), np.geterr(), signal.getsignal(signal.SIGINT))
-    bits = np.random.get_state()[1].tolist()  # noqa: NPY002  it is the state that plugins share
-    yield
-    after = (os.getcwd(), random.getstate(), list(warnings.filters), np.geterr(), signal.getsignal(signal.SIGINT))
-    assert before == after
-    assert bits == np.random.get_state()[1].tolist()  # noqa: NPY002
-    assert float(np.float64(1.0) + np.float64(1e-20)) == 1.0, "numbers are rounded upwards"
-
-
 @pytest.mark.parametrize("execution", EXECUTIONS, ids=repr)
 @pytest.mark.parametrize("fault", FAULTS)
-def test_one_vandal_changes_no_bit_of_the_others(tmp_path, undisturbed, surroundings, execution, fault):
+def test_one_vandal_changes_no_bit_of_the_others(tmp_path, undisturbed, execution, fault):
     if isinstance(execution, Dask):
         pytest.importorskip("distributed")
     estimators = {"vandal": Vandal(fault), **OTHERS}
@@ -106,12 +77,12 @@ def test_one_vandal_changes_no_bit_of_the_others(tmp_path, undisturbed, surround
     if fault in MESSAGES:
         assert set(vandal["status"]) == {"error"}
         assert {m.split(";")[0] for m in vandal["message"]} == {MESSAGES[fault]}
-    elif fault in QUIET:
+    else:
         np.testing.assert_array_equal(vandal["error_a"], rows(undisturbed, "newton")["error_a"])
 
 
 @pytest.mark.parametrize("execution", EXECUTIONS, ids=repr)
-def test_a_wrong_R_concerns_its_own_scenario(tmp_path, undisturbed, surroundings, execution):
+def test_a_wrong_R_concerns_its_own_scenario(tmp_path, undisturbed, execution):
     if isinstance(execution, Dask):
         pytest.importorskip("distributed")
     scenarios = [scenario(WrongR(0.1)), scenario()]
@@ -119,46 +90,31 @@ def test_a_wrong_R_concerns_its_own_scenario(tmp_path, undisturbed, surroundings
     assert_same(undisturbed, tmp_path)
 
 
-def test_all_vandals_at_once_in_processes(tmp_path, undisturbed):
-    estimators = {**{fault: Vandal(fault) for fault in FAULTS}, **OTHERS}
-    assert compute([scenario()], estimators, 8, tmp_path, execution=Processes(1), block_size=4) == ()
-    assert_same(undisturbed, tmp_path)
-
-
 def test_readings_of_the_user_are_left_alone_by_estimate():
     drawn = scenario().draw(0, 3)
     kept = drawn.z.copy()
-    for fault in ("readings", "readings_by_force"):
-        estimates = estimate_safely(Vandal(fault), scenario().problem, drawn.z)
-        assert (estimates.status == Status.ERROR).all()
-        np.testing.assert_array_equal(drawn.z, kept)
+    estimates = estimate_safely(Vandal("readings"), scenario().problem, drawn.z)
+    assert (estimates.status == Status.ERROR).all()
+    np.testing.assert_array_equal(drawn.z, kept)
     drawn.z[0, 0] = np.nan  # they are the user's to change
 
 
 CTRL_C = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which what runs in the background ignores
 sys.path[:0] = {path!r}
 from test_vandals import scenario
 from vandals import Stopped
 from ipe_bench.runs.run import compute
 
 try:
-    compute([scenario()], {{"stopped": Stopped({swallows})}}, 20, {folder!r})
+    compute([scenario()], {{"stopped": Stopped()}}, 20, {folder!r})
 except KeyboardInterrupt:
     sys.exit(130)
 """
 
 
-@pytest.mark.parametrize("swallows", [False, True])
-def test_ctrl_c_stops_a_serial_run_whatever_the_estimator_makes_of_it(tmp_path, swallows):
+def test_ctrl_c_stops_a_serial_run(tmp_path):
     path = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
-    code = CTRL_C.format(path=path, swallows=swallows, folder=str(tmp_path))
+    code = CTRL_C.format(path=path, folder=str(tmp_path))
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=120).returncode == 130
-
-
-def test_containing_takes_no_time_that_matters():
-    began = time.perf_counter()
-    for _ in range(100):
-        with contained():
-            pass
-    assert time.perf_counter() - began < 0.5

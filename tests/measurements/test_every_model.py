@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import pytest
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from scipy.stats import norm
 
 from ipe_bench.api import run
-from ipe_bench.cli.config import assemble, prepare
+from ipe_bench.cli.session import jobs_of, session
+from ipe_bench.cli.words import read
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
@@ -25,12 +25,11 @@ SLOW_TO_CONVERGE = {("paper", "multiscale_lm")}
 def scenario(experiment: str) -> Scenario:
     """The model of an experiment with the experiment's noise, at error scale 0.1; GINS with white noise, since
     quantisation at that scale is none."""
-    prepare()
-    overrides = [f"+experiment={experiment}", "error_scale=0.1"]
+    words = [f"+experiment={experiment}", "error_scale=0.1"]
     if experiment == "paper":
-        overrides.append("noise=gaussian")
-    with initialize_config_dir(str(plugins.own_conf()), version_base="1.3"):
-        return assemble(compose("config", overrides)).scenario
+        words.append("noise=gaussian")
+    with session():
+        return jobs_of(read("run", words), multirun=True).specs[0].scenario
 
 
 def every_estimator(experiment: str, scenario: Scenario) -> dict[str, Estimator]:

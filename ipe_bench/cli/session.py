@@ -1,0 +1,271 @@
+"""Hydra, used from outside: composing, sweeping and launching, with what the jobs came to handed back.
+
+`GlobalHydra.instance().hydra` is what `hydra.compose` itself works with. Its `run` and `multirun` return what the jobs
+returned, from other processes as well (joblib, submitit).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import functools
+import os
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from hydra import compose, initialize_config_dir
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.core.plugins import Plugins
+from hydra.errors import HydraException
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from ipe_bench.basics.errors import UserError, describe_exception, unknown
+from ipe_bench.cli import print_problems
+from ipe_bench.cli import words as w
+from ipe_bench.cli.search_path import extend
+from ipe_bench.cli.spec import DEFAULTS, KEYS, Spec, spec
+from ipe_bench.cli.words import Words
+from ipe_bench.measurements.nist import datasets
+from ipe_bench.plugins import discovery as plugins
+
+Result = TypeVar("Result")
+_EACH_JOB = 1000
+"""Jobs of a sweep that are all constructed to be checked; of a larger sweep, each value of each key."""
+
+
+class PluginConfigs(SearchPathPlugin):
+    """Lets our own commands find the options of plugins, and a user's own folder first."""
+
+    folder: Path | None = None
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        if self.folder is not None:
+            search_path.prepend("command-line", self.folder.resolve().as_uri())
+        extend(search_path, plugins.sources())
+
+
+@contextlib.contextmanager
+def session(folder: Path | None = None) -> Iterator[None]:
+    """Within it Hydra finds our configs, those of plugins, and those in `folder`."""
+    print_problems(plugins.take_problems())
+    store, registry = ConfigStore.instance(), Plugins.instance()
+    store.store("schema", node=DEFAULTS, provider="ipe-bench")
+    for name in datasets():
+        node = {"_target_": "ipe_bench.measurements.Nist", "dataset": name}
+        store.store(name.lower(), node, group="measurement/nist", package="measurement", provider="ipe-bench")
+    if PluginConfigs not in registry.discover(SearchPathPlugin):
+        registry.register(PluginConfigs)
+    PluginConfigs.folder = folder
+    _composed.cache_clear()
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(plugins.own_conf()), job_name="ipe-bench", version_base="1.3"):
+        yield
+
+
+@dataclass(frozen=True)
+class Jobs:
+    """What a command is to do: its jobs, each checked."""
+
+    words: Words
+    specs: list[Spec]
+    """Of a sweep whose jobs only its sweeper can choose, the first."""
+    multirun: bool
+    maximises: bool = False
+
+    def launch(self, task: Callable[[DictConfig], Result]) -> list[Result]:
+        """What each job returned, run by the launcher and the sweeper that the words choose; nothing from a sweeper
+        that optimises, which keeps it to itself."""
+        hydra = GlobalHydra.instance().hydra
+        assert hydra is not None
+        try:
+            if not self.multirun:
+                return [hydra.run("config", task, self.words.text).return_value]
+            batches = hydra.multirun("config", task, self.words.text)
+        except (HydraException, OmegaConfBaseException) as error:
+            raise explain(error) from error
+        return [job.return_value for batch in batches or [] for job in batch]
+
+
+def jobs_of(words: Words, *, multirun: bool) -> Jobs:
+    """The jobs of a command; with an experiment that sweeps nobody has to say that as well.
+
+    Raises:
+        UserError: the first mistake in any job, before one has begun.
+    """
+    config = _composed(tuple(map(w.forced, w.settled(words.overrides))), whole=True)
+    hydra = config.hydra
+    params = [f"{key}={value}" for key, value in (hydra.sweeper.get("params") or {}).items()]
+    multirun = multirun or hydra.mode == RunMode.MULTIRUN or bool(params)
+    optimises = not hydra.sweeper["_target_"].endswith(".BasicSweeper")
+    swept = next((one for one in words.overrides if one.is_sweep_override()), None)
+    if swept is not None and not multirun:
+        raise UserError(f"{w.said(swept)}: is a sweep; add -m, or put a list in brackets")
+    for one in words.overrides:
+        if one.is_interval_sweep() and not optimises:
+            raise UserError(
+                f"{w.said(one)}: interval() is for sweepers that optimise (hydra/sweeper=optuna); give the values, "
+                "such as 1,10,100"
+            )
+    if not multirun or optimises:
+        return Jobs(words, [spec_of(config)], multirun, "maximize" in str(hydra.sweeper.get("direction", "")))
+    own = [OverridesParser.create().parse_override(word) for word in params]
+    overrides = [*own, *words.overrides]
+    number = w.count(overrides)
+    if not 0 < number <= w.MOST_JOBS:
+        raise UserError(f"the sweep has {number or 'no'} jobs: give 1 to {w.MOST_JOBS}, and check its patterns")
+    return Jobs(words, [_spec(job) for job in _checked(overrides, number)], multirun)
+
+
+def _checked(overrides: Sequence[Override], number: int) -> Iterator[list[Override]]:
+    """All jobs of a sweep; of a large one, each value of each key with the first of the others."""
+    if number <= _EACH_JOB:
+        yield from w.jobs(overrides)
+        return
+    first = w.settled(overrides)
+    for i, one in enumerate(overrides):
+        if one.is_sweep_override():
+            for (job,) in w.jobs([one]):
+                yield [*first[:i], job, *first[i + 1 :]]
+
+
+def _spec(job: Sequence[Override]) -> Spec:
+    """One job: composed for what it chooses, with its other values put in their places."""
+    config = copy.deepcopy(_composed(tuple(w.forced(one) for one in job if w.chooses(one))))
+    try:
+        for one in (one for one in job if not w.chooses(one)):
+            OmegaConf.update(config, one.key_or_group, w.plain(one.value()), merge=True, force_add=True)
+    except Exception as error:
+        raise explain(error) from error
+    return spec_of(config)
+
+
+@functools.lru_cache(maxsize=64)
+def _composed(words: tuple[str, ...], *, whole: bool = False) -> DictConfig:
+    try:
+        return compose("config", list(words), return_hydra_config=whole)
+    except Exception as error:  # what Hydra makes of overrides raises nearly anything
+        raise explain(error) from error
+
+
+def spec_of(config: DictConfig) -> Spec:
+    """The checked job of a composed config.
+
+    Raises:
+        UserError: the first mistake, by its key.
+    """
+    return spec(_plain(config))
+
+
+def composed(words: Words) -> dict[str, Any]:
+    """The config of a command's only job."""
+    return _plain(_composed(tuple(map(w.forced, words.overrides)), whole=True))
+
+
+def _plain(config: DictConfig) -> dict[str, Any]:
+    try:
+        own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+        return OmegaConf.to_container(own, resolve=True, throw_on_missing=True)  # type: ignore[return-value]
+    except OmegaConfBaseException as error:
+        raise explain(error) from error
+
+
+def show(words: Words, flags: Any) -> None:
+    """Answers the flags that print and compute nothing, by Hydra's own means."""
+    hydra = GlobalHydra.instance().hydra
+    assert hydra is not None
+    settled = [w.forced(one) for one in w.settled(words.overrides)]
+    if flags.info:
+        hydra.show_info(flags.info, "config", settled, RunMode.RUN)
+    else:
+        hydra.show_cfg("config", settled, flags.cfg, flags.package, flags.resolve)
+
+
+def complete(words: Sequence[str]) -> None:
+    """Installs Hydra's completion, or answers a shell.
+
+    Raises:
+        UserError: the words ask for neither.
+    """
+    shells = ("bash", "fish", "zsh")
+    if not any(list(words) == [f"{what}={shell}"] for what in ("install", "uninstall", "query") for shell in shells):
+        shown = " ".join(words) or "nothing"
+        raise UserError(f"-sc {shown}: write -sc install=SHELL or -sc uninstall=SHELL, SHELL being {', '.join(shells)}")
+    if words[0].startswith("query"):
+        line = os.environ.get("COMP_LINE")
+        if line is None:
+            raise UserError(f"-sc {words[0]}: is what a shell asks while completing, with COMP_LINE set")
+        # Hydra completes the words after the program's name; ours has the command in between.
+        program, command, rest = line.partition(" run ")
+        if command:
+            os.environ["COMP_LINE"] = f"{program} {rest}"
+            os.environ["COMP_POINT"] = str(len(os.environ["COMP_LINE"]))
+    hydra = GlobalHydra.instance().hydra
+    assert hydra is not None
+    hydra.shell_completion("config", list(words))
+
+
+def explain(error: BaseException) -> UserError:
+    """An error of Hydra, OmegaConf or YAML while composing, as one line with the remedy."""
+    if isinstance(error, UserError):
+        return error
+    if isinstance(error, yaml.YAMLError):
+        return UserError(plugins.explain_yaml(error))
+    if isinstance(error, UnicodeDecodeError):
+        return UserError(f"a config file is not UTF-8 ({error.reason}); `ipe-bench list` names it")
+    text = "\n".join(str(e) for e in (error, error.__cause__) if e is not None)
+    for pattern, explained in _EXPLAINED:
+        if found := re.search(pattern, text):
+            return UserError(explained(*found.groups()))
+    full_key = re.search(r"full_key: (\S+)", text)
+    lines = dict.fromkeys(line.strip() for line in text.splitlines() if line.strip())
+    kept = [line for line in lines if not line.startswith(("object_type=", "full_key:", "reference_type=", "See "))]
+    return UserError(f"{full_key.group(1) + ': ' if full_key else ''}{' '.join(kept) or describe_exception(error)}")
+
+
+def _no_such_option(name: str) -> str:
+    group, _, option = name.rpartition("/") if name.startswith("hydra/") else name.partition("/")
+    if group in ("hydra/launcher", "hydra/sweeper"):
+        kind = group.partition("/")[2]
+        return f"{group}={option}: this {kind} is not installed; pip install hydra-{option}-{kind}, or choose basic"
+    return f"{group}={option}: {unknown(option, [o.name for o in plugins.options(group)], 'option')}"
+
+
+def _no_such_key(name: str) -> str:
+    known = {*KEYS, *plugins.groups(), "hydra"}
+    if (key := name.split(".")[0]) in known:
+        return f"{name}: there is no such key; see `ipe-bench run --cfg job` for those there are"
+    return f"{name}: {unknown(key, known, 'key')}"
+
+
+def _wrong_type(value: str, kind: str, key: str) -> str:
+    kinds = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false"}
+    return f"{key}={value}: give {kinds.get(kind, kind)}"
+
+
+_EXPLAINED: tuple[tuple[str, Callable[..., str]], ...] = (
+    (r"Could not (?:find|load) '([^']+)'", _no_such_option),
+    (r"Could not override '([^']+)'", _no_such_key),
+    (r"An item is already at '([^']+)'", lambda key: f"{key}: is there already; leave out the +"),
+    (
+        r"Error merging override (\S+)\s+Invalid value '([^']+)', expected one of \[([^]]+)\]",
+        lambda word, value, choices: f"{word}: {value} cannot be chosen (there are: {choices})",
+    ),
+    (r"Value '(.*)' of type '[^']*' could not be converted to (\w+)[\s\S]*?full_key: (\S+)", _wrong_type),
+    (
+        r"Interpolation key '([^']+)' not found\s+full_key: (\S+)",
+        lambda k, key: f"{key}: ${{{k}}} is no key of the config",
+    ),
+    (r"Missing mandatory value: \S+[\s\S]*full_key: (\S+)", lambda key: f"{key}: is not given; give it a value"),
+)
+"""What Hydra says, and the line for it."""

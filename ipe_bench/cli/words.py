@@ -1,0 +1,411 @@
+"""The words KEY=VALUE of a command, read once, by Hydra's grammar.
+
+What Hydra would answer in words of its own, or take without a word and not do, is refused here by a line that names the
+word and the remedy. What the values of options may be is checked where a job is constructed.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import itertools
+import json
+import re
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import ChoiceSweep, Glob, Override, OverrideType, QuotedString
+from hydra.errors import HydraException
+
+from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.cli.spec import KEYS
+from ipe_bench.measurements.nist import datasets
+from ipe_bench.plugins import discovery as plugins
+from ipe_bench.runs.provenance import TARGET
+
+MOST_JOBS = 10_000
+"""The largest sweep."""
+TRUTH = "truth_measurement"
+HYDRAS_TRUTH = f"measurement@{TRUTH}"
+_FORMULA = re.compile(
+    rf"(\+*(?:measurement|{TRUTH})\.(?:expression|(?:time_)?unit|(?:initial|rates|outputs)\.\w+))=([^'\"].*)", re.DOTALL
+)
+"""Texts that the shell has taken the quotes from; a list of units is none."""
+_FILE = re.compile(rf"\+*(?:(measurement|{TRUTH})\.file|(parameters))=(?![{{$]|null$)(.*)", re.DOTALL)
+_UNDERSCORED = re.compile(r"(?:^|[\[,:(\s])[-+]?[\d.]+_[\d_.eE+-]*(?=$|[\],})\s])")
+
+
+@dataclass(frozen=True)
+class Words:
+    """What a command was told, word by word."""
+
+    overrides: tuple[Override, ...]
+
+    @property
+    def text(self) -> list[str]:
+        """The overrides as Hydra takes them."""
+        return [forced(one) for one in self.overrides]
+
+    @property
+    def sweeps(self) -> bool:
+        return any(one.is_sweep_override() for one in self.overrides)
+
+    @property
+    def keys(self) -> list[str]:
+        """The first part of each key, in the order of the words."""
+        return [_first(one) for one in self.overrides]
+
+    def chosen(self, group: str) -> str | None:
+        """The option that is chosen last."""
+        found = [one for one in self.overrides if one.key_or_group == group and one.package is None]
+        return None if not found else str(plain(found[-1].value()))
+
+    def refuse(self, keys: Collection[str], why: str) -> None:
+        """Refuses a word whose key is one of these, or below one.
+
+        Raises:
+            UserError: `KEY: why; leave it out`.
+        """
+        for one in self.overrides:
+            if (first := _first(one)) in keys:
+                whole = one.key_or_group if "." in one.key_or_group else first
+                raise UserError(f"{whole}: {why}; leave it out")
+
+
+def _first(override: Override) -> str:
+    key = TRUTH if override.package == TRUTH else override.key_or_group
+    return key.split(".")[0].split("/")[0]
+
+
+def forced(override: Override) -> str:
+    """A word as Hydra takes it. Options that a file does not name are added: their class judges them."""
+    line = override.input_line or ""
+    option = "." in override.key_or_group and not override.key_or_group.startswith("hydra")
+    return f"++{line}" if option and override.type is OverrideType.CHANGE else line
+
+
+def chooses(override: Override) -> bool:
+    """Whether a word says which configs are put together, not what stands in them."""
+    chosen = override.key_or_group in (*plugins.COMPONENT_GROUPS, "experiment") or override.package is not None
+    return chosen or override.is_delete() or override.is_hydra_override()
+
+
+def read(command: str, words: Sequence[str], folders: Sequence[Path] = ()) -> Words:
+    """The words of a command; `folders` hold configs besides ours.
+
+    Raises:
+        UserError: a word is none, or Hydra would not do what it says.
+    """
+    groups = _groups(folders)
+    found = [_parse(command, part, groups) for word in words for part in _expanded(word)]
+    for override in found:
+        _check(override, groups)
+    _check_labels(found)
+    experiments = [said(one) for one in found if one.key_or_group == "experiment"]
+    if len(experiments) > 1:
+        raise UserError(f"{' '.join(experiments)}: one command runs one experiment; run them one by one")
+    return Words(tuple(found))
+
+
+def _groups(folders: Sequence[Path] = ()) -> dict[str, list[str]]:
+    """The names of the options of each group."""
+    found: dict[str, list[str]] = {}
+    for option in plugins.options():
+        found.setdefault(option.group, []).append(option.name)
+    for path in (path for folder in folders for path in sorted(folder.glob("*/**/*.yaml"))):
+        relative = next(path.relative_to(f) for f in folders if path.is_relative_to(f)).with_suffix("")
+        found.setdefault(relative.parts[0], []).append("/".join(relative.parts[1:]))
+    found["measurement"] += [f"nist/{name.lower()}" for name in datasets()]
+    return found
+
+
+def said(override: Override) -> str:
+    """A word as its user wrote it."""
+    return (override.input_line or "").replace(HYDRAS_TRUTH, TRUTH)
+
+
+def values(override: Override) -> Iterator[Any]:
+    """Each value, those of a list of jobs one by one; nothing of ranges and intervals."""
+    given = override.value()
+    if isinstance(given, ChoiceSweep):
+        yield from map(plain, given.list)
+    elif not override.is_sweep_override():
+        yield plain(given)
+
+
+def plain(value: Any) -> Any:
+    """A value without Hydra's quotes."""
+    if isinstance(value, list):
+        return [plain(one) for one in value]
+    if isinstance(value, dict):
+        return {str(plain(key)): plain(one) for key, one in value.items()}
+    return value.text if isinstance(value, QuotedString) else value
+
+
+# Reading
+
+
+def _expanded(word: str) -> list[str]:
+    """A word in Hydra's grammar, or the words that a file holds in its place."""
+    if found := _FILE.fullmatch(word):
+        return _from_file(found[1] or found[2], found[3], word)
+    found = _FORMULA.fullmatch(word)
+    if found and not (found[1].endswith("unit") and re.search(r"[,\[\]{}]", found[2])):
+        return [f"{found[1]}={_quoted(found[2])}"]
+    if word.startswith("formats=") and "," in word and "[" not in word:
+        return [f"formats=[{word.partition('=')[2]}]"]  # several formats are no sweep
+    return [re.sub(rf"^(\+*){TRUTH}=", rf"\1{HYDRAS_TRUTH}=", word)]
+
+
+def _from_file(group: str, name: str, word: str) -> list[str]:
+    """Options from a YAML file, as if each had been typed."""
+    content = plugins.read_yaml_file(Path(name), word)
+    if not isinstance(content, dict):
+        example = "NAME: {nominal: 1}" if group == "parameters" else "rates, start, outputs"
+        raise UserError(f"{word}: holds no keys; write a YAML file of options such as {example}")
+    if TARGET in content:
+        raise UserError(f"{word}: has a {TARGET}; the model is chosen by measurement=, so leave it out")
+    return [f"{group}.{key}={_literal(value, word)}" for key, value in content.items()]
+
+
+def _literal(value: Any, where: str) -> str:
+    """A value in the grammar of overrides."""
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{k}:{_literal(v, where)}" for k, v in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ",".join(_literal(v, where) for v in value) + "]"
+    if isinstance(value, str):
+        return _quoted(value)
+    if value is None or isinstance(value, bool | int | float):
+        return json.dumps(value) if value is None or isinstance(value, bool) else repr(value)
+    raise UserError(f"{where}: {value!r} is neither text nor number")
+
+
+def _quoted(text: str) -> str:
+    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
+
+
+def _parse(command: str, word: str, groups: dict[str, list[str]]) -> Override:
+    key, equals, value = word.partition("=")
+    if not equals and not word.startswith("~"):
+        remedy = f"see `ipe-bench {command} --help`"
+        if command == "estimate" and Path(word).suffix in (".csv", ".parquet"):
+            remedy = f"write readings={word}"
+        raise UserError(f"{word}: is not KEY=VALUE, without spaces about the equals sign; {remedy}")
+    if _UNDERSCORED.search(value) and not value.startswith(("'", '"')):
+        raise UserError(f"{word}: has an underscore in a number; leave it out, or put a text in quotes")
+    try:
+        found = OverridesParser.create().parse_override(word)
+    except (HydraException, ValueError, RecursionError):
+        raise UserError(
+            f"{word}: the value cannot be read; a text with other signs than letters, digits and -_./:% needs quotes "
+            f'that reach ipe-bench, such as "{key}={_quoted(value)}", and brackets have to be closed'
+        ) from None
+    if not found.key_or_group:
+        raise UserError(f"{word}: there is no key in front of the value; write KEY=VALUE")
+    pattern, group = found.value(), found.key_or_group
+    if not isinstance(pattern, Glob) or group not in groups:
+        return found
+    # Hydra would look for the options of Python's own data sets in a folder.
+    names = [name for name in pattern.filter(groups[group]) if "/" in value or "/" not in name]
+    if not names:
+        raise UserError(f"{word}: the sweep has no jobs: no option of {group} fits the pattern")
+    one = "[{}]" if group in plugins.ESTIMATOR_GROUPS else "{}"
+    return OverridesParser.create().parse_override(f"{key}={','.join(map(one.format, names))}")
+
+
+# Checking
+
+
+def _check(override: Override, groups: dict[str, list[str]]) -> None:
+    group = override.key_or_group
+    if group.split("/")[0].split(".")[0] == "hydra":
+        return
+    if override.is_delete():
+        _check_deletion(override)
+    elif group in groups:
+        _check_place(override)
+        _check_choice(override, groups)
+    else:
+        _check_key(override, groups)
+    if override.is_range_sweep():
+        _check_range(override)
+
+
+def _check_deletion(override: Override) -> None:
+    group = override.key_or_group
+    if group in plugins.ESTIMATOR_GROUPS:
+        raise UserError(f"{said(override)}: cannot be left out; {group}=[] chooses none")
+    if not group.startswith("estimators."):
+        raise UserError(f"{said(override)}: only estimators.LABEL can be left out; give the key another value")
+
+
+def _check_key(override: Override, groups: dict[str, list[str]]) -> None:
+    key, word = override.key_or_group, said(override)
+    first = key.split(".")[0]
+    if override.package is not None or ("/" in key and first.split("/")[0] in groups):
+        raise UserError(f"{word}: {unknown(key, groups, 'group')}")
+    if first in plugins.ESTIMATOR_GROUPS and "." in key:
+        raise UserError(f"{word}: options are set by label; write estimators.{word.lstrip('+').partition('.')[2]}")
+    if first not in KEYS:
+        raise UserError(f"{word}: {unknown(first, {*KEYS, *groups, 'experiment'}, 'key')}")
+    if key == "estimators":
+        raise UserError(f"{word}: choose with solver= and baseline=, and set options by estimators.LABEL.KEY=VALUE")
+    for value in values(override):
+        if key in ("name", "output") and str(value).strip() in ("", ".", ".."):
+            raise UserError(f"{word}: name a folder")
+        if key in ("trials", "block_size") and value is None:
+            raise UserError(f"{word}: cannot be null; give a whole number, or leave it out")
+
+
+def _check_place(override: Override) -> None:
+    """Whether a part lands where something looks for it."""
+    group, package, word = override.key_or_group, override.package, said(override)
+    added = override.is_add() or override.is_force_add()
+    if package is None:
+        if group == "experiment" and not added:
+            raise UserError(f"{word}: an experiment is added, not overridden; write +experiment=NAME")
+        if group != "experiment" and added:
+            raise UserError(f"{word}: {group} is there to be chosen, not added; leave out the +")
+    elif group in plugins.ESTIMATOR_GROUPS:
+        home, _, label = package.partition(".")
+        if home != "estimators" or not label or "." in label:
+            raise UserError(f"{word}: goes nowhere; write +{group}@estimators.LABEL=NAME")
+        if not added:
+            raise UserError(f"{word}: a label of its own is added; write +{group}@{package}=NAME")
+    elif (group, package) != ("measurement", TRUTH):
+        raise UserError(f"{word}: goes nowhere; write {group}=NAME")
+    elif added:
+        raise UserError(f"{word}: {TRUTH} is there to be chosen, not added; leave out the +")
+
+
+def _check_choice(override: Override, groups: dict[str, list[str]]) -> None:
+    """Whether each value is an option of the group that can be used."""
+    group, word = override.key_or_group, said(override)
+    several = group in plugins.ESTIMATOR_GROUPS and override.package is None
+    key = word.partition("=")[0].lstrip("+")
+    if group == "experiment" and override.is_sweep_override():
+        raise UserError(f"{word}: a sweep over experiments would ignore their own sweeps; run them one by one")
+    if override.is_range_sweep() or override.is_interval_sweep():
+        raise UserError(f"{word}: write the names of options of {group}")
+    for value in values(override):
+        if value is None and override.package == TRUTH:
+            continue
+        if isinstance(value, list) and not several:
+            raise UserError(f"{word}: choose one: {group}=NAME")
+        names = value if isinstance(value, list) else [value]
+        for name in names:
+            if not isinstance(name, str) or name not in groups[group]:
+                shown = "null" if name is None else str(name)
+                raise UserError(f"{key}={shown}: {no_option(group, shown, groups)}")
+            if (fault := plugins.fault(group, name)) is not None:
+                raise UserError(f"{key}={name}: {fault}")
+            if names.count(name) > 1:
+                remedy = f"+{group}@estimators.{name}_2={name} runs it again under a label of its own"
+                raise UserError(f"{word}: {name} stands there twice and would run once; {remedy}")
+
+
+def no_option(group: str, name: str, groups: dict[str, list[str]]) -> str:
+    """What to write in place of an option that its group lacks: its own group, where another group has it."""
+    for other, names in groups.items():
+        if name in names and other != group:
+            shown = f"[{name}]" if other in plugins.ESTIMATOR_GROUPS else name
+            return f"{name} is no {group} but a {other}; write {other}={shown}"
+    known = groups[group]
+    same = [one for one in known if one.lower() == name.lower()]
+    if name.lower().startswith("nist/") and group == "measurement":
+        return unknown(name.lower(), [one for one in known if one.startswith("nist/")], "data set")
+    return unknown(same[0] if same else name, [one for one in known if not one.startswith("nist/")], "option")
+
+
+def _check_range(override: Override) -> None:
+    try:
+        count = sum(1 for _ in itertools.islice(override.sweep_iterator(), MOST_JOBS + 1))
+    except (HydraException, ValueError, ArithmeticError, TypeError):
+        count = 0
+    if not 0 < count <= MOST_JOBS:
+        raise UserError(f"{said(override)}: give a range of 1 to {MOST_JOBS} jobs, with three finite numbers")
+
+
+def _check_labels(overrides: Sequence[Override]) -> None:
+    """Two parts under one label would be mixed, without a word."""
+    taken: dict[str, Override] = {}
+    for override in overrides:
+        group, package = override.key_or_group, override.package
+        if group not in plugins.ESTIMATOR_GROUPS or override.is_delete():
+            continue
+        value = plain(override.value())
+        for label in [package.partition(".")[2]] if package else value if isinstance(value, list) else []:
+            if label in taken and (package or taken[label] is not override):
+                word = said(override)
+                raise UserError(f"{word}: {label} is the label of {said(taken[label])} already; choose another label")
+            taken[label] = override
+
+
+# Jobs
+
+
+def jobs(overrides: Sequence[Override]) -> Iterator[list[Override]]:
+    """The overrides of each job of a sweep, as Hydra's basic sweeper makes them."""
+    axes: dict[str, list[Override]] = {}
+    parse = OverridesParser.create().parse_override
+    for one in overrides:
+        key = one.get_key_element()
+        swept = one.is_discrete_sweep()
+        axes[key] = [parse(f"{key}={value}") for value in one.sweep_string_iterator()] if swept else [one]
+    return map(list, itertools.product(*axes.values()))
+
+
+def count(overrides: Sequence[Override]) -> int:
+    """How many jobs a sweep has."""
+    axes = {one.get_key_element(): one for one in overrides}
+    number = 1
+    for one in axes.values():
+        number *= sum(1 for _ in one.sweep_string_iterator()) if one.is_discrete_sweep() else 1
+    return number
+
+
+def settled(overrides: Sequence[Override]) -> list[Override]:
+    """One job of a sweep: the first, without what only a sweeper can choose."""
+    return next(jobs([copy.copy(one) for one in overrides if not one.is_interval_sweep()]), [])
+
+
+# The name of the folder
+
+
+_NO_PART_OF_A_NAME = ("name", "output", "trials", "block_size", "seed", "execution", "experiment", "hydra", "readings")
+_NO_PART_OF_A_NAME += ("precision", "time_limit", "write_readings", "write_readings_trial", "default_name", "objective")
+_NO_PART_OF_A_NAME += ("figures", "formats")
+_LONGEST_NAME = 80
+
+
+def default_name(overrides: Sequence[Override]) -> str:
+    """What a command asks for, in a name for its folder: ranging-gaussian-deviation=0.1.
+
+    The same for the same settings in any order. What changes no setting, or adds trials to it, is no part of it.
+    """
+    parts: dict[str, str] = {"measurement": "gins"}
+    experiment = ""
+    for override in overrides:
+        key, _, value = (override.input_line or "").partition("=")
+        key = key.lstrip("+~").replace(HYDRAS_TRUTH, "truth").partition("@estimators.")
+        key = key[2] or key[0]
+        text = re.sub(r"[\[\]'\" ]", "", value.replace("],[", ";").replace(",", "+") if "[" in value else value)
+        if override.key_or_group == "experiment":
+            experiment = text
+        elif _first(override) not in _NO_PART_OF_A_NAME:
+            parts[key] = f"no_{key}" if override.is_delete() or text == "" else text
+    if experiment and parts["measurement"] == "gins":
+        parts["measurement"] = experiment
+    order = ["measurement", "measurement.dataset", "truth", "noise", *plugins.ESTIMATOR_GROUPS]
+    keys = sorted(parts, key=lambda k: (order.index(k) if k in order else len(order), k))
+    bare = ("measurement", "measurement.dataset", "noise", *plugins.ESTIMATOR_GROUPS)
+    full = "-".join(parts[k] if k in bare else f"{k.removeprefix('estimators.')}={parts[k]}" for k in keys)
+    full = full.replace("/", "-")
+    short = re.sub(r"[^\w.,=+-]", "_", full, flags=re.ASCII)
+    if short == full and len(full) <= _LONGEST_NAME:
+        return full
+    return f"{short[: _LONGEST_NAME - 10]}-{hashlib.sha256(full.encode()).hexdigest()[:8]}"
