@@ -106,6 +106,19 @@ def test_normalised_residuals_are_standard_normal_and_flag_a_gross_error(correla
     assert abs(own[17]) > outlier_limit(M)
 
 
+def test_normalised_residuals_of_correlated_readings_are_those_of_the_w_test():
+    """(R^-1 r)_i over the root of the diagonal of R^-1 - R^-1 J (J' R^-1 J)^-1 J' R^-1, by plain inverses."""
+    lag = np.abs(np.subtract.outer(np.arange(M), np.arange(M)))
+    R = np.outer(np.linspace(0.5, 2.0, M), np.linspace(0.5, 2.0, M)) * 0.8**lag
+    inverse = np.linalg.inv(R)
+    noise = np.random.default_rng(12).standard_normal(M)
+    r = noise - J @ np.linalg.solve(J.T @ inverse @ J, J.T @ inverse @ noise)
+    spread = inverse - inverse @ J @ np.linalg.solve(J.T @ inverse @ J, J.T @ inverse)
+    covariance = Covariance(np.linalg.cholesky(R))
+    found = normalised(covariance.whiten(r), explained(J, covariance), covariance)
+    np.testing.assert_allclose(found, (inverse @ r) / np.sqrt(np.diag(spread)), rtol=1e-8)
+
+
 def test_nothing_is_said_of_a_reading_that_a_parameter_absorbs():
     alone = np.column_stack([J, np.eye(M)[0]])
     covariance = Covariance(np.ones(M))

@@ -14,23 +14,15 @@ from functools import cached_property
 import numpy as np
 from scipy.special import chdtri, fdtri
 
-from ipe_bench.basics.linalg import Array, Covariance, deviations, inverse
+from ipe_bench.basics.linalg import Array, Covariance, Mask, deviations
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.least_squares import Minima, Objective, minimize
+from ipe_bench.estimators.least_squares import Minima, Objective, inverse_factor, minimize
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.real.fits import Fit, falls_beyond, holding, present_part
 from ipe_bench.real.penalised import penalised
-from ipe_bench.real.profiles import (
-    Profile,
-    Released,
-    end_within,
-    half_width,
-    profiles,
-    profiles_within,
-    wald,
-)
+from ipe_bench.real.profiles import Profile, Released, half_width, natural_limits, profiles, wald_interval
 
 CONFIDENCE = 0.95
 BOOTSTRAPS = 500
@@ -110,7 +102,7 @@ class OnBound:
     bound: float
     other: float
     """and the other end of its profile interval, of which the bound is the first; infinite where the readings set no
-    limit, NaN where it was not found. See `profiles.end_within`."""
+    limit, NaN where it was not found."""
 
 
 @dataclass(frozen=True)
@@ -172,14 +164,10 @@ def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BO
     least = _Least.near(present_part(problem, rows, best.level), z[rows], best)
     if least is None:
         return None
-    found = least.examined(best.label, problem, rows, bootstraps)
     if not on_bounds:
-        return found
+        return least.examined(best.label, problem, rows, bootstraps)
     released = _released(whole, rows, least, best.level, on_bounds)
-    if released is not None:
-        asked = {"confidence": CONFIDENCE, "freedom": least.freedom}
-        within = profiles_within(least.problem, least.z, least.x, least.P, released, **asked)
-        found = replace(found, profiles=within)
+    found = least.examined(best.label, problem, rows, bootstraps, released)
     return replace(found, on_bounds=tuple(_on_bounds(whole, z, rows, least, best.level, on_bounds)))
 
 
@@ -193,11 +181,11 @@ def _released(
     x = np.array(given.measurement.nominal, dtype=float)
     x[np.setdiff1d(np.arange(len(x)), places)] = least.x
     with np.errstate(all="ignore"):
-        J = given.R.whiten_jacobian(given.measurement.jacobian(x[None]))
-        P, singular = inverse(np.matmul(J.swapaxes(1, 2), J))
-    if singular[0] or not (np.diag(P[0]) > 0).all():
+        inverse_U = inverse_factor(given.R.whiten_jacobian(given.measurement.jacobian(x[None])))[0]
+    if not np.isfinite(inverse_U).all():
         return None
-    return Released(given, x, P[0], places, np.sign(start[places] - np.array(list(values.values()))))
+    inwards = np.sign(start[places] - np.array(list(values.values())))
+    return Released(given, x, inverse_U @ inverse_U.T, places, inwards)
 
 
 def examine_with_prior(
@@ -229,16 +217,18 @@ def _on_bounds(
 ) -> Iterator[OnBound]:
     """What the readings say of each parameter on its bound, the others being held on theirs."""
     model = problem.measurement
-    limits = np.sort(model.natural(np.stack([np.full(model.n, -np.inf), np.full(model.n, np.inf)])), axis=0)
+    lower, upper = natural_limits(model)
     for place, bound in values.items():
         others = {k: value for k, value in values.items() if k != place}
         k = place - sum(other < place for other in others)
         part = _released(holding(problem, others) if others else problem, rows, least, level, {k: bound})
         other = np.nan
         if part is not None:
-            towards = {"confidence": CONFIDENCE, "freedom": least.freedom}
-            other = end_within(part.problem, z[rows], part.x, part.P, k, int(part.inwards[0]), **towards)
-        yield OnBound(place, model.natural_parameters[place], bound, float(np.clip(other, *limits[:, place])))
+            sign, towards = int(part.inwards[0]), {"confidence": CONFIDENCE, "freedom": least.freedom}
+            asked = part.problem, z[rows][None], part.x[None], part.P[None]
+            ((found,),) = profiles(*asked, places=(k,), signs=(sign,), **towards)
+            other = np.nan if found.lower_minimum else (found.low, found.high)[sign > 0]
+        yield OnBound(place, model.natural_parameters[place], bound, float(np.clip(other, lower[place], upper[place])))
 
 
 def _sum_of_squares(one: Fit) -> float:
@@ -282,8 +272,11 @@ class _Least:
         """The whitened Jacobian (m, n)."""
         return self.problem.R.whiten_jacobian(self.model.jacobian(self.x[None]))[0]
 
-    def examined(self, label: str, whole: Problem, rows: Array, bootstraps: int) -> Examination:
-        """`whole`: the problem with the readings that are missing, of which the present ones are `rows`."""
+    def examined(
+        self, label: str, whole: Problem, rows: Array, bootstraps: int, released: Released | None = None
+    ) -> Examination:
+        """`whole`: the problem with the readings that are missing, of which the present ones are `rows`; `released`:
+        that in which parameters held on bounds may leave them."""
         model, x, m = self.model, self.x[None], whole.R.m
         q = half_width(CONFIDENCE, self.freedom)
         deviation = np.sqrt(np.diag(self.P))
@@ -300,9 +293,17 @@ class _Least:
             model,
             model.natural(x)[0],
             deviation * np.abs(model.natural_slope(x)[0]),
-            wald(model, self.x, q * deviation),
-            profiles(self.problem, self.z, self.x, self.P, confidence=CONFIDENCE, freedom=self.freedom),
-            self.bootstrap(bootstraps),
+            wald_interval(model, self.x, deviation, q),
+            profiles(
+                self.problem,
+                self.z[None],
+                x,
+                self.P[None],
+                confidence=CONFIDENCE,
+                freedom=self.freedom,
+                released=released,
+            )[0],
+            self.bootstrap(bootstraps, released),
             self.direction(),
             self.influence(rows, m),
             h,
@@ -334,12 +335,13 @@ class _Least:
         shift = np.abs(moved / np.sqrt(np.diag(self.P))[:, None]).max(axis=0)
         return Influence(*(_at(rows, values[: self.readings], m) for values in (leverage, cook, shift)))
 
-    def bootstrap(self, draws: int) -> Bootstrap:
+    def bootstrap(self, draws: int, released: Released | None = None) -> Bootstrap:
         """Estimates from readings simulated at the estimate, started there, with noise of R; the draws are always the
         same ones (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 6.5).
 
         Where the level of the noise is estimated, each set has a level of its own: what the true one may be, given the
-        estimate, so that intervals are those of Student's t where the model is linear.
+        estimate, so that intervals are those of Student's t where the model is linear. A set whose minimum is on a
+        bound has its answer there, and parameters that are held on bounds may leave them.
         """
         rng = np.random.Generator(np.random.Philox(0))
         draws = _affordable(draws, self.J.size)
@@ -351,8 +353,11 @@ class _Least:
         e[:, : self.readings] *= level[:, None]
         h = self.model.simulate(self.x[None])[0]
         z = h + (e * factor if factor.ndim == 1 else e @ factor.T)
-        minima = _minimise(self.problem, z, np.repeat(self.x[None], draws, axis=0))
-        values, answered = _within_bounds(self.problem, z, minima)
+        if released is None:
+            values, answered = answers(self.problem, z, np.repeat(self.x[None], draws, axis=0))
+        else:
+            values, answered = answers(released.problem, z, np.repeat(released.x[None], draws, axis=0), released)
+            values = np.delete(values, released.places, axis=1)
         values = values[answered]
         tail = (1 - CONFIDENCE) / 2
         n, estimate = len(self.x), self.model.natural(self.x[None])[0]
@@ -395,6 +400,35 @@ class _Least:
         return found or [Minimum(self.model.natural(self.x[None])[0], self.chi_square, 1, True)]
 
 
+def answers(problem: Problem, z: Array, x: Array, released: Released | None = None) -> tuple[Array, Mask]:
+    """The least-squares estimates (sets, n) within the bounds, in the parameters' own units, for readings z (sets, m)
+    from x (sets, n), and which sets have one; parameters that are `released` have the bounds where they stood."""
+    minima, model = _minimise(problem, z, x), problem.measurement
+    values, found = model.natural(minima.x), minima.converged.copy()
+    on_bounds: dict[tuple[tuple[int, float], ...], list[int]] = {}
+    outside, bounds = np.zeros((len(x), 0), dtype=bool), np.zeros(0)
+    if released is not None:
+        outside = ~released.inside(minima.x)
+        bounds = model.natural(released.x[None])[0, released.places]
+    for i in np.flatnonzero(~found | outside.any(axis=1)):
+        near = dict(model.near_bounds(minima.x[i]))
+        if released is not None:
+            near |= dict(zip(released.places[outside[i]].tolist(), bounds[outside[i]].tolist(), strict=True))
+        found[i] = False
+        if 0 < len(near) < model.n:
+            on_bounds.setdefault(tuple(sorted(near.items())), []).append(int(i))
+    for key, sets in on_bounds.items():
+        near = dict(key)
+        free = [k for k in range(model.n) if k not in near]
+        held = holding(problem, near)
+        there = _minimise(held, z[sets], np.ascontiguousarray(minima.x[sets][:, free]))
+        least = there.converged & falls_beyond(problem, there.x, near, z[sets], released)
+        values[sets] = np.array([near.get(k, np.nan) for k in range(model.n)])
+        values[np.ix_(sets, free)] = held.measurement.natural(there.x)
+        found[sets] = least
+    return values, found
+
+
 def _affordable(wanted: int, entries: int) -> int:
     """How many minimisations to make of a Jacobian with so many entries."""
     return min(wanted, max(_FEWEST, _WORK // entries))
@@ -410,29 +444,6 @@ def _minimise(problem: Problem, z: Array, x: Array) -> Minima:
     with np.errstate(all="ignore"):
         objective = Objective.of(problem, z, prior=False)
         return minimize(objective, LevenbergMarquardtMethod(1e-3), x, tolerance=_TOLERANCE, max_iterations=_MOST_STEPS)
-
-
-def _within_bounds(problem: Problem, z: Array, minima: Minima) -> tuple[Array, Array]:
-    """The minima (sets, n) of readings z (sets, m) in the parameters' own units, on bounds where the sum of squares
-    falls on beyond them, and which sets have one."""
-    model, n = problem.measurement, problem.measurement.n
-    values, answered = model.natural(minima.x), minima.converged.copy()
-    near: dict[tuple[tuple[int, float], ...], list[int]] = {}
-    for i in np.flatnonzero(~answered & ~np.isnan(minima.x).any(axis=1)).tolist():
-        near.setdefault(tuple(model.near_bounds(minima.x[i]).items()), []).append(i)
-    for bounds, members in near.items():
-        places = np.array([k for k, _ in bounds], dtype=int)
-        if not 0 < len(places) < n:
-            continue
-        rows, kept = np.array(members), np.setdiff1d(np.arange(n), places)
-        held = holding(problem, dict(bounds))
-        again = _minimise(held, z[rows], minima.x[np.ix_(rows, kept)])
-        falls = again.converged.copy()
-        falls[falls] = falls_beyond(problem, dict(bounds), again.x[falls], z[rows[falls]])
-        values[np.ix_(rows[falls], kept)] = held.measurement.natural(again.x[falls])
-        values[np.ix_(rows[falls], places)] = [bound for _, bound in bounds]
-        answered[rows[falls]] = True
-    return values, answered
 
 
 def _at(rows: Array, values: Array, m: int) -> Array:

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri, fdtri, ndtri, stdtr, stdtrit
+from scipy.special import chdtri, fdtri, ndtri, stdtr
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.linalg import Array, Covariance, Mask
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimator, estimate_safely
 from ipe_bench.measurements.base import Measurement, Restricted
@@ -19,9 +19,10 @@ from ipe_bench.measurements.counted import cost
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.gaussian import Gaussian
-from ipe_bench.real.profiles import wald
+from ipe_bench.real.profiles import Released, half_width, wald_interval
 from ipe_bench.real.residuals import Whiteness, explained, normalised, outlier_limit, whiteness
 from ipe_bench.trials.fit_test import fit_probability, inflation_of, spread_of
+from ipe_bench.trials.observability import in_words
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
 _NORMAL = Gaussian(1.0)
@@ -33,6 +34,8 @@ _SAME_LEVEL = 1e-3
 _SMALLEST_LEVEL = 1e-8
 """As a share of the readings, the level that estimators are told at least."""
 _FARTHEST = 40.0
+_OPEN = 1e-4
+"""A combination of parameters that changes the readings by less than this share of what others do may be open."""
 _DOUBTED = 0.05
 """Where the test of the fit gives less, estimators that can look for a better fit: there is but one set of readings."""
 
@@ -81,9 +84,10 @@ class Fit:
     """Whether the estimator was told a prior, so that x is not the least-squares estimate,"""
     prior_inflation: float = 1.0
     """and by how much it widened its deviations."""
-    beaten: bool = False
-    """Whether another estimator's sum of squares is so much smaller that chance does not explain it: tested where the
-    level is estimated, because there nothing else tells a wrong answer."""
+    beaten_by: str = ""
+    """The estimator with the least sum of squares, where it is so much smaller that chance does not explain it."""
+    undetermined: tuple[str, ...] = ()
+    """Combinations of parameters that the readings do not determine, such as 'd2 - d3'."""
 
     @property
     def held_at(self) -> dict[int, float]:
@@ -122,7 +126,7 @@ class Fit:
     @property
     def fits(self) -> bool | None:
         """Whether the residuals are as small as R says, or as small as they can be; None where neither can be told."""
-        if self.beaten:
+        if self.beaten_by:
             return False
         return self.p_value >= FIT_LEVEL if self.testable else None
 
@@ -134,14 +138,13 @@ class Fit:
     def half_width(self, confidence: float = 0.95) -> float:
         """Half the width of a confidence interval in standard errors: of the normal distribution, or of Student's t
         where the level of the noise is estimated."""
-        tail = (1.0 - confidence) / 2.0
-        return -float(ndtri(tail) if self.level is None else stdtrit(self.degrees_of_freedom, tail))
+        return half_width(confidence, None if self.level is None else self.degrees_of_freedom)
 
     def interval(self, confidence: float = 0.95) -> tuple[Array, Array]:
         """Confidence intervals (n,), (n,) from the standard errors; inside of its bounds where a parameter has some."""
         with np.errstate(invalid="ignore"):
-            half = self.half_width(confidence) * np.sqrt(np.diagonal(self.inner_covariance))
-        return wald(self.model, self.inner, half)
+            deviation = np.sqrt(np.diagonal(self.inner_covariance))
+        return wald_interval(self.model, self.inner, deviation, self.half_width(confidence))
 
     def region(self, parameters: int, confidence: float = 0.95) -> float:
         """The squared distance, in standard errors, to the edge of a joint region of so many parameters: chi-square, or
@@ -188,18 +191,20 @@ def fit(
 
 
 def _compared(fits: list[Fit]) -> list[Fit]:
-    """The fits; where the size of residuals tests nothing, those are marked that lie outside of the joint confidence
-    region of the best (Bates and Watts, Nonlinear Regression Analysis and Its Applications, 1988, section 6.1)."""
-    if not fits or fits[0].testable:
-        return fits
+    """The fits, marked where they lie outside of the joint confidence region of the best (Bates and Watts, Nonlinear
+    Regression Analysis and Its Applications, 1988, section 6.1)."""
     sums = [one.chi_square * (1.0 if one.level is None else one.level**2) for one in fits]
-    n, free = len(fits[0].x), fits[0].degrees_of_freedom
-    least = min((value for value in sums if np.isfinite(value)), default=np.nan)
+    known = [value if np.isfinite(value) else np.inf for value in sums]
+    if not np.isfinite(known).any():
+        return fits
+    n, free, best = len(fits[0].x), fits[0].degrees_of_freedom, int(np.argmin(known))
+    least = known[best]
     if fits[0].level is None:
         limit = least + float(chdtri(n, FIT_LEVEL))
     else:
         limit = least * (1 + n / free * float(fdtri(n, free, 1 - FIT_LEVEL))) if free > 0 else np.inf
-    return [replace(one, beaten=not value <= limit) for one, value in zip(fits, sums, strict=True)]
+    label = fits[best].label
+    return [one if value <= limit else replace(one, beaten_by=label) for one, value in zip(fits, sums, strict=True)]
 
 
 def _fit_with_level(label: str, estimator: Estimator, problem: Problem, z: Array, *where: Any) -> Fit:
@@ -289,7 +294,7 @@ def _fit_one(label: str, estimator: Estimator, problem: Problem, z: Array, *wher
     if not 0 < len(near) < len(found.x):
         return found
     held = _fit_inside(label, estimator, holding(problem, near), z, *where, noise=noise)
-    if held.status is not Status.CONVERGED or not falls_beyond(problem, near, held.inner[None], z[None])[0]:
+    if held.status is not Status.CONVERGED or not falls_beyond(problem, held.inner[None], near, z[None])[0]:
         return found
     return _on_bounds(found, held, near)
 
@@ -304,20 +309,26 @@ def holding(problem: Problem, values: Mapping[int, float]) -> Problem:
     return replace(problem, measurement=held, prior_deviation=deviation, prior_correlation=correlation)
 
 
-def falls_beyond(problem: Problem, near: Mapping[int, float], x: Array, z: Array) -> Array:
-    """Whether the sum of squares of readings z (sets, m) falls on beyond every bound, so that its minimum within them
-    is on them (Nocedal and Wright, Numerical Optimization, 2nd ed., 2006, theorem 12.1); x (sets, n - bounds) are the
-    minima with those parameters held there."""
+def falls_beyond(
+    problem: Problem, held: Array, near: Mapping[int, float], z: Array, released: Released | None = None
+) -> Mask:
+    """For which sets of readings z (sets, m) the sum of squares falls on beyond every bound, so that its minimum within
+    them is on them, where it is `held` (sets, free) (Nocedal and Wright, Numerical Optimization, 2nd ed., 2006, theorem
+    12.1)."""
     model, places = problem.measurement.released(near), list(near)
-    whole = np.repeat(np.array(model.nominal, dtype=float)[None], len(x), axis=0)
-    whole[:, [k for k in range(model.n) if k not in near]] = x
+    x = np.repeat(np.array(model.nominal, dtype=float)[None], len(z), axis=0)
+    x[:, [k for k in range(model.n) if k not in near]] = held
     with np.errstate(all="ignore"):
-        r = problem.R.whiten(z - model.simulate(whole))
-        J = problem.R.whiten_jacobian(model.jacobian(whole))[:, :, places]
-        downhill = np.einsum("tmk,tm->tk", J, r)
+        r = problem.R.whiten(z - model.simulate(x))
+        J = problem.R.whiten_jacobian(model.jacobian(x))[:, :, places]
+        downhill = np.einsum("tmi,tm->ti", J, r)
     start = problem.measurement.natural(problem.measurement.nominal[None])[0]
     outward = np.sign(np.array(list(near.values())) - start[places])
-    return (downhill * outward > 0).all(axis=1)
+    if released is not None:
+        # These start on their bounds, and have been told which way leads inwards.
+        inwards = dict(zip(released.places.tolist(), released.inwards.tolist(), strict=True))
+        outward = np.array([-inwards.get(k, -out) for k, out in zip(places, outward, strict=True)])
+    return np.asarray((downhill * outward > 0).all(axis=1))
 
 
 def _on_bounds(found: Fit, held: Fit, near: Mapping[int, float]) -> Fit:
@@ -356,8 +367,10 @@ def _fit_inside(
             except Exception as error:
                 message = message or f"the residuals are unknown: {error}"
     w = problem.R.whiten(r)
+    open_ones: tuple[str, ...] = ()
     if np.isfinite(w).all() and np.isfinite(J).all():
         Q = explained(J, problem.R)
+        open_ones = undetermined(model, problem.R.whiten_jacobian(J), estimates.x[0])
         scaled, white = normalised(w, Q, problem.R), whiteness(w, Q, order)
     else:
         scaled, white = np.full(len(z), np.nan), Whiteness(np.nan, 0, np.nan)
@@ -387,7 +400,25 @@ def _fit_inside(
         P,
         with_prior="prior" in estimator.needs,
         prior_inflation=inflation_of(estimator),
+        undetermined=() if "prior" in estimator.needs else open_ones,
     )
+
+
+def undetermined(model: Measurement, J: Array, x: Array) -> tuple[str, ...]:
+    """The combinations of parameters that whitened readings of slopes J (m, n) do not determine at x (n,): they hardly
+    change the readings, and errors of the parameters along them are larger than the parameters."""
+    size = np.linalg.norm(J, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    missing = max(len(x) - len(J), 0)
+    _, s, right = np.linalg.svd(np.pad(J / size, ((0, missing), (0, 0))), full_matrices=False)
+    found = []
+    for value, direction in zip(s, right / size, strict=True):
+        error = np.abs(direction) / max(value, np.finfo(float).eps * s[0])
+        along = direction * model.natural_slope(x[None])[0]
+        # Of a parameter that is as good as on a bound x says nothing.
+        if value < _OPEN * s[0] and along.any() and (error > np.maximum(np.abs(x), 1.0)).any():
+            found.append(in_words([p.name for p in model.natural_parameters], along))
+    return tuple(found)
 
 
 def _at(rows: NDArray[np.intp], values: Array, m: int) -> Array:

@@ -7,7 +7,7 @@ Applied Statistics 37, 1988; Bates and Watts, Nonlinear Regression Analysis and 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -25,15 +25,17 @@ from ipe_bench.measurements.problem import Problem
 _FIRST = (0.5, 1.0, 1.5)
 """Where a profile is looked at first on either side, in multiples of the half-width from standard errors."""
 _ROUNDS = 24
-"""Further looks at each end,"""
+"""Further looks at each end."""
 _STRETCH = 2.0
-"""each at most so many times as far away as the last."""
+"""How many times farther a look may be than the one before."""
 _PRECISION = 1e-4
-"""of the half-width, to which an end is found."""
+"""The precision of an end, as a share of the half-width."""
 _TOLERANCE = 1e-7
 _MOST_STEPS = 100
 _LOWER = 1e-6
-"""Less of chi-square than at the estimate, by more than this, is another and lower minimum."""
+"""A chi-square that is smaller than at the estimate by more than this is that of a lower minimum."""
+_ON_BOUND = 1e-9
+"""A value nearer to a bound than this share of the start's distance is on the bound: it was reached by round-off."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +47,9 @@ class Profile:
     zeta: Array
     """The signed root of the rise of chi-square (points,): a straight line through zero where the model is linear."""
     low: float
-    """Ends of the interval in the parameter's unit; infinite where the readings set no limit."""
+    """The lower end of the interval in the parameter's unit; infinite where the readings set no limit."""
     high: float
+    """The upper end, likewise."""
     wald: tuple[float, float]
     """The interval from the standard error, of the same confidence."""
     lower_minimum: bool
@@ -60,88 +63,36 @@ class Profile:
         return not max(ends) <= 0.1 * half
 
 
-@dataclass(frozen=True, kw_only=True)
-class Pinned(Counted):
-    """A model in which one parameter of each trial has a value of its own, and x are the others."""
-
-    places: NDArray[np.intp]
-    """Which parameter, for each trial of the tally,"""
-    values: Array
-    """and its value."""
-
-    def simulate(self, x: Array, rows: NDArray[np.intp]) -> Array:
-        return super().simulate(self.whole(x, rows), rows)
-
-    def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: Mask | bool = False) -> Array:
-        J = super().jacobian(self.whole(x, rows), rows, coarse=coarse)
-        return np.take_along_axis(J, self._others(rows)[:, None, :], axis=2)
-
-    def _others(self, rows: NDArray[np.intp]) -> NDArray[np.intp]:
-        k = np.arange(self.measurement.n - 1)
-        return k + (k >= self.places[rows, None])
-
-    def whole(self, x: Array, rows: NDArray[np.intp]) -> Array:
-        """The full parameter vectors (trials, n)."""
-        full = np.empty((len(x), self.measurement.n))
-        np.put_along_axis(full, self._others(rows), x, axis=1)
-        full[np.arange(len(x)), self.places[rows]] = self.values[rows]
-        return full
-
-
-_ON_BOUND = 1e-9
-"""Share of the start's distance from a bound within which a value is on it: round-off of what is a logarithm."""
-
-
-def natural(model: Measurement, x: Array) -> Array:
-    """Values (points, n) in the parameters' own units, exactly on a bound where they are as good as there."""
-    ends = _limits(model)
-    values, start = model.natural(x), model.natural(model.nominal[None])
-    for bound in ends:
-        near = np.isfinite(bound) & (np.abs(values - bound) <= _ON_BOUND * np.abs(start - bound))
-        values = np.where(near, bound, values)
-    return values
-
-
-def _limits(model: Measurement) -> Array:
-    """The lower and the upper bound (2, n) of each parameter, in its own unit; infinite where there is none."""
-    return np.sort(model.natural(np.stack([np.full(model.n, -np.inf), np.full(model.n, np.inf)])), axis=0)
-
-
-def wald(model: Measurement, x: Array, half: Array) -> tuple[Array, Array]:
-    """Ends (n,), (n,) of the intervals x +- half in the parameters' own units.
-
-    They are those of the logarithm of a bounded parameter's distance from its bound, in which its errors are more
-    nearly normal, unless the bound is within the interval that is symmetric in its own unit: then they are those of
-    that interval, which ends on the bound, because the logarithm of what may be 0 has no normal errors.
-    """
-    with np.errstate(invalid="ignore", over="ignore"):
-        ends = np.sort(natural(model, np.stack([x - half, x + half])), axis=0)
-        values, slope = model.natural(x[None])[0], model.natural_slope(x[None])[0]
-        low, high = values - half * np.abs(slope), values + half * np.abs(slope)
-        bounds = _limits(model)
-        reached = (low <= bounds[0]) & np.isfinite(bounds[0]) | (high >= bounds[1]) & np.isfinite(bounds[1])
-        symmetric = np.clip(np.stack([low, high]), *bounds)
-    found = np.where(reached, symmetric, ends)
-    return found[0], found[1]
-
-
 def half_width(level: float, freedom: int | None) -> float:
     """The quantile that a rise of root chi-square is compared with: normal, or Student's t where the level of the noise
     is estimated from `freedom` degrees of freedom."""
     return float(stdtrit(np.inf if freedom is None else freedom, (1 + level) / 2))
 
 
-def profiles(
-    problem: Problem, z: Array, x: Array, P: Array, *, confidence: float = 0.95, freedom: int | None = None
-) -> list[Profile]:
-    """A profile of every parameter about the least-squares estimate x (n,) of covariance P (n, n).
+def natural_limits(model: Measurement) -> tuple[Array, Array]:
+    """The lower and the upper bounds (n,) of the parameters in their own units; infinite where there are none."""
+    ends = model.natural(np.stack([np.full(model.n, -np.inf), np.full(model.n, np.inf)]))
+    return ends.min(axis=0), ends.max(axis=0)
 
-    z (m,) are the readings, all present. `freedom`: see `half_width`; R is then what it was estimated to be.
+
+def wald_interval(model: Measurement, x: Array, deviation: Array, q: float) -> tuple[Array, Array]:
+    """The interval (n,), (n,) of q standard deviations (n,) about the estimate x (n,), in the parameters' own units.
+
+    It is symmetric in x, the logarithm of a distance to a bound, say; where q standard errors reach a bound the
+    logarithm says nothing any more, and the interval is symmetric in the parameter itself and ends at the bound.
     """
-    return profiles_of_sets(problem, z[None], x[None], P[None], confidence=confidence, freedom=freedom)[0]
+    with np.errstate(all="ignore"):
+        ends = model.natural(np.stack([x - q * deviation, x + q * deviation]))
+        value, error = model.natural(x[None])[0], deviation * np.abs(model.natural_slope(x[None])[0])
+    lower, upper = natural_limits(model)
+    with np.errstate(invalid="ignore"):
+        reached = (value - q * error <= lower) | (value + q * error >= upper)
+        reached &= np.isfinite(lower) | np.isfinite(upper)
+    low = np.where(reached, np.maximum(lower, value - q * error), ends.min(axis=0))
+    return low, np.where(reached, np.minimum(upper, value + q * error), ends.max(axis=0))
 
 
-def profiles_of_sets(
+def profiles(
     problem: Problem,
     z: Array,
     x: Array,
@@ -150,135 +101,67 @@ def profiles_of_sets(
     levels: Array | None = None,
     confidence: float = 0.95,
     freedom: int | None = None,
+    places: Sequence[int] | None = None,
+    signs: Sequence[int] = (-1, 1),
+    released: Released | None = None,
 ) -> list[list[Profile]]:
-    """Those of several sets of readings z (sets, m) at once, with estimates x (sets, n) and covariances P (sets, n, n).
+    """For each set of readings z (sets, m), all present, the profiles of the parameters `places`, or of all, about the
+    least-squares estimates x (sets, n) of covariances P (sets, n, n).
 
     `levels` (sets,): what each set has found R^1/2 to be multiplied by, and P has been multiplied by the square of.
+    `signs`: on which sides an end is looked for; the other is infinite. `released`: parameters held on bounds, which
+    may leave them inwards where that fits better.
+
+    Of a parameter whose estimate is on a bound the one end is the bound. The rise of chi-square is compared with the
+    same quantile as inside of bounds: beyond the bound the true value may be anywhere, and an estimate on the bound is
+    only nearer to it, so that the interval holds it at least as often as it says.
     """
-    sets, n = x.shape
-    levels = np.ones(sets) if levels is None else levels
-    q = half_width(confidence, freedom)
-    least = squared(problem.R.whiten(problem.measurement.simulate(x) - z))
-    each = [_Set(problem, z[k], x[k], P[k], float(levels[k]), float(least[k])) for k in range(sets)]
-    looked = [_Looked(one, j, q) for one in each for j in range(n)]
-    _find_ends(problem, looked)
-    return [[one.profile() for one in looked[k * n : (k + 1) * n]] for k in range(sets)]
-
-
-def end_within(
-    problem: Problem,
-    z: Array,
-    x: Array,
-    P: Array,
-    place: int,
-    sign: int,
-    *,
-    confidence: float = 0.95,
-    freedom: int | None = None,
-) -> float:
-    """The other end, in its own unit, of the profile interval of a parameter whose estimate is on a bound; x (n,) is
-    the minimum with it there, and `sign` leads inwards. Infinite where the readings set no limit, NaN where the bound
-    is not the minimum.
-
-    The rise of chi-square is compared with the same quantile as inside of bounds. Below the bound the true value may be
-    anywhere, and an estimate on the bound is only nearer to it than one beyond would be: the interval holds it at
-    least as often as it says, from 95 to 97.5 % where the model is linear.
-    """
-    q = half_width(confidence, freedom)
-    least = float(squared(problem.R.whiten(problem.measurement.simulate(x[None]) - z))[0])
-    looked = _Looked(_Set(problem, z, x, P, 1.0, least), place, q)
-    _find_ends(problem, [looked], signs=(sign,))
-    if looked.lower:
-        return np.nan
-    end = looked.centre + sign * looked.end(sign)
-    return float(looked.natural(np.array([end]))[0])
-
-
-@dataclass(frozen=True)
-class Released:
-    """A problem in which parameters that are on their bounds may leave them inwards."""
-
-    problem: Problem
-    """With those parameters free of bounds,"""
-    x: Array
-    """the minimum (n,) with them on their bounds,"""
-    P: Array
-    """and the covariance (n, n) there."""
-    places: NDArray[np.intp]
-    """Which of the parameters they are,"""
-    inwards: Array
-    """and the sign that leads inwards, of each."""
-
-    @property
-    def others(self) -> NDArray[np.intp]:
-        return np.setdiff1d(np.arange(len(self.x)), self.places)
-
-    def relax(self, z: Array, asked: _Asked) -> None:
-        """Lowers what was seen with the parameters on their bounds to what is seen where they leave them."""
-        places = self.others[[one.place for one, _ in asked]]
-        values = np.array([at for _, at in asked])
-        moved = (values - self.x[places]) / self.P[places, places]
-        begin = self.x + self.P[:, places].T * moved[:, None]
-        x, sums = _fit_others(self.problem, places, values, np.repeat(z[None], len(asked), axis=0), begin)
-        left = (x - self.x)[:, self.places] * self.inwards
-        inwards = np.all(left >= 0, axis=1)
-        for (one, at), total, inside in zip(asked, sums.tolist(), inwards, strict=True):
-            if inside and np.isfinite(total):
-                one.lower_to(at, total)
-
-
-def profiles_within(
-    problem: Problem,
-    z: Array,
-    x: Array,
-    P: Array,
-    released: Released,
-    *,
-    confidence: float = 0.95,
-    freedom: int | None = None,
-) -> list[Profile]:
-    """Those of the parameters that are not on bounds, about the minimum x (n,) with the others held there: the latter
-    may move inwards where that fits better, so that the intervals are not those of parameters that are known."""
-    q = half_width(confidence, freedom)
-    least = float(squared(problem.R.whiten(problem.measurement.simulate(x[None]) - z))[0])
-    whole = _Set(problem, z, x, P, 1.0, least)
-    looked = [_Looked(whole, j, q) for j in range(len(x))]
-    _find_ends(problem, looked, relax=lambda asked: released.relax(z, asked))
-    return [one.profile() for one in looked]
-
-
-@dataclass(frozen=True)
-class _Set:
-    """A set of readings with its estimate; see `profiles_of_sets`."""
-
-    problem: Problem
-    z: Array
-    x: Array
-    P: Array
-    level: float
-    least: float
-    """The sum of squares at the estimate, of readings whitened by R as it is."""
+    q, least = half_width(confidence, freedom), squared(problem.R.whiten(problem.measurement.simulate(x) - z))
+    levels = np.ones(len(x)) if levels is None else levels
+    where = range(x.shape[1]) if places is None else places
+    looked = [
+        [_Looked(problem, z[k], x[k], P[k], float(levels[k]), float(least[k]), j, q) for j in where]
+        for k in range(len(x))
+    ]
+    every = [one for row in looked for one in row]
+    asked = [(one, one.centre + s * f * q * one.deviation) for one in every for s in signs for f in _FIRST]
+    for _ in range(_ROUNDS + 1):
+        _look(problem, asked, released)
+        asked = [(one, at) for one in every for sign in signs if (at := one.next(sign)) is not None]
+        if not asked:
+            break
+    return [[one.profile() for one in row] for row in looked]
 
 
 class _Looked:
-    """What has been seen of one profile so far."""
+    """What has been seen of the profile of one parameter of one set of readings."""
 
-    def __init__(self, whole: _Set, place: int, q: float) -> None:
-        self.whole, self.place, self.q = whole, place, q
-        self.centre = float(whole.x[place])
-        self.deviation = float(np.sqrt(whole.P[place, place]))
-        self.seen: dict[float, tuple[float, Array]] = {self.centre: (0.0, whole.x)}
+    def __init__(
+        self, problem: Problem, z: Array, x: Array, P: Array, level: float, least: float, place: int, q: float
+    ) -> None:
+        self.model, self.z, self.x, self.P, self.level, self.least = problem.measurement, z, x, P, level, least
+        self.place, self.q = place, q
+        self.centre, self.deviation = float(x[place]), float(np.sqrt(P[place, place]))
+        self.seen: dict[float, tuple[float, Array]] = {self.centre: (0.0, x)}
         self.open = {-1: False, 1: False}
         self.lower = False
 
-    def lower_to(self, at: float, total: float) -> None:
-        """Notes a sum of squares at a value where a larger one has been seen."""
-        level, least = self.whole.level, self.whole.least
-        change = (total - least) / level**2
-        zeta, point = self.seen[at]
-        if change < zeta**2:
-            self.lower |= change < -_LOWER * max(1.0, least / level**2)
-            self.seen[at] = (float(np.sign(at - self.centre) * np.sqrt(max(change, 0.0))), point)
+    def note(self, at: float, total: float, point: Array) -> None:
+        """Takes in the sum of squares at a value; of two the smaller counts."""
+        change = (total - self.least) / self.level**2
+        if at in self.seen and not change < self.seen[at][0] ** 2:
+            return
+        self.lower |= change < -_LOWER * max(1.0, self.least / self.level**2)
+        zeta = np.sqrt(max(change, 0.0)) if np.isfinite(change) else np.inf
+        self.seen[at] = (float(np.sign(at - self.centre) * zeta), point)
+
+    def start(self, at: float) -> Array:
+        """Where to begin for that value: the nearest point seen, moved along the line on which the others would follow
+        in a linear model."""
+        nearest = min((v for v, (zeta, _) in self.seen.items() if np.isfinite(zeta)), key=lambda v: abs(v - at))
+        start = self.seen[nearest][1] + self.P[:, self.place] / self.P[self.place, self.place] * (at - nearest)
+        start[self.place] = at
+        return start
 
     def side(self, sign: int) -> list[tuple[float, float]]:
         """(distance, abs zeta) on one side, outwards from the estimate."""
@@ -318,85 +201,118 @@ class _Looked:
         return self.centre + sign * float(np.clip(distance, near + 0.05 * (far - near), far - 0.05 * (far - near)))
 
     def profile(self) -> Profile:
-        values = np.array(sorted(self.seen))
-        zeta = np.array([self.seen[v][0] for v in values])
-        centre, half = self.centre, self.q * self.deviation
+        inner = np.array(sorted(self.seen))
+        zeta = np.array([self.seen[v][0] for v in inner])
         with np.errstate(invalid="ignore"):
-            own = self.natural(np.concatenate([[centre - self.end(-1), centre + self.end(1)], values]))
-        low, high = sorted(own[:2])
-        widths = np.zeros(len(self.whole.x))
-        widths[self.place] = half
-        ends = [float(end[self.place]) for end in wald(self.whole.problem.measurement, self.whole.x, widths)]
-        order = np.argsort(own[2:])
-        zeta = zeta if own[3] >= own[2] else -zeta
-        return Profile(own[2:][order], zeta[order], float(low), float(high), (ends[0], ends[1]), self.lower)
+            low, high = sorted(self._natural(np.array([self.centre - self.end(-1), self.centre + self.end(1)])))
+            values = self._natural(inner)
+        deviation = np.sqrt(np.diag(self.P))
+        wald = tuple(float(end[self.place]) for end in wald_interval(self.model, self.x, deviation, self.q))
+        order = np.argsort(values)
+        zeta = zeta if values[-1] >= values[0] else -zeta
+        return Profile(values[order], zeta[order], float(low), float(high), wald, self.lower)  # type: ignore[arg-type]
 
-    def natural(self, values: Array) -> Array:
-        """Values of the parameter in its own unit."""
-        points = np.repeat(self.whole.x[None], len(values), axis=0)
+    def _natural(self, values: Array) -> Array:
+        """Values of the parameter in its own unit, on a bound where they are as near as round-off."""
+        points = np.repeat(self.x[None], len(values), axis=0)
         points[:, self.place] = values
-        return natural(self.whole.problem.measurement, points)[:, self.place]
+        found = self.model.natural(points)[:, self.place]
+        start = self.model.natural(self.model.nominal[None])[0, self.place]
+        for limits in natural_limits(self.model):
+            bound = limits[self.place]
+            if np.isfinite(bound):
+                found = np.where(np.abs(found - bound) <= _ON_BOUND * abs(start - bound), bound, found)
+        return found
 
 
-_Asked: TypeAlias = "list[tuple[_Looked, float]]"
-"""Which parameters of which sets are to be looked at, and where."""
+_Asked: TypeAlias = "Sequence[tuple[_Looked, float]]"
+"""Which profiles are to be looked at, and where."""
 
 
-def _find_ends(
-    problem: Problem,
-    looked: Sequence[_Looked],
-    signs: Sequence[int] = (-1, 1),
-    relax: Callable[[_Asked], None] | None = None,
-) -> None:
-    """Looks at all these parameters in rounds, until their ends on these sides are found; `relax` may lower what a
-    round has seen."""
-    asked = [(one, one.centre + s * f * one.q * one.deviation) for one in looked for s in signs for f in _FIRST]
-    for _ in range(_ROUNDS + 1):
-        _look(problem, asked)
-        if relax is not None:
-            relax(asked)
-        asked = [(one, at) for one in looked for sign in signs if (at := one.next(sign)) is not None]
-        if not asked:
-            break
-
-
-def _look(problem: Problem, asked: _Asked) -> None:
+def _look(problem: Problem, asked: _Asked, released: Released | None) -> None:
     """Minimises over the other parameters at every place that is asked for, all in one batch."""
     places, values = np.array([one.place for one, _ in asked]), np.array([at for _, at in asked])
-    readings = np.stack([one.whole.z for one, _ in asked])
-    begin = np.stack([_nearest(one, at) for one, at in asked])
-    full, sums = _fit_others(problem, places, values, readings, begin)
+    z, begin = np.stack([one.z for one, _ in asked]), np.stack([one.start(at) for one, at in asked])
+    full, sums = _fit_others(problem, places, values, z, begin)
     for (one, at), total, point in zip(asked, sums.tolist(), full, strict=True):
-        level, least = one.whole.level, one.whole.least
-        change = (total - least) / level**2
-        one.lower |= change < -_LOWER * max(1.0, least / level**2)
-        zeta = np.sqrt(max(change, 0.0)) if np.isfinite(change) else np.inf
-        one.seen[at] = (float(np.sign(at - one.centre) * zeta), point)
+        one.note(at, total, point)
+    if released is None:
+        return
+    inside, sums = released.fits(places, values, z)
+    for (one, at), total, within, point in zip(asked, sums.tolist(), inside, full, strict=True):
+        if within and np.isfinite(total):
+            one.note(at, total, point)
+
+
+@dataclass(frozen=True)
+class Released:
+    """A problem in which parameters that are on their bounds may leave them."""
+
+    problem: Problem
+    """The problem with those parameters free of bounds."""
+    x: Array
+    """The minimum (n,) with them on their bounds."""
+    P: Array
+    """The covariance (n, n) there."""
+    places: NDArray[np.intp]
+    """Which of the parameters they are."""
+    inwards: Array
+    """The sign that leads inwards, of each."""
+
+    def inside(self, x: Array) -> Mask:
+        """Which of the points x (points, n) are within all of these bounds, (points, bounds)."""
+        return (x - self.x)[:, self.places] * self.inwards >= 0
+
+    def fits(self, places: NDArray[np.intp], values: Array, z: Array) -> tuple[Mask, Array]:
+        """Where (asked,) the minima with those of the other parameters at `values` (asked,) lie inwards, and the sums
+        of squares there (asked,)."""
+        places = np.setdiff1d(np.arange(len(self.x)), self.places)[places]
+        moved = (values - self.x[places]) / self.P[places, places]
+        begin = self.x + self.P[:, places].T * moved[:, None]
+        x, sums = _fit_others(self.problem, places, values, z, begin)
+        return np.asarray(self.inside(x).all(axis=1)), sums
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pinned(Counted):
+    """A model in which one parameter of each trial has a value of its own, and x are the others."""
+
+    places: NDArray[np.intp]
+    """Which parameter, for each trial of the tally."""
+    values: Array
+    """Its value."""
+
+    def simulate(self, x: Array, rows: NDArray[np.intp]) -> Array:
+        return super().simulate(self.whole(x, rows), rows)
+
+    def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: Mask | bool = False) -> Array:
+        J = super().jacobian(self.whole(x, rows), rows, coarse=coarse)
+        return np.take_along_axis(J, self._others(rows)[:, None, :], axis=2)
+
+    def _others(self, rows: NDArray[np.intp]) -> NDArray[np.intp]:
+        k = np.arange(self.measurement.n - 1)
+        return k + (k >= self.places[rows, None])
+
+    def whole(self, x: Array, rows: NDArray[np.intp]) -> Array:
+        """The full parameter vectors (trials, n)."""
+        full = np.empty((len(x), self.measurement.n))
+        np.put_along_axis(full, self._others(rows), x, axis=1)
+        full[np.arange(len(x)), self.places[rows]] = self.values[rows]
+        return full
 
 
 def _fit_others(
-    problem: Problem, places: NDArray[np.intp], values: Array, readings: Array, begin: Array
+    problem: Problem, places: NDArray[np.intp], values: Array, z: Array, begin: Array
 ) -> tuple[Array, Array]:
     """The minima (asked, n) with the parameters `places` at `values` (asked,), and the sums of squares there (asked,),
-    for readings (asked, m), from `begin` (asked, n)."""
+    for readings z (asked, m), from `begin` (asked, n)."""
     rows = np.arange(len(values))
     model = Pinned(problem.measurement, Tally.zeros(len(values)), places=places, values=values)
     x = np.stack([np.delete(start, place) for start, place in zip(begin, places, strict=True)])
     with np.errstate(all="ignore"):
         if x.shape[1]:
-            objective = Objective(model, problem.R, readings, rows, problem.x0)
+            objective = Objective(model, problem.R, z, rows, problem.x0)
             method = LevenbergMarquardtMethod(1e-3)
             x = minimize(objective, method, x, tolerance=_TOLERANCE, max_iterations=_MOST_STEPS).x
-        sums = squared(problem.R.whiten(model.simulate(x, rows) - readings))
+        sums = squared(problem.R.whiten(model.simulate(x, rows) - z))
     return model.whole(x, rows), sums
-
-
-def _nearest(one: _Looked, at: float) -> Array:
-    """Where to start for that value: the nearest point seen, moved along the line on which the others would follow in a
-    linear model."""
-    P = one.whole.P
-    known = [v for v, (zeta, _) in one.seen.items() if np.isfinite(zeta)]
-    nearest = min(known, key=lambda v: abs(v - at))
-    start = one.seen[nearest][1] + P[:, one.place] / P[one.place, one.place] * (at - nearest)
-    start[one.place] = at
-    return start

@@ -225,6 +225,14 @@ def _notes(answer: Answer) -> Iterator[str]:
         " resemble each other. deviation: of the residuals, in the readings' unit."
     )
     yield from (f"{one.label}: {one.message}" for one in fits if one.message)
+    for one in fits:
+        if one.beaten_by:
+            yield f"{one.label}: {one.beaten_by} found a better fit, by more than chance explains; this is no answer."
+        if one.undetermined:
+            yield (
+                f"{one.label}: the readings do not determine {'; '.join(one.undetermined)}; fix parameters, or give"
+                " prior, until they do."
+            )
     unknown = [one for one in fits if one.level is not None]
     if unknown:
         yield (
@@ -451,6 +459,7 @@ def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
         "intervals95": named(names, np.transpose(one.interval())),
         "p": plain(one.p_value),
         "on_bounds": {names[k]: value for k, value in one.held_at.items()},
+        "undetermined": list(one.undetermined),
         "noise_level_estimated": plain(one.level),
         "whiteness": {
             "test": "Ljung-Box, p from simulated fits",
@@ -459,7 +468,7 @@ def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
         },
         "outliers": [{**labels[i], "normalised_residual": plain(one.normalised[i])} for i in outliers],
         **picked(one, "message", "correlation", "chi_square", "degrees_of_freedom", "fits", "passes", "with_prior"),
-        **picked(one, "residual_deviation", "outlier_limit", "iterations", "simulations"),
+        **picked(one, "beaten_by", "residual_deviation", "outlier_limit", "iterations", "simulations"),
     }
 
 

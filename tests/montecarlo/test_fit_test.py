@@ -9,7 +9,7 @@ from small_models import Bent
 
 from ipe_bench.baselines import EKF, GaussNewton, MapLM
 from ipe_bench.basics.linalg import Covariance, information
-from ipe_bench.measurements import Gins, Polynomial
+from ipe_bench.measurements import Formula, Gins, Polynomial
 from ipe_bench.noise import Colored, Correlated, Gaussian, NoNoise, Outliers, Quantization, StudentT
 from ipe_bench.solvers import Newton
 from ipe_bench.trials.fit_test import (
@@ -51,6 +51,17 @@ def test_p_is_uniform_for_estimators_with_a_prior(estimator):
     p = p_values(Polynomial(strength=0.001), Gaussian(1.0), 0.2, estimator)
     assert kstest(p, "uniform").pvalue > 0.01
     assert kstest(chi2.sf(chi2.isf(p, 40 - 4), 40), "uniform").pvalue < 1e-3
+
+
+def test_p_is_about_uniform_with_a_prior_where_the_noise_is_not_normal():
+    """Eight readings for six parameters that the prior knows: the residuals have eight degrees of freedom and not two,
+    and their sum of squares a spread twice as large as that of least squares."""
+    t = np.linspace(-1, 1, 8)
+    powers = "+".join(f"c{k}*t**{k}" for k in range(6))
+    model = Formula(powers, {f"c{k}": 1.0 for k in range(6)}, {"t": t.tolist()})
+    p = p_values(model, Quantization(0.3, dither=True), 1e-3, MapLM())
+    assert np.mean(p) == pytest.approx(0.5, abs=0.05)
+    assert np.std(p) == pytest.approx(1 / np.sqrt(12), abs=0.05)
 
 
 def test_p_is_uniform_for_the_frozen_root_where_its_projection_is_oblique():

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 from small_models import Bent
 
 import ipe_bench as ib
@@ -234,6 +235,29 @@ def test_the_threshold_bound_lies_between_van_trees_and_the_best_estimator(sigma
         assert whole == pytest.approx(local, rel=0.02)  # no false root is near enough
     if sigma == 0.1:
         assert whole > 3 * local  # every estimator breaks, and Van Trees's bound does not know
+
+
+def test_the_threshold_bound_is_weiss_and_weinsteins_by_integration():
+    """From its definition, mu(c) the integral of sqrt(p(z, x + c) p(z, x)), with a small step and an offset as test
+    points: G_ij = 2 (mu(c_i - c_j) - mu(c_i + c_j)) / (mu(c_i) mu(c_j)) and the bound c' G^-1 c."""
+    model, sigma, width = Formula(formula=lambda t: (np.sin(t),), m_=1), 0.5, 1.5
+    problem = Problem(model, Covariance(np.full(1, sigma)), np.array([width]))
+    u = width * norm.ppf((np.arange(4000) + 0.5) / 4000)[:, None]
+    expected = information(model.jacobian(u), problem.R).mean(axis=0)
+    x, z = np.linspace(-9, 9, 1501)[:, None], np.linspace(-4, 4, 801)
+
+    def root(at):
+        return np.sqrt(norm.pdf(z, np.sin(at), sigma) * norm.pdf(at, 0, width))
+
+    def mu(c):
+        return np.sum(root(x + c / 2) * root(x - c / 2)) * (x[1, 0] - x[0, 0]) * (z[1] - z[0])
+
+    for offset in (1.0, 2.5, np.pi):
+        points = np.array([1e-3, offset])
+        G = np.array([[2 * (mu(a - b) - mu(a + b)) / (mu(a) * mu(b)) for a in points] for b in points])
+        exact = points @ np.linalg.solve(G, points)
+        assert weiss_weinstein(problem, expected, np.array([[offset]]), u)[0, 0] == pytest.approx(exact, rel=5e-3)
+        assert exact > 1.02 / (expected[0, 0] + width**-2)
 
 
 def test_of_a_linear_model_any_test_point_gives_the_same_bound():

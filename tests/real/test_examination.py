@@ -12,7 +12,7 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Unknown
 from ipe_bench.real.examination import examine
 from ipe_bench.real.fits import fit
-from ipe_bench.real.profiles import profiles, profiles_of_sets
+from ipe_bench.real.profiles import profiles
 from ipe_bench.report.answer import remarks
 from ipe_bench.trials.scenario import Scenario
 
@@ -99,7 +99,7 @@ def test_profile_intervals_cover_the_truth_as_often_as_they_say(unknown):
         residuals = z - SATURATION.simulate(estimates.x)
         levels = np.sqrt(np.sum(problem.R.whiten(residuals) ** 2, axis=1) / 4)
         P, options = P * levels[:, None, None] ** 2, {"levels": levels, "freedom": 4}
-    covered, short = coverage(profiles_of_sets(problem, z, estimates.x, P, **options), SATURATION.sizes)
+    covered, short = coverage(profiles(problem, z, estimates.x, P, **options), SATURATION.sizes)
     assert np.abs(covered - 0.95).max() <= 0.02
     assert short.min() < 0.93
 
@@ -118,7 +118,7 @@ def test_profile_intervals_of_an_epidemic_counted_four_times_cover_the_truth():
     z = model.simulate(model.nominal[None]) + 20.0 * np.random.default_rng(11).standard_normal((1000, 4))
     problem = Problem(model, Gaussian(20.0).covariance(4))
     estimates = LM["lm"].estimate(problem, z)
-    found = profiles_of_sets(problem, z, estimates.x, estimates.covariance)
+    found = profiles(problem, z, estimates.x, estimates.covariance)
     covered, short = coverage(found, model.natural(model.nominal[None])[0])
     assert np.abs(covered - 0.95).max() <= 0.02
     assert short[2] < 0.91
@@ -129,10 +129,10 @@ def test_profiles_of_many_sets_are_those_of_each():
     problem = Problem(SATURATION, Gaussian(0.8).covariance(6))
     estimates, levels = LM["lm"].estimate(problem, z), np.linspace(0.5, 2.0, 5)
     P = estimates.covariance * levels[:, None, None] ** 2
-    together = profiles_of_sets(problem, z, estimates.x, P, levels=levels, freedom=4)
+    together = profiles(problem, z, estimates.x, P, levels=levels, freedom=4)
     for k in range(5):
         scaled = Problem(SATURATION, Gaussian(0.8 * levels[k]).covariance(6))
-        alone = profiles(scaled, z[k], estimates.x[k], P[k], freedom=4)
+        (alone,) = profiles(scaled, z[[k]], estimates.x[[k]], P[[k]], freedom=4)
         for one, other in zip(together[k], alone, strict=True):
             assert (one.low, one.high) == pytest.approx((other.low, other.high), rel=1e-4)
 
@@ -149,6 +149,9 @@ def test_the_reading_that_carries_the_answer_is_named():
         without = np.polyfit(t[rest], z[rest], 1)[::-1]
         moved = np.abs((without - found.x) / found.standard_errors).max()
         assert found.influence.shift[i] == pytest.approx(moved, rel=1e-6)
+        # Cook's distance: how far the answer moves in its own region, per parameter.
+        change, A = without - found.x, np.column_stack([np.ones(5), t]) / 0.5
+        assert found.influence.cook[i] == pytest.approx(np.sum((A @ change) ** 2) / 2, rel=1e-6)
     assert found.influence.leverage.sum() == pytest.approx(2.0)
 
 

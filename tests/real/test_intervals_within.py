@@ -17,7 +17,7 @@ from ipe_bench.priors import GaussianPrior
 from ipe_bench.real.examination import examine, examine_with_prior
 from ipe_bench.real.fits import fit
 from ipe_bench.real.penalised import penalised
-from ipe_bench.real.profiles import end_within, profiles_of_sets
+from ipe_bench.real.profiles import profiles
 from ipe_bench.trials.scenario import Scenario
 
 Q = norm.isf(0.025)
@@ -93,7 +93,7 @@ def test_truths_of_the_prior_are_in_the_penalised_profiles_as_often_as_they_say(
     assert estimates.covariance is not None
     problem, _ = penalised(bench.problem, drawn.z[0], 1.0)
     z = np.column_stack([drawn.z, np.repeat(problem.x0[None], trials, axis=0)])
-    found = profiles_of_sets(problem, z, estimates.x, estimates.covariance)
+    found = profiles(problem, z, estimates.x, estimates.covariance)
     truth = model.natural(drawn.x)
     inside = np.array(
         [[p.low <= v <= p.high for p, v in zip(row, x, strict=True)] for row, x in zip(found, truth, strict=True)]
@@ -239,6 +239,25 @@ def test_standard_errors_of_what_is_far_from_its_bound_are_of_its_logarithm():
     assert np.log([low / c, high / c]) == pytest.approx([-Q * s / c, Q * s / c])
 
 
+def test_simulated_sets_let_a_parameter_leave_the_bound_that_its_estimate_is_on():
+    """Again each minimised by SciPy within the bounds, as were the readings."""
+    one, found = decay_above_zero(0.0, 2, bootstraps=60)
+    assert found is not None
+    assert one.held_at == {2: 0.0}
+    sets = one.x[0] * np.exp(-one.x[1] * TIMES)
+    sets = sets + 0.05 * np.random.Generator(np.random.Philox(0)).standard_normal((60, 25))
+    bounds = ([-np.inf, -np.inf, 0.0], np.inf)
+
+    def residuals(p, z):
+        return p[0] * np.exp(-p[1] * TIMES) + p[2] - z
+
+    x = np.array([least_squares(residuals, one.x, bounds=bounds, xtol=1e-10, args=(z,)).x for z in sets])
+    assert 10 < (x[:, 2] > 1e-6).sum() < 50
+    assert found.bootstrap.converged == 60
+    assert found.bootstrap.low == pytest.approx(np.quantile(x, 0.025, axis=0)[:2], abs=1e-4)
+    assert found.bootstrap.high == pytest.approx(np.quantile(x, 0.975, axis=0)[:2], abs=1e-4)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("c", [0.0, 0.02])
 def test_1000_truths_on_and_near_a_bound_are_in_every_interval(c):
@@ -271,12 +290,11 @@ def test_truths_near_a_bound_are_in_the_intervals_at_least_as_often_as_they_say(
     assert (free.status == 0).all()
     assert free.covariance is not None
     off = free.x[:, 1] > 0
-    inside = [
-        one.low <= rate <= one.high for _, one in profiles_of_sets(problem, z[off], free.x[off], free.covariance[off])
-    ]
+    inside = [one.low <= rate <= one.high for _, one in profiles(problem, z[off], free.x[off], free.covariance[off])]
     for k in np.flatnonzero(~off):
         x = np.array([z[k].mean() / 5.0, 0.0])
         J = problem.R.whiten_jacobian(model.jacobian(x[None]))[0]
-        inside.append(rate <= end_within(problem, z[k], x, np.linalg.inv(J.T @ J), 1, +1))
+        ((found,),) = profiles(problem, z[[k]], x[None], np.linalg.inv(J.T @ J)[None], places=(1,), signs=(1,))
+        inside.append(rate <= found.high)
     assert 50 < (~off).sum() < 600
     assert np.mean(inside) >= 0.95 - 2 * np.sqrt(0.95 * 0.05 / trials)

@@ -1,0 +1,116 @@
+"""What is said of answers that cannot all be right, and of parameters that the readings do not determine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.stats import f as f_law
+from scipy.stats import norm
+from scipy.stats import t as t_law
+
+import ipe_bench as ib
+from ipe_bench.baselines import GaussNewton, LevenbergMarquardt
+from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators import Estimates, Estimator
+from ipe_bench.measurements import Formula
+from ipe_bench.noise import Gaussian, Unknown
+
+T = np.linspace(0, 10, 41)
+
+
+@pytest.mark.parametrize("noise", [Gaussian(0.85), Unknown()], ids=["known level", "unknown level"])
+def test_of_two_minima_far_apart_the_worse_does_not_fit(noise):
+    """A wave in so much noise that a wrong frequency passes the test of the fit by itself."""
+    z = np.sin(2.0 * T) + 0.9 * np.random.default_rng(1).standard_normal(41)
+    near, far = (Formula("a*sin(w*t)", {"w": w, "a": 0.5}, {"t": T.tolist()}) for w in (2.0, 5.0))
+    wrong, right = (ib.estimate(m, z, {"lm": LevenbergMarquardt()}, noise=noise)["lm"] for m in (far, near))
+    w = [p.name for p in right.model.parameters].index("w")
+    assert abs(wrong.x[w] - right.x[w]) > 20 * right.standard_errors[w]
+    assert wrong.fits is not False
+    answer = ib.estimate(far, z, {"lm": LevenbergMarquardt(), "auto": ib.solvers.Auto()}, noise=noise)
+    assert answer["auto"].x == pytest.approx(right.x, rel=1e-4)
+    assert (answer["auto"].passes, answer["lm"].passes) == (True, False)
+    assert answer["lm"].beaten_by == "auto"
+    assert "lm: auto found a better fit" in str(answer)
+    assert "lm: auto found a better fit" in answer._repr_html_()
+
+
+def test_parameters_that_the_readings_do_not_tell_apart_are_named():
+    """Two lengths on parallel axes count by their sum alone, and an offset of nothing does not count at all."""
+    model = Formula("(d2+d3)*cos(t)+a*sin(t)+0*k", {"d2": 0.4, "d3": 0.1, "a": 1.0, "k": 2.0}, {"t": T.tolist()})
+    z = 0.52 * np.cos(T) + 0.9 * np.sin(T) + 0.01 * np.random.default_rng(1).standard_normal(41)
+    answer = ib.estimate(model, z, {"lm": LevenbergMarquardt(), "gn": GaussNewton()}, noise=Gaussian(0.01))
+    for one in answer:
+        assert set(one.undetermined) == {"d2 - d3", "k"}
+    for text in (str(answer), answer._repr_html_()):
+        assert "the readings do not determine" in text
+        assert "k" in text
+    sure = Formula("d2*cos(t)+a*sin(t)", {"d2": 0.4, "a": 1.0}, {"t": T.tolist()})
+    answer = ib.estimate(sure, z, {"lm": LevenbergMarquardt()}, noise=Gaussian(0.01))
+    assert answer["lm"].undetermined == ()
+    assert "do not determine" not in str(answer)
+
+
+@dataclass(frozen=True)
+class Stating(Estimator):
+    """An estimator that has one answer to everything."""
+
+    answer: tuple[float, ...] = ()
+
+    def estimate(self, problem, z, *, history=False):
+        x = np.repeat(np.array(self.answer)[None], len(z), axis=0)
+        return Estimates(x, np.full(len(z), Status.CONVERGED, np.int8), np.repeat(np.eye(x.shape[1])[None], len(z), 0))
+
+
+LINE = Formula("a+b*t+c*t**2", {"a": 1.0, "b": 1.0, "c": 1.0}, {"t": T[:12].tolist()})
+A = np.column_stack([np.ones(12), T[:12], T[:12] ** 2])
+
+
+@pytest.mark.parametrize(("share", "beaten"), [(0.97, ""), (1.03, "lm")])
+def test_with_an_unknown_level_the_joint_region_of_the_best_is_that_of_snedecors_f(share, beaten):
+    z = A @ [1.0, 1.2, 0.8] + 0.3 * np.random.default_rng(2).standard_normal(12)
+    best = np.linalg.lstsq(A, z, rcond=None)[0]
+    variance = np.sum((z - A @ best) ** 2) / 9
+    along = np.array([1.0, -2.0, 0.5])
+    reach = np.sqrt(3 * f_law.isf(1e-3, 3, 9) * variance / np.sum((A @ along) ** 2))
+    away = Stating(tuple((best + np.sqrt(share) * reach * along).tolist()))
+    answer = ib.estimate(LINE, z, {"lm": LevenbergMarquardt(tolerance=1e-10), "away": away}, noise=Unknown())
+    assert answer["away"].beaten_by == beaten
+
+
+def test_with_an_unknown_level_a_normalised_residual_is_as_probable_as_its_error_of_prediction():
+    """The reading, foretold by a fit to all others, is off by so many of its errors: Student's t with m - n - 1."""
+    z = A @ [1.0, 1.2, 0.8] + 0.3 * np.random.default_rng(3).standard_normal(12)
+    z[5] += 4.0
+    found = ib.estimate(LINE, z, {"lm": LevenbergMarquardt(tolerance=1e-12)}, noise=Unknown())["lm"]
+    for i in range(12):
+        kept = np.arange(12) != i
+        x, rest = (np.linalg.lstsq(A[kept], z[kept], rcond=None)[k] for k in (0, 1))
+        spread = np.sqrt(rest[0] / 8 * (1 + A[i] @ np.linalg.solve(A[kept].T @ A[kept], A[i])))
+        deviate = norm.ppf(t_law.cdf((z[i] - A[i] @ x) / spread, 8))
+        assert found.normalised[i] == pytest.approx(deviate, rel=1e-4)
+    assert np.flatnonzero(found.outliers).tolist() == [5]
+
+
+@pytest.mark.parametrize(("excess", "as_good"), [(5.0, True), (9.0, False)])
+def test_with_an_unknown_level_another_minimum_is_as_good_within_snedecors_region(excess, as_good):
+    """Of y = c^2 t + b, c has two minima, which a small odd term tells apart; n F of the 95 % region is 6.9 here."""
+    rng, t = np.random.default_rng(4), np.linspace(-1, 1, 23)
+    s = rng.standard_normal(23)
+    s -= np.column_stack([np.ones(23), t]) @ np.linalg.lstsq(np.column_stack([np.ones(23), t]), s, rcond=None)[0]
+    s /= np.linalg.norm(s)
+    noise = rng.standard_normal(23)
+    for column in (np.ones(23), t, s):
+        noise -= column * (column @ noise) / (column @ column)
+    noise *= np.sqrt(21 / (noise @ noise))  # a level of 1
+    odd = np.sqrt(excess) / 2
+    z = 100 * t + odd * s + noise
+    columns = {"t": t.tolist(), "s": s.tolist()}
+    model = Formula(f"c**2*t+b+{odd:.12f}*(c/10)*s", {"c": 9.0, "b": 1.0}, columns)
+    (found,) = ib.estimate(model, z, {"lm": LevenbergMarquardt(tolerance=1e-10)}, noise=Unknown()).examinations
+    other = next(one for one in found.minima if one.x[0] < 0)
+    assert other.chi_square - found.minima[0].chi_square == pytest.approx(excess, rel=0.02)
+    assert 2 * f_law.isf(0.05, 2, 21) == pytest.approx(6.93, abs=0.01)
+    assert other.as_good == as_good
