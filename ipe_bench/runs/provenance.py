@@ -180,8 +180,8 @@ class _Sources:
         key = hashlib.sha256(hashlib.sha256(content).digest() + tables).hexdigest()
         if key not in self.found:
             tree = ast.parse(content)
-            code = numerical_code(tree).encode()
-            self.found[key] = {"imports": _imported(tree), "digest": hashlib.sha256(code + tables).hexdigest()}
+            imports, code = _imported(tree), numerical_code(tree).encode()
+            self.found[key] = {"imports": imports, "digest": hashlib.sha256(code + tables).hexdigest()}
         self.used.add(key)
         return self.found[key]
 
@@ -228,43 +228,19 @@ def _digest_of(module: str) -> str:
     return hashlib.sha256(path.read_bytes() + tables).hexdigest()
 
 
-def numerical_code(tree: Any) -> str:
+def numerical_code(tree: ast.Module) -> str:
     """Source as one text in which nothing stands that no number depends on: comments, layout, docstrings (also those
-    of fields), and the words of exceptions that are raised.
-
-    Unlike that of `ast.dump`, it is the same in every version of Python that parses the source to the same tree.
-    """
-    parts: list[str] = []
-    _spell(tree, parts, raised=False)
-    return "".join(parts)
+    of fields), and the words of exceptions that are raised. The tree is used up."""
+    return ast.unparse(_Wordless().visit(tree))
 
 
-def _spell(node: Any, parts: list[str], *, raised: bool) -> None:
-    if raised and isinstance(node, ast.Constant) and isinstance(node.value, str):
-        parts.append("words")
-    elif isinstance(node, ast.AST):
-        raised |= isinstance(node, ast.Raise)
-        parts.append(f"{type(node).__name__}(")
-        for name, value in ast.iter_fields(node):
-            # An empty field is one that another version of Python does not know.
-            if (
-                (value is None and not isinstance(node, ast.Constant))
-                or value == []
-                or name in ("kind", "type_comment")
-            ):
-                continue
-            parts.append(f"{name}=")
-            _spell(value, parts, raised=raised)
-        parts.append(")")
-    elif isinstance(node, list):
-        parts.append("[")
-        for item in node:
-            if not (isinstance(item, ast.Expr) and _is_text(item.value)):
-                _spell(item, parts, raised=raised)
-        parts.append("]")
-    else:
-        parts.append(repr(node))
+class _Wordless(ast.NodeTransformer):
+    def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
+        text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+        return None if text else self.generic_visit(node)
 
-
-def _is_text(node: ast.expr) -> bool:
-    return isinstance(node, ast.Constant) and isinstance(node.value, str)
+    def visit_Raise(self, node: ast.Raise) -> ast.AST:
+        for inner in ast.walk(node):
+            if isinstance(inner, ast.Constant) and isinstance(inner.value, str):
+                inner.value = "words"
+        return node
