@@ -284,43 +284,35 @@ class Measurement(Component, Named, ABC):
         return None
 
 
+def of_whole(name: str) -> Any:
+    """A property that is that of the model inside."""
+    return property(lambda model: getattr(model.whole, name))
+
+
 @dataclass(frozen=True)
-class Restricted(Measurement):
-    """Some readings of a model: those of the first epochs, or those that are not missing."""
+class WrappedModel(Measurement):
+    """A model that is another one, `whole`, but for what a subclass overrides."""
 
     whole: Measurement
-    kept: tuple[int, ...]
-    """Rows of the whole model's z, ascending."""
-    stop: int | None = None
-    """Where the rows all lie within the first `stop` epochs: nothing later is computed."""
-    coarse: bool = False
-    """Whether readings near enough for fits that only start another will do."""
 
-    def __post_init__(self) -> None:
-        """Made in every window and epoch, and of no user's options: there is nothing to check."""
-
-    @classmethod
-    def until(cls, whole: Measurement, stop: int, *, coarse: bool = False) -> Restricted:
-        """The readings of the first `stop` epochs."""
-        return cls(whole, tuple(whole.rows(stop).tolist()), stop, coarse)
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return self.whole.parameters
-
-    @property
-    def natural_parameters(self) -> tuple[Parameter, ...]:
-        return self.whole.natural_parameters
+    parameters = of_whole("parameters")
+    natural_parameters = of_whole("natural_parameters")
+    nominal = of_whole("nominal")
+    index = of_whole("index")
+    epochs = of_whole("epochs")
+    offset = of_whole("offset")
+    m = of_whole("m")
+    fixed = of_whole("fixed")
+    reading_unit = of_whole("reading_unit")
+    reading_name = of_whole("reading_name")
+    usual_noise = of_whole("usual_noise")
+    own_parameters = of_whole("own_parameters")
 
     def natural(self, x: Array) -> Array:
         return self.whole.natural(x)
 
     def natural_slope(self, x: Array) -> Array:
         return self.whole.natural_slope(x)
-
-    @property
-    def fixed(self) -> Mapping[str, float]:
-        return self.whole.fixed
 
     def near_bounds(self, x: Array) -> Mapping[int, float]:
         return self.whole.near_bounds(x)
@@ -331,33 +323,42 @@ class Restricted(Measurement):
     def released(self, values: Mapping[int, float]) -> Measurement:
         return replace(self, whole=self.whole.released(values))
 
-    @property
-    def reading_unit(self) -> str:  # type: ignore[override]
-        return self.whole.reading_unit
+    def simulate(self, x: Array) -> Array:
+        return self.whole.simulate(x)
 
-    @property
-    def reading_name(self) -> str:  # type: ignore[override]
-        return self.whole.reading_name
+    def jacobian(self, x: Array) -> Array:
+        return self.whole.jacobian(x)
 
-    @property
-    def usual_noise(self) -> UsualNoise | None:  # type: ignore[override]
-        return self.whole.usual_noise
+    def hindrance(self, x: Array) -> str:
+        return self.whole.hindrance(x)
 
-    @property
-    def own_parameters(self) -> Sequence[str]:
-        return self.whole.own_parameters
+
+@dataclass(frozen=True)
+class Restricted(WrappedModel):
+    """Some readings of a model: those of the first epochs, or those that are not missing."""
+
+    kept: tuple[int, ...]
+    """Rows of the whole model's z, ascending."""
+    stop: int | None = None
+    """Where the rows all lie within the first `stop` epochs: nothing later is computed."""
+    coarse: bool = False
+    """Whether readings near enough for fits that only start another will do."""
+
+    by_differential_equations = of_whole("by_differential_equations")
+    jacobian_cost = of_whole("jacobian_cost")
+    coarse_jacobian_cost = of_whole("coarse_jacobian_cost")
+
+    def __post_init__(self) -> None:
+        """Made in every window and epoch, and of no user's options: there is nothing to check."""
+
+    @classmethod
+    def until(cls, whole: Measurement, stop: int, *, coarse: bool = False) -> Restricted:
+        """The readings of the first `stop` epochs."""
+        return cls(whole, tuple(whole.rows(stop).tolist()), stop, coarse)
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
         return {name: [column[i] for i in self.kept] for name, column in self.whole.index.items()}
-
-    @property
-    def nominal(self) -> Array:
-        return self.whole.nominal
-
-    @property
-    def by_differential_equations(self) -> bool:
-        return self.whole.by_differential_equations
 
     @property
     def offset(self) -> Array:
@@ -401,14 +402,6 @@ class Restricted(Measurement):
     def coarse_jacobian(self, x: Array) -> Array:
         J = self.whole.coarse_jacobian(x) if self.stop is None else self.whole.coarse_jacobian_until(x, self.stop)
         return J[:, self._among_arrived]
-
-    @property
-    def jacobian_cost(self) -> float:
-        return self.whole.jacobian_cost
-
-    @property
-    def coarse_jacobian_cost(self) -> float:
-        return self.whole.coarse_jacobian_cost
 
     def linearization(self) -> Array:
         return self.whole.linearization()[self._rows]

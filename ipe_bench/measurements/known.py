@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, UsualNoise
+from ipe_bench.measurements.base import Measurement, Parameter, Recorded, WrappedModel, of_whole
 from ipe_bench.measurements.joint import Joint
 
 _NEAR = 1e-2
@@ -96,7 +96,7 @@ def _together(general: Known, own: Known) -> Known:
 
 
 @dataclass(frozen=True)
-class Informed(Measurement):
+class Informed(WrappedModel):
     """A model of which some parameters are fixed, bounded or start elsewhere.
 
     x counts the parameters that are left. A bounded one is ln((v - lower) / (v0 - lower)), or
@@ -104,8 +104,12 @@ class Informed(Measurement):
     size is such that one unit of x moves v by as much at v0 as before.
     """
 
-    whole: Measurement
     known: tuple[Known, ...]
+
+    nuisance_deviation = of_whole("nuisance_deviation")
+    inputs = of_whole("inputs")
+    input_columns = of_whole("input_columns")
+    input_columns_known = of_whole("input_columns_known")
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -244,53 +248,8 @@ class Informed(Measurement):
             return self.whole.linearization()[:, self._free] * self._slopes(self.nominal[None])[0]
         return self.jacobian(self.nominal[None])[0]
 
-    @property
-    def index(self) -> Mapping[str, Sequence[Any]]:
-        return self.whole.index
-
-    @property
-    def epochs(self) -> tuple[NDArray[np.intp], ...] | None:
-        return self.whole.epochs
-
-    @property
-    def offset(self) -> Array:
-        return self.whole.offset
-
-    @cached_property
-    def m(self) -> int:
-        return self.whole.m
-
-    @property
-    def reading_unit(self) -> str:  # type: ignore[override]
-        return self.whole.reading_unit
-
-    @property
-    def reading_name(self) -> str:
-        return self.whole.reading_name
-
-    @property
-    def usual_noise(self) -> UsualNoise | None:
-        return self.whole.usual_noise
-
-    @property
-    def nuisance_deviation(self) -> Array:
-        return self.whole.nuisance_deviation
-
-    @property
-    def own_parameters(self) -> Sequence[str]:
-        return self.whole.own_parameters
-
-    @property
-    def inputs(self) -> tuple[Input, ...]:
-        return self.whole.inputs
-
-    @property
-    def input_columns(self) -> Mapping[str, Sequence[Any]]:
-        return self.whole.input_columns
-
-    @property
-    def input_columns_known(self) -> bool:
-        return self.whole.input_columns_known
+    def hindrance(self, x: Array) -> str:
+        return self.whole.hindrance(self._whole_x(x[None])[0])
 
     def absent_input(self, heading: str, columns: Sequence[str]) -> str:
         return self.whole.absent_input(heading, columns)
