@@ -6,16 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array, Covariance
-from ipe_bench.measurements.counted import Counted
+from ipe_bench.measurements.counted import CountingModel
 
 POINTS_AT_ONCE = 8192
 """Points of one call of the model: bounds the memory that a large ensemble takes."""
 
 
-def read_members(model: Counted, R: Covariance, x: Array, rows: NDArray[np.intp]) -> Array:
+def read_members(model: CountingModel, R: Covariance, x: Array, rows: NDArray[np.intp]) -> Array:
     """Whitened h (trials, members, m) at x (trials, members, n), for the trials `rows` of the model's tally."""
     trials, members, n = x.shape
-    counted = Counted(model.measurement, model.tally, model.share * members)
+    counted = CountingModel(model.measurement, model.tally, model.share * members)
     count = min(trials, -(-trials * members // POINTS_AT_ONCE))
     pieces = np.array_split(np.arange(trials), count)
     h = [R.whiten(counted.simulate(x[p].reshape(-1, n), np.repeat(rows[p], members))) for p in pieces]

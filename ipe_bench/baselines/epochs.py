@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from ipe_bench.baselines.ensemble import read_members
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
-from ipe_bench.measurements.base import Measurement, Restricted
-from ipe_bench.measurements.counted import Counted, Tally
+from ipe_bench.measurements.base import Measurement, SubsetModel
+from ipe_bench.measurements.counted import CountingModel, Tally
 from ipe_bench.measurements.problem import Problem
 
 
@@ -27,9 +27,9 @@ class Epoch:
     share: float
     """The cost of this model's readings over that of all."""
 
-    def counted(self, tally: Tally) -> Counted:
+    def counted(self, tally: Tally) -> CountingModel:
         """The model, with the cost of a prefix."""
-        return Counted(self.model, tally, self.share)
+        return CountingModel(self.model, tally, self.share)
 
     def whitened(self, z: Array) -> Array:
         return self.R.whiten(z[..., self.rows])
@@ -48,7 +48,7 @@ def arrivals(problem: Problem) -> Iterator[Epoch]:
     model = problem.measurement
     assert model.epochs is not None
     # A model some of whose readings are missing is measured through the whole one, which can stop early.
-    whole, kept = (model.whole, np.array(model.kept)) if isinstance(model, Restricted) else (model, np.arange(model.m))
+    whole, kept = (model.whole, np.array(model.kept)) if isinstance(model, SubsetModel) else (model, np.arange(model.m))
     stop, arrived = 0, np.empty(0, dtype=np.intp)
     assert whole.epochs is not None
     for number, rows in enumerate(model.epochs, start=1):
@@ -57,7 +57,7 @@ def arrivals(problem: Problem) -> Iterator[Epoch]:
             stop += 1
             arrived = whole.rows(stop)
         _refuse_correlation(problem.R, rows)
-        part = Restricted(whole, tuple(kept[rows].tolist()), stop)
+        part = SubsetModel(whole, tuple(kept[rows].tolist()), stop)
         yield Epoch(number, part, rows, problem.R.restricted(rows), stop / len(whole.epochs))
 
 

@@ -23,7 +23,7 @@ from ipe_bench.basics.options import Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
 from ipe_bench.estimators.least_squares import squared
-from ipe_bench.measurements.counted import Counted, Tally
+from ipe_bench.measurements.counted import CountingModel, Tally
 from ipe_bench.measurements.problem import Problem
 
 
@@ -77,7 +77,7 @@ class EpochReadings:
     belief: Belief
 
     @property
-    def model(self) -> Counted:
+    def model(self) -> CountingModel:
         return self.epoch.counted(self.tally)
 
     def misfit(self, x: Array) -> Array:

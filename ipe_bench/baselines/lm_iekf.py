@@ -14,7 +14,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.driver import Ended, iterate
 from ipe_bench.estimators.least_squares import Descent, squared
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
-from ipe_bench.measurements.counted import Counted
+from ipe_bench.measurements.counted import CountingModel
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Standardized:
         return self.root.shape[1]
 
     @property
-    def model(self) -> Counted:
+    def model(self) -> CountingModel:
         return self.readings.model
 
     @property

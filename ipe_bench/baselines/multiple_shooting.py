@@ -17,8 +17,8 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
 from ipe_bench.estimators.driver import Solver, Standing, iterate
 from ipe_bench.estimators.least_squares import Minima, squared
-from ipe_bench.measurements.base import Measurement, Restricted
-from ipe_bench.measurements.counted import Counted, Tally
+from ipe_bench.measurements.base import Measurement, SubsetModel
+from ipe_bench.measurements.counted import CountingModel, Tally
 from ipe_bench.measurements.ode.interval import Interval
 from ipe_bench.measurements.ode.model import OdeMeasurement
 from ipe_bench.measurements.problem import Problem
@@ -94,7 +94,7 @@ class MultipleShooting(Estimator):
 
 def _whole(model: Measurement) -> tuple[Measurement, NDArray[np.intp]]:
     """The model without missing readings, and which of its readings there are."""
-    if isinstance(model, Restricted):
+    if isinstance(model, SubsetModel):
         return model.whole, np.array(model.kept, dtype=np.intp)
     return model, np.arange(model.m)
 
@@ -305,8 +305,8 @@ class Shooting:
     rows: NDArray[np.intp]
 
     @property
-    def model(self) -> Counted:
-        return Counted(self.pieces.problem.measurement, self.tally)
+    def model(self) -> CountingModel:
+        return CountingModel(self.pieces.problem.measurement, self.tally)
 
     def subset(self, kept: Mask) -> Shooting:
         return replace(self, z=self.z[kept], rows=self.rows[kept])

@@ -14,7 +14,7 @@ from ipe_bench.basics.errors import UserError, describe_exception, unknown
 from ipe_bench.basics.options import Component, Count, Positive, Whole
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.measurements.known import Known, informed
+from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.noise import ModelNoise, Noise
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct, instantiate
@@ -130,14 +130,14 @@ class Spec(Component):
         return unless if self.trials is None else self.trials
 
     @cached_property
-    def known(self) -> tuple[Known, ...]:
+    def known(self) -> tuple[ParameterInfo, ...]:
         """What is known of each parameter."""
         found = []
         for name, options in (self.parameters or {}).items():
             where = f"parameters.{name}"
             if not isinstance(options, Mapping):
                 raise UserError(f"{where}={options}: say what that is, such as {where}.fixed={options}")
-            found.append(instantiate(Known, {"name": str(name), **options}, where))
+            found.append(instantiate(ParameterInfo, {"name": str(name), **options}, where))
         return tuple(found)
 
     @cached_property

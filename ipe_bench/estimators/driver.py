@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ipe_bench.basics.batches import gather, take
 from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.basics.statuses import Status
-from ipe_bench.measurements.counted import Counted
+from ipe_bench.measurements.counted import CountingModel
 
 FAR = 1e8
 """Where the residual is this many times larger than at the start, the iteration has diverged."""
@@ -38,7 +38,7 @@ class Equations(Protocol):
     """What is solved for the trials `rows` of a batch."""
 
     @property
-    def model(self) -> Counted: ...
+    def model(self) -> CountingModel: ...
     @property
     def rows(self) -> NDArray[np.intp]: ...
     def subset(self, kept: Mask) -> Any:

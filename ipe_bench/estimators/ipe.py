@@ -29,7 +29,7 @@ from ipe_bench.basics.linalg import (
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import Solver, Standing, iterate
-from ipe_bench.measurements.counted import Counted, Tally
+from ipe_bench.measurements.counted import CountingModel, Tally
 from ipe_bench.measurements.problem import Problem
 
 Start = Literal["linear_lse", "nominal", "best"]
@@ -85,7 +85,7 @@ class FrozenSystem:
     H+ is frozen: one (1, n, m) for all trials, or one per trial (trials, n, m) where it was re-linearised.
     """
 
-    model: Counted
+    model: CountingModel
     H_plus: Array
     deviation: Array
     """Standard deviations (1, n) or (trials, n) of H+ v, eq. (5): the linear bound."""
@@ -106,7 +106,7 @@ class FrozenSystem:
                 "parameters cannot be told apart there, so there is no linear estimate to start from; give another "
                 "nominal point, start=nominal or best for least squares, or an estimator with a prior"
             )
-        model, H_plus = Counted(problem.measurement, Tally.zeros(len(z))), problem.H_plus[None]
+        model, H_plus = CountingModel(problem.measurement, Tally.zeros(len(z))), problem.H_plus[None]
         deviation = deviations(frozen_covariance(H_plus, problem.R))
         return cls(model, H_plus, deviation, problem.R, z, np.arange(len(z)))
 
@@ -151,7 +151,7 @@ class FrozenSystem:
         usable = finite(x)
         inverse_slope = np.full((len(x), x.shape[1], x.shape[1]), np.nan)
         if usable.any():
-            report = Counted.uncounted(model, int(self.rows.max()) + 1)
+            report = CountingModel.uncounted(model, int(self.rows.max()) + 1)
             part = self.subset(usable)
             inverse_slope[usable], _ = inverse(np.matmul(part.H_plus, report.jacobian(x[usable], part.rows)))
         return np.matmul(np.matmul(inverse_slope, self.covariance()), inverse_slope.swapaxes(1, 2))

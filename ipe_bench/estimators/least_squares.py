@@ -28,7 +28,7 @@ from ipe_bench.basics.linalg import (
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
 from ipe_bench.estimators.driver import Ended, Solver, Standing, iterate
-from ipe_bench.measurements.counted import Counted, Tally
+from ipe_bench.measurements.counted import CountingModel, Tally
 from ipe_bench.measurements.problem import Problem
 
 _VISIBLE = 1e-8
@@ -70,7 +70,7 @@ class Residuals(Protocol):
 class Objective:
     """|R^-1/2 (h(x) - z)|^2, plus |P0^-1/2 (x - x0)|^2 where a prior counts, for the trials `rows`."""
 
-    model: Counted
+    model: CountingModel
     R: Covariance
     z: Array
     rows: NDArray[np.intp]
@@ -83,7 +83,7 @@ class Objective:
     @classmethod
     def of(cls, problem: Problem, z: Array, *, prior: bool, inflation: float = 1.0) -> Objective:
         """The objective of all readings z (trials, m); with the prior, its deviations times `inflation`."""
-        model = Counted(problem.measurement, Tally.zeros(len(z)))
+        model = CountingModel(problem.measurement, Tally.zeros(len(z)))
         counting = problem.prior_covariance(inflation) if prior else None
         return cls(model, problem.R, z, np.arange(len(z)), problem.x0, counting)
 

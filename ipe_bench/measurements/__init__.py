@@ -1,7 +1,7 @@
 """Measurement models: what a parameter vector makes the instruments read. Config group `measurement`."""
 
 from ipe_bench.measurements.accelerometer import Accelerometer
-from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, Restricted, UsualNoise
+from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, SubsetModel, UsualNoise
 from ipe_bench.measurements.bearings import Bearings
 from ipe_bench.measurements.bock import Bock
 from ipe_bench.measurements.falling_body import FallingBody
@@ -39,10 +39,10 @@ __all__ = [
     "Polynomial",
     "Ranging",
     "Recorded",
-    "Restricted",
     "RicherGins",
     "Sir",
     "SixPosition",
+    "SubsetModel",
     "Triad",
     "UsualNoise",
 ]

@@ -143,7 +143,7 @@ class Measurement(Component, Named, ABC):
 
     def taking(self, rows: Sequence[int]) -> Measurement:
         """The model with these of its readings (rows of z, ascending) and no others."""
-        return Restricted(self, tuple(int(row) for row in rows))
+        return SubsetModel(self, tuple(int(row) for row in rows))
 
     @property
     def epochs(self) -> tuple[NDArray[np.intp], ...] | None:
@@ -203,15 +203,15 @@ class Measurement(Component, Named, ABC):
         return np.array([p.size for p in self.parameters])
 
     @property
-    def natural_parameters(self) -> tuple[Parameter, ...]:
+    def physical_parameters(self) -> tuple[Parameter, ...]:
         """The n unknowns as users know them, where those of x are their logarithms, say."""
         return self.parameters
 
-    def natural(self, x: Array) -> Array:
+    def physical(self, x: Array) -> Array:
         """Their values (trials, n), each in its own unit."""
         return x * self.sizes
 
-    def natural_slope(self, x: Array) -> Array:
+    def physical_slope(self, x: Array) -> Array:
         """The derivative of each value by its own entry of x (trials, n)."""
         return np.broadcast_to(self.sizes, x.shape)
 
@@ -225,11 +225,11 @@ class Measurement(Component, Named, ABC):
         del x
         return {}
 
-    def holding(self, values: Mapping[int, float]) -> Measurement:
+    def fixed_at(self, values: Mapping[int, float]) -> Measurement:
         """This model with some of the n parameters fixed at values in their own units."""
         raise NotImplementedError(f"{self.name} holds no parameter")
 
-    def released(self, values: Mapping[int, float]) -> Measurement:
+    def unbounded(self, values: Mapping[int, float]) -> Measurement:
         """This model with some of the n parameters free of bounds, starting at values in their own units."""
         raise NotImplementedError(f"{self.name} holds no parameter")
 
@@ -296,7 +296,7 @@ class WrappedModel(Measurement):
     whole: Measurement
 
     parameters = of_whole("parameters")
-    natural_parameters = of_whole("natural_parameters")
+    physical_parameters = of_whole("physical_parameters")
     nominal = of_whole("nominal")
     index = of_whole("index")
     epochs = of_whole("epochs")
@@ -308,20 +308,20 @@ class WrappedModel(Measurement):
     usual_noise = of_whole("usual_noise")
     own_parameters = of_whole("own_parameters")
 
-    def natural(self, x: Array) -> Array:
-        return self.whole.natural(x)
+    def physical(self, x: Array) -> Array:
+        return self.whole.physical(x)
 
-    def natural_slope(self, x: Array) -> Array:
-        return self.whole.natural_slope(x)
+    def physical_slope(self, x: Array) -> Array:
+        return self.whole.physical_slope(x)
 
     def near_bounds(self, x: Array) -> Mapping[int, float]:
         return self.whole.near_bounds(x)
 
-    def holding(self, values: Mapping[int, float]) -> Measurement:
-        return replace(self, whole=self.whole.holding(values))
+    def fixed_at(self, values: Mapping[int, float]) -> Measurement:
+        return replace(self, whole=self.whole.fixed_at(values))
 
-    def released(self, values: Mapping[int, float]) -> Measurement:
-        return replace(self, whole=self.whole.released(values))
+    def unbounded(self, values: Mapping[int, float]) -> Measurement:
+        return replace(self, whole=self.whole.unbounded(values))
 
     def simulate(self, x: Array) -> Array:
         return self.whole.simulate(x)
@@ -334,7 +334,7 @@ class WrappedModel(Measurement):
 
 
 @dataclass(frozen=True)
-class Restricted(WrappedModel):
+class SubsetModel(WrappedModel):
     """Some readings of a model: those of the first epochs, or those that are not missing."""
 
     kept: tuple[int, ...]
@@ -352,7 +352,7 @@ class Restricted(WrappedModel):
         """Made in every window and epoch, and of no user's options: there is nothing to check."""
 
     @classmethod
-    def until(cls, whole: Measurement, stop: int, *, coarse: bool = False) -> Restricted:
+    def until(cls, whole: Measurement, stop: int, *, coarse: bool = False) -> SubsetModel:
         """The readings of the first `stop` epochs."""
         return cls(whole, tuple(whole.rows(stop).tolist()), stop, coarse)
 

@@ -45,7 +45,7 @@ class Tally:
 
 
 @dataclass(frozen=True)
-class Counted:
+class CountingModel:
     """A model that counts its evaluations per trial, and in which a trial that raises spoils only itself.
 
     `share` is the cost of one evaluation: below 1 for a model restricted to the first epochs.
@@ -56,7 +56,7 @@ class Counted:
     share: float = 1.0
 
     @classmethod
-    def uncounted(cls, measurement: Measurement, trials: int) -> Counted:
+    def uncounted(cls, measurement: Measurement, trials: int) -> CountingModel:
         """For what is part of a report and not of a search: a tally that nobody reads."""
         return cls(measurement, Tally.zeros(trials))
 

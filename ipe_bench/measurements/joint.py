@@ -46,14 +46,14 @@ class Joint(Measurement):
     def _names(self, k: int) -> list[str]:
         """What the parameters of part k are called among those of all."""
         part = self.parts[k]
-        return [f"{p.name}_{k + 1}" if p.name in part.own_parameters else p.name for p in part.natural_parameters]
+        return [f"{p.name}_{k + 1}" if p.name in part.own_parameters else p.name for p in part.physical_parameters]
 
     @cached_property
     def copies(self) -> Mapping[str, tuple[str, ...]]:
         """What the parameters are called here of which every file has its own, by what the model calls them."""
         found: dict[str, list[str]] = {}
         for k, part in enumerate(self.parts):
-            for own, name in zip(part.natural_parameters, self._names(k), strict=True):
+            for own, name in zip(part.physical_parameters, self._names(k), strict=True):
                 if own.name in part.own_parameters:
                     found.setdefault(own.name, []).append(name)
         return {name: tuple(each) for name, each in found.items()}
@@ -70,7 +70,7 @@ class Joint(Measurement):
     def _each(self, parameters: Sequence[tuple[Parameter, ...]]) -> tuple[Parameter, ...]:
         named = []
         for part, i in self._first:
-            own = self.parts[part].natural_parameters[i].name in self.parts[part].own_parameters
+            own = self.parts[part].physical_parameters[i].name in self.parts[part].own_parameters
             p = parameters[part][i]
             named.append(replace(p, name=f"{p.name}_{part + 1}", group=p.group or p.name) if own else p)
         return tuple(named)
@@ -80,8 +80,8 @@ class Joint(Measurement):
         return self._each([part.parameters for part in self.parts])
 
     @cached_property
-    def natural_parameters(self) -> tuple[Parameter, ...]:
-        return self._each([part.natural_parameters for part in self.parts])
+    def physical_parameters(self) -> tuple[Parameter, ...]:
+        return self._each([part.physical_parameters for part in self.parts])
 
     @cached_property
     def nominal(self) -> Array:
@@ -91,12 +91,12 @@ class Joint(Measurement):
     def fixed(self) -> Mapping[str, float]:
         return {name: value for part in self.parts for name, value in part.fixed.items()}
 
-    def natural(self, x: Array) -> Array:
-        values = [part.natural(x[:, places]) for part, places in zip(self.parts, self._places, strict=True)]
+    def physical(self, x: Array) -> Array:
+        values = [part.physical(x[:, places]) for part, places in zip(self.parts, self._places, strict=True)]
         return np.stack([values[part][:, i] for part, i in self._first], axis=1)
 
-    def natural_slope(self, x: Array) -> Array:
-        slopes = [part.natural_slope(x[:, places]) for part, places in zip(self.parts, self._places, strict=True)]
+    def physical_slope(self, x: Array) -> Array:
+        slopes = [part.physical_slope(x[:, places]) for part, places in zip(self.parts, self._places, strict=True)]
         return np.stack([slopes[part][:, i] for part, i in self._first], axis=1)
 
     @cached_property

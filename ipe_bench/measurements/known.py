@@ -24,7 +24,7 @@ _NEAR = 1e-2
 
 
 @dataclass(frozen=True)
-class Known:
+class ParameterInfo:
     """What is known of one parameter; all in its own unit."""
 
     name: str
@@ -61,7 +61,7 @@ class Known:
         return lower, np.inf if self.upper is None else self.upper
 
 
-def informed(model: Measurement, known: Sequence[Known]) -> Measurement:
+def informed(model: Measurement, known: Sequence[ParameterInfo]) -> Measurement:
     """The model in which so much is known of its parameters.
 
     Of a parameter of which every file has its own, what is known of NAME is known of NAME_1, NAME_2 and so on, unless
@@ -72,10 +72,10 @@ def informed(model: Measurement, known: Sequence[Known]) -> Measurement:
     """
     if isinstance(model, Joint):
         known = _of_each_file(known, model)
-    return Informed(model, tuple(known)) if known else model
+    return ConstrainedModel(model, tuple(known)) if known else model
 
 
-def _of_each_file(known: Sequence[Known], model: Joint) -> list[Known]:
+def _of_each_file(known: Sequence[ParameterInfo], model: Joint) -> list[ParameterInfo]:
     """What is known of parameters by the names that they have among those of all files."""
     general = [one for one in known if one.name in model.copies]
     found = {name: replace(one, name=name) for one in general for name in model.copies[one.name]}
@@ -87,7 +87,7 @@ def _of_each_file(known: Sequence[Known], model: Joint) -> list[Known]:
     return list(found.values())
 
 
-def _together(general: Known, own: Known) -> Known:
+def _together(general: ParameterInfo, own: ParameterInfo) -> ParameterInfo:
     """What is known of a parameter of one file, where something is known of all: its own counts."""
     if own.fixed is not None or general.fixed is not None:
         return own
@@ -96,7 +96,7 @@ def _together(general: Known, own: Known) -> Known:
 
 
 @dataclass(frozen=True)
-class Informed(WrappedModel):
+class ConstrainedModel(WrappedModel):
     """A model of which some parameters are fixed, bounded or start elsewhere.
 
     x counts the parameters that are left. A bounded one is ln((v - lower) / (v0 - lower)), or
@@ -104,7 +104,7 @@ class Informed(WrappedModel):
     size is such that one unit of x moves v by as much at v0 as before.
     """
 
-    known: tuple[Known, ...]
+    known: tuple[ParameterInfo, ...]
 
     nuisance_deviation = of_whole("nuisance_deviation")
     inputs = of_whole("inputs")
@@ -130,10 +130,10 @@ class Informed(WrappedModel):
             raise UserError("parameters: all are fixed; leave at least one to be estimated")
 
     @cached_property
-    def _known(self) -> tuple[Known, ...]:
+    def _known(self) -> tuple[ParameterInfo, ...]:
         """One for each of the whole model's parameters."""
         given = {one.name: one for one in self.known}
-        return tuple(given.get(p.name, Known(p.name)) for p in self.whole.parameters)
+        return tuple(given.get(p.name, ParameterInfo(p.name)) for p in self.whole.parameters)
 
     @cached_property
     def _free(self) -> NDArray[np.intp]:
@@ -161,11 +161,11 @@ class Informed(WrappedModel):
     def parameters(self) -> tuple[Parameter, ...]:
         return tuple(
             p if t.plain else Parameter(f"{t.prefix}_{p.name}", size=t.inner_size, group=p.group or p.name)
-            for p, t in zip(self.natural_parameters, self._transformed, strict=True)
+            for p, t in zip(self.physical_parameters, self._transformed, strict=True)
         )
 
     @cached_property
-    def natural_parameters(self) -> tuple[Parameter, ...]:
+    def physical_parameters(self) -> tuple[Parameter, ...]:
         return tuple(self.whole.parameters[i] for i in self._free)
 
     @cached_property
@@ -183,27 +183,27 @@ class Informed(WrappedModel):
     def nominal(self) -> Array:
         return np.array([t.inner(t.v0) for t in self._transformed])
 
-    def natural(self, x: Array) -> Array:
+    def physical(self, x: Array) -> Array:
         return np.stack([t.value(x[:, k]) for k, t in enumerate(self._transformed)], axis=1)
 
-    def natural_slope(self, x: Array) -> Array:
+    def physical_slope(self, x: Array) -> Array:
         return np.stack([t.slope(x[:, k]) for k, t in enumerate(self._transformed)], axis=1)
 
     def near_bounds(self, x: Array) -> dict[int, float]:
         found = {}
-        for k, (t, v) in enumerate(zip(self._transformed, self.natural(x[None])[0], strict=True)):
+        for k, (t, v) in enumerate(zip(self._transformed, self.physical(x[None])[0], strict=True)):
             for bound in (t.lower, t.upper):
                 if abs(v - bound) <= _NEAR * abs(t.v0 - bound) < np.inf:
                     found[k] = bound
         return found
 
-    def holding(self, values: Mapping[int, float]) -> Measurement:
-        return self._with(Known(self.natural_parameters[k].name, fixed=value) for k, value in values.items())
+    def fixed_at(self, values: Mapping[int, float]) -> Measurement:
+        return self._with(ParameterInfo(self.physical_parameters[k].name, fixed=value) for k, value in values.items())
 
-    def released(self, values: Mapping[int, float]) -> Measurement:
-        return self._with(Known(self.natural_parameters[k].name, nominal=value) for k, value in values.items())
+    def unbounded(self, values: Mapping[int, float]) -> Measurement:
+        return self._with(ParameterInfo(self.physical_parameters[k].name, nominal=value) for k, value in values.items())
 
-    def _with(self, known: Iterable[Known]) -> Informed:
+    def _with(self, known: Iterable[ParameterInfo]) -> ConstrainedModel:
         """The model in which that is known, in place of what was known of the same parameters."""
         given = {one.name: one for one in (*self.known, *known)}
         return replace(self, known=tuple(given.values()))

@@ -86,11 +86,11 @@ def prior_of(model: Measurement, P: Array) -> GaussianPrior:
     P = np.asarray(P, dtype=float)
     if P.shape != (model.n, model.n):
         size = " x ".join(map(str, P.shape))
-        names = ", ".join(p.name for p in model.natural_parameters)
+        names = ", ".join(p.name for p in model.physical_parameters)
         raise UserError(f"prior_covariance: is {size}; give a row and a column for each of {model.n} ({names})")
     require_covariance("prior_covariance", P)
     deviation = np.sqrt(np.diag(P))
-    slope = model.natural_slope(model.nominal[None])[0]
+    slope = model.physical_slope(model.nominal[None])[0]
     C = P / np.outer(deviation, deviation) * np.outer(np.sign(slope), np.sign(slope))
     C = (C + C.T) / 2
     np.fill_diagonal(C, 1.0)

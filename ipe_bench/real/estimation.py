@@ -17,7 +17,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.measurements.known import Informed, Known, informed
+from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo, informed
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.measurements.repeatable import require_repeatable
 from ipe_bench.noise import Certified, ModelNoise, Noise, Unknown
@@ -40,7 +40,7 @@ class Question:
     noise: Noise | None = None
     prior: Prior | None = None
     error_scale: float | None = None
-    known: tuple[Known, ...] = ()
+    known: tuple[ParameterInfo, ...] = ()
     covariance: Any = None
     """P0 in the parameters' own units: rows of numbers, or the name of a CSV file."""
     left_out: LeftOut = field(default_factory=LeftOut)
@@ -144,15 +144,15 @@ def prior_stated(prior: Prior, model: Measurement, covariance: Any = None) -> Pr
     Raises:
         UserError: it cannot be told of single parameters, or two of these say the same.
     """
-    deviating = isinstance(model, Informed) and any(one.deviation is not None for one in model.known)
+    deviating = isinstance(model, ConstrainedModel) and any(one.deviation is not None for one in model.known)
     if covariance is not None:
         if not isinstance(prior, GaussianPrior):
             raise UserError(f"prior_covariance: is for prior=gaussian; with prior={prior.name}, leave it out")
         if deviating or prior != GaussianPrior():
             other = "parameters.NAME.deviation" if deviating else "prior.deviations or prior.correlations"
             raise UserError(f"prior_covariance: says all of the prior; leave out {other}")
-        return prior_of(model, read_covariance(covariance, [p.name for p in model.natural_parameters]))
-    if not isinstance(model, Informed):
+        return prior_of(model, read_covariance(covariance, [p.name for p in model.physical_parameters]))
+    if not isinstance(model, ConstrainedModel):
         return prior
     if not isinstance(prior, GaussianPrior):
         raise UserError(f"parameters: goes with prior=gaussian, which is told of each; prior={prior.name} is not")
@@ -165,5 +165,5 @@ def prior_stated(prior: Prior, model: Measurement, covariance: Any = None) -> Pr
         )
     general = dict(zip(names, prior.deviations, strict=True))
     own = {one.name for one in model.known if one.deviation is not None}
-    known = zip(model.natural_parameters, model.prior_deviations, strict=True)
+    known = zip(model.physical_parameters, model.prior_deviations, strict=True)
     return replace(prior, deviations=tuple(d if p.name in own else general[p.name] for p, d in known))

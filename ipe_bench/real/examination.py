@@ -176,8 +176,8 @@ def _released(
 ) -> Released | None:
     """The problem in which what is on bounds may leave them; None where nothing is known of it there."""
     places = np.array(list(values))
-    start = problem.measurement.natural(problem.measurement.nominal[None])[0]
-    given = present_part(replace(problem, measurement=problem.measurement.released(values)), rows, level)
+    start = problem.measurement.physical(problem.measurement.nominal[None])[0]
+    given = present_part(replace(problem, measurement=problem.measurement.unbounded(values)), rows, level)
     x = np.array(given.measurement.nominal, dtype=float)
     x[np.setdiff1d(np.arange(len(x)), places)] = least.x
     with np.errstate(all="ignore"):
@@ -228,7 +228,7 @@ def _on_bounds(
             asked = part.problem, z[rows][None], part.x[None], part.P[None]
             ((found,),) = profiles(*asked, places=(k,), signs=(sign,), **towards)
             other = np.nan if found.lower_minimum else (found.low, found.high)[sign > 0]
-        yield OnBound(place, model.natural_parameters[place], bound, float(np.clip(other, lower[place], upper[place])))
+        yield OnBound(place, model.physical_parameters[place], bound, float(np.clip(other, lower[place], upper[place])))
 
 
 def _sum_of_squares(one: Fit) -> float:
@@ -291,8 +291,8 @@ class _Least:
         return Examination(
             label,
             model,
-            model.natural(x)[0],
-            deviation * np.abs(model.natural_slope(x)[0]),
+            model.physical(x)[0],
+            deviation * np.abs(model.physical_slope(x)[0]),
             wald_interval(model, self.x, deviation, q),
             profiles(
                 self.problem,
@@ -318,7 +318,7 @@ class _Least:
     def direction(self) -> Direction:
         size = np.linalg.norm(self.J, axis=0)
         _, s, V = np.linalg.svd(self.J / size, full_matrices=False)
-        weights = V[-1] / size * self.model.natural_slope(self.x[None])[0]
+        weights = V[-1] / size * self.model.physical_slope(self.x[None])[0]
         leading = np.argmax(np.abs(V[-1]))
         return Direction(weights * np.sign(weights[leading]), float(1.0 / s[-1]))
 
@@ -360,7 +360,7 @@ class _Least:
             values = np.delete(values, released.places, axis=1)
         values = values[answered]
         tail = (1 - CONFIDENCE) / 2
-        n, estimate = len(self.x), self.model.natural(self.x[None])[0]
+        n, estimate = len(self.x), self.model.physical(self.x[None])[0]
         if len(values) < draws / 2:
             unknown = np.full(n, np.nan)
             return Bootstrap(unknown, unknown, unknown, len(values), draws)
@@ -396,20 +396,20 @@ class _Least:
             chi_square = float(minima.chi_square[i])
             least = found[0].chi_square if found else chi_square
             places.append((x, deviation))
-            found.append(Minimum(self.model.natural(x[None])[0], chi_square, 1, chi_square - least <= limit))
-        return found or [Minimum(self.model.natural(self.x[None])[0], self.chi_square, 1, True)]
+            found.append(Minimum(self.model.physical(x[None])[0], chi_square, 1, chi_square - least <= limit))
+        return found or [Minimum(self.model.physical(self.x[None])[0], self.chi_square, 1, True)]
 
 
 def answers(problem: Problem, z: Array, x: Array, released: Released | None = None) -> tuple[Array, Mask]:
     """The least-squares estimates (sets, n) within the bounds, in the parameters' own units, for readings z (sets, m)
     from x (sets, n), and which sets have one; parameters that are `released` have the bounds where they stood."""
     minima, model = _minimise(problem, z, x), problem.measurement
-    values, found = model.natural(minima.x), minima.converged.copy()
+    values, found = model.physical(minima.x), minima.converged.copy()
     on_bounds: dict[tuple[tuple[int, float], ...], list[int]] = {}
     outside, bounds = np.zeros((len(x), 0), dtype=bool), np.zeros(0)
     if released is not None:
         outside = ~released.inside(minima.x)
-        bounds = model.natural(released.x[None])[0, released.places]
+        bounds = model.physical(released.x[None])[0, released.places]
     for i in np.flatnonzero(~found | outside.any(axis=1)):
         near = dict(model.near_bounds(minima.x[i]))
         if released is not None:
@@ -424,7 +424,7 @@ def answers(problem: Problem, z: Array, x: Array, released: Released | None = No
         there = _minimise(held, z[sets], np.ascontiguousarray(minima.x[sets][:, free]))
         least = there.converged & falls_beyond(problem, there.x, near, z[sets], released)
         values[sets] = np.array([near.get(k, np.nan) for k in range(model.n)])
-        values[np.ix_(sets, free)] = held.measurement.natural(there.x)
+        values[np.ix_(sets, free)] = held.measurement.physical(there.x)
         found[sets] = least
     return values, found
 

@@ -14,7 +14,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance, Mask
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimator, estimate_safely
-from ipe_bench.measurements.base import Measurement, Restricted
+from ipe_bench.measurements.base import Measurement, SubsetModel
 from ipe_bench.measurements.counted import cost
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
@@ -269,7 +269,7 @@ def present_part(problem: Problem, rows: NDArray[np.intp], level: float | None =
 
 
 def _restricted(problem: Problem, rows: Array) -> Problem:
-    model = Restricted(problem.measurement, tuple(rows.tolist()))
+    model = SubsetModel(problem.measurement, tuple(rows.tolist()))
     return replace(problem, measurement=model, R=problem.R.restricted(rows))
 
 
@@ -305,7 +305,7 @@ def holding(problem: Problem, values: Mapping[int, float]) -> Problem:
     deviation, correlation = problem.prior_deviation, problem.prior_correlation
     deviation = None if deviation is None else deviation[kept]
     correlation = None if correlation is None else correlation[np.ix_(kept, kept)]
-    held = problem.measurement.holding(values)
+    held = problem.measurement.fixed_at(values)
     return replace(problem, measurement=held, prior_deviation=deviation, prior_correlation=correlation)
 
 
@@ -315,14 +315,14 @@ def falls_beyond(
     """For which sets of readings z (sets, m) the sum of squares falls on beyond every bound, so that its minimum within
     them is on them, where it is `held` (sets, free) (Nocedal and Wright, Numerical Optimization, 2nd ed., 2006, theorem
     12.1)."""
-    model, places = problem.measurement.released(near), list(near)
+    model, places = problem.measurement.unbounded(near), list(near)
     x = np.repeat(np.array(model.nominal, dtype=float)[None], len(z), axis=0)
     x[:, [k for k in range(model.n) if k not in near]] = held
     with np.errstate(all="ignore"):
         r = problem.R.whiten(z - model.simulate(x))
         J = problem.R.whiten_jacobian(model.jacobian(x))[:, :, places]
         downhill = np.einsum("tmi,tm->ti", J, r)
-    start = problem.measurement.natural(problem.measurement.nominal[None])[0]
+    start = problem.measurement.physical(problem.measurement.nominal[None])[0]
     outward = np.sign(np.array(list(near.values())) - start[places])
     if released is not None:
         # These start on their bounds, and have been told which way leads inwards.
@@ -380,12 +380,12 @@ def _fit_inside(
         spread = spread_of(estimator, problem, J[None])
         p = fit_probability(np.array([chi_square]), spread, noise, problem.H, problem.R)[0]
     P = np.full((n, n), np.nan) if estimates.covariance is None else estimates.covariance[0]
-    slope = model.natural_slope(estimates.x)[0]
+    slope = model.physical_slope(estimates.x)[0]
     return Fit(
         label,
         Status(int(estimates.status[0])),
         message,
-        model.natural(estimates.x)[0],
+        model.physical(estimates.x)[0],
         P * np.outer(slope, slope),
         _at(rows, r, m),
         _at(rows, scaled, m),
@@ -414,10 +414,10 @@ def undetermined(model: Measurement, J: Array, x: Array) -> tuple[str, ...]:
     found = []
     for value, direction in zip(s, right / size, strict=True):
         error = np.abs(direction) / max(value, np.finfo(float).eps * s[0])
-        along = direction * model.natural_slope(x[None])[0]
+        along = direction * model.physical_slope(x[None])[0]
         # Of a parameter that is as good as on a bound x says nothing.
         if value < _OPEN * s[0] and along.any() and (error > np.maximum(np.abs(x), 1.0)).any():
-            found.append(in_words([p.name for p in model.natural_parameters], along))
+            found.append(in_words([p.name for p in model.physical_parameters], along))
     return tuple(found)
 
 

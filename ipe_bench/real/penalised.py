@@ -34,8 +34,8 @@ class Penalised(Measurement):
         return self.whole.parameters
 
     @property
-    def natural_parameters(self) -> tuple[Parameter, ...]:
-        return self.whole.natural_parameters
+    def physical_parameters(self) -> tuple[Parameter, ...]:
+        return self.whole.physical_parameters
 
     @property
     def nominal(self) -> Array:
@@ -49,11 +49,11 @@ class Penalised(Measurement):
     def index(self) -> Mapping[str, Sequence[Any]]:
         return {"number": list(range(self.m))}
 
-    def natural(self, x: Array) -> Array:
-        return self.whole.natural(x)
+    def physical(self, x: Array) -> Array:
+        return self.whole.physical(x)
 
-    def natural_slope(self, x: Array) -> Array:
-        return self.whole.natural_slope(x)
+    def physical_slope(self, x: Array) -> Array:
+        return self.whole.physical_slope(x)
 
     def simulate(self, x: Array) -> Array:
         return np.concatenate([self.whole.simulate(x), x], axis=1)

@@ -19,7 +19,7 @@ from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.estimators.least_squares import Objective, minimize, squared
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.measurements.counted import Counted, Tally
+from ipe_bench.measurements.counted import CountingModel, Tally
 from ipe_bench.measurements.problem import Problem
 
 _FIRST = (0.5, 1.0, 1.5)
@@ -71,7 +71,7 @@ def half_width(level: float, freedom: int | None) -> float:
 
 def natural_limits(model: Measurement) -> tuple[Array, Array]:
     """The lower and the upper bounds (n,) of the parameters in their own units; infinite where there are none."""
-    ends = model.natural(np.stack([np.full(model.n, -np.inf), np.full(model.n, np.inf)]))
+    ends = model.physical(np.stack([np.full(model.n, -np.inf), np.full(model.n, np.inf)]))
     return ends.min(axis=0), ends.max(axis=0)
 
 
@@ -82,8 +82,8 @@ def wald_interval(model: Measurement, x: Array, deviation: Array, q: float) -> t
     logarithm says nothing any more, and the interval is symmetric in the parameter itself and ends at the bound.
     """
     with np.errstate(all="ignore"):
-        ends = model.natural(np.stack([x - q * deviation, x + q * deviation]))
-        value, error = model.natural(x[None])[0], deviation * np.abs(model.natural_slope(x[None])[0])
+        ends = model.physical(np.stack([x - q * deviation, x + q * deviation]))
+        value, error = model.physical(x[None])[0], deviation * np.abs(model.physical_slope(x[None])[0])
     lower, upper = natural_limits(model)
     with np.errstate(invalid="ignore"):
         reached = (value - q * error <= lower) | (value + q * error >= upper)
@@ -216,8 +216,8 @@ class _Looked:
         """Values of the parameter in its own unit, on a bound where they are as near as round-off."""
         points = np.repeat(self.x[None], len(values), axis=0)
         points[:, self.place] = values
-        found = self.model.natural(points)[:, self.place]
-        start = self.model.natural(self.model.nominal[None])[0, self.place]
+        found = self.model.physical(points)[:, self.place]
+        start = self.model.physical(self.model.nominal[None])[0, self.place]
         for limits in natural_limits(self.model):
             bound = limits[self.place]
             if np.isfinite(bound):
@@ -274,7 +274,7 @@ class Released:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pinned(Counted):
+class Pinned(CountingModel):
     """A model in which one parameter of each trial has a value of its own, and x are the others."""
 
     places: NDArray[np.intp]

@@ -105,8 +105,8 @@ def write_readings(path: Path, model: Measurement, z: Array) -> None:
 
 def write_truth(path: Path, model: Measurement, x: Array) -> None:
     """Writes parameters x (n,), given in multiples of their sizes, in physical units."""
-    values = model.natural(x[None])[0]
-    rows = [[p.name, p.unit, repr(float(v))] for p, v in zip(model.natural_parameters, values, strict=True)]
+    values = model.physical(x[None])[0]
+    rows = [[p.name, p.unit, repr(float(v))] for p, v in zip(model.physical_parameters, values, strict=True)]
     _write(path, ["parameter", "unit", "value"], rows)
 
 

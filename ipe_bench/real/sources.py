@@ -17,7 +17,7 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Input, Measurement
 from ipe_bench.measurements.joint import Joint
-from ipe_bench.measurements.known import Informed, informed
+from ipe_bench.measurements.known import ConstrainedModel, informed
 from ipe_bench.noise import Gaussian, Noise, Unknown
 from ipe_bench.real import readings
 from ipe_bench.real.readings import Table
@@ -95,13 +95,13 @@ def open_together(
 ) -> Readings:
     """The readings of one file or of several; the latter share the parameters that are not a file's own.
 
-    What is known of parameters (`Informed`) is known of all files, where each has its own of each one's.
+    What is known of parameters (`ConstrainedModel`) is known of all files, where each has its own of each one's.
     `enough`: refuses fewer readings than parameters.
 
     Raises:
         UserError: a file is absent or does not hold readings of this model, or files differ in what they know.
     """
-    if isinstance(model, Informed):
+    if isinstance(model, ConstrainedModel):
         found = open_together(paths, model.whole, left_out, enough=False)
         found = replace(found, model=informed(found.model, model.known))
     else:

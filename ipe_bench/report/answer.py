@@ -110,7 +110,7 @@ class Answer:
 
         found = []
         for one in self.fits:
-            columns = zip(one.model.natural_parameters, one.x, one.standard_errors, *one.interval(), strict=True)
+            columns = zip(one.model.physical_parameters, one.x, one.standard_errors, *one.interval(), strict=True)
             for p, x, error, low, high in columns:
                 values = {"estimate": x, "standard_error": error, "low95": low, "high95": high}
                 found.append(
@@ -147,7 +147,7 @@ def contents(answer: Answer) -> Iterator[Part]:
 
 
 def _estimates(answer: Answer) -> Table:
-    parameters = answer.model.natural_parameters
+    parameters = answer.model.physical_parameters
     columns = [words("parameter", [p.name for p in parameters]), words("unit", [p.unit for p in parameters])]
     columns += [texts(_heading(one), _cells(one)) for one in answer.fits]
     return Table("estimates", f"{answer.name}: estimate ± standard error", "", columns, repeated=2)
@@ -250,7 +250,7 @@ def _notes(answer: Answer) -> Iterator[str]:
         yield f"{', '.join(told)}: with a prior, which counts in the standard errors as further readings would."
     for one in fits:
         if one.held is not None:
-            names = [one.model.natural_parameters[k].name for k in one.held_at]
+            names = [one.model.physical_parameters[k].name for k in one.held_at]
             bounds = ", ".join(f"{name} = {value:g}" for name, value in zip(names, one.held_at.values(), strict=True))
             yield (
                 f"{one.label}: on its bound: {bounds}; the readings want it beyond. It has no error, and those of the"
@@ -297,7 +297,7 @@ def _reading_labels(model: Measurement) -> list[dict[str, Any]]:
 
 def intervals(found: Examination) -> Table:
     """Three intervals of each parameter; of one on a bound, that of its profile."""
-    inside, on_bounds = found.model.natural_parameters, found.on_bounds
+    inside, on_bounds = found.model.physical_parameters, found.on_bounds
     ends = [(one.low, one.high) for one in found.profiles] + [tuple(sorted((b.bound, b.other))) for b in on_bounds]
     absent = ["-"] * len(on_bounds)
     prior = " with its prior" if found.with_prior else ""
@@ -331,7 +331,7 @@ def interval(low: float, high: float) -> str:
 
 def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """What a reader should know before signing, a sentence each."""
-    names = [p.name for p in found.model.natural_parameters]
+    names = [p.name for p in found.model.physical_parameters]
 
     def at(x: Array) -> str:
         return ", ".join(f"{n} = {v:.5g}" for n, v in zip(names, x, strict=True))
@@ -444,13 +444,13 @@ def described(answer: Answer) -> dict[str, Any]:
         "passes": answer.passes,
         "examination": answer.examination and _examined(answer.examination, labels),
         "examination_with_prior": with_prior and _examined(with_prior, labels),
-        "parameters": [picked(p, "name", "unit") for p in model.natural_parameters],
+        "parameters": [picked(p, "name", "unit") for p in model.physical_parameters],
         "estimators": {one.label: _fitted(one, labels) for one in answer.fits},
     }
 
 
 def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
-    names, white = [p.name for p in one.model.natural_parameters], one.whiteness
+    names, white = [p.name for p in one.model.physical_parameters], one.whiteness
     outliers = np.flatnonzero(one.outliers)
     return {
         "status": one.status.label,
@@ -473,7 +473,7 @@ def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _examined(found: Examination, labels: list[dict[str, Any]]) -> dict[str, Any]:
-    names, bootstrap = [p.name for p in found.model.natural_parameters], found.bootstrap
+    names, bootstrap = [p.name for p in found.model.physical_parameters], found.bootstrap
     profiles = zip(names, found.profiles, strict=True)
     return {
         "estimator": found.label,

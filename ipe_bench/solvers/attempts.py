@@ -18,8 +18,8 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.ipe import starting_points
 from ipe_bench.estimators.least_squares import Minima, Objective, minimize, squared
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
-from ipe_bench.measurements.base import Restricted
-from ipe_bench.measurements.counted import Counted, Tally
+from ipe_bench.measurements.base import SubsetModel
+from ipe_bench.measurements.counted import CountingModel, Tally
 from ipe_bench.measurements.problem import Problem
 
 Rows = NDArray[np.intp]
@@ -84,7 +84,7 @@ class Attempts(ABC):
 
     def whole(self, owner: Rows) -> Objective:
         """The objective on all data for candidates of the trials `owner`."""
-        model = Counted(self.problem.measurement, self.spent(owner))
+        model = CountingModel(self.problem.measurement, self.spent(owner))
         return Objective(model, self.problem.R, self.z[owner], np.arange(len(owner)), self.problem.x0)
 
     def spent(self, owner: Rows) -> Tally:
@@ -383,7 +383,9 @@ class Windows(Attempts):
         """The objective of each candidate in a window, with the prior about `centre`."""
         problem, model = self.problem, self.problem.measurement
         assert model.epochs is not None
-        window = Counted(Restricted.until(model, epochs, coarse=True), self.spent(owner), epochs / len(model.epochs))
+        window = CountingModel(
+            SubsetModel.until(model, epochs, coarse=True), self.spent(owner), epochs / len(model.epochs)
+        )
         R, z = problem.R.restricted(arrived), self.z[np.ix_(owner, arrived)]
         prior = None if self.prior is None else Covariance(self.prior)
         return Objective(window, R, z, np.arange(len(owner)), centre, prior).coarsened(0.0)

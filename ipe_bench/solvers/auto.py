@@ -17,7 +17,7 @@ from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.fitting import Fitting, spread_of_starts
 from ipe_bench.estimators.least_squares import Minima, Objective, minimize
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
-from ipe_bench.measurements.counted import Counted, Tally
+from ipe_bench.measurements.counted import CountingModel, Tally
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers.chords import Chords
 from ipe_bench.solvers.progressive import Progressive, accepted
@@ -105,7 +105,7 @@ class Auto(Estimator):
         if not len(rows):
             return best
         draws = normals(own_generators(self.seed, z[rows]), count, n)
-        whole = Objective(Counted(problem.measurement, tally), problem.R, z[rows], rows, problem.x0)
+        whole = Objective(CountingModel(problem.measurement, tally), problem.R, z[rows], rows, problem.x0)
         method = LevenbergMarquardtMethod(_DAMPING, problem.prior_used())
         limits = {"tolerance": self.tolerance, "max_iterations": _STEPS, "budget": self.budget}
         for k in range(count):

@@ -17,7 +17,7 @@ from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import Solver, Standing, iterate
 from ipe_bench.estimators.ipe import IPE, FrozenSystem, Start, State, begin, frozen_covariance, root_standing
 from ipe_bench.estimators.least_squares import inverse_factor
-from ipe_bench.measurements.counted import Counted
+from ipe_bench.measurements.counted import CountingModel
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers.fixed_point import FixedPoint
 
@@ -133,7 +133,7 @@ def _bound(problem: Problem, state: Round) -> Array:
         return P
     J = np.full((len(P), problem.measurement.m, state.x.shape[1]), np.nan)
     if usable.any():
-        model = Counted.uncounted(problem.measurement, len(P))
+        model = CountingModel.uncounted(problem.measurement, len(P))
         J[usable] = model.jacobian(state.x[usable], np.flatnonzero(usable))
     inverse_U = inverse_factor(problem.R.whiten_jacobian(J[lost]))
     return put(P, lost, np.matmul(inverse_U, inverse_U.swapaxes(1, 2)))

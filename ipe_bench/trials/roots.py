@@ -19,7 +19,7 @@ from ipe_bench.estimators.gauss_newton import GaussNewtonMethod
 from ipe_bench.estimators.ipe import IPE, FrozenSystem, State, System
 from ipe_bench.estimators.least_squares import Objective
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
-from ipe_bench.measurements.counted import Counted
+from ipe_bench.measurements.counted import CountingModel
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers.newton import Newton
 
@@ -54,7 +54,7 @@ class Known:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Informed(Counted):
+class _Informed(CountingModel):
     """A model that does not compute again what is known at the starts x (trials, n)."""
 
     x: Array

@@ -27,7 +27,7 @@ from ipe_bench.basics.linalg import (
 )
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Equation, Estimates, Estimator, estimate_safely
-from ipe_bench.measurements.counted import Counted
+from ipe_bench.measurements.counted import CountingModel
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.trials.bounds import bound_deviations
 from ipe_bench.trials.contraction import contraction_of, curvature
@@ -152,7 +152,7 @@ class Block:
 
     def readings_at(self, x: Array) -> Array:
         """h(x) (trials, m) for x (trials, n); NaN where the model fails."""
-        return Counted.uncounted(self.problem.measurement, len(x)).simulate(read_only(x), np.arange(len(x)))
+        return CountingModel.uncounted(self.problem.measurement, len(x)).simulate(read_only(x), np.arange(len(x)))
 
     def _bent(self, names: list[str], H_plus: Array) -> Columns:
         """What second derivatives at the truth say, for the first trials and NaN for the others: M of eq. (23), the

@@ -16,7 +16,7 @@ from ipe_bench.baselines.sequential import Sequential
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Covariance, information, inverse, multiply, quadratic_form
 from ipe_bench.basics.statuses import Status
-from ipe_bench.measurements.base import Restricted
+from ipe_bench.measurements.base import SubsetModel
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Quantization
@@ -239,7 +239,7 @@ def test_a_prefix_costs_its_share(estimator, simulations, jacobians):
 @pytest.mark.parametrize("kept", [tuple(range(11)), (0, 2, 3, 5, 6, 7, 9)], ids=["all readings", "some missing"])
 def test_nothing_is_computed_beyond_the_epoch_at_hand(kept):
     whole = Linear()
-    model = whole if len(kept) == whole.m else Restricted(whole, kept)
+    model = whole if len(kept) == whole.m else SubsetModel(whole, kept)
     problem = Problem(model, Covariance(np.ones(model.m)), np.ones(4))
     z = np.random.default_rng(1).standard_normal((2, model.m))
     found = UKF().estimate(problem, z)

@@ -19,7 +19,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Covariance, multiply
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements import Gins
-from ipe_bench.measurements.base import Restricted
+from ipe_bench.measurements.base import SubsetModel
 from ipe_bench.measurements.counted import Tally
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Quantization
@@ -87,7 +87,7 @@ def test_readings_correlated_within_an_epoch(estimator):
 @pytest.mark.parametrize("estimator", FILTERS, ids=label)
 def test_missing_readings_are_as_if_they_had_never_been_taken(estimator):
     model, kept = Linear(), (0, 2, 3, 5, 6, 8, 9)
-    problem = Problem(Restricted(model, kept), Covariance(np.full(7, 0.3)), np.ones(4))
+    problem = Problem(SubsetModel(model, kept), Covariance(np.full(7, 0.3)), np.ones(4))
     z = np.linspace(-2.0, 3.0, 7)[None]
     whole = Linear()
     A, b = whole.matrix[list(kept)] / 0.3, (z[0] - whole.matrix[list(kept)] @ whole.nominal) / 0.3

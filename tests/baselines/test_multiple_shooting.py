@@ -13,7 +13,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements import Bock, Gins, LotkaVolterra, Sir
-from ipe_bench.measurements.base import Restricted
+from ipe_bench.measurements.base import SubsetModel
 from ipe_bench.measurements.problem import Problem, recorded_problem
 from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.priors import GaussianPrior
@@ -106,7 +106,7 @@ def test_missing_readings_are_as_if_they_had_never_been_taken():
     whole = scenario("lotka_volterra")
     problem, drawn = whole.problem, whole.draw(0, 2)
     kept = tuple(i for i in range(problem.measurement.m) if i not in (2, 11, 12))
-    part = Problem(Restricted(problem.measurement, kept), problem.R.restricted(np.array(kept)))
+    part = Problem(SubsetModel(problem.measurement, kept), problem.R.restricted(np.array(kept)))
     found = MultipleShooting(step=0.05).estimate(part, drawn.z[:, list(kept)])
     single = LevenbergMarquardt().estimate(part, drawn.z[:, list(kept)])
     np.testing.assert_allclose(found.x, single.x, atol=1e-4)

@@ -85,7 +85,7 @@ def test_gauss_newton_leaves_a_start_at_which_a_column_of_j_is_zero():
     for start in ("linear_lse", "nominal"):
         found = GaussNewton(start=start).estimate(problem, z)
         assert found.status[0] == Status.CONVERGED
-        np.testing.assert_allclose(model.natural(found.x), [[1.5, 2.0, 5.3]], rtol=1e-6)
+        np.testing.assert_allclose(model.physical(found.x), [[1.5, 2.0, 5.3]], rtol=1e-6)
 
 
 def test_geodesic_acceleration_finds_the_same_minimum_in_fewer_jacobians():

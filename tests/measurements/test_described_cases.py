@@ -9,7 +9,7 @@ from scipy.optimize import curve_fit
 from ipe_bench.baselines import LevenbergMarquardt
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Ode
-from ipe_bench.measurements.known import Informed, Known
+from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.real.fits import fit
@@ -60,7 +60,7 @@ def test_an_estimate_from_several_cases_is_scipys(file):
     )  # fmt: skip
     assert result.x == pytest.approx(x, rel=1e-8)
     assert result.standard_errors == pytest.approx(np.sqrt(np.diag(P)), rel=1e-6)
-    bounded = fit_of(open_together([path], Informed(MODEL, (Known("k", positive=True),))))
+    bounded = fit_of(open_together([path], ConstrainedModel(MODEL, (ParameterInfo("k", positive=True),))))
     assert bounded.x == pytest.approx(x, rel=1e-8)
 
 

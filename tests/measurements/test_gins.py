@@ -9,7 +9,7 @@ from gins_reference import velocities
 from scipy.integrate import DOP853, solve_ivp
 
 from ipe_bench.measurements import Gins
-from ipe_bench.measurements.base import Restricted
+from ipe_bench.measurements.base import SubsetModel
 from ipe_bench.measurements.ode.levels import Search
 from ipe_bench.noise import Quantization
 from ipe_bench.trials.scenario import Scenario
@@ -224,7 +224,7 @@ def test_a_jacobian_costs_what_the_kernel_computes():
     assert 10.5 < Gins().jacobian_cost < 11.5
     assert Plain().jacobian_cost > 1.3 * Gins().jacobian_cost
     assert Gins().coarse_jacobian_cost < 3.0
-    assert Restricted.until(Gins(), 5).jacobian_cost == Gins().jacobian_cost
+    assert SubsetModel.until(Gins(), 5).jacobian_cost == Gins().jacobian_cost
     assert Gins(step=60.0).coarse_jacobian_cost == Gins().jacobian_cost
 
 
@@ -245,7 +245,7 @@ def test_bits_of_a_coarse_jacobian_depend_on_the_trial_alone():
     assert (Gins().coarse_jacobian(x[::-1]) == coarse[::-1]).all()
     part = model.coarse_jacobian_until(x, 4)
     assert (np.concatenate([Gins().coarse_jacobian_until(row[None], 4) for row in x]) == part).all()
-    assert (Restricted.until(model, 4).coarse_jacobian(x) == part).all()
+    assert (SubsetModel.until(model, 4).coarse_jacobian(x) == part).all()
 
 
 @pytest.mark.parametrize("scale", [300.0, 3000.0, 10000.0])

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from ipe_bench.basics import compiled
-from ipe_bench.measurements import LotkaVolterra, Ode, OdeMeasurement, Parameter, Restricted
+from ipe_bench.measurements import LotkaVolterra, Ode, OdeMeasurement, Parameter, SubsetModel
 from ipe_bench.measurements.joint import Joint
-from ipe_bench.measurements.known import Informed, Known
+from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.measurements.ode.coarse import contraction
 from ipe_bench.measurements.ode.interval import Interval
 from ipe_bench.measurements.ode.tableau import DOP853
@@ -228,11 +228,11 @@ def check(law, gaps, given, batch, seed):
     for stop in {1, (len(gaps) + 1) // 2, len(gaps)}:
         rows = model.rows(stop)
         same(model.simulate_until(x, stop), z[:, rows]), same(model.jacobian_until(x, stop), J[:, rows])
-        same(Restricted.until(model, stop).simulate(x), z[:, rows])
-        near = Restricted.until(model, stop, coarse=True)
+        same(SubsetModel.until(model, stop).simulate(x), z[:, rows])
+        near = SubsetModel.until(model, stop, coarse=True)
         assert np.abs(near.simulate(x) - z[:, rows]).max() < 10 * TOLERANCE * max(1.0, np.abs(z).max())
     kept = tuple(range(seed % 2, model.m, 2)) or (0,)
-    same(Restricted(model, kept).simulate(x), z[:, kept]), same(Restricted(model, kept).jacobian(x), J[:, kept])
+    same(SubsetModel(model, kept).simulate(x), z[:, kept]), same(SubsetModel(model, kept).jacobian(x), J[:, kept])
     other = Written(law, (0.0, 0.5), model.given)
     both = Joint((model, other))
     same(both.simulate(x), np.concatenate([z, other.simulate(x)], axis=1))
@@ -247,7 +247,7 @@ def check(law, gaps, given, batch, seed):
     longest = max([*gaps, 1e-3])
     fixed = Written(law, model.at, model.given, step=longest / 64)
     assert np.abs(fixed.simulate(x)[-1] - exact).max() < 10 * TOLERANCE * max(1.0, np.abs(exact).max())
-    positive = Informed(model, (Known("p0", positive=True),))
+    positive = ConstrainedModel(model, (ParameterInfo("p0", positive=True),))
     inner = positive.inner(x)
     np.testing.assert_allclose(positive.simulate(inner), z, rtol=0, atol=TOLERANCE * max(1.0, np.abs(z).max()))
     ascending = all(gap > 0.0 for gap in gaps[1:])

@@ -35,7 +35,7 @@ def epidemic(t, beta, gamma, infected, population=763.0):
     ).y
 
 
-def natural(model, x):
+def physical(model, x):
     """beta, gamma and I(0), each (trials,), from x (trials, 3)."""
     beta, gamma, odds = np.array([1.66, 0.44, 1.0 / 762.0])[:, None] * np.exp(x * model.sizes).T
     return beta, gamma, 763.0 * odds / (1.0 + odds)
@@ -44,7 +44,7 @@ def natural(model, x):
 def test_the_quantity_that_the_equations_conserve_is_conserved():
     model = Sir(observed=("susceptible", "infected", "removed"))
     x = draw(model)
-    beta, gamma, infected = (value[:, None] for value in natural(model, x))
+    beta, gamma, infected = (value[:, None] for value in physical(model, x))
     S, I, R = np.moveaxis(model.simulate(x).reshape(len(x), -1, 3), 2, 0)  # noqa: E741
     conserved = S + I - 763.0 * gamma / beta * np.log(S)
     start = 763.0 - 763.0 * gamma / beta * np.log(763.0 - infected)
@@ -61,7 +61,7 @@ def test_an_epidemic_that_is_over_has_its_final_size():
 def test_readings_agree_with_an_adaptive_integrator():
     model = Sir()
     x = draw(model, 5)
-    for z, *values in zip(model.simulate(x), *natural(model, x), strict=True):
+    for z, *values in zip(model.simulate(x), *physical(model, x), strict=True):
         np.testing.assert_allclose(z, epidemic(model.times, *values)[1], atol=1e-6)
 
 
@@ -77,7 +77,7 @@ def test_the_boarding_school_is_estimated_as_scipy_estimates_it():
     estimates = MultiscaleLM().estimate(Problem(model, Covariance(np.full(14, 20.0))), IN_BED[None])
     assert estimates.status[0] == 0
     theirs, _ = curve_fit(lambda t, *p: epidemic(t, *np.exp(p))[1], model.times, IN_BED, np.log([1.66, 0.44, 1.0]))
-    np.testing.assert_allclose(np.ravel(natural(model, estimates.x)), np.exp(theirs), rtol=1e-4)
+    np.testing.assert_allclose(np.ravel(physical(model, estimates.x)), np.exp(theirs), rtol=1e-4)
     residuals = IN_BED - model.simulate(estimates.x)[0]
     assert 15.0 < np.sqrt(residuals @ residuals / 11) < 25.0
 

@@ -12,7 +12,7 @@ from scipy import optimize, stats
 import ipe_bench as ib
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.measurements import Gins, Measurement, Parameter, RicherGins
-from ipe_bench.measurements.base import Restricted
+from ipe_bench.measurements.base import SubsetModel
 from ipe_bench.trials.design import design
 from ipe_bench.trials.observability import Observability, in_words, suspects
 
@@ -316,7 +316,7 @@ def test_whole_cases_are_options_and_single_readings_a_restriction():
     assert isinstance(two, Gins)
     assert two.injected == ((0.0, 1500.0), (1299.038, 750.0))
     few = more.taking([0, 5, 700])
-    assert isinstance(few, Restricted)
+    assert isinstance(few, SubsetModel)
     assert isinstance(few.whole, Gins)
     assert len(few.whole.cases) == 2
     x = 10 * np.random.default_rng(2).normal(size=(2, 11))

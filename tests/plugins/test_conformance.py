@@ -13,7 +13,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.measurements import Formula, Gnss, Nist, Ode, Polynomial, Ranging
 from ipe_bench.measurements.joint import Joint
-from ipe_bench.measurements.known import Informed, Known
+from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.measurements.nist import datasets
 from ipe_bench.noise import Colored, Gaussian, Noise, Quantization
 from ipe_bench.plugins import discovery as plugins
@@ -323,7 +323,7 @@ def test_a_fault_in_one_check_leaves_the_others_ok():
             {"all": "x+y"},
             (0.5, 2.0, 3.0),
         ),
-        Informed(Ranging(), (Known("clock", fixed=3.0), Known("up", lower=-50.0, upper=90.0))),
+        ConstrainedModel(Ranging(), (ParameterInfo("clock", fixed=3.0), ParameterInfo("up", lower=-50.0, upper=90.0))),
         Joint((Gnss(), Gnss(rounds=2))),
     ],
     ids=["formula", "ode", "informed", "joint"],

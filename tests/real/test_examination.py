@@ -119,7 +119,7 @@ def test_profile_intervals_of_an_epidemic_counted_four_times_cover_the_truth():
     problem = Problem(model, Gaussian(20.0).covariance(4))
     estimates = LM["lm"].estimate(problem, z)
     found = profiles(problem, z, estimates.x, estimates.covariance)
-    covered, short = coverage(found, model.natural(model.nominal[None])[0])
+    covered, short = coverage(found, model.physical(model.nominal[None])[0])
     assert np.abs(covered - 0.95).max() <= 0.02
     assert short[2] < 0.91
 

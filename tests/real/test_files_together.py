@@ -15,7 +15,7 @@ import ipe_bench as ib
 from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Formula, Sir
-from ipe_bench.measurements.known import Informed, Known, informed
+from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo, informed
 from ipe_bench.noise import Gaussian, ModelNoise
 from ipe_bench.real.sources import LeftOut, Readings, open_together
 
@@ -30,7 +30,7 @@ def files(tmp_path) -> tuple[list[Path], list[np.ndarray]]:
     return [path for path, _ in found], [columns for _, columns in found]
 
 
-def together(paths: list[Path], *known: Known) -> Readings:
+def together(paths: list[Path], *known: ParameterInfo) -> Readings:
     """The files with what is known of the parameters that they have together."""
     found = open_together(paths, OWN)
     return replace(found, model=informed(found.model, known))
@@ -45,13 +45,13 @@ def residuals(data, p, q, rate):
 
 
 def of(result, values) -> dict[str, float]:
-    return dict(zip([p.name for p in result.model.natural_parameters], values, strict=True))
+    return dict(zip([p.name for p in result.model.physical_parameters], values, strict=True))
 
 
 def test_bounds_that_do_not_act_change_nothing(files):
     paths, data = files
-    known = (Known("b1", lower=100.0, upper=300.0), Known("b2", positive=True))
-    result = estimate(open_together(paths, Informed(OWN, known)))
+    known = (ParameterInfo("b1", lower=100.0, upper=300.0), ParameterInfo("b2", positive=True))
+    result = estimate(open_together(paths, ConstrainedModel(OWN, known)))
     x, deviations = solution(lambda p: residuals(data, *p), [250, 250, 5e-4])
     assert of(result, result.x) == pytest.approx({"b1_1": x[0], "b1_2": x[1], "b2": x[2]}, rel=1e-8)
     assert of(result, result.standard_errors) == pytest.approx(
@@ -61,7 +61,7 @@ def test_bounds_that_do_not_act_change_nothing(files):
 
 def test_a_parameter_of_one_file_may_be_known_there(files):
     paths, data = files
-    result = estimate(together(paths, Known("b1", lower=0.0), Known("b1_2", fixed=181.0)))
+    result = estimate(together(paths, ParameterInfo("b1", lower=0.0), ParameterInfo("b1_2", fixed=181.0)))
     x, deviations = solution(lambda p: residuals(data, p[0], 181.0, p[1]), [250, 5e-4])
     assert of(result, result.x) == pytest.approx({"b1_1": x[0], "b2": x[1]}, rel=1e-8)
     assert of(result, result.standard_errors) == pytest.approx({"b1_1": deviations[0], "b2": deviations[1]}, rel=1e-8)
@@ -71,7 +71,7 @@ def test_a_parameter_of_one_file_may_be_known_there(files):
 
 def test_a_common_parameter_may_be_fixed_for_all(files):
     paths, data = files
-    result = estimate(open_together(paths, Informed(OWN, (Known("b2", fixed=5.5e-4),))))
+    result = estimate(open_together(paths, ConstrainedModel(OWN, (ParameterInfo("b2", fixed=5.5e-4),))))
     x, _ = solution(lambda p: residuals(data, p[0], p[1], 5.5e-4), [250, 250])
     assert of(result, result.x) == pytest.approx({"b1_1": x[0], "b1_2": x[1]}, rel=1e-8)
 
@@ -79,7 +79,7 @@ def test_a_common_parameter_may_be_fixed_for_all(files):
 def test_a_bound_acts_in_the_file_that_it_is_of(files):
     """On the bound in one file and free in the other, where SciPy's bounded minimum is."""
     paths, data = files
-    known = (Known("b1", lower=100.0, upper=300.0), Known("b1_2", nominal=160.0, upper=176.0))
+    known = (ParameterInfo("b1", lower=100.0, upper=300.0), ParameterInfo("b1_2", nominal=160.0, upper=176.0))
     result = estimate(together(paths, *known))
     bounded = least_squares(
         lambda p: residuals(data, 100 * p[0], 100 * p[1], 1e-4 * p[2]),
@@ -91,7 +91,7 @@ def test_a_bound_acts_in_the_file_that_it_is_of(files):
     )
     expected = dict(zip(("b1_1", "b1_2", "b2"), bounded.x * [100, 100, 1e-4], strict=True))
     assert of(result, result.x) == pytest.approx(expected, rel=1e-5)
-    assert [result.model.natural_parameters[k].name for k in result.held_at] == ["b1_2"]
+    assert [result.model.physical_parameters[k].name for k in result.held_at] == ["b1_2"]
     _x, deviations = solution(lambda p: residuals(data, p[0], 176.0, p[1]), [250, 5e-4])
     errors = of(result, result.standard_errors)
     assert np.isnan(errors["b1_2"])
@@ -104,7 +104,7 @@ def test_the_noise_of_a_model_is_that_of_its_files_in_whatever_order_they_are(tm
     for name, own in (("a", rows), ("b", rows[::-1])):
         (tmp_path / f"{name}.csv").write_text("\n".join(["time [day],reading [people]", *own]))
     for paths in ([tmp_path / "a.csv"], [tmp_path / "a.csv", tmp_path / "b.csv"]):
-        for model in (Sir(), Informed(Sir(), (Known("ln_gamma", lower=-0.9),))):
+        for model in (Sir(), ConstrainedModel(Sir(), (ParameterInfo("ln_gamma", lower=-0.9),))):
             found = open_together(paths, model)
             assert ModelNoise().of(found.model) == Gaussian(20.0)
             (result,) = ib.estimate(model, list(paths), LM)
@@ -115,15 +115,18 @@ def test_a_file_may_have_fewer_readings_than_the_model_has_parameters(tmp_path):
     first, _columns = simulated(tmp_path / "a.csv", 240.0, 5)
     (tmp_path / "b.csv").write_text("t,y,sigma\n400,36.2,0.5\n")
     result = estimate(open_together([first, tmp_path / "b.csv"], OWN))
-    assert {p.name for p in result.model.natural_parameters} == {"b1_1", "b1_2", "b2"}
+    assert {p.name for p in result.model.physical_parameters} == {"b1_1", "b1_2", "b2"}
     alone = estimate(open_together([first], OWN))
     # One reading and one parameter more: the first file's answer is its own.
     assert of(result, result.x)["b1_1"] == pytest.approx(alone.x[0], rel=1e-7)
 
 
 MISTAKES = {
-    "no such file's": (Known("b1_3", fixed=1.0), r"parameters.b1_3: there is no such parameter; did you mean b1_2"),
-    "start outside": (Known("b1_2", upper=200.0), r"parameters.b1_2: its start, 250, is not inside"),
+    "no such file's": (
+        ParameterInfo("b1_3", fixed=1.0),
+        r"parameters.b1_3: there is no such parameter; did you mean b1_2",
+    ),
+    "start outside": (ParameterInfo("b1_2", upper=200.0), r"parameters.b1_2: its start, 250, is not inside"),
 }
 
 

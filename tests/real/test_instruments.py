@@ -13,7 +13,7 @@ from ipe_bench.baselines import GaussNewton, LevenbergMarquardt
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements import Formula, Gins, Gnss, LotkaVolterra, Sir
-from ipe_bench.measurements.known import Informed, Known
+from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, ModelNoise, Quantization, Unknown
 from ipe_bench.priors import GaussianPrior
@@ -70,7 +70,7 @@ def test_weights_of_the_file_are_those_of_the_fit(tmp_path):
 def test_a_fixed_parameter_is_not_estimated_and_costs_no_degree_of_freedom(tmp_path):
     path, columns = simulated(tmp_path / "a.csv", 240.0, 2)
     t, y, sigma = columns.T
-    found = open_readings(path, Informed(Formula(SATURATION, START), (Known("b2", fixed=5.7e-4),)))
+    found = open_readings(path, ConstrainedModel(Formula(SATURATION, START), (ParameterInfo("b2", fixed=5.7e-4),)))
     result = estimate(found)
     x, deviations = solution(lambda p: (p[0] * (1 - np.exp(-5.7e-4 * t)) - y) / sigma, [250])
     assert result.x == pytest.approx(x, rel=1e-8)
@@ -82,15 +82,15 @@ def test_a_fixed_parameter_is_not_estimated_and_costs_no_degree_of_freedom(tmp_p
 @pytest.mark.parametrize(
     "known",
     [
-        (Known("b1", lower=100.0, upper=300.0), Known("b2", positive=True)),
-        (Known("b1", upper=260.0), Known("b2", lower=1e-5)),
-        (Known("b1", nominal=200.0), Known("b2", nominal=8e-4, lower=0.0, upper=1e-3)),
+        (ParameterInfo("b1", lower=100.0, upper=300.0), ParameterInfo("b2", positive=True)),
+        (ParameterInfo("b1", upper=260.0), ParameterInfo("b2", lower=1e-5)),
+        (ParameterInfo("b1", nominal=200.0), ParameterInfo("b2", nominal=8e-4, lower=0.0, upper=1e-3)),
     ],
 )
 def test_bounds_move_neither_a_minimum_inside_of_them_nor_its_standard_errors(tmp_path, known):
     path, columns = simulated(tmp_path / "a.csv", 240.0, 3)
     t, y, sigma = columns.T
-    result = estimate(open_readings(path, Informed(Formula(SATURATION, START), known)))
+    result = estimate(open_readings(path, ConstrainedModel(Formula(SATURATION, START), known)))
     x, deviations = solution(lambda p: (p[0] * (1 - np.exp(-p[1] * t)) - y) / sigma, [250, 5e-4])
     assert result.status is Status.CONVERGED
     assert result.x == pytest.approx(x, rel=1e-8)
@@ -105,8 +105,8 @@ def test_an_estimate_on_its_bound_is_the_minimum_within_the_bounds(tmp_path, upp
     """Against SciPy's bounded solution; what is on the bound has no error, and the others' are with it held there."""
     path, columns = simulated(tmp_path / "a.csv", 240.0, 3)
     t, y, sigma = columns.T
-    known = (Known("b1", nominal=200.0, lower=100.0, upper=upper), Known("b2", positive=True))
-    result = estimate(open_readings(path, Informed(Formula(SATURATION, START), known)), level_unknown=unknown)
+    known = (ParameterInfo("b1", nominal=200.0, lower=100.0, upper=upper), ParameterInfo("b2", positive=True))
+    result = estimate(open_readings(path, ConstrainedModel(Formula(SATURATION, START), known)), level_unknown=unknown)
     bounded = least_squares(
         lambda p: (p[0] * 100 * (1 - np.exp(-p[1] * 1e-4 * t)) - y) / sigma,
         [2.0, 5.0],
@@ -130,8 +130,8 @@ def test_a_minimum_near_a_bound_but_inside_is_not_on_it(tmp_path):
     path, columns = simulated(tmp_path / "a.csv", 240.0, 3)
     t, y, sigma = columns.T
     x, deviations = solution(lambda p: (p[0] * (1 - np.exp(-p[1] * t)) - y) / sigma, [250, 5e-4])
-    known = (Known("b1", nominal=200.0, upper=x[0] * 1.0005),)
-    result = estimate(open_readings(path, Informed(Formula(SATURATION, START), known)))
+    known = (ParameterInfo("b1", nominal=200.0, upper=x[0] * 1.0005),)
+    result = estimate(open_readings(path, ConstrainedModel(Formula(SATURATION, START), known)))
     assert result.held_at == {}
     assert result.x == pytest.approx(x, rel=1e-8)
     assert result.standard_errors == pytest.approx(deviations, rel=1e-8)
@@ -148,7 +148,7 @@ def test_files_share_the_parameters_that_are_not_their_own(tmp_path):
         return np.concatenate(parts)
 
     x, deviations = solution(residuals, [250, 250, 5e-4])
-    names = [p.name for p in result.model.natural_parameters]
+    names = [p.name for p in result.model.physical_parameters]
     assert names == ["b1_1", "b2", "b1_2"]
     order = [names.index(name) for name in ("b1_1", "b1_2", "b2")]
     assert result.x[order] == pytest.approx(x, rel=1e-8)
@@ -157,7 +157,9 @@ def test_files_share_the_parameters_that_are_not_their_own(tmp_path):
 
 def test_several_files_of_a_bounded_model_are_estimated_together_too(tmp_path):
     paths, data = zip(*(simulated(tmp_path / f"{k}.csv", 240.0, k, 12) for k in range(2)), strict=True)
-    model = Informed(Formula(SATURATION, START), (Known("b1", lower=100.0, upper=300.0), Known("b2", positive=True)))
+    model = ConstrainedModel(
+        Formula(SATURATION, START), (ParameterInfo("b1", lower=100.0, upper=300.0), ParameterInfo("b2", positive=True))
+    )
     t, y, sigma = np.concatenate(data).T
     x, deviations = solution(lambda p: (p[0] * (1 - np.exp(-p[1] * t)) - y) / sigma, [250, 5e-4])
     result = estimate(open_together(list(paths), model))
@@ -166,11 +168,12 @@ def test_several_files_of_a_bounded_model_are_estimated_together_too(tmp_path):
 
 
 def test_draws_of_a_positive_parameter_are_log_normal_and_of_a_bounded_one_inside():
-    model = Informed(
-        LotkaVolterra(), (Known("birth", positive=True, deviation=0.3), Known("death", lower=0.5, upper=1.0))
+    model = ConstrainedModel(
+        LotkaVolterra(),
+        (ParameterInfo("birth", positive=True, deviation=0.3), ParameterInfo("death", lower=0.5, upper=1.0)),
     )
     scenario = Scenario(model, Gaussian(0.5), GaussianPrior(model.prior_deviations), 1.0)
-    values = model.natural(
+    values = model.physical(
         np.stack([scenario.prior.draw(model.nominal, 1.0, rng) for rng in map(np.random.default_rng, range(2000))])
     )
     birth, death = values[:, 0], values[:, 2]
@@ -181,15 +184,15 @@ def test_draws_of_a_positive_parameter_are_log_normal_and_of_a_bounded_one_insid
 
 
 def test_every_coordinate_of_a_known_parameter_leads_back_to_its_value():
-    known = (Known("b1", lower=-3.0, upper=300.0), Known("b2", upper=2e-3))
-    model = Informed(Formula(SATURATION, START, {"t": (1.0, 2.0, 3.0)}), known)
+    known = (ParameterInfo("b1", lower=-3.0, upper=300.0), ParameterInfo("b2", upper=2e-3))
+    model = ConstrainedModel(Formula(SATURATION, START, {"t": (1.0, 2.0, 3.0)}), known)
     x = np.random.default_rng(0).normal(size=(50, 2))
-    assert model.inner(model.natural(x)) == pytest.approx(x, abs=1e-9)
+    assert model.inner(model.physical(x)) == pytest.approx(x, abs=1e-9)
     h = 1e-6
     for k in range(2):
         step = h * np.eye(2)[k]
-        difference = (model.natural(x + step) - model.natural(x - step))[:, k] / (2 * h)
-        assert model.natural_slope(x)[:, k] == pytest.approx(difference, rel=1e-6, abs=1e-6)
+        difference = (model.physical(x + step) - model.physical(x - step))[:, k] / (2 * h)
+        assert model.physical_slope(x)[:, k] == pytest.approx(difference, rel=1e-6, abs=1e-6)
 
 
 def test_a_satellite_file_brings_its_own_sky(tmp_path):

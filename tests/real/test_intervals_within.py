@@ -11,7 +11,7 @@ from small_models import Bent
 import ipe_bench as ib
 from ipe_bench.baselines import EKF, GaussNewton, LevenbergMarquardt, MapLM
 from ipe_bench.measurements import Formula
-from ipe_bench.measurements.known import Informed, Known
+from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.noise import Gaussian, Unknown
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.real.examination import examine, examine_with_prior
@@ -94,7 +94,7 @@ def test_truths_of_the_prior_are_in_the_penalised_profiles_as_often_as_they_say(
     problem, _ = penalised(bench.problem, drawn.z[0], 1.0)
     z = np.column_stack([drawn.z, np.repeat(problem.x0[None], trials, axis=0)])
     found = profiles(problem, z, estimates.x, estimates.covariance)
-    truth = model.natural(drawn.x)
+    truth = model.physical(drawn.x)
     inside = np.array(
         [[p.low <= v <= p.high for p, v in zip(row, x, strict=True)] for row, x in zip(found, truth, strict=True)]
     )
@@ -114,8 +114,8 @@ def test_the_interval_of_a_linear_parameter_on_its_bound_is_known(beyond, side):
     s = 0.7 * np.sqrt(np.linalg.inv(A.T @ A)[1, 1])
     z = 2 + 5 * t  # the unbounded estimate is 5
     bound = 5 - side * (beyond * s + 1e-9)
-    known = Known("b", nominal=5 - 9 * side, **{"upper" if side > 0 else "lower": bound})
-    model = Informed(Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)}), (known,))
+    known = ParameterInfo("b", nominal=5 - 9 * side, **{"upper" if side > 0 else "lower": bound})
+    model = ConstrainedModel(Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)}), (known,))
     problem = Scenario(model, Gaussian(0.7)).problem
     found = examine(problem, z, fit(problem, z, LM))
     assert found is not None
@@ -133,8 +133,8 @@ def test_profiles_of_the_others_let_a_parameter_leave_its_bound_inwards(side):
     P = 0.49 * np.linalg.inv(A.T @ A)
     sa, sb, c = *np.sqrt(np.diag(P)), P[0, 1]
     bound = 5 - side * 0.8 * sb
-    known = Known("b", nominal=5 - 9 * side, **{"upper" if side > 0 else "lower": bound})
-    model = Informed(Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)}), (known,))
+    known = ParameterInfo("b", nominal=5 - 9 * side, **{"upper" if side > 0 else "lower": bound})
+    model = ConstrainedModel(Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)}), (known,))
     problem = Scenario(model, Gaussian(0.7)).problem
     z = 2 + 5 * t
     found = examine(problem, z, fit(problem, z, LM))
@@ -161,7 +161,7 @@ def test_the_interval_on_a_bound_is_where_scipys_profile_rises():
     t = np.linspace(50, 700, 14)
     z = -240 * np.expm1(-5.6e-4 * t) + 0.1 * rng.standard_normal(14)
     model = Formula("b1*(1-exp(-b2*t))", {"b1": 200.0, "b2": 5e-4}, {"t": tuple(t)})
-    problem = Scenario(Informed(model, (Known("b1", upper=235.0),)), Gaussian(0.1)).problem
+    problem = Scenario(ConstrainedModel(model, (ParameterInfo("b1", upper=235.0),)), Gaussian(0.1)).problem
     found = examine(problem, z, fit(problem, z, LM))
     assert found is not None
 
@@ -178,8 +178,8 @@ def test_the_interval_on_a_bound_is_where_scipys_profile_rises():
 
 def test_an_interval_ends_at_the_other_bound_where_the_readings_say_nothing():
     t = np.arange(6.0)
-    known = Known("b", nominal=0.5, lower=0.0, upper=1.0)
-    model = Informed(Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)}), (known,))
+    known = ParameterInfo("b", nominal=0.5, lower=0.0, upper=1.0)
+    model = ConstrainedModel(Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)}), (known,))
     problem = Scenario(model, Gaussian(30.0)).problem
     z = 2 + 5 * t
     found = examine(problem, z, fit(problem, z, LM))
@@ -193,7 +193,7 @@ TIMES = np.linspace(0, 6, 25)
 def decay_above_zero(c: float, seed: int, bootstraps: int = 500):
     """A decay to c, which cannot be negative, read 25 times with errors of .05."""
     model = Formula("a*exp(-b*t)+c", {"a": 1.0, "b": 0.5, "c": 0.1}, {"t": tuple(TIMES)})
-    problem = Scenario(Informed(model, (Known("c", lower=0.0),)), Gaussian(0.05)).problem
+    problem = Scenario(ConstrainedModel(model, (ParameterInfo("c", lower=0.0),)), Gaussian(0.05)).problem
     z = 2 * np.exp(-0.7 * TIMES) + c + 0.05 * np.random.default_rng(seed).standard_normal(25)
     fits = fit(problem, z, LM)
     return fits[0], examine(problem, z, fits, bootstraps=bootstraps)

@@ -10,7 +10,7 @@ import ipe_bench as ib
 from ipe_bench.baselines import CKF, EKF, IPLF, LMIEKF, UKF, EnKF, EsMda, IteratedEKF, MapLM
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Formula
-from ipe_bench.measurements.known import Known, informed
+from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins.conformance import check_component
@@ -92,7 +92,9 @@ def test_residuals_of_the_maximum_a_posteriori_scatter_as_is_said(bench):
 
 
 def test_a_covariance_is_of_the_parameters_in_their_own_units_and_logarithms():
-    model = informed(Formula("a*exp(-b*t)", {"a": 8.0, "b": 0.2}, {"t": (0.0, 1.0, 2.0)}), (Known("b", positive=True),))
+    model = informed(
+        Formula("a*exp(-b*t)", {"a": 8.0, "b": 0.2}, {"t": (0.0, 1.0, 2.0)}), (ParameterInfo("b", positive=True),)
+    )
     P = np.array([[0.25, 0.006], [0.006, 0.0004]])
     problem = Scenario(model, Gaussian(1.0), prior_of(model, P)).problem
     inner = problem.prior_covariance().matrix()  # type: ignore[union-attr]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.measurements.base import Input, Measurement, Restricted
+from ipe_bench.measurements.base import Input, Measurement, SubsetModel
 
 
 def time_heading(unit: str) -> str:
@@ -66,4 +66,4 @@ def sampled(
         ((case - 1) * len(times) + place[float(time)]) * len(outputs) + list(outputs).index(output)
         for case, time, output in rows
     )
-    return whole if kept == tuple(range(whole.m)) else Restricted(whole, kept)
+    return whole if kept == tuple(range(whole.m)) else SubsetModel(whole, kept)

@@ -16,7 +16,7 @@ MOST_PANELS = 9
 
 def draw(found: Examination) -> Iterator[Drawing]:
     """A panel for each parameter whose interval from the standard error is off by more than a tenth."""
-    names = found.model.natural_parameters
+    names = found.model.physical_parameters
     bent = [i for i, one in enumerate(found.profiles) if one.bent][:MOST_PANELS]
     if not bent:
         return

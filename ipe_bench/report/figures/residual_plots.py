@@ -147,7 +147,7 @@ def _ellipses(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look])
         seen |= near
         away |= {f.label for f in converged} - near
         for set_label, k in zip((ax.set_xlabel, ax.set_ylabel), pair, strict=True):
-            parameter = model.natural_parameters[k]
+            parameter = model.physical_parameters[k]
             unit = f" [{parameter.unit}]" if parameter.unit else ""
             sign = "+" if best.x[k] < 0 else "−"
             set_label(common.text(f"{parameter.name} {sign} {abs(best.x[k]):.5g}{unit}"))
