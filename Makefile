@@ -46,7 +46,8 @@ bench: .venv/ready
 	$(if $(PEERS),$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[peers]")
 	IPE_BENCH_THREADS=1 OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks/table.py outputs/bench $(PARTS)
 
-# The documentation, with every experiment executed, in outputs/docs/html. TRIALS=100 makes the gallery's figures finer.
+# The documentation, with every experiment executed, in outputs/docs/html, in minutes. TRIALS=1000 gives the gallery all
+# the trials that experiments have by themselves.
 docs: .venv/ready
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[docs]"
 	$(BIN)/python -m ipe_bench.report.docs outputs/docs $(if $(TRIALS),--trials $(TRIALS))

@@ -24,6 +24,7 @@ def build(output: Path, trials: int, experiments: Sequence[str] | None = None) -
     shutil.rmtree(source, ignore_errors=True)
     with as_file(files("ipe_bench.report.docs") / "pages") as pages:
         shutil.copytree(pages, source)
+    print("reference pages ...", flush=True)
     write_reference(source / "reference")
     write_gallery(source / "gallery", output / "results", trials, experiments)
     site = Sphinx(
