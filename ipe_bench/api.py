@@ -356,7 +356,7 @@ def design(
     will notice), `ways` and `effects`. A way chooses by one column of the model's index, all else as today, or
     reading by reading; `by` names the columns of one way instead. Its `saving` is the choice of fewest readings whose
     mean bound is not above today's, its `sharpest` the smallest mean bound with `readings` readings (today's number
-    where it is None); both say below which bound no choice can go. `measurement(choice)` is the model with those
+    where it is None); units that gain most are taken one after another. `measurement(choice)` is the model with those
     readings.
     Bounds are averaged over truths from the prior: as squares over parameters in units of today's bound
     (`criterion` A), or as the volume of the ellipsoid (D).

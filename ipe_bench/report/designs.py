@@ -122,15 +122,15 @@ def _ways(design: Design) -> Iterator[Part]:
     rows = []
     for way in design.ways:
         few, best = way.saving, way.sharpest
-        cells = [f"{few.readings}", f"{few.mean_bound:.3f}", f"{few.least:.3f}"] if few else [f"{today}", "1", ""]
-        rows.append([*cells, f"{best.readings}", f"{best.mean_bound:.3f}", f"{best.least:.3f}"])
-    titles = ("fewest readings", "bound", "none below", "at most", "smallest bound", "none below")
+        cells = [f"{few.readings}", f"{few.mean_bound:.3f}"] if few else [f"{today}", "1"]
+        rows.append([*cells, f"{best.readings}", f"{best.mean_bound:.3f}"])
+    titles = ("fewest readings", "bound", "at most", "smallest bound")
     columns = [words("chosen", [way.title for way in design.ways])]
     columns += [texts(title, cells) for title, cells in zip(titles, zip(*rows, strict=True), strict=True)]
     title = f"What to take instead (bounds as shares of today's, criterion {design.criterion})"
     note = (
-        f"fewest readings: with no larger bound than today's {today}. none below: no choice of so many readings among"
-        f" the {design.candidates.m} candidates, in this way, has a smaller one."
+        f"fewest readings: with no larger bound than today's {today}. Of {design.candidates.m} candidates those that"
+        " gain most are taken one after another; another choice may be a little better."
     )
     yield Table("ways", title, "", columns, notes=[note], repeated=1)
     for way in design.ways:
@@ -239,7 +239,6 @@ def _chosen(design: Design, way: Way, choice: Choice) -> dict[str, Any]:
     options = {name: value for name, value in describe(model).items() if value != before.get(name)}
     return {
         **picked(choice, "readings", "mean_bound"),
-        "no_design_below": choice.least,
         "units": [plain(way.units.entries[u]) for u in choice.taken],
         "options": options if type(model) is type(today) else None,
     }

@@ -1,8 +1,7 @@
 """What to measure next: which of the readings that a model could take to add, to drop, or to take instead.
 
-Designs are optimal on average over truths from the prior (Chaloner and Larntz, J. Stat. Plan. Inference 21, 1989), by
-exchange (Mitchell, Technometrics 16, 1974), and come with a bound below which no choice of so many readings can go.
-What readings say about each parameter is in `observability`; pictures and words are left to the report.
+Designs are good on average over truths from the prior (Chaloner and Larntz, J. Stat. Plan. Inference 21, 1989): they
+take, one after another, the readings that gain most. What readings say about each parameter is in `observability`.
 """
 
 from __future__ import annotations
@@ -28,10 +27,6 @@ SUSPECTED = 5
 """Truths at which unmodelled errors are tried: each takes two simulations of each of them."""
 _POINTS = 16
 """Numbers of readings on a curve."""
-_ROUNDS = 200
-"""Exchanges, and steps towards the bound on what any design can reach, at most."""
-_CLOSE = 2e-3
-"""A bound on designs that is this near to the best one is near enough."""
 _WEAK = 1e-8
 """What every choice is taken to know beforehand, as a share of what all candidates together say: the first readings
 chosen do not determine the parameters by themselves."""
@@ -79,8 +74,6 @@ class Choice:
     mean_bound: float
     """The bound as a share of today's, over parameters and truths: the root of the mean square (A), or the geometric
     mean along the ellipsoid's axes (D). Infinite where the readings leave a direction open."""
-    least: float = 0.0
-    """No choice of so many readings among the candidates has a mean bound below this."""
 
     @property
     def readings(self) -> int:
@@ -93,9 +86,9 @@ class Way:
 
     units: Units
     curve: tuple[Choice, ...]
-    """The best choice found at each of some numbers of readings, ascending."""
+    """The choice at each of some numbers of readings, ascending."""
     saving: Choice | None
-    """The fewest readings whose mean bound is not above today's; None where that takes as many as today."""
+    """The smallest choice whose mean bound is not above today's; None where that takes as many readings as today."""
     sharpest: Choice
     """The smallest mean bound with no more readings than today."""
 
@@ -264,7 +257,8 @@ def _today_information(model: Measurement, R: Any, x: Array, reference: Observab
 
 @dataclass(frozen=True)
 class _Judge:
-    """A criterion to be small, over information matrices M (truths, n, n) in units of today's bounds."""
+    """A criterion to be small, over information matrices M (truths, n, n) in units of today's bounds: tr M^-1 / n, or
+    -log det M / n, averaged over the truths, with the little that is known beforehand."""
 
     criterion: Criterion
     everything: Array
@@ -279,13 +273,6 @@ class _Judge:
         value = judge.value(today)
         return replace(judge, today=value) if np.isfinite(value) else judge
 
-    def loss(self, M: Array) -> float:
-        """tr M^-1 / n, or -log det M / n, averaged over the truths, with the little that is known beforehand."""
-        M = M + _WEAK * self.everything
-        if self.criterion == "D":
-            return -float(np.linalg.slogdet(M)[1].mean()) / M.shape[-1]
-        return float(np.trace(np.linalg.inv(M), axis1=1, axis2=2).mean()) / M.shape[-1]
-
     def covariance(self, M: Array) -> Array:
         return np.linalg.inv(M + _WEAK * self.everything)
 
@@ -298,10 +285,6 @@ class _Judge:
             return float(np.exp(-0.5 * np.log(s).mean())) / self.today
         return float(np.sqrt((1 / s).mean())) / self.today
 
-    def as_bound(self, loss: float) -> float:
-        """The mean bound in units of today's that belongs to a loss."""
-        return float(np.exp(loss / 2) if self.criterion == "D" else np.sqrt(max(loss, 0.0))) / self.today
-
     def gains(self, P: Array, slopes: Array) -> Array:
         """By how much the loss falls with each further unit (units,), where P is the covariance without it."""
         B, K = self._products(P, slopes)
@@ -309,24 +292,6 @@ class _Judge:
         if self.criterion == "D":
             return _log_det(K)[1].mean(axis=0) / P.shape[-1]
         return np.einsum("turi,turi->u", B, _solved(K, B)) / (P.shape[0] * P.shape[-1])
-
-    def losses(self, P: Array, slopes: Array) -> Array:
-        """By how much the loss rises without each unit (units,), where P is the covariance with it."""
-        B, K = self._products(P, slopes)
-        K = np.eye(K.shape[-1]) - K
-        sign, log = _log_det(K)
-        lost = (sign <= 0).any(axis=0) | (log < np.log(_WEAK)).any(axis=0)
-        if self.criterion == "D":
-            return np.where(lost, np.inf, -log.mean(axis=0) / P.shape[-1])
-        safe = np.where(lost[None, :, None, None], np.eye(K.shape[-1]), K)
-        rise = np.einsum("turi,turi->u", B, _solved(safe, B)) / (P.shape[0] * P.shape[-1])
-        return np.where(lost, np.inf, rise)
-
-    def slopes(self, P: Array, slopes: Array) -> Array:
-        """By how much the loss falls with a little more of each unit (units,): the directional derivatives."""
-        B = _times(slopes, P)
-        other = slopes if self.criterion == "D" else B
-        return np.einsum("turi,turi->u", B, other) / (P.shape[0] * P.shape[-1])
 
     def _products(self, P: Array, slopes: Array) -> tuple[Array, Array]:
         """A P (truths, units, r, n) and A P A' (truths, units, r, r)."""
@@ -354,149 +319,45 @@ def _solved(K: Array, B: Array) -> Array:
 
 
 def _way(judge: _Judge, units: Units, today: int, most: int) -> Way | None:
-    """The curve and its two choices; None where there is nothing to choose."""
+    """The curve of the greedy choice, which adds the unit that gains most per reading, and the two choices on it; None
+    where there is nothing to choose."""
     if len(units.rows) < _FEW:
         return None
-    search = _Search(judge, units)
     reach = min(max(int(_REACH * today), most), int(units.sizes.sum()))
-    wanted = np.unique(np.round(np.geomspace(units.sizes.min(), reach, _POINTS)).astype(int))
-    start = np.zeros(len(units.rows), dtype=bool)
-    curve: list[Choice] = []
-    for budget in sorted({*wanted.tolist(), min(most, reach)}):
-        start = search.improved(search.grown(start, budget), budget)
-        choice = search.choice(start)
-        if np.isfinite(choice.mean_bound) and (not curve or choice.readings > curve[-1].readings):
-            curve.append(choice)
+    grown = _Grown(judge, units)
+    curve = [choice for choice in grown.choices(reach) if np.isfinite(choice.mean_bound)]
     within = [c for c in curve if c.readings <= most]
     if not within:
         return None
     if units.sizes[units.today].sum() <= most:
-        within.append(search.choice(search.improved(units.today, most)))
-    sharpest = search.certified(min(within, key=lambda c: c.mean_bound))
-    saving = search.fewest(curve, today)
-    return Way(units, tuple(curve), saving and search.certified(saving), sharpest)
+        within.append(grown.choice(np.flatnonzero(units.today).tolist()))
+    saving = next((c for c in curve if c.mean_bound <= 1 and c.readings < today), None)
+    wanted = np.unique(np.round(np.geomspace(units.sizes.min(), reach, _POINTS)))
+    shown = dict.fromkeys(next((c for c in reversed(curve) if c.readings <= w), curve[0]) for w in wanted)
+    return Way(units, tuple(shown), saving, min(within, key=lambda c: c.mean_bound))
 
 
 @dataclass(frozen=True)
-class _Search:
-    """Looks for good choices among units; a choice is a mask (units,)."""
+class _Grown:
+    """Choices of units that grow one by one."""
 
     judge: _Judge
     units: Units
 
-    def choice(self, taken: NDArray[np.bool_]) -> Choice:
-        value = self.judge.value(self.units.information(taken.astype(float)))
-        places = np.flatnonzero(taken).tolist()
-        rows = np.sort(np.concatenate([self.units.rows[u] for u in places], dtype=np.intp)) if places else ()
-        return Choice(tuple(places), tuple(map(int, rows)), value)
+    def choice(self, places: Sequence[int]) -> Choice:
+        taken = sorted(places)
+        weights = np.isin(np.arange(len(self.units.rows)), taken).astype(float)
+        rows = np.sort(np.concatenate([self.units.rows[u] for u in taken], dtype=np.intp))
+        return Choice(tuple(taken), tuple(map(int, rows)), self.judge.value(self.units.information(weights)))
 
-    def loss(self, taken: NDArray[np.bool_]) -> float:
-        return self.judge.loss(self.units.information(taken.astype(float)))
-
-    def covariance(self, taken: NDArray[np.bool_]) -> Array:
-        return self.judge.covariance(self.units.information(taken.astype(float)))
-
-    def grown(self, taken: NDArray[np.bool_], budget: int) -> NDArray[np.bool_]:
-        """With units added, the one that gains most per reading first, while they are within the budget."""
-        taken = taken.copy()
-        room = budget - self.units.sizes[taken].sum()
-        while (place := self._best_to_add(taken, room)) is not None:
-            taken[place] = True
-            room -= self.units.sizes[place]
-        return taken
-
-    def _best_to_add(self, taken: NDArray[np.bool_], room: float) -> int | None:
-        free = ~taken & (self.units.sizes <= room)
-        if not free.any():
-            return None
-        gains = self.judge.gains(self.covariance(taken), self.units.slopes)
-        return int(np.argmax(np.where(free, gains / self.units.sizes, -np.inf)))
-
-    def improved(self, taken: NDArray[np.bool_], budget: int) -> NDArray[np.bool_]:
-        """After exchanges: the best unit is added, then the least valuable ones go until the budget holds again."""
-        best, loss = taken, self.loss(taken)
-        for _ in range(_ROUNDS):
-            trial = best.copy()
-            place = self._best_to_add(trial, np.inf)
-            if place is None:
-                return best
-            trial[place] = True
-            while self.units.sizes[trial].sum() > budget:
-                trial[self._least(trial)] = False
-            new = self.loss(trial)
-            if not new < loss - 1e-9 * abs(loss):
-                return best
-            best, loss = trial, new
-        return best
-
-    def _least(self, taken: NDArray[np.bool_]) -> int:
-        """The unit whose loss hurts least per reading."""
-        there = np.flatnonzero(taken)
-        losses = self.judge.losses(self.covariance(taken), self.units.slopes[:, there])
-        return int(there[np.argmin(losses / self.units.sizes[there])])
-
-    def fewest(self, curve: Sequence[Choice], today: int) -> Choice | None:
-        """The smallest choice that is as good as today's set-up, found by bisection between points of the curve."""
-        good = next((c for c in curve if c.mean_bound <= 1 and c.readings < today), None)
-        if good is None:
-            return None
-        below = max((c.readings for c in curve if c.readings < good.readings), default=0)
-        step = int(self.units.sizes.min())
-        while good.readings - below > step:
-            middle = (good.readings + below) // 2
-            taken = np.isin(np.arange(len(self.units.rows)), good.taken)
-            while self.units.sizes[taken].sum() > middle:
-                taken[self._least(taken)] = False
-            choice = self.choice(self.improved(taken, middle))
-            if choice.mean_bound <= 1:
-                good = choice
-            else:
-                below = middle
-        return good
-
-    def certified(self, choice: Choice) -> Choice:
-        """The choice with a bound on all choices of so many readings.
-
-        Weights between 0 and 1 in place of taken or left make the problem convex, so that its gradient anywhere bounds
-        it from below; steps of Frank and Wolfe (Naval Research Logistics Quarterly 3, 1956) raise that bound. What is
-        known beforehand is counted in, which can only lower it.
-        """
-        w = np.isin(np.arange(len(self.units.rows)), choice.taken).astype(float)
-        least = -np.inf
-        for _ in range(_ROUNDS):
-            M = self.units.information(w)
-            loss = self.judge.loss(M)
-            fall = self.judge.slopes(self.judge.covariance(M), self.units.slopes)
-            vertex = self._most(fall, choice.readings)
-            gap = float(fall @ (vertex - w))
-            least = max(least, loss - gap)
-            if self.judge.as_bound(least) >= (1 - _CLOSE) * self.judge.as_bound(loss):
-                break
-            w = self._along(w, vertex, M)
-        return replace(choice, least=min(self.judge.as_bound(least), choice.mean_bound))
-
-    def _most(self, values: Array, budget: int) -> Array:
-        """Weights (units,) from 0 to 1 of at most so many readings with the largest sum of values."""
-        weights, room = np.zeros(len(values)), float(budget)
-        for u in np.argsort(-values / self.units.sizes, kind="stable"):
-            weights[u] = min(1.0, room / self.units.sizes[u])
-            room -= weights[u] * self.units.sizes[u]
-            if room <= 0:
-                break
-        return weights
-
-    def _along(self, w: Array, vertex: Array, M: Array) -> Array:
-        """The best point between the two, by golden section: the loss is convex along the line."""
-        end = self.units.information(vertex)
-        low, high, ratio = 0.0, 1.0, (np.sqrt(5) - 1) / 2
-        for _ in range(20):
-            a, b = high - ratio * (high - low), low + ratio * (high - low)
-            if self.judge.loss((1 - a) * M + a * end) < self.judge.loss((1 - b) * M + b * end):
-                high = b
-            else:
-                low = a
-        step = (low + high) / 2
-        return (1 - step) * w + step * vertex
+    def choices(self, most: int) -> Iterator[Choice]:
+        """One after another, each with one unit more, of at most so many readings."""
+        sizes, taken = self.units.sizes, np.zeros(len(self.units.rows), dtype=bool)
+        while (free := ~taken & (sizes <= most - sizes[taken].sum())).any():
+            P = self.judge.covariance(self.units.information(taken.astype(float)))
+            gains = self.judge.gains(P, self.units.slopes) / sizes
+            taken[int(np.argmax(np.where(free, gains, -np.inf)))] = True
+            yield self.choice(np.flatnonzero(taken).tolist())
 
 
 def _effects(judge: _Judge, model: Measurement, candidates: Measurement, slopes: Array) -> Iterator[Effect]:

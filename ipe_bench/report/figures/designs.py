@@ -15,7 +15,6 @@ from ipe_bench.report.words import plain
 from ipe_bench.trials.design import Choice, Design
 from ipe_bench.trials.observability import Observability, truths_of
 
-_LIMIT: dict[str, Any] = {"marker": "_", "color": BOUND_COLOR, "markersize": 9, "linestyle": "none", "zorder": 4}
 _WORST = 10.0
 """Bounds above this many times today's are off the picture."""
 
@@ -42,9 +41,6 @@ def _curves(ax: Any, design: Design, look: Any) -> None:
         points = {c.readings: c.mean_bound for c in sorted((*shown, *chosen), key=lambda c: -c.mean_bound)}
         line = {**look[way.title].line, "markersize": 4.5, "markeredgewidth": 0.4}
         ax.plot(sorted(points), [points[readings] for readings in sorted(points)], **line)
-        for choice in chosen:
-            ax.plot(choice.readings, choice.least, **_LIMIT)
-    ax.plot([], [], **_LIMIT, label="no choice is below")
     ax.plot(today, 1.0, marker="*", color="#C00000", markersize=13, linestyle="none", zorder=5, label="today")
     counts = [c.readings for way in design.ways for c in way.curve if c.mean_bound <= _WORST] + [today]
     across = np.geomspace(min(counts), max(counts), 30)
