@@ -112,7 +112,7 @@ def _paper(folders: Sequence[Path], keys: Mapping[str, str]) -> int:
     """Writes tables and figures as a paper wants them; exit code 1 where a table is too wide, or data are missing."""
     names = _listed(keys.get("paper", ""))
     if not names:
-        raise UserError("paper=: name tables and figures, such as paper=overview,success_against_scale")
+        raise UserError("paper=: name tables and figures, such as paper=overview,error_against_scale")
     width = {}
     if "width" in keys:
         try:

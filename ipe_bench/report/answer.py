@@ -397,8 +397,7 @@ def write_fits(
     `command` tells one command from another (see `claim`); `provenance` is added to the JSON file and overrides what
     stands there of the same name.
     """
-    from ipe_bench.report.figures import likelihood
-    from ipe_bench.report.figures.residual_plots import draw_fits
+    from ipe_bench.report.figures.readings import draw_fits, draw_profiles
 
     found = answer.examination
     files = [
@@ -407,7 +406,7 @@ def write_fits(
     ]
     drawings = []
     if which != "none":
-        drawings = [*draw_fits(answer.model, answer.fits), *(likelihood.draw(found) if found is not None else ())]
+        drawings = [*draw_fits(answer.model, answer.fits), *(draw_profiles(found) if found is not None else ())]
     files += draw_into(folder, drawings, _FIGURES)
     write_text(folder / PAGE, whole_page(answer, folder, drawings, str(provenance.get("written", ""))))
     return [*files, folder / PAGE]

@@ -125,7 +125,7 @@ def draw(frame: pd.DataFrame, alpha: float) -> Drawing:
         Line2D([], [], color=color, marker="o", markersize=5, label=f"second is {name}" if name else "not sure")
         for name, color in _COLORS.items()
     ]
-    fig.legend(handles=handles, loc="outside lower center", ncols=3)
+    fig.legend(handles=handles, loc="outside upper center", ncols=3)
     caption = f"The second less, or over, the first, with intervals of {_level(alpha)}; coloured where sure."
     return Drawing("comparison", "Comparison", caption, fig)
 

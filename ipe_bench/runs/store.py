@@ -37,7 +37,7 @@ from ipe_bench.runs import parts
 from ipe_bench.runs.execution.base import Execution, Failure
 from ipe_bench.runs.parts import SCHEMA, TRUTH, Part, encoded_history, table_of
 from ipe_bench.runs.provenance import describe, digest, fingerprint
-from ipe_bench.trials.bounds import linear_bound
+from ipe_bench.trials.bounds import linear_bound, linear_correlation
 from ipe_bench.trials.scenario import Scenario
 
 _ABANDONED_S = 3600.0
@@ -109,6 +109,7 @@ class ResultKey:
             "readings": model.m,
             "about": first_sentence(model),
             "linear_bound": linear_bound(scenario.problem).tolist(),
+            "linear_correlation": linear_correlation(scenario.problem).round(4).tolist(),
         }
 
 

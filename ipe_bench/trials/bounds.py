@@ -18,6 +18,12 @@ def linear_bound(problem: Problem) -> Array:
     return deviations(frozen_covariance(problem.H_plus[None], problem.R))[0]
 
 
+def linear_correlation(problem: Problem) -> Array:
+    """Correlation (n, n) of the covariance of eq. (5)."""
+    P, d = frozen_covariance(problem.H_plus[None], problem.R)[0], linear_bound(problem)
+    return P / np.outer(d, d)
+
+
 def bound_deviations(information: Array, rows: Callable[[Mask], Array]) -> Array:
     """Standard deviations (trials, n) of the bound whose inverse is `information` (trials, n, n); NaN where it is
     singular.

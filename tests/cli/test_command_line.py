@@ -76,13 +76,13 @@ def readings(tmp_path_factory) -> Path:
 
 
 def test_a_sweep_leaves_tables_figures_and_a_report(tmp_path, here, monkeypatch):
-    monkeypatch.setattr(figures, "FIGURES", ("success", "cost"))
+    monkeypatch.setattr(figures, "FIGURES", ("costs", "parameters"))
     result = here("run", "-m", "error_scale=1,10", "trials=20", "figures=main", folder=tmp_path)
     assert result.returncode == 0, result.stderr
     folder = tmp_path / "outputs/gins-error_scale=1,10"
     assert {path.name for path in folder.iterdir()} >= {"summary.csv", "report.html", "tables"}
     drawn = {path.name for path in (folder / "figures").iterdir()}
-    assert drawn == {"index.json", "success_against_scale.png"}
+    assert drawn == {"index.json", "cost_against_accuracy.png"}
     assert "fixed_point" in result.stdout
     again = here("run", "-m", "error_scale=1,10", "trials=20", "figures=main", folder=tmp_path)
     assert again.stderr.count("nothing left to compute") == 2

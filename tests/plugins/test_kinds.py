@@ -27,7 +27,7 @@ from ipe_bench.trials.posterior import reference
 
 SMALL = ("measurement=polynomial", "noise=gaussian", "trials=8", "execution=serial", "output=out")
 MAIN = "figures=main"
-OURS = ("success",)
+OURS = ("costs",)
 """Of our figures, one is enough to see whether it stays as it is."""
 
 
@@ -199,10 +199,10 @@ def test_those_that_write_into_what_they_are_given_change_nothing_of_ours(ours, 
 
 def test_a_figure_under_the_name_of_ours_is_left_out_and_ours_stays(ours, capsys):
     main(["new", "figure", "mine"])
-    edit_figure("mine", ('f"mine{view.suffix}"', '"success_against_scale"'))
+    edit_figure("mine", ('f"mine{view.suffix}"', '"cost_against_accuracy"'))
     capsys.readouterr()
     assert main(["report", "out", MAIN]) == 1
-    assert "figure=mine: there is a figure success_against_scale already; it is left out" in capsys.readouterr().err
+    assert "figure=mine: there is a figure cost_against_accuracy already; it is left out" in capsys.readouterr().err
     assert files("out") == ours
 
 

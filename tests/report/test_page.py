@@ -25,7 +25,7 @@ def page_file(tmp_path_factory):
     message = np.array(["LinAlgError: " + "x" * 300, HOSTILE] * 40, dtype=object)
     store.add(scenario, "failing", e, status="error", message=message, solved=False)
     store.record(100, "more")
-    result = write_report([store.directory], store.directory)
+    result = write_report([store.directory], store.directory, figures="all")
     assert result.problems
     return result.report
 

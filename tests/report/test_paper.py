@@ -115,23 +115,23 @@ def test_a_wider_table_is_longer_by_its_columns():
 @pytest.mark.parametrize("width", [COLUMN, PAGE])
 def test_a_figure_is_as_wide_as_the_column(synthetic, tmp_path, width):
     fill(synthetic)
-    done = export(analyse([synthetic.directory]), tmp_path, ["success_against_scale"], width=width)
+    done = export(analyse([synthetic.directory]), tmp_path, ["cost_against_accuracy"], width=width)
     assert [path.name for path in done.files] == [
-        *("success_against_scale.png", "success_against_scale.pdf", "captions.md")
+        *("cost_against_accuracy.png", "cost_against_accuracy.pdf", "captions.md")
     ]
     box = re.search(rb"/MediaBox \[ *([\d. ]+) *\]", done.files[1].read_bytes())
     left, _, right, _ = map(float, box[1].split())
     assert (right - left) / 72 == pytest.approx(width, abs=0.01)
-    assert "Clopper-Pearson" in done.files[2].read_text(encoding="utf-8")
+    assert "simulations" in done.files[2].read_text(encoding="utf-8")
 
 
 def test_drawing_for_a_paper_leaves_the_report_as_it_is(synthetic, tmp_path, monkeypatch):
     fill(synthetic)
     analysis = analyse([synthetic.directory])
-    monkeypatch.setattr(figures, "FIGURES", ("success",))
-    before, *_ = figures.draw_all(analysis, tmp_path / "a", formats=("png",), which="all")
-    export(analysis, tmp_path / "p", ["success_against_scale"])
-    after, *_ = figures.draw_all(analysis, tmp_path / "b", formats=("png",), which="all")
+    monkeypatch.setattr(figures, "FIGURES", ("costs",))
+    before, *_ = figures.draw_all(analysis, tmp_path / "a", formats=("png",))
+    export(analysis, tmp_path / "p", ["cost_against_accuracy"])
+    after, *_ = figures.draw_all(analysis, tmp_path / "b", formats=("png",))
     assert before.files[0].read_bytes() == after.files[0].read_bytes()
 
 

@@ -23,8 +23,7 @@ from synthetic_store import Filter, Seeker, Synthetic
 from ipe_bench.noise import Quantization
 from ipe_bench.report import write_report
 from ipe_bench.report.definitions import DEFINITIONS
-from ipe_bench.report.figures import correlation, distributions, error_scale, nees, success
-from ipe_bench.report.figures.ranks import cliques
+from ipe_bench.report.figures import consistency, correlation, errors, parameters
 from ipe_bench.report.figures.views import views
 from ipe_bench.report.headline import about, headline
 from ipe_bench.report.style import house_style, looks
@@ -75,13 +74,13 @@ def result(tmp_path_factory):
 @pytest.mark.slow
 def test_everything_is_written(synthetic):
     fill(synthetic, scales=(1.0, 10.0), seeds=5)
-    result = write_report([synthetic.directory], synthetic.directory, formats="pdf")
+    result = write_report([synthetic.directory], synthetic.directory, figures="all", formats="pdf")
     assert result.problems == ()
     stored = pd.read_csv(result.summary_path)
     pd.testing.assert_frame_equal(stored, result.summary, check_exact=False, rtol=1e-12)
     names = {p.name for p in result.figures}
-    expected = ("figure_2", "error_against_scale", "success_against_scale", "error_distributions", "consistency")
-    for name in (*expected, "cost_against_accuracy", "profiles", "critical_difference", "correlation"):
+    expected = ("parameter_errors_linear_lse", "error_against_scale", "error_distributions", "consistency")
+    for name in (*expected, "cost_against_accuracy", "profiles", "correlation"):
         assert {f"{name}.png", f"{name}.pdf"} <= names
     assert {p.name for p in result.tables} >= {"overview.csv", "overview.md", "overview.tex", "comparisons.tex"}
     for path in (*result.figures, *result.tables, result.report):
@@ -314,12 +313,6 @@ def test_estimators_keep_their_look_and_no_two_look_alike():
     assert len({(one.marker, str(one.dash)) for one in list(look.values())[:10]}) == 10
 
 
-def test_bars_join_ranks_within_the_critical_difference():
-    assert cliques([1.0, 2.0, 3.0, 4.0], 1.5) == [(0, 1), (1, 2), (2, 3)]
-    assert cliques([1.0, 2.0, 3.0], 5.0) == [(0, 2)]
-    assert cliques([1.0, 3.0], 1.0) == []
-
-
 def test_numbers_are_written_for_readers():
     assert [percent(v) for v in (1.0, 0.9999, 0.974, 0.0, 0.0001, float("nan"))] == [
         "100 %",
@@ -372,14 +365,14 @@ def test_settings_that_differ_have_figures_of_their_own(synthetic, tmp_path):
         for label in ("linear_lse", "one"):
             synthetic.add(scenario, label, 0.1 * rng.normal(size=(40, 3)))
     result = write_report([synthetic.directory], tmp_path / "out", figures="none")
-    modules = (error_scale, success, distributions, correlation, nees)
+    modules = (errors, parameters, correlation, consistency)
     with house_style():
         parts, _ = views(analyse([synthetic.directory]))
         drawn = [drawing for view in parts for module in modules for drawing in module.draw(view)]
     names = {drawing.name for drawing in drawn}
     assert not [drawing.name for drawing in drawn if re.search(r"\bnan\b", drawing.caption)]
     settings = ("gaussian-0.2", "gaussian-0.4", "quantization")
-    for kind in ("figure_2", "success_against_scale", "error_distributions", "correlation", "consistency"):
+    for kind in ("error_by_parameter", "error_against_scale", "error_distributions", "correlation", "consistency"):
         assert {n for n in names if n.startswith(f"{kind}_")} == {f"{kind}_{s}" for s in settings}
     page = re.sub(r'base64,[^"]*', "", result.report.read_text(encoding="utf-8"))
     assert not re.search(r"\bnan\b", page)

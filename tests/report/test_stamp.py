@@ -55,7 +55,7 @@ def test_more_trials_make_another_report(folder: Path) -> None:
 def test_figures_are_all_the_main_ones_or_none(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(figures, "FIGURES", ("success", "cost"))
+    monkeypatch.setattr(figures, "FIGURES", ("costs", "parameters"))
     drawn = {}
     for which in ("none", "main"):
         assert run(tmp_path, f"figures={which}") == 0
@@ -63,7 +63,7 @@ def test_figures_are_all_the_main_ones_or_none(
         page = (tmp_path / "report.html").read_text(encoding="utf-8")
         assert page.count("<img") == len(drawn[which])
     assert drawn["none"] == set()
-    assert drawn["main"] == {"success_against_scale"}
+    assert drawn["main"] == {"cost_against_accuracy"}
     assert main(["report", str(tmp_path), "figures=none"]) == 0
     assert "<img" not in (tmp_path / "report.html").read_text(encoding="utf-8")
     capsys.readouterr()
@@ -74,7 +74,7 @@ def test_figures_are_all_the_main_ones_or_none(
 def test_the_report_has_the_formats_that_were_asked_for_last(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(figures, "FIGURES", ("success", "cost"))
+    monkeypatch.setattr(figures, "FIGURES", ("costs", "parameters"))
 
     def drawn() -> set[str]:
         links = set(re.findall(r'href="figures/([^"]+)"', (tmp_path / "report.html").read_text(encoding="utf-8")))
@@ -84,12 +84,12 @@ def test_the_report_has_the_formats_that_were_asked_for_last(
     # Two formats are no sweep.
     assert run(tmp_path, "figures=main", "formats=pdf,svg") == 0
     assert "multirun" not in "".join(path.name for path in tmp_path.iterdir())
-    assert drawn() == {f"success_against_scale.{kind}" for kind in ("png", "pdf", "svg")}
+    assert drawn() == {f"cost_against_accuracy.{kind}" for kind in ("png", "pdf", "svg")}
     assert run(tmp_path, "figures=all", "formats=[pdf]") == 0
-    assert {"success_against_scale.pdf", "cost_against_accuracy.png"} <= drawn()
+    assert {"cost_against_accuracy.pdf", "error_by_parameter.png"} <= drawn()
     assert {name.rpartition(".")[2] for name in drawn()} == {"png", "pdf"}
     assert run(tmp_path, "figures=main") == 0
-    assert drawn() == {"success_against_scale.png"}
+    assert drawn() == {"cost_against_accuracy.png"}
     capsys.readouterr()
     assert main(["report", str(tmp_path), "formats=pdf,tiff"]) == 2
     assert "formats=pdf,tiff: choose among png, pdf and svg" in capsys.readouterr().err

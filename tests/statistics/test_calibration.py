@@ -10,7 +10,7 @@ from scipy.stats import binom
 from synthetic_store import Seeker
 
 import ipe_bench as ib
-from ipe_bench.report.figures import calibration as figure
+from ipe_bench.report.figures import consistency as figure
 from ipe_bench.report.figures.views import views
 from ipe_bench.report.style import house_style
 from ipe_bench.report.tables import calibration as table
@@ -241,10 +241,8 @@ def test_summary_table_and_figures_say_so(synthetic):
     (view,), _ = views(analysis)
     with house_style():
         drawings = {d.name: d for d in figure.draw(view)}
-    assert set(drawings) == {"calibration", "calibration_parameters"}
+    assert set(drawings) == {"calibration", "consistency"}
     assert "boaster: deviations 2.0 times too small" in drawings["calibration"].caption
-    lines = {line.get_label() for ax in drawings["calibration_parameters"].figure.axes for line in ax.lines}
-    assert {"a", "b", "c", INSIDE} <= lines
 
 
 def test_the_figure_of_nees_is_the_empirical_distribution_function(synthetic):

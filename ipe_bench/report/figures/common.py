@@ -1,17 +1,17 @@
-"""What figures share: panels, axes, curves that stay apart, legends and the words of captions."""
+"""What figures share: panels, axes, curves with their intervals, legends and the words of captions."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import cache
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, Look
+from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, GREY, MOST_FACES, Look
 from ipe_bench.report.words import enumerate_few as enumerate_few
 from ipe_bench.report.words import plain
 from ipe_bench.trials.thresholds import FEW
@@ -20,38 +20,29 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
-    from matplotlib.path import Path
 
-MOST_PANELS = 6
-COINCIDE = 0.015
-"""Points nearer than this part of the axis lie upon each other."""
-NARROWEST, ROOMY = 1.7, 2.2
-"""Inches of a panel in print: where there are many, and where there are few."""
-PRINTED_MARK = 0.62
-"""Size of a marker in print, beside that on the page."""
 REACH = 0.3
 """Part of the span of the points that intervals may add to an axis at either end."""
-LETTER, PRINTED_LETTER = 0.08, 0.068
+LETTER, PRINTED_LETTER = 0.08, 0.062
 """Inches of a letter under an axis, with the space around it: on the page, and in print."""
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-UPON = "Where points coincide, each marker lies smaller upon the one before it."
-
-
-def text(value: Any) -> str:
-    """A name as it stands in a figure: never read as mathematics, never longer than a line."""
-    words = str(value)
-    words = words if len(words) <= 42 else words[:40] + "…"
-    words = words.replace("\\", "\\\\").replace("$", r"\$")
-    # A leading underscore would hide the name from legends.
-    return "\u200b" + words if words.startswith("_") else words
 
 
 _column: ContextVar[float | None] = ContextVar("column", default=None)
 
 
+def text(value: Any) -> str:
+    """A name as it stands in a figure: never read as mathematics, never longer than a line."""
+    words, most = str(value), 42 if _column.get() is None else 16
+    words = words if len(words) <= most else words[: most - 1] + "…"
+    words = words.replace("\\", "\\\\").replace("$", r"\$")
+    # A leading underscore would hide the name from legends.
+    return "\u200b" + words if words.startswith("_") else words
+
+
 @contextmanager
 def column_width(inches: float) -> Iterator[None]:
-    """Figures that are drawn meanwhile are as wide as a column of print, and no panel narrower than `NARROWEST`."""
+    """Figures that are drawn meanwhile are as wide as a column of print."""
     token = _column.set(inches)
     try:
         yield
@@ -60,52 +51,67 @@ def column_width(inches: float) -> Iterator[None]:
 
 
 def figure(width: float, height: float) -> Figure:
+    """An empty figure; in print as wide as the column, in the same shape."""
     from matplotlib.figure import Figure
 
     column = _column.get()
-    if column is None or width == column:
-        size = width, height
-    else:
-        size = column, max(1.8, height * column / width)
+    size = (width, height) if column is None else (column, max(1.9, height * column / width))
     return Figure(figsize=size, layout="constrained")
 
 
-def mark_scale() -> float:
-    """What sizes of markers are multiplied by."""
-    return 1.0 if _column.get() is None else PRINTED_MARK
+def most_panels() -> int:
+    """Panels of a figure: six on the page, two rows in a column of print."""
+    column = _column.get()
+    return 6 if column is None or column > 5 else 4
 
 
 def panels(
     count: int, look: Mapping[str, Look] | None = None, *, height: float = 2.7, most_across: int | None = None
 ) -> tuple[Figure, list[Axes]]:
-    """A figure with that many panels, unused ones switched off, and room for the legend of the estimators."""
-    across = most_across or {4: 2, 7: 4, 8: 4}.get(count, 3)
+    """A figure with that many panels, in print in at most two rows, and room for the legend of the estimators."""
     column = _column.get()
-    if column is not None:
-        return _narrow_panels(count, min(across, count), column)
-    across = min(across, count)
-    down = -(-count // across)
-    width = {1: 5.2, 2: 8.0, 3: 9.2}.get(across, 11.0)
-    fig = figure(width, height * down + 0.4 + 0.2 * len(look or ()) / 5)
+    if column is None:
+        across = min(count, most_across or {4: 2, 7: 4, 8: 4}.get(count, 3))
+        down = -(-count // across)
+        width = {1: 5.2, 2: 8.0, 3: 9.2}.get(across, 11.0)
+        size = width, height * down + 0.4 + 0.2 * len(look or ()) / 5
+    else:
+        across = min(count, max(2, -(-count // 2)) if column < 5 or count == 4 else 3)
+        down = -(-count // across)
+        size = column, max(1.5, 0.85 * column / across) * down + 0.16 * len(look or ()) / 3 + 0.2
+    from matplotlib.figure import Figure
+
+    fig = Figure(figsize=size, layout="constrained")
     axes: list[Axes] = list(fig.subplots(down, across, squeeze=False).flat)
     for ax in axes[count:]:
         ax.set_axis_off()
     return fig, axes[:count]
 
 
-def _narrow_panels(count: int, across: int, column: float) -> tuple[Figure, list[Axes]]:
-    """Panels in a column of print; their legend adds its own height."""
-    across = max(1, min(across, int(column / (NARROWEST if count > 3 else ROOMY))))
-    down = -(-count // across)
-    fig = figure(column, max(1.75, 0.75 * column / across) * down)
-    axes: list[Axes] = list(fig.subplots(down, across, squeeze=False).flat)
-    for ax in axes[count:]:
-        ax.set_axis_off()
-    return fig, axes[:count]
+def title(ax: Axes, words: str) -> None:
+    """Sets the title of a panel, in as many lines as its width needs."""
+    letters = max(12, int(_inches(ax) / (0.078 if _column.get() is None else 0.056)))
+    broken = max(map(len, words.split()), default=0) > 20
+    ax.set_title(fill(words.replace("$", r"\$"), letters, break_long_words=broken))
 
 
-def spread(values: Sequence[Any], most: int = MOST_PANELS) -> list[Any]:
+def _inches(ax: Axes) -> float:
+    """About the width of a panel: in print its labels take a fourth of what the layout has not given them yet."""
+    width = ax.get_position().width * ax.figure.get_figwidth()  # type: ignore[union-attr]
+    return width if _column.get() is None else min(0.75 * width, width - 0.45)
+
+
+def axis_labels(fig: Figure, x: str, y: str) -> None:
+    """Labels of the axes that all panels share, once for the figure."""
+    fig.supxlabel(x, fontsize="medium")
+    fig.supylabel(y, fontsize="medium")
+    for ax in fig.axes:
+        ax.set(xlabel="", ylabel="")
+
+
+def spread(values: Sequence[Any], most: int | None = None) -> list[Any]:
     """At most that many of the values, evenly spread and with both ends."""
+    most = most or most_panels()
     if len(values) <= most:
         return list(values)
     return [values[i] for i in np.unique(np.linspace(0, len(values) - 1, most).round().astype(int))]
@@ -116,18 +122,19 @@ def at_scale(frame: pd.DataFrame, scale: float) -> pd.DataFrame:
 
 
 def scale_axis(ax: Axes, scales: Sequence[float], labels: Sequence[str]) -> None:
-    """A logarithmic axis that shows the error scales themselves; where there is one alone, the labels side by side."""
+    """A logarithmic axis that shows the error scales themselves; if there is one alone, the labels side by side."""
     if len(scales) == 1:
         ax.set_xticks(range(len(labels)), [text(label) for label in labels], rotation=90)
         ax.set_xlim(-0.6, len(labels) - 0.4)
-        ax.set_xlabel("")
         return
     positive = sorted(s for s in scales if s > 0)
     # A scale of zero has no place on a logarithmic axis: a decade below the smallest is as near as it gets.
     least = positive[0] / 10 if len(positive) < len(scales) else positive[0]
     ax.set_xscale("symlog", linthresh=positive[0], linscale=0.5) if least < positive[0] else ax.set_xscale("log")
     span = np.log10(positive[-1] / least)
-    kept = [0.0] * (least < positive[0]) + _labelled(positive, span / (ax.get_position().width * _width(ax)))
+    # Names at the ends of lines take their room, too.
+    inches = _inches(ax) - (0.8 if len(labels) > MOST_FACES else 0.0)
+    kept = [0.0] * (least < positive[0]) + _labelled(positive, span / max(inches, 0.3))
     ax.set_xticks(kept, [plain(s) for s in kept])
     ax.set_xticks([], minor=True)
     margin = 10 ** max(0.06 * span, 0.15)
@@ -147,10 +154,6 @@ def _labelled(scales: Sequence[float], decades_an_inch: float) -> list[float]:
         if apart(kept[-1], scale) and apart(scale, scales[-1]):
             kept.append(scale)
     return [*kept, scales[-1]] if len(scales) > 1 else kept
-
-
-def _width(ax: Axes) -> float:
-    return ax.figure.get_figwidth()  # type: ignore[union-attr]
 
 
 def decades(ax: Axes, values: Any, least: float = 10.0, *, ends: Any = ()) -> None:
@@ -181,7 +184,7 @@ def _positive(values: Any) -> Any:
 
 
 def log_ticks(axis: Axis, low: float, high: float) -> None:
-    """Labels that do not crowd: powers of ten, and 2 and 5 between where those are few."""
+    """Labels that do not crowd: powers of ten, and 2 and 5 between if those are few."""
     from matplotlib.ticker import LogLocator, NullLocator
 
     if high / low < 200:
@@ -194,7 +197,7 @@ def log_ticks(axis: Axis, low: float, high: float) -> None:
 
 
 def power_of_ten(value: float) -> str:
-    """10⁻³ in plain letters, which are set and measured in a fraction of the time that mathematics takes."""
+    """10⁻³ in plain letters, which take a fraction of the time that mathematics does."""
     return "10" + f"{round(np.log10(value))}".translate(_RAISED)
 
 
@@ -206,13 +209,14 @@ def shares(ax: Axes, label: str) -> None:
 
 
 def seaborn_style(look: Mapping[str, Look], by: str = "estimator") -> dict[str, Any]:
-    """Arguments of seaborn's functions that give every label its own colour and dash."""
+    """Arguments of seaborn's functions that give every label its own colour, marker and dash; grey ones lie below."""
+    order = sorted(look, key=lambda label: look[label].color != GREY)
     return {
         "hue": by,
-        "hue_order": list(look),
+        "hue_order": order,
         "palette": {label: one.color for label, one in look.items()},
         "style": by,
-        "style_order": list(look),
+        "style_order": order,
         "legend": False,
     }
 
@@ -226,127 +230,117 @@ def curves(
     *,
     interval: tuple[str, str] | None = None,
     by: str = "estimator",
-    trials: str = "solved_trials",
+    trials: str = "trials",
 ) -> None:
     """A column over the error scales, a line with markers per label, on an axis whose limits are set already.
 
-    Points stand at their scale exactly: markers that coincide are told apart by size. A line is broken where a value is
-    missing; a point that fewer than `FEW` trials carry is hollow and has no interval.
+    Labels stand side by side about their scale, so that points and intervals that coincide are seen. A line is broken
+    where a value is missing; a point that some of the trials or fewer than `FEW` carry is hollow, and without an
+    interval if they are fewer than `FEW`.
     """
+    import seaborn as sns
+
     scale_axis(ax, scales, list(look))
-    place = {label: i for i, label in enumerate(look)}
     rows = rows[rows[by].isin(list(look))].sort_values("error_scale", kind="stable")
-    rows = rows.assign(x=rows["error_scale"] if len(scales) > 1 else rows[by].map(place).astype(float))
+    rows = rows.assign(x=_places(rows, by, list(look), scales))
     rows = rows.assign(run=rows.groupby(by)[y].transform(lambda values: values.isna().cumsum()))
     rows = rows[np.isfinite(rows[y])]
-    if rows.empty:
-        return
-    depths = _depths(ax, rows, y, look, by)
-    if len(scales) > 1:
-        for (label, _), part in rows.groupby([by, "run"], sort=False):
-            one = look[str(label)]
-            ax.plot(part["x"], part[y], color=one.color, linestyle=one.linestyle, linewidth=1.4)
-    few = (rows[trials] < FEW).to_numpy()
-    if interval is not None:
-        low, high = interval
-        sure = rows[~few & np.isfinite(rows[low]) & np.isfinite(rows[high])]
-        ax.vlines(sure["x"], sure[low], sure[high], colors=[look[e].color for e in sure[by]], linewidth=1.0, alpha=0.8)
-    sizes = (mark_scale() * (5.5 + min(2.5, 9 / len(look)) * depths)) ** 2
-    for which in (~few, few):
-        if which.any():
-            part = rows[which]
-            marks(ax, part["x"], part[y], [look[label] for label in part[by]], sizes[which], hollow=which is few)
-    if few.any():
-        _explain_hollow(ax)
+    if not rows.empty:
+        style = seaborn_style(look, by) | {
+            "markers": {label: one.marker for label, one in look.items()},
+            "dashes": {label: one.dash for label, one in look.items()},
+        }
+        size, thick = (5.0, 1.4) if _column.get() is None else (3.4, 1.0)
+        width = {"linewidth": thick if len(scales) > 1 else 0, "markersize": size, "markeredgewidth": 0.5}
+        sns.lineplot(rows, x="x", y=y, units="run", estimator=None, ax=ax, **width, **style)
+        few = rows[trials] < FEW
+        if interval is not None:
+            low, high = interval
+            plain_grey = rows[by].map(lambda label: look[label].color == GREY)
+            sure = rows[~few & ~plain_grey & np.isfinite(rows[low]) & np.isfinite(rows[high])]
+            colors = [look[e].color for e in sure[by]]
+            ax.vlines(sure["x"], sure[low], sure[high], colors=colors, linewidth=1.0, alpha=0.8)
+        _hollow(ax, rows[few | (rows[trials] < rows["trials"].max())], y, look, by, size)
+        if by == "estimator" and len(look) > MOST_FACES and len(scales) > 1 and most_panels() > 4:
+            direct_labels(ax, rows, y, look, by)
     ax.set(xlabel="error scale" if len(scales) > 1 else "", ylabel="")
 
 
-def marks(
-    ax: Axes, x: Any, y: Any, looks: Sequence[Look], sizes: Any, *, hollow: bool = False, linewidth: float = 0.6
-) -> None:
-    """A marker per point in the look of its own, all of them one artist."""
-    colors = [one.color for one in looks]
-    points = ax.scatter(x, y, s=sizes, c=colors, edgecolors="white", linewidths=linewidth, zorder=3)
-    points.set_paths([_marker_path(one.marker) for one in looks])
-    if hollow:
-        points.set(edgecolor=colors, facecolor="white", linewidth=1.2)
+def _places(rows: pd.DataFrame, by: str, labels: Sequence[str], scales: Sequence[float]) -> Any:
+    """Where points stand along the axis: a little beside their scale, each label at the same side of all of them."""
+    order = rows[by].map({label: i for i, label in enumerate(labels)}).to_numpy(dtype=float)
+    if len(scales) == 1:
+        return order
+    positive = np.log10([s for s in sorted(scales) if s > 0])
+    gap = float(np.diff(positive).min(initial=1.0))
+    return rows["error_scale"] * 10 ** (0.3 * gap * ((order + 0.5) / len(labels) - 0.5))
 
 
-@cache
-def _marker_path(marker: str) -> Path:
-    from matplotlib.markers import MarkerStyle
-
-    shape = MarkerStyle(marker)
-    return shape.get_path().transformed(shape.get_transform())
-
-
-def _explain_hollow(ax: Axes) -> None:
-    """Says in the legend what an empty marker means."""
-    from matplotlib.lines import Line2D
-
-    look = {"marker": "o", "color": "white", "markeredgecolor": BOUND_COLOR, "markersize": 6}
-    ax.add_line(Line2D([], [], label=f"hollow: fewer than {FEW} trials", **look))
+def _hollow(ax: Axes, rows: pd.DataFrame, y: str, look: Mapping[str, Look], by: str, size: float) -> None:
+    """Empties the markers of these points, and says in the legend what that means."""
+    empty = {"linestyle": "none", "markerfacecolor": "white", "markersize": size, "markeredgewidth": 1.1, "zorder": 3}
+    for label, part in rows.groupby(by, sort=False):
+        one = look[str(label)]
+        ax.plot(part["x"], part[y], marker=one.marker, markeredgecolor=one.color, **empty)
+    if len(rows):
+        ax.plot([], [], marker="o", markeredgecolor=BOUND_COLOR, label="hollow: trials missing, or few", **empty)
 
 
-def _depths(ax: Axes, rows: pd.DataFrame, y: str, look: Mapping[str, Look], by: str) -> Any:
-    """How many later markers lie upon each point's."""
+def direct_labels(ax: Axes, rows: pd.DataFrame, y: str, look: Mapping[str, Look], by: str) -> None:
+    """Names at the right ends of the lines: those in colour each, grey ones together where they end together."""
+    last = rows[rows["error_scale"] == rows["error_scale"].max()]
     transform = ax.yaxis.get_transform().transform
-    low, high = transform(np.asarray(ax.get_ylim()))
-    heights = (transform(rows[y].to_numpy(dtype=float)) - low) / (high - low)
-    places = rows["x"].to_numpy()
-    order = rows[by].map({label: i for i, label in enumerate(look)}).to_numpy()
-    upon = (places[:, None] == places) & (np.abs(heights[:, None] - heights) < COINCIDE)
-    return (upon & (order[:, None] < order)).sum(axis=1)
+    low, high = transform(np.array(ax.get_ylim()))
+    ends = (transform(last[y].to_numpy(dtype=float)) - low) / (high - low)
+    groups: list[tuple[float, list[str], str]] = []
+    for end, label in sorted(zip(ends, last[by], strict=True)):
+        color = look[label].color
+        if color == GREY and groups and groups[-1][2] == GREY and end - groups[-1][0] < 0.05:
+            groups[-1][1].append(label)
+        else:
+            groups.append((float(end), [label], color))
+    longest = 24 if _column.get() is None else 10
+    gap = 0.11 / (ax.get_position().height * ax.figure.get_figheight())  # type: ignore[union-attr]
+    at = np.array([end for end, *_ in groups])
+    for i in range(1, len(at)):
+        at[i] = max(at[i], at[i - 1] + gap)
+    for i in reversed(range(len(at))):
+        at[i] = min(at[i], 1.0 if i == len(at) - 1 else at[i + 1] - gap)
+    for y_at, (_, labels, color) in zip(at, groups, strict=True):
+        words = labels[0] if len(labels) == 1 else f"{labels[0]} and {len(labels) - 1} more"
+        words = words if len(words) <= longest else words[: longest - 1] + "…"
+        place = {"xycoords": "axes fraction", "va": "center", "fontsize": 6.5, "annotation_clip": False}
+        ax.annotate(text(words), (1.01, y_at), color=color if color != GREY else "#808080", **place)
 
 
-def lines(
-    ax: Axes,
-    rows: pd.DataFrame,
-    x: str,
-    y: str,
-    look: Mapping[str, Look],
-    *,
-    every: int = 1,
-    sort: bool = True,
-    **style: Any,
-) -> None:
-    """A line per estimator through points that are already dense, with a marker at every so many: each estimator's at
-    other ones, so that markers stand side by side where curves coincide."""
+def lines(ax: Axes, rows: pd.DataFrame, x: str, y: str, look: Mapping[str, Look], **style: Any) -> None:
+    """A line per estimator through points that are already dense."""
+    import seaborn as sns
+
     rows = rows[np.isfinite(rows[x]) & np.isfinite(rows[y])]
-    parts = {str(label): part for label, part in rows.groupby("estimator", sort=False)}
-    present = [label for label in look if label in parts]
-    for i, label in enumerate(present):
-        one = look[label]
-        part = parts[label].sort_values([x, y]) if sort else parts[label]
-        ax.plot(
-            part[x],
-            part[y],
-            **{"color": one.color, "linestyle": one.linestyle, "linewidth": 1.4, "marker": one.marker} | style,
-            markersize=5 * mark_scale(),
-            markevery=(every * i // len(present), every),
-            markeredgecolor="white",
-            markeredgewidth=0.5,
-        )
+    rows = rows[rows["estimator"].isin(list(look))]
+    dashes = {label: one.dash for label, one in look.items()}
+    sns.lineplot(rows, x=x, y=y, ax=ax, estimator=None, dashes=dashes, linewidth=1.4, **(seaborn_style(look) | style))
 
 
 def bound_line(ax: Axes, at: float, label: str) -> None:
     ax.axhline(at, color=BOUND_COLOR, linestyle=BOUND_DASH, linewidth=1.0, label=label, zorder=1)
 
 
-def legend_below(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | None = None) -> None:
-    """One legend for all panels, under them: the estimators, then whatever in the panels has a label."""
+def legend(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | None = None) -> None:
+    """One legend for all panels, above them: the estimators in colour, then what in the panels has a label."""
     from matplotlib.lines import Line2D
 
-    handles: dict[str, Any] = {text(label): Line2D([], [], **one.line) for label, one in (look or {}).items()}
+    colored = {label: one for label, one in (look or {}).items() if one.color != GREY}
+    handles: dict[str, Any] = {text(label): Line2D([], [], **one.line) for label, one in colored.items()}
+    if len(colored) < len(look or ()):
+        handles[f"{len(look or ()) - len(colored)} others"] = Line2D([], [], color=GREY, linewidth=1.4)
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
-    if not handles:
-        return
-    columns, printed = _legend_columns(list(handles), fig.get_figwidth()), _column.get() is not None
-    if printed:
-        fig.set_figheight(fig.get_figheight() + 0.15 * -(-len(handles) // columns) + 0.1)
-    fig.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=columns)
+    if handles:
+        columns = _legend_columns(list(handles), fig.get_figwidth())
+        fig.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=columns)
 
 
 def _legend_columns(labels: Sequence[str], width: float) -> int:

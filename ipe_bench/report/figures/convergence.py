@@ -1,4 +1,4 @@
-"""How iterates approach their limit."""
+"""How iterates approach their limit, at every error scale."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pandas as pd
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
+from ipe_bench.report.style import GREY, MARKERS, Look
 from ipe_bench.report.words import plain
 from ipe_bench.statistics.histories import CLOSE
 
@@ -20,6 +21,7 @@ LONG = 60
 
 
 def draw(view: View) -> Iterator[Drawing]:
+    import seaborn as sns
     from matplotlib.ticker import MaxNLocator
 
     if view["convergence"].empty:
@@ -27,22 +29,33 @@ def draw(view: View) -> Iterator[Drawing]:
     medians = median_distances(view["convergence"])
     # A filter's epochs are no iterations; what solves no equation has no limit that it could approach.
     iterating = [label for label, equation in view.equations.items() if equation is not None]
-    medians = medians[medians["estimator"].isin(iterating)]
     # A direct estimate has a start and an end, and nothing between: there is no convergence to see.
     longest = medians.groupby("estimator")["iteration"].transform("max")
-    medians = medians[longest > 0]
+    medians = medians[medians["estimator"].isin(iterating) & (longest > 0)]
     if medians.empty:
         return
     look = view.with_look(medians["estimator"])
-    scales = common.spread(sorted(set(medians["error_scale"])))
-    fig, axes = common.panels(len(scales), look)
+    shown = sorted(look, key=lambda label: look[label].color == GREY)[: common.most_panels()]
+    scales = sorted(set(medians["error_scale"]))
+    colors = sns.color_palette("crest", len(scales)).as_hex()
+    by_scale = {
+        f"error scale {plain(scale)}": Look(color, MARKERS[i % len(MARKERS)])
+        for i, (scale, color) in enumerate(zip(scales, colors, strict=True))
+    }
+    medians = medians.assign(scale=[f"error scale {plain(scale)}" for scale in medians["error_scale"]])
+    fig, axes = common.panels(len(shown), by_scale)
     bottom, top = medians["distance"].min() / 3, medians["distance"].max() * 3
-    for scale, ax in zip(scales, axes, strict=True):
-        rows = common.at_scale(medians, scale)
+    for label, ax in zip(shown, axes, strict=True):
+        rows = medians[medians["estimator"] == label]
+        style = common.seaborn_style(by_scale, "scale") | {
+            "markers": {name: one.marker for name, one in by_scale.items()},
+            "dashes": False,
+        }
+        end = int(rows["iteration"].max())
+        sns.lineplot(rows, x="iteration", y="distance", estimator=None, ax=ax, markevery=1 + end // 12, **style)
         ax.set_yscale("log")
         ax.set_ylim(bottom, top)
-        end = int(rows["iteration"].max())
-        common.lines(ax, rows, "iteration", "distance", look, every=1 + end // 12)
+        common.log_ticks(ax.yaxis, bottom, top)
         common.bound_line(ax, CLOSE, f"{CLOSE:g} standard deviations")
         if end > LONG:
             ax.set_xscale("symlog", linthresh=10)
@@ -50,9 +63,9 @@ def draw(view: View) -> Iterator[Drawing]:
         else:
             ax.set_xlim(-0.03 * end - 0.2, 1.03 * end + 0.2)
             ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-        common.log_ticks(ax.yaxis, bottom, top)
-        ax.set(title=f"error scale {plain(scale)}", ylabel="distance to own limit [σ]", xlabel="iteration")
-    common.legend_below(fig, axes, look)
+        common.title(ax, f"{label}, logarithmic from 10" if end > LONG else label)
+    common.axis_labels(fig, "iteration", "distance to own limit [σ]")
+    common.legend(fig, axes, by_scale)
     last = common.at_scale(medians, scales[-1])
     arrived = last[last["distance"] > CLOSE].groupby("estimator", sort=False)["iteration"].max().add(1)
     seen = [f"{label} {arrived.get(label, 0):g}" for label in look if label in set(last["estimator"])]
@@ -61,9 +74,11 @@ def draw(view: View) -> Iterator[Drawing]:
         " Cramér-Rao bound: median over the first converged trials. The last iterate itself, whose distance is zero by"
         " definition, is not drawn: a curve ends where half of the trials have ended.",
         f"Iterations until the median is within {CLOSE:g} standard deviations at scale {plain(scales[-1])}:"
-        f" {common.enumerate_few(seen, 20)}. {view.label}.",
+        f" {common.enumerate_few(seen, 20)}.",
+        f"{len(look) - len(shown)} further estimators are not shown." if len(look) > len(shown) else "",
+        f"{view.label}.",
     )
-    yield Drawing(f"convergence{view.suffix}", "Convergence", caption, fig)
+    yield Drawing(f"convergence{view.suffix}", "Convergence, converged trials", caption, fig)
 
 
 def median_distances(frame: pd.DataFrame) -> pd.DataFrame:

@@ -29,7 +29,7 @@ def draw_design(design: Design) -> Iterator[Drawing]:
         look = looks([way.title for way in design.ways])
         _curves(left, design, look)
         _by_parameter(right, design, look)
-        common.legend_below(fig, [left, right], look)
+        common.legend(fig, [left, right], look)
         yield Drawing("design", "What to measure next", _caption(design), fig)
 
 

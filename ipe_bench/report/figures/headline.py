@@ -30,15 +30,16 @@ def draw(view: View) -> Iterator[Drawing]:
     ends = ("success_low", "success_high")
     common.curves(success, totals, "success", view.look, view.scales, interval=ends, trials="trials")
     common.shares(success, "share of all trials")
-    success.set_title("success")
+    common.title(success, "success")
     common.decades(error, totals[["error_median", "error_q95"]].clip(lower=0.5), least=4.0)
     common.bound_line(error, 1.0, "1: the bound, an honest covariance")
     ends = ("error_median", "error_q95")
     common.curves(error, totals, "error_median", view.look, view.scales, interval=ends, trials="trials")
-    error.set(title="error over the bound", ylabel="median of all trials, bar up to 95 %")
+    common.title(error, "error over the bound")
+    error.set_ylabel("median, bar to 95 %")
     if len(claims):
         _consistency(axes[2], claims, view)
-    common.legend_below(fig, axes, view.look)
+    common.legend(fig, axes, view.look)
     yield Drawing(f"headline{view.suffix}", _title(view), _caption(view, totals, beyond), fig)
 
 
@@ -48,7 +49,8 @@ def _consistency(ax: common.Axes, claims: pd.DataFrame, view: View) -> None:
     low, high = claims["nees_median_low"].min(), claims["nees_median_high"].max()
     ax.axhspan(low, high, color=BOUND_COLOR, alpha=0.15, linewidth=0, label="limits of an honest one, 95 %")
     common.curves(ax, claims, "nees_median", view.look, view.scales, trials="trials")
-    ax.set(title="squared error over claimed variance", ylabel="NEES, median of all trials")
+    common.title(ax, "squared error over claimed variance")
+    ax.set_ylabel("NEES, median")
 
 
 def _title(view: View) -> str:

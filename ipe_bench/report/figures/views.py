@@ -1,7 +1,6 @@
 """What figures are drawn from: the analysis seen setting by setting, with what a figure may know of its estimators.
 
-A figure gets a `View` that holds the frames which it declared and nothing else, so that a digest of the view says
-whether the figure would look the same again.
+A figure gets a `View` that holds the frames which it declared and nothing else.
 """
 
 from __future__ import annotations
@@ -16,10 +15,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ipe_bench.report.style import Look, looks
+from ipe_bench.report.style import MOST_FACES, Look, looks
 from ipe_bench.report.words import plain
 from ipe_bench.statistics.analysis import Analysis
-from ipe_bench.statistics.comparisons import Ranking
 from ipe_bench.statistics.summary import ALL
 
 MOST_SETTINGS = 6
@@ -53,7 +51,10 @@ class View:
     """What each estimator solves; None for filters and direct estimates, which have no iterations and no root."""
     parameters: Sequence[Mapping[str, Any]] = ()
     """Name, unit, size and group of each; empty for all settings."""
-    ranking: Ranking | None = None
+    bound_correlation: Any = None
+    """Correlation (n, n) of the linear bound's covariance, if it is known."""
+    paper: bool = False
+    """Whether this is the setting of the paper: the gimballed INS with quantised readings."""
     parts: Sequence[View] = field(default=())
     """The settings one by one, in a view of all."""
 
@@ -92,31 +93,16 @@ class View:
         frames = {name: frame.copy() for name, frame in self.frames.items()}
         return replace(self, frames=frames, parts=tuple(part.copied() for part in self.parts))
 
-    def digest(self) -> str:
-        """Changes with anything that a figure of this view can show."""
-        digest = hashlib.sha256()
-        for value in (self.suffix, self.label, self.look, self.equations, self.parameters, self.ranking):
-            digest.update(repr(value).encode())
-        for name, frame in self.frames.items():
-            digest.update(repr((name, list(frame.columns), len(frame))).encode())
-            plain_frame = frame.astype({c: str for c in frame.columns if frame[c].dtype == object})
-            digest.update(pd.util.hash_pandas_object(plain_frame, index=False).to_numpy().tobytes())
-        for part in self.parts:
-            digest.update(part.digest().encode())
-        return digest.hexdigest()
-
 
 def views(analysis: Analysis) -> tuple[list[View], View]:
     """The settings of an analysis, at most `MOST_SETTINGS`, and all of them together."""
-    look = looks(analysis.collection.estimators)
+    look = _looks(analysis)
     equations = {g.estimator: g.footer.get("equation") for g in analysis.collection.groups}
     columns = analysis.setting_columns
     keys = {name: _keys(getattr(analysis, name), columns) for name in FRAMES}
     groups = list(dict.fromkeys(keys["scores"]))
     varying = [c for i, c in enumerate(columns) if len({key[i] for key in groups}) > 1]
-    parameters = {
-        tuple(_word(g.columns.get(c)) for c in columns): g.footer["parameters"] for g in analysis.collection.groups
-    }
+    footers = {tuple(_word(g.columns.get(c)) for c in columns): g.footer for g in analysis.collection.groups}
     parts: list[View] = []
     for number, key in enumerate(groups[:MOST_SETTINGS], 1):
         frames = {
@@ -129,9 +115,36 @@ def views(analysis: Analysis) -> tuple[list[View], View]:
         suffix = _suffix(dict(zip(columns, key, strict=True)), varying, [part.suffix for part in parts])
         seen = {label: one for label, one in look.items() if label in there}
         solve = {label: equations[label] for label in seen}
-        parts.append(View(suffix, label, frames, seen, solve, parameters[key]))
+        footer, names = footers[key], dict(zip(columns, key, strict=True))
+        paper = (names.get("measurement"), names.get("noise")) == ("gins", "quantization")
+        known = footer["parameters"], footer.get("linear_correlation"), paper
+        parts.append(View(suffix, label, frames, seen, solve, *known))
     frames = {name: getattr(analysis, name) for name in FRAMES}
-    return parts, View("", "", frames, look, equations, (), analysis.ranking, tuple(parts))
+    return parts, View("", "", frames, look, equations, parts=tuple(parts))
+
+
+def _looks(analysis: Analysis) -> dict[str, Look]:
+    """A look for each estimator, in the family of its kind; of more than `MOST_FACES` the two best of each kind and the
+    reference are in colour."""
+    labels = analysis.collection.estimators
+    kinds = {g.estimator: kind_of(g.footer) for g in analysis.collection.groups}
+    if len(labels) <= MOST_FACES or analysis.summary.empty:
+        return looks(labels, kinds)
+    totals = analysis.summary[analysis.summary["parameter"] == ALL]
+    success = totals.groupby("estimator")["success"].mean()
+    ranked = sorted(labels, key=lambda label: -success.get(label, 0.0))
+    best = [label for label in labels if label in [e for e in ranked if kinds.get(e) == kinds.get(label)][:2]]
+    return looks(labels, kinds, chosen=best)
+
+
+def kind_of(footer: Mapping[str, Any]) -> str:
+    """The kind of estimator, one of `FAMILIES`, from what is stored of it."""
+    path = str(footer["identity"]["estimator"]["_target_"])
+    if ".enkf." in path or ".es_mda." in path:
+        return "ensembles"
+    if footer.get("sequential"):
+        return "filters"
+    return "IPE" if ".solvers." in path or footer.get("equation") == "frozen" else "least squares"
 
 
 def _keys(frame: pd.DataFrame, columns: Sequence[str]) -> list[tuple[str, ...]]:

@@ -32,12 +32,11 @@ def draw(view: View) -> Iterator[Drawing]:
     common.curves(tail, rows, "tail", look, view.scales, trials="trials")
     tail.set(title="over the median", ylabel="ratio")
     common.bound_line(tail, 1.0, "every trial alike")
-    common.legend_below(fig, [by, tail], look)
+    common.legend(fig, [by, tail], look)
     last = rows[rows["error_scale"] == view.scales[-1]].sort_values("deadline", kind="stable")
     caption = common.sentence(
         "The cost by which 99 % of trials are done, well or not, with its 95 % interval where there are trials enough"
         " for one; and how many times the median that is: far above 1, a few trials take most of the time.",
-        common.UPON,
         f"At the largest scale: {common.values_of(last, 'deadline')}. {view.label}.",
     )
     yield Drawing(f"deadline{view.suffix}", "How long the slowest trials take", caption, fig)

@@ -43,14 +43,14 @@ def test_a_report_has_the_column_and_the_figure(tmp_path, monkeypatch):
     (tmp_path / "plugins" / "deadline").symlink_to(PLUGIN)
     monkeypatch.chdir(tmp_path)
     # Of the bench's own figures one will do.
-    monkeypatch.setattr("ipe_bench.report.figures.FIGURES", ("success",))
+    monkeypatch.setattr("ipe_bench.report.figures.FIGURES", ("costs",))
     discovery.sources.cache_clear()
     try:
         bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=30.0)
         ib.run(bench, {"newton": ib.solvers.Newton()}, 40, output="out")
         trials = ib.load("out")
         cost = trials["simulations"] + trials["jacobians"] * bench.measurement.n
-        result = ib.report("out")
+        result = ib.report("out", figures="all")
     finally:
         monkeypatch.undo()
         discovery.sources.cache_clear()

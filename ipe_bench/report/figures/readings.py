@@ -1,4 +1,4 @@
-"""Figures of estimates from real readings: residuals, and what the readings leave open of pairs of parameters."""
+"""Figures of estimates from real readings: residuals, covariance ellipses of pairs, and profiles of the likelihood."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from scipy.special import chdtri
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement
+from ipe_bench.real.examination import CONFIDENCE, Examination
 from ipe_bench.real.fits import Fit
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.figures import common
@@ -21,7 +22,7 @@ from ipe_bench.report.words import p_value
 
 MOST_ESTIMATORS = 12
 """Estimators with a panel of residuals; `residuals.csv` has all."""
-MOST_PAIRS = 9
+MOST_PAIRS = MOST_PROFILES = 9
 LEVEL = 0.95
 _MANY = 5000
 """Points from which on they are pixels in the PDF, too."""
@@ -50,7 +51,7 @@ def _residuals(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look]
         tests = f"fit p {p_value(one.p_value)}, white p {p_value(one.whiteness.p_value, LEAST_P)}"
         ax.set_title(f"{common.text(one.label)}\n{tests}")
         ax.set(xlabel=common.text(heading), ylabel="residual / its deviation")
-    common.legend_below(fig, axes)
+    common.legend(fig, axes)
     parts = [f"{one.label} {int(one.outliers.sum())}" for one in shown]
     caption = common.sentence(
         "Normalised residuals of the readings; each is standard normal where the model and the noise are right."
@@ -70,23 +71,11 @@ def _residual_panel(ax: Any, x: Array, one: Fit, color: str) -> None:
     common.bound_line(ax, limit, "limit for outliers")
     common.bound_line(ax, -limit, "")
     good = known & ~out
-    sns.scatterplot(
-        x=x[good],
-        y=one.normalised[good],
-        s=9,
-        alpha=0.75,
-        linewidth=0,
-        color=color,
-        legend=False,
-        ax=ax,
-        rasterized=len(x) > _MANY,
-    )
+    dots = {"s": 9, "alpha": 0.75, "linewidth": 0, "rasterized": len(x) > _MANY}
+    style = {"color": color, "legend": False, "ax": ax}
+    sns.scatterplot(x=x[good], y=one.normalised[good], **dots, **style)
     if out.any():
-        sns.scatterplot(
-            x=x[out], y=one.normalised[out], s=25, marker="x", linewidth=1.2, color=color, legend=False, ax=ax
-        )
-        ring = {"s": 100 if out.mean() < 0.1 else 25, "facecolor": "none", "edgecolor": "#C00000", "linewidth": 1.0}
-        sns.scatterplot(x=x[out], y=one.normalised[out], label="outlier", legend=False, ax=ax, **ring)
+        sns.scatterplot(x=x[out], y=one.normalised[out], s=25, marker="x", linewidth=1.2, label="outlier", **style)
     largest = float(np.abs(one.normalised[known]).max())
     if largest > _BENT:
         ax.set_yscale("symlog", linthresh=10.0, linscale=1.0)
@@ -152,7 +141,7 @@ def _ellipses(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look])
             sign = "+" if best.x[k] < 0 else "−"
             set_label(common.text(f"{parameter.name} {sign} {abs(best.x[k]):.5g}{unit}"))
         ax.set_title(f"correlation {best.correlation[pair]:.3f}".replace("-", "−"))
-    common.legend_below(fig, axes, {label: one for label, one in look.items() if label in seen})
+    common.legend(fig, axes, {label: one for label, one in look.items() if label in seen})
     count = model.n * (model.n - 1) // 2
     which = f"the {len(pairs)} most correlated of {count} pairs" if count > len(pairs) else "each pair of parameters"
     out_of_view = common.enumerate_few([label for label in look if label in away])
@@ -184,3 +173,34 @@ def _ellipse_panel(ax: Any, pair: list[int], best: Fit, fits: Sequence[Fit], loo
     ax.yaxis.set_major_locator(MaxNLocator(5))
     ax.ticklabel_format(style="sci", scilimits=(-3, 4), useMathText=True)
     return {one.label for one in near}
+
+
+def draw_profiles(found: Examination) -> Iterator[Drawing]:
+    """A panel for each parameter whose interval from the standard error is off by more than a tenth."""
+    names = found.model.physical_parameters
+    bent = [i for i, one in enumerate(found.profiles) if one.bent][:MOST_PROFILES]
+    if not bent:
+        return
+    with house_style():
+        across = {1: 1, 2: 2, 3: 3, 4: 2}.get(len(bent), 3)
+        fig, axes = common.panels(len(bent), height=2.6, most_across=across)
+        for i, ax in zip(bent, axes, strict=True):
+            one, estimate, deviation = found.profiles[i], found.x[i], found.standard_errors[i]
+            known = np.isfinite(one.zeta) & (np.abs(one.zeta) <= 2.5 * found.half_width)
+            values = one.values[known]
+            line = np.linspace(values[0], values[-1], 200)
+            ax.plot(values, one.zeta[known] ** 2, marker="o", markersize=3, label="profile")
+            parabola = ((line - estimate) / deviation) ** 2
+            ax.plot(line, parabola, color=BOUND_COLOR, linewidth=0.8, label="standard error")
+            common.bound_line(ax, found.half_width**2, f"limit of {CONFIDENCE:.0%}".replace("%", " %"))
+            ax.set_ylim(0, 2.5 * found.half_width**2)
+            unit = f" [{names[i].unit}]" if names[i].unit else ""
+            ax.set_xlabel(common.text(f"{names[i].name}{unit}"))
+            ax.set_ylabel("rise of chi-square")
+        common.legend(fig, axes)
+    told = "; ".join(f"{names[i].name} {found.profiles[i].low:.4g} to {found.profiles[i].high:.4g}" for i in bent)
+    caption = (
+        "How chi-square rises when one parameter is held and the others adapt to it, beside the parabola that a"
+        f" standard error stands for. The interval is where the profile stays below the line: {told}."
+    )
+    yield Drawing("likelihood", "Profiles of the likelihood", caption, fig)
