@@ -46,9 +46,16 @@ class Bock(OdeMeasurement):
     """What one unit of error is, of each parameter."""
     deviation: Positive = 0.05
     """The standard deviation that R states of the recorded readings."""
-    step: Positive | None = 0.0025
+    step: Positive | None = None
+    """A longest step for all trials; None: each trial's follows its parameters."""
 
     states, outputs = 2, ("x1", "x2")
+    tolerance = 1e-13
+    """The error that the integration may leave in a reading, times cosh(mu t), by which solutions grow."""
+
+    @cached_property
+    def _tolerances(self) -> Array:
+        return np.repeat(self.tolerance * np.cosh(self.mu * self.times), 2)
 
     @property
     def usual_noise(self) -> UsualNoise:  # type: ignore[override]

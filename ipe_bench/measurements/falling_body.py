@@ -57,11 +57,12 @@ class FallingBody(OdeMeasurement):
     """What one unit of error of the velocity is, in m/s."""
     ballistic_size: Positive = float(np.log(1e-3 / 3e-5))
     """What one unit of error of the logarithm of the ballistic coefficient is."""
-    step: Positive | None = 0.5
+    step: Positive | None = None
+    """A longest step in s for all trials; None: each trial's follows its parameters."""
     sampled: tuple[float, ...] | None = None
     """Times of the ranges in s, in place of equal intervals."""
 
-    states, outputs, reading_unit = 2, ("range",), "m"
+    states, outputs, reading_unit, tolerance = 2, ("range",), "m", 1e-5
     usual_noise = UsualNoise(100 * _FOOT)
 
     @cached_property

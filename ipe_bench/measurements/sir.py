@@ -50,11 +50,12 @@ class Sir(OdeMeasurement):
     """What one unit of error of the logarithm of a rate is."""
     infected_size: Positive = 0.3
     """What one unit of error of the logarithm of the odds I(0) / S(0) is."""
-    step: Positive | None = 0.125
+    step: Positive | None = None
+    """A longest step in days for all trials; None: each trial's follows its parameters."""
     sampled: tuple[float, ...] | None = None
     """Times of the readings in days, in place of one at the end of each day."""
 
-    states, time_unit, reading_unit = 2, "day", "people"
+    states, time_unit, reading_unit, tolerance = 2, "day", "people", 1e-6
     usual_noise = UsualNoise(20.0)
 
     def __post_init__(self) -> None:

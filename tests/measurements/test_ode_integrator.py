@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import DOP853
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import OdeMeasurement, Parameter, Polynomial, ode
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode import tableau
@@ -240,7 +241,7 @@ def test_without_a_tolerance_or_a_step_the_model_says_what_is_missing():
     class Silent(Pulse):
         tolerance = None
 
-    with pytest.raises(ValueError, match="state `tolerance`"):
+    with pytest.raises(UserError, match=r"^measurement.step=null: silent states neither .*; give one"):
         Silent(step=None).simulate(np.ones((1, 2)))
 
 

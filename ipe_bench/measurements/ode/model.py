@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, own
 from ipe_bench.measurements.base import Input, Measurement
 from ipe_bench.measurements.ode import sampling
@@ -319,7 +320,8 @@ class OdeMeasurement(Measurement):
     def _tolerances(self) -> Array:
         """What each reading (m,) may be off by."""
         if self.tolerance is None:
-            raise ValueError(f"{self.name}: state `tolerance`, the error that a reading may have, or a fixed `step`")
+            lacking = "states neither a step nor `tolerance`, the error that readings may have"
+            raise UserError(f"measurement.step=null: {self.name} {lacking}; give one, as measurement.step=0.1")
         per_output = np.broadcast_to(np.asarray(self.tolerance, dtype=float), len(self.outputs))
         return np.tile(per_output, self.m // len(self.outputs))
 
