@@ -9,7 +9,7 @@ import numpy as np
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.estimators.ipe import FrozenSystem
 from ipe_bench.measurements import Measurement, Parameter
-from ipe_bench.measurements.counted import CountingModel, Tally
+from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 
 
 @dataclass(frozen=True)
@@ -85,5 +85,5 @@ def system_of(model: Measurement, trials: int) -> FrozenSystem:
     """h(x) = 0 for each trial."""
     unit = np.eye(model.n)[None]
     R = Covariance(np.ones(model.m))
-    counted = CountingModel(model, Tally.zeros(trials))
+    counted = CountingModel(model, EvaluationCount.zeros(trials))
     return FrozenSystem(counted, unit, np.ones((1, model.n)), R, np.zeros((trials, model.m)), np.arange(trials))

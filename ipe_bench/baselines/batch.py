@@ -11,7 +11,7 @@ from ipe_bench.basics.options import Count, Positive
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import Solver
 from ipe_bench.estimators.ipe import Start, starting_points
-from ipe_bench.estimators.least_squares import Descent, Objective, minimize
+from ipe_bench.estimators.least_squares import LeastSquaresSystem, Objective, minimize
 from ipe_bench.measurements.problem import Problem
 
 
@@ -36,7 +36,7 @@ class Batch(Estimator):
         return Objective.of(problem, z, prior=False)
 
     @abstractmethod
-    def method(self, objective: Objective) -> Solver[Descent]:
+    def method(self, objective: Objective) -> Solver[LeastSquaresSystem]:
         """What minimises it."""
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:

@@ -17,7 +17,7 @@ from ipe_bench.baselines.epochs import Epoch
 from ipe_bench.basics.linalg import Array, Mask, finite, multiply, solve
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
-from ipe_bench.measurements.counted import Tally
+from ipe_bench.measurements.counted import EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
 Rows = NDArray[np.intp]
@@ -65,7 +65,7 @@ class _Walk:
     def __init__(self, stack: Stack, problem: Problem, z: Array, *, slopes: bool) -> None:
         self.stack, self.problem, self.z, self.slopes = stack, problem, z, slopes
         self.d = np.asarray(problem.prior_deviation, dtype=float)
-        self.tally = Tally.zeros(len(z))
+        self.tally = EvaluationCount.zeros(len(z))
         self.status = np.full(len(z), Status.RUNNING, dtype=np.int8)
         self.messages: dict[int, str] = {}
         self.taken = np.zeros(len(z), dtype=np.int64)

@@ -12,7 +12,7 @@ from ipe_bench.baselines.ensemble import read_members
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.measurements.base import Measurement, SubsetModel
-from ipe_bench.measurements.counted import CountingModel, Tally
+from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
 
@@ -27,14 +27,16 @@ class Epoch:
     share: float
     """The cost of this model's readings over that of all."""
 
-    def counted(self, tally: Tally) -> CountingModel:
+    def counted(self, tally: EvaluationCount) -> CountingModel:
         """The model, with the cost of a prefix."""
         return CountingModel(self.model, tally, self.share)
 
     def whitened(self, z: Array) -> Array:
         return self.R.whiten(z[..., self.rows])
 
-    def read(self, x: Array, trials: NDArray[np.intp], tally: Tally, *, slopes: bool) -> tuple[Array, Array | None]:
+    def read(
+        self, x: Array, trials: NDArray[np.intp], tally: EvaluationCount, *, slopes: bool
+    ) -> tuple[Array, Array | None]:
         """Whitened h (trials, points, m) at x (trials, points, n), and dh/dx (trials, m, n) where it is asked for."""
         h = read_members(self.counted(tally), self.R, x, trials)
         if not slopes:

@@ -9,7 +9,7 @@ from ipe_bench.basics.options import Positive
 from ipe_bench.estimators.driver import Solver
 from ipe_bench.estimators.gauss_newton import GaussNewtonMethod
 from ipe_bench.estimators.ipe import Start
-from ipe_bench.estimators.least_squares import Descent, Objective
+from ipe_bench.estimators.least_squares import LeastSquaresSystem, Objective
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 
 
@@ -22,5 +22,5 @@ class GaussNewton(Batch):
     damping: Positive | None = None
     """The initial lambda of Levenberg-Marquardt with Marquardt's scaling; None: no damping."""
 
-    def method(self, objective: Objective) -> Solver[Descent]:
+    def method(self, objective: Objective) -> Solver[LeastSquaresSystem]:
         return GaussNewtonMethod() if self.damping is None else LevenbergMarquardtMethod(self.damping)

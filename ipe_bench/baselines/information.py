@@ -23,7 +23,7 @@ from ipe_bench.basics.options import Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
 from ipe_bench.estimators.least_squares import squared
-from ipe_bench.measurements.counted import CountingModel, Tally
+from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
 
@@ -71,7 +71,7 @@ class EpochReadings:
     problem: Problem
     deviation: Array
     """Of the scenario's prior (n,), in multiples of the parameters' units."""
-    tally: Tally
+    tally: EvaluationCount
     z: Array
     rows: NDArray[np.intp]
     belief: Belief
@@ -133,7 +133,7 @@ class _Pass:
         deviation = problem.prior_used()
         assert deviation is not None
         self.deviation = deviation
-        self.tally = Tally.zeros(trials)
+        self.tally = EvaluationCount.zeros(trials)
         # U0' U0 = P0^-1, in deviations of the prior.
         U0 = np.linalg.cholesky(np.linalg.inv(problem.scaled_prior)).T / filter.prior_inflation
         self.belief = Belief(np.zeros((trials, n)), np.repeat(U0[None], trials, axis=0))

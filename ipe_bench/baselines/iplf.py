@@ -11,7 +11,7 @@ from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array, Mask, finite, multiply
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.driver import Solver, Standing, iterate
+from ipe_bench.estimators.driver import ConvergenceCheck, Solver, iterate
 from ipe_bench.estimators.least_squares import squared
 
 _SHORTEST = 2.0**-10
@@ -132,10 +132,10 @@ class PosteriorLinearization(Solver[Linearized]):
             state = put(state, settled, replace(renewed, innovations=part.innovations))
         return state
 
-    def standing(self, readings: EpochReadings, before: Linearized | None, state: Linearized) -> Standing:
+    def check(self, readings: EpochReadings, before: Linearized | None, state: Linearized) -> ConvergenceCheck:
         """Done where bringing the covariance up to date has changed neither it nor the mean."""
         level = np.where(np.isfinite(state.cost) & state.proposal.usable, 1.0, np.nan)
-        return Standing(state.change, level, np.full(len(state.x), np.inf))
+        return ConvergenceCheck(state.change, level, np.full(len(state.x), np.inf))
 
 
 def _linearized(readings: EpochReadings, x: Array, U: Array, change: Array) -> Linearized:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from ipe_bench.baselines.batch import Batch
 from ipe_bench.basics.options import Positive
 from ipe_bench.estimators.driver import Solver
-from ipe_bench.estimators.least_squares import Descent, Objective
+from ipe_bench.estimators.least_squares import LeastSquaresSystem, Objective
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 
 
@@ -22,5 +22,5 @@ class LevenbergMarquardt(Batch):
     """Bends each step along the curvature of the readings, for one more simulation (Transtrum and Sethna, 2012,
     arXiv 1201.5885)."""
 
-    def method(self, objective: Objective) -> Solver[Descent]:
+    def method(self, objective: Objective) -> Solver[LeastSquaresSystem]:
         return LevenbergMarquardtMethod(self.damping, geodesic=self.geodesic)

@@ -11,8 +11,8 @@ from ipe_bench.baselines.information import Belief, EpochReadings, InformationFi
 from ipe_bench.basics.linalg import Array, multiply
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.driver import Ended, iterate
-from ipe_bench.estimators.least_squares import Descent, squared
+from ipe_bench.estimators.driver import SolveResult, iterate
+from ipe_bench.estimators.least_squares import LeastSquaresSystem, squared
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.counted import CountingModel
 
@@ -74,7 +74,7 @@ class Standardized:
     def subset(self, kept: NDArray[np.bool_]) -> Standardized:
         return Standardized(self.readings.subset(kept), self.root[kept])
 
-    def belief(self, ended: Ended[Descent]) -> Belief:
+    def belief(self, ended: SolveResult[LeastSquaresSystem]) -> Belief:
         """What is believed where the search has ended, the readings linearised there; a lost trial has no mean."""
         slope = ended.state.slope
         # The step still to go is within the tolerance, and costs nothing.

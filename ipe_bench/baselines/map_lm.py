@@ -8,7 +8,7 @@ from ipe_bench.baselines.batch import Batch
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Positive
 from ipe_bench.estimators.driver import Solver
-from ipe_bench.estimators.least_squares import Descent, Objective
+from ipe_bench.estimators.least_squares import LeastSquaresSystem, Objective
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.problem import Problem
 
@@ -32,5 +32,5 @@ class MapLM(Batch):
     def objective(self, problem: Problem, z: Array) -> Objective:
         return Objective.of(problem, z, prior=True, inflation=self.prior_inflation)
 
-    def method(self, objective: Objective) -> Solver[Descent]:
+    def method(self, objective: Objective) -> Solver[LeastSquaresSystem]:
         return LevenbergMarquardtMethod(self.damping, None if objective.prior is None else objective.prior.deviations)

@@ -15,10 +15,10 @@ from ipe_bench.basics.linalg import Array, Covariance, Mask, finite, inverse, mu
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
-from ipe_bench.estimators.driver import Solver, Standing, iterate
+from ipe_bench.estimators.driver import ConvergenceCheck, Solver, iterate
 from ipe_bench.estimators.least_squares import Minima, squared
 from ipe_bench.measurements.base import Measurement, SubsetModel
-from ipe_bench.measurements.counted import CountingModel, Tally
+from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.ode.interval import Interval
 from ipe_bench.measurements.ode.model import OdeMeasurement
 from ipe_bench.measurements.problem import Problem
@@ -67,7 +67,7 @@ class MultipleShooting(Estimator):
         assert isinstance(model, OdeMeasurement)
         pieces = Pieces(problem, model, kept, self.segments, self.step)
         with np.errstate(all="ignore"):
-            shooting = Shooting(pieces, z, Tally.zeros(len(z)), np.arange(len(z)))
+            shooting = Shooting(pieces, z, EvaluationCount.zeros(len(z)), np.arange(len(z)))
             x = np.repeat(problem.x0[None], len(z), axis=0)
             ended = iterate(
                 shooting,
@@ -301,7 +301,7 @@ class Shooting:
 
     pieces: Pieces
     z: Array
-    tally: Tally
+    tally: EvaluationCount
     rows: NDArray[np.intp]
 
     @property
@@ -390,7 +390,7 @@ class CondensedGaussNewton(Solver[Trajectory]):
         )
         return put(state, taken, new)
 
-    def standing(self, system: Shooting, before: Trajectory | None, state: Trajectory) -> Standing:
+    def check(self, system: Shooting, before: Trajectory | None, state: Trajectory) -> ConvergenceCheck:
         """The step still to go, the gaps, and whether a step can still be shortened."""
         gap = np.abs(state.d).max(axis=1, initial=0.0)
         size = np.fmax(_reach(state, state.step), gap)
@@ -398,7 +398,7 @@ class CondensedGaussNewton(Solver[Trajectory]):
         unknown = ~finite(state.step)
         ending = np.where(unknown, Status.SINGULAR, Status.STALLED)
         size = np.where(unknown, np.inf, size)
-        return Standing(size, level, state.moved, unknown | (state.share < _SHORTEST), ending)
+        return ConvergenceCheck(size, level, state.moved, unknown | (state.share < _SHORTEST), ending)
 
 
 def _reach(state: Trajectory, change: Array) -> Array:

@@ -15,7 +15,7 @@ from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Equation, Estimates, Estimator, one_by_one
 from ipe_bench.estimators.ipe import Start, starting_points
-from ipe_bench.measurements.counted import Tally
+from ipe_bench.measurements.counted import EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
 _OUT_OF_EVALUATIONS = 0
@@ -62,7 +62,7 @@ class LeastSquares(Estimator):
         return "least_squares" if self.loss == "linear" else None
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        tally = Tally.zeros(len(z))
+        tally = EvaluationCount.zeros(len(z))
         x = starting_points(problem, z, self.start, tally)
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)

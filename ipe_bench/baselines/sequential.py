@@ -22,7 +22,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import NonNegative, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
-from ipe_bench.measurements.counted import Tally
+from ipe_bench.measurements.counted import EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
 _LARGEST = 1e150
@@ -123,7 +123,7 @@ class _Run:
         self.filter, self.problem, self.z = filter, problem, z
         trials, n = len(z), problem.measurement.n
         self.d = np.asarray(problem.prior_deviation, dtype=float)
-        self.tally = Tally.zeros(trials)
+        self.tally = EvaluationCount.zeros(trials)
         self.epochs = list(arrivals(problem))
         self.status = np.full(trials, Status.RUNNING, dtype=np.int8)
         self.messages: dict[int, str] = {}

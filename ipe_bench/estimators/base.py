@@ -15,7 +15,7 @@ from ipe_bench.basics.errors import describe_exception
 from ipe_bench.basics.linalg import Array, read_only
 from ipe_bench.basics.options import Component
 from ipe_bench.basics.statuses import Status
-from ipe_bench.measurements.counted import Tally
+from ipe_bench.measurements.counted import EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
 Need = Literal["differential equations", "epochs", "prior"]
@@ -75,7 +75,7 @@ class Estimates:
                 setattr(self, name, np.zeros(len(self.x), values.dtype))
 
     @classmethod
-    def of(cls, ended: Answer, tally: Tally, **further: Any) -> Estimates:
+    def of(cls, ended: Answer, tally: EvaluationCount, **further: Any) -> Estimates:
         """What an iteration came to, with what it cost; `further` are fields that only the estimator knows."""
         counts = {"simulations": tally.simulations.copy(), "jacobians": tally.jacobians.copy()}
         found = {"x": ended.x, "status": ended.status, "iterations": ended.iterations, "history": ended.history}

@@ -46,7 +46,7 @@ class Equations(Protocol):
 
 
 @dataclass(frozen=True)
-class Standing:
+class ConvergenceCheck:
     """Where each trial stands after a step; every field is (trials,)."""
 
     size: Array
@@ -73,12 +73,12 @@ class Solver(ABC, Generic[S]):
         """The state after one more iteration."""
 
     @abstractmethod
-    def standing(self, system: Any, before: S | None, state: S) -> Standing:
+    def check(self, system: Any, before: S | None, state: S) -> ConvergenceCheck:
         """How far the trials have come; `before` is the state of a step ago, None at the start."""
 
 
 @dataclass(frozen=True)
-class Ended(Generic[S]):
+class SolveResult(Generic[S]):
     """Where the iteration of each trial ended."""
 
     state: S
@@ -105,11 +105,11 @@ def iterate(
     max_iterations: int,
     budget: float | None = None,
     history: bool = False,
-) -> Ended[S]:
+) -> SolveResult[S]:
     """Iterates from `start`, which is x (trials, n) or a state, until every trial has ended.
 
-    Converged is where `Standing.size` is at most `tolerance`. `budget` bounds the simulations of a trial, a Jacobian
-    counting n; None: no limit. Finished trials leave the batch.
+    Converged is where `ConvergenceCheck.size` is at most `tolerance`. `budget` bounds the simulations of a trial, a
+    Jacobian counting n; None: no limit. Finished trials leave the batch.
     """
     state = solver.begin(equations, start) if isinstance(start, np.ndarray) else start
     trials, n = state.x.shape
@@ -117,12 +117,12 @@ def iterate(
     status, iterations = np.full(trials, Status.RUNNING, np.int8), np.zeros(trials, np.int64)
     iterates = [[row] for row in state.x] if history else None
     ended: list[tuple[NDArray[np.intp], S]] = []
-    standing = solver.standing(equations, None, state)
-    begun = np.maximum(standing.level, 1.0)
+    check = solver.check(equations, None, state)
+    begun = np.maximum(check.level, 1.0)
     for iteration in range(max_iterations + 1):
         if iteration:
             before, state = state, solver.step(equations, state)
-            standing = solver.standing(equations, before, state)
+            check = solver.check(equations, before, state)
             iterations[active] = iteration
             if iterates is not None:
                 for row, x in zip(active, state.x, strict=True):
@@ -130,7 +130,7 @@ def iterate(
         rows = equations.rows
         spent = budget is not None and tally.cost(n)[rows] >= budget
         last = Status.MAX_ITERATIONS if iteration == max_iterations else Status.RUNNING
-        now = _endings(standing, tally.failed(rows), tally.singular[rows], begun, spent, tolerance, last)
+        now = _endings(check, tally.failed(rows), tally.singular[rows], begun, spent, tolerance, last)
         status[active] = now
         going = now == Status.RUNNING
         if not going.all():
@@ -140,21 +140,27 @@ def iterate(
             active, begun = active[going], begun[going]
             equations, state = equations.subset(going), take(state, going)
     paths = None if iterates is None else [np.array(x) for x in iterates]
-    return Ended(gather(ended) if ended else state, status, iterations, paths)
+    return SolveResult(gather(ended) if ended else state, status, iterations, paths)
 
 
 def _endings(
-    standing: Standing, failed: Mask, singular: Mask, begun: Array, spent: Mask | bool, tolerance: float, last: Status
+    check: ConvergenceCheck,
+    failed: Mask,
+    singular: Mask,
+    begun: Array,
+    spent: Mask | bool,
+    tolerance: float,
+    last: Status,
 ) -> NDArray[np.int8]:
     """The status of each trial: the first line that holds, else `last`."""
     lines = (
         (failed, Status.ERROR),
         (singular, Status.SINGULAR),
-        (~np.isfinite(standing.level), Status.NONFINITE),
-        (standing.size <= tolerance, Status.CONVERGED),
-        (standing.stuck, standing.ending),
-        (standing.level > FAR * begun, Status.DIVERGED),
-        (standing.moved < TINY_STEP * tolerance, standing.ending),
+        (~np.isfinite(check.level), Status.NONFINITE),
+        (check.size <= tolerance, Status.CONVERGED),
+        (check.stuck, check.ending),
+        (check.level > FAR * begun, Status.DIVERGED),
+        (check.moved < TINY_STEP * tolerance, check.ending),
         (spent, Status.BUDGET),
     )
     status = np.full(begun.shape, last, np.int8)

@@ -7,21 +7,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ipe_bench.basics.linalg import Array, finite, multiply
-from ipe_bench.estimators.driver import Solver, Standing
-from ipe_bench.estimators.least_squares import Descent, Residuals, slope_at, squared
+from ipe_bench.estimators.driver import ConvergenceCheck, Solver
+from ipe_bench.estimators.least_squares import LeastSquaresSystem, Residuals, slope_at, squared
 
 _SMALL = 1e-10
 """Singular values of J below this share of the largest are taken for zero where J lacks rank."""
 
 
 @dataclass(frozen=True)
-class GaussNewtonMethod(Solver[Descent]):
+class GaussNewtonMethod(Solver[LeastSquaresSystem]):
     """x <- x - (J' R^-1 J)^-1 J' R^-1 (h(x) - z), undamped; where J lacks rank, the shortest of all such steps."""
 
-    def begin(self, objective: Residuals, x: Array) -> Descent:
-        return Descent.at(objective, x)
+    def begin(self, objective: Residuals, x: Array) -> LeastSquaresSystem:
+        return LeastSquaresSystem.at(objective, x)
 
-    def step(self, objective: Residuals, state: Descent) -> Descent:
+    def step(self, objective: Residuals, state: LeastSquaresSystem) -> LeastSquaresSystem:
         step = _shortest(state) if state.rankless.any() else state.slope.newton
         x = state.x + step
         r = objective.residual(x)
@@ -33,12 +33,14 @@ class GaussNewtonMethod(Solver[Descent]):
             state, x=x, r=r, cost=squared(r), slope=slope, moved=moved, regular=regular, exact=exact, near=near
         )
 
-    def standing(self, objective: Residuals, before: Descent | None, state: Descent) -> Standing:
+    def check(
+        self, objective: Residuals, before: LeastSquaresSystem | None, state: LeastSquaresSystem
+    ) -> ConvergenceCheck:
         """Where J lacks rank and no step leads on, the trial ends as singular."""
-        return state.standing(objective, stuck=state.rankless & (state.moved == 0))
+        return state.check(objective, stuck=state.rankless & (state.moved == 0))
 
 
-def _shortest(state: Descent) -> Array:
+def _shortest(state: LeastSquaresSystem) -> Array:
     """The step (trials, n) of least length, in multiples of the parameters' sizes, that minimises |r + J s|."""
     slope, lost = state.slope, state.rankless & finite(state.slope.U) & finite(state.slope.gradient)
     step = slope.newton.copy()

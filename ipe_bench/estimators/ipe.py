@@ -28,8 +28,8 @@ from ipe_bench.basics.linalg import (
 )
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.estimators.base import Estimates, Estimator
-from ipe_bench.estimators.driver import Solver, Standing, iterate
-from ipe_bench.measurements.counted import CountingModel, Tally
+from ipe_bench.estimators.driver import ConvergenceCheck, Solver, iterate
+from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
 Start = Literal["linear_lse", "nominal", "best"]
@@ -106,7 +106,7 @@ class FrozenSystem:
                 "parameters cannot be told apart there, so there is no linear estimate to start from; give another "
                 "nominal point, start=nominal or best for least squares, or an estimator with a prior"
             )
-        model, H_plus = CountingModel(problem.measurement, Tally.zeros(len(z))), problem.H_plus[None]
+        model, H_plus = CountingModel(problem.measurement, EvaluationCount.zeros(len(z))), problem.H_plus[None]
         deviation = deviations(frozen_covariance(H_plus, problem.R))
         return cls(model, H_plus, deviation, problem.R, z, np.arange(len(z)))
 
@@ -175,7 +175,7 @@ def begin(problem: Problem, z: Array, start: Start) -> tuple[Array, FrozenSystem
     return (x0 - system.F(x0) if start == "linear_lse" else x0), system
 
 
-def starting_points(problem: Problem, z: Array, start: Start, tally: Tally) -> Array:
+def starting_points(problem: Problem, z: Array, start: Start, tally: EvaluationCount) -> Array:
     """Where least squares begins (trials, n); what that costs goes to the tally.
 
     Where H has not full column rank at the nominal point there is no linear LSE, and it begins at the nominal point:
@@ -235,9 +235,9 @@ class IPE(Solver[S], Estimator, Generic[S]):
     def begin(self, system: Any, x: Array) -> S:
         return self.init(system, x, system.F(x))
 
-    def standing(self, system: Any, before: S | None, state: S) -> Standing:
+    def check(self, system: Any, before: S | None, state: S) -> ConvergenceCheck:
         """abs(F_i), and the step, in standard deviations of the linear bound."""
-        return root_standing(system.deviation, before, state)
+        return root_check(system.deviation, before, state)
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         x, system = begin(problem, z, self.start)
@@ -253,9 +253,9 @@ class IPE(Solver[S], Estimator, Generic[S]):
         return Estimates.of(ended, system.model.tally, covariance=system.sandwich(ended.x))
 
 
-def root_standing(deviation: Array, before: State | None, state: State) -> Standing:
+def root_check(deviation: Array, before: State | None, state: State) -> ConvergenceCheck:
     """How far F is from zero, and how long the last step was, in standard deviations (1, n) or (trials, n)."""
     residual = np.abs(state.F / deviation).max(axis=1)
     if before is None:
-        return Standing(residual, residual, np.full(len(residual), np.inf))
-    return Standing(residual, residual, np.abs((state.x - before.x) / deviation).max(axis=1))
+        return ConvergenceCheck(residual, residual, np.full(len(residual), np.inf))
+    return ConvergenceCheck(residual, residual, np.abs((state.x - before.x) / deviation).max(axis=1))

@@ -27,8 +27,8 @@ from ipe_bench.basics.linalg import (
 )
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
-from ipe_bench.estimators.driver import Ended, Solver, Standing, iterate
-from ipe_bench.measurements.counted import CountingModel, Tally
+from ipe_bench.estimators.driver import ConvergenceCheck, Solver, SolveResult, iterate
+from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
 _VISIBLE = 1e-8
@@ -83,7 +83,7 @@ class Objective:
     @classmethod
     def of(cls, problem: Problem, z: Array, *, prior: bool, inflation: float = 1.0) -> Objective:
         """The objective of all readings z (trials, m); with the prior, its deviations times `inflation`."""
-        model = CountingModel(problem.measurement, Tally.zeros(len(z)))
+        model = CountingModel(problem.measurement, EvaluationCount.zeros(len(z)))
         counting = problem.prior_covariance(inflation) if prior else None
         return cls(model, problem.R, z, np.arange(len(z)), problem.x0, counting)
 
@@ -128,7 +128,7 @@ class Objective:
 
 
 @dataclass(frozen=True)
-class Slope:
+class NormalEquations:
     """J = Q U of each trial: all that a step needs to know of the Jacobian."""
 
     U: Array
@@ -150,7 +150,7 @@ class Slope:
     """(trials, m, n), where a method asks for it."""
 
     @classmethod
-    def of(cls, J: Array, r: Array, deviation: Array | None = None, *, keep_Q: bool = False) -> Slope:
+    def of(cls, J: Array, r: Array, deviation: Array | None = None, *, keep_Q: bool = False) -> NormalEquations:
         """Of J (trials, m, n), its rows divided by `deviation` (m,), and residuals r (trials, m)."""
         G, along = normal_equations(J, r, deviation)
         U, inverse_U, well = definite_factor(G)
@@ -173,7 +173,7 @@ class Slope:
         along = np.abs(multiply(U.swapaxes(1, 2), gradient)) / np.where(columns > 0, columns, 1.0)
         return cls(U, inverse_U, gradient, columns, newton, size, along.max(axis=1), Q)
 
-    def towards(self, r: Array) -> Slope:
+    def towards(self, r: Array) -> NormalEquations:
         """The same Jacobian with another residual r (trials, m): a chord. It needs Q."""
         assert self.Q is not None
         gradient = multiply(self.Q.swapaxes(1, 2), r)
@@ -222,7 +222,9 @@ def inverse_factor(J: Array) -> Array:
     return _by_orthogonal_factor(J, np.zeros(J.shape[:2]))[2]
 
 
-def slope_at(objective: Residuals, x: Array, r: Array, exact: Mask, *, keep_Q: bool = False) -> tuple[Slope, Mask]:
+def slope_at(
+    objective: Residuals, x: Array, r: Array, exact: Mask, *, keep_Q: bool = False
+) -> tuple[NormalEquations, Mask]:
     """The slope at x, where the residuals are r, and where it is that of an exact Jacobian: where `exact` (trials,)
     says so, and where a coarse one has not full rank."""
     if exact.all():
@@ -240,13 +242,13 @@ def slope_at(objective: Residuals, x: Array, r: Array, exact: Mask, *, keep_Q: b
     return slope, lost
 
 
-def _slope_of(objective: Residuals, x: Array, r: Array, *, coarse: bool, keep_Q: bool) -> Slope:
+def _slope_of(objective: Residuals, x: Array, r: Array, *, coarse: bool, keep_Q: bool) -> NormalEquations:
     J, deviation = objective.slopes(x, coarse=coarse)
-    return Slope.of(J, r, deviation, keep_Q=keep_Q)
+    return NormalEquations.of(J, r, deviation, keep_Q=keep_Q)
 
 
 @dataclass(frozen=True)
-class Descent:
+class LeastSquaresSystem:
     """What these methods carry from step to step; every field has the trials in front."""
 
     x: Array
@@ -254,7 +256,7 @@ class Descent:
     """Whitened residuals, those of the prior included."""
     cost: Array
     """|r|^2."""
-    slope: Slope
+    slope: NormalEquations
     moved: Array
     """The last step, tried or taken, in standard deviations of the readings that it moves."""
     lam: Array
@@ -273,7 +275,7 @@ class Descent:
     """and where it is from now on, since little is left to go."""
 
     @classmethod
-    def at(cls, objective: Residuals, x: Array, lam: float = 0.0, *, keep_Q: bool = False) -> Descent:
+    def at(cls, objective: Residuals, x: Array, lam: float = 0.0, *, keep_Q: bool = False) -> LeastSquaresSystem:
         """The state at the start."""
         r = objective.residual(x)
         trials = len(x)
@@ -308,7 +310,7 @@ class Descent:
         """Where J has not full rank (trials,)."""
         return ~np.isfinite(self.slope.size)
 
-    def standing(self, objective: Residuals, stuck: Mask) -> Standing:
+    def check(self, objective: Residuals, stuck: Mask) -> ConvergenceCheck:
         """The Gauss-Newton step still to go says how far the gradient is from zero, where J is good enough to end with;
         the cost says what diverges."""
         known = np.isfinite(self.cost) & finite(self.slope.gradient)
@@ -318,7 +320,7 @@ class Descent:
         size = np.where(self.settled, 0.0, size)
         if objective.exact_within > 0:
             size = np.where(self.exact, size, np.inf)
-        return Standing(size, level, self.moved, stuck, ending)
+        return ConvergenceCheck(size, level, self.moved, stuck, ending)
 
 
 @dataclass(frozen=True)
@@ -348,7 +350,7 @@ class Minima:
 
         return chdtrc(max(readings - self.x.shape[1], 1), self.chi_square)
 
-    def estimates(self, tally: Tally, readings: int) -> Estimates:
+    def estimates(self, tally: EvaluationCount, readings: int) -> Estimates:
         """What an estimator hands back."""
         extras = {"fit_p": self.fit_probability(readings)}
         return Estimates.of(self, tally, covariance=self.covariance, extras=extras)
@@ -356,7 +358,7 @@ class Minima:
 
 def minimize(
     objective: Objective,
-    method: Solver[Descent],
+    method: Solver[LeastSquaresSystem],
     x: Array,
     *,
     tolerance: float,
@@ -376,12 +378,12 @@ def minimize(
     return reached(objective, iterate(objective, method, x, history=history, **limits))
 
 
-def reached(objective: Objective, ended: Ended[Any]) -> Minima:
-    """What is known of the objective where an iteration of it, by states like `Descent`, ended."""
+def reached(objective: Objective, ended: SolveResult[Any]) -> Minima:
+    """What is known of the objective where an iteration of it, by states like `LeastSquaresSystem`, ended."""
     return minima_of(ended, _exact_slope(objective, ended.state), objective.readings)
 
 
-def minima_of(ended: Ended[Any], slope: Slope, readings: int) -> Minima:
+def minima_of(ended: SolveResult[Any], slope: NormalEquations, readings: int) -> Minima:
     """The same where the slope there is known."""
     # U^-1 U^-T: inverting U'U would lose twice the digits, and with them the sign of a variance.
     inverse_U, lost = slope.inverse_U, ~finite(slope.inverse_U)
@@ -393,12 +395,12 @@ def minima_of(ended: Ended[Any], slope: Slope, readings: int) -> Minima:
     return Minima(ended.x, ended.status, ended.iterations, ended.history, covariance, squared(r), bulk)
 
 
-def _exact_slope(objective: Objective, state: Descent) -> Slope:
+def _exact_slope(objective: Objective, state: LeastSquaresSystem) -> NormalEquations:
     """The slope where an iteration has ended; for the report alone where it ended on a coarse one, so not counted."""
     coarse = ~state.exact & finite(state.x)
     if objective.exact_within == 0 or not coarse.any():
         return state.slope
-    tally = Tally.zeros(len(objective.model.tally.simulations))
+    tally = EvaluationCount.zeros(len(objective.model.tally.simulations))
     report = dataclasses.replace(objective, model=dataclasses.replace(objective.model, tally=tally)).subset(coarse)
     keep_Q = state.slope.Q is not None
     exact = _slope_of(report, state.x[coarse], state.r[coarse], coarse=False, keep_Q=keep_Q)

@@ -8,8 +8,8 @@ import numpy as np
 
 from ipe_bench.basics.batches import put
 from ipe_bench.basics.linalg import Array, finite, multiply
-from ipe_bench.estimators.driver import Solver, Standing
-from ipe_bench.estimators.least_squares import Descent, Residuals, slope_at, squared
+from ipe_bench.estimators.driver import ConvergenceCheck, Solver
+from ipe_bench.estimators.least_squares import LeastSquaresSystem, Residuals, slope_at, squared
 
 _LARGEST_DAMPING = 1e30
 _ROUND_OFF = 1e-8
@@ -21,7 +21,7 @@ _MOST_BENT = 0.75
 
 
 @dataclass(frozen=True)
-class LevenbergMarquardtMethod(Solver[Descent]):
+class LevenbergMarquardtMethod(Solver[LeastSquaresSystem]):
     """The step minimises |r + J s|^2 + lambda |D s|^2, and lambda follows the gain ratio.
 
     D = 1 / `deviation` (n,), the metric of a prior covariance; None: Marquardt's, the column norms of J, which only
@@ -41,8 +41,8 @@ class LevenbergMarquardtMethod(Solver[Descent]):
     """Bends each step along the curvature of the readings, for one more simulation (Transtrum and Sethna, 2012,
     arXiv 1201.5885)."""
 
-    def begin(self, objective: Residuals, x: Array) -> Descent:
-        state = Descent.at(objective, x, self.damping, keep_Q=self.geodesic)
+    def begin(self, objective: Residuals, x: Array) -> LeastSquaresSystem:
+        state = LeastSquaresSystem.at(objective, x, self.damping, keep_Q=self.geodesic)
         if self.deviation is not None:
             state = replace(state, scale=np.broadcast_to(1.0 / self.deviation, state.scale.shape))
         elif self.sizes is not None:
@@ -54,7 +54,7 @@ class LevenbergMarquardtMethod(Solver[Descent]):
         far = np.nan_to_num(state.cost / state.r.shape[1], nan=1.0, posinf=1.0)
         return replace(state, lam=np.maximum(state.lam, far))
 
-    def step(self, objective: Residuals, state: Descent) -> Descent:
+    def step(self, objective: Residuals, state: LeastSquaresSystem) -> LeastSquaresSystem:
         weights = np.sqrt(state.lam)[:, None] * state.scale
         step, predicted = state.slope.damped(weights)
         bent, believed = self._bend(objective, state, weights, step)
@@ -76,7 +76,7 @@ class LevenbergMarquardtMethod(Solver[Descent]):
             there, known = slope_at(part, x[renewed], r[renewed], wanted, keep_Q=self.geodesic)
             slope, exact = put(slope, renewed, there), put(exact, renewed, known)
         cost = np.where(taken, cost, state.cost)
-        return Descent(
+        return LeastSquaresSystem(
             x,
             r,
             cost,
@@ -91,11 +91,15 @@ class LevenbergMarquardtMethod(Solver[Descent]):
             near,
         )
 
-    def standing(self, objective: Residuals, before: Descent | None, state: Descent) -> Standing:
+    def check(
+        self, objective: Residuals, before: LeastSquaresSystem | None, state: LeastSquaresSystem
+    ) -> ConvergenceCheck:
         """Damping goes on where J lacks rank, until it can gain nothing more."""
-        return state.standing(objective, stuck=state.lam > _LARGEST_DAMPING)
+        return state.check(objective, stuck=state.lam > _LARGEST_DAMPING)
 
-    def _bend(self, objective: Residuals, state: Descent, weights: Array, step: Array) -> tuple[Array, Array]:
+    def _bend(
+        self, objective: Residuals, state: LeastSquaresSystem, weights: Array, step: Array
+    ) -> tuple[Array, Array]:
         """The step v + a / 2 with the geodesic acceleration a, and where a is small enough beside v to be believed."""
         if not self.geodesic:
             return step, np.ones(len(step), dtype=bool)

@@ -21,7 +21,7 @@ def cost(simulations: Array, jacobians: Array, jacobian_cost: float) -> Array:
 
 
 @dataclass
-class Tally:
+class EvaluationCount:
     """What a batch has cost and what went wrong in it, by trial; shared by all views of one batch."""
 
     simulations: Array
@@ -30,7 +30,7 @@ class Tally:
     messages: dict[int, str] = field(default_factory=dict)
 
     @classmethod
-    def zeros(cls, trials: int) -> Tally:
+    def zeros(cls, trials: int) -> EvaluationCount:
         return cls(np.zeros(trials), np.zeros(trials), np.zeros(trials, dtype=bool))
 
     def cost(self, n: int) -> Array:
@@ -52,13 +52,13 @@ class CountingModel:
     """
 
     measurement: Measurement
-    tally: Tally
+    tally: EvaluationCount
     share: float = 1.0
 
     @classmethod
     def uncounted(cls, measurement: Measurement, trials: int) -> CountingModel:
         """For what is part of a report and not of a search: a tally that nobody reads."""
-        return cls(measurement, Tally.zeros(trials))
+        return cls(measurement, EvaluationCount.zeros(trials))
 
     def simulate(self, x: Array, rows: NDArray[np.intp]) -> Array:
         """h(x) (trials, m) for the trials `rows` of the tally."""

@@ -19,7 +19,7 @@ from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.estimators.least_squares import Objective, minimize, squared
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.measurements.counted import CountingModel, Tally
+from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
 _FIRST = (0.5, 1.0, 1.5)
@@ -307,7 +307,7 @@ def _fit_others(
     """The minima (asked, n) with the parameters `places` at `values` (asked,), and the sums of squares there (asked,),
     for readings z (asked, m), from `begin` (asked, n)."""
     rows = np.arange(len(values))
-    model = Pinned(problem.measurement, Tally.zeros(len(values)), places=places, values=values)
+    model = Pinned(problem.measurement, EvaluationCount.zeros(len(values)), places=places, values=values)
     x = np.stack([np.delete(start, place) for start, place in zip(begin, places, strict=True)])
     with np.errstate(all="ignore"):
         if x.shape[1]:

@@ -19,7 +19,7 @@ from ipe_bench.estimators.ipe import starting_points
 from ipe_bench.estimators.least_squares import Minima, Objective, minimize, squared
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.base import SubsetModel
-from ipe_bench.measurements.counted import CountingModel, Tally
+from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
 Rows = NDArray[np.intp]
@@ -47,7 +47,7 @@ class Attempts(ABC):
     """The deviations (n,) of the prior that counts; None where none does. Its correlations do not: a search ends in a
     fit without the prior."""
     z: Array
-    tally: Tally
+    tally: EvaluationCount
     history: bool
 
     planned: int = 0
@@ -87,11 +87,13 @@ class Attempts(ABC):
         model = CountingModel(self.problem.measurement, self.spent(owner))
         return Objective(model, self.problem.R, self.z[owner], np.arange(len(owner)), self.problem.x0)
 
-    def spent(self, owner: Rows) -> Tally:
+    def spent(self, owner: Rows) -> EvaluationCount:
         """A tally for candidates of the trials `owner`, which begins at what each trial has cost so far."""
-        return Tally(self.tally.simulations[owner], self.tally.jacobians[owner], np.zeros(len(owner), dtype=bool))
+        return EvaluationCount(
+            self.tally.simulations[owner], self.tally.jacobians[owner], np.zeros(len(owner), dtype=bool)
+        )
 
-    def charge(self, owner: Rows, tally: Tally) -> None:
+    def charge(self, owner: Rows, tally: EvaluationCount) -> None:
         """Adds to each trial what its candidates have cost since `spent`."""
         for total, now in ((self.tally.simulations, tally.simulations), (self.tally.jacobians, tally.jacobians)):
             np.add.at(total, owner, now - total[owner])
@@ -324,7 +326,7 @@ class Windows(Attempts):
         """How far the parameters of the trials `rows` may lie, where no prior says so: the median of the distances in
         the linear estimate, rounded up to a power of ten. On GINS that median is mostly right within a factor of three
         at any scale, and a prior ten times too wide does no harm."""
-        tally = Tally.zeros(len(rows))
+        tally = EvaluationCount.zeros(len(rows))
         x = starting_points(self.problem, self.z[rows], "linear_lse", tally)
         self.tally.simulations[rows] += tally.simulations
         distance = np.median(np.abs(x - self.problem.x0), axis=1)

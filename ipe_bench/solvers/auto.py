@@ -17,7 +17,7 @@ from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.fitting import Fitting, spread_of_starts
 from ipe_bench.estimators.least_squares import Minima, Objective, minimize
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
-from ipe_bench.measurements.counted import CountingModel, Tally
+from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers.chords import Chords
 from ipe_bench.solvers.progressive import Progressive, accepted
@@ -72,7 +72,7 @@ class Auto(Estimator):
         fitting = Fitting.none(len(z), z.shape[1], self.fit_level)
         fits = fitting.note(best, np.arange(len(z)))
         answered = accepted(best, z.shape[1], max(self.fit_level, problem.doubted))
-        tally = Tally(tally.simulations, tally.jacobians - answered, np.zeros(len(z), dtype=bool))
+        tally = EvaluationCount(tally.simulations, tally.jacobians - answered, np.zeros(len(z), dtype=bool))
         left = np.flatnonzero(~answered)
         if len(left):
             thorough = Progressive(tolerance=self.tolerance, fit_level=self.fit_level, budget=self.budget)
@@ -95,7 +95,7 @@ class Auto(Estimator):
         problem: Problem,
         z: Array,
         best: Minima,
-        tally: Tally,
+        tally: EvaluationCount,
         fitting: Fitting,
         rows: NDArray[np.intp],
         history: bool,

@@ -10,8 +10,8 @@ import numpy as np
 from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array, Mask, finite, multiply
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.driver import Ended, Solver, Standing, iterate
-from ipe_bench.estimators.least_squares import Minima, Objective, Slope, minima_of, squared
+from ipe_bench.estimators.driver import ConvergenceCheck, Solver, SolveResult, iterate
+from ipe_bench.estimators.least_squares import Minima, NormalEquations, Objective, minima_of, squared
 from ipe_bench.solvers.anderson import accelerated, push
 
 _ITERATIONS = 25
@@ -40,7 +40,7 @@ class OnChord:
     x: Array
     r: Array
     """Whitened residuals."""
-    slope: Slope
+    slope: NormalEquations
     """That of the chord's Jacobian, towards r."""
     dx: Array
     dF: Array
@@ -57,7 +57,7 @@ class OnChord:
     """and how many there have been since."""
 
     @classmethod
-    def at(cls, x: Array, r: Array, slope: Slope, turn: Array) -> OnChord:
+    def at(cls, x: Array, r: Array, slope: NormalEquations, turn: Array) -> OnChord:
         nothing = np.zeros((*x.shape, min(_DEPTH, x.shape[1])))
         unknown, far = np.full(len(x), np.nan), np.full(len(x), np.inf)
         return cls(x, r, slope.towards(r), nothing, nothing, x, turn, far, unknown, unknown, np.full(len(x), -1))
@@ -97,7 +97,7 @@ class Chord(Solver[OnChord]):
     def begin(self, objective: Objective, x: Array) -> OnChord:
         J = objective.jacobian(x)
         r = objective.residual(x)
-        return OnChord.at(x, r, Slope.of(J, r, keep_Q=True), np.zeros_like(J))
+        return OnChord.at(x, r, NormalEquations.of(J, r, keep_Q=True), np.zeros_like(J))
 
     def step(self, objective: Objective, state: OnChord) -> OnChord:
         F = -state.slope.newton
@@ -119,12 +119,12 @@ class Chord(Solver[OnChord]):
             steps=state.steps + 1,
         )
 
-    def standing(self, objective: Objective, before: OnChord | None, state: OnChord) -> Standing:
+    def check(self, objective: Objective, before: OnChord | None, state: OnChord) -> ConvergenceCheck:
         rankless = ~np.isfinite(state.slope.size)
         useless = state.wanders if np.isinf(self.bent) else state.off > self.bent
         size = np.where(useless, np.inf, state.slope.size)
         ending = np.where(rankless, Status.SINGULAR, Status.MAX_ITERATIONS)
-        return Standing(size, np.sqrt(squared(state.r)), state.moved, rankless | useless, ending)
+        return ConvergenceCheck(size, np.sqrt(squared(state.r)), state.moved, rankless | useless, ending)
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,9 @@ class Chords:
         """
         x0 = np.repeat(self.objective.x0[None], len(self.objective.rows), axis=0)
         minima, contracts = _nowhere(x0, self.history), np.zeros(len(x0), dtype=bool)
-        nominal = Slope.of(self.objective.R.whiten_jacobian(self.H[None]), np.zeros((1, len(self.H))), keep_Q=True)
+        nominal = NormalEquations.of(
+            self.objective.R.whiten_jacobian(self.H[None]), np.zeros((1, len(self.H))), keep_Q=True
+        )
         if not np.isfinite(nominal.size).all():  # H lacks rank, which says nothing of other points
             return minima, contracts
         frozen = take(nominal, np.zeros(len(x0), np.intp))
@@ -158,17 +160,19 @@ class Chords:
             contracts[near] = _radius(nominal, slope) <= _CONTRACTING
         return minima, contracts
 
-    def _renewed(self, objective: Objective, before: Ended[OnChord], origin: Array) -> tuple[Minima, Slope]:
+    def _renewed(
+        self, objective: Objective, before: SolveResult[OnChord], origin: Array
+    ) -> tuple[Minima, NormalEquations]:
         """Chord steps for trials that are near, each time with a new Jacobian until it is that of the end."""
         at, latest = np.arange(len(origin)), before
-        whole: tuple[Minima, Slope] | None = None
+        whole: tuple[Minima, NormalEquations] | None = None
         bent, off = _BENT * self.tolerance, np.full(len(origin), np.inf)
         for _ in range(_JACOBIANS):
             x, r, slope = latest.x, latest.state.r, latest.state.slope
             J = objective.jacobian(x)
             assert slope.Q is not None
             turn = (J - np.matmul(slope.Q, slope.U)) / _length(slope, x - origin)[:, None, None]
-            start = OnChord.at(x, r, Slope.of(J, r, keep_Q=True), turn)
+            start = OnChord.at(x, r, NormalEquations.of(J, r, keep_Q=True), turn)
             ended = self._iterate(objective, Chord(bent), start, self.tolerance, _CHORDS)
             latest = _after(latest, ended)
             result = minima_of(latest, ended.state.slope, objective.readings), ended.state.slope
@@ -189,7 +193,7 @@ class Chords:
 
     def _iterate(
         self, objective: Objective, chord: Chord, start: OnChord, tolerance: float, limit: int
-    ) -> Ended[OnChord]:
+    ) -> SolveResult[OnChord]:
         return iterate(
             objective,
             chord,
@@ -201,13 +205,13 @@ class Chords:
         )
 
 
-def _length(slope: Slope, step: Array) -> Array:
+def _length(slope: NormalEquations, step: Array) -> Array:
     """|J dx| (trials,): the length of a step (trials, n) in deviations of the readings; infinite where it is zero."""
     length = np.linalg.norm(multiply(slope.U, step), axis=1)
     return np.where(length > 0, length, np.inf)
 
 
-def _radius(nominal: Slope, slope: Slope) -> Array:
+def _radius(nominal: NormalEquations, slope: NormalEquations) -> Array:
     """The spectral radius (trials,) of I - H+ J, the rate at which fixed-point iteration converges."""
     assert nominal.Q is not None
     assert slope.Q is not None
@@ -217,7 +221,7 @@ def _radius(nominal: Slope, slope: Slope) -> Array:
     return np.where(usable, np.abs(rates).max(axis=1), np.inf)
 
 
-def _after(first: Ended[OnChord], second: Ended[OnChord]) -> Ended[OnChord]:
+def _after(first: SolveResult[OnChord], second: SolveResult[OnChord]) -> SolveResult[OnChord]:
     """The second of two iterations, with the iterations and iterates of both."""
     history = second.history
     if first.history is not None and history is not None:

@@ -18,7 +18,7 @@ from ipe_bench.basics.options import Count, Positive, Whole
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.least_squares import Minima
-from ipe_bench.measurements.counted import Tally
+from ipe_bench.measurements.counted import EvaluationCount
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers.attempts import Limits, Stages, Windows
 
@@ -85,7 +85,7 @@ class Progressive(Estimator):
 
     def search(
         self, problem: Problem, z: Array, *, before: Minima | None = None, history: bool = False
-    ) -> tuple[Minima, Tally]:
+    ) -> tuple[Minima, EvaluationCount]:
         """The best minimum of each trial, and what it has cost to find it. `before`: what is known already, minima
         that do not fit, or none."""
         kind = Stages if problem.measurement.epochs is None else Windows
@@ -93,7 +93,7 @@ class Progressive(Estimator):
             self.tolerance, self.max_iterations, self.budget, self.growth, self.window_tolerance, self.restarts
         )
         prior = problem.prior_used(self.prior_inflation) if self.use_prior else None
-        attempts = kind(limits, problem, prior, z, Tally.zeros(len(z)), history)
+        attempts = kind(limits, problem, prior, z, EvaluationCount.zeros(len(z)), history)
         level = max(self.fit_level, problem.doubted)
         best = attempts.attempt(0, np.arange(len(z)), None)
         if before is not None:

@@ -14,8 +14,8 @@ from ipe_bench.basics.linalg import Array, Mask, finite
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
-from ipe_bench.estimators.driver import Solver, Standing, iterate
-from ipe_bench.estimators.ipe import IPE, FrozenSystem, Start, State, begin, frozen_covariance, root_standing
+from ipe_bench.estimators.driver import ConvergenceCheck, Solver, iterate
+from ipe_bench.estimators.ipe import IPE, FrozenSystem, Start, State, begin, frozen_covariance, root_check
 from ipe_bench.estimators.least_squares import inverse_factor
 from ipe_bench.measurements.counted import CountingModel
 from ipe_bench.measurements.problem import Problem
@@ -91,11 +91,11 @@ class Relinearized(Solver[Round], Estimator):
         path = [np.concatenate([old, new[1:]]) for old, new in zip(state.path, ended.history, strict=True)]
         return self._relinearize(system, ended.x, ended.status, state.steps + ended.iterations, path)
 
-    def standing(self, system: FrozenSystem, before: Round | None, state: Round) -> Standing:
+    def check(self, system: FrozenSystem, before: Round | None, state: Round) -> ConvergenceCheck:
         """F at its own linearisation; an inner root, stall or limit is only the end of a round."""
-        standing = root_standing(state.deviation, None, state)
+        check = root_check(state.deviation, None, state)
         stuck = ~np.isin(state.inner, [Status.RUNNING, *_ROUND_ENDS])
-        return Standing(standing.size, standing.level, standing.moved, stuck, state.inner)
+        return ConvergenceCheck(check.size, check.level, check.moved, stuck, state.inner)
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         x, system = begin(problem, z, self.start)

@@ -20,7 +20,7 @@ from ipe_bench.basics.linalg import Covariance, multiply
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements import Gins
 from ipe_bench.measurements.base import SubsetModel
-from ipe_bench.measurements.counted import Tally
+from ipe_bench.measurements.counted import EvaluationCount
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.priors import GaussianPrior
@@ -224,7 +224,7 @@ def test_regression_over_the_cubature_points_is_the_textbooks():
     rng = np.random.default_rng(5)
     U, x = rng.standard_normal((4, 3, 3)) + 2 * np.eye(3), rng.standard_normal((4, 3))
     z = epoch.whitened(trials.z)
-    readings = EpochReadings(epoch, problem, np.ones(3), Tally.zeros(4), z, np.arange(4), Belief(x, U))
+    readings = EpochReadings(epoch, problem, np.ones(3), EvaluationCount.zeros(4), z, np.arange(4), Belief(x, U))
     found = Affine.over(readings, x, U)
     for k in range(4):
         S = np.linalg.inv(U[k])

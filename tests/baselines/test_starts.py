@@ -13,7 +13,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.ipe import begin, starting_points
 from ipe_bench.measurements import Formula, Mgh
-from ipe_bench.measurements.counted import Tally
+from ipe_bench.measurements.counted import EvaluationCount
 from ipe_bench.measurements.problem import recorded_problem
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
@@ -70,7 +70,7 @@ def test_a_singular_start_is_not_a_problem_without_an_answer():
         found = estimator.estimate(problem, z)
         assert found.status[0] == Status.CONVERGED
         np.testing.assert_allclose(found.x * model.sizes, [[3.0, 0.5]], rtol=1e-5)
-    tally = Tally.zeros(1)
+    tally = EvaluationCount.zeros(1)
     np.testing.assert_array_equal(starting_points(problem, z, "best", tally), model.nominal[None])
     assert tally.simulations[0] == 0
 

@@ -15,7 +15,7 @@ from ipe_bench.baselines import GaussNewton, LevenbergMarquardt, MapLM
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance, information, inverse, quadratic_form
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.least_squares import Slope
+from ipe_bench.estimators.least_squares import NormalEquations
 from ipe_bench.measurements import Gins, Mgh, Polynomial
 from ipe_bench.measurements.mgh import score
 from ipe_bench.measurements.problem import Problem
@@ -95,7 +95,7 @@ def test_a_step_is_exact_however_badly_conditioned_the_jacobian_is():
         left, right = (np.linalg.qr(rng.standard_normal((k, 5)))[0] for k in (40, 5))
         J, r = left * np.geomspace(1, 1 / condition, 5) @ right, rng.standard_normal(40)
         sizes = 10.0 ** np.linspace(-100, 100, 5)
-        slope = Slope.of((J * sizes)[None], r[None], keep_Q=True)
+        slope = NormalEquations.of((J * sizes)[None], r[None], keep_Q=True)
         P = exact_inverse_of_normal_matrix(J)
         step = -P @ (np.vectorize(Fraction)(J).T @ np.vectorize(Fraction)(r))
         step, deviation = step.astype(float), np.sqrt(np.diag(P).astype(float))
@@ -106,12 +106,12 @@ def test_a_step_is_exact_however_badly_conditioned_the_jacobian_is():
 
 def test_trials_without_full_rank_do_not_disturb_others():
     J, r = np.random.default_rng(2).standard_normal((2, 5, 9, 3))[0], np.ones((5, 9))
-    alone = Slope.of(J[:1], r[:1])
+    alone = NormalEquations.of(J[:1], r[:1])
     J[1, :, 2] = J[1, :, 1]
     J[2, 4, 1] = np.nan
     J[3] = 0.0
     J[4] *= 1e150
-    slope = Slope.of(J, r)
+    slope = NormalEquations.of(J, r)
     np.testing.assert_array_equal(slope.newton[0], alone.newton[0])
     np.testing.assert_array_equal(np.isfinite(slope.size), [True, False, False, False, True])
 

@@ -14,7 +14,7 @@ from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.ipe import FrozenSystem
 from ipe_bench.measurements import Gins
-from ipe_bench.measurements.counted import CountingModel, Tally
+from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Quantization
 from ipe_bench.priors import GaussianPrior
@@ -46,7 +46,7 @@ def gins(scale: float, trials: int):
 def test_a_coarse_jacobian_counts_as_what_it_costs():
     model, rows, x = Crude(0.01), np.arange(3), np.ones((3, 3))
     x[1] = 11.0
-    counted = CountingModel(model, Tally.zeros(3), share=0.5)
+    counted = CountingModel(model, EvaluationCount.zeros(3), share=0.5)
     J = counted.jacobian(x, rows, coarse=True)
     np.testing.assert_array_equal(counted.tally.jacobians, [0.125, 0.625, 0.125])
     np.testing.assert_array_equal(J[[0, 2]], model.coarse_jacobian(x[[0, 2]]))
@@ -56,7 +56,7 @@ def test_a_coarse_jacobian_counts_as_what_it_costs():
 
 def test_a_model_without_a_cheaper_one_computes_the_exact_one():
     model, x = Crude(0.01, cheap=1.0), np.ones((3, 3))
-    counted = CountingModel(model, Tally.zeros(3))
+    counted = CountingModel(model, EvaluationCount.zeros(3))
     np.testing.assert_array_equal(counted.jacobian(x, np.arange(3), coarse=True), model.jacobian(x))
     assert (counted.tally.jacobians == 1).all()
 

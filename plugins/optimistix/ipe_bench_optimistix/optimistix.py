@@ -16,7 +16,7 @@ from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, one_by_one
 from ipe_bench.estimators.ipe import Start, starting_points
-from ipe_bench.measurements.counted import Tally
+from ipe_bench.measurements.counted import EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
 jax.config.update("jax_enable_x64", True)
@@ -53,7 +53,7 @@ class Optimistix(Estimator):
     equation = "least_squares"
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        tally = Tally.zeros(len(z))
+        tally = EvaluationCount.zeros(len(z))
         x = starting_points(problem, z, self.start, tally)
         residuals = _Residuals(problem, z, tally)
         _readers[id(residuals)] = residuals
@@ -135,7 +135,7 @@ def _read_slopes(s: Any, of: Any) -> Array:
 class _Residuals:
     """Whitened residuals of each trial and their slopes, counted."""
 
-    def __init__(self, problem: Problem, z: Array, tally: Tally) -> None:
+    def __init__(self, problem: Problem, z: Array, tally: EvaluationCount) -> None:
         self.problem, self.z, self.tally = problem, z, tally
         self.x0 = problem.x0
         H = problem.R.whiten_jacobian(problem.H[None])[0]
