@@ -1,4 +1,4 @@
-"""Figures, tables and sections of plugins: found, made where they change nothing of ours, and named where they fail.
+"""Figures, tables and sections of plugins: found, made from copies of what was analysed, and named where they fail.
 
 A report is whole without them: what raises, or gives something that cannot be shown, is left out with a line that says
 so.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
 import pandas as pd
@@ -29,7 +29,7 @@ _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 
 
 def guarded(make: Callable[[], T]) -> T:
-    """What somebody else's code makes.
+    """Runs the code of a plugin.
 
     Raises:
         UserError: it raises, in a line that says where.
@@ -42,18 +42,21 @@ def guarded(make: Callable[[], T]) -> T:
         raise UserError(blame(error) or place_of(error)) from error
 
 
+def _usable(group: str, problems: list[str], make: Callable[[Option, Any], T]) -> Iterator[tuple[Option, T]]:
+    """What is made of each record of the group; a line is added to the problems for every one that cannot be used."""
+    for option, record in records(group, problems):
+        try:
+            yield option, make(option, record)
+        except UserError as error:
+            problems.append(f"{group}={option.name}: {error}; it is left out")
+
+
 # Figures
 
 
 def figures(problems: list[str]) -> list[tuple[Option, Figure]]:
     """The figures of plugins; a line is added to the problems for every one that is none."""
-    found = []
-    for option, record in records("figure", problems):
-        try:
-            found.append((option, checked_figure(record)))
-        except UserError as error:
-            problems.append(f"figure={option.name}: {error}; it is left out")
-    return found
+    return list(_usable("figure", problems, lambda _, record: checked_figure(record)))
 
 
 def checked_figure(record: Any) -> Figure:
@@ -103,15 +106,11 @@ def report_tables(analysis: Analysis) -> list[Table]:
 def tables(analysis: Analysis, taken: Iterable[str], problems: list[str]) -> list[Table]:
     """The tables of plugins, under other names than those that are taken."""
     names, found = set(taken), []
-    for option, record in records("table", problems) if not analysis.summary.empty else ():
-        try:
-            table = made_table(record, analysis, names)
-        except UserError as error:
-            problems.append(f"table={option.name}: {error}; it is left out")
-            continue
-        if table is not None:
-            names.add(table.name)
-            found.append(table)
+    if not analysis.summary.empty:
+        for _, table in _usable("table", problems, lambda _, record: made_table(record, analysis, names)):
+            if table is not None:
+                names.add(table.name)
+                found.append(table)
     return found
 
 
@@ -143,15 +142,10 @@ def _require_table(table: Any, taken: Iterable[str]) -> None:
 def sections(analysis: Analysis, taken: Iterable[str], problems: list[str]) -> list[Written]:
     """The sections of plugins that have something to say."""
     names, found = set(taken), []
-    for option, record in records("section", problems) if not analysis.summary.empty else ():
-        try:
-            written = made_section(option.name, record, analysis, names)
-        except UserError as error:
-            problems.append(f"section={option.name}: {error}; it is left out")
-            continue
-        names |= {table.name for table in written.tables}
-        if written.parts:
-            found.append(written)
+    if not analysis.summary.empty:
+        for _, written in _usable("section", problems, lambda o, record: made_section(o.name, record, analysis, names)):
+            names.update(table.name for table in written.tables)
+            found += [written] if written.parts else []
     return found
 
 
