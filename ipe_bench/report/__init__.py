@@ -29,11 +29,11 @@ class ReportResult:
     figures: tuple[Path, ...]
     report: Path
     problems: tuple[str, ...]
-    """One line per piece that is missing, failed, foreign or damaged; the exit code is 1 where there is any."""
+    """One line per piece that is missing, failed, foreign or damaged; the exit code is 1 if there is any."""
     stale: tuple[str, ...]
     """One line per piece that older code computed, which is left out."""
     certified: pd.DataFrame
-    """Mean correct digits per estimator and start, on certified readings; empty where there are none."""
+    """Mean correct digits per estimator and start on certified readings; empty without such runs."""
 
     @property
     def files(self) -> tuple[Path, ...]:

@@ -68,7 +68,7 @@ class Answer:
     """Name of the model in titles."""
     model: Measurement
     z: Array
-    """The readings (m,); NaN where one is missing."""
+    """Readings (m,); NaN if one is missing."""
     fits: list[Fit]
     """One for each estimator, in the order in which they were given."""
     examinations: tuple[Examination, ...]
@@ -79,7 +79,7 @@ class Answer:
 
     @classmethod
     def to(cls, opened: Opened, name: str = "") -> Answer:
-        """The answer to a question; `name` is what the model is called, where that is not its own name."""
+        """The answer to a question; `name` is what the model is called if that is not its own name."""
         model, fits_and_examinations = opened.scenario.measurement, opened.fitted()
         return cls(name or model.name, model, opened.readings.z, *fits_and_examinations, opened.question.left_out.said)
 
@@ -214,7 +214,7 @@ def _verdicts(answer: Answer) -> Table:
 
 
 def _fit_p(one: Fit) -> str:
-    """p of the fit; a limit where it is the least that simulated fits can tell."""
+    """The p-value of the fit as text; an upper limit if it is the least that simulated fits resolve."""
     return p_value(one.p_value, LEAST_FIT_P if one.p_value == LEAST_FIT_P else 0.0)
 
 
@@ -413,7 +413,7 @@ def write_fits(
 
 
 def whole_page(answer: Answer, folder: Path, drawings: Sequence[Drawing], written: str) -> str:
-    """estimate.html: one file with everything in it, the figures of the folder among it."""
+    """The page estimate.html as one file that includes the figures of the folder."""
     return (
         environment()
         .get_template("answer.html.j2")

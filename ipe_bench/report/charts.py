@@ -30,7 +30,7 @@ class Axis:
     """Whether it runs from none to all, shown in per cent."""
     low: str = ""
     high: str = ""
-    """The columns of its interval, where it has one."""
+    """Columns of the ends of its interval; empty without one."""
     reference: float | None = None
     """Where a line says what is best, or honest."""
     reference_title: str = ""

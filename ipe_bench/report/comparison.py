@@ -107,7 +107,7 @@ def write(frame: pd.DataFrame, output: Path, alpha: float) -> tuple[Path, ...]:
 
 
 def draw(frame: pd.DataFrame, alpha: float) -> Drawing:
-    """A line per comparison, a panel per quantity: the change and its interval, coloured where it is sure."""
+    """Draws a line per comparison and a panel per quantity, with intervals, coloured if significant."""
     from matplotlib.lines import Line2D
 
     found = list(_comparisons(frame))[:MOST_ROWS]

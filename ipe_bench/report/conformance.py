@@ -55,7 +55,7 @@ def is_a_statistic(_: str, record: Any, __: Sequence[Analysis]) -> None:
 
 
 def has_values(_: str, record: Statistic, analyses: Sequence[Analysis]) -> None:
-    """Has a value, or NaN, for every parameter and for all, whatever became of the trials; the same twice."""
+    """Has a value, or NaN, for every parameter and for all, however the trials ended; the same twice."""
     for sample in _samples(analyses):
         first, second = (columns_of_added(record, sample) for _ in range(2))
         for name, values in first.items():
@@ -66,7 +66,7 @@ def has_values(_: str, record: Statistic, analyses: Sequence[Analysis]) -> None:
 
 
 def has_ordered_limits(_: str, record: Statistic, analyses: Sequence[Analysis]) -> None:
-    """Lies in its interval, where it has one."""
+    """Lies in its interval, if it has one."""
     if record.limits is None:
         return
     for sample in _samples(analyses):
@@ -94,7 +94,7 @@ def is_a_figure(_: str, record: Any, __: Sequence[Analysis]) -> None:
 
 
 def can_be_drawn(_: str, record: Any, analyses: Sequence[Analysis]) -> None:
-    """Is drawn and written of whatever a run came to, one trial or estimators that fail, or gives nothing."""
+    """Is drawn and written for any run, of one trial or with estimators that fail, or gives nothing."""
     with tempfile.TemporaryDirectory(prefix="ipe-bench-") as folder, house_style():
         for analysis in analyses:
             for view in _views(record, analysis):
@@ -122,13 +122,13 @@ def _views(record: Any, analysis: Analysis) -> list[View]:
 
 
 def makes_a_table(_: str, record: Any, analyses: Sequence[Analysis]) -> None:
-    """Makes a table of whatever a run came to that can be written in every format, or None."""
+    """Makes a table of any run that can be written in every format, or None."""
     for analysis in analyses:
         extensions.made_table(record, analysis, [table.name for table in all_tables(analysis)])
 
 
 def can_be_read(name: str, record: Any, analyses: Sequence[Analysis]) -> None:
-    """Is a Section that writes texts and tables of whatever a run came to."""
+    """Is a Section that writes texts and tables of any run."""
     for analysis in analyses:
         extensions.made_section(name, record, analysis, [table.name for table in all_tables(analysis)])
 

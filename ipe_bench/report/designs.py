@@ -233,7 +233,7 @@ def _choices(way: Way) -> Sequence[tuple[str, Choice | None]]:
 
 
 def _chosen(design: Design, way: Way, choice: Choice) -> dict[str, Any]:
-    """A choice, and the options of the model that takes these readings; None where no options say it."""
+    """A choice as plain data, with the options of the model that takes these readings, or None if no options do."""
     model, today = design.measurement(choice), design.scenario.measurement
     before = describe(today)
     options = {name: value for name, value in describe(model).items() if value != before.get(name)}

@@ -1,7 +1,7 @@
-"""Figures, tables and sections of plugins: found, made from copies of what was analysed, and named where they fail.
+"""Figures, tables and sections of plugins, made from copies of what was analysed.
 
-A report is whole without them: what raises, or gives something that cannot be shown, is left out with a line that says
-so.
+A report is complete without them: one that raises, or gives something that cannot be shown, is left out with a line
+that says so.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def figures(problems: list[str]) -> list[tuple[Option, Figure]]:
 
 
 def checked_figure(record: Any) -> Figure:
-    """The record, where it is a figure that can be drawn from what there is.
+    """The record, if it is a figure of frames that exist.
 
     Raises:
         UserError: it is not.
@@ -74,7 +74,7 @@ def checked_figure(record: Any) -> Figure:
 
 
 def drawings(figure: Figure, view: View) -> list[Drawing]:
-    """What a plugin's figure draws of a view, of which it gets a copy.
+    """The drawings that a plugin's figure makes of a copy of a view.
 
     Raises:
         UserError: it raises, or gives something else than drawings under names of their own.
@@ -115,7 +115,7 @@ def tables(analysis: Analysis, taken: Iterable[str], problems: list[str]) -> lis
 
 
 def made_table(record: Any, analysis: Analysis, taken: Iterable[str] = ()) -> Table | None:
-    """What a plugin's function makes of a copy of the analysis; None where there is nothing to show.
+    """The table that a plugin's function makes of a copy of the analysis; None if there is nothing to show.
 
     Raises:
         UserError: it raises, or gives something else than a table under a name of its own.
@@ -150,7 +150,7 @@ def sections(analysis: Analysis, taken: Iterable[str], problems: list[str]) -> l
 
 
 def made_section(name: str, record: Any, analysis: Analysis, taken: Iterable[str] = ()) -> Written:
-    """What a plugin's section says of a copy of the analysis.
+    """The texts and tables that a plugin's section makes of a copy of the analysis.
 
     Raises:
         UserError: it raises, or gives something else than texts and tables.

@@ -1,4 +1,4 @@
-"""report.html: one file with everything in it, readable on a phone, on paper and without a network."""
+"""The page report.html: one file that is readable on a phone, on paper and without a network."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ def export(
 
 
 def column_names(table: Table) -> list[str]:
-    """What the columns are called where they are chosen: their titles in letters, digits and underscores."""
+    """The names by which columns are chosen: their titles in letters, digits and underscores."""
     names: list[str] = []
     for column in table.columns:
         name = re.sub(r"[^a-z0-9]+", "_", column.title.lower()).strip("_") or "column"
@@ -69,7 +69,7 @@ def column_names(table: Table) -> list[str]:
 
 
 def chosen_columns(table: Table, names: Sequence[str]) -> Table:
-    """The table with these columns, in this order; all where none is named.
+    """The table with these columns, in this order; all columns if none is named.
 
     Raises:
         UserError: it has no such column.

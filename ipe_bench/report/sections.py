@@ -15,7 +15,7 @@ class Section:
 
     title: str
     write: Callable[[Analysis], Iterator[str | Table]]
-    """Yields a paragraph of plain text, or a table; nothing where it would be empty."""
+    """Yields paragraphs of plain text and tables; nothing if the section would be empty."""
 
 
 @dataclass(frozen=True)

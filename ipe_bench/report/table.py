@@ -190,7 +190,7 @@ def _fits(table: Table, width: int) -> bool:
 
 
 def _needed(table: Table, *, folded: bool) -> list[int]:
-    """The least letters that each column takes: numbers are whole, words and, where that is asked, titles are not."""
+    """Minimal width of each column in letters: numbers are never folded, words are, and titles if `folded`."""
     from rich.cells import cell_len
 
     found = []
@@ -206,8 +206,8 @@ def _needed(table: Table, *, folded: bool) -> list[int]:
 
 
 def _fitting(table: Table, width: int) -> tuple[int, list[int]]:
-    """How many columns fit, counted from the left, and the letters that each takes at least; titles are folded where
-    more columns fit then."""
+    """The number of columns that fit, from the left, and their minimal widths; titles are folded if more columns fit
+    then."""
     least = max(2, table.naming + 1, table.repeated + 1)
 
     def count(needed: Sequence[int]) -> int:
@@ -308,7 +308,7 @@ def markdown(table: Table) -> str:
 
 
 def comma_separated(table: Table) -> str:
-    """The numbers behind the table in full precision, or its cells where there are none."""
+    """The numbers behind the table in full precision, or else its cells."""
     if table.data is not None:
         return table.data.to_csv(index=False)
     import csv
@@ -353,7 +353,7 @@ _NUMBER = re.compile(r"-?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
 
 def latex(table: Table, width: float | None = None) -> str:
     """To be read into a document with `\\input`: the bare table, or one that floats with its caption in a column of
-    that many inches; a longtable where rows are many."""
+    that many inches; a longtable if it has more than `LONG` rows."""
     shape = "".join("r" if each.numeric else "l" for each in table.columns)
     titles = _latex_row(map(_latex_title, table.columns))
     head, rows = (
@@ -388,7 +388,7 @@ def _latex_row(cells: Iterable[str]) -> str:
 
 
 def _latex_title(column: Column) -> str:
-    """A title, stacked where it is longer than what stands below it."""
+    """The title of a column, stacked if it is longer than its cells."""
     lines = [escaped(line) for line in textwrap.wrap(column.title, letters(column), break_on_hyphens=False)]
     stacked = r"\\".join(lines)
     return rf"\shortstack[{'r' if column.numeric else 'l'}]{{{stacked}}}" if len(lines) > 1 else stacked

@@ -19,8 +19,8 @@ from ipe_bench.statistics.summary import ALL
 
 
 def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]:
-    """Every table that the data allow, in the order of the report; `whole` is the analysis whose endings are listed,
-    where this one leaves some trials out."""
+    """Every table that the data allow, in the order of the report; `whole` is the analysis whose endings are listed
+    if this one leaves some trials out."""
     if analysis.summary.empty:
         return [table for table in [endings(whole or analysis)] if table is not None]
     tables = [overview(analysis), costs(analysis), portfolio(analysis), comparisons(analysis), ranks(analysis)]

@@ -1,4 +1,4 @@
-"""The summary as tables in the terminal: where it is narrow, columns go from the right, never the names."""
+"""The summary as tables in a terminal; a narrow one lacks columns from the right, never the names."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ _VERDICTS |= {"diverged but confident": ("diverged", "!"), "-": ("", "")}
 
 
 def leading(rows: Sequence[Mapping[str, Any]], scenario: Sequence[str]) -> list[bool]:
-    """Whether each row's estimator may be the best of its scenario, where another is surely beaten."""
+    """Whether each row's estimator may be the best of its scenario, if another one is surely beaten."""
     keys = [tuple(str(row[name]) for name in scenario) for row in rows]
     beaten = {key for key, row in zip(keys, rows, strict=True) if not row[BEST]}
     return [bool(row[BEST]) and key in beaten for key, row in zip(keys, rows, strict=True)]
@@ -124,7 +124,7 @@ def _setting(title: str, part: Sequence[Mapping[str, Any]], width: int) -> Table
 
 
 def _statistic(record: Statistic, part: Sequence[Mapping[str, Any]]) -> Iterator[Column]:
-    """The column of a statistic, and that of its interval where it has one."""
+    """The column of a statistic, and that of its interval if it has one."""
     yield texts(record.titles.get("terminal", record.title), [shown(record, "terminal", row) for row in part])
     if "terminal" in record.limits_titles:
         ends = [limits(record, "terminal", row) for row in part]
@@ -133,5 +133,5 @@ def _statistic(record: Statistic, part: Sequence[Mapping[str, Any]]) -> Iterator
 
 
 def _says(value: Any) -> bool:
-    """Whether a setting is spoken of in a title: not where it is absent, as an option of another class is."""
+    """Whether a title names a setting; an option that the class lacks is left out."""
     return value is not None and not (isinstance(value, float) and math.isnan(value))

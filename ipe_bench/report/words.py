@@ -17,7 +17,7 @@ def plain(value: Any) -> str:
 
 
 def percent(share: float) -> str:
-    """A share in per cent; 100 and 0 only where it is all or none."""
+    """A share in per cent; 100 and 0 only if it is all or none."""
     if not math.isfinite(share):
         return "-"
     value = 100 * share
@@ -27,7 +27,7 @@ def percent(share: float) -> str:
 
 
 def points(share: float) -> str:
-    """A share in per cent without the sign; 100 and 0 only where it is all or none."""
+    """A share in per cent without the sign; 100 and 0 only if it is all or none."""
     return percent(share).removesuffix(" %")
 
 
@@ -64,7 +64,7 @@ def short(value: float) -> str:
 
 
 def compact(value: float) -> str:
-    """Three figures in at most five characters where that can be: thousands as k, millions as M."""
+    """Three figures in at most five characters if possible: thousands as k, millions as M."""
     if not math.isfinite(value):
         return "inf" if value == math.inf else "-"
     rounded = float(f"{value:.2e}")
@@ -126,12 +126,12 @@ def applies(record: Statistic, where: Where, row: Mapping[str, Any]) -> bool:
 
 
 def reported(record: Statistic, rows: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether a table has the column: one that few estimators report only where one of the rows does."""
+    """Whether a table has the column of a statistic; a rare one needs a finite value in some row."""
     return not record.rare or any(math.isfinite(row[record.name]) for row in rows)
 
 
 def shown(record: Statistic, where: Where, row: Mapping[str, Any]) -> str:
-    """A value as it stands in a table: with the number of trials that it is conditional on, where that is not all."""
+    """A value as it stands in a table, with the number of trials that it is conditional on unless that is all."""
     if not applies(record, where, row):
         return "-"
     text = shower(record.kind, where)(row[record.name])
@@ -141,6 +141,6 @@ def shown(record: Statistic, where: Where, row: Mapping[str, Any]) -> str:
 
 
 def limits(record: Statistic, where: Where, row: Mapping[str, Any]) -> tuple[float, float]:
-    """The ends of a statistic's interval; NaN where it has none."""
+    """The ends of a statistic's interval; NaN if it has none."""
     low, high = (float(row[name]) for name in record.columns[1:])
     return (low, high) if math.isfinite(low) and applies(record, where, row) else (math.nan, math.nan)

@@ -1,4 +1,4 @@
-"""Reference pages, from where the program itself reads: options, statuses, statistics, commands, Python names."""
+"""Reference pages of options, statuses, statistics, commands and Python names, from the program's own descriptions."""
 
 from __future__ import annotations
 
