@@ -1,0 +1,102 @@
+"""README: short, its links lead somewhere, its lines run in the order in which they stand, and its numbers come out."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import chi2
+
+import ipe_bench as ib
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+LINES = [line.removeprefix("    ") for line in README.splitlines() if line.startswith("    ") or not line]
+
+
+def test_it_is_short_and_leads_somewhere():
+    assert len(README.split()) <= 1100
+    led_to = re.findall(r"\]\((?!https?:)([^)#]+)\)", README)
+    assert len(led_to) >= 8
+    assert [path for path in led_to if not (ROOT / path).exists()] == []
+
+
+def recomputed(folder: Path) -> pd.DataFrame:
+    """What a reader computes from the trials alone, with pandas: a row per error scale and estimator."""
+    rows = ib.load(folder)
+    n = sum(column.startswith("error_") for column in rows) - 1  # the error scale is no parameter
+    rows["error"] = np.sqrt(rows["crlb_distance"] / n).fillna(np.inf)
+    rows["nees"] = rows["nees"].fillna(np.inf) / chi2.median(n)
+    noticed = (rows["status"] != "converged") | ~(rows["fit_p"] >= 1e-3)
+    rows["silent"] = ~rows["success"] & ~noticed
+    rows["known"] = ~rows["success"] & noticed
+    rows["square"] = rows["error"].clip(upper=5) ** 2
+    groups = rows.groupby(["error_scale", "estimator"])
+    found = groups[["success", "silent", "known"]].mean()
+    found["error"] = groups["error"].median()
+    found["error_95"] = groups["error"].apply(lambda error: np.quantile(error[np.isfinite(error)], 0.95))
+    found["whole"] = groups["error"].apply(lambda error: np.isfinite(error).all())
+    found["efficiency"] = groups["square"].mean() ** -0.5
+    found["nees"] = groups["nees"].median()
+    return found
+
+
+def check(folder: Path) -> pd.DataFrame:
+    """Holds the summary of a folder against what pandas makes of its trials, and returns the latter."""
+    summary = pd.read_csv(folder / "summary.csv")
+    summary = summary[summary["parameter"] == "all"].set_index(["error_scale", "estimator"]).sort_index()
+    found = recomputed(folder).sort_index()
+    for column, mine in (
+        ("success", "success"),
+        ("failed_silent", "silent"),
+        ("failed_known", "known"),
+        ("error_median", "error"),
+        ("efficiency_capped", "efficiency"),
+        ("nees_median", "nees"),
+    ):
+        np.testing.assert_allclose(summary[column], found[mine], rtol=1e-9, err_msg=column)
+    whole = found["whole"]
+    np.testing.assert_allclose(summary["error_q95"][whole], found["error_95"][whole], rtol=1e-9)
+    return found
+
+
+def test_the_summary_is_what_pandas_makes_of_the_trials(tmp_path):
+    estimators = {"newton": ib.solvers.Newton(), "linear_lse": ib.baselines.LinearLSE(), "ekf": ib.baselines.EKF()}
+    for scale in (1.0, 40.0):
+        bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=scale)
+        ib.run(bench, estimators, trials=60, output=tmp_path)
+    ib.report(tmp_path, figures="none")
+    found = check(tmp_path)
+    assert found["known"].between(0, 1, inclusive="neither").any()
+
+
+@pytest.mark.slow
+def test_every_line_runs_in_order_and_the_table_comes_out(tmp_path):
+    (tmp_path / "ipe_bench").symlink_to(ROOT / "ipe_bench")
+    (command,) = re.findall(
+        r"^run:.*\n\t\$\(BIN\)/(.*)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    script = "\n".join(LINES).replace("make run\n", f"{command}\n").replace(". .venv/bin/activate\n", "")
+    assert script.count("ipe-bench ") >= 9
+    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    done = subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    found = check(tmp_path / "outputs/headline")
+    scales = [0.1, 1, 10, 33, 100, 300, 1000]
+    table = [line.replace("*", "").strip("| ").split(" | ") for line in README.splitlines() if line.startswith("| `")]
+    assert len(table) == 6
+    for name, *cells in table:
+        own = found.xs(name.strip("`"), level="estimator")
+        assert [float(cell) for cell in cells[:7]] == pytest.approx([100 * own["success"][s] for s in scales])
+        assert float(cells[7].replace("M", "e6")) == pytest.approx(own["nees"][100.0], rel=0.005)
+        cost = ib.load(tmp_path / "outputs/headline").query("error_scale == 100 and estimator == @name.strip('`')")
+        paid = np.median(cost["simulations"] + cost["jacobians"] * 11.08695652173913)
+        assert float(cells[8]) == pytest.approx(paid, abs=0.5)
