@@ -112,6 +112,7 @@ class Synthetic:
         start: int = 0,
         block: int | None = None,
         estimator: Estimator | None = None,
+        history: Mapping[str, np.ndarray] | None = None,
         **columns: Any,
     ) -> ResultKey:
         """Rows with these errors (trials, n), in multiples of sizes; further columns replace the defaults."""
@@ -146,7 +147,7 @@ class Synthetic:
         for at in range(0, trials, step):
             part = slice(at, min(at + step, trials))
             first, last = start + part.start, start + part.stop
-            self.store.write(cell, first, last, {k: v[part] for k, v in rows.items()})
+            self.store.write(cell, first, last, {k: v[part] for k, v in rows.items()}, None if at else history)
             if not (self.store.trials / f"{truth.key}-{first}-{last}.parquet").exists():
                 self.store.write(truth, first, last, {k: v[part] for k, v in facts.items()})
         self.cells |= {cell.key: cell, truth.key: truth}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,7 +22,7 @@ def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]
     if this one leaves some trials out."""
     if analysis.summary.empty:
         return [table for table in [endings(whole or analysis)] if table is not None]
-    tables = [overview(analysis), costs(analysis), portfolio(analysis), comparisons(analysis), ranks(analysis)]
+    tables = [overview(analysis), costs(analysis), comparisons(analysis), ranks(analysis)]
     tables += [parameters(analysis), calibration(analysis), endings(whole or analysis)]
     tables += [
         all_trials(analysis),
@@ -234,35 +233,6 @@ def comparisons(analysis: Analysis) -> Table | None:
         " scenarios. Success is the gate of the Cramér-Rao bound here, prior or not."
     )
     return Table("comparisons", "Paired comparisons", caption, columns, rows)
-
-
-def portfolio(analysis: Analysis) -> Table | None:
-    """What the best choice of an estimator would come to, and `auto` beside it."""
-    rows = analysis.portfolio
-    if rows.empty:
-        return None
-    single = rows[rows["scenario"] >= 0]
-    varying = [c for c in analysis.setting_columns if len(set(single[c].astype(str))) > 1]
-    columns = [words(c, [plain(v) for v in rows[c]]) for c in varying]
-    columns += [
-        column("error scale", rows["error_scale"], lambda v: "all" if math.isnan(v) else f"{v:g}"),
-        column("trials", rows["trials"], lambda v: f"{v:d}"),
-        column("virtual best", rows["virtual_success"], percent),
-        interval("95 % of it", rows["virtual_low"], rows["virtual_high"], percent),
-        column("at cost", rows["virtual_cost"], short),
-        words("single best", rows["single"]),
-        column("its success", rows["single_success"], percent),
-        column("its cost", rows["single_cost"], short),
-    ]
-    if rows["auto_success"].notna().any():
-        columns += [column("auto", rows["auto_success"], percent), column("its cost", rows["auto_cost"], short)]
-    caption = (
-        "Virtual best: in each trial the cheapest estimator that succeeds; the share of trials in which any does."
-        " Single best: the one estimator that succeeds most often, of several the cheapest. Costs are medians over all"
-        " trials in simulations, a trial without success costing infinitely much. The row of all error scales has the"
-        " estimators that are everywhere."
-    )
-    return Table("portfolio", "Virtual best and single best", caption, columns, rows)
 
 
 def ranks(analysis: Analysis) -> Table | None:

@@ -29,8 +29,6 @@ from ipe_bench.runs.parts import SCHEMA, TRUTH, Outdated, Part, Unusable, as_arr
 from ipe_bench.runs.provenance import canonical_json
 from ipe_bench.runs.store import Store, describe_names, gaps, title
 
-CHUNK = 1 << 14
-"""Number of rows that are looked at together: few enough to stay in a processor's cache."""
 T = TypeVar("T")
 AGAIN = "run the same command again, which computes it anew"
 
@@ -407,14 +405,6 @@ class Results:
                         raise Unusable(f"damaged: has no column {lacking[0]}")
                     yield table.slice(max(0, reached - part.start))
                     reached = part.stop
-
-    def chunks(
-        self, cell: StoredCell, columns: Sequence[str], optional: Sequence[str] = (), rows: int = CHUNK
-    ) -> Iterator[dict[str, Array]]:
-        """The same some rows at a time: each chunk but the last has that many."""
-        whole = self.load(cell, columns, optional)
-        for at in range(0, len(whole["trial"]), rows):
-            yield {name: values[at : at + rows] for name, values in whole.items()}
 
     def load_history(self, cell: StoredCell, columns: Sequence[str]) -> dict[str, Array] | None:
         """The iterates of a cell's first trials in order; None if none are stored."""

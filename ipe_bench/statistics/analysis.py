@@ -24,7 +24,6 @@ from ipe_bench.statistics.comparisons import (
 )
 from ipe_bench.statistics.histories import History, trial_label
 from ipe_bench.statistics.intervals import quantile, quantiles
-from ipe_bench.statistics.portfolio import pooled, portfolio_row
 from ipe_bench.statistics.profiles import Profiles
 from ipe_bench.statistics.records import SCORES, capped_error, rows_of
 from ipe_bench.statistics.sample import Sample, Shared
@@ -69,9 +68,6 @@ class Analysis:
     within in 95 % of cases, and whether this one is `outside` (by either of its curves)."""
     contraction: pd.DataFrame
     """Per scenario, how much the fixed-point iteration contracts at the truth; empty where no file says so."""
-    portfolio: pd.DataFrame
-    """Per scenario, and over all of them where there are several (`scenario` is -1), the virtual best and the single
-    best estimator; see `portfolio.portfolio_row`."""
     attained: pd.DataFrame
     """Which estimator attains known minima, over all scenarios; see `attained.attained_table`."""
 
@@ -82,11 +78,6 @@ class Analysis:
     @property
     def stale(self) -> tuple[str, ...]:
         return tuple(self.collection.stale)
-
-    @property
-    def with_equation(self) -> set[str]:
-        """The estimators that seek a root of something; filters and the linear LSE do not, and only finish."""
-        return {g.estimator for g in self.collection.groups if g.footer.get("equation") is not None}
 
     @property
     def setting_columns(self) -> list[str]:
@@ -133,7 +124,6 @@ class Begun:
         for where, outcomes in self._scenarios:
             self._rows.pairs += [(where, pair) for pair in compare_pairs(outcomes)]
             self._rows.profiles.add({label: outcome for label, outcome in outcomes.items() if label in everywhere})
-        self._rows.portfolio += _portfolio_rows(self._scenarios, everywhere)
         self._scenarios.clear()
         return _analysis(self.collection, self._rows, everywhere)
 
@@ -155,7 +145,6 @@ def _analysis(collection: Collection, rows: _Rows, everywhere: set[str]) -> Anal
         convergence=_joined(rows.convergence, ("trial", "iteration", "distance")),
         calibration=_joined(rows.calibration, ("parameter", "at", "difference", "low", "high", "outside")),
         contraction=pd.DataFrame(rows.contraction),
-        portfolio=pd.DataFrame(rows.portfolio),
         attained=attained_table(collection),
     )
 
@@ -174,7 +163,6 @@ class _Rows:
     correlations: list[dict[str, Any]] = field(default_factory=list)
     convergence: list[dict[str, Any]] = field(default_factory=list)
     calibration: list[dict[str, Any]] = field(default_factory=list)
-    portfolio: list[dict[str, Any]] = field(default_factory=list)
     replicates: list[tuple[int, int, str, float]] = field(default_factory=list)
     """Scenario, seed, estimator and capped error."""
     profiles: Profiles = field(default_factory=Profiles)
@@ -231,18 +219,6 @@ def _add_scenario(rows: _Rows, collection: Collection, number: int, groups: Sequ
     return dict(groups[0].columns) | {"scenario": number}, outcomes
 
 
-def _portfolio_rows(scenarios: Sequence[_Compared], everywhere: set[str]) -> list[dict[str, Any]]:
-    """A row per scenario, and one over all of them with the estimators that are everywhere."""
-    rows = [where | row for where, outcomes in scenarios if (row := portfolio_row(outcomes))]
-    if len(rows) > 1:
-        labels = [label for label in scenarios[0][1] if label in everywhere]
-        together = portfolio_row(pooled([outcomes for _, outcomes in scenarios], labels))
-        if together:
-            nothing = dict.fromkeys(scenarios[0][0]) | {"error_scale": np.nan, "scenario": -1}
-            rows.append(nothing | together)
-    return rows
-
-
 def _everywhere(collection: Collection) -> set[str]:
     """The estimators that every scenario has: profiles compare on the same scenarios only."""
     labels = [{group.estimator for group in groups} for groups in collection.scenarios.values()]
@@ -285,8 +261,8 @@ def numbered(group: Group, number: int) -> dict[str, Any]:
 def _group_rows(sample: Sample) -> list[dict[str, Any]]:
     """Per group of parameters, in the order of the parameters; the group's bound is one in these units."""
     sums, first = sample.sums, sample.n + 1
-    totals = sums.binned.sums.sum(axis=0)[first:]
-    rmse = np.sqrt(totals / sums.mse.count) if sums.mse.count else np.full(len(totals), np.nan)
+    totals, count = sums.binned.sum(axis=0)[first:], sums.squares.count
+    rmse = np.sqrt(totals / count) if count else np.full(len(totals), np.nan)
     low, high = (ends[first:] for ends in sample.rmse_limits)
     return [
         head(sample.group) | {"group": name, "rmse": float(rmse[i]), "low": low[i], "high": high[i]}

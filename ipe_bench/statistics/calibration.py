@@ -9,8 +9,8 @@ how is left to others.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from scipy.special import bdtr, bdtrc, chdtri, gammaincinv, gammaln, ndtri
@@ -26,8 +26,6 @@ _OTHER = "of another shape"
 _RESOLVED = 1e-9
 """Below it, one less a coverage is round-off: then the sum over the points bounds the probability."""
 _LEAST_TAIL = 1e-13
-_WAITING_BYTES = 1 << 25
-"""Errors that are in memory before their curves are found."""
 
 
 # The simultaneous bands ----------------------------------------------------------------------------------------------
@@ -142,9 +140,9 @@ class Calibration:
 
     claims: int
     """Their number."""
-    z: Array | None = field(repr=False)
+    z: Array = field(repr=False)
     """(claims,), ascending: error over reported deviation, or the square root of NEES; infinite where the claim is
-    void. None where they were let go."""
+    void."""
     degrees: int
     """Of the chi-square law that z² has if the claims are true."""
     size: Curve
@@ -177,23 +175,12 @@ class Calibration:
             self._told[level] = "; ".join(self._faults(level)) or self._leaning() if self.p < 1 - level else INSIDE
         return self._told[level]
 
-    def light(self, level: float) -> Calibration:
-        """The same with the words at that level, and without the errors that others would be found from."""
-        self.words(level)
-        return replace(self, z=None)
-
     _told: dict[float, str] = field(default_factory=dict, repr=False, compare=False)
     """What was said at each level: it takes longer than all else."""
 
-    @property
-    def _values(self) -> Array:
-        if self.z is None:
-            raise ValueError("the errors of this calibration were let go; ask for words at the level that it was told")
-        return self.z
-
     def _faults(self, level: float) -> list[str]:
         """Shift, scale and tails, as far as each is sure by itself; by order statistics, which no outlier moves."""
-        z, faults = self._values, []
+        z, faults = self.z, []
         if self.place is not None:
             low, high = median_limits(z, level)
             if low > 0 or high < 0:
@@ -213,11 +200,11 @@ class Calibration:
     def _leaning(self) -> str:
         """What a curve as a whole shows where no order statistic shows it surely: that it lies to one side."""
         if self.place is not None and self.place.p < self.size.p:
-            return f"shifted by {_signed(float(np.median(self._values)))} deviations" if self.place.leans else _OTHER
+            return f"shifted by {_signed(float(np.median(self.z)))} deviations" if self.place.leans else _OTHER
         if not self.size.leans:
             return _OTHER
         at = POINTS[np.argmax(np.abs(self.size.difference))]
-        scale = float(np.quantile(np.abs(self._values), at) / np.sqrt(2 * gammaincinv(self.degrees / 2, at)))
+        scale = float(np.quantile(np.abs(self.z), at) / np.sqrt(2 * gammaincinv(self.degrees / 2, at)))
         return _scaled(scale)
 
     def _far(self, z: Array, level: float) -> float:
@@ -233,57 +220,19 @@ def calibrations(error: Array, deviation: Array, nees: Array, claimed: Array) ->
     error and deviation (trials, n), nees (trials,) and claimed (trials,) boolean. A deviation that is none, or 0, puts
     its truth infinitely far out; a trial whose NEES is not a number reports no covariance and claims nothing.
     """
-    claims = Claims(nees, claimed, error.shape[1], keep=True)
-    for e, d in zip(error.T, deviation.T, strict=True):
-        claims.add(e, d)
-    return claims.calibrations
-
-
-class Claims:
-    """The calibrations of n parameters whose errors come one after another; see `calibrations`.
-
-    What each came to is kept. Its errors are not, unless to `keep` them is asked for: those of a million trials are in
-    memory for a few parameters at a time.
-    """
-
-    def __init__(self, nees: Array, claimed: Array, n: int, *, keep: bool = False) -> None:
-        self.claimed = claimed & ~np.isnan(nees)
-        self.nees = nees
-        self.n = n
-        self.keep = keep
-        self.level = 1 - (1 - LEVEL) / (n + 1)
-        """See `shared_level`."""
-        self._waiting: list[Array] = []
-        self._found: list[Calibration] = []
-
-    def add(self, error: Array, deviation: Array) -> None:
-        """The next parameter's errors (trials,), and what is reported of them."""
-        if self.claimed.any():
-            self._waiting.append(_normalised(error[self.claimed], deviation[self.claimed]))
-            if sum(z.nbytes for z in self._waiting) > _WAITING_BYTES:
-                self._find([])
-
-    @cached_property
-    def calibrations(self) -> list[Calibration]:
-        """Of each parameter, and of all together last."""
-        if self.claimed.any():
-            self._find([np.sort(np.sqrt(self.nees[self.claimed]))])
-        return self._found
-
-    def _find(self, together: Sequence[Array]) -> None:
-        """Those of the parameters that wait, and that of all together where it is given: many curves take little
-        longer than one."""
-        # Each u is below a point where z is beyond that point's quantile: 99 quantiles are had sooner than every u.
-        least, radius, whole = -ndtri(POINTS), np.sqrt(chdtri(1, 1 - POINTS)), np.sqrt(chdtri(self.n, 1 - POINTS))
-        place = [len(row) - np.searchsorted(row, least) for row in self._waiting]
-        size = [np.searchsorted(row, radius, side="right") - np.searchsorted(row, -radius) for row in self._waiting]
-        size += [np.searchsorted(row, whole, side="right") for row in together]
-        claims, k = int(self.claimed.sum()), len(self._waiting)
-        found = _curves_of([*place, *size], claims)
-        parts = [Calibration(claims, z, 1, found[k + i], found[i]) for i, z in enumerate(self._waiting)]
-        parts += [Calibration(claims, z, self.n, found[2 * k]) for z in together]
-        self._waiting = []
-        self._found += parts if self.keep else [part.light(self.level) for part in parts]
+    claimed = claimed & ~np.isnan(nees)
+    if not claimed.any():
+        return []
+    n, trials = error.shape[1], int(claimed.sum())
+    each = [_normalised(e[claimed], d[claimed]) for e, d in zip(error.T, deviation.T, strict=True)]
+    together = np.sort(np.sqrt(nees[claimed]))
+    # Each u is below a point where z is beyond that point's quantile: 99 quantiles are had sooner than every u.
+    least, radius, whole = -ndtri(POINTS), np.sqrt(chdtri(1, 1 - POINTS)), np.sqrt(chdtri(n, 1 - POINTS))
+    place = [trials - np.searchsorted(z, least) for z in each]
+    size = [np.searchsorted(z, radius, side="right") - np.searchsorted(z, -radius) for z in each]
+    found = _curves_of([*place, *size, np.searchsorted(together, whole, side="right")], trials)
+    parts = [Calibration(trials, z, 1, found[n + i], found[i]) for i, z in enumerate(each)]
+    return [*parts, Calibration(trials, together, n, found[-1])]
 
 
 def _normalised(e: Array, d: Array) -> Array:

@@ -11,15 +11,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import bdtr, ndtr
+from scipy.special import bdtr
 
 from ipe_bench.basics.linalg import Array
 
 TIE = 1e-3
 """Errors closer than this, in standard deviations, are equal: round-off is never a difference."""
 ALPHA = 0.05
-_MANY = 200
-"""Ranks from which the normal law is as good as exact."""
 
 
 @dataclass(frozen=True)
@@ -97,20 +95,21 @@ def corrected(pairs: Sequence[Pair]) -> list[Pair]:
 
 
 def _compare(first: str, second: str, a: Outcomes, b: Outcomes) -> Pair:
+    from scipy.stats import rankdata, wilcoxon  # late: takes longer to load than all else here
+
     d = differences(a.distance, b.distance)
-    wins, losses = int((d < 0).sum()), int((d > 0).sum())
+    differing = d[d != 0]
+    side = float(np.sign(differing) @ rankdata(np.abs(differing)))
     only_a, only_b = int((a.success & ~b.success).sum()), int((b.success & ~a.success).sum())
-    ranks = signed_ranks(d)
-    side = ranks.sum()
     return Pair(
         first,
         second,
         trials=len(d),
-        wins=wins,
-        ties=len(d) - wins - losses,
-        losses=losses,
+        wins=int((d < 0).sum()),
+        ties=len(d) - len(differing),
+        losses=int((d > 0).sum()),
         median_difference=float(np.median(d)) if len(d) else float("nan"),
-        p_error=_p_of_ranks(ranks),
+        p_error=float(np.asarray(wilcoxon(differing))[1]) if len(differing) else 1.0,
         favours=first if side < 0 else second if side > 0 else "",
         only_first=only_a,
         only_second=only_b,
@@ -125,50 +124,6 @@ def differences(first: Array, second: Array) -> Array:
     d[~np.isfinite(first) & ~np.isfinite(second)] = 0.0
     d[np.abs(d) < TIE] = 0.0
     return d
-
-
-def signed_rank(d: Array) -> float:
-    """Two-sided p of Wilcoxon's signed-rank test (Biometrics Bulletin 1, 1945), zeros left out; 1 where all are."""
-    return _p_of_ranks(signed_ranks(d))
-
-
-def _p_of_ranks(ranks: Array) -> float:
-    """Exact where ranks are few; else by the normal law, with the variance that ties leave."""
-    if len(ranks) == 0:
-        return 1.0
-    if len(ranks) <= _MANY:
-        return _exact_p_of_ranks(ranks)
-    # The sum of squared mean ranks is n (n + 1) (2 n + 1) / 6 less what ties take; the sum of signed ranks has it as
-    # its variance.
-    return float(2 * ndtr(-abs(ranks.sum()) / np.sqrt(np.sum(ranks**2))))
-
-
-def _exact_p_of_ranks(ranks: Array) -> float:
-    """All signs being equally likely, whatever ranks are tied; `scipy.stats` takes longer to load than a small run."""
-    halves = np.rint(2 * np.abs(ranks)).astype(int)
-    # The law of the sum of the positive ranks, in halves as mean ranks are, one rank after another.
-    law = np.zeros(halves.sum() + 1)
-    law[0] = 1.0
-    for rank in halves:
-        law[rank:] += law[:-rank]
-        law /= 2
-    positive = halves[ranks > 0].sum()
-    return min(1.0, 2 * float(law[: min(positive, len(law) - 1 - positive) + 1].sum()))
-
-
-def signed_ranks(d: Array) -> Array:
-    """The ranks of the magnitudes of what is not zero, with its signs; an infinite one ranks above the others."""
-    d = d[d != 0]
-    if len(d) == 0:
-        return d
-    magnitude = np.abs(d)
-    order = np.argsort(magnitude)
-    ordered = magnitude[order]
-    group = np.cumsum(np.append(True, ordered[1:] != ordered[:-1])) - 1
-    counts = np.bincount(group)
-    ranks = np.empty(len(d))
-    ranks[order] = (np.cumsum(counts) - (counts - 1) / 2)[group]
-    return np.sign(d) * ranks
 
 
 def mcnemar(only_first: int, only_second: int) -> float:
@@ -245,15 +200,10 @@ def rank_over_replicates(scores: Sequence[Mapping[str, float]]) -> Ranking | Non
 
 def tied_ranks(scores: Array) -> Array:
     """Ranks from 1; scores closer than `TIE` to the next one share their mean rank."""
+    from scipy.stats import rankdata
+
     scores = np.where(np.isfinite(scores), scores, np.inf)
     order = np.argsort(scores, kind="stable")
-    ordered = scores[order]
     with np.errstate(invalid="ignore"):
-        gap = np.diff(ordered)
-    starts = np.concatenate([[True], gap >= TIE])
-    group = np.cumsum(starts) - 1
-    position = np.arange(1, len(scores) + 1, dtype=float)
-    means = np.bincount(group, position) / np.bincount(group)
-    ranks = np.empty(len(scores))
-    ranks[order] = means[group]
-    return ranks
+        groups = np.cumsum(np.append(0, np.diff(scores[order]) >= TIE))
+    return rankdata(groups[np.argsort(order, kind="stable")])

@@ -12,8 +12,7 @@ import numpy as np
 from scipy.special import betaincinv, chdtri
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.statistics.intervals import few_carry, rms_interval
-from ipe_bench.statistics.running import Squares
+from ipe_bench.statistics.intervals import Squares, few_carry, rms_interval
 from ipe_bench.trials.thresholds import FEW, GATE
 
 TOLERATED = 0.01
@@ -70,9 +69,7 @@ def verdict(nees: Array, n: int, level: float = 0.95) -> Verdict:
     outside = int(np.sum(claims > chdtri(n, GATE)))
     if above and clopper_pearson(outside, len(claims), level)[0] > TOLERATED:
         return "diverged but confident"
-    squares = Squares(1)
-    squares.add(x[None])
-    if few_carry(squares, np.array([n]))[0]:
+    if few_carry(Squares.of(x[None]), np.array([n]))[0]:
         return "optimistic" if above else "undecided"
     low, high = rms_interval(x[:, None], np.ones(len(x), dtype=bool), level)
     return "optimistic" if low[0] > 1 else "pessimistic" if high[0] < 1 else "consistent"

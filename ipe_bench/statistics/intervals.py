@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 from math import prod
@@ -10,7 +11,6 @@ import numpy as np
 from scipy.special import ndtri
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.statistics.running import Bins, Squares
 from ipe_bench.trials.thresholds import FEW
 
 LEVEL = 0.95
@@ -34,12 +34,17 @@ def rms_interval(squares: Array, used: Array, level: float = LEVEL) -> tuple[Arr
     Trials are drawn with replacement, used or not; the draws are the same for every estimator. Of more than
     `LARGEST_SAMPLE` trials, groups of consecutive ones are drawn, which is as good since trials are independent.
     """
-    trials, k = squares.shape
-    sums, counts = Bins(k, trials, LARGEST_SAMPLE), Bins(1, trials, LARGEST_SAMPLE)
-    if trials:
-        sums.add(np.where(used[:, None], squares, 0.0).T)
-        counts.add(used.astype(float)[None])
-    return rms_interval_of(sums.sums, counts.sums, level)
+    sums = grouped(np.where(used[:, None], squares, 0.0).T)
+    return rms_interval_of(sums, grouped(used.astype(float)[None]), level)
+
+
+def grouped(values: Array) -> Array:
+    """Sums (groups, k) of values (k, trials) over groups of trials in succession, as many as `LARGEST_SAMPLE` and as
+    alike as can be; the values themselves where there are no more trials than that."""
+    trials = values.shape[1]
+    if trials > LARGEST_SAMPLE:
+        values = np.add.reduceat(values, np.linspace(0, trials, LARGEST_SAMPLE, endpoint=False).astype(int), axis=1)
+    return np.ascontiguousarray(values.T)
 
 
 def rms_interval_of(sums: Array, counts: Array, level: float = LEVEL) -> tuple[Array, Array]:
@@ -80,6 +85,42 @@ def _draws(size: int) -> Array:
     return rng.multinomial(size, np.full(size, 1 / size), size=RESAMPLES).astype(float)
 
 
+@dataclass(frozen=True)
+class Squares:
+    """Squares beside their own size: they may be anything from 1e-200 to 1e200, whose squares are no numbers."""
+
+    count: int
+    size: Array
+    """(k,), the largest."""
+    mean: Array
+    """(k,), in units of the size."""
+    deviations: Array
+    """(k,), sum of squared deviations from the mean, in units of the size."""
+
+    @classmethod
+    def of(cls, squares: Array) -> Squares:
+        """Of squares (k, trials)."""
+        size, count = squares.max(axis=1, initial=0.0), squares.shape[1]
+        if not count:
+            return cls(0, size, np.zeros(len(size)), np.zeros(len(size)))
+        with np.errstate(all="ignore"):
+            scaled = np.where(size[:, None] > 0, squares / size[:, None], 0.0)
+        mean = scaled.mean(axis=1)
+        return cls(count, size, mean, ((scaled - mean[:, None]) ** 2).sum(axis=1))
+
+    @property
+    def deviation(self) -> Array:
+        """Standard deviation (k,), in units of the size."""
+        return np.sqrt(self.deviations / (self.count - 1)) if self.count > 1 else np.full(len(self.size), np.nan)
+
+    @property
+    def effective(self) -> Array:
+        """The effective number (k,) of those that share in the sum: its square over the sum of squares."""
+        with np.errstate(all="ignore"):
+            total = self.count * self.mean
+            return total**2 / (self.deviations + total * self.mean)
+
+
 def few_carry(squares: Squares, degrees: Array) -> Array:
     """Whether few trials carry the sum of squares (k,), so that no interval made of the trials can be relied on.
 
@@ -89,9 +130,8 @@ def few_carry(squares: Squares, degrees: Array) -> Array:
     of the trials: then nothing in them can tell.
     """
     with np.errstate(all="ignore"):
-        total = squares.count * squares.mean
-        fourth = squares.deviations + squares.count * squares.mean**2
-        shares, largest = fourth / total**2, 1 / fourth
+        shares = 1 / squares.effective
+        largest = 1 / (squares.deviations + squares.count * squares.mean**2)
     limits = np.array([_heaviest(squares.count, int(d)) for d in degrees])
     return (shares > limits) & (largest > _ONE_TRIAL)
 

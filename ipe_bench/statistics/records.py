@@ -20,9 +20,8 @@ from ipe_bench.statistics.calibration import overall_p, overall_words, shared_le
 from ipe_bench.statistics.consistency import clopper_pearson, mean_limits, verdict
 from ipe_bench.statistics.histories import CLOSE, FixedPointBound, fixed_point_bound, observed_constant, orders_of
 from ipe_bench.statistics.intervals import HEAVY, LARGEST_SAMPLE, RESAMPLES, quantile, rms_interval
-from ipe_bench.statistics.sample import AMBIGUOUS, FIT, NIS, QUANTILES, Sample
+from ipe_bench.statistics.sample import AMBIGUOUS, FIT, NIS, NORMAL_95, QUANTILES, Sample
 from ipe_bench.statistics.sequences import FIRST, share_sequence
-from ipe_bench.statistics.sums import NORMAL_95
 from ipe_bench.trials.thresholds import EXPECTED, FEW, FIT_LEVEL, GATE, SAME_ROOT
 
 Kind = Literal["count", "share", "number", "physical", "seconds", "probability", "word"]
@@ -161,7 +160,7 @@ def _failures_flagged(s: Sample) -> float:
 
 
 def _bias(s: Sample) -> Array:
-    return s.sums.bias.value
+    return s.sums.bias
 
 
 def _std(s: Sample) -> Array:
@@ -169,27 +168,30 @@ def _std(s: Sample) -> Array:
 
 
 def _rmse_common(s: Sample) -> Array:
-    return s.sums.mse_common.root
+    return s.sums.rmse_common
 
 
 def _crlb(s: Sample) -> Array:
-    return s.sums.crlb.root
+    return s.sums.crlb
 
 
 def _bayes(s: Sample) -> Array:
-    return s.sums.bayes.root
+    return s.sums.bayes
 
 
 def _van_trees(s: Sample) -> Array:
-    return s.sums.van_trees.root
+    return s.sums.van_trees
 
 
 def _van_trees_ends(s: Sample) -> tuple[Array, Array]:
     """Where the bound (n,) lies for truths without end, by the scatter of the information among those it is from."""
-    bound = s.sums.van_trees.root
-    # Of squares of several seeds, each twice the bound times its error.
-    error = s.sums.van_trees_error.root / np.sqrt(max(s.sums.van_trees_error.count, 1)) / (2 * bound)
+    bound, error = s.sums.van_trees, s.sums.van_trees_error
     return np.maximum(bound - NORMAL_95 * error, 0.0), bound + NORMAL_95 * error
+
+
+def _median_known(s: Sample, name: str) -> float:
+    values = s.truth[name]
+    return quantile(values[np.isfinite(values)], 0.5)
 
 
 def _van_trees_limits(s: Sample) -> Limits:
@@ -203,18 +205,18 @@ def _van_trees_limits_each(s: Sample) -> Limits:
 
 
 def _applying_bound(s: Sample) -> Array:
-    return s.sums.bayes.root if s.bound_kind == "bayes" else s.sums.crlb.root
+    return s.sums.bayes if s.bound_kind == "bayes" else s.sums.crlb
 
 
 def _reported(s: Sample) -> Array:
-    return s.sums.reported.root
+    return s.sums.reported
 
 
 def _eq_14(s: Sample) -> Array:
     """Eq. (14): eq. (5) plus the mean square of H+ dN, which at a root of eq. (11) is the error less H+ v."""
     if s.group.footer.get("equation") != "frozen":
         return np.full(s.n, np.nan)
-    return np.sqrt(s.linear_bound**2 + s.sums.compensation.value)
+    return np.sqrt(s.linear_bound**2 + s.sums.compensation)
 
 
 def _rms(values: Array) -> float:
@@ -233,9 +235,9 @@ def _predicted(s: Sample) -> tuple[Array, Array]:
     if s.group.footer.get("equation") != "least_squares":
         return np.full(s.n, np.nan), np.full(s.n, np.nan)
     if s.group.footer["identity"]["scenario"].get("truth") is not None:
-        return s.sums.wrong.value, s.sums.wrong_mse.root
-    box = s.sums.box_square
-    return s.sums.box.value, np.sqrt(s.sums.crlb.value + (box.value if box.count else 0.0))
+        return s.sums.predicted[0], np.sqrt(s.sums.predicted[1])
+    bias, square = s.sums.box
+    return bias, np.sqrt(s.sums.crlb_square + np.where(np.isnan(square), 0.0, square))
 
 
 def _predicted_bias(s: Sample) -> Array:
@@ -291,11 +293,11 @@ def _efficiency_limits_each(s: Sample) -> Limits:
 
 
 def _rmse_all(s: Sample) -> Array:
-    return s.sums.mse_all.root
+    return s.sums.rmse_all
 
 
 def _bound_all(s: Sample) -> Array:
-    return (s.sums.bayes_all if s.bound_kind == "bayes" else s.sums.crlb_all).root
+    return s.sums.bayes_all if s.bound_kind == "bayes" else s.sums.crlb_all
 
 
 def _efficiency_each(s: Sample) -> Array:
@@ -320,7 +322,7 @@ def _nees(s: Sample) -> float:
 def _nees_each(s: Sample) -> Array:
     if not (s.reports_covariance and s.solved.any()):
         return np.full(s.n, np.nan)
-    return s.sums.nees.value
+    return s.sums.nees
 
 
 def _nees_limits(s: Sample) -> Limits:
@@ -339,7 +341,7 @@ def _coverage(s: Sample) -> float:
 def _coverage_each(s: Sample) -> Array:
     if not s.reports_covariance:
         return np.full(s.n, np.nan)
-    return s.sums.covered.value
+    return s.sums.covered
 
 
 def _claims(s: Sample) -> int:
@@ -664,8 +666,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "How many equal ones would share the sum of squared errors as evenly as the trials do, (Σ e²)² / Σ e⁴ (Kish,"
         " Survey Sampling, 1965): a third of the trials for normal errors of one parameter, one where a single trial"
         " carries all.",
-        lambda s: float(s.effective_trials[s.n]),
-        lambda s: s.effective_trials[: s.n],
+        lambda s: float(s.sums.squares.effective[s.n]),
+        lambda s: s.sums.squares.effective[: s.n],
         given="solved",
         where=("parameters",),
     ),
@@ -759,7 +761,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "the first trials",
         "Median relative curvature of the surface of readings at the truth, within the 95 % region of the bound (Bates"
         " and Watts, J. R. Stat. Soc. B 42, 1980): linear theory holds well below 0.3.",
-        lambda s: quantile(s.sums.known_curvature("curvature_intrinsic"), 0.5),
+        lambda s: _median_known(s, "curvature_intrinsic"),
         where=("theory",),
     ),
     Statistic(
@@ -767,7 +769,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "parameter curvature",
         "the first trials",
         "The same of the parameters' lines on that surface: how uneven they are.",
-        lambda s: quantile(s.sums.known_curvature("curvature_parameter"), 0.5),
+        lambda s: _median_known(s, "curvature_parameter"),
         where=("theory",),
     ),
     Statistic(

@@ -16,8 +16,7 @@ from scipy.special import betaln
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
-from ipe_bench.statistics.intervals import few_carry
-from ipe_bench.statistics.running import Squares
+from ipe_bench.statistics.intervals import Squares, few_carry
 
 if TYPE_CHECKING:
     from ipe_bench.statistics.sample import Sample
@@ -78,13 +77,11 @@ def mean_sequence(deviation: Array, count: int, level: float = LEVEL) -> Array:
 def rms_sequence(squares: Array, level: float = LEVEL) -> tuple[Array, Array]:
     """Root mean square (k,) of squares (trials, k): the sequence of the logarithm of their mean; NaN below `FIRST`, and
     where few trials carry the sum, as those of one degree of freedom; see `few_carry`."""
-    running = Squares(squares.shape[1])
-    running.add(squares.T)
-    return rms_sequence_of(running, np.ones(squares.shape[1]), level)
+    return rms_sequence_of(Squares.of(squares.T), np.ones(squares.shape[1]), level)
 
 
 def rms_sequence_of(squares: Squares, degrees: Array, level: float = LEVEL) -> tuple[Array, Array]:
-    """The same from running sums of them; see `rms_sequence`."""
+    """The same from what is known of them; see `rms_sequence`."""
     size, mean = squares.size, squares.mean
     if squares.count < FIRST:
         return np.full(len(size), np.nan), np.full(len(size), np.nan)

@@ -48,14 +48,3 @@ def test_tables_have_the_columns_only_where_somebody_looks(folders):
         titles = {c.title for c in table.columns}
         assert ({"ambiguous", "failures flagged"} <= titles) == there
         assert "misfit" in titles
-
-
-def test_the_best_choices_stand_in_a_table_of_their_own(folders):
-    analysis = analyse([folders[0]])
-    table = next(t for t in all_tables(analysis) if t.name == "portfolio")
-    assert len(table) == 1
-    row = analysis.portfolio.iloc[0]
-    shares = dict(zip(analysis.summary["estimator"], analysis.summary["success"], strict=True))
-    assert row["auto_success"] == shares["auto"]
-    assert row["single_success"] == max(shares.values())
-    assert row["virtual_success"] >= row["single_success"]

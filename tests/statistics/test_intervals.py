@@ -5,8 +5,7 @@ import pytest
 from scipy.stats import binom, chi2
 
 from ipe_bench.statistics.consistency import clopper_pearson, mean_limits
-from ipe_bench.statistics.intervals import few_carry, quantile, quantiles, rms_interval
-from ipe_bench.statistics.running import Squares
+from ipe_bench.statistics.intervals import Squares, few_carry, grouped, quantile, quantiles, rms_interval
 
 
 @pytest.mark.parametrize("p", [0.01, 0.3, 0.5, 0.97])
@@ -29,6 +28,18 @@ def test_bootstrap_interval_has_the_width_of_theory():
         e = rng.normal(size=(trials, 3)) * [1.0, 2.0, 3.0]
         low, high = rms_interval(e**2, np.ones(trials, dtype=bool))
         np.testing.assert_allclose((high - low) / [1, 2, 3], 2 * 1.96 / np.sqrt(2 * trials), rtol=0.2)
+
+
+@pytest.mark.parametrize("trials", [7, 2000, 2001, 5003])
+def test_groups_hold_every_trial_once_in_its_order_and_are_alike(trials):
+    values = np.random.default_rng(2).integers(1, 100, (2, trials)).astype(float)
+    found = grouped(values)
+    assert len(found) == min(trials, 2000)
+    np.testing.assert_array_equal(found.sum(axis=0), values.sum(axis=1))
+    counts = grouped(np.ones((1, trials)))[:, 0]
+    assert counts.max() - counts.min() <= 1
+    starts = np.append(0, np.cumsum(counts)[:-1]).astype(int)
+    np.testing.assert_array_equal(found, np.add.reduceat(values, starts, axis=1).T)
 
 
 def test_squares_of_any_size_have_an_interval():
@@ -94,9 +105,7 @@ def test_the_table_of_coverage():
 
 def carried(squares: np.ndarray, degrees: int) -> np.ndarray:
     """Whether few trials carry each column of squares (trials, k)."""
-    running = Squares(squares.shape[1])
-    running.add(squares.T)
-    return few_carry(running, np.full(squares.shape[1], degrees))
+    return few_carry(Squares.of(squares.T), np.full(squares.shape[1], degrees))
 
 
 @pytest.mark.parametrize(("trials", "degrees"), [(20, 1), (20, 11), (50, 1), (50, 3), (100, 1)])

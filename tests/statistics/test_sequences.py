@@ -8,7 +8,7 @@ from scipy.stats import binom
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.statistics.consistency import clopper_pearson
-from ipe_bench.statistics.running import Squares
+from ipe_bench.statistics.intervals import Squares
 from ipe_bench.statistics.sequences import Precision, next_trials, rms_sequence, rms_sequence_of, share_sequence
 
 
@@ -158,11 +158,8 @@ def ever_missing(law: str, studies: int) -> tuple[float, float]:
     miss, none = np.zeros(studies, dtype=bool), 0
     for k in range(0, studies, 50):
         squares = np.mean(draw(rng, (4000, 50, n)) ** 2, axis=2)
-        running, at = Squares(50), 0
         for look in looks.tolist():
-            running.add(squares[at:look].T)
-            at = look
-            low, high = rms_sequence_of(running, np.full(50, n))
+            low, high = rms_sequence_of(Squares.of(squares[:look].T), np.full(50, n))
             miss[k : k + 50] |= (low > np.sqrt(mean_square)) | (high < np.sqrt(mean_square))
         none += int(np.isnan(low).sum())
     return float(miss.mean()), none / studies

@@ -301,13 +301,10 @@ def test_a_jacobian_counts_what_the_model_says_it_costs(synthetic):
 
 def test_epochs_of_a_filter_are_not_iterations(synthetic):
     scenario = synthetic.scenario()
-    synthetic.add(scenario, "ekf", errors(40), iterations=30, estimator=Filter())
-    synthetic.add(scenario, "newton", errors(40), iterations=3)
-    for cell in list(synthetic.cells.values()):
-        path = 0.1 * 0.5 ** np.arange(6.0)
-        columns = {"trial": np.zeros(6, dtype=int), "iteration": np.arange(6)} | {f"x_{n}": path for n in "abc"}
-        if cell.label != "truth":
-            synthetic.store.write_history(cell, columns)
+    path = 0.1 * 0.5 ** np.arange(6.0)
+    history = {"trial": np.zeros(6, dtype=int), "iteration": np.arange(6)} | {f"x_{n}": path for n in "abc"}
+    synthetic.add(scenario, "ekf", errors(40), iterations=30, estimator=Filter(), history=history)
+    synthetic.add(scenario, "newton", errors(40), iterations=3, history=history)
     analysis = analyse([synthetic.directory])
     assert np.isnan(row(analysis.summary, "ekf")["iterations_median"])
     assert row(analysis.summary, "newton")["iterations_median"] == 3
