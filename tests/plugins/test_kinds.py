@@ -114,11 +114,9 @@ def test_a_report_has_what_plugins_add_beside_all_that_is_ours(ours, capsys):
     assert Path("out/report.html").stat().st_mtime_ns == stamp
     # The code of a plugin is part of what a report is made from.
     module = Path("plugins/own_figure/ipe_bench_own_figure/own_figure.py")
-    digest = Path("out/figures/index.json").read_bytes()
     module.write_text(module.read_text() + "\n# changed\n")
     assert main(["report", "out", MAIN]) == 0
     assert Path("out/report.html").stat().st_mtime_ns > stamp
-    assert Path("out/figures/index.json").read_bytes() != digest
 
 
 RAISING = {

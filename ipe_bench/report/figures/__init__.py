@@ -18,6 +18,5 @@ FIGURES = (
     "convergence",
     "profiles",
     "correlation",
-    "theory",
 )
 """The modules, in the order of the report; a new figure is a module with a FIGURE, and its name here."""
