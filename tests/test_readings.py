@@ -12,7 +12,8 @@ from small_models import Bent
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Bearings, Gins, Ranging
-from ipe_bench.real.readings import header, read_readings, write_readings
+from ipe_bench.real.readings import header, write_readings
+from ipe_bench.real.sources import open_together
 
 MODELS = [Ranging(), Bearings(), Gins(), Bent(count=5)]
 
@@ -33,7 +34,7 @@ def european(path: Path) -> Path:
 
 def refusal(path: Path, model) -> str:
     with pytest.raises(UserError) as told:
-        read_readings(path, model)
+        open_together([path], model)
     assert "\n" not in str(told.value)
     return str(told.value).removeprefix(f"readings={path}: ")
 
@@ -51,16 +52,16 @@ def test_what_is_written_is_read_bit_for_bit_with_points_and_with_commas(tmp_pat
     z = model.simulate(model.nominal[None])[0] * np.pi
     z[1] = np.nan
     path = written(tmp_path, model, z)
-    np.testing.assert_array_equal(read_readings(path, model), z)
-    np.testing.assert_array_equal(read_readings(european(path), model), z)
+    np.testing.assert_array_equal(open_together([path], model).z, z)
+    np.testing.assert_array_equal(open_together([european(path)], model).z, z)
 
 
 @settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(value=st.floats(allow_nan=False, allow_infinity=False))
 def test_every_number_survives_both_ways_of_writing_it(tmp_path, value):
     path = with_reading(tmp_path, repr(value))
-    assert read_readings(path, Bent(count=5))[2] == value
-    assert read_readings(european(path), Bent(count=5))[2] == value
+    assert open_together([path], Bent(count=5)).z[2] == value
+    assert open_together([european(path)], Bent(count=5)).z[2] == value
 
 
 @settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -69,7 +70,7 @@ def test_no_text_is_read_as_a_number_that_it_does_not_say(tmp_path, text):
     """What is accepted consists of the signs that numbers are written with, and is what Python reads."""
     path = with_reading(tmp_path, text)
     try:
-        value = read_readings(path, Bent(count=5))[2]
+        value = open_together([path], Bent(count=5)).z[2]
     except UserError as error:
         lines = str(error).splitlines()
     else:
@@ -125,7 +126,7 @@ def test_points_and_commas_in_one_file_are_refused(tmp_path):
 
 
 def test_semicolons_with_points_are_read_too(tmp_path):
-    assert read_readings(with_reading(tmp_path, "1.234", ";"), Bent(count=5))[2] == 1.234
+    assert open_together([with_reading(tmp_path, "1.234", ";")], Bent(count=5)).z[2] == 1.234
 
 
 ROWS = ["1,0.25", "2,0.25", "3,0.25", "4,0.25", "5,0.25"]
@@ -136,8 +137,7 @@ ROWS = ["1,0.25", "2,0.25", "3,0.25", "4,0.25", "5,0.25"]
     [
         ("number,reading [m]", ["1", *ROWS[1:]], "row 2: has 1 cells and the header 2; a missing reading is an empty"),
         ("number,reading [m]", ["1,,", *ROWS[1:]], "row 2: has 3 cells and the header 2"),
-        ("number,reading [m],sigma", [r + ",0.1" for r in ROWS], "column sigma is not understood; remove it"),
-        ("number,reading [m],sigma [m]", [r + ",0.1" for r in ROWS], "column sigma [m] is not understood; remove it"),
+        ("number,reading [m],weight", [r + ",0.1" for r in ROWS], "column weight is not understood; remove it"),
         ("number,reading [m],", [r + "," for r in ROWS], "column 3, which has no name, is not understood; remove it"),
         ("number,note,reading [m],note", ROWS, "column note stands there twice; keep one"),
         ("number,reading [m]", ["1\xa0000,0.25", *ROWS[1:]], "row 2: bent has no reading number=1"),
@@ -161,5 +161,5 @@ def test_a_file_in_another_encoding_is_refused(tmp_path):
 def test_labels_are_compared_as_what_they_say(tmp_path):
     path = tmp_path / "readings.csv"
     path.write_text("reading [m],number\n" + "\n".join(f"{i}.5,{i}.0" for i in (5, 3, 1, 2, 4)))
-    np.testing.assert_array_equal(read_readings(path, Bent(count=5)), [1.5, 2.5, 3.5, 4.5, 5.5])
+    np.testing.assert_array_equal(open_together([path], Bent(count=5)).z, [1.5, 2.5, 3.5, 4.5, 5.5])
     assert header(Bent(count=5)) == ["number", "reading [m]"]

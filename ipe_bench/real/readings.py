@@ -121,18 +121,6 @@ def _write(path: Path, heading: Sequence[str], rows: Sequence[Sequence[Any]]) ->
     write_atomically(path, write)
 
 
-def read_readings(path: Path, model: Measurement) -> Array:
-    """The readings z (m,) of a file, in the model's order; NaN where a cell is empty.
-
-    Raises:
-        UserError: the file is absent or does not hold this model's readings, by row and column.
-    """
-    table = read_table(path)
-    z = readings_of(table, model, rows_of(table, model))
-    require_enough(table.error, z, model)
-    return z
-
-
 def require_enough(error: Callable[[str], UserError], z: Array, model: Measurement) -> None:
     """Refuses fewer readings z (m,) than the model has parameters, by what `error` makes of it."""
     if np.isfinite(z).sum() < model.n:

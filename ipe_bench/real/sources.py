@@ -223,17 +223,6 @@ def noise_of(found: Readings, stated: Noise | None) -> Noise | None:
     return Gaussian(deviations)
 
 
-def open_readings(path: Path, model: Measurement) -> Readings:
-    """The readings of a file, in the order of the model that comes with them.
-
-    Raises:
-        UserError: the file is absent or does not hold readings of this model, by row and column.
-    """
-    found = _readings_in(readings.read_table(path), model)
-    require_enough([path], found)
-    return found
-
-
 def _readings_in(table: Table, model: Measurement) -> Readings:
     """The readings of a file, of which there may be too few."""
     sigma = _column_of(SIGMA, table.heading)

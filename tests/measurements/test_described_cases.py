@@ -14,7 +14,7 @@ from ipe_bench.noise import Gaussian
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.real.fits import fit
 from ipe_bench.real.readings import write_readings
-from ipe_bench.real.sources import open_readings, open_together
+from ipe_bench.real.sources import open_together
 from ipe_bench.trials.scenario import Scenario
 
 FEED, BEGIN = (2.0, 0.0, 5.0), (1.0, 9.0, 4.0)
@@ -43,7 +43,7 @@ def file(tmp_path):
 
 def test_cases_have_inputs_and_initial_states_of_their_own(file):
     path, case, t, z = file
-    found = open_readings(path, MODEL)
+    found = open_together([path], MODEL)
     assert found.z == pytest.approx(z, abs=1e-15)
     x = np.array([[0.9, 1.3], [0.6, 0.8]])
     h = found.model.simulate(x)
@@ -53,7 +53,7 @@ def test_cases_have_inputs_and_initial_states_of_their_own(file):
 
 def test_an_estimate_from_several_cases_is_scipys(file):
     path, case, t, z = file
-    result = fit_of(open_readings(path, MODEL))
+    result = fit_of(open_together([path], MODEL))
     x, P = curve_fit(
         lambda t, k, gain: solution(case, t, k, gain), t, z, (0.5, 1.0), np.full(15, 0.05), True,
         ftol=1e-15, xtol=1e-15, gtol=1e-15,
@@ -72,7 +72,7 @@ def fit_of(found):
 
 def test_files_of_one_case_each_are_estimated_together(file, tmp_path):
     path, *_ = file
-    whole = fit_of(open_readings(path, MODEL))
+    whole = fit_of(open_together([path], MODEL))
     _heading, *rows = path.read_text().splitlines()
     paths = []
     for case in "123":
@@ -95,14 +95,14 @@ def test_a_model_in_the_config_has_its_cases_there(tmp_path):
     assert not [f for f in check_component("ode", model) if f.complaint]
     write_readings(tmp_path / "w.csv", model, z)
     assert (tmp_path / "w.csv").read_text().splitlines()[0] == "case,time,output,feed,begin,reading"
-    again = open_readings(tmp_path / "w.csv", MODEL)
+    again = open_together([tmp_path / "w.csv"], MODEL)
     assert again.model.simulate(np.array([[1.0, 1.0]]))[0] == pytest.approx(z, abs=1e-6)
 
 
 def test_a_constant_of_the_config_stands_for_a_column(tmp_path):
     (tmp_path / "a.csv").write_text("time,reading,begin\n1,2,1\n2,3,1\n3,3,1\n")
     model = Ode({"y": "feed - k*y"}, {"k": 0.5, "gain": 1.0}, {"y": "begin"}, {"s": "gain*y"}, constants={"feed": 2.0})
-    h = open_readings(tmp_path / "a.csv", model).model.simulate(np.array([[1.0, 1.0]]))[0]
+    h = open_together([tmp_path / "a.csv"], model).model.simulate(np.array([[1.0, 1.0]]))[0]
     assert h == pytest.approx([4 - 3 * np.exp(-0.5 * t) for t in (1, 2, 3)], abs=1e-6)
 
 
@@ -131,7 +131,7 @@ def test_a_wrong_file_is_refused(tmp_path, case):
     text, expected = REFUSED[case]
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(UserError, match=expected):
-        open_readings(tmp_path / "a.csv", MODEL)
+        open_together([tmp_path / "a.csv"], MODEL)
 
 
 MISTAKES = {

@@ -21,7 +21,7 @@ from ipe_bench.measurements.nist import datasets, digits
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Unknown
 from ipe_bench.real.fits import fit
-from ipe_bench.real.sources import open_readings
+from ipe_bench.real.sources import open_together
 
 _POLYNOMIALS = "(b1+b2*x+b3*x**2+b4*x**3)/(1+b5*x+b6*x**2+b7*x**3)"
 _GAUSS = "b1*exp(-b2*x) + b3*exp(-(x-b4)**2/b5**2) + b6*exp(-(x-b7)**2/b8**2)"
@@ -78,7 +78,7 @@ def test_nist_answers_come_from_the_formula_with_an_unknown_noise(dataset, tmp_p
         rows = zip(*(c.tolist() for c in nist.predictors), nist.readings.tolist(), strict=True)
         csv.writer(file).writerows([[*names, "y"], *rows])
     start = {f"b{i + 1}": float(b) for i, b in enumerate(nist.start_values)}
-    found = open_readings(path, Formula(NIST[dataset], start))
+    found = open_together([path], Formula(NIST[dataset], start))
     order = [[p.name for p in found.model.parameters].index(name) for name in start]
     estimators = {"lm": LeastSquares(method="lm", start="nominal", ftol=1e-15, xtol=1e-15, gtol=1e-15, max_nfev=5000)}
     result = fit(Problem(found.model, Unknown().covariance(len(found.z))), found.z, estimators, level_unknown=True)[0]
@@ -162,8 +162,8 @@ def test_a_misspelt_column_is_named(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("t [s],y\n0,1\n1,2\n2,4\n")
     with pytest.raises(UserError, match=r"column b2 is missing.*If b2 is a parameter.*measurement.start.b2=VALUE"):
-        open_readings(path, Formula("b1*exp(b2*t)", {"b1": 1.0}))
-    assert open_readings(path, Formula("b1*t", {"b1": 1.0})).z.tolist() == [1.0, 2.0, 4.0]
+        open_together([path], Formula("b1*exp(b2*t)", {"b1": 1.0}))
+    assert open_together([path], Formula("b1*t", {"b1": 1.0})).z.tolist() == [1.0, 2.0, 4.0]
 
 
 def test_a_formula_is_evaluated_or_refused_however_long():

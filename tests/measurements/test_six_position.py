@@ -13,7 +13,7 @@ from ipe_bench.noise import Gaussian
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.real.fits import fit
 from ipe_bench.real.readings import write_readings
-from ipe_bench.real.sources import open_readings
+from ipe_bench.real.sources import open_together
 
 BIAS = np.array([120.0, -340.0, 55.0, -12.0, 30.0, 7.0])
 SCALE = np.array([0.00241, 0.00237, 0.00246, 0.0075, 0.0077, 0.00761])
@@ -75,7 +75,7 @@ def test_a_file_of_positions_and_rates_is_estimated_as_by_regression(tmp_path):
     assert heading == ("row,sensor,fx [m/s^2],fy [m/s^2],fz [m/s^2],wx [deg/s],wy [deg/s],wz [deg/s],reading [counts]")
     order = rng.permutation(72)
     (tmp_path / "own.csv").write_text("\n".join([heading[4:], *(rows[i].partition(",")[2] for i in order)]))
-    found = open_readings(tmp_path / "own.csv", SixPosition())
+    found = open_together([tmp_path / "own.csv"], SixPosition())
     (result,) = fit(Problem(found.model, Gaussian(0.4).covariance(72)), found.z, {"gn": GaussNewton(tolerance=1e-9)})
     there = np.isfinite(z)
     sensors = np.array(model.sensors)[there]

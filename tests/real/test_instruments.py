@@ -19,7 +19,7 @@ from ipe_bench.noise import Gaussian, ModelNoise, Quantization, Unknown
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.real.fits import Fit, fit
 from ipe_bench.real.readings import write_readings
-from ipe_bench.real.sources import open_readings, open_together
+from ipe_bench.real.sources import open_together
 from ipe_bench.trials.scenario import Scenario
 
 SATURATION = "b1*(1-exp(-b2*t))"
@@ -59,7 +59,7 @@ def estimate(found, **options) -> Fit:
 
 def test_weights_of_the_file_are_those_of_the_fit(tmp_path):
     path, (t, y, sigma) = (lambda p, c: (p, c.T))(*simulated(tmp_path / "a.csv", 240.0, 1))
-    result = estimate(open_readings(path, Formula(SATURATION, START)))
+    result = estimate(open_together([path], Formula(SATURATION, START)))
     x, deviations = solution(lambda p: (p[0] * (1 - np.exp(-p[1] * t)) - y) / sigma, [250, 5e-4])
     assert result.x == pytest.approx(x, rel=1e-8)
     assert result.standard_errors == pytest.approx(deviations, rel=1e-8)
@@ -70,7 +70,7 @@ def test_weights_of_the_file_are_those_of_the_fit(tmp_path):
 def test_a_fixed_parameter_is_not_estimated_and_costs_no_degree_of_freedom(tmp_path):
     path, columns = simulated(tmp_path / "a.csv", 240.0, 2)
     t, y, sigma = columns.T
-    found = open_readings(path, ConstrainedModel(Formula(SATURATION, START), (ParameterInfo("b2", fixed=5.7e-4),)))
+    found = open_together([path], ConstrainedModel(Formula(SATURATION, START), (ParameterInfo("b2", fixed=5.7e-4),)))
     result = estimate(found)
     x, deviations = solution(lambda p: (p[0] * (1 - np.exp(-5.7e-4 * t)) - y) / sigma, [250])
     assert result.x == pytest.approx(x, rel=1e-8)
@@ -90,7 +90,7 @@ def test_a_fixed_parameter_is_not_estimated_and_costs_no_degree_of_freedom(tmp_p
 def test_bounds_move_neither_a_minimum_inside_of_them_nor_its_standard_errors(tmp_path, known):
     path, columns = simulated(tmp_path / "a.csv", 240.0, 3)
     t, y, sigma = columns.T
-    result = estimate(open_readings(path, ConstrainedModel(Formula(SATURATION, START), known)))
+    result = estimate(open_together([path], ConstrainedModel(Formula(SATURATION, START), known)))
     x, deviations = solution(lambda p: (p[0] * (1 - np.exp(-p[1] * t)) - y) / sigma, [250, 5e-4])
     assert result.status is Status.CONVERGED
     assert result.x == pytest.approx(x, rel=1e-8)
@@ -106,7 +106,7 @@ def test_an_estimate_on_its_bound_is_the_minimum_within_the_bounds(tmp_path, upp
     path, columns = simulated(tmp_path / "a.csv", 240.0, 3)
     t, y, sigma = columns.T
     known = (ParameterInfo("b1", nominal=200.0, lower=100.0, upper=upper), ParameterInfo("b2", positive=True))
-    result = estimate(open_readings(path, ConstrainedModel(Formula(SATURATION, START), known)), level_unknown=unknown)
+    result = estimate(open_together([path], ConstrainedModel(Formula(SATURATION, START), known)), level_unknown=unknown)
     bounded = least_squares(
         lambda p: (p[0] * 100 * (1 - np.exp(-p[1] * 1e-4 * t)) - y) / sigma,
         [2.0, 5.0],
@@ -131,7 +131,7 @@ def test_a_minimum_near_a_bound_but_inside_is_not_on_it(tmp_path):
     t, y, sigma = columns.T
     x, deviations = solution(lambda p: (p[0] * (1 - np.exp(-p[1] * t)) - y) / sigma, [250, 5e-4])
     known = (ParameterInfo("b1", nominal=200.0, upper=x[0] * 1.0005),)
-    result = estimate(open_readings(path, ConstrainedModel(Formula(SATURATION, START), known)))
+    result = estimate(open_together([path], ConstrainedModel(Formula(SATURATION, START), known)))
     assert result.held_at == {}
     assert result.x == pytest.approx(x, rel=1e-8)
     assert result.standard_errors == pytest.approx(deviations, rel=1e-8)
@@ -204,7 +204,7 @@ def test_a_satellite_file_brings_its_own_sky(tmp_path):
     p = np.array([120.0, -40.0, 30.0, 2500.0])
     z = truth.simulate((p / truth.sizes)[None])[0] + rng.normal(size=6)
     write_readings(tmp_path / "g.csv", truth, z)
-    found = open_readings(tmp_path / "g.csv", Gnss(earth_rate=0.0))
+    found = open_together([tmp_path / "g.csv"], Gnss(earth_rate=0.0))
     assert found.model.m == 6
     result = fit(Problem(found.model, ModelNoise().of(found.model).covariance(6)), found.z, {"gn": GaussNewton()})[0]
     low, high = result.interval(0.9999)
@@ -231,7 +231,7 @@ def test_an_epidemic_is_read_when_its_file_says(tmp_path):
     write_readings(tmp_path / "s.csv", truth, truth.simulate(x)[0])
     lines = (tmp_path / "s.csv").read_text().splitlines()
     (tmp_path / "s.csv").write_text("\n".join([lines[0], *reversed(lines[1:])]))
-    found = open_readings(tmp_path / "s.csv", Sir())
+    found = open_together([tmp_path / "s.csv"], Sir())
     assert found.model.simulate(x)[0] == pytest.approx(found.z, abs=1e-9)
     assert found.model.index["time [day]"] == list(reversed(times))
     result = fit(Problem(found.model, Gaussian(20.0).covariance(6)), found.z, {"gn": GaussNewton(max_iterations=50)})[0]
@@ -278,11 +278,11 @@ def test_a_wrong_file_is_refused_with_its_row(tmp_path, case):
     text, expected = REFUSED[case]
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(UserError, match=expected):
-        open_readings(tmp_path / "a.csv", Formula("a+b*t", {"a": 1.0, "b": 1.0}))
+        open_together([tmp_path / "a.csv"], Formula("a+b*t", {"a": 1.0, "b": 1.0}))
 
 
 def test_a_missing_reading_keeps_its_row(tmp_path):
     (tmp_path / "a.csv").write_text("t,y,sigma\n1,2,1\n2,,\n3,4,1\n4,5.5,1\n")
-    found = open_readings(tmp_path / "a.csv", Formula("a+b*t", {"a": 1.0, "b": 1.0}))
+    found = open_together([tmp_path / "a.csv"], Formula("a+b*t", {"a": 1.0, "b": 1.0}))
     assert np.isnan(found.z).tolist() == [False, True, False, False]
     assert np.isnan(found.deviations).tolist() == [False, True, False, False]

@@ -19,7 +19,7 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
 from ipe_bench.real.fits import fit
 from ipe_bench.real.readings import write_readings
-from ipe_bench.real.sources import open_readings, open_together
+from ipe_bench.real.sources import open_together
 
 LINE = Formula("a+b*t", {"a": 1.0, "b": 1.0})
 T = [0.5, 1.25, 2.0, 3.5, 5.0, 8.0]
@@ -333,13 +333,13 @@ def test_a_file_is_read_as_meant_or_refused_with_its_row(case, tmp_path):
     path.write_bytes(case.content)
     if case.refusal:
         with pytest.raises(UserError) as refused:
-            open_readings(path, case.model)
+            open_together([path], case.model)
         told = str(refused.value)
         assert told.startswith(f"readings={path}: ")
         assert "\n" not in told
         assert re.search(case.refusal, told), told
         return
-    found = open_readings(path, case.model)
+    found = open_together([path], case.model)
     if case.model is LINE:
         z, known = np.array(Y), found.model.columns["t"]
         assert list(known) == T
@@ -370,7 +370,7 @@ def test_a_million_rows_are_read_and_estimated_as_a_small_file_is(tmp_path):
     np.savetxt(path, np.column_stack([t, y, sigma]), "%.17g", ",", header="t,y,sigma", comments="")
     from ipe_bench.baselines import GaussNewton
 
-    found = open_readings(path, LINE)
+    found = open_together([path], LINE)
     np.testing.assert_array_equal(found.z, y)
     np.testing.assert_array_equal(found.deviations, sigma)
     problem = Problem(found.model, Gaussian(tuple(found.deviations)).covariance(t.size))
@@ -383,4 +383,4 @@ def test_a_million_rows_are_read_and_estimated_as_a_small_file_is(tmp_path):
     with path.open("a") as file:
         file.write("1,2.O,1\n")
     with pytest.raises(UserError, match=r"row 1000002, column y: '2.O' is not a number"):
-        open_readings(path, LINE)
+        open_together([path], LINE)
