@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
@@ -347,17 +348,18 @@ def design(
     by: Sequence[str] | None = None,
     readings: int | None = None,
     criterion: Criterion = "A",
-    errors: Sequence[Measurement] = (),
+    errors: Sequence[Measurement] | None = None,
 ) -> Design:
     """What a scenario's readings say about each parameter, and which readings would say more; nothing is simulated.
 
     The result has `observability` (singular values, bounds, correlations, the least observable direction),
     `suspects` (what each error of the richer models `errors` does to the estimates, and whether a test of residuals
-    will notice), `ways` and `effects`. A way chooses by one column of the model's index, all else as today, or
-    reading by reading; `by` names the columns of one way instead. Its `saving` is the choice of fewest readings whose
-    mean bound is not above today's, its `sharpest` the smallest mean bound with `readings` readings (today's number
-    where it is None); units that gain most are taken one after another. `measurement(choice)` is the model with those
-    readings.
+    will notice), `ways` and `effects`. The richer models are the scenario's truth, or every option of `measurement`
+    that is the same model with more errors, unless others are given. A way chooses by one column of the model's index,
+    all else as today, or reading by reading; `by` names the columns of one way instead. Its `saving` is the choice of
+    fewest readings whose mean bound is not above today's, its `sharpest` the smallest mean bound with `readings`
+    readings (today's number where it is None); units that gain most are taken one after another.
+    `measurement(choice)` is the model with those readings.
     Bounds are averaged over truths from the prior: as squares over parameters in units of today's bound
     (`criterion` A), or as the volume of the ellipsoid (D).
 
@@ -373,8 +375,11 @@ def design(
     Raises:
         UserError: the errors of readings are correlated, a column is unknown, or there are too few readings.
     """
+    from ipe_bench.plugins.construct import richer_models
     from ipe_bench.trials.design import design as designed
 
+    errors = richer_models(scenario) if errors is None else errors
+    scenario = dataclasses.replace(scenario, truth=None)
     return designed(scenario, by=by, readings=readings, criterion=criterion, errors=errors)
 
 

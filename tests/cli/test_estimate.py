@@ -273,13 +273,19 @@ MISTAKES = {
         "prior_covariance: says all of the prior; leave out parameters.NAME.deviation",
     ),
     "no such file": (("readings=my.csv", "parameters=no.yaml"), "parameters=no.yaml: cannot be read"),
+    "a key twice": (("readings=my.csv", "parameters=twice.yaml"), "line 2: is not YAML that can be read (the key b1"),
+    "an alias": (("readings=my.csv", "parameters=alias.yaml"), "an alias (*NAME); write out what is meant"),
+    "nested": (("readings=my.csv", "parameters=deep.yaml"), "it is nested too deeply"),
     "deviations too few": (("readings=my.csv", "noise.deviation=[1,2]"), "has 2 numbers; give one for each of 14"),
 }
 
 
 @pytest.mark.parametrize("case", MISTAKES)
-def test_mistakes_are_one_line_with_the_key(estimate, misra, case):
+def test_mistakes_are_one_line_with_the_key(estimate, misra, case, tmp_path):
     words, expected = MISTAKES[case]
+    (tmp_path / "twice.yaml").write_text("b1: {fixed: 1}\nb1: {fixed: 2}\n")
+    (tmp_path / "alias.yaml").write_text("b1: &one {nominal: 1}\nb2: *one\n")
+    (tmp_path / "deep.yaml").write_text("b1: " + "[" * 3000 + "]" * 3000)
     code, printed, _ = estimate(*SATURATION, *LM, *words)
     assert code == 2
     assert expected in printed
