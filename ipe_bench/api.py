@@ -375,7 +375,7 @@ def design(
     Raises:
         UserError: the errors of readings are correlated, a column is unknown, or there are too few readings.
     """
-    from ipe_bench.plugins.construct import richer_models
+    from ipe_bench.plugins.extensions import richer_models
     from ipe_bench.trials.design import design as designed
 
     errors = richer_models(scenario) if errors is None else errors

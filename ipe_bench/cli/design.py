@@ -9,7 +9,7 @@ from ipe_bench.api import design
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console, show
 from ipe_bench.cli.single import OF_FILES, OF_MANY_TRIALS, single
-from ipe_bench.plugins.construct import richer_models
+from ipe_bench.plugins.extensions import richer_models
 from ipe_bench.runs.provenance import describe
 from ipe_bench.trials.design import Criterion
 

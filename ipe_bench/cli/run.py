@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import shlex
 from argparse import Namespace
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from ipe_bench.basics.errors import StorageError, UserError, shortened
+from ipe_bench.basics.errors import StorageError, UserError
 from ipe_bench.cli import console, interrupts
 from ipe_bench.cli import words as w
 from ipe_bench.cli.dry_run import DryRun
@@ -22,6 +21,7 @@ from ipe_bench.cli.parser import INFO_TOPICS, parsers
 from ipe_bench.cli.progress import shown_progress
 from ipe_bench.cli.report import show_command
 from ipe_bench.cli.session import Jobs, complete, jobs_of, session, show, spec_of
+from ipe_bench.cli.single import OF_FILES
 from ipe_bench.cli.spec import Spec
 from ipe_bench.measurements import Nist
 from ipe_bench.runs.execution import Execution, Serial
@@ -46,7 +46,7 @@ class Outcome:
     failures: tuple[str, ...] = ()
     stop: str = ""
     """How many trials a job with a precision took, and why no more."""
-    short: bool = False
+    precision_missed: bool = False
     """Whether it did not come to its precision."""
     objective: float | None = None
     mistake: str = ""
@@ -79,8 +79,8 @@ def main(arguments: Sequence[str]) -> int:
         if flags.cfg or flags.info:
             show(jobs.words, flags)
             return 0
+        jobs.words.refuse(OF_FILES, "is for `ipe-bench estimate`: run simulates its readings")
         for one in jobs.specs:
-            _refuse_keys_without_use(one)
             _ = one.scenario  # whose parts may not suit one another
         if flags.dry_run:
             dry = DryRun()
@@ -89,12 +89,7 @@ def main(arguments: Sequence[str]) -> int:
             print(dry.summary())
             return 0
         task = Task(shlex.join(["ipe-bench", "run", *arguments]))
-        try:
-            outcomes = jobs.launch(task) or task.outcomes
-        except BrokenPipeError:
-            raise
-        except OSError as error:  # Hydra writes its own files before a job begins
-            raise _explained(error) from error
+        outcomes = jobs.launch(task) or task.outcomes
     return _conclude(jobs, outcomes)
 
 
@@ -157,7 +152,7 @@ def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
     name = title(job, begun.words)
     with shown_progress(name) as watch:
         execution = Serial() if _launched_elsewhere() else job.execution
-        failures, stop, short = _compute(job, execution, watch, command)
+        failures, stop, missed = _compute(job, execution, watch, command)
     value = None
     if job.objective is not None:
         from ipe_bench.statistics.stopping import objective
@@ -165,7 +160,7 @@ def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
         value = objective(job.scenario, job.estimators, *job.aim, job.output)
     cells = {one.key: describe_names(one.names) for one in result_keys(job.scenario, job.estimators)}
     said = f"{name}: {stop}" if stop else ""
-    return replace(begun, cells=cells, failures=failures, stop=said, short=short, objective=value)
+    return replace(begun, cells=cells, failures=failures, stop=said, precision_missed=missed, objective=value)
 
 
 def _compute(job: Spec, execution: Execution, watch: Watcher, command: str) -> tuple[tuple[str, ...], str, bool]:
@@ -188,7 +183,7 @@ def _conclude(jobs: Jobs, outcomes: list[Outcome]) -> int:
         raise StorageError(full[0])
     end_idle()  # a report on many trials has use for their memory
     _note_refusals(jobs, outcomes)
-    code = 1 if any(one.failures or one.short for one in outcomes) else 0
+    code = 1 if any(one.failures or one.precision_missed for one in outcomes) else 0
     folders: dict[str, dict[str, str]] = {}
     # Of jobs that a sweeper ran in other processes nothing is known but the folder.
     for one in outcomes or [Outcome(job.output) for job in jobs.specs]:
@@ -240,27 +235,6 @@ def _best(outcomes: Sequence[Outcome], maximises: bool) -> str:
     of = f", the {'greatest' if maximises else 'least'} of {len(known)} jobs" if len(known) > 1 else ""
     own = _own_words(best, known)
     return f"Objective {float(best):.6g}{of}" + (own and f": {own}")
-
-
-def _explained(error: OSError) -> UserError | OSError:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return error
-    where, reason = shortened(str(error.filename or "output")), error.strerror or str(error)
-    return UserError(f"output: {where} cannot be written to ({reason}); choose another folder with output=")
-
-
-def _refuse_keys_without_use(job: Spec) -> None:
-    if job.readings is not None:
-        raise UserError(
-            f"readings={job.readings}: run simulates its readings; `ipe-bench estimate` estimates from a file"
-        )
-    for key in ("ignore_rows", "ignore_columns"):
-        if getattr(job, key) is not None:
-            raise UserError(
-                f"{key}={getattr(job, key)}: is of a file of readings, for `ipe-bench estimate`; leave it out"
-            )
-    if job.write_readings is None and job.write_readings_trial:
-        raise UserError(f"write_readings_trial={job.write_readings_trial}: goes with write_readings=FILE")
 
 
 def _launched_elsewhere() -> bool:

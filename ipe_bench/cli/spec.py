@@ -102,6 +102,8 @@ class Spec(Component):
             raise UserError(f"output={self.output}: is an address; name a folder of this machine")
         if self.time_limit is not None and self.precision is None:
             raise UserError(f"time_limit={self.time_limit:g}: goes with precision=; give that, or leave it out")
+        if self.write_readings is None and self.write_readings_trial:
+            raise UserError(f"write_readings_trial={self.write_readings_trial}: goes with write_readings=FILE")
         if self.objective is not None:
             self._check_objective(*self.aim)
 

@@ -13,9 +13,7 @@ from typing import Any
 
 from ipe_bench.basics.errors import UserError, place_of, unknown
 from ipe_bench.basics.options import checked, option_types
-from ipe_bench.measurements.base import Measurement
 from ipe_bench.runs.provenance import TARGET
-from ipe_bench.trials.scenario import Scenario
 
 _registered_packages: set[str] = {"ipe_bench"}
 
@@ -107,35 +105,6 @@ def instantiate(cls: type, options: Mapping[str, Any], where: str) -> Any:
         if _is_ours(cls.__module__):
             raise
         raise UserError(f"{where}: {cls.__name__} cannot be made: {place_of(error)}") from None
-
-
-def richer_models(scenario: Scenario) -> list[Measurement]:
-    """What else may act on the readings of a scenario: the truth that simulates them, or every option of `measurement`
-    that is the same model with more errors, with the model's own options.
-
-    Raises:
-        UserError: the truth has no errors besides the parameters.
-    """
-    from ipe_bench.plugins import discovery
-
-    model, truth = scenario.measurement, scenario.truth
-    if truth is not None:
-        if not truth.nuisance_deviation.any():
-            raise UserError(
-                f"truth_measurement={truth.name}: has no errors besides the parameters; leave it out, or choose a "
-                "richer one"
-            )
-        return [truth]
-    own = {f.name: getattr(model, f.name) for f in dataclasses.fields(model) if f.init}  # type: ignore[arg-type]
-    found: list[Any] = []
-    for option in discovery.options("measurement"):
-        try:
-            other = None if option.fault is not None else construct(option.config, f"measurement={option.name}")
-        except UserError:
-            continue  # `ipe-bench list` tells of options that cannot be made
-        if isinstance(other, type(model)) and type(other) is not type(model) and other.nuisance_deviation.any():
-            found.append(dataclasses.replace(other, **own))  # type: ignore[type-var]
-    return found
 
 
 def _is_ours(module: str) -> bool:

@@ -1,4 +1,5 @@
-"""What plugins add to a report: statistics, figures, tables and sections, each a record that a config file names.
+"""What plugins add: richer models of an instrument, and to a report statistics, figures, tables and sections, each a
+record that a config file names.
 
 The file `conf/figure/NAME.yaml` has one key, `_target_`, the dotted name of the record in the plugin's package. What
 a record of each kind is, the rooms say that compute and show it.
@@ -6,15 +7,45 @@ a record of each kind is, the rooms say that compute and show it.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.plugins.construct import find_object
+from ipe_bench.measurements.base import Measurement
+from ipe_bench.plugins.construct import construct, find_object
 from ipe_bench.plugins.discovery import RECORD_GROUPS, Option, options
 from ipe_bench.runs.provenance import TARGET
+from ipe_bench.trials.scenario import Scenario
+
+
+def richer_models(scenario: Scenario) -> list[Measurement]:
+    """What else may act on the readings of a scenario: the truth that simulates them, or every option of `measurement`
+    that is the same model with more errors, with the model's own options.
+
+    Raises:
+        UserError: the truth has no errors besides the parameters.
+    """
+    model, truth = scenario.measurement, scenario.truth
+    if truth is not None:
+        if not truth.nuisance_deviation.any():
+            raise UserError(
+                f"truth_measurement={truth.name}: has no errors besides the parameters; leave it out, or choose a "
+                "richer one"
+            )
+        return [truth]
+    own = {f.name: getattr(model, f.name) for f in dataclasses.fields(model) if f.init}  # type: ignore[arg-type]
+    found: list[Any] = []
+    for option in options("measurement"):
+        try:
+            other = None if option.fault is not None else construct(option.config, f"measurement={option.name}")
+        except UserError:
+            continue  # `ipe-bench list` tells of options that cannot be made
+        if isinstance(other, type(model)) and type(other) is not type(model) and other.nuisance_deviation.any():
+            found.append(dataclasses.replace(other, **own))  # type: ignore[type-var]
+    return found
 
 
 def find_record(option: Option) -> Any:

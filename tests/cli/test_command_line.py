@@ -122,7 +122,7 @@ MISTAKES = {
     "infinite tolerance": (["run", "estimators.fixed_point.tolerance=inf"], "tolerance=inf: give a number above 0"),
     "label truth": (["run", "+solver@estimators.truth=newton"], "estimators.truth: is what the truth itself"),
     "options that are none": (["run", "estimators.fixed_point=3"], "estimators.fixed_point=3: set its options"),
-    "impossible folder": (["run", "output=/proc/x"], "cannot be written to"),
+    "impossible folder": (["run", "output=/proc/x"], "choose another"),
     "taken name": (["new", "solver", "newton"], "newton: solver=newton is there already"),
     "word of Python": (["new", "solver", "class"], "class: is a word of Python"),
     "no trials": (["run", "trials=0"], "trials=0: give a whole number above 0"),

@@ -273,7 +273,10 @@ MISTAKES = {
         "prior_covariance: says all of the prior; leave out parameters.NAME.deviation",
     ),
     "no such file": (("readings=my.csv", "parameters=no.yaml"), "parameters=no.yaml: cannot be read"),
-    "a key twice": (("readings=my.csv", "parameters=twice.yaml"), "line 2: is not YAML that can be read (the key b1"),
+    "a key twice": (
+        ("readings=my.csv", "parameters=twice.yaml"),
+        "is not YAML that can be read (the key b1 is there twice)",
+    ),
     "an alias": (("readings=my.csv", "parameters=alias.yaml"), "an alias (*NAME); write out what is meant"),
     "nested": (("readings=my.csv", "parameters=deep.yaml"), "it is nested too deeply"),
     "deviations too few": (("readings=my.csv", "noise.deviation=[1,2]"), "has 2 numbers; give one for each of 14"),
