@@ -20,7 +20,11 @@ FIGURES = 3
 ORDINARY, LEAST = 1000, 3
 """Trials of an ordinary experiment, and the least number that a costly one is cut to."""
 
-_PARTS = {"beyond": ("error_scale=300,1000,3000",), "mgh": ("measurement.start=1",)}
+_PARTS = {
+    "beyond": ("error_scale=300,1000,3000",),
+    "mgh": ("measurement.start=1",),
+    "nist": ("measurement.start=2",),
+}
 """What is asked for of experiments that take minutes even with few trials."""
 
 
