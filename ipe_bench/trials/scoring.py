@@ -243,6 +243,8 @@ class Block:
         # Whatever the estimator says: what is not finite has not converged.
         usable = np.isfinite(error).all(axis=1)
         status = np.where((estimates.status == Status.CONVERGED) & ~usable, Status.NONFINITE, estimates.status)
+        unread = ~np.isfinite(self.trials.z).all(axis=1)
+        status = np.where(unread, Status.NO_READINGS, status)
         converged = status == Status.CONVERGED
         bound = self.bayes_information if "prior" in estimator.needs else self.crlb_information
         distance = np.maximum(quadratic_form(bound, error), 0.0)  # round-off where J lacks rank

@@ -9,6 +9,7 @@ import pytest
 from small_models import Bent
 from synthetic_store import Repeated
 
+import ipe_bench as ib
 from ipe_bench import Scenario, run
 from ipe_bench.baselines import GaussNewton, LinearLSE, MapLM
 from ipe_bench.basics.errors import UserError
@@ -161,3 +162,22 @@ def test_van_trees_bound_tells_its_own_error():
     bounds, errors = np.array(found).T
     assert 0.01 < bounds.std() / bounds.mean() < 0.2
     assert np.sqrt(np.mean(errors**2)) == pytest.approx(bounds.std(ddof=1), rel=0.25)
+
+
+@dataclass(frozen=True)
+class Gap(Bent):
+    """Has readings where the first parameter is above 0 alone."""
+
+    analytic, nominal = False, np.array([0.5, 0.0, 0.0])  # type: ignore[assignment]
+
+    def simulate(self, x):
+        return np.where(x[:, :1] > 0.0, super().simulate(x), np.nan)
+
+
+def test_trials_whose_truth_has_no_readings_are_told_apart_from_failures_of_estimators(tmp_path):
+    block = Block.draw(Scenario(Gap(), Gaussian(0.1)), 0, 20)
+    _, columns = block.estimate(LinearLSE())
+    assert ((columns["status"] == "no_readings") == (block.trials.x[:, 0] <= 0.0)).all()
+    table = run(Scenario(Gap(), Gaussian(0.1)), {"lse": LinearLSE()}, trials=20, output=tmp_path)
+    assert "no_readings" in set(ib.load(tmp_path)["status"])
+    assert len(table)
