@@ -219,7 +219,7 @@ class Gins(OdeMeasurement):
 
         return Variation(8, slope, moved)
 
-    def rate(self, p: Sequence[Any]) -> Any:
+    def fastest_rate(self, p: Sequence[Any]) -> Any:
         """rad/s: Schuler rate with its scale factors, drifts with their g-terms, Earth, and what injected velocity and
         biases add over the span."""
         bx, by, kx, ky = p[:4]

@@ -14,6 +14,7 @@ import pytest
 
 import ipe_bench as ib
 from ipe_bench import api
+from ipe_bench.runs.store import ResultKey
 
 HEAVY = ("pandas", "matplotlib", "seaborn", "hydra", "omegaconf", "filterpy", "llvmlite", "rich")
 FUNCTIONS = ("check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status")
@@ -141,7 +142,8 @@ def test_mistakes_in_an_estimate_are_one_line(polynomial, arguments, options, wo
 def test_status_and_report_agree_and_the_report_is_still_a_function_afterwards(tmp_path, polynomial):
     ib.run(polynomial, {"newton": ib.solvers.Newton()}, 10, output=tmp_path, block_size=5)
     assert ib.status(tmp_path).attrs["problems"] == []
-    next((tmp_path / "trials").glob("*-0-10.parquet")).unlink()
+    newton = ResultKey(polynomial, "newton", ib.solvers.Newton())
+    (tmp_path / "trials" / f"{newton.key}-0-10.parquet").unlink()
     problems = ib.status(tmp_path).attrs["problems"]
     assert len(problems) == 1
     for _ in range(2):  # the second call finds the room `report` where the function was

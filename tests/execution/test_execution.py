@@ -118,7 +118,7 @@ def test_one_estimator_that_fails_loses_nothing_but_itself(tmp_path, reference, 
     (failure,) = compute([scenario()], estimators, 10, tmp_path, execution=Processes(1, **limits))
     assert message in failure
     assert "rogue" in failure
-    assert_same(stored(tmp_path), {name: values for name, values in reference.items() if "-0-10." in name})
+    assert_same(stored(tmp_path), {name.replace("-0-40.", "-0-10."): rows[:10] for name, rows in reference.items()})
     rogue = next(cell for cell in Results.read([tmp_path]).cells if cell.names["estimator"] == "rogue")
     assert (rogue.done, rogue.failed, rogue.missing) == (0, 10, 0)
 

@@ -155,7 +155,7 @@ def test_it_keeps_the_promises_of_models(options):
     ("message", "options"),
     [
         ("satellites: 3 readings", {"satellites": ((2e7, 0.0, 0.0),) * 3}),
-        (r"satellites\[0\]=\(2.*, 0\.0\): give a list of 3 numbers", {"satellites": ((2e7, 0.0),) * 9}),
+        (r"satellites\[0\]=\[2.*, 0\.0\]: give a list of 3 numbers", {"satellites": ((2e7, 0.0),) * 9}),
         ("times: 2 entries", {"satellites": ((2e7, 0.0, 0.0),) * 9, "times": (1, 2)}),
         ("constellations: give", {"constellations": ("gps",)}),
         ("position:", {"position": (0.0, 0.0, 0.0)}),

@@ -292,11 +292,9 @@ def test_a_flat_direction_is_singular_for_gauss_newton():
             return super().simulate(x * np.array([1.0, 1.0, 0.0]))
 
     problem = Problem(Flat(), Covariance(np.full(12, 0.1)), None)
-    for estimator in (GaussNewton(start="nominal"), LevenbergMarquardt()):
+    for estimator in (GaussNewton(), GaussNewton(start="nominal"), LevenbergMarquardt()):
         estimates = estimator.estimate(problem, np.ones((2, 12)))
         assert (estimates.status == Status.SINGULAR).all()
-    with pytest.raises(UserError, match="column rank"):
-        GaussNewton().estimate(problem, np.ones((2, 12)))
 
 
 @pytest.mark.parametrize(

@@ -154,7 +154,15 @@ def test_different_models_are_never_pooled_and_always_told_apart(tmp_path_factor
 def test_a_sweep_over_lists_names_what_differs_in_tables_status_and_files(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     one, other = ("[" + ",".join(str(list(b)).replace(" ", "") for b in part) + "]" for part in (BEACONS, BEACONS[:4]))
-    arguments = ["noise=gaussian", "noise.deviation=0.1", "trials=20", "solver=[]", "execution=serial", "output=out"]
+    arguments = [
+        "noise=gaussian",
+        "noise.deviation=0.1",
+        "trials=20",
+        "solver=[]",
+        "baseline=[linear_lse]",
+        "execution=serial",
+        "output=out",
+    ]
     arguments += ["figures=none"]
     assert main(["run", "-m", "measurement=ranging", f"measurement.beacons={one},{other}", *arguments]) == 0
     titles = titles_in(capsys.readouterr().out)

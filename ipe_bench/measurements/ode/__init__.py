@@ -36,6 +36,6 @@ come machine code for whole batches and the exact Jacobian; nothing else is to b
 share the parameters and differ in constants c, and `si_sizes` the sizes of parameters that are shown in other units.
 
 The method is of eighth order. Each trial's step follows from its own parameters: it is halved until half the step shows
-that the readings hold `tolerance`, and the Jacobian uses the same. `step` fixes it for all trials instead, and `rate`
-may say where the search begins. `lotka_volterra` is a small model of this kind, `gins` a large one.
+that the readings hold `tolerance`, and the Jacobian uses the same. `step` fixes it for all trials instead, and
+`fastest_rate` may say where the search begins. `lotka_volterra` is a small model of this kind, `gins` a large one.
 """

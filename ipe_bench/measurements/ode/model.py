@@ -71,7 +71,7 @@ class OdeMeasurement(Measurement):
     """Steps do not become shorter than about this, however wild the parameters, nor than 1/1024 of the usual interval
     between readings: what an iterate that diverges may cost."""
     trusted_angle: float = 0.0
-    """A step that is at most this over `rate` is known to hold the tolerance; 0: every trial is tested."""
+    """A step that is at most this over `fastest_rate` is known to hold the tolerance; 0: every trial is tested."""
 
     @property
     @abstractmethod
@@ -105,9 +105,9 @@ class OdeMeasurement(Measurement):
         """Equations of small deviations in fewer numbers than the state has, where the model knows them."""
         return None
 
-    rate: Callable[[Sequence[Any]], Any] | None = None
-    """A method rate(p), recorded like `rhs`: how fast the solution may turn, grow or decay, per unit of time. It says
-    with which step the search begins; where there is none, it begins with that of the nominal parameters."""
+    fastest_rate: Callable[[Sequence[Any]], Any] | None = None
+    """A method fastest_rate(p), recorded like `rhs`: how fast the solution may turn, grow or decay, per unit of time.
+    It says with which step the search begins; where there is none, it begins with that of the nominal parameters."""
 
     @property
     def by_differential_equations(self) -> bool:
@@ -274,10 +274,10 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def _rate_function(self) -> Rates | None:
-        if self.rate is None:
+        if self.fastest_rate is None:
             return None
         p = Graph().inputs("p", self.n)
-        return Rates(Program.of([self.rate(p)], p))
+        return Rates(Program.of([self.fastest_rate(p)], p))
 
     @cached_property
     def _longest(self) -> float:
