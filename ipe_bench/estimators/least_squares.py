@@ -34,9 +34,9 @@ from ipe_bench.measurements.problem import Problem
 _VISIBLE = 1e-8
 """The smallest share by which the objective must have decreased to have decreased at all."""
 _FLAT = 30
-"""Steps without a visible decrease after which a nearly stationary point is as good as it gets,"""
+"""Steps without a visible decrease after which a nearly stationary point is as good as it gets."""
 _STATIONARY = 1e-3
-"""where nearly means: within this part of a deviation along every column of J."""
+"""The part of a deviation, along every column of J, within which a point is nearly stationary."""
 
 _NEAR = 0.03
 """Steps still to go of fewer deviations are computed from exact Jacobians: a coarse one leaves the gradient about a
@@ -266,13 +266,13 @@ class LeastSquaresSystem:
     regular: Mask
     """Where J had full rank somewhere on the way: an end without it is then a place, and no property of the problem."""
     mark: Array
-    """The objective when it last decreased visibly,"""
+    """The objective when it last decreased visibly."""
     idle: NDArray[np.int64]
-    """and how many steps ago."""
+    """Steps since the objective last decreased visibly."""
     exact: Mask
-    """Where the slope is that of an exact Jacobian,"""
+    """Where the slope is that of an exact Jacobian."""
     near: Mask
-    """and where it is from now on, since little is left to go."""
+    """Where Jacobians are exact from now on, since little is left to go."""
 
     @classmethod
     def at(cls, objective: Residuals, x: Array, lam: float = 0.0, *, keep_Q: bool = False) -> LeastSquaresSystem:

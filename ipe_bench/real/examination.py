@@ -27,15 +27,15 @@ from ipe_bench.real.profiles import Profile, Released, half_width, natural_limit
 CONFIDENCE = 0.95
 BOOTSTRAPS = 500
 STARTS = 64
-"""Points that the search for other minima begins from,"""
+"""Points that the search for other minima begins from."""
 _SPREADS = (1.0, 3.0)
-"""drawn from the prior, half of them at so many times its deviations."""
+"""Multiples of the prior's deviations with which these points are drawn, half of them with each."""
 _WORK = 20_000_000
-"""Entries of Jacobians that one iteration of all draws or starts may come to: of very many readings there are fewer,"""
+"""Entries of Jacobians that one iteration of all draws or starts may come to: of very many readings there are fewer."""
 _FEWEST = 4
-"""but so many at least."""
+"""The least number of draws or starts."""
 _ENTRIES = 4_000_000
-"""of which so many are in memory at a time."""
+"""Entries of Jacobians that are in memory at a time."""
 _TOLERANCE = 1e-8
 _MOST_STEPS = 200
 _SAME = 1e-2
@@ -97,12 +97,12 @@ class OnBound:
     """A parameter whose estimate is on a bound, because the readings want it beyond."""
 
     place: int
-    """Which of the parameters of the fit,"""
+    """The place of the parameter among those of the fit."""
     parameter: Parameter
     bound: float
     other: float
-    """and the other end of its profile interval, of which the bound is the first; infinite where the readings set no
-    limit, NaN where it was not found."""
+    """The end of its profile interval that is not the bound; infinite where the readings set no limit, NaN where it was
+    not found."""
 
 
 @dataclass(frozen=True)
@@ -113,21 +113,21 @@ class Examination:
     """The estimator whose answer it is."""
     model: Measurement
     x: Array
-    """The least-squares estimate (n,) in the parameters' own units,"""
+    """The least-squares estimate (n,) in the parameters' own units."""
     standard_errors: Array
     wald: tuple[Array, Array]
-    """intervals from them,"""
+    """The intervals (n,), (n,) from the standard errors."""
     profiles: list[Profile]
-    """and those of the profiles."""
+    """The profile of each parameter, with its interval."""
     bootstrap: Bootstrap
     direction: Direction
     influence: Influence
     fitted: Array
-    """h (m,) at the estimate, where readings are missing too,"""
+    """h (m,) at the estimate, where readings are missing too."""
     fitted_errors: Array
-    """and its standard errors: the band of the prediction is `half_width` times this;"""
+    """Standard errors (m,) of `fitted`: the band of the prediction is `half_width` times these."""
     new_errors: Array
-    """that of a further reading, with its noise; NaN where that is not known."""
+    """Standard errors (m,) of a further reading, with its noise; NaN where that is not known."""
     half_width: float
     minima: list[Minimum]
     """All that were found, the least first."""

@@ -28,9 +28,9 @@ from ipe_bench.trials.thresholds import FIT_LEVEL
 _NORMAL = Gaussian(1.0)
 """Its whitened errors are those of any normal noise."""
 _MOST_LEVELS = 6
-"""Fits in search of the level of the noise,"""
+"""Fits in search of the level of the noise."""
 _SAME_LEVEL = 1e-3
-"""which is found where it changes by less than this share."""
+"""The share by which the level changes at most where it is found."""
 _SMALLEST_LEVEL = 1e-8
 """As a share of the readings, the level that estimators are told at least."""
 _FARTHEST = 40.0
@@ -81,9 +81,9 @@ class Fit:
     """Where parameters are on their bounds: the fit of the model in which they are held there. Errors of the others are
     from it; those on a bound have none."""
     with_prior: bool = False
-    """Whether the estimator was told a prior, so that x is not the least-squares estimate,"""
+    """Whether the estimator was told a prior, so that x is not the least-squares estimate."""
     prior_inflation: float = 1.0
-    """and by how much it widened its deviations."""
+    """The factor by which the estimator widened the prior's deviations."""
     beaten_by: str = ""
     """The estimator with the least sum of squares, where it is so much smaller that chance does not explain it."""
     undetermined: tuple[str, ...] = ()

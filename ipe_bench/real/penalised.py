@@ -16,30 +16,18 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from ipe_bench.basics.linalg import Array, Covariance
-from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.measurements.base import WrappedModel
 from ipe_bench.measurements.problem import Problem
 
 
 @dataclass(frozen=True)
-class Penalised(Measurement):
+class Penalised(WrappedModel):
     """The readings of a model, and behind them x itself, which its prior has measured."""
 
-    whole: Measurement
+    epochs = None
 
     def __post_init__(self) -> None:
         """Made of a model that has been checked."""
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return self.whole.parameters
-
-    @property
-    def physical_parameters(self) -> tuple[Parameter, ...]:
-        return self.whole.physical_parameters
-
-    @property
-    def nominal(self) -> Array:
-        return self.whole.nominal
 
     @cached_property
     def m(self) -> int:
@@ -49,11 +37,13 @@ class Penalised(Measurement):
     def index(self) -> Mapping[str, Sequence[Any]]:
         return {"number": list(range(self.m))}
 
-    def physical(self, x: Array) -> Array:
-        return self.whole.physical(x)
+    @property
+    def offset(self) -> Array:
+        return np.concatenate([self.whole.offset, np.zeros(self.whole.n)])
 
-    def physical_slope(self, x: Array) -> Array:
-        return self.whole.physical_slope(x)
+    def near_bounds(self, x: Array) -> Mapping[int, float]:
+        """None: an estimate with a prior is not held on a bound."""
+        return {}
 
     def simulate(self, x: Array) -> Array:
         return np.concatenate([self.whole.simulate(x), x], axis=1)

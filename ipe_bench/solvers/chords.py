@@ -52,9 +52,9 @@ class OnChord:
     bend: Array
     """The part (trials,) of the first step that the next one had to take back; NaN before it."""
     begun: Array
-    """The step still to go (trials,), in deviations, after the first one,"""
+    """The step still to go (trials,), in deviations, after the first one; NaN before it."""
     steps: Array
-    """and how many there have been since."""
+    """Steps (trials,) since the first one; -1 before it."""
 
     @classmethod
     def at(cls, x: Array, r: Array, slope: NormalEquations, turn: Array) -> OnChord:

@@ -25,9 +25,9 @@ from ipe_bench.solvers.attempts import Limits, Stages, Windows
 _SAME_FIT = 1e-6
 """Two minima whose chi-squares differ by less than this share are one."""
 _BULK = 1.0
-"""Where half of the residuals are within so many deviations, for .67 where all is right, and there are at least"""
+"""The median residual in deviations, .67 where all is right, up to which the minimum is right and R wrong for a few."""
 _READINGS = 4
-"""so many readings for each parameter, the minimum is right and it is R that is wrong for a few of them."""
+"""The least number of readings per parameter for which the median says so."""
 _TRUSTED = 1e-3
 """A level of the test of fit from which on a large bulk of residuals is asked for no longer: R is known, or unknown."""
 _WORTH = 20.0

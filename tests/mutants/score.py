@@ -62,7 +62,6 @@ ROOMS = {
             "tests/baselines/test_filterpy_traps.py",
             "tests/baselines/test_batched_engine.py",
             "tests/baselines/test_filters.py",
-            "tests/baselines/test_information_filters.py",
         ),
     ),
 }
