@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from ipe_bench.report.certified_tables import without_certified
+from ipe_bench.report.figures.views import kind_of
 from ipe_bench.report.words import brief, duration, enumerate_few, percent, plain, short
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.attained import attained_totals
-from ipe_bench.statistics.collect import Group
 from ipe_bench.statistics.digits import certified_averages, certified_table
 from ipe_bench.statistics.summary import ALL, BEST
 
-NEAR = 0.005
-"""Capped errors within this part of the smallest count as equally good."""
 ALIKE = 0.05
 """Efficiencies within this part of each other count as equal."""
 BROKEN = 0.9
@@ -69,19 +66,11 @@ def _simulated(analysis: Analysis) -> Iterator[str]:
     if several or len(scales) < 2 or rows["estimator"].nunique() < 2:
         yield _ranked(analysis, rows)
         return
-    kinds = {group.estimator: _kind(group) for group in analysis.collection.groups}
+    kinds = {group.estimator: kind_of(group.footer) for group in analysis.collection.groups}
     yield from _agreement(rows, scales, kinds)
     yield from _honesty(rows)
     yield from _reach(rows, scales)
     yield _costs(rows, scales)
-
-
-def _kind(group: Group) -> str:
-    """IPE solves its own equation, filters take epoch after epoch; what else there is has no name here."""
-    if group.footer.get("sequential"):
-        return "filters"
-    target = str((group.footer["identity"]["estimator"] or {}).get("_target_", ""))
-    return "IPE" if ".solvers." in target or group.footer.get("equation") == "frozen" else ""
 
 
 def _agreement(rows: pd.DataFrame, scales: Sequence[float], kinds: Mapping[str, str]) -> Iterator[str]:
@@ -202,19 +191,3 @@ def about(analysis: Analysis) -> list[str]:
             f" scale s the true ones scatter about the nominal ones by s times {enumerate_few(sizes, 8)}."
         )
     return list(found.values())
-
-
-def best_of(scores: pd.DataFrame, summary: pd.DataFrame) -> str:
-    """The estimator with the smallest mean capped error over the scenarios that most estimators have.
-
-    Of those within `NEAR` of it the one that succeeds most, and of those the cheapest. Both frames are of the same
-    scenarios and estimators, in the same order.
-    """
-    success = summary.loc[summary["parameter"] == ALL, "success"].to_numpy()
-    scores = scores.assign(success=success)
-    counts = scores.groupby("estimator", sort=False).size()
-    scores = scores[scores["estimator"].isin(counts.index[counts == counts.max()])]
-    means = scores.groupby("estimator", sort=False)[["capped_error", "success", "cost_median"]].mean()
-    means = means[means["capped_error"] <= means["capped_error"].min() * (1 + NEAR)]
-    means = means[means["success"] >= means["success"].max() - 1e-9]
-    return str(means.index[int(np.argmin(means["cost_median"].to_numpy()))])

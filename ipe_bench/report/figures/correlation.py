@@ -11,12 +11,15 @@ import pandas as pd
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
-from ipe_bench.report.headline import best_of
 from ipe_bench.report.words import plain
+from ipe_bench.statistics.summary import ALL
 
 MOST_PARAMETERS = 30
 MOST_NUMBERED = 12
 """Parameters up to which the values stand in the cells."""
+
+NEAR = 0.005
+"""Capped errors within this part of the smallest count as equally good."""
 
 
 def draw(view: View) -> Iterator[Drawing]:
@@ -25,7 +28,7 @@ def draw(view: View) -> Iterator[Drawing]:
     if not 2 <= view.n <= MOST_PARAMETERS or view["correlations"].empty:
         return
     scale = view.scales[-1]
-    best = best_of(view["scores"], view["summary"])
+    best = _best_of(view["scores"], view["summary"])
     rows = common.at_scale(view["correlations"], scale)
     table = _table(rows[rows["estimator"] == best], view)
     if not np.isfinite(table.to_numpy()).any():
@@ -73,6 +76,22 @@ def two_decimals(value: float) -> str:
     """0.97 as .97; never a minus before zero, and the sign that typography has."""
     words = f"{value:.2f}".replace("-0.00", "0.00").replace("0.", ".")
     return words.replace("-", "\N{MINUS SIGN}") if np.isfinite(value) else ""
+
+
+def _best_of(scores: pd.DataFrame, summary: pd.DataFrame) -> str:
+    """The estimator with the smallest mean capped error over the scenarios that most estimators have.
+
+    Of those within `NEAR` of it the one that succeeds most, and of those the cheapest. Both frames are of the same
+    scenarios and estimators, in the same order.
+    """
+    success = summary.loc[summary["parameter"] == ALL, "success"].to_numpy()
+    scores = scores.assign(success=success)
+    counts = scores.groupby("estimator", sort=False).size()
+    scores = scores[scores["estimator"].isin(counts.index[counts == counts.max()])]
+    means = scores.groupby("estimator", sort=False)[["capped_error", "success", "cost_median"]].mean()
+    means = means[means["capped_error"] <= means["capped_error"].min() * (1 + NEAR)]
+    means = means[means["success"] >= means["success"].max() - 1e-9]
+    return str(means.index[int(np.argmin(means["cost_median"].to_numpy()))])
 
 
 FIGURE = Figure(draw, ("summary", "scores", "correlations"))

@@ -65,7 +65,6 @@ function filled(node, attributes, children) {
 }
 
 function element(name, attributes, ...children) { return filled(document.createElement(name), attributes, children); }
-
 function shape(name, attributes, ...children) {
   return filled(document.createElementNS("http://www.w3.org/2000/svg", name), attributes, children);
 }
@@ -107,22 +106,15 @@ class Scale {
   }
 
   decades() {
-    const first = Math.floor(Math.log10(this.low)), last = Math.ceil(Math.log10(this.high));
-    const ticks = [];
-    for (let power = first; power <= last; power += Math.ceil((last - first) / 7)) {
-      for (const step of last - first <= 3 ? [1, 2, 5] : [1]) {
-        ticks.push(Number((step * Math.pow(10, power)).toPrecision(1)));
-      }
-    }
-    return ticks;
+    const first = Math.floor(Math.log10(this.low)), apart = Math.ceil((Math.log10(this.high) - first) / 7);
+    const steps = this.high / this.low < 1e3 ? [1, 2, 5] : [1];
+    return Array.from({ length: 8 }, (_, k) => steps.map((step) => Number(step + "e" + (first + k * apart)))).flat();
   }
 
   steps() {
     const rough = (this.high - this.low) / 6, size = Math.pow(10, Math.floor(Math.log10(rough)));
-    const step = [1, 2, 5, 10].map((k) => k * size).find((s) => s >= rough);
-    const ticks = [];
-    for (let k = Math.ceil(this.low / step); k * step <= this.high; k++) ticks.push(Number((k * step).toPrecision(12)));
-    return ticks;
+    const step = [1, 2, 5, 10].map((k) => k * size).find((s) => s >= rough), first = Math.ceil(this.low / step);
+    return Array.from({ length: 12 }, (_, k) => Number(((first + k) * step).toPrecision(12)));
   }
 }
 
@@ -134,12 +126,11 @@ function polygon(corners, turn) {
   });
 }
 
-const DIAMOND = polygon(4, 0);
+const STAR = (turn) => polygon(8, turn).map(([x, y], k) => (k % 2 ? [0.4 * x, 0.4 * y] : [x, y]));
 const OUTLINES = {
-  "s": polygon(4, Math.PI / 4), "D": DIAMOND, "d": DIAMOND.map(([x, y]) => [0.6 * x, y]), "^": polygon(3, 0),
-  "v": polygon(3, Math.PI), "<": polygon(3, -Math.PI / 2), ">": polygon(3, Math.PI / 2), "p": polygon(5, 0),
-  "h": polygon(6, 0), "P": polygon(8, 0).map(([x, y], k) => (k % 2 ? [0.4 * x, 0.4 * y] : [x, y])),
-  "X": polygon(8, Math.PI / 4).map(([x, y], k) => (k % 2 ? [0.4 * x, 0.4 * y] : [x, y])),
+  "s": polygon(4, Math.PI / 4), "D": polygon(4, 0), "d": polygon(4, 0).map(([x, y]) => [0.6 * x, y]),
+  "^": polygon(3, 0), "v": polygon(3, Math.PI), "<": polygon(3, -Math.PI / 2), ">": polygon(3, Math.PI / 2),
+  "p": polygon(5, 0), "h": polygon(6, 0), "P": STAR(0), "X": STAR(Math.PI / 4),
 };
 
 function marker(kind, x, y, radius) {
@@ -242,11 +233,9 @@ class Chart {
       parts.append(shape("path", { d: `M${left} ${y}H${right}`, class: "grid" }),
         shape("text", { x: left - 6, y: y + 4, "text-anchor": "end" }, written(tick, this.y.share)));
     }
-    if (this.up.holds(this.y.reference)) {
-      const y = this.up.place(this.y.reference);
-      parts.append(shape("path", { d: `M${left} ${y}H${right}`, class: "reference" }),
-        shape("text", { x: right - 4, y: y - 4, "text-anchor": "end", class: "says" }, this.y.reference_title));
-    }
+    const y = this.up.holds(this.y.reference) ? this.up.place(this.y.reference) : -99;
+    parts.append(shape("path", { d: `M${left} ${y}H${right}`, class: "reference" }),
+      shape("text", { x: right - 4, y: y - 4, "text-anchor": "end", class: "says" }, this.y.reference_title));
     const turned = "translate(14 " + (top + bottom) / 2 + ") rotate(-90)";
     parts.append(
       shape("path", { d: `M${left} ${top}V${bottom}H${right}`, class: "edge" }),
@@ -286,7 +275,6 @@ class Chart {
 
   key(event) {
     const along = { ArrowRight: 1, ArrowLeft: -1 }[event.key], between = { ArrowDown: 1, ArrowUp: -1 }[event.key];
-    if (event.key === "Escape") this.tell(null);
     if ((!along && !between) || !this.points.length) return;
     event.preventDefault();
     if (!this.at) { this.tell(this.points[0]); return; }
