@@ -1,12 +1,65 @@
-"""`python -m ipe_bench.report.docs [OUTPUT] [--trials N]`: builds the site."""
+"""`python -m ipe_bench.report.docs [OUTPUT] [--trials N]`: builds the site of written and generated pages by Sphinx."""
 
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from importlib.resources import as_file, files
 from pathlib import Path
+from typing import Any
 
-from ipe_bench.report.docs.build import build
+from ipe_bench.report.docs.gallery import write_gallery
+from ipe_bench.report.docs.reference import write_reference
+
+
+def build(output: Path, trials: int, experiments: Sequence[str] | None = None) -> int:
+    """Writes the site to OUTPUT/html and what it is made of beside it; returns Sphinx's exit code.
+
+    Experiments that were run before with as many trials are not run again.
+    """
+    from sphinx.application import Sphinx  # pyright: ignore[reportMissingImports]
+
+    source = output / "source"
+    shutil.rmtree(source, ignore_errors=True)
+    with as_file(files("ipe_bench.report.docs") / "pages") as pages:
+        shutil.copytree(pages, source)
+    print("reference pages ...", flush=True)
+    write_reference(source / "reference")
+    write_gallery(source / "gallery", output / "results", trials, experiments)
+    site = Sphinx(
+        source, None, output / "html", output / "doctrees", "html", settings(), warningiserror=True, freshenv=True
+    )
+    site.build()
+    return site.statuscode
+
+
+def settings() -> dict[str, Any]:
+    """Sphinx's; nothing that a page needs is fetched when it is opened."""
+    return {
+        "project": "ipe-bench",
+        "version": version("ipe-bench"),
+        "release": version("ipe-bench"),
+        "copyright": "the authors of ipe-bench",
+        "extensions": ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "ipe_bench.report.docs.mathml"],
+        "myst_enable_extensions": ["dollarmath", "deflist", "colon_fence"],
+        "myst_heading_anchors": 3,
+        "html_theme": "pydata_sphinx_theme",
+        "html_title": "ipe-bench",
+        "html_show_sourcelink": False,
+        "html_math_renderer": "mathml",
+        "html_theme_options": {
+            "show_prev_next": False,
+            "navigation_with_keys": False,
+            "secondary_sidebar_items": ["page-toc"],
+        },
+        "autodoc_typehints": "none",
+        "autodoc_member_order": "bysource",
+        "nitpicky": False,
+    }
+
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)

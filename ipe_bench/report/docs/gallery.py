@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ipe_bench.basics.files import make_folder, write_text
 from ipe_bench.plugins import discovery
-from ipe_bench.report.docs.program import printed_by
+from ipe_bench.report.docs.reference import printed_by
 from ipe_bench.report.figures.gallery import INDEX
 from ipe_bench.report.words import duration
 

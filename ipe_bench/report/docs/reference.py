@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import re
+import shlex
+import subprocess
+import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import ipe_bench
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import write_text
 from ipe_bench.basics.statuses import Status
 from ipe_bench.plugins import discovery
 from ipe_bench.plugins.description import described
 from ipe_bench.report.definitions import DEFINITIONS
-from ipe_bench.report.docs.program import printed_by
 from ipe_bench.statistics.records import STATISTICS
 
 GROUPS = {
@@ -99,3 +103,20 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 def _cell(text: str) -> str:
     return " ".join(text.replace("|", "\\|").replace("<", "&lt;").split())
+
+
+_STYLE = re.compile(r"\x1b\[[0-9;]*m")
+
+
+def printed_by(command: Sequence[str], columns: int = 80) -> str:
+    """What `ipe-bench COMMAND` prints, without colours and blanks at the ends of lines.
+
+    Raises:
+        UserError: it failed.
+    """
+    program = [sys.executable, "-m", "ipe_bench", *command]
+    environment = os.environ | {"COLUMNS": str(columns), "NO_COLOR": "1"}
+    done = subprocess.run(program, capture_output=True, text=True, env=environment, check=False)
+    if done.returncode != 0:
+        raise UserError(f"{shlex.join(command)}: ended with exit code {done.returncode}: {done.stderr[-2000:]}")
+    return "\n".join(line.rstrip() for line in _STYLE.sub("", done.stdout).splitlines())
