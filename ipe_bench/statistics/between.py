@@ -21,12 +21,8 @@ from ipe_bench.statistics.records import gate_radius
 from ipe_bench.statistics.sample import Sample, Shared
 from ipe_bench.statistics.summary import outcomes_of
 
-QUANTITIES = ("success", "error", "cost", "time")
 JUDGED = ("success", "error", "cost")
 """Those that are tested. Time is not: the trials of a block share theirs evenly, and machines differ."""
-FAIL_ON = ("success", "error")
-
-
 BOTH = " | "
 """Stands between the values of what differs."""
 _SAYS_NOTHING = {"null": "-", "None": "-", "false": "-"}
@@ -127,16 +123,17 @@ def _rows(match: Match, first: Collection, second: Collection, alpha: float) -> 
             f"{match.first.label}: has {a.n} parameters in the first and {b.n} in the second; compare results on the"
             " same measurement"
         )
-    pair, by_trial = a.beside(b)
-    if not len(pair[0].distance):
+    one, other, by_trial = a.beside(b)
+    trials = len(one[1])
+    if not trials:
         raise UserError(f"{match.first.estimator}: has no trials to compare; run more of them")
     head = match.columns | {
         "first": match.first.estimator,
         "second": match.second.estimator,
-        "trials": len(pair[0].distance),
+        "trials": trials,
         "matched_by": "trial" if by_trial else "order",
     }
-    for quantity, effect in _effects(*pair, a.n, alpha).items():
+    for quantity, effect in _effects(one, other, a.n, alpha).items():
         yield head | {
             "quantity": quantity,
             "first_value": effect.first,
@@ -151,49 +148,38 @@ def _rows(match: Match, first: Collection, second: Collection, alpha: float) -> 
 
 
 @dataclass(frozen=True)
-class _Columns:
-    """What is compared of some trials."""
-
-    distance: Array
-    success: Array
-    cost: Array
-    seconds: Array
-
-    def at(self, rows: Array) -> _Columns:
-        return _Columns(self.distance[rows], self.success[rows], self.cost[rows], self.seconds[rows])
-
-
-@dataclass(frozen=True)
 class _Loaded:
     n: int
-    ids: Array
-    columns: _Columns
+    trials: Outcomes
+    seconds: Array
 
-    def beside(self, other: _Loaded) -> tuple[tuple[_Columns, _Columns], bool]:
+    def at(self, rows: Array) -> tuple[Outcomes, Array]:
+        return self.trials.at(self.trials.ids[rows]), self.seconds[rows]
+
+    def beside(self, other: _Loaded) -> tuple[tuple[Outcomes, Array], tuple[Outcomes, Array], bool]:
         """Both on the same trials, and whether they are the same: where they share none, as with other seeds, they are
         matched in their order, which is right, since all are independent, but gains nothing."""
-        _, mine, theirs = np.intersect1d(self.ids, other.ids, assume_unique=True, return_indices=True)
-        if len(mine):
-            return (self.columns.at(mine), other.columns.at(theirs)), True
-        order = np.arange(min(len(self.ids), len(other.ids)))
-        return (self.columns.at(order), other.columns.at(order)), False
+        ids = self.trials.ids, other.trials.ids
+        _, mine, theirs = np.intersect1d(*ids, assume_unique=True, return_indices=True)
+        if by_trial := len(mine) > 0:
+            return self.at(mine), other.at(theirs), by_trial
+        order = np.arange(min(map(len, ids)))
+        return self.at(order), other.at(order), by_trial
 
 
 def _loaded(collection: Collection, group: Group) -> _Loaded:
     sample = Sample.load(collection, group, Shared.among(collection, [group]))
-    outcomes: Outcomes = outcomes_of(sample)
-    seconds = sample.scalars["time_s"][np.argsort(sample.number, kind="stable")]
-    columns = _Columns(outcomes.distance, outcomes.success, outcomes.cost, seconds)
-    return _Loaded(sample.n, outcomes.ids, columns)
+    return _Loaded(sample.n, outcomes_of(sample), sample.scalars["time_s"][np.argsort(sample.number, kind="stable")])
 
 
-def _effects(first: _Columns, second: _Columns, n: int, alpha: float) -> dict[str, Effect]:
+def _effects(one: tuple[Outcomes, Array], other: tuple[Outcomes, Array], n: int, alpha: float) -> dict[str, Effect]:
+    (first, seconds), (second, other_seconds) = one, other
     radius = gate_radius(n)
     a, b = np.minimum(first.distance, radius), np.minimum(second.distance, radius)
     d = differences(b, a)
     # The first trial's cost is the unit: whoever looks later divides by the same.
     unit = float(first.cost[0] + second.cost[0]) or 1.0
-    medians = float(np.median(first.seconds)), float(np.median(second.seconds))
+    medians = float(np.median(seconds)), float(np.median(other_seconds))
     time = medians[1] / medians[0] if medians[0] > 0 else np.nan
     return {
         "success": success_effect(first.success, second.success, alpha),

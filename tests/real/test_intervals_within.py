@@ -261,21 +261,24 @@ def test_simulated_sets_let_a_parameter_leave_the_bound_that_its_estimate_is_on(
 @pytest.mark.slow
 @pytest.mark.parametrize("c", [0.0, 0.02])
 def test_1000_truths_on_and_near_a_bound_are_in_every_interval(c):
-    """Profile, standard error and bootstrap each hold c at least as often as .93; beside it their median widths."""
+    """Profile and standard error, and the bootstrap in 200 of them, hold c in .93 of cases or more, up to 2 standard
+    errors; beside it their median widths."""
+    studies, drawn = 1000, 200
     inside, widths = np.zeros(3), []
-    for seed in range(1000):
-        one, found = decay_above_zero(c, seed, bootstraps=100)
+    for seed in range(studies):
+        one, found = decay_above_zero(c, seed, bootstraps=100 if seed < drawn else 4)
         assert found is not None
         if one.held_at:
-            (bound,) = found.on_bounds
-            ends = [(bound.bound, bound.other)] * 3
+            ends = [(found.on_bounds[0].bound, found.on_bounds[0].other)] * 3
         else:
-            ends = [(p.low, p.high) for p in (found.profiles[2],)] + [found.profiles[2].wald]
-            ends.append((float(found.bootstrap.low[2]), float(found.bootstrap.high[2])))
-        inside += [low <= c <= high for low, high in ends]
+            profile, bootstrap = found.profiles[2], found.bootstrap
+            ends = [(profile.low, profile.high), profile.wald, (bootstrap.low[2], bootstrap.high[2])]
+        held = [low <= c <= high for low, high in ends]
+        inside += held if seed < drawn else [*held[:2], False]
         widths.append([high - low for low, high in ends])
-    print(f"c = {c}: covered {inside / 1000} (profile, standard error, bootstrap), widths {np.median(widths, axis=0)}")
-    assert (inside >= 930).all()
+    covered = inside / [studies, studies, drawn]
+    print(f"c = {c}: covered {covered} (profile, standard error, bootstrap), widths {np.median(widths, axis=0)}")
+    assert (covered >= 0.93 - 2 * np.sqrt(0.07 * 0.93 / np.array([studies, studies, drawn]))).all()
 
 
 @pytest.mark.slow

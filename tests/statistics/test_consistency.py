@@ -126,6 +126,16 @@ def test_a_deviation_30_per_cent_off_is_found_with_100_trials(claimed, word):
     assert verdicts(normal, 3, 6, 100, 40, claimed)[word] >= 0.9
 
 
+def test_a_covariance_that_is_right_on_average_is_not_called_diverged():
+    """3 % of 400 trials lie beyond the gate, at 6 n, and the mean of NEES / n is 1."""
+    values = np.full(400, 11 * (1 - 0.03 * 6) / 0.97)
+    values[:12] = 66.0
+    assert values.mean() / 11 == pytest.approx(1.0)
+    assert verdict(values, 11) != "diverged but confident"
+    values[:12] = 6600.0
+    assert verdict(values, 11) == "diverged but confident"
+
+
 def test_where_few_trials_carry_the_mean_only_too_large_a_mean_is_sure():
     """Markov: numbers of mean 1 exceed 40 with a probability of at most 1 / 40, whatever else they are."""
     few = np.full(200, 0.5)
