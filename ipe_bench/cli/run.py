@@ -20,7 +20,7 @@ from ipe_bench.cli.dry_run import DryRun
 from ipe_bench.cli.parser import INFO_TOPICS, parsers
 from ipe_bench.cli.progress import shown_progress
 from ipe_bench.cli.report import show_command
-from ipe_bench.cli.session import Jobs, complete, jobs_of, session, show, spec_of
+from ipe_bench.cli.session import STANDARD_FILTERS, Jobs, by_default, complete, jobs_of, session, show, spec_of, suited
 from ipe_bench.cli.single import OF_FILES
 from ipe_bench.cli.spec import Spec
 from ipe_bench.measurements import Nist
@@ -88,9 +88,19 @@ def main(arguments: Sequence[str]) -> int:
                 print(dry.add(one, title(one, words.text)))
             print(dry.summary())
             return 0
-        task = Task(shlex.join(["ipe-bench", "run", *arguments]))
+        standard = by_default(words)
+        if standard and (line := _left_out(jobs.specs)):
+            console().print(line, markup=False, soft_wrap=True)
+        task = Task(shlex.join(["ipe-bench", "run", *arguments]), standard)
         outcomes = jobs.launch(task) or task.outcomes
     return _conclude(jobs, outcomes)
+
+
+def _left_out(jobs: Sequence[Spec]) -> str:
+    """A line on the standard filters that do not suit every job."""
+    models = dict.fromkeys(job.measurement.name for job in jobs if not set(STANDARD_FILTERS) <= job.estimators.keys())
+    filters = " and ".join(STANDARD_FILTERS)
+    return f"{filters} are left out for {', '.join(models)}: filters need epochs and a prior" if models else ""
 
 
 def _flags(arguments: Sequence[str]) -> Namespace:
@@ -117,9 +127,11 @@ class Task:
     """One job of Hydra's. What is a mistake in one stops no other; where nothing can be stored any more, no other is
     begun in this process."""
 
-    def __init__(self, command: str) -> None:
+    def __init__(self, command: str, standard: bool) -> None:
         self.command = command
         """As it was typed."""
+        self.standard = standard
+        """Whether the baselines are those of a plain run."""
         self.full = ""
         self.outcomes: list[Outcome] = []
         """Of the jobs in this process: a sweeper that optimises keeps to itself what they return."""
@@ -134,7 +146,8 @@ class Task:
         if self.full:
             return begun
         try:
-            done = _computed(spec_of(config), begun, self.command)
+            job = spec_of(config)
+            done = _computed(suited(job) if self.standard else job, begun, self.command)
             accept(done.output, done.job)
             return done
         except StorageError as error:

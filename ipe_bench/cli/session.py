@@ -12,7 +12,7 @@ import functools
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -40,6 +40,8 @@ from ipe_bench.measurements.nist import datasets
 from ipe_bench.plugins import discovery as plugins
 
 Result = TypeVar("Result")
+STANDARD_FILTERS = ("ekf", "ukf")
+"""Baselines of a plain run that suit models with epochs and a prior alone."""
 _EACH_JOB = 1000
 """Jobs of a sweep that are all constructed to be checked; of a larger sweep, each value of each key."""
 
@@ -117,14 +119,15 @@ def jobs_of(words: Words, *, multirun: bool) -> Jobs:
                 f"{w.said(one)}: interval() is for sweepers that optimise (hydra/sweeper=optuna); give the values, "
                 "such as 1,10,100"
             )
+    choose = suited if by_default(words) else lambda job: job
     if not multirun or optimises:
-        return Jobs(words, [spec_of(config)], multirun, "maximize" in str(hydra.sweeper.get("direction", "")))
+        return Jobs(words, [choose(spec_of(config))], multirun, "maximize" in str(hydra.sweeper.get("direction", "")))
     own = [OverridesParser.create().parse_override(word) for word in params]
     overrides = [*own, *words.overrides]
     number = w.count(overrides)
     if not 0 < number <= w.MOST_JOBS:
         raise UserError(f"the sweep has {number or 'no'} jobs: give 1 to {w.MOST_JOBS}, and check its patterns")
-    return Jobs(words, [_spec(job) for job in _checked(overrides, number)], multirun)
+    return Jobs(words, [choose(_spec(job)) for job in _checked(overrides, number)], multirun)
 
 
 def _checked(overrides: Sequence[Override], number: int) -> Iterator[list[Override]]:
@@ -165,6 +168,19 @@ def spec_of(config: DictConfig) -> Spec:
         UserError: the first mistake, by its key.
     """
     return spec(_plain(config))
+
+
+def by_default(words: Words) -> bool:
+    """Whether nothing that was typed chooses the baselines."""
+    return {"baseline", "experiment"}.isdisjoint(words.keys)
+
+
+def suited(job: Spec) -> Spec:
+    """The job without the standard filters if its model lacks what they need. What a user chooses is refused."""
+    problem = job.scenario.problem
+    unsuited = {label: one.missing(problem) for label, one in job.estimators.items() if label in STANDARD_FILTERS}
+    kept = {label: one for label, one in job.estimators.items() if not unsuited.get(label)}
+    return replace(job, estimators=kept) if len(kept) < len(job.estimators) else job
 
 
 def composed(words: Words) -> dict[str, Any]:

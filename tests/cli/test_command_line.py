@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import ipe_bench as ib
 from ipe_bench.cli.main import main
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.report import figures
@@ -439,3 +440,13 @@ def test_a_stream_that_knows_no_greek_letters_shows_question_marks(tmp_path):
     result = subprocess.run([sys.executable, "-m", "ipe_bench", *words], env=environment, capture_output=True)
     assert result.returncode == 0, result.stderr
     assert result.stdout.isascii()
+
+
+def test_filters_that_nobody_chose_are_left_out_where_the_model_has_no_use_for_them(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["run", "measurement=nist/boxbod", "noise=certified", "trials=1", "figures=none", "output=out"]
+    assert main(words) in (0, 1)
+    assert "ekf and ukf are left out for nist" in " ".join(capsys.readouterr().out.split())
+    assert set(ib.load("out")["estimator"]) == {"fixed_point", "linear_lse"}
+    assert main([*words, "baseline=[ekf]"]) == 2
+    assert "estimators.ekf: needs epochs" in capsys.readouterr().err
