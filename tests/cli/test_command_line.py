@@ -101,7 +101,7 @@ def test_estimates_from_a_file_find_the_parameters_that_made_it(readings, here):
         )
     }
     for name, value in truth.items():
-        row = next(line for line in result.stdout.splitlines() if line.startswith(name))
+        row = next(line for line in result.stdout.splitlines() if line.split()[:1] == [name])
         estimate, error = map(float, re.search(r"(\S+) ± (\S+)", row).groups())
         assert abs(estimate - value) < 5 * error
 
