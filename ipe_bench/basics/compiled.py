@@ -162,16 +162,17 @@ def digest_of(file: Path) -> str:
 
 
 _NOTHING = ctypes.c_char * 0
+DOUBLE, WHOLE = np.dtype(np.float64), np.dtype(np.int64)
 
 
-def at(a: Any, kind: Any = np.float64) -> int:
+def at(a: Any, kind: Any = DOUBLE) -> int:
     """Where the numbers of an array lie; a third of the time that `a.ctypes.data` takes.
 
     Raises:
         TypeError: the numbers are of another kind, not C-contiguous, or not to be written to.
     """
     if a.dtype != kind:
-        raise TypeError(f"an array of {a.dtype}, where one of {np.dtype(kind)} is taken")
+        raise TypeError(f"an array of {a.dtype}, where one of {kind} is taken")
     if not a.size:
         return 0
     return ctypes.addressof(_NOTHING.from_buffer(a))

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics import compiled
-from ipe_bench.basics.compiled import INTEGER, POINTER, aligned, at
+from ipe_bench.basics.compiled import INTEGER, POINTER, WHOLE, aligned, at
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import cores
 from ipe_bench.measurements.ode.plan import Equations, Plan
@@ -97,9 +97,9 @@ class Kernel:
             interpret(self.plan, x, si, cases, rows, times, steps, *more)
             return
         function, size = self._machine_code
-        given = (at(x), at(si), at(cases), len(cases), at(rows, np.int64))
+        given = (at(x), at(si), at(cases), len(cases), at(rows, WHOLE))
         stride = len(offset[0]) // len(cases) if offset else 0
-        taken = (at(times), at(steps, np.int64), len(times), at(offset[0]) if offset else None, stride, at(out))
+        taken = (at(times), at(steps, WHOLE), len(times), at(offset[0]) if offset else None, stride, at(out))
 
         def work_on(pieces: Sequence[tuple[int, int]] | Any) -> None:
             memory, frame = aligned(size)
