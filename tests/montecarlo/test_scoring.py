@@ -66,8 +66,11 @@ def test_bounds_of_ill_conditioned_models_are_those_of_their_singular_values(mu)
         deviation = np.sqrt(np.sum((right / s[:, :, None]) ** 2, axis=1))
         found = np.stack([columns[f"{bound}_{p.name}"] for p in block.problem.measurement.parameters], axis=1)
         np.testing.assert_allclose(found, deviation, rtol=1e-9)
-    expected = [columns[f"van_trees_{p.name}"][0] for p in block.problem.measurement.parameters]
-    assert (np.array(expected) > 0).all()
+    found = [columns[f"van_trees_{p.name}"][0] for p in block.problem.measurement.parameters]
+    truths = block.scenario.truths(0, EXPECTED)
+    rows = block.problem.R.whiten_jacobian(block.problem.measurement.jacobian(truths)).reshape(-1, 3)
+    _, s, right = np.linalg.svd(np.concatenate([rows / np.sqrt(EXPECTED), prior]), full_matrices=False)
+    np.testing.assert_allclose(found, np.sqrt(np.sum((right / s[:, None]) ** 2, axis=0)), rtol=1e-8)
 
 
 def test_the_test_of_the_fit_is_uniform_where_the_model_is_right():
