@@ -111,6 +111,14 @@ def test_pairs_are_compared_on_the_trials_that_both_have():
     assert (pair.trials, pair.wins, pair.losses) == (2, 1, 1)
 
 
+@pytest.mark.parametrize(("alone", "kept"), [(5, True), (6, False)])
+def test_a_best_one_is_judged_by_each_of_two_rivals_at_half_the_level(alone, kept):
+    """Beaten in five trials and in none ahead, p = 1/32 > .025; in six, 1/64."""
+    success = np.ones((50, 3), dtype=bool)
+    success[:alone, 0] = False
+    assert may_be_best(success).tolist() == [kept, True, True]
+
+
 def test_the_best_are_left_out_no_oftener_than_stated():
     """600 boards of six estimators, of which two are truly best: how often a given one of them is left out."""
     rng, left_out = np.random.default_rng(5), 0

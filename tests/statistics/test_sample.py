@@ -157,6 +157,41 @@ def test_a_truth_that_is_missing_is_not_a_number_beside_its_estimates(synthetic)
         assert np.isnan(sample.linear_error).all()
 
 
+def test_bounds_of_several_seeds_are_pooled_as_squares(tmp_path):
+    """Van Trees's of two seeds, and the error of the mean of their squares."""
+    scenarios = [
+        ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0, seed=s) for s in (0, 1)
+    ]
+    rows = ib.run(scenarios, {"linear": ib.baselines.LinearLSE()}, 4, output=tmp_path)
+    stored = ib.load(tmp_path)
+    stored = stored[stored["trial"] == 0]
+    for name, row in rows.set_index("parameter").drop(index="all").iterrows():
+        bound, error = stored[f"van_trees_{name}"].to_numpy(), stored[f"van_trees_error_{name}"].to_numpy()
+        size = row["linear_bound"] / sample_bound(tmp_path, str(name))
+        mean = np.sqrt(np.mean(bound**2))
+        assert row["van_trees"] == pytest.approx(size * mean)
+        reach = norm.isf(0.025) * np.sqrt(np.sum((2 * bound * error) ** 2)) / 2 / (2 * mean)
+        assert row["van_trees_high"] == pytest.approx(size * (mean + reach))
+
+
+def sample_bound(folder: Path, name: str) -> float:
+    """The linear bound in multiples of the parameter's size."""
+    footer = collect([folder]).groups[0].footer
+    return footer["linear_bound"][[p["name"] for p in footer["parameters"]].index(name)]
+
+
+@pytest.mark.parametrize(("shared", "degrees"), [(1.0, (1,)), (0.0, (2, 3))])
+def test_all_parameters_have_as_many_degrees_as_their_errors_are_apart(synthetic, shared, degrees):
+    rng = RNG(0)
+    common, own = rng.standard_normal((500, 1)), rng.standard_normal((500, 3))
+    synthetic.add(synthetic.scenario(), "one", 0.1 * (shared * common + (1 - shared) * own))
+    collection = collect([synthetic.directory])
+    group = collection.groups[0]
+    found = Sample.load(collection, group, Shared.among(collection, [group])).sums.degrees
+    assert found[3] in degrees
+    assert (np.delete(found, 3) == 1).all()
+
+
 @pytest.mark.slow
 def test_a_million_trials_would_fit_into_2_gib(tmp_path):
     """11 parameters and 50,000 trials, at 2 GiB for each million."""

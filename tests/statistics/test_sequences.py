@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 from scipy.stats import binom
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.statistics.consistency import clopper_pearson
 from ipe_bench.statistics.intervals import Squares
-from ipe_bench.statistics.sequences import Precision, next_trials, rms_sequence, rms_sequence_of, share_sequence
+from ipe_bench.statistics.sequences import (
+    Precision,
+    mean_sequence,
+    next_trials,
+    rms_sequence,
+    rms_sequence_of,
+    share_sequence,
+)
 
 
 def ever_missed(p: float, step: int, looks: int) -> float:
@@ -59,6 +67,17 @@ def test_looking_costs_half_as_much_again_at_a_thousand_trials():
     """Robbins's normal mixture, tightest there, is 3.04 deviations wide where a fixed number has 1.96."""
     low, high = share_sequence(500, 1000)
     assert (high - low) / 2 == pytest.approx(3.04 * np.sqrt(0.25 / 1000), rel=0.02)
+
+
+def test_the_sequence_of_a_mean_is_as_narrow_as_a_mixture_can_be_at_a_thousand_trials():
+    """Over all variances r of it: sqrt(2 (1000 r + 1) / (1000 r) ln(sqrt(1000 r + 1) / .05)) standard errors."""
+
+    def errors(log_r: float) -> float:
+        grown = 1000 * np.exp(log_r) + 1
+        return float(np.sqrt(2 * grown / (grown - 1) * np.log(np.sqrt(grown) / 0.05)))
+
+    least = minimize_scalar(errors, bounds=(-12, 0), method="bounded").fun
+    assert mean_sequence(np.array(2.0), 1000) == pytest.approx(2 * least / np.sqrt(1000), rel=5e-3)
 
 
 def test_a_root_mean_square_scales_with_its_errors_and_narrows_with_trials():
