@@ -108,7 +108,7 @@ def house_style(scale: float = 0.95, more: Mapping[str, Any] | None = None) -> I
     import matplotlib as mpl
     import seaborn as sns
 
-    theme = {**sns.axes_style("whitegrid"), **sns.plotting_context("paper", font_scale=scale)}
+    theme: dict[Any, Any] = {**sns.axes_style("whitegrid"), **sns.plotting_context("paper", font_scale=scale)}
     with mpl.rc_context({**theme, **_HOUSE, **(more or {})}):
         yield
 

@@ -287,7 +287,7 @@ def test_every_path_solves_the_equations_with_the_same_bits(draw):
     check(**draw)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @settings(max_examples=2000, deadline=None, suppress_health_check=list(HealthCheck))
 @given(draws)
 def test_every_path_solves_the_equations_with_the_same_bits_in_many_draws(draw):
@@ -403,7 +403,7 @@ def test_equations_that_are_drawn_are_solved_as_a_plain_loop_solves_them(draw):
     check_drawn(**draw)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
 @given(written)
 def test_equations_that_are_drawn_are_solved_as_a_plain_loop_solves_them_in_many_draws(draw):

@@ -258,7 +258,7 @@ def test_simulated_sets_let_a_parameter_leave_the_bound_that_its_estimate_is_on(
     assert found.bootstrap.high == pytest.approx(np.quantile(x, 0.975, axis=0)[:2], abs=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize("c", [0.0, 0.02])
 def test_1000_truths_on_and_near_a_bound_are_in_every_interval(c):
     """Profile and standard error, and the bootstrap in 200 of them, hold c in .93 of cases or more, up to 2 standard

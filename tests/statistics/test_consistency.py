@@ -148,7 +148,7 @@ def test_where_few_trials_carry_the_mean_only_too_large_a_mean_is_sure():
     assert verdict(nees(error, P), 3) == "optimistic"
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize("trials", [20, 50, 100, 400])
 @pytest.mark.parametrize(("n", "m"), [(1, 6), (3, 20), (11, 40)])
 @pytest.mark.parametrize("noise", [normal, student, contaminated])

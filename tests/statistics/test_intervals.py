@@ -166,7 +166,7 @@ def test_intervals_that_miss_are_not_given(law):
     assert missed(law, 200, 300)[1] > 0.8
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize("law", HEAVY)
 def test_1000_studies_of_a_root_mean_square(law):
     """From 200 trials on at most 7 % miss, up to 3 deviations. Of the studies of 20 trials .36, of 50 still .08 have

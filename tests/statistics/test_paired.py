@@ -102,7 +102,7 @@ def test_intervals_count_the_failures_that_may_be_unseen(q, trials):
     assert width < 2.2 * 2 * 3.7 / trials * 6 / 1.6
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("q", "trials"), [(0.02, 20), (0.02, 50), (0.01, 100), (0.01, 200), (0.05, 100), (0.05, 200), (0.1, 200)]
 )

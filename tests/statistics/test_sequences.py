@@ -184,7 +184,7 @@ def ever_missing(law: str, studies: int) -> tuple[float, float]:
     return float(miss.mean()), none / studies
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize("law", LAWS)
 def test_1000_studies_of_a_root_mean_square_are_covered_however_often_one_looks(law):
     """An asymptotic promise of 95 %; .12 to .44 of the last three are missed without the rule, from 20 trials on."""

@@ -81,10 +81,10 @@ def _estimate(ax: Any, one: Reference, label: str, look: Look, which: list[int])
     P = None if estimates.covariance is None else estimates.covariance[0][np.ix_(which, which)] / np.outer(d, d)
     style = {"color": look.color, "linestyle": look.linestyle, "linewidth": 1.0}
     known = P is not None and np.isfinite(P).all() and np.isfinite(centre).all() and np.linalg.eigvalsh(P)[0] > 0
-    if known and len(which) == 1:
+    if P is not None and known and len(which) == 1:
         x = np.linspace(-_VIEW, _VIEW, 201)
         ax.plot(x, np.exp(-0.5 * (x - centre[0]) ** 2 / P[0, 0]) / np.sqrt(2 * np.pi * P[0, 0]), **style)
-    elif known:
+    elif P is not None and known:
         ax.plot(*(centre + ellipse(P)).T, **style)
     elif len(which) == 2 and np.isfinite(centre).all():
         ax.plot(*centre, color=look.color, marker=look.marker, markersize=3)
