@@ -82,13 +82,15 @@ def main(arguments: Sequence[str]) -> int:
         jobs.words.refuse(OF_FILES, "is for `ipe-bench estimate`: run simulates its readings")
         for one in jobs.specs:
             _ = one.scenario  # whose parts may not suit one another
+        standard = by_default(words)
+        if standard:
+            jobs = replace(jobs, specs=[suited(one) for one in jobs.specs])
         if flags.dry_run:
             dry = DryRun()
             for one in jobs.specs:
                 print(dry.add(one, title(one, words.text)))
             print(dry.summary())
             return 0
-        standard = by_default(words)
         if standard and (line := _left_out(jobs.specs)):
             console().print(line, markup=False, soft_wrap=True)
         task = Task(shlex.join(["ipe-bench", "run", *arguments]), standard)

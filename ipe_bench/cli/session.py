@@ -119,15 +119,14 @@ def jobs_of(words: Words, *, multirun: bool) -> Jobs:
                 f"{w.said(one)}: interval() is for sweepers that optimise (hydra/sweeper=optuna); give the values, "
                 "such as 1,10,100"
             )
-    choose = suited if by_default(words) else lambda job: job
     if not multirun or optimises:
-        return Jobs(words, [choose(spec_of(config))], multirun, "maximize" in str(hydra.sweeper.get("direction", "")))
+        return Jobs(words, [spec_of(config)], multirun, "maximize" in str(hydra.sweeper.get("direction", "")))
     own = [OverridesParser.create().parse_override(word) for word in params]
     overrides = [*own, *words.overrides]
     number = w.count(overrides)
     if not 0 < number <= w.MOST_JOBS:
         raise UserError(f"the sweep has {number or 'no'} jobs: give 1 to {w.MOST_JOBS}, and check its patterns")
-    return Jobs(words, [choose(_spec(job)) for job in _checked(overrides, number)], multirun)
+    return Jobs(words, [_spec(job) for job in _checked(overrides, number)], multirun)
 
 
 def _checked(overrides: Sequence[Override], number: int) -> Iterator[list[Override]]:

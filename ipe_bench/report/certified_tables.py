@@ -113,4 +113,6 @@ def without_certified(analysis: Analysis) -> Analysis:
         for name, table in held.items()
         if isinstance(table, pd.DataFrame) and "noise" in table
     }
+    if not groups:
+        tables["profiles"] = analysis.profiles.iloc[:0]
     return replace(analysis, collection=replace(analysis.collection, groups=groups), **tables)

@@ -108,8 +108,9 @@ def house_style(scale: float = 0.95, more: Mapping[str, Any] | None = None) -> I
     import matplotlib as mpl
     import seaborn as sns
 
-    theme: dict[Any, Any] = {**sns.axes_style("whitegrid"), **sns.plotting_context("paper", font_scale=scale)}
-    with mpl.rc_context({**theme, **_HOUSE, **(more or {})}):
+    settings: dict[Any, Any] = {**sns.axes_style("whitegrid"), **sns.plotting_context("paper", font_scale=scale)}
+    settings |= {**_HOUSE, **(more or {})}
+    with mpl.rc_context(settings):
         yield
 
 

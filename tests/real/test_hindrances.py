@@ -49,7 +49,7 @@ def truth(path: str) -> dict[str, float]:
 def test_run_does_not_ignore_a_file_of_readings(ipe_bench):
     code, printed = ipe_bench("run", "readings=/nonexistent.csv")
     assert code == 2
-    assert "run simulates its readings; `ipe-bench estimate` estimates from a file" in printed
+    assert "readings: is for `ipe-bench estimate`: run simulates its readings" in printed
 
 
 def test_a_model_is_simulated_with_its_own_noise(ipe_bench):

@@ -256,9 +256,9 @@ def curves(
         few = rows[trials] < FEW
         if interval is not None:
             low, high = interval
-            plain_grey = rows[by].map(lambda label: look[label].color == GREY)
+            plain_grey = rows[by].map(lambda label: look[str(label)].color == GREY)
             sure = rows[~few & ~plain_grey & np.isfinite(rows[low]) & np.isfinite(rows[high])]
-            colors = [look[str(e)].color for e in sure[by]]
+            colors = [look[e].color for e in sure[by]]
             ax.vlines(sure["x"], sure[low], sure[high], colors=colors, linewidth=1.0, alpha=0.8)
         _hollow(ax, rows[few | (rows[trials] < rows["trials"].max())], y, look, by, size)
         if by == "estimator" and len(look) > MOST_FACES and len(scales) > 1 and most_panels() > 4:

@@ -38,11 +38,10 @@ def quantiles(view: View, share: float) -> pd.DataFrame:
     """
     from scipy.stats import binom
 
-    counts = view.totals.set_index(["error_scale", "estimator"])["trials"]
+    counts: dict[Any, int] = view.totals.set_index(["error_scale", "estimator"])["trials"].to_dict()
     found = []
     for key, part in view["distributions"].groupby(["error_scale", "estimator"], sort=False):
-        scale, label = key
-        trials = int(counts.loc[scale, label])
+        trials = int(counts[key])
         at, errors = part["probability"].to_numpy(), part["distance"].to_numpy() / efficient(share, view.n)
         low, high = np.add(binom.interval(0.95, trials, share), (0, 1)) / trials
         ends = errors[at <= low][-1] if low > 0 else 0.0, errors[at >= high][0] if high < 1 else np.inf

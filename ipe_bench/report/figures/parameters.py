@@ -148,7 +148,8 @@ def _of_all(view: View) -> Drawing:
     mesh = axes[0].collections[0]
     fig.colorbar(mesh, ax=axes, label="95 % error / bound's", shrink=0.8, extend="max").outline.set_linewidth(0)
     last = common.at_scale(rows, scales[-1])
-    worst = last.loc[last["ratio"].replace(np.inf, np.nan).idxmax()] if last["ratio"].notna().any() else None
+    ratios = last["ratio"].replace(np.inf, np.nan).to_numpy(dtype=float)
+    worst = last.iloc[int(np.nanargmax(ratios))] if np.isfinite(ratios).any() else None
     caption = common.sentence(
         "What 95 % of all trials err by at most in each parameter, over 1.96 deviations of its Cramér-Rao bound: 1 for"
         f" an efficient estimator; one colour from {plain(WORST)} on.",
