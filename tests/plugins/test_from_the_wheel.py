@@ -55,7 +55,7 @@ def test_all_kinds_of_plugins_are_made_checked_run_and_seen(installed, tmp_path)
         assert "all checks passed" in run("check", f"plugins/own_{kind}")
         assert f"own_{kind}" in run("list", kind)
     chosen = [f"{kind}=own_{kind}" for kind in ("measurement", "noise", "prior", "execution")]
-    chosen += ["solver=[own_solver]", "baseline=[own_baseline]", "trials=20", "output=out"]
+    chosen += ["solver=[own_solver]", "baseline=[own_baseline]", "trials=20", "output=out", "figures=all"]
     printed = run("run", *chosen)
     assert "own_solver" in printed
     assert "own_baseline" in printed
