@@ -50,10 +50,6 @@ class Words:
         return [forced(one) for one in self.overrides]
 
     @property
-    def sweeps(self) -> bool:
-        return any(one.is_sweep_override() for one in self.overrides)
-
-    @property
     def keys(self) -> list[str]:
         """The first part of each key, in the order of the words."""
         return [_first(one) for one in self.overrides]
