@@ -224,9 +224,9 @@ def compare(
     with opened(paths[0]) as one, opened(paths[1]) as other:
         frame = _compared([one, other], (first, second), alpha, anytime, fail_on)
     if output is not None:
-        from ipe_bench.report.comparison import write
+        from ipe_bench.report.comparison import write_comparison
 
-        write(frame, Path(output), alpha)
+        write_comparison(frame, Path(output), alpha)
     return frame
 
 

@@ -32,8 +32,8 @@ def main(
     errors = richer_models(scenario)
     found = design(scenario, by=by, readings=readings, criterion=criterion, errors=errors)
 
-    from ipe_bench.report.designs import FILES, RESULT, contents, write_design
-    from ipe_bench.report.folders import claim
+    from ipe_bench.report.designs import FILES, NAME, contents, write_design
+    from ipe_bench.report.writer import claim
 
     command = {
         "scenario": describe(dataclasses.replace(scenario, truth=None)),
@@ -42,8 +42,8 @@ def main(
         "readings": readings,
         "criterion": criterion,
     }
-    folder = claim(asked.folder, command, elsewhere=not asked.named, result=RESULT, files=FILES)
-    files = write_design(folder, found, command, {"measurement": asked.measurement})
+    folder = claim(asked.folder, NAME, command, elsewhere=not asked.named, files=FILES)
+    files = write_design(folder, asked.measurement, found, command)
     show(contents(asked.measurement, found))
     console().print(f"In {folder}: {', '.join(path.name for path in files)}", markup=False, soft_wrap=True)
     return 0 if found.observability.observable else 1

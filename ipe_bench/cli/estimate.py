@@ -22,14 +22,14 @@ def main(arguments: Sequence[str]) -> int:
     asked = single("estimate", arguments, STANDARD_ESTIMATORS, run=_OF_RUNS)
     opened = asked.spec.question(asked.words.keys).opened()
 
-    from ipe_bench.report.answer import FILES, RESULT, Answer, contents, write_fits
-    from ipe_bench.report.folders import claim
+    from ipe_bench.report.answer import FILES, NAME, Answer, contents, write_answer
+    from ipe_bench.report.writer import claim
 
     command = _command(opened)
-    folder = claim(asked.folder, command, elsewhere=not asked.named, result=RESULT, files=FILES)
+    folder = claim(asked.folder, NAME, command, elsewhere=not asked.named, files=FILES)
     answer = Answer.to(opened, asked.measurement)
     written = {"measurement": asked.measurement, "config": asked.config, **_provenance(opened)}
-    files = write_fits(folder, answer, command, written, which=asked.spec.figures)
+    files = write_answer(folder, answer, command, written, which=asked.spec.figures)
     show(contents(answer))
     out = console()
     out.print(f"\nIn {folder}:", markup=False, soft_wrap=True)

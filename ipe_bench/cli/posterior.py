@@ -26,8 +26,8 @@ def main(arguments: Sequence[str], particles: int) -> int:
         raise UserError("noise=certified: has no prior to begin with; choose another noise and an error_scale")
     validate([job.scenario], job.estimators, trials)
 
-    from ipe_bench.report.folders import claim
-    from ipe_bench.report.posteriors import RESULT, contents, write_posteriors
+    from ipe_bench.report.posteriors import NAME, contents, write_posteriors
+    from ipe_bench.report.writer import claim
 
     command = {
         "scenario": describe(job.scenario),
@@ -35,11 +35,10 @@ def main(arguments: Sequence[str], particles: int) -> int:
         "trials": trials,
         "particles": particles,
     }
-    files_ours = [f"corner_{trial}.{kind}" for trial in range(trials) for kind in ("png", "pdf")]
-    folder = claim(asked.folder, command, elsewhere=not asked.named, result=RESULT, files=files_ours)
+    folder = claim(asked.folder, NAME, command, elsewhere=not asked.named)
     found = posterior(job.scenario, job.estimators, trials, particles=particles)
-    files = write_posteriors(folder, job.scenario.measurement, found, command, {"measurement": name})
     scenario = f"{name}, {job.scenario.noise.name}, error scale {job.scenario.error_scale:g}"
+    files = write_posteriors(folder, name, scenario, job.scenario.measurement, found, command)
     show(contents(scenario, found))
     console().print(f"\nIn {folder}: {', '.join(path.name for path in files)}", markup=False, soft_wrap=True)
     return 0 if all(one.posterior.settled for one in found) else 1

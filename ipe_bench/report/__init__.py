@@ -118,7 +118,7 @@ def write_analysis(begun: Begun, output: Path, which: Which = "main", formats: S
     from ipe_bench.report.figures import draw_all
     from ipe_bench.report.figures.views import views
     from ipe_bench.report.html import render_page
-    from ipe_bench.report.tables import write_tables
+    from ipe_bench.report.table import write_table
     from ipe_bench.statistics.digits import certified_averages, certified_table
 
     analysis = begun.finish()
@@ -129,7 +129,10 @@ def write_analysis(begun: Begun, output: Path, which: Which = "main", formats: S
     tables = extensions.report_tables(analysis)
     sections = extensions.sections(analysis, [table.name for table in tables], problems)
     further = [table for section in sections for table in section.tables]
-    table_paths = write_tables(analysis, [*tables, *further], output / "tables")
+    table_paths = [path for table in (*tables, *further) for path in write_table(table, output / "tables")]
+    if len(analysis.profiles):
+        table_paths.append(output / "tables" / "profiles.csv")
+        write_text(table_paths[-1], analysis.profiles.to_csv(index=False))
     drawn = draw_all(simulated, output / "figures", which=which, formats=formats, problems=problems)
     page = render_page(analysis, tables, drawn, sections, list(charts(views(simulated)[0])))
     report = output / "report.html"
@@ -137,7 +140,7 @@ def write_analysis(begun: Begun, output: Path, which: Which = "main", formats: S
     return ReportResult(
         analysis.summary,
         summary_path,
-        table_paths,
+        tuple(table_paths),
         tuple(path for figure in drawn for path in figure.files),
         report,
         analysis.problems,

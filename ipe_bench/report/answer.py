@@ -1,11 +1,7 @@
-"""Estimates from real readings: the tables and sentences of an answer, and its files.
-
-What is known of an answer beyond its standard errors stands behind it: intervals in three ways, and remarks.
-"""
+"""Estimates from real readings: what is said of them in tables and sentences, and in files."""
 
 from __future__ import annotations
 
-import base64
 import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ipe_bench.basics.files import write_text
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement
@@ -24,21 +19,16 @@ from ipe_bench.real.examination import CONFIDENCE, Examination
 from ipe_bench.real.fits import Fit
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.choice import Which
-from ipe_bench.report.folders import draw_into, named, picked, plain, write_json, write_rows
-from ipe_bench.report.table import Part, Strong, Table, environment, html, terminal, texts, words
-from ipe_bench.report.words import enumerate_few, p_value
+from ipe_bench.report.table import Part, Strong, Table, html, terminal, texts, words
+from ipe_bench.report.words import p_value
+from ipe_bench.report.writer import named, picked, plain, write
 from ipe_bench.trials.fit_test import DRAWS
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from ipe_bench.report.figures.drawing import Drawing
-
-SCHEMA = 2
-RESULT = "estimate.json"
-RESIDUALS = "residuals.csv"
-PAGE = "estimate.html"
+NAME, RESIDUALS, SCHEMA = "estimate", "residuals.csv", 2
 _FIGURES = tuple(f"{name}{suffix}" for name in ("residuals", "ellipses", "likelihood") for suffix in (".png", ".pdf"))
 FILES = (RESIDUALS, *_FIGURES)
 LEAST_FIT_P = 1 / (DRAWS + 1)
@@ -48,14 +38,14 @@ _FEW = 0.05
 """Share of outliers above which the model is wrong, and a list of readings says nothing."""
 _ALIKE = 0.02
 """Relative difference of normalised residuals up to which estimators are shown together."""
+_INFLUENCE = ("leverage", "cook", "shift")
 _FITS = {True: "yes", False: "NO", None: "not tested"}
 _COLLINEAR = 10.0
 """Collinearity index from which on the readings hardly tell parameters apart (Brun, Reichert and Künsch, Water
 Resources Research 37)."""
 _INFLUENTIAL = 1.0
 """Standard errors by which a parameter moves without a reading from which on that reading is named."""
-_MOST_READINGS = 5
-_MOST_MINIMA = 3
+_MOST_READINGS, _MOST_MINIMA = 5, 3
 _SMALL_SHARE = 0.1
 """Share of the largest component below which a component of the least observable direction is left out."""
 
@@ -108,22 +98,21 @@ class Answer:
         """A row per estimator and parameter: estimate, standard error, 95 % interval, and whether the fit passes."""
         import pandas as pd
 
-        found = []
+        frames = []
         for one in self.fits:
-            columns = zip(one.model.physical_parameters, one.x, one.standard_errors, *one.interval(), strict=True)
-            for p, x, error, low, high in columns:
-                values = {"estimate": x, "standard_error": error, "low95": low, "high95": high}
-                found.append(
-                    {"estimator": one.label, "parameter": p.name, "unit": p.unit, **values, "passes": one.passes}
-                )
-        return pd.DataFrame(found)
+            parameters, (low, high) = one.model.physical_parameters, one.interval()
+            frame = pd.DataFrame({"parameter": [p.name for p in parameters], "unit": [p.unit for p in parameters]})
+            frame = frame.assign(estimate=one.x, standard_error=one.standard_errors, low95=low, high95=high)
+            frame.insert(0, "estimator", one.label)
+            frames.append(frame.assign(passes=one.passes))
+        return pd.concat(frames, ignore_index=True)
 
     def __str__(self) -> str:
         from rich.console import Console
 
-        console = Console(width=120, file=io.StringIO())
-        console.print(terminal(contents(self), 120))
-        return console.file.getvalue()  # type: ignore[attr-defined]
+        shown = io.StringIO()
+        Console(width=120, file=shown).print(terminal(contents(self), 120))
+        return shown.getvalue()
 
     def _repr_html_(self) -> str:
         return html(contents(self))
@@ -147,26 +136,18 @@ def contents(answer: Answer) -> Iterator[Part]:
 
 
 def _estimates(answer: Answer) -> Table:
+    """Estimates with their errors; what is not an answer stands in brackets, without errors that would be wrong."""
     parameters = answer.model.physical_parameters
     columns = [words("parameter", [p.name for p in parameters]), words("unit", [p.unit for p in parameters])]
-    columns += [texts(_heading(one), _cells(one)) for one in answer.fits]
+    for one in answer.fits:
+        if one.passes:
+            cells = [with_error(*pair) for pair in zip(one.x, one.standard_errors, strict=True)]
+            columns.append(texts(one.label, cells))
+        else:
+            failing = "MISFIT" if one.status is Status.CONVERGED else one.status.label.replace("_", " ").upper()
+            cells = [f"({value:.4g})" if math.isfinite(value) else "-" for value in one.x]
+            columns.append(texts(f"{one.label}: {failing}", cells))
     return Table("estimates", f"{answer.name}: estimate ± standard error", "", columns, repeated=2)
-
-
-def _heading(one: Fit) -> str:
-    return one.label if one.passes else f"{one.label}: {_failing(one)}"
-
-
-def _failing(one: Fit) -> str:
-    """Why a fit is not an answer."""
-    return "MISFIT" if one.status is Status.CONVERGED else one.status.label.replace("_", " ").upper()
-
-
-def _cells(one: Fit) -> list[str]:
-    """Estimates with their errors; what is not an answer stands in brackets, without errors that would be wrong."""
-    if one.passes:
-        return [with_error(*pair) for pair in zip(one.x, one.standard_errors, strict=True)]
-    return [f"({value:.4g})" if math.isfinite(value) else "-" for value in one.x]
 
 
 def with_error(value: float, error: float) -> str:
@@ -193,15 +174,15 @@ def _verdicts(answer: Answer) -> Table:
     """Whether each fit passes; if the residuals make the level of the noise, chi-square is the degrees of freedom and
     is left out."""
     fits = answer.fits
-    tested = [one for one in fits if one.level is None]
     columns = [
         words("estimator", [one.label for one in fits]),
         words("status", [one.status.label.replace("_", " ") for one in fits]),
         words("fits", [_FITS[one.fits] for one in fits]),
     ]
-    if tested:
+    if any(one.level is None for one in fits):
+        # The least p that simulated fits resolve is an upper limit.
         columns += [
-            texts("p", [_fit_p(one) for one in fits]),
+            texts("p", [p_value(one.p_value, LEAST_FIT_P * (one.p_value == LEAST_FIT_P)) for one in fits]),
             texts("chi2", [_number(one.chi_square) if one.level is None else "-" for one in fits]),
         ]
     columns += [
@@ -210,12 +191,7 @@ def _verdicts(answer: Answer) -> Table:
         texts("outliers", [str(int(one.outliers.sum())) for one in fits]),
         texts("deviation", [_number(one.residual_deviation) for one in fits]),
     ]
-    return Table("verdicts", "Does the model fit?", "", columns, notes=list(_notes(answer)), repeated=1)
-
-
-def _fit_p(one: Fit) -> str:
-    """The p-value of the fit as text; an upper limit if it is the least that simulated fits resolve."""
-    return p_value(one.p_value, LEAST_FIT_P if one.p_value == LEAST_FIT_P else 0.0)
+    return Table("verdicts", "Does the model fit?", "", columns, notes=list(_notes(answer)))
 
 
 def _notes(answer: Answer) -> Iterator[str]:
@@ -233,53 +209,56 @@ def _notes(answer: Answer) -> Iterator[str]:
                 f"{one.label}: the readings do not determine {'; '.join(one.undetermined)}; fix parameters, or give"
                 " prior, until they do."
             )
-    unknown = [one for one in fits if one.level is not None]
-    if unknown:
+    if any(one.level is not None for one in fits):
         yield (
             "The level of the noise is estimated from the residuals: standard errors are scaled by it, intervals are"
             " those of Student's t, and the size of the residuals cannot test the model."
         )
-    suspect = [one.label for one in unknown if one.whiteness.p_value < FIT_LEVEL]
-    if suspect:
+    if suspect := [one.label for one in fits if one.level is not None and one.whiteness.p_value < FIT_LEVEL]:
         yield (
             f"{', '.join(suspect)}: successive residuals resemble each other (white p below {FIT_LEVEL:g}); the model"
             " is in doubt, and standard errors are too small."
         )
-    told = [one.label for one in fits if one.with_prior]
-    if told:
+    if told := [one.label for one in fits if one.with_prior]:
         yield f"{', '.join(told)}: with a prior, which counts in the standard errors as further readings would."
     for one in fits:
         if one.held is not None:
-            names = [one.model.physical_parameters[k].name for k in one.held_at]
-            bounds = ", ".join(f"{name} = {value:g}" for name, value in zip(names, one.held_at.values(), strict=True))
+            at = {one.model.physical_parameters[k].name: value for k, value in one.held_at.items()}
             yield (
-                f"{one.label}: on its bound: {bounds}; the readings want it beyond. It has no error, and those of the"
-                " others are with it held there."
+                f"{one.label}: on its bound: {_values(at)}; the readings want it beyond. It has no error, and those of"
+                " the others are with it held there."
             )
     if answer.model.fixed:
-        yield "Fixed: " + ", ".join(f"{name} = {value:g}" for name, value in answer.model.fixed.items())
+        yield f"Fixed: {_values(answer.model.fixed)}"
     if answer.left_out:
         yield f"Left out on purpose: {answer.left_out}."
-    failing = [one.label for one in fits if not one.passes]
-    if failing:
+    if failing := [one.label for one in fits if not one.passes]:
         yield f"In brackets: {', '.join(failing)}. Not an answer: errors are not given, for they would be wrong."
 
 
+def _values(values: Mapping[str, float], figures: int = 6) -> str:
+    return ", ".join(f"{name} = {value:.{figures}g}" for name, value in values.items())
+
+
 def _outliers(answer: Answer) -> Iterator[Table]:
+    """The readings that lie farthest off, with what estimators say of each."""
     told = [f for f in answer.fits if 0 < f.outliers.sum() <= max(3, _FEW * len(f.outliers))]
-    rows = {int(i) for f in told for i in np.flatnonzero(f.outliers)}
+    rows = {
+        int(i): {f.label: float(f.normalised[i]) for f in told if f.outliers[i]}
+        for each in told
+        for i in np.flatnonzero(each.outliers)
+    }
     if not rows:
         return
-    largest = {i: max(abs(f.normalised[i]) for f in told if f.outliers[i]) for i in rows}
-    listed = sorted(rows, key=lambda i: -largest[i])[:_MOST_OUTLIERS]
+    largest = {i: max(map(abs, values.values())) for i, values in rows.items()}
+    listed = sorted(sorted(rows), key=lambda i: -largest[i])[:_MOST_OUTLIERS]
     labels, shown = _reading_labels(answer.model), []
     for i in listed:
-        values = {f.label: float(f.normalised[i]) for f in told if f.outliers[i]}
-        text = ", ".join(f"{label} {value:.1f}" for label, value in values.items())
-        if max(values.values()) - min(values.values()) < _ALIKE * largest[i]:
-            whose = f"{len(values)} estimators" if len(values) > 1 else next(iter(values))
-            text = f"{next(iter(values.values())):.1f} ({whose})"
-        shown.append(text)
+        (first, value), values = next(iter(rows[i].items())), rows[i].values()
+        if max(values) - min(values) < _ALIKE * largest[i]:
+            shown.append(f"{value:.1f} ({f'{len(values)} estimators' if len(values) > 1 else first})")
+        else:
+            shown.append(", ".join(f"{label} {value:.1f}" for label, value in rows[i].items()))
     columns = [words("reading", [_where(labels[i]) for i in listed]), words("residual", shown)]
     more = [f"And {len(rows) - _MOST_OUTLIERS} others: see {RESIDUALS}."] if len(rows) > _MOST_OUTLIERS else []
     title = f"Outliers: normalised residual beyond ±{told[0].outlier_limit:.2f}"
@@ -297,23 +276,19 @@ def _reading_labels(model: Measurement) -> list[dict[str, Any]]:
 
 def intervals(found: Examination) -> Table:
     """Three intervals of each parameter; of one on a bound, that of its profile."""
-    inside, on_bounds = found.model.physical_parameters, found.on_bounds
+    on_bounds, absent = found.on_bounds, ["-"] * len(found.on_bounds)
+    parameters = [*found.model.physical_parameters, *(b.parameter for b in on_bounds)]
     ends = [(one.low, one.high) for one in found.profiles] + [tuple(sorted((b.bound, b.other))) for b in on_bounds]
-    absent = ["-"] * len(on_bounds)
+    columns = [
+        words("parameter", [p.name for p in parameters]),
+        words("unit", [p.unit for p in parameters]),
+        texts("standard error", [*map(interval, *found.wald), *absent]),
+        texts("profile", [interval(*pair) for pair in ends]),
+        texts("bootstrap", [*map(interval, found.bootstrap.low, found.bootstrap.high), *absent]),
+    ]
     prior = " with its prior" if found.with_prior else ""
-    return Table(
-        "intervals",
-        f"{CONFIDENCE:.0%} intervals of {found.label}{prior}, by three ways".replace("%", " %"),
-        "",
-        [
-            words("parameter", [p.name for p in (*inside, *(b.parameter for b in on_bounds))]),
-            words("unit", [p.unit for p in (*inside, *(b.parameter for b in on_bounds))]),
-            texts("standard error", [*map(interval, *found.wald), *absent]),
-            texts("profile", [interval(*pair) for pair in ends]),
-            texts("bootstrap", [*map(interval, found.bootstrap.low, found.bootstrap.high), *absent]),
-        ],
-        repeated=2,
-    )
+    title = f"{100 * CONFIDENCE:.0f} % intervals of {found.label}{prior}, by three ways"
+    return Table("intervals", title, "", columns, repeated=2)
 
 
 def interval(low: float, high: float) -> str:
@@ -334,7 +309,7 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
     names = [p.name for p in found.model.physical_parameters]
 
     def at(x: Array) -> str:
-        return ", ".join(f"{n} = {v:.5g}" for n, v in zip(names, x, strict=True))
+        return _values(dict(zip(names, x, strict=True)), 5)
 
     if not found.least:
         best = found.minima[0]
@@ -344,11 +319,10 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
         )
     for one in found.ambiguous[:_MOST_MINIMA]:
         yield f"AMBIGUOUS: the readings fit as well at {at(one.x)} (chi-square {one.chi_square:.5g})."
-    bent = [n for n, p in zip(names, found.profiles, strict=True) if p.bent]
-    if bent:
+    profiles = list(zip(names, found.profiles, strict=True))
+    if bent := [n for n, p in profiles if p.bent]:
         yield f"Profiles that are no parabola: {', '.join(bent)}; trust their profile intervals, see likelihood.png."
-    unlimited = [n for n, p in zip(names, found.profiles, strict=True) if not math.isfinite(p.high - p.low)]
-    if unlimited:
+    if unlimited := [n for n, p in profiles if not math.isfinite(p.high - p.low)]:
         yield f"The readings set no limit to one side of {', '.join(unlimited)}."
     for one in found.on_bounds:
         yield (
@@ -362,7 +336,16 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
             " and the bootstrap draws the prior's means, too."
         )
     if len(names) > 1:
-        yield _direction(found, names)
+        # Components count by what they are in standard errors.
+        told = np.abs(found.direction.weights / found.standard_errors)
+        pairs = zip(found.direction.weights, names, told >= _SMALL_SHARE * told.max(), strict=True)
+        parts = [f"{n} {w:+.3g}" for w, n, shown in pairs if shown]
+        index = found.direction.collinearity
+        yield (
+            f"Least observable: {', '.join(parts)} together, which changes all readings by {1 / index:.2g} standard"
+            f" deviations; collinearity index {index:.3g}"
+            f"{': the readings hardly tell these apart' if index >= _COLLINEAR else ''}."
+        )
     shift = np.nan_to_num(found.influence.shift, nan=0.0)
     for i in [i for i in np.argsort(-shift)[:_MOST_READINGS] if shift[i] >= _INFLUENTIAL]:
         where = _where(labels[i])
@@ -372,59 +355,34 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
         yield f"Bootstrap: {drawn - converged} of {drawn} simulated sets of readings have no answer."
 
 
-def _direction(found: Examination, names: Sequence[str]) -> str:
-    weights = found.direction.weights / found.standard_errors
-    told = np.abs(weights) >= _SMALL_SHARE * np.abs(weights).max()
-    parts = [f"{n} {w:+.3g}" for w, n, shown in zip(found.direction.weights, names, told, strict=True) if shown]
-    index = found.direction.collinearity
-    verdict = ": the readings hardly tell these apart" if index >= _COLLINEAR else ""
-    return (
-        f"Least observable: {enumerate_few(parts, len(parts))} together, which changes all readings by {1 / index:.2g}"
-        f" standard deviations; collinearity index {index:.3g}{verdict}."
-    )
-
-
 # Files ---------------------------------------------------------------------------------------------------------------
 
 
-def write_fits(
+def write_answer(
     folder: Path, answer: Answer, command: Any, provenance: Mapping[str, Any], *, which: Which = "all"
 ) -> list[Path]:
     """Writes an answer; each file appears whole or not at all. Returns the files.
 
-    All its figures are main ones: `which` is all, main or none.
-
-    `command` tells one command from another (see `claim`); `provenance` is added to the JSON file and overrides what
-    stands there of the same name.
+    All its figures are main ones: `which` is all, main or none. `command` tells one command from another (see
+    `writer.claim`); `provenance` is added to the JSON file and overrides what stands there of the same name.
     """
     from ipe_bench.report.figures.readings import draw_fits, draw_profiles
 
     found = answer.examination
-    files = [
-        write_json(folder / RESULT, SCHEMA, command, {**described(answer), **provenance}),
-        write_rows(folder / RESIDUALS, _residual_rows(answer)),
-    ]
     drawings = []
     if which != "none":
         drawings = [*draw_fits(answer.model, answer.fits), *(draw_profiles(found) if found is not None else ())]
-    files += draw_into(folder, drawings, _FIGURES)
-    write_text(folder / PAGE, whole_page(answer, folder, drawings, str(provenance.get("written", ""))))
-    return [*files, folder / PAGE]
-
-
-def whole_page(answer: Answer, folder: Path, drawings: Sequence[Drawing], written: str) -> str:
-    """The page estimate.html as one file that includes the figures of the folder."""
-    return (
-        environment()
-        .get_template("answer.html.j2")
-        .render(
-            title=f"{answer.name}: estimates",
-            readings=int(np.isfinite(answer.z).sum()),
-            verdict="an answer that passes" if answer.passes else "NO ANSWER THAT PASSES",
-            written=written,
-            parts=list(contents(answer)),
-            figures=[(d, base64.b64encode((folder / f"{d.name}.png").read_bytes()).decode()) for d in drawings],
-        )
+    verdict = "an answer that passes" if answer.passes else "NO ANSWER THAT PASSES"
+    return write(
+        folder,
+        NAME,
+        f"{answer.name}: estimates",
+        contents(answer),
+        lead=f"{np.isfinite(answer.z).sum()} readings; {verdict}. {provenance.get('written', '')}",
+        content={"schema": SCHEMA, "command": command, **described(answer), **provenance},
+        table=(RESIDUALS, _residuals(answer)),
+        drawings=drawings,
+        old=_FIGURES,
     )
 
 
@@ -451,6 +409,7 @@ def described(answer: Answer) -> dict[str, Any]:
 def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
     names, white = [p.name for p in one.model.physical_parameters], one.whiteness
     outliers = np.flatnonzero(one.outliers)
+    test = {"test": "Ljung-Box, p from simulated fits", "p": plain(white.p_value)}
     return {
         "status": one.status.label,
         "estimates": named(names, one.x),
@@ -460,11 +419,7 @@ def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
         "on_bounds": {names[k]: value for k, value in one.held_at.items()},
         "undetermined": list(one.undetermined),
         "noise_level_estimated": plain(one.level),
-        "whiteness": {
-            "test": "Ljung-Box, p from simulated fits",
-            "p": plain(white.p_value),
-            **picked(white, "statistic", "lags"),
-        },
+        "whiteness": test | picked(white, "statistic", "lags"),
         "outliers": [{**labels[i], "normalised_residual": plain(one.normalised[i])} for i in outliers],
         **picked(one, "message", "correlation", "chi_square", "degrees_of_freedom", "fits", "passes", "with_prior"),
         **picked(one, "beaten_by", "residual_deviation", "outlier_limit", "iterations", "simulations"),
@@ -473,7 +428,7 @@ def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _examined(found: Examination, labels: list[dict[str, Any]]) -> dict[str, Any]:
     names, bootstrap = [p.name for p in found.model.physical_parameters], found.bootstrap
-    profiles = zip(names, found.profiles, strict=True)
+    minima = [named(names, one.x) for one in found.minima]
     return {
         "estimator": found.label,
         "confidence": CONFIDENCE,
@@ -484,15 +439,15 @@ def _examined(found: Examination, labels: list[dict[str, Any]]) -> dict[str, Any
             "profile": named(names, [(p.low, p.high) for p in found.profiles]),
             "bootstrap": named(names, np.column_stack([bootstrap.low, bootstrap.high])),
         },
-        "profiles": {name: picked(p, "values", "zeta", "bent") for name, p in profiles},
+        "profiles": dict(zip(names, [picked(p, "values", "zeta", "bent") for p in found.profiles], strict=True)),
         "bootstrap": {**picked(bootstrap, "drawn", "converged"), "bias": named(names, bootstrap.bias)},
         "least_observable": {
             "direction": named(names, found.direction.weights),
             "collinearity_index": plain(found.direction.collinearity),
         },
         "minima": [
-            {"estimates": named(names, one.x), "starts": one.found, **picked(one, "chi_square", "as_good")}
-            for one in found.minima
+            {"estimates": x, "starts": one.found, **picked(one, "chi_square", "as_good")}
+            for x, one in zip(minima, found.minima, strict=True)
         ],
         "is_least_minimum": found.least,
         "with_prior": found.with_prior,
@@ -501,27 +456,21 @@ def _examined(found: Examination, labels: list[dict[str, Any]]) -> dict[str, Any
     }
 
 
-def _residual_rows(answer: Answer) -> Iterator[list[Any]]:
+def _residuals(answer: Answer) -> pd.DataFrame:
     """A row per estimator and reading; of the estimator that is examined, with the influence of each reading, and with
     predictions of those that are missing."""
+    import pandas as pd
+
     model, z, found = answer.model, answer.z, answer.examination
     unit = f" [{model.reading_unit}]" if model.reading_unit else ""
-    influence = ["leverage", "cook", "shift", f"fitted_error{unit}", f"prediction_error{unit}"]
-    quantities = [f"{name}{unit}" for name in ("reading", "fitted", "residual")]
-    yield ["estimator", *model.index, *quantities, "normalised_residual", "outlier", *influence]
-    labels = list(zip(*model.index.values(), strict=True))
+    frames = []
     for one in answer.fits:
-        more: tuple[Array, ...] = (np.full(len(z), np.nan),) * len(influence)
-        fitted = z - one.residuals
-        if found is not None and one.label == found.label:
-            parts = found.influence
-            more = (parts.leverage, parts.cook, parts.shift, found.fitted_errors, found.new_errors)
-            fitted = np.where(np.isnan(z), found.fitted, fitted)
-        for i, label in enumerate(labels):
-            values = (z[i], fitted[i], one.residuals[i], one.normalised[i])
-            outlier = "yes" if one.outliers[i] else "no"
-            yield [one.label, *label, *map(_cell, values), outlier, *(_cell(column[i]) for column in more)]
-
-
-def _cell(value: float) -> str:
-    return "" if math.isnan(value) else repr(float(value))
+        examined = found if found is not None and one.label == found.label else None
+        fitted = z - one.residuals if examined is None else np.where(np.isnan(z), examined.fitted, z - one.residuals)
+        own = {f"reading{unit}": z, f"fitted{unit}": fitted, f"residual{unit}": one.residuals}
+        own |= {"normalised_residual": one.normalised, "outlier": np.where(one.outliers, "yes", "no")}
+        own |= {name: np.nan if examined is None else getattr(examined.influence, name) for name in _INFLUENCE}
+        own[f"fitted_error{unit}"] = np.nan if examined is None else examined.fitted_errors
+        own[f"prediction_error{unit}"] = np.nan if examined is None else examined.new_errors
+        frames.append(pd.DataFrame({"estimator": one.label, **model.index, **own}))
+    return pd.concat(frames)

@@ -14,44 +14,30 @@ from ipe_bench.statistics.attained import BUDGETS, attained_table, attained_tota
 from ipe_bench.statistics.collect import Collection
 from ipe_bench.statistics.digits import certified_averages, certified_table
 
-_DIGITS = (
-    "Log relative error against the certified answer, at most 11: the fewest over a data set's parameters, over their"
-    " standard deviations, and of the residual sum of squares."
-)
-_AVERAGES = _DIGITS + " Averaged over the data sets; solved: four digits or more of every parameter."
-_ATTAINED = (
-    "Problems whose least minimum the estimate attains: f at most f* (1 + 1e-6) + 1e-12. 1 x, 10 x: from these"
-    " multiples of the standard start. Converged: solved, and the status says so. Elsewhere: unsolved, and the status"
-    " says converged. Median cost: simulations over all problems, a Jacobian counting n, infinite where unsolved."
-    " In 10, 100, 1000: solved within so many simplex gradients of n + 1 simulations."
-)
-_PROBLEMS = (
-    "Which of a function's known minima has the estimate's sum of squares, the lowest being 1; a dash: none of them."
-)
-
 
 def certified_tables(collection: Collection) -> list[Table]:
     """Digits per data set and their averages, who attains known minima in all and problem by problem; those tables
     that there are data for. What a terminal shows of them is what names the file that holds the whole."""
     digits, minima = certified_table(collection), attained_table(collection)
-    shown = [] if digits.empty else [_digits(digits), averages_table(certified_averages(digits))]
-    return shown if minima.empty else [*shown, attained_totals_table(attained_totals(minima)), _problems(minima)]
+    found = [] if digits.empty else _digits(digits)
+    return found if minima.empty else [*found, attained_totals_table(attained_totals(minima)), _problems(minima)]
 
 
-def _digits(table: pd.DataFrame) -> Table:
+def _digits(digits: pd.DataFrame) -> list[Table]:
+    """Digits per data set, and the mean digits of an estimator from each start, the most first."""
+    caption = (
+        "Log relative error against the certified answer, at most 11: the fewest over a data set's parameters, over"
+        " their standard deviations, and of the residual sum of squares."
+    )
     columns = [
-        words("data set", table["dataset"]),
-        column("start", table["start"], str),
-        words("estimator", table["estimator"]),
-        *_lre(table, ""),
-        words("status", table["status"]),
+        words("data set", digits["dataset"]),
+        column("start", digits["start"], str),
+        words("estimator", digits["estimator"]),
+        *_lre(digits, ""),
+        words("status", digits["status"]),
     ]
-    return Table("certified", "Certified readings", _DIGITS, columns, table.round(2))
-
-
-def averages_table(averages: pd.DataFrame) -> Table:
-    """Mean digits of an estimator from each start, the most first."""
-    rows = averages.sort_values(["mean_lre_parameters", "start"], ascending=False)
+    each = Table("certified", "Certified readings", caption, columns, digits.round(2))
+    rows = certified_averages(digits).sort_values(["mean_lre_parameters", "start"], ascending=False)
     columns = [
         words("estimator", rows["estimator"]),
         column("start", rows["start"], str),
@@ -60,8 +46,9 @@ def averages_table(averages: pd.DataFrame) -> Table:
         *_lre(rows, "mean_"),
         column("deviations to 6 digits", rows["deviations_to_6_digits"], str),
     ]
-    name, title = "certified_averages", "Certified readings, averages"
-    return Table(name, title, _AVERAGES, columns, rows.round(2), whole=f"tables/{name}.csv")
+    caption += " Averaged over the data sets; solved: four digits or more of every parameter."
+    title, whole = "Certified readings, averages", "tables/certified_averages.csv"
+    return [each, Table("certified_averages", title, caption, columns, rows.round(2), whole=whole)]
 
 
 def _lre(rows: pd.DataFrame, prefix: str) -> list[Column]:
@@ -84,7 +71,13 @@ def attained_totals_table(totals: pd.DataFrame) -> Table:
         column("median cost", rows["cost_median"], short),
         *(column(f"in {b}", rows[f"within_{b}"], str) for b in BUDGETS),
     ]
-    return Table("attained", "Known minima", _ATTAINED, columns, rows, whole="tables/attained.csv")
+    caption = (
+        "Problems whose least minimum the estimate attains: f at most f* (1 + 1e-6) + 1e-12. 1 x, 10 x: from these"
+        " multiples of the standard start. Converged: solved, and the status says so. Elsewhere: unsolved, and the"
+        " status says converged. Median cost: simulations over all problems, a Jacobian counting n, infinite where"
+        " unsolved. In 10, 100, 1000: solved within so many simplex gradients of n + 1 simulations."
+    )
+    return Table("attained", "Known minima", caption, columns, rows, whole="tables/attained.csv")
 
 
 def _problems(minima: pd.DataFrame) -> Table:
@@ -99,7 +92,11 @@ def _problems(minima: pd.DataFrame) -> Table:
         words("status", rows["status"]),
         column("cost", rows["cost"], short),
     ]
-    return Table("attained_problems", "Known minima, problem by problem", _PROBLEMS, columns, rows)
+    caption = (
+        "Which of a function's known minima has the estimate's sum of squares, the lowest being 1; a dash: none of"
+        " them."
+    )
+    return Table("attained_problems", "Known minima, problem by problem", caption, columns, rows)
 
 
 def without_certified(analysis: Analysis) -> Analysis:
@@ -107,12 +104,8 @@ def without_certified(analysis: Analysis) -> Analysis:
     groups = tuple(g for g in analysis.collection.groups if g.columns["noise"] != "certified")
     if len(groups) == len(analysis.collection.groups):
         return analysis
-    held = {f.name: getattr(analysis, f.name) for f in fields(analysis)}
-    tables: dict[str, Any] = {
-        name: table[table["noise"] != "certified"]
-        for name, table in held.items()
-        if isinstance(table, pd.DataFrame) and "noise" in table
-    }
+    held: dict[str, Any] = {f.name: getattr(analysis, f.name) for f in fields(analysis)}
+    held = {k: v[v["noise"] != "certified"] for k, v in held.items() if isinstance(v, pd.DataFrame) and "noise" in v}
     if not groups:
-        tables["profiles"] = analysis.profiles.iloc[:0]
-    return replace(analysis, collection=replace(analysis.collection, groups=groups), **tables)
+        held["profiles"] = analysis.profiles.iloc[:0]
+    return replace(analysis, **held | {"collection": replace(analysis.collection, groups=groups)})

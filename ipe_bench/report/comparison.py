@@ -11,45 +11,44 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ipe_bench.basics.files import make_folder, write_text
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, house_style
 from ipe_bench.report.table import Table, texts, words
 from ipe_bench.report.words import compact, duration, p_value, percent, plain
+from ipe_bench.report.writer import write
 from ipe_bench.statistics.between import NOT_SETTINGS, described
 
 if TYPE_CHECKING:
     import pandas as pd
 
-_HEADINGS = ("", "first", "second", "change", "95 %", "p", "e", "second is")
-_NAMES = {"success": "success", "error": "error", "cost": "cost", "time": "time"}
 _COLORS = {"better": "#009E73", "worse": "#D55E00", "": BOUND_COLOR}
 MOST_ROWS = 40
 """Comparisons that the figure shows; the CSV file has all."""
-_PANELS = (
-    ("success", "success: share gained"),
-    ("error", "capped error: ratio"),
-    ("cost", "cost in simulations: ratio"),
-)
+_PANELS = {
+    "success": "success: share gained",
+    "error": "capped error: ratio",
+    "cost": "cost in simulations: ratio",
+}
 
 
 def contents(frame: pd.DataFrame, alpha: float) -> list[Table]:
     """A table per comparison, within 80 columns; what the columns mean stands below the last."""
+    titles = ("", "first", "second", "change", f"{100 * (1 - alpha):g} %", "p", "e", "second is")
     tables = []
     for title, rows in _comparisons(frame):
         cells = list(zip(*map(_cells, rows), strict=True))
-        titles = [each if each != "95 %" else _level(alpha) for each in _HEADINGS]
-        columns = [
-            (words if each in ("", "second is") else texts)(each, column)
-            for each, column in zip(titles, cells, strict=True)
-        ]
-        tables.append(Table("comparison", title, "", columns, repeated=1))
-    return [*tables[:-1], *(replace(last, notes=[_note(frame)]) for last in tables[-1:])]
-
-
-def _level(alpha: float) -> str:
-    return f"{100 * (1 - alpha):g} %"
+        last = len(titles) - 1
+        columns = [(words if i in (0, last) else texts)(t, cells[i]) for i, t in enumerate(titles)]
+        tables.append(Table("comparison", title, "", columns))
+    note = (
+        "error: mean Mahalanobis error, each trial's at most the radius of the gate of success. cost: simulations."
+        " p: McNemar's exact test, random signs for ratios; Holm over all rows. e: evidence that may be looked at as"
+        " often as one likes, 20 being as rare as p = 0.05. Intervals are each row's own. time: not tested."
+    )
+    if (frame["matched_by"] == "order").any():
+        note += " Without common trials nothing is gained from pairing: the intervals are wider."
+    return [*tables[:-1], *(replace(last, notes=[note]) for last in tables[-1:])]
 
 
 def _comparisons(frame: pd.DataFrame) -> Iterator[tuple[str, list[dict[str, Any]]]]:
@@ -67,57 +66,43 @@ def _comparisons(frame: pd.DataFrame) -> Iterator[tuple[str, list[dict[str, Any]
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     quantity = row["quantity"]
     show = {"success": percent, "time": lambda v: duration(v, 2)}.get(quantity, compact)
-    values = show(row["first_value"]), show(row["second_value"])
-    finding = row["finding"] or ("-" if quantity != "time" else "")
     if quantity == "success":
         change, ends = f"{100 * row['change']:+.1f} %", f"{100 * row['low']:+.1f} to {100 * row['high']:+.1f}"
     else:
         change, ends = _ratio(row["change"]), f"{_ratio(row['low'])} to {_ratio(row['high'])}"
-    if not math.isfinite(row["low"]):
-        ends = "-"
-    p = p_value(row["p"]) if math.isfinite(row["p"]) else ""
-    return _NAMES[quantity], *values, change, ends, p, _evidence(row["e"]), finding
+    p, e = row["p"], row["e"]
+    evidence = f"{e:.2g}" if e < 1e4 else f"{e:.0e}".replace("e+0", "e").replace("e+", "e")
+    return (
+        *(quantity, show(row["first_value"]), show(row["second_value"]), change),
+        ends if math.isfinite(row["low"]) else "-",
+        p_value(p) if math.isfinite(p) else "",
+        evidence if math.isfinite(e) else "",
+        row["finding"] or ("-" if quantity != "time" else ""),
+    )
 
 
 def _ratio(value: float) -> str:
     return f"{value:.3f}" if 0.1 <= value < 9.9995 else compact(value)
 
 
-def _evidence(e: float) -> str:
-    return "" if not math.isfinite(e) else f"{e:.2g}" if e < 1e4 else f"{e:.0e}".replace("e+0", "e").replace("e+", "e")
-
-
-def _note(frame: pd.DataFrame) -> str:
-    unmatched = (frame["matched_by"] == "order").any()
-    return (
-        "error: mean Mahalanobis error, each trial's at most the radius of the gate of success. cost: simulations."
-        " p: McNemar's exact test, random signs for ratios; Holm over all rows. e: evidence that may be looked at as"
-        " often as one likes, 20 being as rare as p = 0.05. Intervals are each row's own. time: not tested."
-        + (" Without common trials nothing is gained from pairing: the intervals are wider." if unmatched else "")
-    )
-
-
-def write(frame: pd.DataFrame, output: Path, alpha: float) -> tuple[Path, ...]:
-    """Writes comparison.csv, and comparison as PNG and PDF."""
-    make_folder(output)
-    table = output / "comparison.csv"
-    write_text(table, frame.to_csv(index=False))
+def write_comparison(frame: pd.DataFrame, output: Path, alpha: float) -> list[Path]:
+    """Writes comparison.csv, comparison as PNG and PDF, and a page of all; returns the files."""
     with house_style():
-        return (table, *draw(frame, alpha).save(output))
+        drawings, table = [draw(frame, alpha)], ("comparison.csv", frame)
+        return write(output, "comparison", "Comparison", contents(frame, alpha), table=table, drawings=drawings)
 
 
 def draw(frame: pd.DataFrame, alpha: float) -> Drawing:
     """Draws a line per comparison and a panel per quantity, with intervals, coloured if significant."""
     from matplotlib.lines import Line2D
 
-    found = list(_comparisons(frame))[:MOST_ROWS]
-    labels = [_row_label(rows[0], frame) for _, rows in found]
+    found = [rows for _, rows in _comparisons(frame)][:MOST_ROWS]
+    labels = [_row_label(rows[0], frame) for rows in found]
     longest = max(len(label) for label in labels)
     fig = common.figure(7.4 + min(0.065 * longest, 3.2), 1.3 + 0.28 * len(found))
     axes = list(fig.subplots(1, len(_PANELS), sharey=True))
-    for (quantity, title), ax in zip(_PANELS, axes, strict=True):
-        rows = [next(row for row in part if row["quantity"] == quantity) for _, part in found]
-        _panel(ax, rows, quantity)
+    for (quantity, title), ax in zip(_PANELS.items(), axes, strict=True):
+        _panel(ax, [row for rows in found for row in rows if row["quantity"] == quantity], quantity)
         ax.set_title(title)
     axes[0].set_yticks(range(len(labels)), [common.text(label) for label in labels])
     axes[0].set_ylim(len(labels) - 0.4, -0.6)
@@ -126,7 +111,8 @@ def draw(frame: pd.DataFrame, alpha: float) -> Drawing:
         for name, color in _COLORS.items()
     ]
     fig.legend(handles=handles, loc="outside upper center", ncols=3)
-    caption = f"The second less, or over, the first, with intervals of {_level(alpha)}; coloured where sure."
+    level = f"{100 * (1 - alpha):g} %"
+    caption = f"The second less, or over, the first, with intervals of {level}; coloured where sure."
     return Drawing("comparison", "Comparison", caption, fig)
 
 
@@ -136,10 +122,8 @@ def _panel(ax: Any, rows: Sequence[dict[str, Any]], quantity: str) -> None:
     none = 0.0 if quantity == "success" else 1.0
     for i, row in enumerate(rows):
         color = _COLORS[row["finding"]]
-        if math.isfinite(row["low"]):
-            ax.plot([row["low"], row["high"]], [i, i], color=color, linewidth=1.6, solid_capstyle="butt")
-        if math.isfinite(row["change"]):
-            ax.plot([row["change"]], [i], color=color, marker="o", markersize=5, linestyle="")
+        ax.plot([row["low"], row["high"]], [i, i], color=color, linewidth=1.6, solid_capstyle="butt")
+        ax.plot([row["change"]], [i], color=color, marker="o", markersize=5, linestyle="")
     ax.axvline(none, color=BOUND_COLOR, linewidth=0.8, zorder=0)
     ends = np.array([[row["low"], row["high"], row["change"], none] for row in rows], dtype=float)
     ends = ends[np.isfinite(ends)]
@@ -165,5 +149,4 @@ def _row_label(row: dict[str, Any], frame: pd.DataFrame) -> str:
     settings = [c for c in frame.columns if c not in NOT_SETTINGS]
     varying = [c for c in settings if len(set(frame[c].astype(str))) > 1] or ["error_scale"]
     who = row["first"] if row["first"] == row["second"] else f"{row['first']}, {row['second']}"
-    named = [f"{c.replace('_', ' ')} {plain(row[c])}" for c in varying if c in row]
-    return ", ".join([who, *named])
+    return ", ".join([who, *(f"{c.replace('_', ' ')} {plain(row[c])}" for c in varying if c in row)])

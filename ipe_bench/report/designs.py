@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ipe_bench.report.folders import draw_into, picked, plain, write_json, write_rows
 from ipe_bench.report.table import Part, Strong, Table, texts, words
 from ipe_bench.report.words import enumerate_few, percent
+from ipe_bench.report.writer import picked, plain, write
 from ipe_bench.runs.provenance import describe
 from ipe_bench.trials.design import Choice, Design, Effect, Way, levels_of
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
-SCHEMA = 1
-RESULT = "design.json"
-READINGS = "readings.csv"
+if TYPE_CHECKING:
+    import pandas as pd
+
+NAME, READINGS, SCHEMA = "design", "readings.csv", 1
 FILES = (READINGS, "design.png", "design.pdf")
 _MOST_SUSPECTS = 12
 _MUST_BREAK = 1.02
@@ -33,36 +34,36 @@ def contents(name: str, design: Design) -> Iterator[Part]:
     """The tables and sentences of a design; `name` is what the model is called in the title."""
     yield _parameters(name, design)
     seen = design.observability
-    yield Strong(
-        f"{'Least observable direction' if seen.observable else 'The readings do not determine'}: {seen.words}"
-    )
+    direction = "Least observable direction" if seen.observable else "The readings do not determine"
+    yield Strong(f"{direction}: {seen.words}")
     if design.threshold:
         yield _threshold(design)
     yield from _suspects(design)
     yield from _ways(design)
-    yield from _effects(design)
+    if design.effects:
+        yield _effects(design)
 
 
 def _parameters(name: str, design: Design) -> Table:
     seen, scenario = design.observability, design.scenario
-    C = seen.correlation - np.eye(len(seen.parameters))
-    most = [int(np.argmax(np.abs(row))) for row in C]
+    parameters, others = seen.parameters, seen.correlation - np.eye(len(seen.parameters))
     s = np.median(seen.singular_values, axis=0)
     columns = [
-        words("parameter", [p.name for p in seen.parameters]),
-        words("unit", [p.unit for p in seen.parameters]),
-        texts("bound", [f"{bound * p.size:.3g}" for p, bound in zip(seen.parameters, seen.bound, strict=True)]),
+        words("parameter", [p.name for p in parameters]),
+        words("unit", [p.unit for p in parameters]),
+        texts("bound", [f"{bound * p.size:.3g}" for p, bound in zip(parameters, seen.bound, strict=True)]),
         texts("with the others", [f"{r:.2f}" for r in seen.multiple_correlation]),
     ]
-    if len(C) > 1:
-        columns.append(words("most", [f"{seen.parameters[j].name} {C[i, j]:+.2f}" for i, j in enumerate(most)]))
+    if len(parameters) > 1:
+        most = np.argmax(np.abs(others), axis=1)
+        columns.append(words("most", [f"{parameters[j].name} {others[i, j]:+.2f}" for i, j in enumerate(most)]))
     notes = [
         "bound: of the standard deviation, root mean square over the prior. with the others: multiple correlation of"
         " its error; most: the one it goes with most.",
         f"Singular values of the whitened Jacobian, per parameter's size: {s[0]:.3g} to {s[-1]:.3g}.",
     ]
     title = f"{name}, {scenario.noise.name}, error scale {scenario.error_scale:g}: what {scenario.measurement.m}"
-    return Table("parameters", f"{title} readings say", "", columns, notes=notes, repeated=1)
+    return Table("parameters", f"{title} readings say", "", columns, notes=notes)
 
 
 def _threshold(design: Design) -> str:
@@ -72,13 +73,12 @@ def _threshold(design: Design) -> str:
     if not limit.false_roots:
         return f"False roots: none in {limit.runs} runs of least squares from other truths."
     loss = float(np.max(limit.weiss_weinstein / limit.van_trees))
-    blame = (
-        f"so no estimator can do better than {loss:.2f} times Van Trees's bound"
-        if loss > _MUST_BREAK
-        else "so ending there is the estimator's fault and not that of noise"
-        if limit.confusion < _UNSEEN
-        else "which the Weiss-Weinstein bound, averaged over the prior, does not feel"
-    )
+    if loss > _MUST_BREAK:
+        blame = f"so no estimator can do better than {loss:.2f} times Van Trees's bound"
+    elif limit.confusion < _UNSEEN:
+        blame = "so ending there is the estimator's fault and not that of noise"
+    else:
+        blame = "which the Weiss-Weinstein bound, averaged over the prior, does not feel"
     return (
         f"False roots: {limit.false_roots} of {limit.runs} runs of least squares from other truths; readings of the"
         f" nearest are {limit.nearest:.3g} deviations off, and noise makes it fit better in {percent(limit.confusion)},"
@@ -103,7 +103,7 @@ def _suspects(design: Design) -> Iterator[Part]:
         words("hidden", ["yes" if s.hidden else "" for s in shown]),
         words("looks like", [s.words for s in shown]),
     ]
-    yield Table("suspects", "Errors that the model leaves out", "", columns, notes=[note], repeated=1)
+    yield Table("suspects", "Errors that the model leaves out", "", columns, notes=[note])
     unseen = [s for s in design.suspects if s.hidden and s.noticed < _UNSEEN]
     if unseen:
         yield Strong(
@@ -119,20 +119,19 @@ def _ways(design: Design) -> Iterator[Part]:
         yield f"There is nothing to choose among the candidates: {why}."
         return
     today = design.scenario.measurement.m
-    rows = []
-    for way in design.ways:
-        few, best = way.saving, way.sharpest
-        cells = [f"{few.readings}", f"{few.mean_bound:.3f}"] if few else [f"{today}", "1"]
-        rows.append([*cells, f"{best.readings}", f"{best.mean_bound:.3f}"])
-    titles = ("fewest readings", "bound", "at most", "smallest bound")
-    columns = [words("chosen", [way.title for way in design.ways])]
-    columns += [texts(title, cells) for title, cells in zip(titles, zip(*rows, strict=True), strict=True)]
+    columns = [
+        words("chosen", [way.title for way in design.ways]),
+        texts("fewest readings", [f"{way.saving.readings if way.saving else today}" for way in design.ways]),
+        texts("bound", [f"{way.saving.mean_bound:.3f}" if way.saving else "1" for way in design.ways]),
+        texts("at most", [f"{way.sharpest.readings}" for way in design.ways]),
+        texts("smallest bound", [f"{way.sharpest.mean_bound:.3f}" for way in design.ways]),
+    ]
     title = f"What to take instead (bounds as shares of today's, criterion {design.criterion})"
     note = (
         f"fewest readings: with no larger bound than today's {today}. Of {design.candidates.m} candidates those that"
         " gain most are taken one after another; another choice may be a little better."
     )
-    yield Table("ways", title, "", columns, notes=[note], repeated=1)
+    yield Table("ways", title, "", columns, notes=[note])
     for way in design.ways:
         if way.saving and len(way.units.by) == 1:
             yield f"{way.saving.readings} readings {way.title}: {taken(design, way, way.saving)}"
@@ -144,41 +143,41 @@ def taken(design: Design, way: Way, choice: Choice) -> str:
     return ", ".join(levels_of(design.candidates, column, way.units.entries[u][0]) for u in choice.taken)
 
 
-def _effects(design: Design) -> Iterator[Table]:
-    found: list[Effect] = []
-    for column in dict.fromkeys(e.column for e in design.effects):
-        for action in ("add", "drop"):
-            finite = [
-                e for e in design.effects if (e.column, e.action) == (column, action) and np.isfinite(e.mean_bound)
-            ]
-            found += [min(finite, key=lambda e: e.mean_bound)] if finite else []
-    if not design.effects:
-        return
+def _effects(design: Design) -> Table:
+    best: dict[tuple[str, str], Effect] = {}
+    for e in design.effects:
+        if np.isfinite(e.mean_bound):
+            best[e.column, e.action] = min(best.get((e.column, e.action), e), e, key=lambda e: e.mean_bound)
+    found = [best[key] for key in sorted(best, key=lambda key: ([c for c, _ in best].index(key[0]), key[1]))]
     columns = [
         words("what", [f"{e.action} {e.column} {levels_of(design.candidates, e.column, e.entry)}" for e in found]),
         texts("readings", [str(e.readings) for e in found]),
         texts("bound", [f"{e.mean_bound:.3f}" for e in found]),
     ]
-    yield Table(
-        "effects", "One more, one less", "", columns, notes=["The best to add, and the one that is missed least."]
-    )
+    note = "The best to add, and the one that is missed least."
+    return Table("effects", "One more, one less", "", columns, notes=[note])
 
 
 # Files ---------------------------------------------------------------------------------------------------------------
 
 
-def write_design(folder: Path, design: Design, command: Any, provenance: Mapping[str, Any]) -> list[Path]:
-    """Writes design.json, readings.csv (what each choice takes) and the figure; returns the files.
+def write_design(folder: Path, name: str, design: Design, command: Any) -> list[Path]:
+    """Writes a design, of which readings.csv has what each choice takes, and returns the files.
 
-    `command` tells one command from another; `provenance` is added to the JSON file.
+    `command` tells one command from another.
     """
     from ipe_bench.report.figures.designs import draw_design
 
-    files = [
-        write_json(folder / RESULT, SCHEMA, command, {**described(design), **provenance}),
-        write_rows(folder / READINGS, _reading_rows(design)),
-    ]
-    return files + draw_into(folder, draw_design(design), FILES[1:])
+    return write(
+        folder,
+        NAME,
+        f"{name}: design",
+        contents(name, design),
+        content={"schema": SCHEMA, "command": command, **described(design), "measurement": name},
+        table=(READINGS, _readings(design)),
+        drawings=draw_design(design),
+        old=FILES[1:],
+    )
 
 
 def described(design: Design) -> dict[str, Any]:
@@ -220,7 +219,7 @@ def described(design: Design) -> dict[str, Any]:
                 "by": list(way.units.by),
                 "units": len(way.units.rows),
                 "curve": [picked(c, "readings", "mean_bound") for c in way.curve],
-                **{name: choice and _chosen(design, way, choice) for name, choice in _choices(way)},
+                **{name: choice and _chosen(design, way, choice) for name, choice in _choices(way).items()},
             }
             for way in design.ways
         ],
@@ -228,8 +227,8 @@ def described(design: Design) -> dict[str, Any]:
     }
 
 
-def _choices(way: Way) -> Sequence[tuple[str, Choice | None]]:
-    return ("saving", way.saving), ("sharpest", way.sharpest)
+def _choices(way: Way) -> Mapping[str, Choice | None]:
+    return {"saving": way.saving, "sharpest": way.sharpest}
 
 
 def _chosen(design: Design, way: Way, choice: Choice) -> dict[str, Any]:
@@ -244,10 +243,17 @@ def _chosen(design: Design, way: Way, choice: Choice) -> dict[str, Any]:
     }
 
 
-def _reading_rows(design: Design) -> Iterator[list[Any]]:
-    index = design.candidates.index
-    yield ["by", "choice", *index]
+def _readings(design: Design) -> pd.DataFrame:
+    """What each choice takes, a row per reading."""
+    import pandas as pd
+
+    index = pd.DataFrame(dict(design.candidates.index))
+    frames = [pd.DataFrame(columns=["by", "choice", *index])]
     for way in design.ways:
-        for name, choice in _choices(way):
-            for row in choice.rows if choice else ():
-                yield [" and ".join(way.units.by), name, *(column[row] for column in index.values())]
+        for name, choice in _choices(way).items():
+            if choice:
+                own = index.iloc[list(choice.rows)]
+                own.insert(0, "by", " and ".join(way.units.by))
+                own.insert(1, "choice", name)
+                frames.append(own)
+    return pd.concat(frames[1:] or frames)

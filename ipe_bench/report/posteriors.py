@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +10,12 @@ import numpy as np
 
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.report.folders import draw_into, named, picked, plain, write_json
 from ipe_bench.report.table import Table, texts, words
 from ipe_bench.report.words import compact, percent
+from ipe_bench.report.writer import named, picked, plain, write
 from ipe_bench.trials.posterior import Divergence, Posterior, Reference
 
-SCHEMA = 1
-RESULT = "posterior.json"
+NAME, SCHEMA = "posterior", 1
 HONEST = 0.1
 """Nats below which a Gaussian may stand for another: a deviation 40 % too large in one direction, or a mean that is
 half a deviation off, are about a tenth."""
@@ -40,7 +39,7 @@ def contents(name: str, found: Sequence[Reference]) -> list[Table]:
         texts("energy", [compact(d.energy) for *_, d in rows]),
     ]
     title = f"{name}: estimators beside the posterior"
-    return [Table("posterior", title, "", columns, notes=list(_notes(found)), grouped=3, repeated=4)]
+    return [Table("posterior", title, "", columns, notes=list(_notes(found)), grouped=3)]
 
 
 def _status(one: Reference, label: str) -> str:
@@ -61,7 +60,6 @@ def _notes(found: Sequence[Reference]) -> Iterator[str]:
                 f"Trial {one.trial}: the populations differ by {one.posterior.apart:.2g} deviations, so its posterior"
                 " is not to be believed; give more --particles."
             )
-    for one in found:
         if len(one.posterior.modes) > 1:
             shares = ", ".join(percent(float(share)) for share in one.posterior.shares)
             yield f"Trial {one.trial}: {len(one.posterior.modes)} modes, with {shares} of the draws."
@@ -76,13 +74,16 @@ def honesty(d: Divergence, sampled: Posterior) -> str:
 
 
 def write_posteriors(
-    folder: Path, model: Measurement, found: Sequence[Reference], command: Any, provenance: Mapping[str, Any]
+    folder: Path, name: str, scenario: str, model: Measurement, found: Sequence[Reference], command: Any
 ) -> list[Path]:
-    """Writes posterior.json and a corner picture of each trial; returns the files."""
+    """Writes posteriors with a corner picture of each trial, and returns the files; `name` is the model's and
+    `scenario` says what was sampled."""
     from ipe_bench.report.figures.corner import draw_corners
 
-    content = {"trials": [_described(model, one) for one in found], **provenance}
-    return [write_json(folder / RESULT, SCHEMA, command, content), *draw_into(folder, draw_corners(model, found), ())]
+    trials = [_described(model, one) for one in found]
+    content = {"schema": SCHEMA, "command": command, "trials": trials, "measurement": name}
+    title, parts = f"{name}: posteriors", contents(scenario, found)
+    return write(folder, NAME, title, parts, content=content, drawings=draw_corners(model, found))
 
 
 def _described(model: Measurement, one: Reference) -> dict[str, Any]:

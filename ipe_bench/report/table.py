@@ -1,8 +1,4 @@
-"""The one kind of table, and what it looks like in a terminal, as HTML, Markdown, LaTeX and CSV.
-
-What tables contain is said elsewhere, in `tables`, `answer`, `designs` and their kin. Must not import pandas or rich
-before a table is shown.
-"""
+"""The one kind of table, and how it is shown in a terminal, as HTML, Markdown, LaTeX and CSV."""
 
 from __future__ import annotations
 
@@ -10,7 +6,7 @@ import math
 import re
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,11 +28,10 @@ COLUMN_GAP = 3.0
 """Points between the edge of a column of a LaTeX table and its text."""
 _NAMES = ("estimator", "first", "data set", "function", "parameter", "error")
 """Titles of the column that names a row."""
-_WHOLE_NAME = 24
-"""Letters of a row's name up to which a terminal shows it on one line."""
-_WHOLE_WORD = 11
-"""Letters of any other text up to which a terminal shows it on one line."""
+_WHOLE_NAME, _WHOLE_WORD = 24, 11
+"""Letters of a row's name, and of any other text, up to which a terminal shows it on one line."""
 _PADDING = 2
+"""Blanks between two columns of a terminal."""
 
 
 @dataclass(frozen=True)
@@ -72,11 +67,11 @@ class Table:
     notes: Sequence[str] = ()
     grouped: int = 0
     """Number of leading columns whose texts make a group of rows: a terminal shows them once a group."""
-    repeated: int = 0
+    repeated: int = 1
     """Number of leading columns that a terminal repeats when it shows the others in several tables, one below the
-    other; 0: columns for which there is no room are left out, from the right."""
+    other."""
     whole: str = ""
-    """The file that has the columns for which a terminal has no room."""
+    """The file that has the columns for which a terminal has no room: they are named and not shown below."""
 
     @property
     def rows(self) -> Iterator[tuple[Cell, ...]]:
@@ -96,20 +91,20 @@ class Strong(str):
 
 
 Part = Table | str
-"""What an answer is made of: tables and sentences."""
+"""What reports are made of: tables and sentences."""
 
 
-def column(title: str, values: Iterable[Any], show: Callable[[Any], str], best: Sequence[bool] | None = None) -> Column:
+def column(title: str, values: Iterable[Any], show: Callable[[Any], str], best: Iterable[bool] = ()) -> Column:
     """A column of numbers, written by `show`."""
     values = list(values)
-    marks = [False] * len(values) if best is None else list(best)
+    marks = list(best) or [False] * len(values)
     return Column(title, [Cell(show(v), sort_key(v), m) for v, m in zip(values, marks, strict=True)])
 
 
-def words(title: str, values: Iterable[Any], best: Sequence[bool] | None = None) -> Column:
+def words(title: str, values: Iterable[Any], best: Iterable[bool] = ()) -> Column:
     """A column of texts."""
     values = [str(v) for v in values]
-    marks = [False] * len(values) if best is None else list(best)
+    marks = list(best) or [False] * len(values)
     return Column(title, [Cell(v, None, m) for v, m in zip(values, marks, strict=True)], numeric=False)
 
 
@@ -119,9 +114,9 @@ def interval(title: str, low: Iterable[float], high: Iterable[float], show: Call
     return Column(title, [Cell(f"{show(a)} to {show(b)}" if math.isfinite(a) else "-", sort_key(a)) for a, b in pairs])
 
 
-def texts(title: str, values: Iterable[str], *, numeric: bool = True) -> Column:
-    """A column of cells that are written already and are not sorted by a number."""
-    return Column(title, [Cell(value) for value in values], numeric)
+def texts(title: str, values: Iterable[str]) -> Column:
+    """A column of numbers that are written already and by which no row is sorted."""
+    return Column(title, [Cell(value) for value in values])
 
 
 def sort_key(value: Any) -> str:
@@ -134,91 +129,51 @@ def sort_key(value: Any) -> str:
 
 
 def terminal(parts: Iterable[Part], width: int) -> Group:
-    """Tables and sentences for a terminal of that width; what has no room is named with the file that has it."""
+    """Tables and sentences for a terminal; columns without room go below, or are named with the file that has them."""
     from rich.console import Group
     from rich.text import Text
 
     shown: list[Any] = []
-    absent: dict[str, dict[str, None]] = {}
-
-    def tell() -> None:
-        for file, titles in absent.items():
-            where = f"; {file} has them" if file else ""
-            shown.append(Text(f"Too narrow for: {', '.join(titles)}{where}.", style="dim"))
-        absent.clear()
-
     for part in parts:
         if not isinstance(part, Table):
-            tell()
             shown.append(Text(part, style="bold" if isinstance(part, Strong) else "dim"))
             continue
-        if part.whole not in absent:
-            tell()
-        for piece in _pieces(part, width):
-            fitting, room = _fitting(piece, width)
-            if piece.title:
-                blank = [Text()] if shown and isinstance(shown[-1], Text) else []
-                shown += [*blank, Text(piece.title, style="bold")]
-            shown.append(_rich(replace(piece, columns=piece.columns[:fitting]), room))
-            for left_out in piece.columns[fitting:]:
-                absent.setdefault(part.whole, {})[left_out.title] = None
+        if part.title:
+            shown += [Text()] if shown and isinstance(shown[-1], Text) else []
+            shown.append(Text(part.title, style="bold"))
+        kept = max(part.repeated, part.naming + 1)
+        head, rest = list(part.columns[:kept]), list(part.columns[kept:])
         notes = [text for text in (part.caption, *part.notes) if text]
-        if notes:
-            tell()
-            shown += [Text(note, style="dim") for note in notes]
-    tell()
+        while True:
+            count = min(1, len(rest))
+            while count < len(rest) and _taken([*head, *rest[: count + 1]], part, folded=True) <= width:
+                count += 1
+            shown.append(_rich([*head, *rest[:count]], part, width))
+            rest = rest[count:]
+            if rest and part.whole:
+                notes.insert(0, f"Too narrow for: {', '.join(c.title for c in rest)}; {part.whole} has them.")
+            if not rest or part.whole:
+                break
+        shown += [Text(note, style="dim") for note in notes]
     return Group(*shown)
 
 
-def _pieces(table: Table, width: int) -> Iterator[Table]:
-    """The table itself, or tables with the repeated columns and as many of the others as have room beside them."""
-    if not table.repeated:
-        yield table
-        return
-    head, rest = list(table.columns[: table.repeated]), list(table.columns[table.repeated :])
-    title = table.title
-    while rest:
-        count = 1
-        while count < len(rest) and _fits(replace(table, columns=[*head, *rest[: count + 1]]), width):
-            count += 1
-        yield replace(table, title=title, columns=[*head, *rest[:count]])
-        rest, title = rest[count:], ""
-
-
-def _fits(table: Table, width: int) -> bool:
-    return _taken(_needed(table, folded=False)) <= width
-
-
-def _needed(table: Table, *, folded: bool) -> list[int]:
-    """Minimal width of each column in letters: numbers are never folded, words are, and titles if `folded`."""
+def _needed(column: Column, table: Table, *, folded: bool) -> int:
+    """Minimal width of a column in letters: numbers are never folded, words are, and titles if `folded`."""
     from rich.cells import cell_len
 
-    found = []
-    for i, each in enumerate(table.columns):
-        title = cell_len(each.title)
-        if folded:
-            title = min(max(map(cell_len, _words_of(each.title))), _WHOLE_NAME)
-        longest = max((cell_len(cell.text) for cell in each.cells), default=0)
-        if not each.numeric:
-            longest = min(longest, _WHOLE_NAME if i == table.naming else _WHOLE_WORD)
-        found.append(max(title, longest))
-    return found
+    title = cell_len(column.title)
+    if folded:
+        title = min(max(map(cell_len, _words_of(column.title))), _WHOLE_NAME)
+    longest = max((cell_len(cell.text) for cell in column.cells), default=0)
+    if not column.numeric:
+        longest = min(longest, _WHOLE_NAME if column is table.columns[table.naming] else _WHOLE_WORD)
+    return max(title, longest)
 
 
-def _fitting(table: Table, width: int) -> tuple[int, list[int]]:
-    """The number of columns that fit, from the left, and their minimal widths; titles are folded if more columns fit
-    then."""
-    least = max(2, table.naming + 1, table.repeated + 1)
-
-    def count(needed: Sequence[int]) -> int:
-        fitting = len(needed)
-        while fitting > least and _taken(needed[:fitting]) > width:
-            fitting -= 1
-        return fitting
-
-    whole, folded = _needed(table, folded=False), _needed(table, folded=True)
-    needed = folded if count(folded) > count(whole) else whole
-    return count(needed), needed[: count(needed)]
+def _taken(columns: Iterable[Column], table: Table, *, folded: bool) -> int:
+    """The width of a table of such columns, with the space between them."""
+    return 2 + sum(_needed(column, table, folded=folded) + _PADDING for column in columns)
 
 
 def _words_of(title: str) -> list[str]:
@@ -226,39 +181,30 @@ def _words_of(title: str) -> list[str]:
     return title.replace(" %", "\u00a0%").split(" ")
 
 
-def _taken(widths: Iterable[int]) -> int:
-    """The width of a table of such columns, with the space between them."""
-    return 2 + sum(width + _PADDING for width in widths)
-
-
-def _rich(table: Table, room: Sequence[int]) -> Any:
+def _rich(columns: Sequence[Column], table: Table, width: int) -> Any:
+    """Some columns of a table; titles are folded where they have no room otherwise."""
     from rich import box
     from rich.table import Table as RichTable
     from rich.text import Text
 
-    shown = RichTable(
-        box=box.SIMPLE_HEAD,
-        padding=(0, 1),
-        pad_edge=False,
-        collapse_padding=True,
-    )
-    for each, letters in zip(table.columns, room, strict=True):
-        folded = textwrap.fill(" ".join(_words_of(each.title)), max(letters, 1))
-        title = Text(folded.replace("\u00a0", " "))
+    shown = RichTable(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, collapse_padding=True)
+    folded = _taken(columns, table, folded=False) > width
+    for each in columns:
+        letters = max(_needed(each, table, folded=folded), 1)
+        title = Text(textwrap.fill(" ".join(_words_of(each.title)), letters).replace("\u00a0", " "))
         if each.numeric:
             shown.add_column(title, justify="right", no_wrap=True)
         else:
             shown.add_column(title, overflow="fold", min_width=letters)
     group: list[str] | None = None
-    for row in table.rows:
+    for row in zip(*(c.cells for c in columns), strict=True):
         cells = [cell.text for cell in row]
-        if table.grouped:
-            if group == cells[: table.grouped]:
-                cells[: table.grouped] = [""] * table.grouped
-            else:
-                if group is not None:
-                    shown.add_section()
-                group = cells[: table.grouped]
+        if table.grouped and group == cells[: table.grouped]:
+            cells[: table.grouped] = [""] * table.grouped
+        elif table.grouped:
+            if group is not None:
+                shown.add_section()
+            group = cells[: table.grouped]
         shown.add_row(*(Text(text, style="bold" if cell.best else "") for text, cell in zip(cells, row, strict=True)))
     return shown
 
@@ -288,37 +234,7 @@ def html(parts: Iterable[Part]) -> str:
     return environment().get_template("parts.html.j2").module.fragment(list(parts))  # type: ignore[attr-defined]
 
 
-# Markdown and CSV ----------------------------------------------------------------------------------------------------
-
-
-def markdown(table: Table) -> str:
-    """A GitHub table; names cannot break it."""
-
-    def cell(value: str) -> str:
-        value = value.replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
-        return " ".join(value.split())
-
-    lines = [f"**{table.title}.** {cell(table.caption)}", ""]
-    lines.append("| " + " | ".join(cell(c.title) for c in table.columns) + " |")
-    lines.append("|" + "|".join("---:" if c.numeric else ":---" for c in table.columns) + "|")
-    for row in table.rows:
-        shown = [f"**{cell(c.text)}**" if c.best else cell(c.text) for c in row]
-        lines += ["| " + " | ".join(shown) + " |"]
-    return "\n".join([*lines, *(f"\n{cell(note)}" for note in table.notes)]) + "\n"
-
-
-def comma_separated(table: Table) -> str:
-    """The numbers behind the table in full precision, or else its cells."""
-    if table.data is not None:
-        return table.data.to_csv(index=False)
-    import csv
-    import io
-
-    written = io.StringIO()
-    lines = csv.writer(written, lineterminator="\n")
-    lines.writerow([each.title for each in table.columns])
-    lines.writerows([cell.text for cell in row] for row in table.rows)
-    return written.getvalue()
+# Files ---------------------------------------------------------------------------------------------------------------
 
 
 def write_table(table: Table, folder: Path) -> list[Path]:
@@ -329,13 +245,37 @@ def write_table(table: Table, folder: Path) -> list[Path]:
     return [folder / f"{table.name}{suffix}" for suffix in formats]
 
 
-# LaTeX, with booktabs and siunitx ------------------------------------------------------------------------------------
+def comma_separated(table: Table) -> str:
+    """The numbers behind the table in full precision, or else its cells."""
+    import pandas as pd
 
-_SIGNS = {
+    data = table.data
+    if data is None:
+        rows = [[cell.text for cell in row] for row in table.rows]
+        data = pd.DataFrame(rows, columns=[c.title for c in table.columns])
+    return data.to_csv(index=False)
+
+
+def markdown(table: Table) -> str:
+    """A GitHub table; names cannot break it."""
+
+    def cell(value: str) -> str:
+        for sign, escaped in (("\\", "\\\\"), ("|", "\\|"), ("<", "&lt;"), ("*", "\\*")):
+            value = value.replace(sign, escaped)
+        return " ".join(value.split())
+
+    lines = [f"**{table.title}.** {cell(table.caption)}", ""]
+    lines.append("| " + " | ".join(cell(c.title) for c in table.columns) + " |")
+    lines.append("|" + "|".join("---:" if c.numeric else ":---" for c in table.columns) + "|")
+    rows = [[f"**{cell(c.text)}**" if c.best else cell(c.text) for c in row] for row in table.rows]
+    lines += [f"| {' | '.join(row)} |" for row in rows]
+    return "\n".join([*lines, *(f"\n{cell(note)}" for note in table.notes)]) + "\n"
+
+
+_SIGNS = {sign: f"\\{sign}" for sign in "&%$#_{}"} | {
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
-    **{sign: f"\\{sign}" for sign in "&%$#_{}"},
     "µ": r"\ensuremath{\mu}",
     "σ": r"\ensuremath{\sigma}",
     "√": r"\ensuremath{\surd}",
@@ -352,34 +292,31 @@ _NUMBER = re.compile(r"-?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
 def latex(table: Table, width: float | None = None) -> str:
-    """To be read into a document with `\\input`: the bare table, or one that floats with its caption in a column of
-    that many inches; a longtable if it has more than `LONG` rows."""
-    shape = "".join("r" if each.numeric else "l" for each in table.columns)
-    titles = _latex_row(map(_latex_title, table.columns))
-    head, rows = (
-        [r"\toprule", titles, r"\midrule"],
-        [_latex_row(map(_latex_cell, r, table.columns)) for r in table.rows],
-    )
-    caption = (
-        rf"\caption{{{escaped(table.title)}. {escaped(table.caption)}}}\label{{tab:{table.name.replace('_', '-')}}}"
-    )
+    """To be read into a document with `\\input`, with booktabs and siunitx: the bare table, or one that floats with its
+    caption in a column of that many inches; a longtable if it has more than `LONG` rows."""
+    shape = "@{}" + "".join("r" if c.numeric else "l" for c in table.columns) + "@{}"
+    head = [r"\toprule", _latex_row(map(_latex_title, table.columns)), r"\midrule"]
+    rows = [_latex_row(map(_latex_cell, row, table.columns)) for row in table.rows]
+    label = f"tab:{table.name.replace('_', '-')}"
+    caption = rf"\caption{{{escaped(table.title)}. {escaped(table.caption)}}}\label{{{label}}}"
     size = rf"\footnotesize\setlength{{\tabcolsep}}{{{COLUMN_GAP:g}pt}}"
-    needs = r"\usepackage{booktabs, longtable, siunitx, amsmath} and \usepackage[T1]{fontenc}"
-    comment = f"% {' '.join(table.title.split())}. Needs {needs}."
+    comment = (
+        rf"% {' '.join(table.title.split())}. Needs \usepackage{{booktabs, longtable, siunitx, amsmath}} and"
+        r" \usepackage[T1]{fontenc}."
+    )
     if len(table) > LONG:
-        more = rf"\multicolumn{{{len(shape)}}}{{r}}{{continued on the next page}} \\"
+        comment += " A longtable stands where the text has one column."
+        more = rf"\multicolumn{{{len(table.columns)}}}{{r}}{{continued on the next page}} \\"
         foot = [r"\midrule", more, r"\endfoot", r"\bottomrule", r"\endlastfoot"]
         named = [] if width is None else [rf"{caption} \\"]
-        lines = [*named, *head, r"\endfirsthead", *head, r"\endhead", *foot, *rows, r"\end{longtable}"]
-        lines = [rf"\begin{{longtable}}{{@{{}}{shape}@{{}}}}", *lines]
-        comment += " A longtable stands where the text has one column."
+        lines = [*named, *head, r"\endfirsthead", *head, r"\endhead", *foot, *rows]
+        lines = [rf"\begin{{longtable}}{{{shape}}}", *lines, r"\end{longtable}"]
         lines = lines if width is None else [f"{{{size}", *lines, "}"]
     else:
-        lines = [rf"\begin{{tabular}}{{@{{}}{shape}@{{}}}}", *head, *rows, r"\bottomrule", r"\end{tabular}"]
+        lines = [rf"\begin{{tabular}}{{{shape}}}", *head, *rows, r"\bottomrule", r"\end{tabular}"]
         if width is not None:
             kind = "table" if width <= COLUMN else "table*"
-            begin = [rf"\begin{{{kind}}}[tb]", r"\centering", caption, size]
-            lines = [*begin, *lines, rf"\end{{{kind}}}"]
+            lines = [rf"\begin{{{kind}}}[tb]", r"\centering", caption, size, *lines, rf"\end{{{kind}}}"]
     return "\n".join([comment, *lines, ""])
 
 
@@ -400,7 +337,10 @@ def letters(column: Column) -> int:
 
 
 def _latex_cell(cell: Cell, column: Column) -> str:
-    text = _set_numbers(escaped(cell.text)) if column.numeric else escaped(cell.text)
+    """A cell; siunitx sets numbers, whose digits it groups by its own rules."""
+    text = escaped(cell.text)
+    if column.numeric:
+        text = _NUMBER.sub(lambda m: f"\\num{{{m.group().replace(',', '')}}}", text).replace(r"} \%", r"}\,\%")
     return rf"\textbf{{{text}}}" if cell.best else text
 
 
@@ -410,9 +350,3 @@ def escaped(text: str) -> str:
         _SIGNS.get(char) or (char if char.isascii() and char.isprintable() else f"\\texttt{{U+{ord(char):04X}}}")
         for char in " ".join(text.split())
     )
-
-
-def _set_numbers(escaped: str) -> str:
-    """The numbers of a cell set by siunitx, which groups digits by its own rules."""
-    text = _NUMBER.sub(lambda m: f"\\num{{{m.group().replace(',', '')}}}", escaped)
-    return text.replace(r"} \%", r"}\,\%")

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench.report.table import Cell, Column, Table, column, sort_key, terminal, texts, words
-from ipe_bench.report.words import brief, compact, duration, limits, plain, points, reported, shown
-from ipe_bench.statistics.records import CAP, Statistic, all_statistics
+from ipe_bench.report.words import brief, compact, duration, limits, percent, plain, reported, shown
+from ipe_bench.statistics.records import CAP, all_statistics
 from ipe_bench.statistics.summary import ALL, BEST
 from ipe_bench.statistics.summary import columns as summary_columns
 
@@ -17,53 +17,66 @@ if TYPE_CHECKING:
     import pandas as pd
     from rich.console import Group
 
-WIDE = 120
 _WIDE_ENOUGH = 100
 """Letters of a screen that has room for failures, and for verdicts in words."""
-
-
-def render(
-    summary: pd.DataFrame | Sequence[Mapping[str, Any]], totals: Iterable[Table] = (), width: int = WIDE
-) -> Group:
-    """One table per setting (measurement, noise, and every option that differs), a section per error scale.
-
-    `summary` is the frame or its rows. Columns that do not fit the width are left out, and named below. Runs on
-    certified readings and on problems of known minimum are shown by their `totals` instead.
-    """
-    tables = list(totals)
-    listed: list[Any] = list(summary) if isinstance(summary, Sequence) else [*summary.to_dict("records")]
-    tables += _settings([row for row in listed if row["parameter"] == ALL and row["noise"] != "certified"], width)
-    return terminal(tables or ["nothing is stored yet"], width)
-
-
-def _settings(rows: Sequence[Mapping[str, Any]], width: int) -> list[Table]:
-    """A table for each setting; what its columns mean stands below the last."""
-    known = {*summary_columns(), "parameter", "unit", "estimator", "error_scale"}
-    columns = dict.fromkeys(c for row in rows for c in row if c not in known and not c.startswith("estimator."))
-    settings: dict[str, list[Any]] = {}
-    for row in rows:
-        named = {k: row.get(k) for k in columns}
-        title = ", ".join(
-            str(v) if k in ("measurement", "noise") else f"{k}={plain(v)}" for k, v in named.items() if _says(v)
-        )
-        settings.setdefault(title, []).append(row)
-    tables = [_setting(title, part, width) for title, part in settings.items()]
-    if tables:
-        tables[-1] = replace(tables[-1], notes=LEGEND)
-    return tables
-
-
 LEGEND = (
     "success: of all trials, in per cent, with its 95 % interval; bold: may be the best, since no rival surely succeeds"
     " more often. failed (on wide screens): known / silently, by whether the status or the test of fit says so.",
     "error: median / 95 % quantile of all trials, in multiples of the bound at the truth, 1 at best; efficiency: one"
     f" over its root mean square, a trial counting at most {CAP:g}.",
-    "NEES: squared error over the variance that the estimator claims (median), 1 if honest; optimistic (+): it claims"
-    " too much, pessimistic (-): too little, diverged (!): it is lost and does not know. cost: simulations.",
+    "NEES: squared error over the variance that the estimator claims, 1 if honest, the median of all trials; the word"
+    " or sign is the verdict on the converged trials alone: optimistic (+) claims too much, pessimistic (-) too little,"
+    " diverged (!) is lost and does not know. cost: simulations.",
 )
 """What the columns of the overview mean."""
 _VERDICTS = {"consistent": ("", ""), "optimistic": ("optimistic", "+"), "pessimistic": ("pessimistic", "-")}
 _VERDICTS |= {"diverged but confident": ("diverged", "!"), "-": ("", "")}
+
+
+def render(
+    summary: pd.DataFrame | Sequence[Mapping[str, Any]], totals: Iterable[Table] = (), width: int = 120
+) -> Group:
+    """A table per setting (measurement, noise, and every option that differs), a section per error scale.
+
+    `summary` is the frame or its rows. Runs on certified readings and on problems of known minimum are shown by their
+    `totals` instead.
+    """
+    listed: list[Any] = list(summary) if isinstance(summary, Sequence) else [*summary.to_dict("records")]
+    rows = [row for row in listed if row["parameter"] == ALL and row["noise"] != "certified"]
+    known = {*summary_columns(), "parameter", "unit", "estimator", "error_scale"}
+    columns = dict.fromkeys(c for row in rows for c in row if c not in known and not c.startswith("estimator."))
+    settings: dict[str, list[Any]] = {}
+    for row in rows:
+        # An option that the class lacks is left out.
+        named = {k: plain(row.get(k)) for k in columns if plain(row.get(k)) != "-"}
+        title = ", ".join(v if k in ("measurement", "noise") else f"{k}={v}" for k, v in named.items())
+        settings.setdefault(title, []).append(row)
+    tables = [_setting(title, part, width) for title, part in settings.items()]
+    if tables:
+        tables[-1] = replace(tables[-1], notes=LEGEND)
+    return terminal([*totals, *tables] or ["nothing is stored yet"], width)
+
+
+def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table:
+    """The table of one setting."""
+    scales = column("scale", [row["error_scale"] for row in rows], lambda v: f"{v:g}")
+    columns = [scales, *overview_columns(rows, leading(rows, ["error_scale"]), narrow=width < _WIDE_ENOUGH)]
+    # The number of trials stands in the title if it is the same for all.
+    counts = sorted({row["trials"] for row in rows})
+    if len(counts) > 1:
+        columns.append(column("trials", [row["trials"] for row in rows], str))
+    else:
+        title = f"{title}: {counts[0]} trial{'s' * (counts[0] != 1)} per row"
+    for record in all_statistics():
+        if "terminal" in record.where and reported(record, rows):
+            columns.append(
+                texts(record.titles.get("terminal", record.title), [shown(record, "terminal", row) for row in rows])
+            )
+            if "terminal" in record.limits_titles:
+                ends = [limits(record, "terminal", row) for row in rows]
+                written = [f"{compact(low)}-{compact(high)}" if math.isfinite(low) else "-" for low, high in ends]
+                columns.append(texts(record.limits_titles["terminal"], written))
+    return Table("summary", title, "", columns, grouped=1, whole="summary.csv")
 
 
 def leading(rows: Sequence[Mapping[str, Any]], scenario: Sequence[str]) -> list[bool]:
@@ -80,9 +93,8 @@ def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *,
         marks = best or [False] * len(rows)
         return Column(title, [Cell(show(r), sort_key(r[key]), mark) for r, mark in zip(rows, marks, strict=True)])
 
-    def success(row: Mapping[str, Any]) -> str:
-        low, high = 100 * row["success_low"], 100 * row["success_high"]
-        return f"{points(row['success'])} ({low:.0f}-{high:.0f})"
+    def points(share: float) -> str:
+        return percent(share).removesuffix(" %")
 
     def efficiency(row: Mapping[str, Any]) -> str:
         # Where half of the trials are capped, it is a limit and no value.
@@ -91,47 +103,20 @@ def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *,
     def nees(row: Mapping[str, Any]) -> str:
         return f"{brief(row['nees_median'])} {_VERDICTS.get(row['verdict'], (row['verdict'], '?'))[narrow]}".strip()
 
-    def failed(row: Mapping[str, Any]) -> str:
-        return f"{points(row['failed_known'])} / {points(row['failed_silent'])}"
-
     slash = "/" if narrow else " / "
-    found = [
+    failed = cells("failed", "failed_silent", lambda r: f"{points(r['failed_known'])} / {points(r['failed_silent'])}")
+    return [
         words("estimator", [row["estimator"] for row in rows], best),
-        cells("success", "success", success, best),
-        cells("failed", "failed_silent", failed),
+        cells(
+            "success",
+            "success",
+            lambda r: f"{points(r['success'])} ({100 * r['success_low']:.0f}-{100 * r['success_high']:.0f})",
+            best,
+        ),
+        *([] if narrow else [failed]),
         cells("error", "error_median", lambda r: f"{brief(r['error_median'])}{slash}{brief(r['error_q95'])}"),
         cells("eff." if narrow else "efficiency", "efficiency_capped", efficiency),
         cells("NEES", "nees_median", nees),
         cells("cost", "simulations_median", lambda r: brief(r["simulations_median"])),
         cells("time", "time_median_s", lambda r: duration(r["time_median_s"], 2)),
     ]
-    return [column for column in found if not (narrow and column.title == "failed")]
-
-
-def _setting(title: str, part: Sequence[Mapping[str, Any]], width: int) -> Table:
-    """The table of one setting."""
-    # The number of trials stands in the title where it is the same for all.
-    counts = sorted({row["trials"] for row in part})
-    scales = column("scale", [row["error_scale"] for row in part], lambda v: f"{v:g}")
-    columns = [scales, *overview_columns(part, leading(part, ["error_scale"]), narrow=width < _WIDE_ENOUGH)]
-    if len(counts) > 1:
-        columns.append(column("trials", [row["trials"] for row in part], str))
-    for record in all_statistics():
-        if "terminal" in record.where and reported(record, part):
-            columns += _statistic(record, part)
-    title = f"{title}: {counts[0]} trial{'s' * (counts[0] != 1)} per row" if len(counts) == 1 else title
-    return Table("summary", title, "", columns, grouped=1, whole="summary.csv")
-
-
-def _statistic(record: Statistic, part: Sequence[Mapping[str, Any]]) -> Iterator[Column]:
-    """The column of a statistic, and that of its interval if it has one."""
-    yield texts(record.titles.get("terminal", record.title), [shown(record, "terminal", row) for row in part])
-    if "terminal" in record.limits_titles:
-        ends = [limits(record, "terminal", row) for row in part]
-        written = [f"{compact(low)}-{compact(high)}" if math.isfinite(low) else "-" for low, high in ends]
-        yield texts(record.limits_titles["terminal"], written)
-
-
-def _says(value: Any) -> bool:
-    """Whether a title names a setting; an option that the class lacks is left out."""
-    return value is not None and not (isinstance(value, float) and math.isnan(value))

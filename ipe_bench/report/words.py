@@ -16,6 +16,16 @@ def plain(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
+def enumerate_few(items: Sequence[str], most: int = 6) -> str:
+    """'a, b and 3 others'."""
+    more = f" and {len(items) - most} others" if len(items) > most else ""
+    return ", ".join(items[:most]) + more
+
+
+def _not_finite(value: float) -> str:
+    return "inf" if value == math.inf else "-"
+
+
 def percent(share: float) -> str:
     """A share in per cent; 100 and 0 only if it is all or none."""
     if not math.isfinite(share):
@@ -26,34 +36,10 @@ def percent(share: float) -> str:
     return f"{value:.0f} %" if value in (0, 100) else f"{value:.1f} %"
 
 
-def points(share: float) -> str:
-    """A share in per cent without the sign; 100 and 0 only if it is all or none."""
-    return percent(share).removesuffix(" %")
-
-
-def brief(value: float) -> str:
-    """Two decimals below ten, three figures above, in at most five characters."""
-    if not math.isfinite(value):
-        return "inf" if value == math.inf else "-"
-    if value == int(value) and value < 1000:
-        return str(int(value))
-    if value >= 999.5e6:
-        return f"{value:.0e}".replace("e+0", "e").replace("e+", "e")
-    return compact(value) if value >= 9.995 else f"{value:.2f}"
-
-
-def enumerate_few(items: Sequence[str], most: int = 6) -> str:
-    """'a, b and 3 others'."""
-    items = list(items)
-    if len(items) > most:
-        return ", ".join(items[:most]) + f" and {len(items) - most} others"
-    return ", ".join(items)
-
-
 def short(value: float) -> str:
     """About four figures."""
     if not math.isfinite(value):
-        return "inf" if value == math.inf else "-"
+        return _not_finite(value)
     if value == int(value) and abs(value) < 1000:
         return str(int(value))
     if abs(value) >= 1e6 or 0 < abs(value) < 1e-3:
@@ -63,24 +49,26 @@ def short(value: float) -> str:
     return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"
 
 
+def brief(value: float) -> str:
+    """Two decimals below ten, three figures above, in at most five characters."""
+    if not math.isfinite(value):
+        return _not_finite(value)
+    if value == int(value) and value < 1000:
+        return str(int(value))
+    if value >= 999.5e6:
+        return f"{value:.0e}".replace("e+0", "e").replace("e+", "e")
+    return compact(value) if value >= 9.995 else f"{value:.2f}"
+
+
 def compact(value: float) -> str:
     """Three figures in at most five characters if possible: thousands as k, millions as M."""
     if not math.isfinite(value):
-        return "inf" if value == math.inf else "-"
+        return _not_finite(value)
     rounded = float(f"{value:.2e}")
     if rounded == 0 or not 1e-2 <= abs(rounded) < 1e9:
         return f"{value:.1e}" if rounded else "0"
-    size, letter = next((s, u) for s, u in ((1e6, "M"), (1e3, "k"), (1.0, ""), (1e-9, "")) if abs(rounded) >= s)
-    size = 1.0 if size < 1 else size
-    decimals = max(0, 2 - math.floor(math.log10(abs(rounded) / size) + 1e-9))
-    return f"{rounded / size:.{decimals}f}{letter}"
-
-
-def precise(value: float) -> str:
-    """Four significant figures, for physical units of any size."""
-    if not math.isfinite(value):
-        return "inf" if value == math.inf else "-"
-    return f"{value:.4g}"
+    size, letter = next(((s, u) for s, u in ((1e6, "M"), (1e3, "k")) if abs(rounded) >= s), (1.0, ""))
+    return f"{rounded / size:.{_decimals(rounded / size, 3)}f}{letter}"
 
 
 def duration(seconds: float, figures: int = 3) -> str:
@@ -91,9 +79,12 @@ def duration(seconds: float, figures: int = 3) -> str:
         return "0 s"
     rounded = float(f"{seconds:.{figures - 1}e}")
     size, unit = next(((s, u) for s, u in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")) if rounded >= s), (1e-9, "ns"))
-    value = rounded / size
-    decimals = max(0, figures - 1 - math.floor(math.log10(value) + 1e-9))
-    return f"{value:.{decimals}f} {unit}"
+    return f"{rounded / size:.{_decimals(rounded / size, figures)}f} {unit}"
+
+
+def _decimals(value: float, figures: int) -> int:
+    """Those that leave a number so many figures."""
+    return max(0, figures - 1 - math.floor(math.log10(abs(value)) + 1e-9))
 
 
 def p_value(p: float, least: float = 0.0) -> str:
@@ -106,13 +97,18 @@ def p_value(p: float, least: float = 0.0) -> str:
     return f"{p:.3f}" if p >= 1e-3 else f"{p:.0e}" if p > 1e-300 else "<1e-300"
 
 
+# Statistics ----------------------------------------------------------------------------------------------------------
+
+
 def shower(kind: Kind, where: Where) -> Callable[[Any], str]:
     """How values of that kind are written in that table."""
+    # Physical units are of any size.
+    physical = (lambda v: f"{v:.4g}" if math.isfinite(v) else _not_finite(v)) if where == "parameters" else short
     return {
         "count": lambda v: f"{int(v):d}" if math.isfinite(v) else "-",
         "share": percent,
         "number": short,
-        "physical": precise if where == "parameters" else short,
+        "physical": physical,
         "seconds": (lambda v: duration(v, 2)) if where == "terminal" else duration,
         "probability": p_value,
         "word": str,

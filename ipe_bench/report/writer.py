@@ -1,9 +1,8 @@
-"""The folder of a command that answers one question: whose it is, and its files as JSON, CSV and figures."""
+"""The folder of a command that answers one question: whose it is, and its page, JSON, CSV and figures."""
 
 from __future__ import annotations
 
-import csv
-import io
+import base64
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,22 +13,25 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import write_text
+from ipe_bench.report.table import Part, environment
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from ipe_bench.report.figures.drawing import Drawing
 
 
-def claim(folder: Path, command: Any, *, elsewhere: bool, result: str, files: Sequence[str]) -> Path:
+def claim(folder: Path, name: str, command: Any, *, elsewhere: bool, files: Sequence[str] = ()) -> Path:
     """Reserves the folder that a command writes to: it is new, or holds what the same command wrote before.
 
-    `result` is the JSON file that says which command it was, `files` are the others. If the folder holds anything else
-    of ours, `elsewhere` allows folder-2, folder-3 and so on in its place.
+    `name`.json says which command that was, `files` are further files of its kind. If the folder holds anything else of
+    ours, `elsewhere` allows folder-2, folder-3 and so on in its place.
 
     Raises:
         UserError: the folder is taken, or cannot be written to.
     """
     number, candidate = 1, folder
-    while not _is_free(candidate, command, result, files):
+    while not _is_free(candidate, f"{name}.json", command, files):
         if not elsewhere:
             raise UserError(
                 f"output={candidate}: holds results of another command, which are not overwritten; choose another "
@@ -48,7 +50,7 @@ def claim(folder: Path, command: Any, *, elsewhere: bool, result: str, files: Se
     return candidate
 
 
-def _is_free(folder: Path, command: Any, result: str, files: Sequence[str]) -> bool:
+def _is_free(folder: Path, result: str, command: Any, files: Sequence[str]) -> bool:
     if not (folder / result).exists():
         return not any((folder / name).exists() for name in files)
     try:
@@ -57,26 +59,41 @@ def _is_free(folder: Path, command: Any, result: str, files: Sequence[str]) -> b
         return False
 
 
-def write_json(path: Path, schema: int, command: Any, content: Mapping[str, Any]) -> Path:
-    """Writes the result of a command; it comes first, since it says whose folder this is."""
-    write_text(path, json.dumps({"schema": schema, "command": command, **content}, indent=1) + "\n")
-    return path
+def write(
+    folder: Path,
+    name: str,
+    title: str,
+    parts: Iterable[Part],
+    *,
+    lead: str = "",
+    content: Mapping[str, Any] | None = None,
+    table: tuple[str, pd.DataFrame] | None = None,
+    drawings: Iterable[Drawing] = (),
+    old: Sequence[str] = (),
+) -> list[Path]:
+    """Writes the files of a command, each of which appears whole or not at all, and returns them.
 
-
-def write_rows(path: Path, rows: Iterable[Sequence[Any]]) -> Path:
-    """Writes rows as CSV."""
-    written = io.StringIO()
-    csv.writer(written).writerows(rows)
-    write_text(path, written.getvalue())
-    return path
-
-
-def draw_into(folder: Path, drawings: Iterable[Drawing], names: Iterable[str]) -> list[Path]:
-    """Writes figures, and removes those of these names that the same command drew before and does not draw now."""
-    files = [path for drawing in drawings for path in drawing.save(folder)]
-    for name in names:
-        if folder / name not in files:
-            (folder / name).unlink(missing_ok=True)
+    They are `name`.json with the `content`, the `table` under its name, the `drawings`, and the
+    page `name`.html of all the tables, sentences and figures below the sentence `lead`. Of the `old` files, which the
+    same command may have written before, those go that it does not write now.
+    """
+    files = []
+    if content is not None:  # first, since it says whose folder this is
+        files.append(folder / f"{name}.json")
+        write_text(files[0], json.dumps(content, indent=1) + "\n")
+    if table is not None:
+        files.append(folder / table[0])
+        write_text(files[-1], table[1].to_csv(index=False))
+    figures = []
+    for drawing in drawings:
+        files += drawing.save(folder)
+        png = base64.b64encode((folder / f"{drawing.name}.png").read_bytes()).decode()
+        figures.append({"title": drawing.title, "caption": drawing.caption, "png": png})
+    page = environment().get_template("answer.html.j2")
+    files.append(folder / f"{name}.html")
+    write_text(files[-1], page.render(title=title, lead=lead, parts=list(parts), figures=figures))
+    for other in {folder / each for each in old} - set(files):
+        other.unlink(missing_ok=True)
     return files
 
 
