@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import os
 import socket
 import tempfile
@@ -69,27 +68,3 @@ def cache_folder() -> Path:
             return base
     except OSError:
         return Path(tempfile.mkdtemp(prefix="ipe-bench-"))
-
-
-_SEAL = b"ipe_bench_sha256:"
-BLANK_SEAL = (_SEAL + b"0" * 64).decode()
-"""Stands in content that is to be sealed where the digest goes."""
-
-
-def seal(content: bytes) -> bytes:
-    """The content with the SHA-256 digest of all of it in place of the last `BLANK_SEAL` in it."""
-    at = content.rindex(BLANK_SEAL.encode()) + len(_SEAL)
-    return b"".join([content[:at], hashlib.sha256(content).hexdigest().encode(), content[at + 64 :]])
-
-
-def is_sealed(content: bytes) -> bool | None:
-    """Whether not one bit has changed since `seal`; None where there is no seal at all."""
-    at = content.rfind(_SEAL)
-    if at < 0:
-        return None
-    at += len(_SEAL)
-    view = memoryview(content)
-    digest = hashlib.sha256(view[:at])
-    digest.update(b"0" * 64)
-    digest.update(view[at + 64 :])
-    return digest.hexdigest().encode() == content[at : at + 64]

@@ -21,20 +21,16 @@ from typing import Any
 
 from ipe_bench import __version__
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.files import BLANK_SEAL, is_sealed, seal, write_atomically, write_bytes
+from ipe_bench.basics.files import write_atomically
 from ipe_bench.runs.results import Results, require_results
 from ipe_bench.runs.store import Store
 
-SCHEMA = 2
+SCHEMA = 3
 MANIFEST = "manifest.json"
 SUFFIX = ".zip"
 BUNDLES = "bundles"
 """Where bundles are unpacked below a report on them."""
-_EPOCH = (1980, 1, 1, 0, 0, 0)
-"""The time of every entry, since times are no part of what is bundled."""
 _NAME = re.compile(r"(?!\.\.?/)[^/\\\x00-\x1f]{1,200}/(trials|runs|failed)/[A-Za-z0-9][A-Za-z0-9._-]*")
-_LARGEST = 1 << 33
-"""Bytes that a bundle may unpack to."""
 _BROKEN = (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, NotImplementedError)
 _BROKEN += (KeyError, ValueError, TypeError, AttributeError)
 """What reading an archive may raise that is cut short, changed, encrypted or none at all."""
@@ -83,7 +79,7 @@ def write_bundle(directories: Sequence[Path | str], path: Path, further: Mapping
         raise UserError(f"{', '.join(map(str, directories))}: holds no whole results to bundle; run something first")
     digests = {name: _digest(content) for name, content in sorted(contents.items())}
     record = {"bundle": "ipe-bench", "schema": SCHEMA, "version": __version__, **(further or {}), "files": digests}
-    manifest = seal(json.dumps({**record, "seal": BLANK_SEAL}, indent=1, ensure_ascii=False).encode())
+    manifest = json.dumps(record, indent=1, ensure_ascii=False).encode()
     if path.exists():
         found = read_bundle(path)
         if found.digest != _digest(manifest):
@@ -92,12 +88,12 @@ def write_bundle(directories: Sequence[Path | str], path: Path, further: Mapping
 
     def write(temporary: Path) -> None:
         with zipfile.ZipFile(temporary, "w") as archive:
-            for name, content in {MANIFEST: manifest, **{name: contents[name] for name in digests}}.items():
-                entry = zipfile.ZipInfo(name, _EPOCH)
+            for name in (MANIFEST, *digests):
+                entry = zipfile.ZipInfo(name)  # of 1980: times are no part of what is bundled
                 entry.external_attr, entry.create_system = 0o644 << 16, 3
                 # Tables are compressed already.
                 entry.compress_type = zipfile.ZIP_STORED if name.endswith(".parquet") else zipfile.ZIP_DEFLATED
-                archive.writestr(entry, content)
+                archive.writestr(entry, manifest if name == MANIFEST else contents[name])
 
     write_atomically(path, write)
     return read_bundle(path)
@@ -109,54 +105,34 @@ def _contents(directory: Path) -> dict[str, bytes]:
     while True:
         damaged = Results.read([directory]).damaged
         files = [p for folder in (store.trials, store.runs, store.failed) for p in folder.glob("[!.]*.*")]
+        kept = [file for file in files if file.suffix in (".parquet", ".json") and file not in damaged]
         with contextlib.suppress(FileNotFoundError):
-            return {
-                f"{file.parent.name}/{file.name}": file.read_bytes()
-                for file in files
-                if file.suffix in (".parquet", ".json") and file not in damaged
-            }
+            return {f"{file.parent.name}/{file.name}": file.read_bytes() for file in kept}
 
 
-def read_bundle(path: Path, into: Path | None = None) -> Bundle:
-    """The bundle, all of whose files were read and are as its manifest says; they are written below `into`, if given.
+def read_bundle(path: Path) -> Bundle:
+    """The bundle, all of whose files were read and are as its manifest says.
 
     Raises:
         UserError: it is none, or was damaged or changed.
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > _LARGEST:
-                raise UserError(f"{path}: would unpack to more than {_LARGEST >> 30} GiB; nothing of it is read")
             manifest = archive.read(MANIFEST)
-            digests = _checked(path, manifest, archive.namelist())
-            for name, digest in digests.items():
-                content = archive.read(name)
-                if _digest(content) != digest:
+            record = json.loads(manifest)
+            if record["bundle"] != "ipe-bench" or record["schema"] != SCHEMA:
+                raise UserError(f"{path}: is a bundle of another version of ipe-bench; read it with that one")
+            digests, there = dict(record["files"]), {*archive.namelist()} - {MANIFEST}
+            for name in sorted({*digests, *there}):
+                if not _NAME.fullmatch(name):
+                    raise UserError(f"{path}: {name!r} is no name of a result; nothing of it is read")
+                if name not in there or digests.get(name) != _digest(archive.read(name)):
                     raise UserError(
                         f"{path}: was damaged or changed: {name} is not what the manifest says; get it anew"
                     )
-                if into is not None and not ((into / name).is_file() and (into / name).read_bytes() == content):
-                    write_bytes(into / name, content)
     except _BROKEN as error:
         raise UserError(f"{path}: is not a whole bundle of ipe-bench ({error or type(error).__name__})") from None
     return Bundle(path, _digest(manifest), digests)
-
-
-def _checked(path: Path, manifest: bytes, names: Sequence[str]) -> dict[str, str]:
-    """The digests by name, if the manifest is whole and lists exactly what is in the archive."""
-    if not is_sealed(manifest):
-        raise UserError(f"{path}: was damaged or changed: the manifest does not match its own digest; get it anew")
-    record = json.loads(manifest)
-    if record["bundle"] != "ipe-bench" or record["schema"] != SCHEMA:
-        raise UserError(f"{path}: is a bundle of another version of ipe-bench; read it with that one")
-    digests = dict(record["files"])
-    if sorted(names) != sorted([MANIFEST, *digests]):
-        odd = sorted({*names} ^ {MANIFEST, *digests}) or ["a name that stands there twice"]
-        raise UserError(f"{path}: was damaged or changed: {odd[0]} is not in both manifest and archive; get it anew")
-    for name in digests:
-        if not _NAME.fullmatch(name):
-            raise UserError(f"{path}: {name!r} is no name of a result; nothing of it is read")
-    return digests
 
 
 @contextlib.contextmanager
@@ -175,7 +151,8 @@ def opened(paths: Sequence[Path | str], into: Path | None = None) -> Iterator[li
             bundle = read_bundle(path)  # nothing is written of one that is not whole
             place = into or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ipe-bench-")))
             place = place / f"{path.name.removesuffix(SUFFIX)}-{bundle.digest[:8]}"
-            read_bundle(path, place)
+            with zipfile.ZipFile(path) as archive:
+                archive.extractall(place, bundle.files)
             found += [place / folder for folder in bundle.folders]
         yield found
 

@@ -1,14 +1,15 @@
-"""Stored files: Parquet whose pages carry checksums and whose footer carries a digest, so that each proves what it is.
+"""Stored files that prove what they are: Parquet parts with the rows of trials, and JSON records.
 
-Parquet's own CRC-32 covers the pages and nothing else; the digest covers the footer, which says where the pages are,
-what they belong to and by what they were made. Which files there are is left to `runs.results`.
+Parquet's own CRC-32 covers the pages and nothing else; a SHA-256 digest covers the footer, which says where the pages
+are, what they belong to and by what they were made. It stands between the pages and the footer, where every reader of
+Parquet passes over it. Which files there are is left to `runs.results`.
 """
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import functools
+import hashlib
 import json
 import os
 import re
@@ -23,19 +24,19 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ipe_bench.basics.files import BLANK_SEAL, is_sealed, seal, write_atomically
+from ipe_bench.basics.files import write_atomically, write_text
 from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.provenance import canonical_json
 
-SCHEMA = 3
+SCHEMA = 4
 FOOTER, HISTORY = b"ipe_bench", b"history"
 TRUTH = "truth"
 """Label of the files that hold the truth and its bounds, in place of an estimator's."""
-ROW_GROUP = 1 << 16
-"""Number of rows that are compressed together."""
 _TAIL = 8
 """Bytes at the end of a Parquet file: the length of the footer, and a mark."""
+_DIGEST = 32
 _NAME = re.compile(r"([0-9a-f]+)-(\d+)-(\d+)\.parquet")
+_OLDER = tuple(f'"schema":{number},'.encode() for number in range(1, SCHEMA))
 
 
 class Unusable(Exception):
@@ -44,6 +45,9 @@ class Unusable(Exception):
 
 class Outdated(Unusable):
     """A file that an older version wrote."""
+
+    def __init__(self) -> None:
+        super().__init__("was written by an older version of ipe-bench")
 
 
 @dataclass(frozen=True)
@@ -83,14 +87,15 @@ class Part:
                 raise Unusable(f"damaged: its column trial does not count from {self.start} to {self.stop}")
         return footer, table.replace_schema_metadata(None)
 
-    def history(self) -> bytes | None:
-        """The iterates of its first trials, as `decoded_history` takes them; None if there are none.
+    def history(self) -> dict[str, Array] | None:
+        """The iterates of its first trials, by column; None if there are none.
 
         Raises:
             FileNotFoundError, Unusable: as `read`.
         """
         with _opened(self.path) as file:
-            return file.metadata.metadata.get(HISTORY)
+            text = file.metadata.metadata.get(HISTORY)
+        return None if text is None else {name: np.array(x, dtype=float) for name, x in json.loads(text).items()}
 
 
 @contextlib.contextmanager
@@ -101,7 +106,7 @@ def _opened(path: Path) -> Iterator[pq.ParquetFile]:
         if not stat.S_ISREG(os.lstat(path).st_mode):
             raise Unusable("damaged: is not a plain file")
         with pa.OSFile(str(path)) as source:
-            _require_sealed(source)
+            _require_footer(source)
             with pq.ParquetFile(source, page_checksum_verification=True) as file:
                 yield file
     except FileNotFoundError:
@@ -111,7 +116,7 @@ def _opened(path: Path) -> Iterator[pq.ParquetFile]:
         raise Unusable(f"damaged: cannot be read ({reason})") from None
 
 
-def _require_sealed(source: pa.NativeFile) -> None:
+def _require_footer(source: pa.NativeFile) -> None:
     """Raises Unusable unless the footer of a Parquet file is the one that was written."""
     size = source.size()
     source.seek(max(0, size - _TAIL))
@@ -119,11 +124,11 @@ def _require_sealed(source: pa.NativeFile) -> None:
     length = int.from_bytes(tail[:4], "little") + _TAIL
     if tail[4:] != b"PAR1" or length > size:
         raise Unusable("damaged: is cut short, or no table")
-    source.seek(size - length)
-    footer = source.read(length)
-    if b'"schema":1,' in footer or b'"schema":2,' in footer:
-        raise Outdated("was written by an older version of ipe-bench")
-    if not is_sealed(footer):
+    source.seek(max(0, size - length - _DIGEST))
+    digest, footer = source.read(min(_DIGEST, size - length)), source.read(length)
+    if any(schema in footer for schema in _OLDER):
+        raise Outdated
+    if hashlib.sha256(footer).digest() != digest:
         raise Unusable("damaged: its footer does not match its digest")
 
 
@@ -134,7 +139,12 @@ def _parsed(footer: bytes) -> Mapping[str, Any]:
 
 
 def write(
-    path: Path, table: pa.Table, footer: Mapping[str, Any], history: bytes | None = None, *, lasting: bool = False
+    path: Path,
+    table: pa.Table,
+    footer: Mapping[str, Any],
+    history: Mapping[str, Array] | None = None,
+    *,
+    lasting: bool = False,
 ) -> None:
     """Writes a file that appears complete or not at all; if `lasting`, not in a buffer of the system only.
 
@@ -146,11 +156,12 @@ def write(
     floats = [field.name for field in table.schema if pa.types.is_floating(field.type)]
     how: dict[str, Any] = {"compression": "lz4", "use_dictionary": texts, "use_byte_stream_split": floats}
     how |= {"write_page_checksum": True, "write_statistics": False, "store_schema": False}
-    metadata = {FOOTER: canonical_json(footer).encode(), b"seal": BLANK_SEAL.encode()}
-    metadata |= {} if history is None else {HISTORY: history}
+    metadata = {FOOTER: canonical_json(footer)}
+    if history is not None:
+        metadata[HISTORY] = canonical_json({name: values.tolist() for name, values in history.items()})
     buffer = pa.BufferOutputStream()
     with pq.ParquetWriter(buffer, table.schema, **how) as writer:
-        writer.write_table(table, row_group_size=ROW_GROUP)
+        writer.write_table(table)
         writer.add_key_value_metadata(metadata)
     content = memoryview(buffer.getvalue())
     end = len(content) - int.from_bytes(content[-_TAIL:-4], "little") - _TAIL
@@ -158,7 +169,8 @@ def write(
     def written(temporary: Path) -> None:
         with temporary.open("wb") as file:
             file.write(content[:end])
-            file.write(seal(bytes(content[end:])))
+            file.write(hashlib.sha256(content[end:]).digest())
+            file.write(content[end:])
             file.flush()
             if lasting:
                 os.fsync(file.fileno())
@@ -166,33 +178,18 @@ def write(
     write_atomically(path, written)
 
 
-def encoded_history(columns: Mapping[str, Array]) -> bytes:
-    """Columns of numbers, all of one length, as text."""
-    rows = np.stack([np.asarray(values, dtype="<f8") for values in columns.values()])
-    return f"{','.join(columns)};{base64.b64encode(rows.tobytes()).decode()}".encode()
-
-
-def decoded_history(text: bytes) -> dict[str, Array]:
-    """The columns of `encoded_history`."""
-    names, _, rows = text.partition(b";")
-    columns = names.decode().split(",")
-    return dict(zip(columns, np.frombuffer(base64.b64decode(rows), "<f8").reshape(len(columns), -1), strict=True))
-
-
 def table_of(columns: Mapping[str, Array]) -> pa.Table:
     """Columns as Arrow stores them: numbers, flags or texts."""
-    return pa.Table.from_arrays([_arrow(values) for values in columns.values()], names=list(columns))
+    return pa.Table.from_arrays([_arrow(np.ascontiguousarray(values)) for values in columns.values()], list(columns))
 
 
 def _arrow(values: Array) -> pa.Array:
     """A column. `pa.array` would import pandas, a second that a worker can do without."""
-    values = np.ascontiguousarray(values)
     if values.dtype == object:
         texts = [str(value).encode() for value in values]
         ends = np.cumsum([0, *(len(text) for text in texts)], dtype=np.int32)
-        return pa.Array.from_buffers(
-            pa.string(), len(values), [None, pa.py_buffer(ends.tobytes()), pa.py_buffer(b"".join(texts))]
-        )
+        buffers = [None, pa.py_buffer(ends.tobytes()), pa.py_buffer(b"".join(texts))]
+        return pa.Array.from_buffers(pa.string(), len(values), buffers)
     kind = pa.bool_() if values.dtype == bool else pa.from_numpy_dtype(values.dtype)
     data = np.packbits(values, bitorder="little") if values.dtype == bool else values
     return pa.Array.from_buffers(kind, len(values), [None, pa.py_buffer(data.tobytes())])
@@ -200,19 +197,43 @@ def _arrow(values: Array) -> pa.Array:
 
 def as_array(column: pa.ChunkedArray) -> Array:
     """A column as an array. Arrow's own `to_numpy` would import pandas as well."""
-    chunks = [_of(chunk) for chunk in column.chunks]
-    return chunks[0] if len(chunks) == 1 else np.concatenate(chunks) if chunks else np.empty(0)
-
-
-def _of(chunk: pa.Array) -> Array:
-    kind, start, stop = chunk.type, chunk.offset, chunk.offset + len(chunk)
-    if pa.types.is_string(kind):
+    if pa.types.is_string(column.type):
         # A million words are few different ones, each kept once.
-        coded = chunk.dictionary_encode(null_encoding="encode")
-        return np.array(coded.dictionary.to_pylist(), dtype=object)[_of(coded.indices)]
-    if chunk.null_count or pa.types.is_null(kind):
-        return chunk.to_numpy(zero_copy_only=False)
-    data = chunk.buffers()[1]
-    if pa.types.is_boolean(kind):
-        return np.unpackbits(np.frombuffer(data, np.uint8), bitorder="little")[start:stop].astype(bool)
-    return np.frombuffer(data, dtype=kind.to_pandas_dtype())[start:stop]
+        coded = column.combine_chunks().dictionary_encode(null_encoding="encode")
+        return np.array(coded.dictionary.to_pylist(), dtype=object)[np.asarray(np.from_dlpack(coded.indices), int)]
+    if column.null_count or pa.types.is_null(column.type):
+        return column.to_numpy()
+    if pa.types.is_boolean(column.type):
+        return as_array(column.cast(pa.uint8())).astype(bool)
+    return np.concatenate([np.empty(0, column.type.to_pandas_dtype()), *map(np.from_dlpack, column.chunks)])
+
+
+def write_record(path: Path, record: Mapping[str, Any]) -> None:
+    """Writes a JSON record with a digest of all that it says; see `write`."""
+    said = json.loads(json.dumps({"schema": SCHEMA, "file": path.stem, **record}, default=str))
+    write_text(path, json.dumps({**said, "digest": _digest(said)}, indent=1))
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """A JSON record that says what was written.
+
+    Raises:
+        Unusable: it is damaged, or not one of ours.
+    """
+    try:
+        if not path.is_file() or path.is_symlink():
+            raise Unusable("damaged: is not a plain file")
+        record = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        raise Unusable(f"damaged: cannot be read ({type(error).__name__})") from None
+    if not isinstance(record, dict):
+        raise Unusable("damaged: is no record of ipe-bench")
+    if record.get("schema") in range(1, SCHEMA):
+        raise Outdated
+    if record.pop("digest", None) != _digest(record) or record.get("file") != path.stem:
+        raise Unusable("damaged: is not a whole record of ipe-bench, or that of another file")
+    return record
+
+
+def _digest(record: Mapping[str, Any]) -> str:
+    return hashlib.sha256(canonical_json(record).encode()).hexdigest()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -13,13 +12,12 @@ import json
 import sys
 import uuid
 from collections.abc import Iterable, Mapping
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.errors import StorageError
-from ipe_bench.basics.files import BLANK_SEAL, cache_folder, is_sealed, seal, write_bytes
 from ipe_bench.basics.options import component_classes
 
 TARGET = "_target_"
@@ -31,8 +29,6 @@ WITHOUT_NUMBERS = tuple(
     )
 )
 """Modules and rooms that no number of a trial comes from: they word messages, name, store, summarise and show."""
-_MOST_SOURCES = 2000
-"""Kept in the cache; beyond it, only those that this process read."""
 _SESSION = uuid.uuid4().hex
 """Stands for source that no file holds, as of a notebook: what it computed is nobody's but this session's."""
 
@@ -79,9 +75,8 @@ def fingerprint(components: Iterable[Any]) -> dict[str, Any]:
         for cls in component_classes(component):
             modules |= _import_closure(cls.__module__)
     packages = sorted({m.split(".")[0] for m in modules})
-    digest = hashlib.sha256("".join(f"{m} {_digest_of(m)}\n" for m in sorted(modules)).encode())
-    _known().keep()
-    return {"versions": {p: package_version(p) for p in packages}, "source": digest.hexdigest()[:16]}
+    digest = hashlib.sha256("".join(f"{m} {_source_of(m)[0]}\n" for m in sorted(modules)).encode())
+    return {"versions": {p: _package_version(p) for p in packages}, "source": digest.hexdigest()[:16]}
 
 
 def class_modules(component: Any) -> set[str]:
@@ -90,7 +85,7 @@ def class_modules(component: Any) -> set[str]:
 
 
 @functools.cache
-def package_version(package: str) -> str:
+def _package_version(package: str) -> str:
     """The version of the distribution that a top-level package comes from, where it is installed as one."""
     if package == "ipe_bench":
         from ipe_bench import __version__
@@ -110,122 +105,51 @@ def _import_closure(module: str) -> frozenset[str]:
         name = waiting.pop()
         if name not in found and not f"{name}.".startswith(tuple(f"{n}." for n in WITHOUT_NUMBERS)):
             found.add(name)
-            waiting.extend(_imports(name))
+            own = {name.split(".")[0], "ipe_bench"}
+            waiting += [n for n in _source_of(name)[1] if n.split(".")[0] in own and _spec_of(n) is not None]
     return frozenset(found)
 
 
 @functools.cache
-def _imports(module: str) -> tuple[str, ...]:
-    path = _path_of(module)
-    if path is None or path.suffix != ".py":
-        return ()
-    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-    names = {importlib.util.resolve_name(name, package) for name in _source_of(path)["imports"]}
-    own = {module.split(".")[0], "ipe_bench"}
-    return tuple(sorted(n for n in names if n.split(".")[0] in own and _is_module(n)))
-
-
-@functools.cache
-def _is_module(name: str) -> bool:
-    parent = name.rpartition(".")[0]
+def _spec_of(module: str) -> ModuleSpec | None:
+    """Where a module comes from; None where there is no such module, or none that can be found again."""
+    parent = module.rpartition(".")[0]
     try:
         # To look for something in a module would import the module; and only a package has modules in it.
-        if parent and not _is_package(parent):
-            return False
-        return importlib.util.find_spec(name) is not None
+        if parent and ((package := _spec_of(parent)) is None or package.submodule_search_locations is None):
+            return None
+        return importlib.util.find_spec(module)
     except (ValueError, ImportError):
-        return False
+        return None
 
 
 @functools.cache
-def _is_package(name: str) -> bool:
-    spec = importlib.util.find_spec(name)
-    return spec is not None and spec.submodule_search_locations is not None
-
-
-@functools.cache
-def _path_of(module: str) -> Path | None:
-    try:
-        spec = importlib.util.find_spec(module)
-        origin = None if spec is None else spec.origin
-    except (ValueError, ImportError):  # a script, a notebook, or a module that was made by hand
-        origin = getattr(sys.modules.get(module), "__file__", None)
-    return Path(origin) if origin is not None and Path(origin).is_file() else None
-
-
-@functools.cache
-def _source_of(path: Path) -> dict[str, Any]:
-    """What a source file imports, as it is written there, and the digest of its numerical code with the JSON files
-    beside it, tables of constants."""
-    content = path.read_bytes()
+def _source_of(module: str) -> tuple[str, frozenset[str]]:
+    """A digest of what a module computes with, its code and the JSON files beside it, tables of constants; and the
+    names of modules, and of what may be modules, that it imports."""
+    spec, loaded = _spec_of(module), sys.modules.get(module)
+    origin = getattr(loaded, "__file__", None) if spec is None else spec.origin  # a script has no spec
+    path = None if origin is None else Path(origin)
+    if path is None or not path.is_file():
+        return "" if hasattr(loaded, "__path__") else _SESSION, frozenset()
+    content, imported = path.read_bytes(), frozenset()
+    if path.suffix == ".py":
+        tree = ast.parse(content)
+        imported = _imported(tree, module if path.name == "__init__.py" else module.rpartition(".")[0])
+        content = numerical_code(tree).encode()
     tables = b"".join(table.read_bytes() for table in sorted(path.parent.glob("*.json")))
-    return _known().get(content, tables)
+    return hashlib.sha256(content + tables).hexdigest(), imported
 
 
-class _Sources:
-    """What was found in sources before, by the digest of all their bytes: to parse them takes longer than all else in
-    a run that has nothing to compute."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.found: dict[str, dict[str, Any]] = {}
-        self.used: set[str] = set()
-        with contextlib.suppress(OSError, ValueError, KeyError):
-            content = path.read_bytes()
-            if is_sealed(content):
-                self.found = json.loads(content)["found"]
-        self.stored = set(self.found)
-
-    def get(self, content: bytes, tables: bytes) -> dict[str, Any]:
-        key = hashlib.sha256(hashlib.sha256(content).digest() + tables).hexdigest()
-        if key not in self.found:
-            tree = ast.parse(content)
-            imports, code = _imported(tree), numerical_code(tree).encode()
-            self.found[key] = {"imports": imports, "digest": hashlib.sha256(code + tables).hexdigest()}
-        self.used.add(key)
-        return self.found[key]
-
-    def keep(self) -> None:
-        """Leaves what was found to later processes, where there is a place for it."""
-        if self.stored.issuperset(self.used):
-            return
-        if len(self.found) > _MOST_SOURCES:
-            self.found = {key: self.found[key] for key in self.used}
-        self.stored = set(self.found)
-        text = json.dumps({"found": self.found, "seal": BLANK_SEAL})
-        with contextlib.suppress(StorageError):
-            write_bytes(self.path, seal(text.encode()))
-
-
-@functools.cache
-def _known() -> _Sources:
-    reader = hashlib.sha256(Path(__file__).read_bytes() + sys.version.encode()).hexdigest()[:16]
-    return _Sources(cache_folder() / f"sources-{reader}.json")
-
-
-def _imported(tree: ast.Module) -> list[str]:
-    """The names of modules, and of what may be modules, that are imported; with leading dots where relative."""
+def _imported(tree: ast.Module, package: str) -> frozenset[str]:
     names: set[str] = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            base = "." * node.level + (node.module or "")
-            dot = "." if node.module else ""
-            names |= {base} | {f"{base}{dot}{alias.name}" for alias in node.names}
-    return sorted(names)
-
-
-@functools.cache
-def _digest_of(module: str) -> str:
-    """What a module computes with: its code, and the JSON files beside it, tables of constants."""
-    path = _path_of(module)
-    if path is None:
-        return "" if hasattr(sys.modules.get(module), "__path__") else _SESSION
-    if path.suffix == ".py":
-        return _source_of(path)["digest"]
-    tables = b"".join(table.read_bytes() for table in sorted(path.parent.glob("*.json")))
-    return hashlib.sha256(path.read_bytes() + tables).hexdigest()
+            base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
+            names |= {base} | {f"{base}.{alias.name}" for alias in node.names}
+    return frozenset(names)
 
 
 def numerical_code(tree: ast.Module) -> str:

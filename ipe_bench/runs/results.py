@@ -8,29 +8,27 @@ is used, or named with what is wrong with it; nothing is guessed, mixed or delet
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import uuid
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Collection as Keys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 import pyarrow as pa
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.files import is_sealed
 from ipe_bench.basics.linalg import Array
-from ipe_bench.runs.parts import SCHEMA, TRUTH, Outdated, Part, Unusable, as_array, decoded_history
+from ipe_bench.runs.parts import TRUTH, Outdated, Part, Unusable, as_array, read_record
 from ipe_bench.runs.provenance import canonical_json
-from ipe_bench.runs.store import Store, describe_names, gaps, title
+from ipe_bench.runs.store import ResultKey, Store, describe_names, gaps, title
 
 T = TypeVar("T")
-AGAIN = "run the same command again, which computes it anew"
+_AGAIN = "run the same command again, which computes it anew"
 
 
 @dataclass(frozen=True)
@@ -64,12 +62,23 @@ class StoredCell:
 
     @cached_property
     def covered(self) -> tuple[tuple[int, int], ...]:
-        """The union of the trials that are there, as disjoint ranges in ascending order."""
-        return merge_ranges((p.start, p.stop) for p in self.parts)
+        """The trials that are there, as ranges that may overlap."""
+        return tuple((part.start, part.stop) for part in self.parts)
 
     @property
     def trials(self) -> int:
-        return _count(self.covered)
+        """How many there are, each counted once."""
+        last = max(part.stop for part in self.parts)
+        return last - _count(gaps(self.covered, 0, last))
+
+    @property
+    def written(self) -> float:
+        """When the youngest of its files was written; 0 if they went away meanwhile."""
+        times = [0.0]
+        for part in self.parts:
+            with contextlib.suppress(OSError):
+                times.append(part.path.stat().st_mtime)
+        return max(times)
 
 
 @dataclass(frozen=True)
@@ -95,7 +104,7 @@ class CellState:
     @property
     def title(self) -> str:
         """Its scenario in a line for people."""
-        return title(self.names) + (f" (#{self.tag})" if self.tag else "")
+        return title(self.names) + self.tag
 
     @property
     def complete(self) -> bool:
@@ -104,7 +113,7 @@ class CellState:
     @property
     def problems(self) -> Iterator[str]:
         """A line for what is wrong with it, if anything."""
-        who = describe_names(self.names) + (f" (#{self.tag})" if self.tag else "")
+        who = describe_names(self.names) + self.tag
         for line in self.messages if self.failed else ():
             yield f"failed: {who}: {self.failed} of {self.expected} expected trials: {line}"
         if self.missing:
@@ -129,34 +138,13 @@ class Run:
         return str(self.record.get("refused", ""))
 
 
-@dataclass(frozen=True)
-class Failed:
-    """One record of failed/: trials that could not be computed, and why."""
+class _Asked(NamedTuple):
+    """What the newest run that asked for a cell said of it."""
 
     key: str
-    start: int
-    stop: int
-    reason: str
-
-
-def _read_record(path: Path) -> dict[str, Any]:
-    """A JSON record of which not one bit has changed.
-
-    Raises:
-        Unusable: it is damaged, or not one of ours.
-    """
-    try:
-        if not path.is_file() or path.is_symlink():
-            raise Unusable("damaged: is not a plain file")
-        content = path.read_bytes()
-        record = json.loads(content) if is_sealed(content) else {}
-    except (OSError, ValueError) as error:
-        raise Unusable(f"damaged: cannot be read ({error})") from None
-    if record.get("schema") in (1, 2):
-        raise Outdated("was written by an older version of ipe-bench")
-    if record.get("schema") != SCHEMA or record["file"] != path.stem:
-        raise Unusable("damaged: is not a whole record of ipe-bench, or that of another file")
-    return record
+    trials: int
+    names: Mapping[str, Any]
+    refused: str
 
 
 @dataclass
@@ -167,8 +155,8 @@ class Results:
     runs: tuple[Run, ...] = ()
     stored: dict[str, StoredCell] = field(default_factory=dict)
     """The usable cells by key, stale ones included."""
-    attempts: tuple[Failed, ...] = ()
-    """What could not be computed, whether or not it was since."""
+    attempts: list[Mapping[str, Any]] = field(default_factory=list)
+    """Records of what could not be computed, whether or not it was since."""
     damaged: dict[Path, str] = field(default_factory=dict)
     """What is wrong with each file that is left out."""
     outdated: list[Path] = field(default_factory=list)
@@ -183,14 +171,13 @@ class Results:
         Raises:
             UserError: a directory does not exist.
         """
-        paths = tuple(Path(d) for d in directories)
-        for path in paths:
+        results = cls(tuple(map(Path, directories)))
+        for path in results.directories:
             if not path.is_dir():
                 raise UserError(f"{path}: there is no such directory; give one that a run wrote to")
-        results = cls(paths)
-        for path in paths:
+        for path in results.directories:
             results._read_directory(Store(path), keys)
-        results.runs = tuple(sorted(results.runs, key=lambda r: (r.started, r.path.name)))
+        results.runs = tuple(sorted(results.runs, key=lambda run: (run.started, run.path.name)))
         return results
 
     def _read_directory(self, store: Store, keys: Keys[str] | None) -> None:
@@ -199,39 +186,29 @@ class Results:
                 self.further.append(f"{folder}: cannot be listed; what is in it is left out")
                 return
         listed: set[Path] = set()
-        gone = True
-        while gone:  # what went away meanwhile is in a larger file, which was not there yet when these were listed
-            gone = False
-            for key, several in store.parts(keys).items():
-                for part in [part for part in several if part.path not in listed]:
-                    listed.add(part.path)
-                    gone |= not self._add(key, part)
-        for path in self._records(store.runs):
-            with self._naming(path):
-                self.runs += (Run(path, _read_record(path)),)
-        for path in self._records(store.failed):
-            with self._naming(path):
-                r = _read_record(path)
-                reason = f"{r['status']}: {r['message']}"
-                self.attempts += (Failed(r["key"], r["start"], r["stop"], reason),)
+        # What is gone before it is read is in a larger file, which may not have been there when these were listed.
+        while fresh := [part for part in store.parts(keys) if part.path not in listed]:
+            for part in fresh:
+                listed.add(part.path)
+                self._add(part)
+        self.runs += tuple(Run(path, record) for path, record in self._records(store.runs))
+        self.attempts += [record for _, record in self._records(store.failed)]
         if keys is None and not listed and not self.runs:
             self.further.append(f"{store.directory}: holds no results of ipe-bench")
         if self.outdated and not self.stored and keys is None:
-            self.further.append(f"{store.directory}: was written by an older version of ipe-bench; {AGAIN}")
+            self.further.append(f"{store.directory}: was written by an older version of ipe-bench; {_AGAIN}")
 
-    def _add(self, key: str, part: Part) -> bool:
-        """Adds a part to what is stored, if every byte of it is whole; False if it is not there any more."""
-        with self._naming(part.path):
-            try:
-                footer, _ = part.read()
-            except FileNotFoundError:
-                return False
-            before = self.stored[key].parts if key in self.stored else ()
-            self.stored[key] = StoredCell(footer, tuple(sorted([*before, part], key=lambda p: p.order)))
-        return True
+    def _add(self, part: Part) -> None:
+        """Adds a part to what is stored, if it is there and every byte of it is whole."""
+        with self._naming(part.path), contextlib.suppress(FileNotFoundError):
+            footer, _ = part.read()
+            known = self.stored[part.key].parts if part.key in self.stored else ()
+            self.stored[part.key] = StoredCell(footer, tuple(sorted([*known, part], key=lambda p: p.order)))
 
-    def _records(self, folder: Path) -> list[Path]:
-        return sorted(path for path in folder.glob("*.json") if not path.name.startswith("."))
+    def _records(self, folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
+        for path in sorted(folder.glob("[!.]*.json")):
+            with self._naming(path):
+                yield path, read_record(path)
 
     @contextlib.contextmanager
     def _naming(self, path: Path) -> Iterator[None]:
@@ -268,7 +245,7 @@ class Results:
             for cell in stale
         ] + [
             f"stale: {folder}: {sum(path.is_relative_to(folder) for path in self.outdated)} files were written by an"
-            f" older version of ipe-bench; left out: {AGAIN}"
+            f" older version of ipe-bench; left out: {_AGAIN}"
             for folder in dict.fromkeys(path.parents[1] for path in self.outdated)
         ]
 
@@ -282,16 +259,21 @@ class Results:
         """Those of them with every trial."""
         return sum(cell.complete for cell in self.cells[: len(self._asked_for)])
 
+    def announces(self, cells: Iterable[ResultKey], trials: int) -> bool:
+        """Whether the records of runs ask for all this already, and a further one would change nothing."""
+        asked = [(cell, self._asked_for.get(cell.identity_key)) for cell in cells]
+        return all(a and (a.key, a.refused) == (cell.key, "") and a.trials >= trials for cell, a in asked)
+
     @cached_property
-    def _asked_for(self) -> dict[str, tuple[str, int, Mapping[str, Any], str]]:
-        """By identity: the key that the newest run has for it, the number of trials, the names, why it was refused."""
-        asked: dict[str, tuple[str, int, Mapping[str, Any], str]] = {}
+    def _asked_for(self) -> dict[str, _Asked]:
+        """What runs asked for, by identity: the newest decides on the key, the largest number of trials counts."""
+        asked: dict[str, _Asked] = {}
         for run in self.runs:
             for cell in run.record["cells"]:
-                trials = int(cell.get("trials", run.record["trials"]))
-                key, before, *_ = asked.get(cell["identity_key"], (cell["key"], 0))
-                trials = max(trials, before) if key == cell["key"] else trials
-                asked[cell["identity_key"]] = (cell["key"], trials, cell["names"], run.refused)
+                new = _Asked(cell["key"], int(run.record["trials"]), cell["names"], run.refused)
+                known = asked.get(cell["identity_key"], new)
+                trials = max(new.trials, known.trials) if known.key == new.key else new.trials
+                asked[cell["identity_key"]] = new._replace(trials=trials)
         return asked
 
     @cached_property
@@ -305,10 +287,8 @@ class Results:
             rivals.setdefault(cell.footer["identity_key"], []).append(cell)
         result: dict[str, tuple[StoredCell | None, list[StoredCell]]] = {}
         for identity, cells in rivals.items():
-            if identity in self._asked_for:
-                key = self._asked_for[identity][0]
-            else:
-                key = max(cells, key=_written).key
+            asked = self._asked_for.get(identity)
+            key = max(cells, key=lambda cell: cell.written).key if asked is None else asked.key
             result[identity] = self.stored.get(key), [c for c in cells if c.key != key]
         return result
 
@@ -318,36 +298,32 @@ class Results:
         return [cell for cell, _ in self._rivals.values() if cell is not None]
 
     @cached_property
-    def failures(self) -> tuple[Failed, ...]:
-        """What could not be computed and has not been computed since."""
-        return tuple(f for f in self.attempts if gaps(self._covered(f.key), f.start, f.stop))
+    def failures(self) -> list[Mapping[str, Any]]:
+        """Records of what could not be computed and has not been computed since."""
+        return [f for f in self.attempts if gaps(self._covered(f["key"]), f["start"], f["stop"])]
 
     @cached_property
     def cells(self) -> tuple[CellState, ...]:
         """How far every cell is: those that runs asked for in their order, then others that are there."""
-        others = [(i, c, old) for i, (c, old) in self._rivals.items() if i not in self._asked_for and c is not None]
-        names = [n for _, _, n, _ in self._asked_for.values()] + [c.names for _, c, _ in others]
-        alike = Counter(map(describe_names, names))
-
-        def tag(key: str, names: Mapping[str, Any]) -> str:
-            return key[:6] if alike[describe_names(names)] > 1 else ""
-
-        failures: dict[str, list[Failed]] = {}
-        for failure in self.failures:
-            failures.setdefault(failure.key, []).append(failure)
-        states = []
+        states, keys = [], []
         for identity, (key, trials, names, refused) in self._asked_for.items():
-            lacking, lost = self.missing(key, trials), failures.get(key, [])
-            untried = [gap for start, stop in lacking for gap in gaps([(f.start, f.stop) for f in lost], start, stop)]
-            done, missing = trials - _count(lacking), _count(untried)
+            lost = [failure for failure in self.failures if failure["key"] == key]
+            tried = [*self._covered(key), *((failure["start"], failure["stop"]) for failure in lost)]
+            missing, lacking = _count(gaps(tried, 0, trials)), _count(self.missing(key, trials))
             stale = sum(cell.trials for cell in self._rivals.get(identity, (None, []))[1])
-            messages = tuple(dict.fromkeys(f.reason for f in lost))
-            counts = trials, done, trials - done - missing, missing, stale
-            states.append(CellState(names, *counts, messages, tag(key, names), refused if missing else ""))
-        for _, cell, old in others:
-            counts = 0, cell.trials, 0, 0, sum(c.trials for c in old)
-            states.append(CellState(cell.names, *counts, (), tag(cell.key, cell.names)))
-        return tuple(states)
+            messages = tuple(dict.fromkeys(f"{f['status']}: {f['message']}" for f in lost))
+            counts = trials, trials - lacking, lacking - missing, missing, stale
+            states.append(CellState(names, *counts, messages, refused=refused if missing else ""))
+            keys.append(key)
+        for identity, (cell, old) in self._rivals.items():
+            if identity not in self._asked_for and cell is not None:
+                states.append(CellState(cell.names, 0, cell.trials, 0, 0, sum(c.trials for c in old), ()))
+                keys.append(cell.key)
+        alike = Counter(describe_names(state.names) for state in states)
+        return tuple(
+            replace(state, tag=f" (#{key[:6]})") if alike[describe_names(state.names)] > 1 else state
+            for state, key in zip(states, keys, strict=True)
+        )
 
     def set_aside(self) -> list[str]:
         """Renames what is damaged, so that it is computed again under its own name; returns a line for each file."""
@@ -376,7 +352,7 @@ class Results:
         some parts lack of the `optional` columns is NaN or None there.
         """
         names = None if columns is None else list(dict.fromkeys(["trial", *columns, *optional]))
-        tables = self._trying(cell, lambda parts: list(self._tables(parts, names, columns or ())))
+        tables = self._of_parts(cell, lambda parts: list(self._tables(parts, names, columns or ())))
         if sum(map(len, tables)) < cell.trials and self.damaged.keys().isdisjoint(p.path for p in cell.parts):
             self.further.append(f"missing: {describe_names(cell.names)}: trials went away while they were read")
         if not tables:
@@ -384,14 +360,25 @@ class Results:
         table = pa.concat_tables(tables, promote_options="default")
         return {name: as_array(table[name]) for name in names or table.column_names if name in table.column_names}
 
-    def _trying(self, cell: StoredCell, read: Callable[[Sequence[Part]], T]) -> T:
+    def load_history(self, cell: StoredCell) -> dict[str, Array] | None:
+        """The iterates of a cell's first trials, by column; None if none are stored."""
+
+        def first(parts: Sequence[Part]) -> dict[str, Array] | None:
+            for part in parts[:1]:
+                with self._naming(part.path):
+                    return part.history() if part.start == 0 else None
+            return None
+
+        return self._of_parts(cell, first)
+
+    def _of_parts(self, cell: StoredCell, read: Callable[[Sequence[Part]], T]) -> T:
         """What `read` makes of the parts of a cell; of those that are there now, if some were merged meanwhile."""
         parts: Sequence[Part] = cell.parts
         while True:
             try:
                 return read(parts)
             except FileNotFoundError:
-                found = [part for d in self.directories for part in Store(d).parts({cell.key}).get(cell.key, ())]
+                found = [part for directory in self.directories for part in Store(directory).parts({cell.key})]
                 parts = sorted((part for part in found if part.path not in self.damaged), key=lambda p: p.order)
 
     def _tables(self, parts: Sequence[Part], names: Sequence[str] | None, needed: Sequence[str]) -> Iterator[pa.Table]:
@@ -406,30 +393,6 @@ class Results:
                     yield table.slice(max(0, reached - part.start))
                     reached = part.stop
 
-    def load_history(self, cell: StoredCell, columns: Sequence[str]) -> dict[str, Array] | None:
-        """The iterates of a cell's first trials in order; None if none are stored."""
-
-        def first(parts: Sequence[Part]) -> bytes | None:
-            for part in parts[:1]:
-                with self._naming(part.path):
-                    return part.history() if part.start == 0 else None
-            return None
-
-        history = self._trying(cell, first)
-        if history is None:
-            return None
-        found = decoded_history(history)
-        return {name: found[name] for name in ("trial", *columns)}
-
-
-def _written(cell: StoredCell) -> float:
-    """When the youngest of its files was written; 0 if they went away meanwhile."""
-    times = [0.0]
-    for part in cell.parts:
-        with contextlib.suppress(OSError):
-            times.append(part.path.stat().st_mtime)
-    return max(times)
-
 
 def require_results(directories: Iterable[Path | str]) -> None:
     """Refuses directories that no run ever wrote to.
@@ -441,17 +404,6 @@ def require_results(directories: Iterable[Path | str]) -> None:
         store = Store(directory)
         if not (store.runs.is_dir() or store.trials.is_dir()):
             raise UserError(f"{directory}: holds no results of ipe-bench; give the output folder of a run")
-
-
-def merge_ranges(ranges: Iterable[tuple[int, int]]) -> tuple[tuple[int, int], ...]:
-    """The union of half-open ranges, as disjoint ranges in ascending order."""
-    merged: list[tuple[int, int]] = []
-    for start, stop in sorted(ranges):
-        if merged and start <= merged[-1][1]:
-            merged[-1] = (merged[-1][0], max(stop, merged[-1][1]))
-        else:
-            merged.append((start, stop))
-    return tuple(merged)
 
 
 def _count(ranges: Iterable[tuple[int, int]]) -> int:

@@ -20,14 +20,13 @@ import numpy as np
 from ipe_bench.basics.errors import StorageError, UserError
 from ipe_bench.basics.machine import cores, library_versions
 from ipe_bench.estimators.base import Estimator
-from ipe_bench.measurements.problem import Problem
 from ipe_bench.measurements.repeatable import require_repeatable
 from ipe_bench.runs.execution import Execution, Serial
-from ipe_bench.runs.parts import TRUTH
+from ipe_bench.runs.parts import TRUTH, Unusable
 from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.runs.results import Results
-from ipe_bench.runs.schedule import RunLog, Watcher, block_size_for, plan, run_task, run_tasks
-from ipe_bench.runs.store import ResultKey, Store, compact
+from ipe_bench.runs.schedule import Watcher, block_size_for, book, logged_to, plan, run_task, run_tasks, warn
+from ipe_bench.runs.store import ResultKey, Store
 from ipe_bench.trials.bounds import linear_bound
 from ipe_bench.trials.scenario import Scenario
 
@@ -58,43 +57,46 @@ def compute(
 
     Trials are computed `block_size` at once, which changes no number: where it is None, so many as are quickest.
 
-    The run is recorded under a new name, or under `record_as`, in place of what is there; with `further` facts, and the
-    `command` as it was typed.
+    The run is recorded, unless nothing is missing and the same was asked for before: under a new name, or under
+    `record_as`, in place of what is there; with `further` facts, and the `command` as it was typed.
 
     Raises:
         UserError: what was asked for cannot be computed, or the folder cannot be written to; nothing is computed then.
         StorageError: nothing can be stored any more.
     """
+    # Absolute: workers may have another working folder.
+    store = Store(Path(output).absolute())
     # What is stored of a scenario shows that its numbers can be computed with, without drawing any.
-    stored = [any(Path(output).glob(f"trials/{ResultKey(scenario).key}-*.parquet")) for scenario in scenarios]
-    untried = [scenario for scenario, known in zip(scenarios, stored, strict=True) if not known]
+    stored = {part.key for part in store.parts()}
+    untried = [scenario for scenario in scenarios if ResultKey(scenario).key not in stored]
     execution = execution or Serial()
     block_size = block_size_for(trials) if block_size is None else block_size
     if block_size > 0:
         # Workers start while this process looks at what is asked for.
         execution.warm_up(run_task, len(untried) * -(-trials // block_size))
     validate(scenarios, estimators, trials, block_size, untried=untried)
-    # Absolute: workers may have another working folder.
-    store = Store(Path(output).absolute())
     store.prepare()
-    cells = [result_keys(scenario, estimators) for scenario in scenarios]
-    results = Results.read([store.directory], keys={cell.key for part in cells for cell in part})
+    of_scenarios = [result_keys(scenario, estimators) for scenario in scenarios]
+    cells = [cell for several in of_scenarios for cell in several]
+    results = Results.read([store.directory], keys={cell.key for cell in cells})
     aside = results.set_aside()
-    tasks = [task for part in cells for task in plan(store.directory, part, results, trials, block_size)]
+    tasks = [task for several in of_scenarios for task in plan(store.directory, several, results, trials, block_size)]
     execution.warm_up(run_task, len(tasks))
-    record = _record(scenarios, estimators, trials) | dict(further or {})
-    known = None if tasks or aside else store.same_run(record)
-    typed = {"command": command, "blocks": len(tasks)}
-    identifier = known or _write_record(store, record | typed, record_as or new_name())
-    with RunLog(store.directory / "log" / f"{identifier}.log") as log:
+    if tasks or aside or record_as or not results.announces(cells, trials):
+        record = {"started": _now(), **_record(scenarios, estimators, trials), **(further or {})}
+        written = store.write_run(record_as or new_name(), record | {"command": command, "blocks": len(tasks)})
+    else:
+        written = results.runs[-1].path
+    with logged_to(store.directory / "log" / f"{written.stem}.log"):
         for line in aside:
-            log.warning(line)
-        failures = run_tasks(tasks, execution, store, watch or (lambda progress: None), log)
-        store.require()
-        gone, hindrances = compact(store.directory, {cell.key for part in cells for cell in part}, execution)
-        for line in [f"{gone} small files were merged into larger ones"] * bool(gone) + hindrances:
-            log.info(line)
-    if not (store.runs / f"{identifier}.json").is_file():
+            warn(line)
+        failures = run_tasks(tasks, execution, store, watch or (lambda progress: None))
+        for key in {cell.key for cell in cells}:
+            try:
+                store.merge(key)
+            except (Unusable, StorageError) as error:
+                book.info(f"{key}: its parts stay as they are: {error}")
+    if not written.is_file():
         raise StorageError(f"{store.directory}: lost the record of this run; the same command computes what is missing")
     return failures
 
@@ -106,12 +108,10 @@ def validate(
     block_size: int | None = None,
     *,
     untried: Sequence[Scenario] | None = None,
-    estimating: bool = False,
 ) -> None:
-    """Raises one UserError with everything that stands in the way of this run, or of `estimating` from real readings.
+    """Raises one UserError with everything that stands in the way of this run.
 
-    Trials are drawn of the scenarios `untried` (all where it is None), to see whether numbers hold what is asked for;
-    none are where readings are real.
+    Trials are drawn of the scenarios `untried` (all where it is None), to see whether numbers hold what is asked for.
     """
     mistakes = []
     if trials < 1:
@@ -128,26 +128,22 @@ def validate(
     if not estimators:
         mistakes.append("there is no estimator; choose with solver= and baseline=")
     for scenario in scenarios:
-        if scenario.noise.estimated and not estimating:
-            mistakes.append("noise=unknown: has no level to simulate with; choose another noise, or use `estimate`")
         if scenario.noise.real and trials != 1:
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
-        if not estimating and not scenario.noise.estimated and (untried is None or scenario in untried):
+        if scenario.noise.estimated:
+            mistakes.append("noise=unknown: has no level to simulate with; choose another noise, or use `estimate`")
+        elif untried is None or scenario in untried:
             mistakes += _beyond_numbers(scenario)
             require_repeatable(scenario.measurement)
             require_repeatable(scenario.simulator)
-        mistakes += unmet_needs(scenario.problem, estimators)
+        model = scenario.measurement.name
+        mistakes += [
+            f"estimators.{label}: needs {need}, which measurement={model} does not have; leave it out"
+            for label, estimator in estimators.items()
+            for need in estimator.missing(scenario.problem)
+        ]
     if mistakes:
         raise UserError("; ".join(dict.fromkeys(mistakes)))
-
-
-def unmet_needs(problem: Problem, estimators: Mapping[str, Estimator]) -> list[str]:
-    """A line for each thing that an estimator needs and the problem does not have."""
-    return [
-        f"estimators.{label}: needs {need}, which measurement={problem.measurement.name} does not have; leave it out"
-        for label, estimator in estimators.items()
-        for need in estimator.missing(problem)
-    ]
 
 
 def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
@@ -187,12 +183,6 @@ def result_keys(scenario: Scenario, estimators: Mapping[str, Estimator]) -> list
 def new_name() -> str:
     """A name for the record of a run."""
     return f"{datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}"
-
-
-def _write_record(store: Store, record: Mapping[str, Any], identifier: str) -> str:
-    """States what is going to be computed, so that what is missing later is known to be missing; returns its name."""
-    store.write_run(identifier, {"started": _now(), **record})
-    return identifier
 
 
 def record_refusal(

@@ -13,13 +13,12 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import json
 import os
 import socket
 import tempfile
 import time
 from collections.abc import Collection as Keys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -28,14 +27,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from ipe_bench.basics.errors import StorageError, UserError
-from ipe_bench.basics.files import BLANK_SEAL, seal, write_bytes
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import library_versions
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.runs import parts
-from ipe_bench.runs.execution.base import Execution, Failure
-from ipe_bench.runs.parts import SCHEMA, TRUTH, Part, encoded_history, table_of
+from ipe_bench.runs.execution.base import Failure
+from ipe_bench.runs.parts import SCHEMA, TRUTH, Part
 from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.trials.bounds import linear_bound, linear_correlation
 from ipe_bench.trials.scenario import Scenario
@@ -51,6 +49,11 @@ class ResultKey:
     scenario: Scenario
     label: str = TRUTH
     estimator: Estimator | None = None
+
+    @property
+    def components(self) -> list[Any]:
+        """The scenario, and the estimator if there is one."""
+        return [self.scenario] if self.estimator is None else [self.scenario, self.estimator]
 
     @cached_property
     def identity(self) -> dict[str, Any]:
@@ -73,7 +76,7 @@ class ResultKey:
     @cached_property
     def made_by(self) -> dict[str, Any]:
         """The versions of the packages and the digest of the numerical source."""
-        return fingerprint([self.scenario] if self.estimator is None else [self.scenario, self.estimator])
+        return fingerprint(self.components)
 
     @property
     def names(self) -> dict[str, Any]:
@@ -107,13 +110,13 @@ class ResultKey:
             "jacobian_cost": float(getattr(model, "jacobian_cost", model.n)),
             "parameters": [describe(p) for p in model.parameters],
             "readings": model.m,
-            "about": first_sentence(model),
+            "about": _first_sentence(model),
             "linear_bound": linear_bound(scenario.problem).tolist(),
             "linear_correlation": linear_correlation(scenario.problem).round(4).tolist(),
         }
 
 
-def first_sentence(component: Any) -> str:
+def _first_sentence(component: Any) -> str:
     """The first sentence of the docstring of a component's class; empty where it has none of its own."""
     kind = type(component)
     words = " ".join((kind.__doc__ or "").split())
@@ -144,29 +147,16 @@ class Store:
             raise UserError(
                 f"output={self.directory}: cannot be written to ({reason}); choose another folder"
             ) from None
-        for folder in (self.directory, *(f for f in self.directory.iterdir() if f.is_dir() and not f.is_symlink())):
-            for path in folder.glob(".*.tmp"):
-                with contextlib.suppress(OSError):
-                    if time.time() - path.stat().st_mtime > _ABANDONED_S:
-                        path.unlink()
+        for path in (*self.directory.glob(".*.tmp"), *self.directory.glob("*/.*.tmp")):
+            with contextlib.suppress(OSError):
+                if time.time() - path.stat().st_mtime > _ABANDONED_S:
+                    path.unlink()
 
-    def require(self) -> None:
-        """Refuses to go on in a folder that went away: what it held is missing, and would not be missed.
-
-        Raises:
-            StorageError: it did.
-        """
-        if not self.trials.is_dir():
-            raise StorageError(f"{self.directory}: went away while it was being filled; the same command starts anew")
-
-    def parts(self, keys: Keys[str] | None = None) -> dict[str, list[Part]]:
-        """The parts that lie here, or those of these keys, by key in the order of reading."""
-        found: dict[str, list[Part]] = {}
-        for name in os.listdir(self.trials) if self.trials.is_dir() else ():
-            part = Part.parse(self.trials / name)
-            if part is not None and (keys is None or part.key in keys):
-                found.setdefault(part.key, []).append(part)
-        return {key: sorted(several, key=lambda part: part.order) for key, several in sorted(found.items())}
+    def parts(self, keys: Keys[str] | None = None) -> list[Part]:
+        """The parts that lie here, or those of these keys, by key and in the order of reading."""
+        names = os.listdir(self.trials) if self.trials.is_dir() else ()
+        found = [part for name in names if (part := Part.parse(self.trials / name)) is not None]
+        return sorted((p for p in found if keys is None or p.key in keys), key=lambda part: (part.key, part.order))
 
     def write(
         self,
@@ -175,20 +165,12 @@ class Store:
         stop: int,
         columns: Mapping[str, Array],
         history: Mapping[str, Array] | None = None,
-    ) -> Path:
-        """Stores the rows of trials start to stop, with the iterates of the first trials of all if there are any.
-
-        Raises:
-            ValueError: the rows are not those of these trials.
-        """
-        if not np.array_equal(columns["trial"], np.arange(start, stop)):
-            raise ValueError(f"{describe_names(result.names)}: its trials do not count from {start} to {stop}")
-        path = self._path(result, start, stop)
-        table = table_of({name: _typed(name, np.asarray(values)) for name, values in columns.items()})
-        parts.write(path, table, result.footer, None if history is None else encoded_history(history))
+    ) -> None:
+        """Stores the rows of trials start to stop, with the iterates of the first trials of all if there are any."""
+        table = parts.table_of({name: _typed(name, np.asarray(values)) for name, values in columns.items()})
+        parts.write(self._path(result, start, stop), table, result.footer, history)
         with contextlib.suppress(OSError):
             self._failure(result, start, stop).unlink()
-        return path
 
     def _path(self, result: ResultKey, start: int, stop: int) -> Path:
         return self.trials / f"{result.key}-{start}-{stop}.parquet"
@@ -197,7 +179,7 @@ class Store:
         """Whether exactly this block is stored."""
         return self._path(result, start, stop).is_file()
 
-    def write_failure(self, result: ResultKey, start: int, stop: int, failure: Failure) -> Path:
+    def write_failure(self, result: ResultKey, start: int, stop: int, failure: Failure) -> None:
         """States that these trials could not be computed, and why; the next run tries them again."""
         record = {
             "key": result.key,
@@ -211,28 +193,43 @@ class Store:
             "when": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "host": socket.gethostname(),
         }
-        return _write_json(self._failure(result, start, stop), record)
+        parts.write_record(self._failure(result, start, stop), record)
 
     def _failure(self, result: ResultKey, start: int, stop: int) -> Path:
         return self.failed / f"{result.key}-{start}-{stop}.json"
 
     def write_run(self, identifier: str, record: Mapping[str, Any]) -> Path:
         """States, before any work, what a run is going to compute."""
-        return _write_json(self.runs / f"{identifier}.json", {"run": identifier, **record})
+        path = self.runs / f"{identifier}.json"
+        parts.write_record(path, {"run": identifier, **record})
+        return path
 
-    def same_run(self, record: Mapping[str, Any]) -> str | None:
-        """The name of a stored record that says the same, and after which nothing else was asked of its results; None
-        if there is none. A run that has nothing to compute needs no other record then."""
-        record = json.loads(json.dumps(record, default=str))
-        keys = {cell["identity_key"]: cell["key"] for cell in record["cells"]}
-        for path in sorted(self.runs.glob("*.json"), reverse=True):
-            with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
-                known = json.loads(path.read_text(encoding="utf-8"))
-                if all(known.get(name) == value for name, value in record.items()):
-                    return path.stem
-                if any(keys.get(cell["identity_key"], cell["key"]) != cell["key"] for cell in known["cells"]):
-                    return None
-        return None
+    def merge(self, key: str) -> int:
+        """Makes one part of the parts of a result for each range without gaps; returns how many files are gone.
+
+        It may be stopped, or done twice, at any moment, while others read and write in the folder: a merged part is on
+        the disk and was read back before those go whose rows it holds, and until they do, a reader takes each trial
+        once.
+
+        Raises:
+            Unusable: a part is damaged; all stay as they are.
+            StorageError: the folder cannot be written to any more; everything that was there is there.
+        """
+        found, gone, footer = self.parts({key}), 0, None
+        group: list[Part] = []
+        tables: list[pa.Table] = []
+        with contextlib.suppress(FileNotFoundError):  # another run merges the same
+            for part in found if len(found) > 1 else ():
+                belongs, table = part.read()
+                reached = max((p.stop for p in group), default=0)
+                if group and (part.start > reached or belongs != footer):
+                    gone += _join(group, tables)
+                    group, tables = [], []
+                tables.append(table.slice(max(0, reached - part.start) if group else 0))
+                group.append(part)
+                footer = belongs
+            gone += _join(group, tables)
+        return gone
 
 
 def _typed(name: str, values: Array) -> Array:
@@ -240,70 +237,6 @@ def _typed(name: str, values: Array) -> Array:
     if values.dtype.kind in "fiu" and name not in ("trial", "iterations"):
         return values.astype(np.float64)
     return values.astype(np.int64) if values.dtype.kind in "iu" else values
-
-
-def _write_json(path: Path, record: Mapping[str, Any]) -> Path:
-    text = json.dumps({"schema": SCHEMA, "file": path.stem, **record, "seal": BLANK_SEAL}, indent=1, default=str)
-    write_bytes(path, seal(text.encode()))
-    return path
-
-
-@dataclass(frozen=True)
-class Merge:
-    """A task: the parts of one result, which become one part for each range without gaps."""
-
-    directory: Path
-    key: str
-
-    @property
-    def trusted(self) -> bool:
-        """Whether it runs code of this package alone: it does."""
-        return True
-
-
-def compact(directory: Path, keys: Keys[str], execution: Execution) -> tuple[int, list[str]]:
-    """Makes one part of the parts of each result; returns how many files are gone, and what stood in the way.
-
-    It may be stopped, or done twice, at any moment, while others read and write in the folder.
-    """
-    tasks = [Merge(directory, key) for key, several in Store(directory).parts(keys).items() if len(several) > 1]
-    gone, hindrances = 0, []
-    try:
-        for event in execution.run(merge, tasks) if tasks else ():
-            gone += 0 if event.ended else int(event.step)
-            if event.failure is not None:
-                hindrances.append(event.failure.message)
-    except StorageError as error:
-        hindrances.append(str(error))
-    return gone, hindrances
-
-
-def merge(task: Merge) -> Iterator[int]:
-    """Does one merge, and yields how many files are gone.
-
-    A part is on the disk and was read back before those go whose rows it holds, so that nothing is lost on the way;
-    until they do, a reader takes each trial once.
-
-    Raises:
-        Unusable: a part is damaged; all stay as they are.
-        StorageError: the folder cannot be written to any more; everything that was there is there.
-    """
-    gone = 0
-    group: list[Part] = []
-    tables: list[pa.Table] = []
-    reached, footer = 0, None
-    with contextlib.suppress(FileNotFoundError):  # another run merges the same
-        for part in Store(task.directory).parts({task.key}).get(task.key, []):
-            found, table = part.read()
-            if group and (part.start > reached or found != footer):
-                gone += _join(group, tables)
-                group, tables = [], []
-            fresh = table.slice(max(0, reached - part.start) if group else 0)
-            group.append(part)
-            tables.append(fresh)
-            reached, footer = max(reached, part.stop) if len(group) > 1 else part.stop, found
-        gone += _join(group, tables)
-    yield gone
 
 
 def _join(group: Sequence[Part], tables: Sequence[pa.Table]) -> int:
@@ -327,10 +260,8 @@ def gaps(covered: Iterable[tuple[int, int]], start: int, stop: int) -> list[tupl
     """The parts of the range start to stop that no covered range holds."""
     found, reached = [], start
     for first, last in sorted(covered):
-        if first >= stop or reached >= stop:
-            break
-        if first > reached:
-            found.append((reached, first))
+        if reached < min(first, stop):
+            found.append((reached, min(first, stop)))
         reached = max(reached, last)
     return [*found, (reached, stop)] if reached < stop else found
 

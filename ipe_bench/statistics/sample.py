@@ -354,7 +354,7 @@ class Sample:
         names = [*(f"crlb_{name}" for name in self.names), *TRUTH]
         result: list[History] = []
         for cell, known in self.group.cells:
-            stored = self.collection.load_history(cell, [*columns, "iteration"])
+            stored = self.collection.load_history(cell)
             if stored is None:
                 continue
             x = np.stack([stored[c] for c in columns], axis=1)

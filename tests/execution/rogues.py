@@ -21,7 +21,7 @@ _begun: set[int] = set()
 class Rogue(Estimator):
     """Estimates nothing but zeros, or does what it says; `until` names a file from whose existence on it behaves."""
 
-    does: Literal["behave", "sleep", "exit", "sys_exit", "kill", "memory", "raise", "shape", "row", "fork", "once"]
+    does: Literal["behave", "sleep", "exit", "sys_exit", "kill", "memory", "raise", "shape", "row", "once"]
     until: str = ""
 
     def estimate(self, problem, z, *, history=False):
@@ -50,8 +50,6 @@ class Rogue(Estimator):
                 hog = []
                 while True:
                     hog.append(np.ones(1_000_000))
-            case "fork":
-                os.fork()
             case "once":
                 if os.getpid() not in _begun:
                     _begun.add(os.getpid())

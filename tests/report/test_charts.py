@@ -139,7 +139,7 @@ def test_the_page_says_which_commands_computed_what_it_shows(synthetic):
     """One entry for the jobs of a sweep; none for a run that found everything stored."""
     fill(synthetic)
     record = json.loads(next((synthetic.directory / "runs").glob("*.json")).read_text(encoding="utf-8"))
-    record = {k: v for k, v in record.items() if k not in ("schema", "file", "run", "seal")}
+    record = {k: v for k, v in record.items() if k not in ("schema", "file", "run", "digest")}
     for name, command, blocks in (
         ("b", "ipe-bench run -m error_scale=1,10", 2),
         ("c", "ipe-bench run -m error_scale=1,10", 1),

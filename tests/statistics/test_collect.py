@@ -12,7 +12,6 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.runs import parts
 from ipe_bench.runs.execution.base import Failure
 from ipe_bench.runs.provenance import digest
-from ipe_bench.runs.results import merge_ranges
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.collect import collect, config_leaves, differing
 
@@ -184,7 +183,3 @@ def test_the_name_of_a_component_is_not_repeated_as_its_class(synthetic):
     (first, second) = collect([synthetic.directory]).groups
     assert list(first.columns) == ["measurement", "noise", "error_scale"]
     assert {first.columns["noise"], second.columns["noise"]} == {"gaussian", "quantization"}
-
-
-def test_ranges_merge():
-    assert merge_ranges([(5, 7), (0, 3), (2, 5), (9, 10)]) == ((0, 7), (9, 10))

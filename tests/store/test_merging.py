@@ -19,10 +19,9 @@ from ipe_bench.baselines import LinearLSE
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.runs import parts
-from ipe_bench.runs.execution import Processes, Serial
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import compute
-from ipe_bench.runs.store import compact
+from ipe_bench.runs.store import Store
 from ipe_bench.statistics import summarize
 
 TRIALS, BLOCK = 100, 3
@@ -59,24 +58,21 @@ def assert_same(found, expected) -> None:
             np.testing.assert_array_equal(found[key][name], values)
 
 
-def merge(folder: Path, execution=None) -> int:
-    gone, hindrances = compact(folder, set(Results.read([folder]).stored), execution or Serial())
-    assert hindrances == []
-    return gone
+def merge(folder: Path) -> int:
+    return sum(Store(folder).merge(key) for key in Results.read([folder]).stored)
 
 
 def names(folder: Path, key: str = "") -> list[str]:
     return sorted(path.name.partition("-")[2] for path in (folder / "trials").glob(f"{key}*.parquet"))
 
 
-@pytest.mark.parametrize("execution", [Serial(), Processes(workers=2)], ids=repr)
-def test_the_rows_are_the_same_in_one_file(tmp_path, execution):
+def test_the_rows_are_the_same_in_one_file(tmp_path):
     filled(tmp_path)
     expected = everything(tmp_path)
-    assert merge(tmp_path, execution) == 68
+    assert merge(tmp_path) == 68
     assert names(tmp_path) == ["0-100.parquet"] * 2
     assert_same(everything(tmp_path), expected)
-    assert merge(tmp_path, execution) == 0
+    assert merge(tmp_path) == 0
 
 
 def test_a_file_that_the_disk_does_not_give_back_stands_for_none(tmp_path, monkeypatch):
@@ -89,9 +85,9 @@ def test_a_file_that_the_disk_does_not_give_back_stands_for_none(tmp_path, monke
         path.write_bytes(path.read_bytes()[:-20] + 20 * b"x")
 
     monkeypatch.setattr(parts, "write_atomically", spoiled)
-    gone, hindrances = compact(tmp_path, set(Results.read([tmp_path]).stored), Serial())
-    assert gone == 0
-    assert len(hindrances) == 2
+    for key in Results.read([tmp_path]).stored:
+        with pytest.raises(parts.Unusable, match="damaged"):
+            Store(tmp_path).merge(key)
     assert set(before) < set(names(tmp_path))
 
 
@@ -103,7 +99,7 @@ def test_a_gap_and_a_part_by_other_libraries_stay_as_they_are(tmp_path):
         tmp_path / "trials" / f"{cell.key}-27-30.parquet",
         lambda rows, footer: footer.update(libraries={"numpy": "0.1"}),
     )
-    compact(tmp_path, {cell.key}, Serial())
+    Store(tmp_path).merge(cell.key)
     assert names(tmp_path, cell.key) == sorted(f"{r}.parquet" for r in ("0-9", "12-27", "27-30", "30-100"))
 
 
@@ -138,9 +134,9 @@ def test_ranges_that_overlap_are_read_and_merged_once(tmp_path):
 
 KILLED = """
 import os, pathlib, signal, sys
-from ipe_bench.runs.execution.serial import Serial
+from ipe_bench.runs.execution import Serial
 from ipe_bench.runs.results import Results
-from ipe_bench.runs.store import compact
+from ipe_bench.runs.store import Store
 folder, moment = pathlib.Path(sys.argv[1]), int(sys.argv[2])
 keys, count = set(Results.read([folder]).stored), 0
 
@@ -154,7 +150,8 @@ def deadly(call):
     return wrapped
 
 os.fsync, os.replace, os.unlink = deadly(os.fsync), deadly(os.replace), deadly(os.unlink)
-compact(folder, keys, Serial())
+for key in keys:
+    Store(folder).merge(key)
 print(count)
 """
 

@@ -1,4 +1,5 @@
-"""What an execution is: it runs tasks somewhere and tells, in any order, how each of them gets on and ends."""
+"""What an execution is: it runs tasks somewhere and tells, in any order, how each of them gets on and ends. And the
+simplest one: one task after another, in this process."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ from annotated_types import Gt, Lt, doc
 
 from ipe_bench.basics.errors import StorageError, UserError, describe_exception
 from ipe_bench.basics.naming import Named
-from ipe_bench.basics.options import Component
+from ipe_bench.basics.options import Component, Count
 
 
 class Task(Protocol):
@@ -50,9 +51,8 @@ class Limits:
 
             # Data, not address space: compiled code and thread pools reserve far more addresses than they use.
             _, most = resource.getrlimit(resource.RLIMIT_DATA)
-            resource.setrlimit(
-                resource.RLIMIT_DATA, (most if self.memory_gb is None else int(self.memory_gb * 1e9), most)
-            )
+            limit = most if self.memory_gb is None else int(self.memory_gb * 1e9)
+            resource.setrlimit(resource.RLIMIT_DATA, (limit, most))
 
 
 FATAL = (UserError, StorageError)
@@ -97,3 +97,45 @@ class Execution(Component, Named, ABC):
 
     def warm_up(self, work: Work, tasks: int) -> None:
         """Starts what takes time to start before so many tasks can run, without waiting for it. May be left out."""
+
+
+@dataclass(frozen=True)
+class Serial(Execution):
+    """Runs tasks in this process; compiled models still use every core.
+
+    Nothing stands between an estimator and this process: one that never returns, or ends the process, ends the run.
+    """
+
+    def run(self, work: Work, tasks: Sequence[Task]) -> Iterator[Event]:
+        for index, task in enumerate(tasks):
+            failure = None
+            try:
+                for step in work(task):
+                    yield Event(index, step)
+            except FATAL:
+                raise
+            except (Exception, SystemExit) as error:
+                failure = Failure.of(error)
+            yield Event(index, ended=True, failure=failure)
+
+
+@dataclass(frozen=True)
+class LimitedExecution(Execution):
+    """An execution whose tasks run in worker processes, within limits."""
+
+    workers: Count | None = None
+    """How many processes; None: one per core."""
+    block_timeout_s: Limit | None = None
+    """Seconds that one estimator may take for one block; None: no limit."""
+    memory_limit_gb: Limit | None = None
+    """Memory that one worker may use, in 1e9 bytes; None: no limit. Linux only."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.memory_limit_gb is not None and not sys.platform.startswith("linux"):
+            raise UserError(f"memory_limit_gb={self.memory_limit_gb}: can be enforced on Linux only; give null")
+
+    @property
+    def limits(self) -> Limits:
+        """What one task may use."""
+        return Limits(self.block_timeout_s, self.memory_limit_gb)

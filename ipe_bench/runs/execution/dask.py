@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import atexit
+import concurrent.futures
 import contextlib
 import functools
 import json
@@ -20,7 +22,7 @@ import cloudpickle
 from ipe_bench.basics.errors import StorageError, UserError, describe_exception
 from ipe_bench.basics.machine import cores
 from ipe_bench.basics.options import Count
-from ipe_bench.runs.execution.base import FATAL, Event, Execution, Failure, Limit, Limits, Task, Work
+from ipe_bench.runs.execution.base import FATAL, Event, Failure, LimitedExecution, Limits, Task, Work
 from ipe_bench.runs.execution.processes import supervise
 
 log = logging.getLogger(__name__)
@@ -28,10 +30,12 @@ log = logging.getLogger(__name__)
 _CONNECT_S = 30
 _PATIENCE_S = 15.0
 """So long nothing is said while a cluster has no workers."""
+_CANCELLED = asyncio.CancelledError, concurrent.futures.CancelledError
+"""What is raised of a task that was called off."""
 
 
 @dataclass(frozen=True)
-class Dask(Execution):
+class Dask(LimitedExecution):
     """Runs tasks on the workers of a Dask cluster, which write to the output directory themselves: all machines need it
     under the same path, and the same installation of ipe-bench and its plugins.
 
@@ -47,10 +51,6 @@ class Dask(Execution):
     """A cluster class of dask-jobqueue, such as SLURMCluster, to start workers as jobs of a batch system."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """Keyword arguments of the cluster class."""
-    block_timeout_s: Limit | None = None
-    """Seconds that one estimator may take for one block; None: no limit."""
-    memory_limit_gb: Limit | None = None
-    """Memory that one estimating process may use, in 1e9 bytes; None: no limit."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -60,13 +60,13 @@ class Dask(Execution):
     def run(self, work: Work, tasks: Sequence[Task]) -> Iterator[Event]:
         if not tasks:
             return
-        client = self._client()
+        options = json.dumps(dict(self.options), sort_keys=True, default=str)
+        client = _connect(self.workers, self.address, self.jobqueue, options)
         from distributed import as_completed
 
-        limits = Limits(self.block_timeout_s, self.memory_limit_gb)
         # As bytes: what a Dask worker cannot unpickle, such as a plugin that it lacks, is then ours to name.
         payloads = [cloudpickle.dumps((work, task)) for task in tasks]
-        futures = {client.submit(_run_one, payload, limits, pure=False): i for i, payload in enumerate(payloads)}
+        futures = {client.submit(_run_one, payload, self.limits, pure=False): i for i, payload in enumerate(payloads)}
         heard = threading.Event()
         threading.Thread(target=_say_when_nobody_works, args=(client, heard), daemon=True).start()
         try:
@@ -76,7 +76,7 @@ class Dask(Execution):
                 error = None if future.cancelled() else future.exception()
                 if isinstance(error, FATAL):
                     raise error
-                if future.cancelled() or isinstance(error, _cancelled()):
+                if future.cancelled() or isinstance(error, _CANCELLED):
                     raise _lost(client)
                 if error is not None:  # Dask gave up on it: its workers died again and again
                     failure = Failure("died", f"{type(error).__name__}: {' '.join(str(error).split())}")
@@ -86,25 +86,12 @@ class Dask(Execution):
                 for step in steps:
                     yield Event(index, step)
                 yield Event(index, ended=True, failure=failure)
-        except (*_cancelled(), OSError) as error:  # what as_completed raises where the scheduler is gone
+        except (*_CANCELLED, OSError) as error:  # what as_completed raises where the scheduler is gone
             raise _lost(client) from error
         finally:
             heard.set()
-            with contextlib.suppress(Exception, *_cancelled()):
+            with contextlib.suppress(Exception, *_CANCELLED):
                 client.cancel(list(futures), force=True)
-
-    def _client(self) -> Any:
-        options = json.dumps(dict(self.options), sort_keys=True, default=str)
-        return _connect(self.workers, self.address, self.jobqueue, options)
-
-
-@functools.cache
-def _cancelled() -> tuple[type[BaseException], ...]:
-    """What is raised of a task that was called off."""
-    import asyncio
-    import concurrent.futures
-
-    return asyncio.CancelledError, concurrent.futures.CancelledError
 
 
 def _lost(client: Any) -> StorageError:
@@ -149,18 +136,17 @@ def _connect(workers: int | None, address: str | None, jobqueue: str | None, opt
             client = distributed.Client(address, timeout=_CONNECT_S)
         except (OSError, ValueError) as error:
             raise UserError(f"execution.address={address}: no scheduler answers there ({error})") from None
-        atexit.register(client.close)
-        return client
-    if jobqueue is not None:
-        cluster = _jobqueue_cluster(jobqueue, options)
-        cluster.scale(workers or 1)
     else:
-        defaults = {"n_workers": workers or cores(), "threads_per_worker": 1, "dashboard_address": None}
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # it may warn of ports in use
-            cluster = distributed.LocalCluster(**{**defaults, **options})  # pyright: ignore[reportArgumentType]
-    client = distributed.Client(cluster)
-    atexit.register(cluster.close)
+        if jobqueue is not None:
+            cluster = _jobqueue_cluster(jobqueue, options)
+            cluster.scale(workers or 1)
+        else:
+            options = {"n_workers": workers or cores(), "threads_per_worker": 1, "dashboard_address": None, **options}
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # it may warn of ports in use
+                cluster = distributed.LocalCluster(**options)
+        client = distributed.Client(cluster)
+        atexit.register(cluster.close)
     atexit.register(client.close)
     return client
 

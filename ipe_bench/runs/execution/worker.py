@@ -21,9 +21,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ipe_bench.runs.execution.base import Limits
 
-IDLE_S = 300.0
-"""A worker that nobody has used for so long ends by itself."""
-
 
 def main(handle: int) -> None:
     # Ctrl-C is the parent's business: it ends its workers.
@@ -35,10 +32,7 @@ def main(handle: int) -> None:
     # Reading in a thread, so that the end of the parent is noticed in the middle of a task.
     threading.Thread(target=_listen, args=(connection, messages), daemon=True).start()
     while True:
-        try:
-            path, threads, payload = messages.get(timeout=IDLE_S)
-        except queue.Empty:
-            return
+        path, threads, payload = messages.get()
         sys.path[:] = path
         os.environ["IPE_BENCH_THREADS"] = str(threads)
         if isinstance(payload, str):
@@ -53,14 +47,10 @@ def _listen(connection: Connection, messages: queue.SimpleQueue[Any]) -> None:
         try:
             messages.put(connection.recv())
         except (EOFError, OSError):
-            _end()
-
-
-def _end() -> None:
-    """Ends this process at once, and with it those that a task has started: its session holds nothing else."""
-    if sys.platform != "win32" and os.getsid(0) == os.getpid():
-        os.killpg(0, signal.SIGKILL)
-    os._exit(0)
+            # The parent is gone. This session holds nothing but this process and those that a task has started.
+            if sys.platform != "win32" and os.getsid(0) == os.getpid():
+                os.killpg(0, signal.SIGKILL)
+            os._exit(0)
 
 
 def _perform(connection: Connection, limits: Limits, payload: bytes) -> tuple[str, Any]:
