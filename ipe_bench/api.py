@@ -328,7 +328,7 @@ def estimate(
     """
     from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
     from ipe_bench.real.estimation import Question
-    from ipe_bench.real.sources import LeftOut
+    from ipe_bench.real.readings import LeftOut
     from ipe_bench.report.answer import Answer
     from ipe_bench.solvers import Auto
 

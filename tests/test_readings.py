@@ -12,8 +12,7 @@ from small_models import Bent
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Bearings, Gins, Ranging
-from ipe_bench.real.readings import header, write_readings
-from ipe_bench.real.sources import open_together
+from ipe_bench.real.readings import header, open_together, write_readings
 
 MODELS = [Ranging(), Bearings(), Gins(), Bent(count=5)]
 

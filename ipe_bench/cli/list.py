@@ -100,8 +100,7 @@ def _describe_measurement(out: Console, option: plugins.Option) -> None:
     from omegaconf import OmegaConf
     from omegaconf.errors import MissingMandatoryValue
 
-    from ipe_bench.real.readings import header
-    from ipe_bench.real.sources import input_rows
+    from ipe_bench.real.readings import header, labels
 
     try:
         model = construct(OmegaConf.to_container(OmegaConf.load(option.path), throw_on_missing=True), "measurement")
@@ -121,7 +120,7 @@ def _describe_measurement(out: Console, option: plugins.Option) -> None:
         table.add_row(parameter.name, f"{parameter.size:g}", parameter.unit)
     out.print(table)
     out.print(f"readings={{FILE}}: {model.m} rows, header: {columns}", markup=False, soft_wrap=True)
-    first = ",".join(str(column[0]) for column in input_rows(model).values())
+    first = ",".join(str(column[0]) for column in labels(model).values())
     out.print(f"first row: {first},<reading>", markup=False, soft_wrap=True)
     if model.inputs:
         known = ", ".join(i.heading for i in model.inputs)

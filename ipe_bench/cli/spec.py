@@ -21,7 +21,7 @@ from ipe_bench.plugins.construct import construct, instantiate
 from ipe_bench.plugins.description import Described, options_of
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.real.estimation import Question, prior_stated
-from ipe_bench.real.sources import LeftOut
+from ipe_bench.real.readings import LeftOut
 from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.provenance import TARGET, canonical_json, describe

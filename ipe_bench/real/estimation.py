@@ -20,12 +20,12 @@ from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo, informed
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.measurements.repeatable import require_repeatable
-from ipe_bench.noise import Certified, ModelNoise, Noise, Unknown
+from ipe_bench.noise import Certified, Gaussian, ModelNoise, Noise, Unknown
 from ipe_bench.priors import GaussianPrior, Prior, prior_of
 from ipe_bench.real.covariances import read_covariance
 from ipe_bench.real.examination import Examination, examinations
 from ipe_bench.real.fits import Fit, fit
-from ipe_bench.real.sources import LeftOut, Readings, noise_of, open_together, require_enough
+from ipe_bench.real.readings import SIGMA, LeftOut, Readings, open_together, require_enough
 from ipe_bench.trials.scenario import Scenario
 
 
@@ -96,7 +96,17 @@ class Question:
         stated = self.noise.of(found.model) if isinstance(self.noise, ModelNoise) else self.noise
         if self.readings is None and stated is None:
             return Certified()
-        return noise_of(found, stated) or ModelNoise().of(found.model) or Unknown()
+        if found.deviations is None:
+            return stated or ModelNoise().of(found.model) or Unknown()
+        deviations = tuple(np.where(np.isfinite(found.deviations), found.deviations, 1.0).tolist())
+        if isinstance(stated, Unknown):
+            return Unknown(deviations)
+        if stated is not None:
+            raise UserError(
+                f"noise: is given, and the readings have a column {SIGMA}, too; leave one of them out, or set"
+                " noise=unknown to take the column for relative weights"
+            )
+        return Gaussian(deviations)
 
 
 @dataclass(frozen=True)

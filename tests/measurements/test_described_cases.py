@@ -13,8 +13,7 @@ from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.real.fits import fit
-from ipe_bench.real.readings import write_readings
-from ipe_bench.real.sources import open_together
+from ipe_bench.real.readings import open_together, write_readings
 from ipe_bench.trials.scenario import Scenario
 
 FEED, BEGIN = (2.0, 0.0, 5.0), (1.0, 9.0, 4.0)

@@ -21,7 +21,7 @@ from ipe_bench.measurements.nist import datasets, digits
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Unknown
 from ipe_bench.real.fits import fit
-from ipe_bench.real.sources import open_together
+from ipe_bench.real.readings import open_together
 
 _POLYNOMIALS = "(b1+b2*x+b3*x**2+b4*x**3)/(1+b5*x+b6*x**2+b7*x**3)"
 _GAUSS = "b1*exp(-b2*x) + b3*exp(-(x-b4)**2/b5**2) + b6*exp(-(x-b7)**2/b8**2)"

@@ -12,8 +12,7 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.real.fits import fit
-from ipe_bench.real.readings import write_readings
-from ipe_bench.real.sources import open_together
+from ipe_bench.real.readings import open_together, write_readings
 
 BIAS = np.array([120.0, -340.0, 55.0, -12.0, 30.0, 7.0])
 SCALE = np.array([0.00241, 0.00237, 0.00246, 0.0075, 0.0077, 0.00761])

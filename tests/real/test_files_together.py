@@ -17,7 +17,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Formula, Sir
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo, informed
 from ipe_bench.noise import Gaussian, ModelNoise
-from ipe_bench.real.sources import LeftOut, Readings, open_together
+from ipe_bench.real.readings import LeftOut, Readings, open_together
 
 OWN = Formula(SATURATION, START, own=("b1",))
 LM = {"lm": LevenbergMarquardt(tolerance=1e-10, max_iterations=300)}

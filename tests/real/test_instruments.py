@@ -18,8 +18,7 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, ModelNoise, Quantization, Unknown
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.real.fits import Fit, fit
-from ipe_bench.real.readings import write_readings
-from ipe_bench.real.sources import open_together
+from ipe_bench.real.readings import open_together, write_readings
 from ipe_bench.trials.scenario import Scenario
 
 SATURATION = "b1*(1-exp(-b2*t))"

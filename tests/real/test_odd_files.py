@@ -18,8 +18,7 @@ from ipe_bench.measurements import Accelerometer, Formula, Gnss, Measurement, Ra
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
 from ipe_bench.real.fits import fit
-from ipe_bench.real.readings import write_readings
-from ipe_bench.real.sources import open_together
+from ipe_bench.real.readings import open_together, write_readings
 
 LINE = Formula("a+b*t", {"a": 1.0, "b": 1.0})
 T = [0.5, 1.25, 2.0, 3.5, 5.0, 8.0]
