@@ -9,7 +9,7 @@ from typing import ClassVar
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.estimators.base import Estimates, Estimator
-from ipe_bench.estimators.driver import Solver
+from ipe_bench.estimators.driver import Limits, Solver
 from ipe_bench.estimators.ipe import Start, starting_points
 from ipe_bench.estimators.least_squares import LeastSquaresSystem, Objective, minimize
 from ipe_bench.measurements.problem import Problem
@@ -17,7 +17,7 @@ from ipe_bench.measurements.problem import Problem
 
 @dataclass(frozen=True)
 class Batch(Estimator):
-    """Least squares on all readings at once; what is minimised, and by which method, is left to the subclass."""
+    """Least squares on all readings at once; a subclass says what is minimised, and by which method."""
 
     start: Start = "nominal"
     """Where the iteration begins: at the linear LSE, eq. (16), at the nominal point, or at that of the two where the
@@ -43,13 +43,6 @@ class Batch(Estimator):
         objective = self.objective(problem, z)
         tally = objective.model.tally
         x = starting_points(problem, z, self.start, tally)
-        minima = minimize(
-            objective,
-            self.method(objective),
-            x,
-            tolerance=self.tolerance,
-            max_iterations=self.max_iterations,
-            budget=self.budget,
-            history=history,
-        )
+        limits = Limits(self.tolerance, self.max_iterations, self.budget, history)
+        minima = minimize(objective, self.method(objective), x, limits)
         return minima.estimates(tally, z.shape[1])

@@ -16,6 +16,7 @@ from ipe_bench.basics.options import Count, Positive, Whole
 from ipe_bench.basics.statuses import Status
 from ipe_bench.basics.streams import normals, own_generators
 from ipe_bench.estimators.base import Equation, Estimates, Estimator, Need
+from ipe_bench.estimators.driver import Limits, continued
 from ipe_bench.estimators.gauss_newton import GaussNewtonMethod
 from ipe_bench.estimators.least_squares import Objective, minimize
 from ipe_bench.measurements.problem import Problem
@@ -101,21 +102,9 @@ class EsMda(Estimator):
         )
 
     def _polish(self, objective: Objective, smoothed: Estimates) -> Estimates:
-        minima = minimize(
-            objective,
-            GaussNewtonMethod(),
-            smoothed.x,
-            tolerance=self.tolerance,
-            max_iterations=self.polish,
-            history=True,
-        )
-        estimates = minima.estimates(objective.model.tally, objective.readings)
-        assert smoothed.history is not None
-        assert estimates.history is not None
-        parts = zip(smoothed.history, estimates.history, strict=True)
-        estimates.history = [np.concatenate([before, after[1:]]) for before, after in parts]
-        estimates.iterations = smoothed.iterations + estimates.iterations
-        return estimates
+        limits = Limits(self.tolerance, self.polish, history=True)
+        minima = continued(smoothed, minimize(objective, GaussNewtonMethod(), smoothed.x, limits))
+        return minima.estimates(objective.model.tally, objective.readings)
 
 
 def assimilated(s: Array, h: Array, z: Array, inflation: float) -> Array:

@@ -18,11 +18,10 @@ from ipe_bench.baselines.ensemble import read_members
 from ipe_bench.baselines.epochs import Epoch, arrivals
 from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, Mask, finite, inverse, multiply
+from ipe_bench.basics.linalg import Array, Mask, finite, inverse, multiply, squared
 from ipe_bench.basics.options import Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
-from ipe_bench.estimators.least_squares import squared
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
 

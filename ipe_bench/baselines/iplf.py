@@ -8,11 +8,10 @@ import numpy as np
 
 from ipe_bench.baselines.information import Belief, EpochReadings, InformationFilter
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array, Mask, finite, multiply
+from ipe_bench.basics.linalg import Array, Mask, finite, multiply, squared
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.driver import ConvergenceCheck, Solver, iterate
-from ipe_bench.estimators.least_squares import squared
+from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, iterate
 
 _SHORTEST = 2.0**-10
 """A share of a step below which no shorter one is tried: the covariance is brought up to date instead."""
@@ -41,7 +40,7 @@ class IPLF(InformationFilter):
         prior = readings.belief
         method = PosteriorLinearization(self.inner_iterations, self.tolerance)
         start = method.begin(readings, prior.mean)
-        ended = iterate(readings, method, start, tolerance=self.tolerance, max_iterations=self.max_iterations)
+        ended = iterate(readings, method, start, Limits(self.tolerance, self.max_iterations))
         lost = (ended.status == Status.NONFINITE)[:, None]
         belief = ended.state.proposal
         return replace(belief, mean=np.where(lost, np.nan, belief.mean)), start.innovations

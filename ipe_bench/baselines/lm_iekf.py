@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.baselines.information import Belief, EpochReadings, InformationFilter
-from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.basics.linalg import Array, multiply, squared
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.driver import SolveResult, iterate
-from ipe_bench.estimators.least_squares import LeastSquaresSystem, squared
+from ipe_bench.estimators.driver import Limits, SolveResult, iterate
+from ipe_bench.estimators.least_squares import LeastSquaresSystem
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.counted import CountingModel
 
@@ -38,7 +38,7 @@ class LMIEKF(InformationFilter):
         problem = Standardized(readings, readings.belief.root())
         method = LevenbergMarquardtMethod(self.damping, np.ones(problem.n))
         start = method.begin(problem, np.zeros_like(readings.belief.mean))
-        ended = iterate(problem, method, start, tolerance=self.tolerance, max_iterations=self.max_iterations)
+        ended = iterate(problem, method, start, Limits(self.tolerance, self.max_iterations))
         return problem.belief(ended), start.cost - squared(start.slope.gradient)
 
 

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, Covariance, Mask, finite, inverse, multiply, solve
+from ipe_bench.basics.linalg import Array, Covariance, Mask, finite, inverse, multiply, solve, squared
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
-from ipe_bench.estimators.driver import ConvergenceCheck, Solver, iterate
-from ipe_bench.estimators.least_squares import Minima, squared
+from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, iterate
+from ipe_bench.estimators.least_squares import Minima
 from ipe_bench.measurements.base import Measurement, SubsetModel
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.ode.interval import Interval
@@ -69,15 +69,8 @@ class MultipleShooting(Estimator):
         with np.errstate(all="ignore"):
             shooting = Shooting(pieces, z, EvaluationCount.zeros(len(z)), np.arange(len(z)))
             x = np.repeat(problem.x0[None], len(z), axis=0)
-            ended = iterate(
-                shooting,
-                CondensedGaussNewton(),
-                x,
-                tolerance=self.tolerance,
-                max_iterations=self.max_iterations,
-                budget=self.budget,
-                history=history,
-            )
+            limits = Limits(self.tolerance, self.max_iterations, self.budget, history)
+            ended = iterate(shooting, CondensedGaussNewton(), x, limits)
             state = ended.state
             r = state.r
             minima = Minima(

@@ -10,6 +10,7 @@ from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.estimators.base import Estimates, Estimator
+from ipe_bench.estimators.driver import Limits
 from ipe_bench.estimators.least_squares import Minima, Objective, minimize
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.problem import Problem
@@ -43,9 +44,7 @@ class MultiscaleLM(Estimator):
                 objective,
                 LevenbergMarquardtMethod(self.damping, metric),
                 np.repeat(problem.x0[None], len(z), axis=0),
-                tolerance=self.tolerance,
-                max_iterations=self.max_iterations,
-                history=history,
+                Limits(self.tolerance, self.max_iterations, history=history),
             )
             for metric in (size, None)
         )

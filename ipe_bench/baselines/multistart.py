@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Annotated
+from dataclasses import dataclass
 
 import numpy as np
-from annotated_types import Ge, Lt
+from numpy.typing import NDArray
 
-from ipe_bench.basics.batches import put, take
+from ipe_bench.basics.batches import take
 from ipe_bench.basics.linalg import Array, Mask, finite
 from ipe_bench.basics.options import Count, Positive, Whole
 from ipe_bench.basics.streams import normals, own_generators
 from ipe_bench.estimators.base import Estimates, Estimator
-from ipe_bench.estimators.fitting import Fitting, spread_of_starts
+from ipe_bench.estimators.driver import Limits
+from ipe_bench.estimators.fitting import Fitting, passes, spread_of_starts
 from ipe_bench.estimators.least_squares import Minima, Objective, minimize
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.problem import Problem
@@ -42,8 +42,6 @@ class Multistart(Estimator):
     """Steps tried from each start."""
     tolerance: Positive = 1e-6
     """Largest Gauss-Newton step in standard deviations of the local bound."""
-    fit_level: Annotated[float, Ge(0), Lt(1)] = 1e-6
-    """Residuals less probable than this are taken for those of a wrong minimum."""
     seed: Whole = 0
     """A trial's random stream depends on this and on its readings: on nothing else in the batch."""
     budget: Positive | None = None
@@ -55,10 +53,14 @@ class Multistart(Estimator):
         objective = Objective.of(problem, z, prior=False)
         tally, x0, trials = objective.model.tally, problem.x0, len(z)
         draws = normals(own_generators(self.seed, z), self.starts - 1, len(x0))
-        fitting = Fitting.none(trials, z.shape[1], self.fit_level)
+        fitting = Fitting.none(trials, z.shape[1])
+
+        def fits(found: Minima, rows: NDArray[np.intp]) -> Mask:
+            """Which minima are believed; those that fit are noted."""
+            return fitting.note(found, rows) & passes(found, z.shape[1], problem.doubted)
+
         best = self._descend(objective, problem, np.repeat(x0[None], trials, axis=0), history)
-        fits = fitting.note(best, np.arange(trials))
-        confirmed = np.where(fits, 0, -1)
+        confirmed = np.where(fits(best, np.arange(trials)), 0, -1)
         for k in range(self.starts - 1):
             affordable = tally.cost(len(x0)) < (np.inf if self.budget is None else self.budget)
             hopeless = ~finite(z) | tally.failed(np.arange(trials))
@@ -67,26 +69,10 @@ class Multistart(Estimator):
                 break
             x = x0 + spread_of_starts(problem) * draws[rows, k]
             again = self._descend(objective.subset(rows), problem, x, history)
-            fits = fitting.note(again, rows)
-            confirmed[rows] += (confirmed[rows] >= 0) | fits
-            better = _is_better(again, take(best, rows))
-            spent = best.iterations.copy()
-            spent[rows] += again.iterations
-            best = replace(put(best, rows[better], take(again, better)), iterations=spent)
+            confirmed[rows] += (confirmed[rows] >= 0) | fits(again, rows)
+            best = best.replaced(rows, again, again.better_than(take(best, rows)))
         return fitting.report(best.estimates(tally, z.shape[1]))
 
     def _descend(self, objective: Objective, problem: Problem, x: Array, history: bool) -> Minima:
-        return minimize(
-            objective,
-            LevenbergMarquardtMethod(self.damping, problem.prior_used()),
-            x,
-            tolerance=self.tolerance,
-            max_iterations=self.max_iterations,
-            budget=self.budget,
-            history=history,
-        )
-
-
-def _is_better(new: Minima, old: Minima) -> Mask:
-    """Where a new minimum counts rather than the old one: it converged and is lower, or the old one had no end."""
-    return new.converged & (~(new.chi_square >= old.chi_square) | ~old.converged)
+        method = LevenbergMarquardtMethod(self.damping, problem.prior_used())
+        return minimize(objective, method, x, Limits(self.tolerance, self.max_iterations, self.budget, history))

@@ -104,6 +104,11 @@ def deviations(P: Array) -> Array:
     return np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
 
 
+def squared(r: Array) -> Array:
+    """|r|^2 (trials,) of vectors (trials, k)."""
+    return np.einsum("ti,ti->t", r, r)
+
+
 def quadratic_form(P_inverse: Array, e: Array) -> Array:
     """e' P^-1 e for each trial: P_inverse (..., n, n), e (trials, n) -> (trials,)."""
     return np.einsum("...i,...i->...", e, multiply(P_inverse, e))

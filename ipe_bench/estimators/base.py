@@ -6,7 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,28 +22,6 @@ Need = Literal["differential equations", "epochs", "prior"]
 Equation = Literal["frozen", "least_squares", "map"]
 
 
-def _nothing() -> Array:
-    """Stands for zero in every trial."""
-    return np.zeros(0)
-
-
-def _no_counts() -> NDArray[np.int64]:
-    return np.zeros(0, np.int64)
-
-
-class Answer(Protocol):
-    """Where an iteration of a batch ended."""
-
-    @property
-    def x(self) -> Array: ...
-    @property
-    def status(self) -> NDArray[np.int8]: ...
-    @property
-    def iterations(self) -> NDArray[np.int64]: ...
-    @property
-    def history(self) -> list[Array] | None: ...
-
-
 @dataclass
 class Estimates:
     """The result of a batch; every field has a leading trials axis."""
@@ -53,14 +31,14 @@ class Estimates:
     status: NDArray[np.int8]
     covariance: Array | None = None
     """(trials, n, n): the covariance that the estimator itself reports."""
-    iterations: NDArray[np.int64] = field(default_factory=_no_counts)
-    simulations: Array = field(default_factory=_nothing)
+    iterations: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    simulations: Array = field(default_factory=lambda: np.zeros(0))
     """Evaluations of h per trial; a prefix of the epochs counts as its share."""
-    jacobians: Array = field(default_factory=_nothing)
+    jacobians: Array = field(default_factory=lambda: np.zeros(0))
     """Evaluations of dh/dx per trial, likewise."""
     messages: dict[int, str] = field(default_factory=dict)
     """What went wrong, by trial within the batch."""
-    seconds: Array = field(default_factory=_nothing)
+    seconds: Array = field(default_factory=lambda: np.zeros(0))
     """Computing time per trial; a batch's time is shared evenly."""
     history: list[Array] | None = None
     """For each trial the iterates (iterations + 1, n), where they were asked for."""
@@ -75,8 +53,8 @@ class Estimates:
                 setattr(self, name, np.zeros(len(self.x), values.dtype))
 
     @classmethod
-    def of(cls, ended: Answer, tally: EvaluationCount, **further: Any) -> Estimates:
-        """What an iteration came to, with what it cost; `further` are fields that only the estimator knows."""
+    def of(cls, ended: Any, tally: EvaluationCount, **further: Any) -> Estimates:
+        """Where an iteration ended, with what it cost; `further` are fields that only the estimator knows."""
         counts = {"simulations": tally.simulations.copy(), "jacobians": tally.jacobians.copy()}
         found = {"x": ended.x, "status": ended.status, "iterations": ended.iterations, "history": ended.history}
         return cls(**{**found, **counts, "messages": dict(tally.messages), **further})
@@ -84,30 +62,29 @@ class Estimates:
     @classmethod
     def join(cls, parts: Sequence[Estimates]) -> Estimates:
         """The batches one after another."""
-        first, starts = parts[0], np.cumsum([0, *(len(p.x) for p in parts)])
-        covariances = [p.covariance for p in parts]
-        if all(c is None for c in covariances):
-            covariance = None
-        else:
-            n = first.x.shape[1]
-            missing = [np.full((len(p.x), n, n), np.nan) for p in parts]
-            covariance = np.concatenate([m if c is None else c for c, m in zip(covariances, missing, strict=True)])
-        names = dict.fromkeys(name for p in parts for name in p.extras)
-        unknown = [np.full(len(p.x), np.nan) for p in parts]
-        histories = [p.history for p in parts]
+        n, sizes = parts[0].x.shape[1], [len(p.x) for p in parts]
+        starts = np.cumsum([0, *sizes[:-1]])
+
+        def joined(values: list[Any], *shape: int) -> Any:
+            """NaN where a part has none, and None where no part has any."""
+            if all(v is None for v in values):
+                return None
+            known = (np.full((size, *shape), np.nan) if v is None else v for v, size in zip(values, sizes, strict=True))
+            return np.concatenate(list(known))
+
+        whole = ("x", "status", "iterations", "simulations", "jacobians", "seconds")
+        histories, others = [p.history for p in parts], [p.alternatives for p in parts]
+        none = [[np.zeros((0, n))] * size for size in sizes]
         return cls(
-            x=np.concatenate([p.x for p in parts]),
-            status=np.concatenate([p.status for p in parts]),
-            covariance=covariance,
-            iterations=np.concatenate([p.iterations for p in parts]),
-            simulations=np.concatenate([p.simulations for p in parts]),
-            jacobians=np.concatenate([p.jacobians for p in parts]),
-            messages={int(s) + i: m for s, p in zip(starts, parts, strict=False) for i, m in p.messages.items()},
-            seconds=np.concatenate([p.seconds for p in parts]),
+            **{name: joined([getattr(p, name) for p in parts]) for name in whole},
+            covariance=joined([p.covariance for p in parts], n, n),
+            messages={int(s) + i: m for s, p in zip(starts, parts, strict=True) for i, m in p.messages.items()},
             history=None if any(h is None for h in histories) else [x for h in histories if h for x in h],
-            alternatives=_joined_alternatives(parts),
+            alternatives=None
+            if all(o is None for o in others)
+            else [x for o, empty in zip(others, none, strict=True) for x in (o or empty)],
             extras={
-                k: np.concatenate([p.extras.get(k, u) for p, u in zip(parts, unknown, strict=True)]) for k in names
+                k: joined([p.extras.get(k) for p in parts]) for k in dict.fromkeys(k for p in parts for k in p.extras)
             },
         )
 
@@ -116,14 +93,6 @@ class Estimates:
         """Trials that ended in an exception."""
         status = np.full(trials, Status.ERROR, dtype=np.int8)
         return cls(np.full((trials, n), np.nan), status, messages=dict.fromkeys(range(trials), message))
-
-
-def _joined_alternatives(parts: Sequence[Estimates]) -> list[Array] | None:
-    """Those of all parts; none for the trials of a part that knows of none."""
-    if all(p.alternatives is None for p in parts):
-        return None
-    none = [[np.zeros((0, p.x.shape[1]))] * len(p.x) for p in parts]
-    return [x for p, empty in zip(parts, none, strict=True) for x in (p.alternatives or empty)]
 
 
 class Estimator(Component, ABC):

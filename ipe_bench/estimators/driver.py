@@ -1,13 +1,13 @@
-"""The one loop: iterates any method on a batch of trials until each has an answer, or a failure that has a name.
+"""The loop that iterates any method on a batch of trials until each has an answer, or a failure that has a name.
 
 A method (`Solver`) says where it begins, what a step is, and how far its equation is from holding. Stopping, counting,
-histories and the table of endings are here; what the equation is and what is made of its root is left to others.
+histories and the table of endings are here.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -78,6 +78,19 @@ class Solver(ABC, Generic[S]):
 
 
 @dataclass(frozen=True)
+class Limits:
+    """How far an iteration goes."""
+
+    tolerance: float
+    """Converged is where `ConvergenceCheck.size` is at most this."""
+    max_iterations: int
+    budget: float | None = None
+    """Simulations that a trial may cost, a Jacobian counting n; None: no limit."""
+    history: bool = False
+    """Whether the iterates are kept."""
+
+
+@dataclass(frozen=True)
 class SolveResult(Generic[S]):
     """Where the iteration of each trial ended."""
 
@@ -96,30 +109,17 @@ class SolveResult(Generic[S]):
         return self.status == Status.CONVERGED
 
 
-def iterate(
-    equations: Equations,
-    solver: Solver[S],
-    start: Array | S,
-    *,
-    tolerance: float,
-    max_iterations: int,
-    budget: float | None = None,
-    history: bool = False,
-) -> SolveResult[S]:
-    """Iterates from `start`, which is x (trials, n) or a state, until every trial has ended.
-
-    Converged is where `ConvergenceCheck.size` is at most `tolerance`. `budget` bounds the simulations of a trial, a
-    Jacobian counting n; None: no limit. Finished trials leave the batch.
-    """
+def iterate(equations: Equations, solver: Solver[S], start: Array | S, limits: Limits) -> SolveResult[S]:
+    """Iterates from `start`, which is x (trials, n) or a state, until every trial has ended; those leave the batch."""
     state = solver.begin(equations, start) if isinstance(start, np.ndarray) else start
     trials, n = state.x.shape
     tally, active = equations.model.tally, np.arange(trials)
     status, iterations = np.full(trials, Status.RUNNING, np.int8), np.zeros(trials, np.int64)
-    iterates = [[row] for row in state.x] if history else None
+    iterates = [[row] for row in state.x] if limits.history else None
     ended: list[tuple[NDArray[np.intp], S]] = []
     check = solver.check(equations, None, state)
     begun = np.maximum(check.level, 1.0)
-    for iteration in range(max_iterations + 1):
+    for iteration in range(limits.max_iterations + 1):
         if iteration:
             before, state = state, solver.step(equations, state)
             check = solver.check(equations, before, state)
@@ -128,9 +128,9 @@ def iterate(
                 for row, x in zip(active, state.x, strict=True):
                     iterates[row].append(x)
         rows = equations.rows
-        spent = budget is not None and tally.cost(n)[rows] >= budget
-        last = Status.MAX_ITERATIONS if iteration == max_iterations else Status.RUNNING
-        now = _endings(check, tally.failed(rows), tally.singular[rows], begun, spent, tolerance, last)
+        spent = limits.budget is not None and tally.cost(n)[rows] >= limits.budget
+        last = Status.MAX_ITERATIONS if iteration == limits.max_iterations else Status.RUNNING
+        now = _endings(check, tally.failed(rows), tally.singular[rows], begun, spent, limits.tolerance, last)
         status[active] = now
         going = now == Status.RUNNING
         if not going.all():
@@ -141,6 +141,18 @@ def iterate(
             equations, state = equations.subset(going), take(state, going)
     paths = None if iterates is None else [np.array(x) for x in iterates]
     return SolveResult(gather(ended) if ended else state, status, iterations, paths)
+
+
+R = TypeVar("R")
+
+
+def continued(first: Any, second: R) -> R:
+    """The second of two iterations, results with `iterations` and `history`, with the iterates of both."""
+    history = second.history  # type: ignore[attr-defined]
+    if history is not None:
+        history = [np.concatenate([a, b[1:]]) for a, b in zip(first.history, history, strict=True)]
+    iterations = first.iterations + second.iterations  # type: ignore[attr-defined]
+    return replace(second, iterations=iterations, history=history)  # type: ignore[type-var]
 
 
 def _endings(

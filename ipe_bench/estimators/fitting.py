@@ -1,4 +1,4 @@
-"""Minima that fit the readings alike, which no test of residuals can tell apart: they are found, counted and listed."""
+"""Minima that fit the readings alike, which no test of residuals can tell apart, counted and listed."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from ipe_bench.estimators.base import Estimates
 from ipe_bench.estimators.least_squares import Minima
 from ipe_bench.measurements.problem import Problem
 
+FIT_LEVEL = 1e-6
+"""Residuals less probable than this are taken for those of a wrong minimum."""
 _APART = 0.1
 """Two minima further apart than this, in standard deviations of the local bound, are two."""
 
@@ -21,18 +23,16 @@ class Fitting:
     """The distinct minima that pass the test of the fit, for the trials of a batch."""
 
     readings: int
-    level: float
-    """Residuals less probable than this do not fit."""
     known: list[list[Array]]
     """Of each trial, in the order in which they were found."""
 
     @classmethod
-    def none(cls, trials: int, readings: int, level: float) -> Fitting:
-        return cls(readings, level, [[] for _ in range(trials)])
+    def none(cls, trials: int, readings: int) -> Fitting:
+        return cls(readings, [[] for _ in range(trials)])
 
     def note(self, found: Minima, rows: NDArray[np.intp]) -> Mask:
-        """Adds those minima of the trials `rows` that fit and are not known yet; which of them fit."""
-        fits: Mask = found.converged & (found.fit_probability(self.readings) >= self.level)
+        """Adds the minima of the trials `rows` that fit and are not known yet, and says which of them fit."""
+        fits: Mask = found.converged & passes(found, self.readings, FIT_LEVEL)
         deviation = deviations(found.covariance)
         for i in np.flatnonzero(fits):
             known = self.known[rows[i]]
@@ -41,8 +41,8 @@ class Fitting:
         return fits
 
     def report(self, estimates: Estimates) -> Estimates:
-        """The estimates, with the extras `minima`, how many distinct ones that fit were found, and `ambiguous`, 1 where
-        there are several; the others are their `alternatives`."""
+        """The estimates with the extras `minima`, the number of distinct ones that fit, and `ambiguous`, 1 where there
+        are several; the others are their `alternatives`."""
         minima = np.array([len(known) for known in self.known], dtype=float)
         estimates.extras |= {"minima": minima, "ambiguous": (minima > 1).astype(float)}
         assert estimates.covariance is not None
@@ -52,6 +52,11 @@ class Fitting:
             for known, x, d in zip(self.known, estimates.x, deviation, strict=True)
         ]
         return estimates
+
+
+def passes(found: Minima, readings: int, level: float) -> Mask:
+    """Which minima (trials,) pass the test of the fit at a level; none at 1, where their residuals say nothing."""
+    return (found.fit_probability(readings) >= level) & (level < 1)
 
 
 def spread_of_starts(problem: Problem) -> Array:

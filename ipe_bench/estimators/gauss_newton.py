@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array, finite, multiply
+from ipe_bench.basics.linalg import Array, finite, multiply, squared
 from ipe_bench.estimators.driver import ConvergenceCheck, Solver
-from ipe_bench.estimators.least_squares import LeastSquaresSystem, Residuals, slope_at, squared
+from ipe_bench.estimators.least_squares import LeastSquaresSystem, Residuals, slope_at
 
 _SMALL = 1e-10
 """Singular values of J below this share of the largest are taken for zero where J lacks rank."""

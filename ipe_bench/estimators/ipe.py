@@ -25,10 +25,11 @@ from ipe_bench.basics.linalg import (
     multiply,
     pseudo_inverse,
     solve,
+    squared,
 )
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.estimators.base import Estimates, Estimator
-from ipe_bench.estimators.driver import ConvergenceCheck, Solver, iterate
+from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, iterate
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
@@ -194,13 +195,8 @@ def _better_fitting(system: FrozenSystem, x0: Array) -> Array:
     r0 = system.model.simulate(x0, system.rows) - system.z
     lse = x0 - multiply(system.H_plus, r0)
     r = system.model.simulate(lse, system.rows) - system.z
-    better = squared_norm(system.R.whiten(r)) < squared_norm(system.R.whiten(r0))
+    better = squared(system.R.whiten(r)) < squared(system.R.whiten(r0))
     return np.where(better[:, None], lse, x0)
-
-
-def squared_norm(r: Array) -> Array:
-    """|r|^2 of each trial (trials,)."""
-    return np.einsum("ti,ti->t", r, r)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,21 +237,13 @@ class IPE(Solver[S], Estimator, Generic[S]):
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         x, system = begin(problem, z, self.start)
-        ended = iterate(
-            system,
-            self,
-            x,
-            tolerance=self.tolerance,
-            max_iterations=self.max_iterations,
-            budget=self.budget,
-            history=history,
-        )
+        ended = iterate(system, self, x, Limits(self.tolerance, self.max_iterations, self.budget, history))
         return Estimates.of(ended, system.model.tally, covariance=system.sandwich(ended.x))
 
 
 def root_check(deviation: Array, before: State | None, state: State) -> ConvergenceCheck:
     """How far F is from zero, and how long the last step was, in standard deviations (1, n) or (trials, n)."""
     residual = np.abs(state.F / deviation).max(axis=1)
-    if before is None:
-        return ConvergenceCheck(residual, residual, np.full(len(residual), np.inf))
-    return ConvergenceCheck(residual, residual, np.abs((state.x - before.x) / deviation).max(axis=1))
+    first = before is None
+    moved = np.full(len(residual), np.inf) if first else np.abs((state.x - before.x) / deviation).max(axis=1)
+    return ConvergenceCheck(residual, residual, moved)

@@ -1,7 +1,6 @@
 """Least squares for a batch of trials: the objective, what a Jacobian says of it, and where a minimisation ended.
 
-The methods have pages of their own, `gauss_newton` and `levenberg_marquardt`; what an estimator starts from, fits and
-reports is left to it.
+The methods have pages of their own, `gauss_newton` and `levenberg_marquardt`.
 """
 
 from __future__ import annotations
@@ -24,10 +23,11 @@ from ipe_bench.basics.linalg import (
     multiply,
     normal_equations,
     solve,
+    squared,
 )
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
-from ipe_bench.estimators.driver import ConvergenceCheck, Solver, SolveResult, iterate
+from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, SolveResult, iterate
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
@@ -339,9 +339,29 @@ class Minima:
     """The median magnitude (trials,) of the readings' residuals in deviations: .67 where R is right, and little more
     where it is wrong for some of them only."""
 
+    @classmethod
+    def nowhere(cls, x: Array, history: bool) -> Minima:
+        """No minimum for any trial, at its start x (trials, n)."""
+        trials, n = x.shape
+        far = np.full(trials, np.inf)
+        status, none = np.full(trials, Status.MAX_ITERATIONS, np.int8), np.zeros(trials, np.int64)
+        return cls(
+            x, status, none, [row[None] for row in x] if history else None, np.full((trials, n, n), np.nan), far, far
+        )
+
     @property
     def converged(self) -> Mask:
         return self.status == Status.CONVERGED
+
+    def better_than(self, old: Minima) -> Mask:
+        """Which of these count rather than the old ones: they converged and are lower, or the old one had no end."""
+        return self.converged & (~(self.chi_square >= old.chi_square) | ~old.converged)
+
+    def replaced(self, rows: NDArray[np.intp], again: Minima, better: Mask) -> Minima:
+        """The minima after further ones `again` of the trials `rows`, where these are `better`; iterations add up."""
+        spent = self.iterations.copy()
+        spent[rows] += again.iterations
+        return dataclasses.replace(put(self, rows[better], take(again, better)), iterations=spent)
 
     def fit_probability(self, readings: int) -> Array:
         """The chi-square test of the fit (trials,): how probable residuals at least this large are if the model holds,
@@ -356,35 +376,21 @@ class Minima:
         return Estimates.of(self, tally, covariance=self.covariance, extras=extras)
 
 
-def minimize(
-    objective: Objective,
-    method: Solver[LeastSquaresSystem],
-    x: Array,
-    *,
-    tolerance: float,
-    max_iterations: int,
-    budget: float | None = None,
-    history: bool = False,
-) -> Minima:
+def minimize(objective: Objective, method: Solver[LeastSquaresSystem], x: Array, limits: Limits) -> Minima:
     """Minimises the objective from x (trials, n) by Gauss-Newton or Levenberg-Marquardt.
 
-    Converged is where the Gauss-Newton step, which is the gradient in whitened units, is at most `tolerance` standard
-    deviations of the local bound in every parameter. An iteration is a step tried, taken or not. Jacobians are coarse
-    on the way, where the model has cheaper ones, and exact at the end.
+    Converged is where the Gauss-Newton step, which is the gradient in whitened units, is at most `limits.tolerance`
+    standard deviations of the local bound in every parameter. An iteration is a step tried, taken or not. Jacobians are
+    coarse on the way, if the model has cheaper ones, and exact at the end.
     """
     if np.isinf(objective.exact_within):
         objective = objective.coarsened(_NEAR)
-    limits: dict[str, Any] = {"tolerance": tolerance, "max_iterations": max_iterations, "budget": budget}
-    return reached(objective, iterate(objective, method, x, history=history, **limits))
-
-
-def reached(objective: Objective, ended: SolveResult[Any]) -> Minima:
-    """What is known of the objective where an iteration of it, by states like `LeastSquaresSystem`, ended."""
+    ended = iterate(objective, method, x, limits)
     return minima_of(ended, _exact_slope(objective, ended.state), objective.readings)
 
 
 def minima_of(ended: SolveResult[Any], slope: NormalEquations, readings: int) -> Minima:
-    """The same where the slope there is known."""
+    """What is known of the objective where an iteration of it ended with that slope."""
     # U^-1 U^-T: inverting U'U would lose twice the digits, and with them the sign of a variance.
     inverse_U, lost = slope.inverse_U, ~finite(slope.inverse_U)
     if lost.any():
@@ -405,8 +411,3 @@ def _exact_slope(objective: Objective, state: LeastSquaresSystem) -> NormalEquat
     keep_Q = state.slope.Q is not None
     exact = _slope_of(report, state.x[coarse], state.r[coarse], coarse=False, keep_Q=keep_Q)
     return put(state.slope, coarse, exact)
-
-
-def squared(r: Array) -> Array:
-    """|r|^2 of each trial."""
-    return np.einsum("ti,ti->t", r, r)

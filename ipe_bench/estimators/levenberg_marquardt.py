@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ipe_bench.basics.batches import put
-from ipe_bench.basics.linalg import Array, finite, multiply
+from ipe_bench.basics.linalg import Array, finite, multiply, squared
 from ipe_bench.estimators.driver import ConvergenceCheck, Solver
-from ipe_bench.estimators.least_squares import LeastSquaresSystem, Residuals, slope_at, squared
+from ipe_bench.estimators.least_squares import LeastSquaresSystem, Residuals, slope_at
 
 _LARGEST_DAMPING = 1e30
 _ROUND_OFF = 1e-8

@@ -25,8 +25,8 @@ class Problem:
     prior_correlation: Array | None = None
     """Their correlation (n, n); None: they are independent."""
     doubted: float = 0.0
-    """Residuals less probable than this are reason to look for a better fit, if that is above an estimator's own
-    `fit_level`; 1 where the level of the noise is not known, so that the size of residuals says nothing."""
+    """Residuals less probable than this are reason to look for a better fit; 1 if the level of the noise is not known,
+    so that the size of residuals says nothing."""
 
     def __post_init__(self) -> None:
         for name in ("prior_deviation", "prior_correlation"):

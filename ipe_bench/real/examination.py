@@ -16,6 +16,7 @@ from scipy.special import chdtri, fdtri
 
 from ipe_bench.basics.linalg import Array, Covariance, Mask, deviations
 from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.driver import Limits
 from ipe_bench.estimators.least_squares import Minima, Objective, inverse_factor, minimize
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.base import Measurement, Parameter
@@ -443,7 +444,7 @@ def _minimise(problem: Problem, z: Array, x: Array) -> Minima:
         return Minima(**joined, history=None)
     with np.errstate(all="ignore"):
         objective = Objective.of(problem, z, prior=False)
-        return minimize(objective, LevenbergMarquardtMethod(1e-3), x, tolerance=_TOLERANCE, max_iterations=_MOST_STEPS)
+        return minimize(objective, LevenbergMarquardtMethod(1e-3), x, Limits(_TOLERANCE, _MOST_STEPS))
 
 
 def _at(rows: Array, values: Array, m: int) -> Array:

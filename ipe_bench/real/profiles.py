@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from ipe_bench.basics.linalg import Array, Mask
-from ipe_bench.estimators.least_squares import Objective, minimize, squared
+from ipe_bench.basics.linalg import Array, Mask, squared
+from ipe_bench.estimators.driver import Limits
+from ipe_bench.estimators.least_squares import Objective, minimize
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
@@ -313,6 +314,6 @@ def _fit_others(
         if x.shape[1]:
             objective = Objective(model, problem.R, z, rows, problem.x0)
             method = LevenbergMarquardtMethod(1e-3)
-            x = minimize(objective, method, x, tolerance=_TOLERANCE, max_iterations=_MOST_STEPS).x
+            x = minimize(objective, method, x, Limits(_TOLERANCE, _MOST_STEPS)).x
         sums = squared(problem.R.whiten(model.simulate(x, rows) - z))
     return model.whole(x, rows), sums

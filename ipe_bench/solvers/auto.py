@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Annotated
+from dataclasses import dataclass
 
 import numpy as np
-from annotated_types import Ge, Lt
-from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Positive, Whole
 from ipe_bench.basics.streams import normals, own_generators
 from ipe_bench.estimators.base import Estimates, Estimator
-from ipe_bench.estimators.fitting import Fitting, spread_of_starts
+from ipe_bench.estimators.driver import Limits
+from ipe_bench.estimators.fitting import FIT_LEVEL, Fitting, spread_of_starts
 from ipe_bench.estimators.least_squares import Minima, Objective, minimize
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.solvers.chords import Chords
+from ipe_bench.solvers.chords import by_chords
 from ipe_bench.solvers.progressive import Progressive, accepted
 
 _CONFIRMATIONS = 4
@@ -53,8 +51,6 @@ class Auto(Estimator):
 
     tolerance: Positive = 1e-6
     """Largest Gauss-Newton step still to go, in standard deviations of the local bound."""
-    fit_level: Annotated[float, Ge(0), Lt(1)] = 1e-6
-    """Residuals less probable than this are taken for those of a wrong minimum."""
     confirmations: Whole | None = None
     """Minimisations that look for other minima that fit, where the problem is far from linear; None: four where a prior
     says where to look and no differential equations make each of them dear, else none."""
@@ -66,56 +62,48 @@ class Auto(Estimator):
     equation = "least_squares"
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
+        everyone, m = np.arange(len(z)), z.shape[1]
         objective = Objective.of(problem, z, prior=False)
-        tally = objective.model.tally
-        best, contracts = Chords(objective, problem.H, self.tolerance, self.budget, history).minima()
-        fitting = Fitting.none(len(z), z.shape[1], self.fit_level)
-        fits = fitting.note(best, np.arange(len(z)))
-        answered = accepted(best, z.shape[1], max(self.fit_level, problem.doubted))
-        tally = EvaluationCount(tally.simulations, tally.jacobians - answered, np.zeros(len(z), dtype=bool))
+        best, contracts = by_chords(objective, problem.H, self.tolerance, self.budget, history=history)
+        fitting = Fitting.none(len(z), m)
+        fits = fitting.note(best, everyone)
+        answered = accepted(best, m, max(FIT_LEVEL, problem.doubted))
+        spent = objective.model.tally
+        tally = EvaluationCount(spent.simulations, spent.jacobians - answered, np.zeros(len(z), dtype=bool))
         left = np.flatnonzero(~answered)
         if len(left):
-            thorough = Progressive(tolerance=self.tolerance, fit_level=self.fit_level, budget=self.budget)
+            thorough = Progressive(tolerance=self.tolerance, budget=self.budget)
             found, spent = thorough.search(problem, z[left], before=take(best, left), history=history)
             best = put(best, left, found)
             tally.simulations[left] += spent.simulations
             tally.jacobians[left] += spent.jacobians
             tally.messages.update({int(left[i]): message for i, message in spent.messages.items()})
         fits[left] = fitting.note(take(best, left), left)
-        examined = np.flatnonzero(fits & ~(answered & contracts)) if self._confirmations(problem) else left[:0]
-        best = self._confirmed(problem, z, best, tally, fitting, examined, history)
-        estimates = fitting.report(best.estimates(tally, z.shape[1]))
-        nobody_looked = ~np.isin(np.arange(len(z)), examined)
-        estimates.extras["ambiguous"][nobody_looked] = np.nan
+        count = self._confirmations(problem)
+        looked = fits & ~(answered & contracts) & (count > 0)
+        if looked.any():
+            rows = np.flatnonzero(looked)
+            model = CountingModel(problem.measurement, tally)
+            whole = Objective(model, problem.R, z[rows], rows, problem.x0)
+            best = self._confirmed(problem, whole, best, fitting, count, history)
+        estimates = fitting.report(best.estimates(tally, m))
+        estimates.extras["ambiguous"][~looked] = np.nan
         estimates.extras["stage"] = np.where(answered, CHORDS, PROGRESSIVE).astype(float)
         return estimates
 
     def _confirmed(
-        self,
-        problem: Problem,
-        z: Array,
-        best: Minima,
-        tally: EvaluationCount,
-        fitting: Fitting,
-        rows: NDArray[np.intp],
-        history: bool,
+        self, problem: Problem, objective: Objective, best: Minima, fitting: Fitting, count: int, history: bool
     ) -> Minima:
-        """The answers, after a look for others in the trials `rows`."""
-        count, n = self._confirmations(problem), len(problem.x0)
-        if not len(rows):
-            return best
-        draws = normals(own_generators(self.seed, z[rows]), count, n)
-        whole = Objective(CountingModel(problem.measurement, tally), problem.R, z[rows], rows, problem.x0)
+        """The answers, after `count` looks for others in the trials of the objective."""
+        rows, n = objective.rows, len(problem.x0)
+        draws = normals(own_generators(self.seed, objective.z), count, n)
         method = LevenbergMarquardtMethod(_DAMPING, problem.prior_used())
-        limits = {"tolerance": self.tolerance, "max_iterations": _STEPS, "budget": self.budget}
+        limits = Limits(self.tolerance, _STEPS, self.budget, history)
         for k in range(count):
-            x = problem.x0 + spread_of_starts(problem) * draws[:, k]
-            again = minimize(whole, method, x, history=history, **limits)
+            again = minimize(objective, method, problem.x0 + spread_of_starts(problem) * draws[:, k], limits)
             known = take(best, rows)
             better = fitting.note(again, rows) & (_improbability(problem, again) < _improbability(problem, known))
-            spent = best.iterations.copy()
-            spent[rows] += again.iterations
-            best = replace(put(best, rows[better], take(again, better)), iterations=spent)
+            best = best.replaced(rows, again, better)
         return best
 
     def _confirmations(self, problem: Problem) -> int:

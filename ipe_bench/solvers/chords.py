@@ -1,5 +1,5 @@
 """Least squares by chords: Gauss-Newton steps with a Jacobian of nearby, each for one simulation. For problems that are
-nearly linear; what does not arrive is left to others."""
+nearly linear."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array, Mask, finite, multiply
+from ipe_bench.basics.linalg import Array, Mask, finite, multiply, squared
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.driver import ConvergenceCheck, Solver, SolveResult, iterate
-from ipe_bench.estimators.least_squares import Minima, NormalEquations, Objective, minima_of, squared
+from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, SolveResult, continued, iterate
+from ipe_bench.estimators.least_squares import Minima, NormalEquations, Objective, minima_of
 from ipe_bench.solvers.anderson import accelerated, push
 
 _ITERATIONS = 25
@@ -127,82 +127,46 @@ class Chord(Solver[OnChord]):
         return ConvergenceCheck(size, np.sqrt(squared(state.r)), state.moved, rankless | useless, ending)
 
 
-@dataclass(frozen=True)
-class Chords:
-    """What all trials of a batch share on their way by chords."""
-
-    objective: Objective
-    H: Array
-    """The Jacobian (m, n) at the nominal point."""
-    tolerance: float
-    budget: float | None
-    history: bool
-
-    def minima(self) -> tuple[Minima, Mask]:
-        """The least-squares minimum of each trial, and where fixed-point iteration contracts well there, eq. (18).
-
-        Trials that do not arrive have not converged.
-        """
-        x0 = np.repeat(self.objective.x0[None], len(self.objective.rows), axis=0)
-        minima, contracts = _nowhere(x0, self.history), np.zeros(len(x0), dtype=bool)
-        nominal = NormalEquations.of(
-            self.objective.R.whiten_jacobian(self.H[None]), np.zeros((1, len(self.H))), keep_Q=True
-        )
-        if not np.isfinite(nominal.size).all():  # H lacks rank, which says nothing of other points
-            return minima, contracts
-        frozen = take(nominal, np.zeros(len(x0), np.intp))
-        start = OnChord.at(x0, self.objective.residual(x0), frozen, np.zeros((len(x0), *self.H.shape)))
-        ended = self._iterate(self.objective, Chord(), start, _NEAR, _ITERATIONS)
-        near = np.flatnonzero(ended.converged)
-        if len(near):
-            found, slope = self._renewed(self.objective.subset(ended.converged), take(ended, near), x0[near])
-            minima = put(minima, near, found)
-            contracts[near] = _radius(nominal, slope) <= _CONTRACTING
+def by_chords(
+    objective: Objective, H: Array, tolerance: float, budget: float | None, *, history: bool
+) -> tuple[Minima, Mask]:
+    """The least-squares minimum of each trial, H (m, n) being the Jacobian at the nominal point, and where fixed-point
+    iteration contracts well there, eq. (18). Trials that do not arrive have not converged."""
+    x0 = np.repeat(objective.x0[None], len(objective.rows), axis=0)
+    minima, contracts = Minima.nowhere(x0, history), np.zeros(len(x0), dtype=bool)
+    nominal = NormalEquations.of(objective.R.whiten_jacobian(H[None]), np.zeros((1, len(H))), keep_Q=True)
+    if not np.isfinite(nominal.size).all():  # H lacks rank, which says nothing of other points
         return minima, contracts
+    frozen = take(nominal, np.zeros(len(x0), np.intp))
+    start = OnChord.at(x0, objective.residual(x0), frozen, np.zeros((len(x0), *H.shape)))
+    ended = iterate(objective, Chord(), start, Limits(_NEAR, _ITERATIONS, budget, history))
+    near = np.flatnonzero(ended.converged)
+    if len(near):
+        limits = Limits(tolerance, _CHORDS, budget, history)
+        found = _renewed(objective.subset(ended.converged), take(ended, near), x0[near], limits)
+        minima = put(minima, near, minima_of(found, found.state.slope, objective.readings))
+        contracts[near] = _radius(nominal, found.state.slope) <= _CONTRACTING
+    return minima, contracts
 
-    def _renewed(
-        self, objective: Objective, before: SolveResult[OnChord], origin: Array
-    ) -> tuple[Minima, NormalEquations]:
-        """Chord steps for trials that are near, each time with a new Jacobian until it is that of the end."""
-        at, latest = np.arange(len(origin)), before
-        whole: tuple[Minima, NormalEquations] | None = None
-        bent, off = _BENT * self.tolerance, np.full(len(origin), np.inf)
-        for _ in range(_JACOBIANS):
-            x, r, slope = latest.x, latest.state.r, latest.state.slope
-            J = objective.jacobian(x)
-            assert slope.Q is not None
-            turn = (J - np.matmul(slope.Q, slope.U)) / _length(slope, x - origin)[:, None, None]
-            start = OnChord.at(x, r, NormalEquations.of(J, r, keep_Q=True), turn)
-            ended = self._iterate(objective, Chord(bent), start, self.tolerance, _CHORDS)
-            latest = _after(latest, ended)
-            result = minima_of(latest, ended.state.slope, objective.readings), ended.state.slope
-            whole = result if whole is None else (put(whole[0], at, result[0]), put(whole[1], at, result[1]))
-            now = ended.state.off
-            again = (now > bent) & (now < off) & (ended.status == Status.MAX_ITERATIONS)
-            if not again.any():
-                break
-            off, at, origin, objective, latest = (
-                now[again],
-                at[again],
-                x[again],
-                objective.subset(again),
-                take(latest, again),
-            )
-        assert whole is not None
-        return whole
 
-    def _iterate(
-        self, objective: Objective, chord: Chord, start: OnChord, tolerance: float, limit: int
-    ) -> SolveResult[OnChord]:
-        return iterate(
-            objective,
-            chord,
-            start,
-            tolerance=tolerance,
-            max_iterations=limit,
-            budget=self.budget,
-            history=self.history,
-        )
+def _renewed(objective: Objective, found: SolveResult[OnChord], origin: Array, limits: Limits) -> SolveResult[OnChord]:
+    """Chord steps for trials that are near, with a new Jacobian as long as that of the start is not that of the end."""
+    bent, rows, off = _BENT * limits.tolerance, np.arange(len(origin)), np.full(len(origin), np.inf)
+    for _ in range(_JACOBIANS):
+        part, latest = objective.subset(rows), take(found, rows)
+        x, r, slope = latest.x, latest.state.r, latest.state.slope
+        J = part.jacobian(x)
+        assert slope.Q is not None
+        turn = (J - np.matmul(slope.Q, slope.U)) / _length(slope, x - origin)[:, None, None]
+        start = OnChord.at(x, r, NormalEquations.of(J, r, keep_Q=True), turn)
+        ended = iterate(part, Chord(bent), start, limits)
+        found = put(found, rows, continued(latest, ended))
+        now = ended.state.off
+        again = (now > bent) & (now < off) & (ended.status == Status.MAX_ITERATIONS)
+        if not again.any():
+            break
+        rows, off, origin = rows[again], now[again], x[again]
+    return found
 
 
 def _length(slope: NormalEquations, step: Array) -> Array:
@@ -219,26 +183,3 @@ def _radius(nominal: NormalEquations, slope: NormalEquations) -> Array:
     usable = finite(J_F)
     rates = np.linalg.eigvals(np.where(usable[:, None, None], np.eye(J_F.shape[1]) - J_F, 0.0))
     return np.where(usable, np.abs(rates).max(axis=1), np.inf)
-
-
-def _after(first: SolveResult[OnChord], second: SolveResult[OnChord]) -> SolveResult[OnChord]:
-    """The second of two iterations, with the iterations and iterates of both."""
-    history = second.history
-    if first.history is not None and history is not None:
-        history = [np.concatenate([a, b[1:]]) for a, b in zip(first.history, history, strict=True)]
-    return replace(second, iterations=first.iterations + second.iterations, history=history)
-
-
-def _nowhere(x0: Array, history: bool) -> Minima:
-    """No answer for any trial; x0 (trials, n)."""
-    trials, n = x0.shape
-    far = np.full(trials, np.inf)
-    return Minima(
-        x0,
-        np.full(trials, Status.MAX_ITERATIONS, np.int8),
-        np.zeros(trials, np.int64),
-        [x[None] for x in x0] if history else None,
-        np.full((trials, n, n), np.nan),
-        far,
-        far,
-    )

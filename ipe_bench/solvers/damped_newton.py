@@ -9,8 +9,10 @@ import numpy as np
 from annotated_types import Gt, Lt
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.basics.options import Whole
 from ipe_bench.estimators.ipe import IPE, State, System
+
+_HALVINGS = 30
+"""Of a step, before the trial counts as stalled."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +24,6 @@ class DampedNewton(IPE):
 
     decrease: Annotated[float, Gt(0), Lt(1)] = 1e-4
     """The share of the decrease that the slope promises which is enough."""
-    halvings: Whole = 30
 
     def step(self, system: System, state: State) -> State:
         direction = -system.solve(system.J(state.x, state.F), state.F)
@@ -31,7 +32,7 @@ class DampedNewton(IPE):
         F = system.F(state.x + direction)
         # A singular trial has no direction to search along: its NaN goes back to the driver at once.
         searching = np.isfinite(direction).all(axis=1)
-        for _ in range(self.halvings):
+        for _ in range(_HALVINGS):
             searching &= ~(_norm(F) <= (1 - self.decrease * t) * size)
             if not searching.any():
                 break

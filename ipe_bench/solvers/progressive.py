@@ -1,6 +1,6 @@
 """Progressive IPE: the least-squares estimate, reached from far away by windows that grow as a filter sees the data.
 
-The attempts are those of `attempts`; here is the judge, and when to stop.
+The attempts are those of `attempts`; here are the judge and the end of the search.
 """
 
 from __future__ import annotations
@@ -9,18 +9,19 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from annotated_types import Ge, Gt, Lt
-from numpy.typing import NDArray
+from annotated_types import Gt
 
 from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array, Mask, finite
 from ipe_bench.basics.options import Count, Positive, Whole
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
+from ipe_bench.estimators.driver import Limits
+from ipe_bench.estimators.fitting import FIT_LEVEL, passes
 from ipe_bench.estimators.least_squares import Minima
 from ipe_bench.measurements.counted import EvaluationCount
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.solvers.attempts import Limits, Stages, Windows
+from ipe_bench.solvers.attempts import Rows, Stages, Windows
 
 _SAME_FIT = 1e-6
 """Two minima whose chi-squares differ by less than this share are one."""
@@ -72,8 +73,6 @@ class Progressive(Estimator):
     """Of the last pass: the Gauss-Newton step in standard deviations of the local bound."""
     restarts: Whole | None = None
     """Further attempts at a trial that fails the test; None: eight with windows, fifteen without."""
-    fit_level: Annotated[float, Ge(0), Lt(1)] = 1e-6
-    """Residuals less probable than this are taken for those of a wrong minimum."""
     budget: Positive | None = None
     """Simulations that a trial may cost, a Jacobian counting n and a window its share; None: no limit."""
 
@@ -86,67 +85,60 @@ class Progressive(Estimator):
     def search(
         self, problem: Problem, z: Array, *, before: Minima | None = None, history: bool = False
     ) -> tuple[Minima, EvaluationCount]:
-        """The best minimum of each trial, and what it has cost to find it. `before`: what is known already, minima
-        that do not fit, or none."""
-        kind = Stages if problem.measurement.epochs is None else Windows
-        limits = Limits(
-            self.tolerance, self.max_iterations, self.budget, self.growth, self.window_tolerance, self.restarts
+        """The best minimum of each trial and the cost of finding it. `before`: minima that are known already and do not
+        fit."""
+        everyone, n, m = np.arange(len(z)), len(problem.x0), z.shape[1]
+        attempts = (Stages if problem.measurement.epochs is None else Windows)(
+            problem,
+            problem.prior_used(self.prior_inflation) if self.use_prior else None,
+            z,
+            EvaluationCount.zeros(len(z)),
+            Limits(self.tolerance, self.max_iterations, self.budget, history),
+            self.growth,
+            self.window_tolerance,
+            self.restarts,
         )
-        prior = problem.prior_used(self.prior_inflation) if self.use_prior else None
-        attempts = kind(limits, problem, prior, z, EvaluationCount.zeros(len(z)), history)
-        level = max(self.fit_level, problem.doubted)
-        best = attempts.attempt(0, np.arange(len(z)), None)
+        tally, level = attempts.tally, max(FIT_LEVEL, problem.doubted)
+        best = attempts.attempt(0, everyone, None)
         if before is not None:
-            worse = before.converged & ~_is_better(best, before)
+            worse = before.converged & ~best.better_than(before)
             best = put(best, worse, take(before, worse))
-        account = _Account.of(len(z))
+        account, first = _Account(np.zeros((3, len(z)), np.int64)), np.full(len(z), np.inf)
         for k in range(1, attempts.last + 1):
-            cost = attempts.tally.cost(best.x.shape[1])
-            account.first = np.where(best.converged, np.minimum(account.first, cost), np.inf)
-            going = ~accepted(best, z.shape[1], level) & finite(z) & ~attempts.tally.failed(np.arange(len(z)))
-            going &= (cost < _WORTH * account.first) | (account.draws == 0)
-            going &= cost < (np.inf if self.budget is None else self.budget)
-            going &= account.repeats < attempts.repeats
-            suspect = np.flatnonzero(going)
-            if not len(suspect):
+            cost = tally.cost(n)
+            first = np.where(best.converged, np.minimum(first, cost), np.inf)
+            going = ~accepted(best, m, level) & finite(z) & ~tally.failed(everyone)
+            going &= (cost < _WORTH * first) | (account.draws == 0)
+            going &= (cost < (np.inf if self.budget is None else self.budget)) & (account.repeats < attempts.repeats)
+            rows = np.flatnonzero(going)
+            if not len(rows):
                 break
-            known = take(best, suspect)
-            again = attempts.attempt(k, suspect, known)
-            account.note(suspect, again, known, attempts.draws(k))
-            better = _is_better(again, known)
-            best = put(best, suspect[better], take(again, better))
-        raised = attempts.tally.failed(np.arange(len(z))) & ~best.converged
-        for i in np.flatnonzero(best.converged & ~accepted(best, z.shape[1], level) & (account.attempts > 0)):
-            attempts.tally.messages[int(i)] = account.words(int(i))
-        return replace(best, status=np.where(raised, Status.ERROR, best.status).astype(np.int8)), attempts.tally
+            known = take(best, rows)
+            again = attempts.attempt(k, rows, known)
+            better = again.better_than(known)
+            account.note(rows, again, known, better, attempts.draws(k))
+            best = put(best, rows[better], take(again, better))
+        raised = tally.failed(everyone) & ~best.converged
+        for i in np.flatnonzero(best.converged & ~accepted(best, m, level) & (account.attempts > 0)):
+            tally.messages[int(i)] = account.words(int(i))
+        return replace(best, status=np.where(raised, Status.ERROR, best.status).astype(np.int8)), tally
 
 
-@dataclass
 class _Account:
-    """What the search for a better fit has tried in each trial; every field is (trials,)."""
+    """What the search for a better fit has tried in each trial (trials,): attempts after the first one, independent
+    draws among their starts, and attempts from draws that have led to the best minimum again."""
 
-    first: Array
-    """What the first fit had cost; infinite before there is one."""
-    attempts: NDArray[np.int64]
-    """Attempts after the first one."""
-    draws: NDArray[np.int64]
-    """Independent draws among their starts."""
-    repeats: NDArray[np.int64]
-    """Attempts from independent draws that have led to the best minimum again."""
+    def __init__(self, nothing: Rows) -> None:
+        self.attempts, self.draws, self.repeats = nothing
 
-    @classmethod
-    def of(cls, trials: int) -> _Account:
-        return cls(np.full(trials, np.inf), *np.zeros((3, trials), np.int64))
-
-    def note(self, rows: NDArray[np.intp], again: Minima, known: Minima, draws: int) -> None:
+    def note(self, rows: Rows, again: Minima, known: Minima, better: Mask, draws: int) -> None:
         """Books an attempt from so many draws at the trials `rows`, of which `known` were the best minima."""
         with np.errstate(invalid="ignore"):  # two infinite fits are not one minimum
             near = _SAME_FIT * np.maximum(again.chi_square, known.chi_square)
             same = again.converged & known.converged & (np.abs(again.chi_square - known.chi_square) <= near)
-        lower = _is_better(again, known) & ~same
         self.attempts[rows] += 1
         self.draws[rows] += draws
-        self.repeats[rows] = np.where(lower, 0, self.repeats[rows] + (same & (draws > 0)))
+        self.repeats[rows] = np.where(better & ~same, 0, self.repeats[rows] + (same & (draws > 0)))
 
     def words(self, i: int) -> str:
         """What was tried in trial i."""
@@ -159,11 +151,5 @@ class _Account:
 def accepted(minima: Minima, readings: int, level: float) -> Mask:
     """Which minima (trials,) are taken for the least: those that fit, and those whose bulk of residuals does."""
     gross_errors_only = (minima.bulk <= _BULK) & (readings >= _READINGS * minima.x.shape[1])
-    fits = minima.fit_probability(readings) >= level
+    fits = passes(minima, readings, level)
     return minima.converged & (fits | (gross_errors_only & (level < _TRUSTED)))
-
-
-def _is_better(new: Minima, old: Minima) -> Mask:
-    """Where a new attempt counts rather than the old one: it converged and fits better, or the old one had no end."""
-    fits_better = ~(new.chi_square >= old.chi_square)
-    return new.converged & (fits_better | ~old.converged)

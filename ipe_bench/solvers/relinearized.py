@@ -14,7 +14,7 @@ from ipe_bench.basics.linalg import Array, Mask, finite
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
-from ipe_bench.estimators.driver import ConvergenceCheck, Solver, iterate
+from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, iterate
 from ipe_bench.estimators.ipe import IPE, FrozenSystem, Start, State, begin, frozen_covariance, root_check
 from ipe_bench.estimators.least_squares import inverse_factor
 from ipe_bench.measurements.counted import CountingModel
@@ -78,15 +78,8 @@ class Relinearized(Solver[Round], Estimator):
     def step(self, system: FrozenSystem, state: Round) -> Round:
         """One round: inner steps from the last linearisation, then a new one where they end."""
         linearized = system.with_slope(state.H_plus, state.deviation)
-        ended = iterate(
-            linearized,
-            self.solver,
-            self.solver.init(linearized, state.x, state.F),
-            tolerance=self.tolerance,
-            max_iterations=self.inner_iterations,
-            budget=self.budget,
-            history=True,
-        )
+        limits = Limits(self.tolerance, self.inner_iterations, self.budget, history=True)
+        ended = iterate(linearized, self.solver, self.solver.init(linearized, state.x, state.F), limits)
         assert ended.history is not None
         path = [np.concatenate([old, new[1:]]) for old, new in zip(state.path, ended.history, strict=True)]
         return self._relinearize(system, ended.x, ended.status, state.steps + ended.iterations, path)
@@ -99,9 +92,7 @@ class Relinearized(Solver[Round], Estimator):
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         x, system = begin(problem, z, self.start)
-        ended = iterate(
-            system, self, x, tolerance=self.tolerance, max_iterations=self.max_iterations, budget=self.budget
-        )
+        ended = iterate(system, self, x, Limits(self.tolerance, self.max_iterations, self.budget))
         return Estimates.of(
             ended,
             system.model.tally,

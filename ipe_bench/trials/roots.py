@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array, Mask
-from ipe_bench.estimators.driver import Solver, SolveResult, iterate
+from ipe_bench.estimators.driver import Limits, Solver, iterate
 from ipe_bench.estimators.gauss_newton import GaussNewtonMethod
 from ipe_bench.estimators.ipe import IPE, FrozenSystem, State, System
 from ipe_bench.estimators.least_squares import Objective
@@ -117,7 +117,7 @@ def _first_root(
                 here = known if len(missing) == len(z) else take(known, missing)
                 informed = _Informed(system.model.measurement, system.model.tally, x=start, known=here)
                 system = replace(system, model=informed)
-            ended: SolveResult[Any] = iterate(system, method, start, tolerance=_TOLERANCE, max_iterations=limit)
+            ended = iterate(system, method, start, Limits(_TOLERANCE, limit))
             x = put(x, missing[ended.converged], ended.x[ended.converged])
             missing = missing[~ended.converged]
     return x

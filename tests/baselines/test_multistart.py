@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -154,3 +154,13 @@ def test_without_readings_that_fit_every_start_is_tried():
     found = Multistart(starts=5).estimate(narrow, alien)
     np.testing.assert_array_equal(found.extras["minima"], 0)
     assert (found.jacobians >= 5).all()
+
+
+def test_no_fit_is_believed_where_the_level_of_the_noise_is_unknown():
+    """Under an assumed deviation far too wide any minimum fits; the lowest of all starts counts."""
+    problem, trials = draw(Wave(), 0.1, 1.0, 12)
+    wide = Problem(problem.measurement, Covariance(np.full(40, 10.0)), problem.prior_deviation)
+    believed, doubted = (Multistart(starts=40).estimate(replace(wide, doubted=d), trials.z) for d in (0.0, 1.0))
+    wanted = np.array([lowest_of_a_grid(z) for z in trials.z])
+    hits = [(np.abs(found.x[:, 0] - wanted) < 2e-3).mean() for found in (believed, doubted)]
+    assert hits[0] < 0.8 < hits[1]

@@ -9,7 +9,7 @@ import pytest
 from square_systems import BurdenFaires, Cubic, NoRoot, Rosenbrock, Temperamental, system_of
 
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.driver import iterate
+from ipe_bench.estimators.driver import Limits, iterate
 from ipe_bench.measurements import Gins, Polynomial
 from ipe_bench.noise import Gaussian, NoNoise, Quantization
 from ipe_bench.priors import GaussianPrior
@@ -26,7 +26,7 @@ def roots_of(model, solver, starts, *, tolerance=1e-9, max_iterations=2000, hist
     starts = np.atleast_2d(np.asarray(starts, dtype=float))
     system = system_of(model, len(starts))
     with np.errstate(all="ignore"):
-        roots = iterate(system, solver, starts, tolerance=tolerance, max_iterations=max_iterations, history=history)
+        roots = iterate(system, solver, starts, Limits(tolerance, max_iterations, history=history))
     return roots, system.model.tally
 
 
