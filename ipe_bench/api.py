@@ -18,7 +18,7 @@ from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.noise.base import Noise
 from ipe_bench.priors import Prior
-from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
+from ipe_bench.runs.bundles import opened
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.results import Results, require_results
 from ipe_bench.runs.run import TRIALS, compute, validate
@@ -162,12 +162,7 @@ def report(
     """
     from ipe_bench.report import write_report
 
-    paths = _paths(directories)
-    if output is None and any(map(is_bundle, paths)):
-        raise UserError(f"{paths[0]}: a bundle is read and not written to; give output=, where the report goes")
-    with opened(paths, None if output is None else Path(output) / BUNDLES) as folders:
-        require_results(folders)
-        return write_report(folders, output, figures=figures, formats=formats)
+    return write_report(directories, output, figures=figures, formats=formats)
 
 
 def compare(

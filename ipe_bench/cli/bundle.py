@@ -25,7 +25,7 @@ def main(arguments: Sequence[str]) -> int:
         _show(read_bundle(paths[0]), "Whole")
         return 0
     path = Path(outputs[0]) if outputs else paths[0].with_name(paths[0].resolve().name + SUFFIX)
-    from ipe_bench.report.citation import CITATION
+    from ipe_bench.report.definitions import CITATION
 
     bundle = write_bundle(paths, path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX), {"citation": CITATION})
     problems = Results.read(paths).problems

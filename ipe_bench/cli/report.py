@@ -59,7 +59,7 @@ def show_command(output: Path, cells: Mapping[str, str], figures: Which, formats
 
     `cells` has a line for people by key; where it is empty, everything is printed.
     """
-    report = begin_report(output, figures=figures, formats=formats)
+    report = begin_report([output], figures=figures, formats=formats)
     collection = report.begun.collection
     others = sum(cell.key not in cells and cell.label != TRUTH for cell in collection.current) if cells else 0
     if others:

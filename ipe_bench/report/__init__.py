@@ -7,9 +7,13 @@ import types
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.files import write_text
 from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
+from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
+from ipe_bench.runs.results import require_results
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -51,10 +55,16 @@ def write_report(
     """Writes summary.csv, tables/, figures/ and report.html from what is stored, under `output` or the first directory.
 
     Raises:
-        UserError: a directory does not exist, or there is no such choice of `figures` (all, main or none) or of
+        UserError: no run ever wrote to a directory, or there is no such choice of `figures` (all, main or none) or of
             `formats` (png, pdf and svg).
+        StorageError: the files cannot be written.
     """
-    return begin_report(directories, output, figures=figures, formats=formats).written()
+    paths = [Path(one) for one in ([directories] if isinstance(directories, Path | str) else directories)]
+    if output is None and any(map(is_bundle, paths)):
+        raise UserError(f"{paths[0]}: a bundle is read and not written to; give output=, where the report goes")
+    with opened(paths, None if output is None else Path(output) / BUNDLES) as folders:
+        require_results(folders)
+        return begin_report(folders, output, figures=figures, formats=formats).written()
 
 
 @dataclass(frozen=True)
@@ -68,40 +78,68 @@ class Pending:
     made: str
     """A digest of what it is made from."""
 
-    def written(self) -> ReportResult:
-        """Writes all files."""
-        from ipe_bench.report.stamp import leave
-
-        result = write_analysis(self.begun, self.output, self.figures, self.formats)
-        leave(self.output, self.made, self._lines, result.files)
-        return result
-
     def write_unless_current(self) -> None:
         """Writes all files, unless they are there already."""
         from ipe_bench.report.stamp import is_current
 
-        if not is_current(self.output, self.made, self._lines):
+        if not is_current(self.output, self.made):
             self.written()
 
-    @property
-    def _lines(self) -> list[str]:
-        return [*self.begun.collection.problems, *self.begun.collection.stale]
+    def written(self) -> ReportResult:
+        """Writes all files."""
+        from ipe_bench.report import extensions
+        from ipe_bench.report.certified_tables import without_certified
+        from ipe_bench.report.charts import charts
+        from ipe_bench.report.figures import draw_all
+        from ipe_bench.report.figures.views import views
+        from ipe_bench.report.html import render_page
+        from ipe_bench.report.stamp import leave
+        from ipe_bench.report.table import write_table
+        from ipe_bench.statistics.digits import certified_averages, certified_table
+
+        analysis, output = self.begun.finish(), self.output
+        simulated, problems = without_certified(analysis), analysis.collection.further
+        known = len(problems)
+        tables = extensions.report_tables(analysis)
+        sections = extensions.sections(analysis, [table.name for table in tables], problems)
+        added = [table for section in sections for table in section.tables]
+        csv = [(output / "summary.csv", analysis.summary)]
+        if len(analysis.profiles):
+            csv.append((output / "tables" / "profiles.csv", analysis.profiles))
+        for path, frame in csv:
+            write_text(path, frame.to_csv(index=False))
+        files = [path for table in (*tables, *added) for path in write_table(table, output / "tables")]
+        drawn = draw_all(simulated, output / "figures", which=self.figures, formats=self.formats, problems=problems)
+        page = render_page(analysis, tables, drawn, sections, list(charts(views(simulated)[0])))
+        write_text(output / "report.html", page)
+        result = ReportResult(
+            summary=analysis.summary,
+            summary_path=csv[0][0],
+            tables=(*files, *(path for path, _ in csv[1:])),
+            figures=tuple(path for figure in drawn for path in figure.files),
+            report=output / "report.html",
+            problems=analysis.problems,
+            stale=analysis.stale,
+            certified=certified_averages(certified_table(analysis.collection)),
+        )
+        if len(problems) == known:  # what plugins cannot make is said each time
+            leave(output, self.made, result.files)
+        return result
 
 
 def begin_report(
-    directories: Path | str | Sequence[Path | str],
-    output: Path | str | None = None,
-    *,
-    figures: Which = "main",
-    formats: str | Sequence[str] = PAGE,
+    folders: Sequence[Path], output: Path | str | None = None, *, figures: Any = "main", formats: Any = PAGE
 ) -> Pending:
-    """Collects and summarises, with the statistics of plugins. Raises UserError as `write_report` does."""
+    """Collects and summarises what folders hold, with the statistics of plugins.
+
+    Raises:
+        UserError: as `write_report` does.
+    """
     from ipe_bench.plugins.extensions import use_statistics
     from ipe_bench.report.stamp import made_from
     from ipe_bench.statistics.analysis import begin
 
     kinds, which = file_formats(formats), which_figures(figures)
-    folders = [Path(one) for one in ([directories] if isinstance(directories, Path | str) else directories)]
     place = folders[0] if output is None else Path(output)
     made, faults = made_from(folders, place, which, kinds), use_statistics()
     begun = begin(folders)
@@ -109,58 +147,11 @@ def begin_report(
     return Pending(begun, place, which, kinds, made)
 
 
-def write_analysis(begun: Begun, output: Path, which: Which = "main", formats: Sequence[str] = (PAGE,)) -> ReportResult:
-    """Finishes an analysis and writes the report on it under `output`, with these figures in these formats."""
-    from ipe_bench.basics.files import write_text
-    from ipe_bench.report import extensions
-    from ipe_bench.report.certified_tables import without_certified
-    from ipe_bench.report.charts import charts
-    from ipe_bench.report.figures import draw_all
-    from ipe_bench.report.figures.views import views
-    from ipe_bench.report.html import render_page
-    from ipe_bench.report.table import write_table
-    from ipe_bench.statistics.digits import certified_averages, certified_table
-
-    analysis = begun.finish()
-    summary_path = output / "summary.csv"
-    write_text(summary_path, analysis.summary.to_csv(index=False))
-    simulated = without_certified(analysis)
-    problems = analysis.collection.further
-    tables = extensions.report_tables(analysis)
-    sections = extensions.sections(analysis, [table.name for table in tables], problems)
-    further = [table for section in sections for table in section.tables]
-    table_paths = [path for table in (*tables, *further) for path in write_table(table, output / "tables")]
-    if len(analysis.profiles):
-        table_paths.append(output / "tables" / "profiles.csv")
-        write_text(table_paths[-1], analysis.profiles.to_csv(index=False))
-    drawn = draw_all(simulated, output / "figures", which=which, formats=formats, problems=problems)
-    page = render_page(analysis, tables, drawn, sections, list(charts(views(simulated)[0])))
-    report = output / "report.html"
-    write_text(report, page)
-    return ReportResult(
-        analysis.summary,
-        summary_path,
-        tuple(table_paths),
-        tuple(path for figure in drawn for path in figure.files),
-        report,
-        analysis.problems,
-        analysis.stale,
-        certified_averages(certified_table(analysis.collection)),
-    )
-
-
 class _Callable(types.ModuleType):
     """`ipe_bench.report` is this room once it is imported, and a public function before: so the room can be called."""
 
-    def __call__(
-        self,
-        directories: Path | str | Sequence[Path | str],
-        output: Path | str | None = None,
-        *,
-        figures: Which = "main",
-        formats: str | Sequence[str] = PAGE,
-    ) -> ReportResult:
-        return write_report(directories, output, figures=figures, formats=formats)
+    def __call__(self, *arguments: Any, **options: Any) -> ReportResult:
+        return write_report(*arguments, **options)
 
 
 sys.modules[__name__].__class__ = _Callable

@@ -1,6 +1,6 @@
 """What statistics, figures, tables and sections promise, as checks on analyses of small runs.
 
-Components are checked by `plugins.conformance`; the small runs are computed by whoever asks.
+Components are checked by `plugins.conformance`; whoever asks computes the small runs, of which the first is a sweep.
 """
 
 from __future__ import annotations
@@ -17,35 +17,26 @@ from ipe_bench.plugins.conformance import Finding
 from ipe_bench.plugins.discovery import Option
 from ipe_bench.plugins.extensions import find_record
 from ipe_bench.report import extensions
-from ipe_bench.report.figures.views import View, views
+from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.figures.views import views
 from ipe_bench.report.style import house_style
 from ipe_bench.report.tables import all_tables
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.records import Statistic, columns_of_added, fault_of
 from ipe_bench.statistics.sample import Sample, Shared
 
-Check = Callable[[str, Any, Sequence[Analysis]], None]
-
 
 def check_record(option: Option, analyses: Sequence[Analysis]) -> Iterator[Finding]:
     """Runs the checks on the record that an option names; one that is not there is a finding."""
-    name = f"{option.group}={option.name}"
+    name, title = f"{option.group}={option.name}", "Can be found from its config"
     try:
         record = find_record(option)
-    except UserError as error:
-        yield Finding(name, "Can be found from its config", str(error))
-        return
-    for check in _CHECKS[option.group]:
-        title = (check.__doc__ or "").strip().splitlines()[0].rstrip(".")
-        try:
+        for check in _CHECKS[option.group]:
+            title = (check.__doc__ or "").strip().rstrip(".")
             check(option.name, record, analyses)
-        except (UserError, AssertionError) as error:
-            yield Finding(name, title, str(error) or "it does not")
-            return  # what follows takes it for granted
-        yield Finding(name, title)
-
-
-# Statistics
+            yield Finding(name, title)
+    except (UserError, AssertionError) as error:
+        yield Finding(name, title, str(error) or "it does not")
 
 
 def is_a_statistic(_: str, record: Any, __: Sequence[Analysis]) -> None:
@@ -55,70 +46,48 @@ def is_a_statistic(_: str, record: Any, __: Sequence[Analysis]) -> None:
 
 
 def has_values(_: str, record: Statistic, analyses: Sequence[Analysis]) -> None:
-    """Has a value, or NaN, for every parameter and for all, however the trials ended; the same twice."""
-    for sample in _samples(analyses):
-        first, second = (columns_of_added(record, sample) for _ in range(2))
-        for name, values in first.items():
-            same = values == second[name] or np.array_equal(
-                np.array(values, dtype=float), np.array(second[name], dtype=float), equal_nan=True
-            )
-            assert same, f"{name} of {sample.group.estimator} is another value each time"
-
-
-def has_ordered_limits(_: str, record: Statistic, analyses: Sequence[Analysis]) -> None:
-    """Lies in its interval, if it has one."""
-    if record.limits is None:
-        return
-    for sample in _samples(analyses):
-        columns = columns_of_added(record, sample)
-        for value, low, high in zip(*(columns[name] for name in record.columns), strict=True):
-            inside = not np.isfinite([value, low, high]).all() or low <= value <= high
-            assert inside, f"{value:g} of {sample.group.estimator} is not within its interval, {low:g} to {high:g}"
-
-
-def _samples(analyses: Sequence[Analysis]) -> Iterator[Sample]:
+    """Has a value, or NaN, for every parameter and for all, however the trials ended; the same twice; in its limits."""
     for analysis in analyses:
-        collection = analysis.collection
-        for groups in collection.scenarios.values():
-            shared = Shared.among(collection, groups)
+        for groups in analysis.collection.scenarios.values():
+            shared = Shared.among(analysis.collection, groups)
             for group in groups:
-                yield Sample.load(collection, group, shared)
+                _check_values(record, Sample.load(analysis.collection, group, shared))
 
 
-# Figures
-
-
-def is_a_figure(_: str, record: Any, __: Sequence[Analysis]) -> None:
-    """Is a Figure that reads frames that there are."""
-    extensions.checked_figure(record)
+def _check_values(record: Statistic, sample: Sample) -> None:
+    first, second = (columns_of_added(record, sample) for _ in range(2))
+    whose = f"of {sample.group.estimator}"
+    for name, values in first.items():
+        numbers = record.kind != "word"
+        same = np.array_equal(values, second[name], equal_nan=numbers)
+        assert same, f"{name} {whose} is another value each time"
+    for value, low, high in zip(*first.values(), strict=True) if record.limits else ():
+        inside = not np.isfinite([value, low, high]).all() or low <= value <= high
+        assert inside, f"{value:g} {whose} is not within its interval, {low:g} to {high:g}"
 
 
 def can_be_drawn(_: str, record: Any, analyses: Sequence[Analysis]) -> None:
     """Is drawn and written for any run, of one trial or with estimators that fail, or gives nothing."""
+    extensions.checked_figure(record)
     with tempfile.TemporaryDirectory(prefix="ipe-bench-") as folder, house_style():
-        for analysis in analyses:
-            for view in _views(record, analysis):
-                for drawing in extensions.drawings(record, view):
-                    assert drawing.title.strip(), f"{drawing.name} has no title"
-                    assert drawing.caption.strip(), f"{drawing.name} has no caption"
-                    extensions.guarded(lambda drawing=drawing: drawing.save(Path(folder)))
+        for drawing in [drawing for analysis in analyses for drawing in _drawn(record, analysis)]:
+            assert drawing.title.strip(), f"{drawing.name} has no title"
+            assert drawing.caption.strip(), f"{drawing.name} has no caption"
+            extensions.guarded(lambda drawing=drawing: drawing.save(Path(folder)))
 
 
 def draws_a_sweep(_: str, record: Any, analyses: Sequence[Analysis]) -> None:
     """Draws something of an ordinary sweep, named for each of its settings."""
     with house_style():
-        found = [extensions.drawings(record, view) for view in _views(record, analyses[0])]
-    assert any(found), "it draws nothing of polynomial at three error scales by four estimators"
-    names = [drawing.name for drawings in found for drawing in drawings]
+        names = [drawing.name for drawing in _drawn(record, analyses[0])]
+    assert names, "it draws nothing of polynomial at three error scales by four estimators"
     assert len(set(names)) == len(names), "two settings share a name; end each in view.suffix"
 
 
-def _views(record: Any, analysis: Analysis) -> list[View]:
+def _drawn(record: Any, analysis: Analysis) -> list[Drawing]:
     parts, whole = views(analysis)
-    return [view.only(record.frames) for view in ([whole] if record.together else parts)]
-
-
-# Tables and sections
+    seen = [view.only(record.frames) for view in ([whole] if record.together else parts)]
+    return [drawing for view in seen for drawing in extensions.drawings(record, view)]
 
 
 def makes_a_table(_: str, record: Any, analyses: Sequence[Analysis]) -> None:
@@ -133,9 +102,9 @@ def can_be_read(name: str, record: Any, analyses: Sequence[Analysis]) -> None:
         extensions.made_section(name, record, analysis, [table.name for table in all_tables(analysis)])
 
 
-_CHECKS: dict[str, tuple[Check, ...]] = {
-    "statistic": (is_a_statistic, has_values, has_ordered_limits),
-    "figure": (is_a_figure, can_be_drawn, draws_a_sweep),
+_CHECKS: dict[str, tuple[Callable[[str, Any, Sequence[Analysis]], None], ...]] = {
+    "statistic": (is_a_statistic, has_values),
+    "figure": (can_be_drawn, draws_a_sweep),
     "table": (makes_a_table,),
     "section": (can_be_read,),
 }

@@ -1,16 +1,18 @@
 """What every number in the report means, and where it comes from: the report's appendix. A statistic's definition
-stands in its record; here are the words that records are written in, and the comparisons."""
+stands in its record; here are the words that records are written in, the comparisons, and how to cite."""
 
 from __future__ import annotations
 
+from ipe_bench import __version__
 from ipe_bench.statistics.comparisons import TIE
-from ipe_bench.statistics.records import SCORES, STATISTICS, Statistic, all_statistics
+from ipe_bench.statistics.records import SCORES, STATISTICS, all_statistics
 
-
-def _definition(record: Statistic) -> tuple[str, str]:
-    return record.title, record.definition
-
-
+CITATION = (
+    f"The ipe-bench developers (2026). ipe-bench, version {__version__} [computer program]. Beside it, state the"
+    " command, the git commit and the source's digest that stand with the provenance, and the digest of the bundle"
+    " where results are shared as one (`ipe-bench bundle`)."
+)
+"""How results of the bench are cited."""
 DEFINITIONS: tuple[tuple[str, str], ...] = (
     ("trial", "One draw of true parameters and of noise. Trial t is the same for every estimator."),
     (
@@ -18,12 +20,12 @@ DEFINITIONS: tuple[tuple[str, str], ...] = (
         "Standard deviation of the true parameters about the nominal point, in multiples of the parameters' unit"
         " inputs.",
     ),
-    *map(_definition, STATISTICS),
+    *((record.title, record.definition) for record in STATISTICS),
     (
         "parameter 'all'",
         "Root mean square over parameters of the statistic over the linear bound, unless the statistic says otherwise.",
     ),
-    *map(_definition, SCORES),
+    *((record.title, record.definition) for record in SCORES),
     (
         "win, tie, loss",
         f"Paired by trial; Mahalanobis errors that differ by less than {TIE:g} are a tie: estimators that share a root"
@@ -64,4 +66,4 @@ DEFINITIONS: tuple[tuple[str, str], ...] = (
 
 def definitions() -> tuple[tuple[str, str], ...]:
     """The definitions, with those of the statistics that plugins add."""
-    return (*DEFINITIONS, *map(_definition, all_statistics()[len(STATISTICS) :]))
+    return (*DEFINITIONS, *((record.title, record.definition) for record in all_statistics()[len(STATISTICS) :]))

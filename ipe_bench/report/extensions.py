@@ -1,4 +1,4 @@
-"""Figures, tables and sections of plugins, made from copies of what was analysed.
+"""Figures, tables and sections of plugins.
 
 A report is complete without them: one that raises, or gives something that cannot be shown, is left out with a line
 that says so.
@@ -6,12 +6,9 @@ that says so.
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
-
-import pandas as pd
 
 from ipe_bench.basics.errors import StorageError, UserError, place_of
 from ipe_bench.plugins.discovery import Option, blame
@@ -51,7 +48,17 @@ def _usable(group: str, problems: list[str], make: Callable[[Option, Any], T]) -
             problems.append(f"{group}={option.name}: {error}; it is left out")
 
 
-# Figures
+def _require(thing: Any, kind: type, says: str = "is") -> None:
+    if not isinstance(thing, kind):
+        raise UserError(f"{says} a {type(thing).__name__} and not a {kind.__name__}")
+
+
+def _require_file_name(name: Any) -> None:
+    if not (isinstance(name, str) and _FILE_NAME.fullmatch(name)):
+        raise UserError(f"{name!r} is not a name for a file; use letters, digits and underscores")
+
+
+# Figures -------------------------------------------------------------------------------------------------------------
 
 
 def figures(problems: list[str]) -> list[tuple[Option, Figure]]:
@@ -65,8 +72,7 @@ def checked_figure(record: Any) -> Figure:
     Raises:
         UserError: it is not.
     """
-    if not isinstance(record, Figure):
-        raise UserError(f"is a {type(record).__name__} and not a Figure")
+    _require(record, Figure)
     frames = (record.frames,) if isinstance(record.frames, str) else record.frames
     if isinstance(record.frames, str) or not set(frames) <= set(FRAMES):
         raise UserError(f"frames={','.join(frames)}: name some of {', '.join(FRAMES)}, in a tuple")
@@ -74,64 +80,53 @@ def checked_figure(record: Any) -> Figure:
 
 
 def drawings(figure: Figure, view: View) -> list[Drawing]:
-    """The drawings that a plugin's figure makes of a copy of a view.
+    """The drawings that a plugin's figure makes of a view.
 
     Raises:
         UserError: it raises, or gives something else than drawings under names of their own.
     """
-    drawn = guarded(lambda: list(figure.draw(view.copied())))
+    drawn = guarded(lambda: list(figure.draw(view)))
     for drawing in drawn:
-        if not isinstance(drawing, Drawing):
-            raise UserError(f"gives a {type(drawing).__name__} and not a Drawing")
-        require_file_name(drawing.name)
+        _require(drawing, Drawing, "gives")
+        _require_file_name(drawing.name)
     if len({drawing.name for drawing in drawn}) < len(drawn):
         raise UserError("two drawings have one name; end each in view.suffix")
     return drawn
 
 
-def require_file_name(name: Any) -> None:
-    if not (isinstance(name, str) and _FILE_NAME.fullmatch(name)):
-        raise UserError(f"{name!r} is not a name for a file; use letters, digits and underscores")
-
-
-# Tables and sections
+# Tables and sections -------------------------------------------------------------------------------------------------
 
 
 def report_tables(analysis: Analysis) -> list[Table]:
     """Every table of the report: those on certified readings, ours on simulated trials, and those of plugins."""
     shown = certified_tables(analysis.collection) + all_tables(without_certified(analysis), analysis)
-    return shown + tables(analysis, [table.name for table in shown], analysis.collection.further)
-
-
-def tables(analysis: Analysis, taken: Iterable[str], problems: list[str]) -> list[Table]:
-    """The tables of plugins, under other names than those that are taken."""
-    names, found = set(taken), []
     if not analysis.summary.empty:
-        for _, table in _usable("table", problems, lambda _, record: made_table(record, analysis, names)):
+        names = {table.name for table in shown}
+        made = _usable("table", analysis.collection.further, lambda _, record: made_table(record, analysis, names))
+        for _, table in made:
             if table is not None:
                 names.add(table.name)
-                found.append(table)
-    return found
+                shown.append(table)
+    return shown
 
 
 def made_table(record: Any, analysis: Analysis, taken: Iterable[str] = ()) -> Table | None:
-    """The table that a plugin's function makes of a copy of the analysis; None if there is nothing to show.
+    """The table that a plugin's function makes of the analysis; None if there is nothing to show.
 
     Raises:
         UserError: it raises, or gives something else than a table under a name of its own.
     """
     if not callable(record):
         raise UserError(f"is a {type(record).__name__} and not a function of the analysis")
-    table: Any = guarded(lambda: record(copied(analysis)))
+    table: Any = guarded(lambda: record(analysis))
     if table is not None:
         _require_table(table, taken)
     return table
 
 
 def _require_table(table: Any, taken: Iterable[str]) -> None:
-    if not isinstance(table, Table):
-        raise UserError(f"gives a {type(table).__name__} and not a Table")
-    require_file_name(table.name)
+    _require(table, Table, "gives")
+    _require_file_name(table.name)
     if table.name in taken or table.name == "profiles":
         raise UserError(f"there is a table {table.name} already; choose another name")
     if not table.columns:
@@ -150,23 +145,16 @@ def sections(analysis: Analysis, taken: Iterable[str], problems: list[str]) -> l
 
 
 def made_section(name: str, record: Any, analysis: Analysis, taken: Iterable[str] = ()) -> Written:
-    """The texts and tables that a plugin's section makes of a copy of the analysis.
+    """The texts and tables that a plugin's section makes of the analysis.
 
     Raises:
         UserError: it raises, or gives something else than texts and tables.
     """
-    if not isinstance(record, Section):
-        raise UserError(f"is a {type(record).__name__} and not a Section")
-    parts = guarded(lambda: list(record.write(copied(analysis))))
+    _require(record, Section)
+    parts = guarded(lambda: list(record.write(analysis)))
     names = set(taken)
     for part in parts:
         if not isinstance(part, str):
             _require_table(part, names)
             names.add(part.name)
     return Written(name, str(record.title), parts)
-
-
-def copied(analysis: Analysis) -> Analysis:
-    """The analysis with frames of its own."""
-    held = {f.name: getattr(analysis, f.name) for f in dataclasses.fields(analysis)}
-    return dataclasses.replace(analysis, **{k: v.copy() for k, v in held.items() if isinstance(v, pd.DataFrame)})

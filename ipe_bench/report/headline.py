@@ -24,10 +24,7 @@ BROKEN = 0.9
 def headline(analysis: Analysis) -> list[str]:
     """Who solves most on certified readings and on problems of known minimum; on simulated ones, who agrees with whom,
     who is honest, who breaks where, and what that costs."""
-    simulated = without_certified(analysis)
-    found = [*_certified(analysis), *_attained(analysis)]
-    if not simulated.summary.empty:
-        found += _simulated(simulated)
+    found = [*_certified(analysis), *_attained(analysis), *_simulated(without_certified(analysis))]
     # A number and its sign stay on one line.
     return [s.replace(" %", "\u00a0%") for s in found] or ["Nothing is stored yet, so there is nothing to find."]
 
@@ -42,32 +39,34 @@ def _certified(analysis: Analysis) -> Iterator[str]:
     first = best.iloc[0]
     yield (
         f"Of {first['datasets']:.0f} certified problems, {enumerate_few(list(best.index))} solve"
-        f"{'s' if len(best) == 1 else ''} most, {first['solved']:.0f}, with four digits or more of every parameter;"
+        f"{'s' * (len(best) == 1)} most, {first['solved']:.0f}, with four digits or more of every parameter;"
         f" {best.index[0]} has {first['digits'] / first['datasets']:.1f} of 11 digits on average."
     )
 
 
 def _attained(analysis: Analysis) -> Iterator[str]:
-    totals = attained_totals(analysis.attained) if len(analysis.attained) else analysis.attained
-    if totals.empty:
+    if analysis.attained.empty or (totals := attained_totals(analysis.attained)).empty:
         return
     best = totals[totals["solved"] == totals["solved"].max()]
     yield (
         f"Of {best['problems'].iloc[0]} problems of known minimum, {enumerate_few(list(best['estimator']))} attain"
-        f"{'s' if len(best) == 1 else ''} most, {best['solved'].iloc[0]}."
+        f"{'s' * (len(best) == 1)} most, {best['solved'].iloc[0]}."
     )
 
 
 def _simulated(analysis: Analysis) -> Iterator[str]:
     """What a sweep over error scales says of one setting; of several, or of one scale, who succeeds how often."""
     rows = analysis.summary[analysis.summary["parameter"] == ALL]
+    if rows.empty:
+        return
     scales = sorted(rows["error_scale"].unique())
     several = rows.groupby(["error_scale", "estimator"]).size().max() > 1
     if several or len(scales) < 2 or rows["estimator"].nunique() < 2:
-        yield _ranked(analysis, rows)
+        yield _ranked(analysis, rows, scales)
         return
-    kinds = {group.estimator: kind_of(group.footer) for group in analysis.collection.groups}
-    yield from _agreement(rows, scales, kinds)
+    yield from _agreement(
+        rows, scales, {group.estimator: kind_of(group.footer) for group in analysis.collection.groups}
+    )
     yield from _honesty(rows)
     yield from _reach(rows, scales)
     yield _costs(rows, scales)
@@ -79,7 +78,7 @@ def _agreement(rows: pd.DataFrame, scales: Sequence[float], kinds: Mapping[str, 
     named = {kind: [e for e, k in kinds.items() if k == kind] for kind in ("IPE", "filters")}
     if not all(named.values()):
         return
-    who = ", ".join(f"{kind} ({enumerate_few(names)})" for kind, names in named.items()).replace("), ", ") and ", 1)
+    who = " and ".join(f"{kind} ({enumerate_few(names)})" for kind, names in named.items())
     last = None
     for scale in scales:
         here = compared[compared["error_scale"] == scale]
@@ -91,24 +90,21 @@ def _agreement(rows: pd.DataFrame, scales: Sequence[float], kinds: Mapping[str, 
         yield f"{who} differ already at error scale {plain(scales[0])}."
         return
     low, high = (f"{v:.2f}" for v in (last["efficiency_capped"].min(), last["efficiency_capped"].max()))
-    success = last["success"].min()
+    success, scale = last["success"].min(), last["error_scale"].iloc[0]
     succeed = "all their trials succeed" if success == 1 else f"at least {percent(success)} of their trials succeed"
-    scale = last["error_scale"].iloc[0]
     reach = "at every error scale" if scale == scales[-1] else f"up to error scale {plain(scale)}"
     yield f"{who} agree {reach}: {succeed} there, with an efficiency of {low if low == high else f'{low} to {high}'}."
 
 
+def _listed(rows: pd.DataFrame, value: Callable[[Any], str]) -> str:
+    """The estimators of the rows, each with a value in brackets."""
+    return enumerate_few([f"{row['estimator']} ({value(row)})" for _, row in rows.iterrows()])
+
+
 def _from_scale(rows: pd.DataFrame, value: Callable[[Any], str]) -> list[str]:
-    """Who is in the rows, by the smallest scale at which it is, with a value in brackets."""
+    """The estimators of the rows, by the smallest scale at which each is there."""
     first = rows.sort_values("error_scale", kind="stable").drop_duplicates("estimator")
-    return [
-        f"{enumerate_few([_with(row, value(row)) for _, row in part.iterrows()])} from scale {plain(scale)}"
-        for scale, part in first.groupby("error_scale")
-    ]
-
-
-def _with(row: pd.Series, words: str) -> str:
-    return f"{row['estimator']} ({words})"
+    return [f"{_listed(part, value)} from scale {plain(scale)}" for scale, part in first.groupby("error_scale")]
 
 
 def _honesty(rows: pd.DataFrame) -> Iterator[str]:
@@ -124,11 +120,14 @@ def _honesty(rows: pd.DataFrame) -> Iterator[str]:
 
 def _reach(rows: pd.DataFrame, scales: Sequence[float]) -> Iterator[str]:
     """From which scale on who surely fails in more than a tenth of the trials, and who never does."""
+
+    def success(row: Any) -> str:
+        return percent(row["success"])
+
     broken = rows[rows["success_high"] < BROKEN]
-    parts = _from_scale(broken, lambda row: percent(row["success"]))
+    parts = _from_scale(broken, success)
     top = rows[(rows["error_scale"] == scales[-1]) & ~rows["estimator"].isin(broken["estimator"])]
-    holds = enumerate_few([_with(row, percent(row["success"])) for _, row in top.iterrows()])
-    parts += [f"{holds} hold{'s' * (len(top) == 1)} to {plain(scales[-1])}"] if len(top) else []
+    parts += [f"{_listed(top, success)} hold{'s' * (len(top) == 1)} to {plain(scales[-1])}"] if len(top) else []
     yield f"Success falls surely below {100 * BROKEN:.0f} %: {'; '.join(parts)}."
     silent = rows.sort_values("failed_silent", kind="stable").iloc[-1]
     if silent["failed_silent"] > 0:
@@ -141,10 +140,9 @@ def _costs(rows: pd.DataFrame, scales: Sequence[float]) -> str:
     holding = rows[rows["success_high"] >= BROKEN]
     number = holding.groupby("error_scale")["estimator"].nunique()
     most = number[number > rows["estimator"].nunique() / 2]
-    at = dict.fromkeys([most.index.max()] if len(most) else [])
-    at |= dict.fromkeys([number.index.max()] if len(number) else [scales[-1]])
+    at = [*([most.index.max()] if len(most) else []), number.index.max() if len(number) else scales[-1]]
     parts = []
-    for scale in at:
+    for scale in dict.fromkeys(at):
         part = (holding if len(number) else rows).query("error_scale == @scale")
         listed = [
             f"{row['estimator']} {brief(row['simulations_median'])} ({duration(row['time_median_s'], 2)})"
@@ -154,20 +152,20 @@ def _costs(rows: pd.DataFrame, scales: Sequence[float]) -> str:
     return f"A trial costs, in simulations: {'; '.join(parts)}."
 
 
-def _ranked(analysis: Analysis, rows: pd.DataFrame) -> str:
+def _ranked(analysis: Analysis, rows: pd.DataFrame, scales: Sequence[float]) -> str:
     """Who succeeds in how many of the trials, pooled over all scenarios, and who fails silently."""
     rows = rows.assign(**{name: rows[name] * rows["trials"] for name in ("success", "failed_silent")})
     sums = rows.groupby("estimator", sort=False)[["success", "failed_silent", "trials"]].sum()
-    sums = sums.assign(share=sums["success"] / sums["trials"]).sort_values("share", ascending=False, kind="stable")
+    sums = sums.assign(share=sums["success"] / sums["trials"], silent=sums["failed_silent"] / sums["trials"])
+    sums = sums.sort_values("share", ascending=False, kind="stable")
     listed = [f"{label} in {percent(row['share'])}" for label, row in sums.iterrows()]
-    scales = sorted(rows["error_scale"].unique())
-    reach = f"error scale {plain(scales[0])}"
-    if len(scales) > 1:
-        reach = f"error scales {plain(scales[0])} to {plain(scales[-1])}"
+    reach = (
+        f"error scale{'s' * (len(scales) > 1)} {' to '.join(plain(s) for s in dict.fromkeys([scales[0], scales[-1]]))}"
+    )
     scenarios = len(set(analysis.scores["scenario"]))
     number = f"{int(sums['trials'].max()):,} trials" + (f" in {scenarios} scenarios" if scenarios > 1 else "")
     sentence = f"At {reach}, of {number} succeed: {enumerate_few(listed)}."
-    worst = sums.assign(silent=sums["failed_silent"] / sums["trials"]).sort_values("silent").iloc[-1]
+    worst = sums.sort_values("silent").iloc[-1]
     if worst["silent"] > 0:
         sentence += f" Failures that look right: {percent(worst['silent'])} at most ({worst.name})."
     return sentence

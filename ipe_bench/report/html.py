@@ -11,8 +11,7 @@ from typing import Any
 
 from ipe_bench import __version__
 from ipe_bench.report.charts import Chart
-from ipe_bench.report.citation import CITATION
-from ipe_bench.report.definitions import definitions
+from ipe_bench.report.definitions import CITATION, definitions
 from ipe_bench.report.figures.gallery import Drawn
 from ipe_bench.report.headline import about, headline
 from ipe_bench.report.sections import Written
@@ -23,15 +22,6 @@ from ipe_bench.statistics.collect import Run
 MOST_RUNS = 20
 MOST_COMMANDS = 3
 """At the head of the page; all stand with the provenance."""
-_SECTIONS = (
-    ("explore", "Explore"),
-    ("figures", "Figures"),
-    ("tables", "Tables"),
-    ("appendix", "Further tables"),
-    ("provenance", "Configuration and provenance"),
-    ("definitions", "Definitions"),
-    ("cite", "How to cite"),
-)
 _PYTHON, _UNKNOWN = "from Python", "a command that was not recorded"
 
 
@@ -45,11 +35,25 @@ def render_page(
     """The page as text; what plugins have written stands behind our tables."""
     from markupsafe import Markup
 
-    collection = analysis.collection
-    script, style = _template("report.js"), _template("report.css")
-    runs = _runs(collection.runs)
+    collection, runs = analysis.collection, _runs(analysis.collection.runs)
+    main, appendix = ([table for table in tables if table.appendix is last] for last in (False, True))
     nothing_failed = analysis.endings.empty and not analysis.summary.empty
-    commands = [run["command"] for run in runs if run["command"] not in (_PYTHON, _UNKNOWN)]
+    # The first figure, or else the first chart, opens the page.
+    sections = {
+        "explore": ("Explore", len(charts) > (not figures)),
+        "figures": ("Figures", len(figures) > 1),
+        "tables": ("Tables", len(main) > 1 or nothing_failed),
+        **{f"section-{section.name}": (section.title, True) for section in written},
+        "appendix": ("Further tables", bool(appendix)),
+        "provenance": ("Configuration and provenance", True),
+        "definitions": ("Definitions", True),
+        "cite": ("How to cite", True),
+    }
+    commands = dict.fromkeys(run["command"] for run in runs if run["command"] not in (_PYTHON, _UNKNOWN))
+    script, style = (
+        resources.files("ipe_bench.report").joinpath("templates", name).read_text(encoding="utf-8")
+        for name in ("report.js", "report.css")
+    )
     return (
         environment()
         .get_template("report.html.j2")
@@ -65,12 +69,12 @@ def render_page(
             complete=collection.complete,
             problems=[*collection.problems, *collection.stale],
             title=", ".join(d.resolve().name or str(d) for d in collection.directories),
-            computed=collection.runs[-1].started[:16].replace("T", " ") if collection.runs else "",
-            commands=list(dict.fromkeys(commands))[:MOST_COMMANDS],
-            sections=_contents(tables, written, figures, charts, nothing_failed),
-            tables=[t for t in tables if not t.appendix],
+            computed=_minute(collection.runs[-1]) if collection.runs else "",
+            commands=list(commands)[:MOST_COMMANDS],
+            sections=[(name, title) for name, (title, there) in sections.items() if there],
+            tables=main,
             written=written,
-            appendix=[t for t in tables if t.appendix],
+            appendix=appendix,
             figures=[_picture(figure) for figure in figures],
             charts=charts,
             nothing_failed=nothing_failed,
@@ -80,10 +84,6 @@ def render_page(
             definitions=definitions(),
         )
     )
-
-
-def _template(name: str) -> str:
-    return resources.files("ipe_bench.report").joinpath("templates", name).read_text(encoding="utf-8")
 
 
 def _policy(script: str, style: str) -> str:
@@ -96,32 +96,12 @@ def _policy(script: str, style: str) -> str:
 
 
 def _picture(figure: Drawn) -> dict[str, Any]:
-    return {
-        "name": figure.name,
-        "title": figure.title,
-        "caption": figure.caption,
-        "data": base64.b64encode(figure.files[0].read_bytes()).decode(),
-        "files": [path.name for path in figure.files],
-    }
+    png, names = base64.b64encode(figure.files[0].read_bytes()).decode(), [path.name for path in figure.files]
+    return {"name": figure.name, "title": figure.title, "caption": figure.caption, "data": png, "files": names}
 
 
-def _contents(
-    tables: Sequence[Table],
-    written: Sequence[Written],
-    figures: Sequence[Drawn],
-    charts: Sequence[Chart],
-    nothing_failed: bool,
-) -> list[tuple[str, str]]:
-    """The folded parts that there are, in order; those of plugins stand behind our tables."""
-    there = {
-        "explore": len(charts) > (not figures),
-        "figures": len(figures) > 1,
-        "tables": sum(not t.appendix for t in tables) > 1 or nothing_failed,
-        "appendix": any(t.appendix for t in tables),
-    }
-    own = [(name, title) for name, title in _SECTIONS if there.get(name, True)]
-    split = next(i for i, (name, _) in enumerate(own) if name in ("appendix", "provenance"))
-    return [*own[:split], *((f"section-{s.name}", s.title) for s in written), *own[split:]]
+def _minute(run: Run) -> str:
+    return run.started[:16].replace("T", " ")
 
 
 def _runs(runs: Sequence[Run]) -> list[dict[str, Any]]:
@@ -139,21 +119,16 @@ def _runs(runs: Sequence[Run]) -> list[dict[str, Any]]:
 def _command(command: str, runs: Sequence[Run]) -> dict[str, Any]:
     """Everything that its jobs have in common, and each job's configuration."""
     last = runs[-1].record
-    machine = last.get("machine") or {}
     facts = {
         "runs": ", ".join(run.path.stem for run in runs),
         "trials": ", ".join(dict.fromkeys(str(run.record.get("trials")) for run in runs)),
         "cells": sum(len(run.record.get("cells", ())) for run in runs),
         "git commit": last.get("git_commit") or "unknown",
         "source": last.get("source"),
-        "machine": ", ".join(f"{k} {v}" for k, v in machine.items()) if isinstance(machine, dict) else machine,
+        "machine": ", ".join(f"{k} {v}" for k, v in (last.get("machine") or {}).items()),
         "versions": ", ".join(f"{k} {v}" for k, v in (last.get("libraries") or {}).items()),
     }
     scenarios = [scenario for run in runs for scenario in run.record.get("scenarios", ())]
     config = {"scenarios": scenarios, "estimators": last.get("estimators", {})}
-    return {
-        "command": command,
-        "started": runs[0].started[:16].replace("T", " "),
-        "facts": facts,
-        "config": json.dumps(config, indent=1, ensure_ascii=False),
-    }
+    config_text = json.dumps(config, indent=1, ensure_ascii=False)
+    return {"command": command, "started": _minute(runs[0]), "facts": facts, "config": config_text}

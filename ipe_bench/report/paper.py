@@ -7,18 +7,19 @@ nothing is scaled. What they say is what the report says.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.files import write_text
+from ipe_bench.report.certified_tables import without_certified
 from ipe_bench.report.extensions import report_tables
-from ipe_bench.report.table import COLUMN, COLUMN_GAP, PAGE, Table, latex, letters
+from ipe_bench.report.table import COLUMN, COLUMN_GAP, PAGE, Column, Table, latex, letters
 from ipe_bench.statistics.analysis import Analysis
 
 _NARROWEST, _WIDEST = 2.0, 20.0
-POINTS_A_LETTER = 4.0
+_POINTS_A_LETTER = 4.0
 """Mean width of a letter of 8 points."""
 
 
@@ -42,85 +43,68 @@ def export(
     if not _NARROWEST <= width <= _WIDEST:
         raise UserError(f"width={width:g}: give inches, such as {COLUMN:g} for one column and {PAGE:g} for two")
     tables = {table.name: table for table in report_tables(analysis)}
-    chosen = [chosen_columns(tables[name], columns) for name in names if name in tables]
+    chosen = [_with_columns(tables[name], columns) for name in names if name in tables]
     if columns and not chosen:
         raise UserError(f"columns={','.join(columns)}: goes with a table; paper={','.join(names)} names none")
-    files, captions = _figures(analysis, folder, [name for name in names if name not in tables], width, tables)
+    files = _figures(analysis, folder, [name for name in names if name not in tables], width, list(tables))
     for table in chosen:
-        path = folder / f"{table.name}.tex"
-        write_text(path, latex(table, width))
-        files.append(path)
-    if captions:
-        write_text(folder / "captions.md", "\n\n".join(captions) + "\n")
-        files.append(folder / "captions.md")
-    return Export(tuple(files), tuple(line for table in chosen for line in _excess(table, width)))
+        files.append(folder / f"{table.name}.tex")
+        write_text(files[-1], latex(table, width))
+    too_wide = [
+        f"{table.name}: is about {inches(table):.1f} in wide, and {width:g} in were asked for; choose with columns="
+        f" among {', '.join(_columns(table))}"
+        for table in chosen
+        if inches(table) > width
+    ]
+    return Export(tuple(files), tuple(too_wide))
 
 
-# Tables --------------------------------------------------------------------------------------------------------------
-
-
-def column_names(table: Table) -> list[str]:
-    """The names by which columns are chosen: their titles in letters, digits and underscores."""
-    names: list[str] = []
+def _columns(table: Table) -> dict[str, Column]:
+    """The columns by the names by which they are chosen: their titles in letters, digits and underscores."""
+    named: dict[str, Column] = {}
     for column in table.columns:
         name = re.sub(r"[^a-z0-9]+", "_", column.title.lower()).strip("_") or "column"
-        names.append(name if name not in names else f"{name}_{names.count(name) + 1}")
-    return names
+        alike = sum(re.fullmatch(rf"{name}(_\d+)?", other) is not None for other in named)
+        named[f"{name}_{alike + 1}" if alike else name] = column
+    return named
 
 
-def chosen_columns(table: Table, names: Sequence[str]) -> Table:
-    """The table with these columns, in this order; all columns if none is named.
-
-    Raises:
-        UserError: it has no such column.
-    """
-    if not names:
-        return table
-    known = dict(zip(column_names(table), table.columns, strict=True))
+def _with_columns(table: Table, names: Sequence[str]) -> Table:
+    """The table with these columns, in this order; all columns if none is named."""
+    known = _columns(table)
     for name in names:
         if name not in known:
             raise UserError(f"columns={name}: {unknown(name, known, f'column of {table.name}')}")
-    return replace(table, columns=[known[name] for name in names])
+    return replace(table, columns=[known[name] for name in names or known])
 
 
 def inches(table: Table) -> float:
     """About how wide a table is."""
-    points = sum(POINTS_A_LETTER * letters(column) for column in table.columns)
+    points = sum(_POINTS_A_LETTER * letters(column) for column in table.columns)
     return (points + 2 * COLUMN_GAP * (len(table.columns) - 1)) / 72
 
 
-def _excess(table: Table, width: float) -> Iterator[str]:
-    if inches(table) > width:
-        yield (
-            f"{table.name}: is about {inches(table):.1f} in wide, and {width:g} in were asked for; choose"
-            f" with columns= among {', '.join(column_names(table))}"
-        )
-
-
-# Figures -------------------------------------------------------------------------------------------------------------
-
-
-def _figures(
-    analysis: Analysis, folder: Path, names: Sequence[str], width: float, tables: dict[str, Table]
-) -> tuple[list[Path], list[str]]:
-    """Their files and captions."""
-    from ipe_bench.report.certified_tables import without_certified
+def _figures(analysis: Analysis, folder: Path, names: Sequence[str], width: float, tables: Sequence[str]) -> list[Path]:
+    """Writes figures, and captions.md with their captions; returns the files."""
     from ipe_bench.report.figures.common import column_width
     from ipe_bench.report.figures.gallery import drawings
     from ipe_bench.report.style import print_style
 
+    if not names:
+        return []
     files: list[Path] = []
-    captions: list[str] = []
+    captions: dict[str, str] = {}
     seen: list[str] = []
     with print_style(), column_width(width):
-        for drawing in drawings(without_certified(analysis), analysis.collection.further) if names else ():
+        for drawing in drawings(without_certified(analysis), analysis.collection.further):
             seen.append(drawing.name)
             if drawing.name in names:
                 files += drawing.save(folder)
-                captions.append(f"**{drawing.name}.** {drawing.title}. {drawing.caption}")
+                captions[drawing.name] = f"**{drawing.name}.** {drawing.title}. {drawing.caption}"
             if set(names) <= set(seen):
                 break
     for name in names:
         if name not in seen:
             raise UserError(f"paper={name}: {unknown(name, [*tables, *seen], 'table or figure')}")
-    return files, captions
+    write_text(folder / "captions.md", "\n\n".join(captions.values()) + "\n")
+    return [*files, folder / "captions.md"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import sys
 from collections.abc import Iterable, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -26,34 +25,30 @@ def made_from(directories: Sequence[Path], output: Path, *choices: object) -> st
     sources = [p for p in Path(__file__).parents[1].rglob("*") if p.suffix in {".py", ".j2", ".css", ".js"}]
     stores = [Store(directory) for directory in directories]
     stored = [p for s in stores for folder in (s.trials, s.runs, s.failed) for p in folder.glob("*")]
-    libraries = [sys.version, *map(version, ("jinja2", "matplotlib", "numpy", "pandas", "scipy", "seaborn"))]
+    libraries = [version(name) for name in ("jinja2", "matplotlib", "numpy", "pandas", "scipy", "seaborn")]
     names = [str(path.absolute()) for path in (output, *directories)]
     known = [names, choices, libraries, digest_of_all(), _digests(sources), _digests(stored)]
     return hashlib.sha256(repr(known).encode()).hexdigest()
 
 
-def is_current(output: Path, made: str, problems: Sequence[str]) -> bool:
-    """Whether the report under `output` was made from this with these problems, and its files are as written."""
+def is_current(output: Path, made: str) -> bool:
+    """Whether the report under `output` was made from this, and its files are as written."""
     with contextlib.suppress(OSError, ValueError):
         known = json.loads((output / NAME).read_text(encoding="utf-8"))
-        return known == _stamp(output, made, problems, [output / name for name in known["files"]])
+        return known == {"from": made, "files": _digests(map(Path, known["files"]))}
     return False
 
 
-def leave(output: Path, made: str, problems: Sequence[str], files: Iterable[Path]) -> None:
+def leave(output: Path, made: str, files: Iterable[Path]) -> None:
     """States what the report under `output` was made from, and which files belong to it."""
     with contextlib.suppress(StorageError):
-        write_text(output / NAME, json.dumps(_stamp(output, made, problems, files), indent=1) + "\n")
+        write_text(output / NAME, json.dumps({"from": made, "files": _digests(files)}, indent=1) + "\n")
 
 
-def _stamp(output: Path, made: str, problems: Sequence[str], files: Iterable[Path]) -> dict[str, object]:
-    return {"from": made, "problems": list(problems), "files": _digests(files, output)}
-
-
-def _digests(paths: Iterable[Path], top: Path | None = None) -> dict[str, str]:
-    """By path; a file that another command removes at this moment is left out."""
+def _digests(paths: Iterable[Path]) -> dict[str, str]:
+    """By absolute path; a file that another command removes at this moment is left out."""
     found = {}
     for path in sorted(paths):
         with contextlib.suppress(FileNotFoundError):
-            found[str(path.relative_to(top) if top else path)] = hashlib.sha256(path.read_bytes()).hexdigest()
+            found[str(path.absolute())] = hashlib.sha256(path.read_bytes()).hexdigest()
     return found

@@ -88,11 +88,6 @@ class View:
         frames = {name: self.frames[name] for name in names}
         return replace(self, frames=frames, parts=tuple(part.only(names) for part in self.parts))
 
-    def copied(self) -> View:
-        """The same with frames that may be written into."""
-        frames = {name: frame.copy() for name, frame in self.frames.items()}
-        return replace(self, frames=frames, parts=tuple(part.copied() for part in self.parts))
-
 
 def views(analysis: Analysis) -> tuple[list[View], View]:
     """The settings of an analysis, at most `MOST_SETTINGS`, and all of them together."""
