@@ -95,7 +95,7 @@ class Pending:
         from ipe_bench.report.html import render_page
         from ipe_bench.report.stamp import leave
         from ipe_bench.report.table import write_table
-        from ipe_bench.statistics.digits import certified_averages, certified_table
+        from ipe_bench.statistics.certified import certified_averages, certified_table
 
         analysis, output = self.begun.finish(), self.output
         simulated, problems = without_certified(analysis), analysis.collection.further

@@ -10,9 +10,14 @@ import pandas as pd
 from ipe_bench.report.table import Column, Table, column, words
 from ipe_bench.report.words import plain, short
 from ipe_bench.statistics.analysis import Analysis
-from ipe_bench.statistics.attained import BUDGETS, attained_table, attained_totals
+from ipe_bench.statistics.certified import (
+    BUDGETS,
+    attained_table,
+    attained_totals,
+    certified_averages,
+    certified_table,
+)
 from ipe_bench.statistics.collect import Collection
-from ipe_bench.statistics.digits import certified_averages, certified_table
 
 
 def certified_tables(collection: Collection) -> list[Table]:

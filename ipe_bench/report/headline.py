@@ -11,8 +11,7 @@ from ipe_bench.report.certified_tables import without_certified
 from ipe_bench.report.figures.views import kind_of
 from ipe_bench.report.words import brief, duration, enumerate_few, percent, plain, short
 from ipe_bench.statistics.analysis import Analysis
-from ipe_bench.statistics.attained import attained_totals
-from ipe_bench.statistics.digits import certified_averages, certified_table
+from ipe_bench.statistics.certified import attained_totals, certified_averages, certified_table
 from ipe_bench.statistics.summary import ALL, BEST
 
 ALIKE = 0.05

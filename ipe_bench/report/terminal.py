@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from ipe_bench.report.table import Cell, Column, Table, column, sort_key, terminal, texts, words
 from ipe_bench.report.words import brief, compact, duration, limits, percent, plain, reported, shown
-from ipe_bench.statistics.records import CAP, all_statistics
+from ipe_bench.statistics.formulas import CAP
+from ipe_bench.statistics.records import all_statistics
 from ipe_bench.statistics.summary import ALL, BEST
 from ipe_bench.statistics.summary import columns as summary_columns
 

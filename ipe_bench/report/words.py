@@ -122,8 +122,10 @@ def applies(record: Statistic, where: Where, row: Mapping[str, Any]) -> bool:
 
 
 def reported(record: Statistic, rows: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether a table has the column of a statistic; a rare one needs a finite value in some row."""
-    return not record.rare or any(math.isfinite(row[record.name]) for row in rows)
+    """Whether a table has the column of a statistic; a rare one needs a finite value in some row, a rare count one
+    above 0."""
+    values = [row[record.name] for row in rows]
+    return not record.rare or any(math.isfinite(v) and (v > 0 or record.kind != "count") for v in values)
 
 
 def shown(record: Statistic, where: Where, row: Mapping[str, Any]) -> str:

@@ -16,8 +16,8 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.provenance import canonical_json
 from ipe_bench.statistics.collect import Collection, Group, config_leaves, differing, shown_leaf
 from ipe_bench.statistics.comparisons import ALPHA, Outcomes, differences, holm
+from ipe_bench.statistics.formulas import gate_radius
 from ipe_bench.statistics.paired import Effect, no_drift, no_lean, ratio_effect, success_effect
-from ipe_bench.statistics.records import gate_radius
 from ipe_bench.statistics.sample import Sample, Shared
 from ipe_bench.statistics.summary import outcomes_of
 

@@ -1,4 +1,5 @@
-"""Comparisons of estimators on the same trials: differences of error, of success, and ranks over replicates.
+"""Comparisons of estimators on the same trials: differences of error and of success, ranks over replicates, and what
+success costs.
 
 The error of a trial is its Mahalanobis distance sqrt(e' J' R^-1 J e) from the truth, in standard deviations of the
 Cramér-Rao bound: about sqrt(n) for an efficient estimator. An estimate that is not finite is infinitely wrong.
@@ -9,15 +10,24 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import bdtr
 
 from ipe_bench.basics.linalg import Array
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 TIE = 1e-3
 """Errors closer than this, in standard deviations, are equal: round-off is never a difference."""
 ALPHA = 0.05
+REPLICATES = 5
+"""Fewer seeds than this are not ranked: the distribution of Friedman's statistic is not known well enough."""
+RATIOS = np.unique(np.round(np.geomspace(1, 1000, 181), 6))
+BUDGETS = np.unique(np.round(np.geomspace(1, 100_000, 301)))
+"""Costs at which performance and data profiles are tabulated: over the cheapest success, and in simulations."""
 
 
 @dataclass(frozen=True)
@@ -168,10 +178,6 @@ class Ranking:
     """Nemenyi's, q_0.05 sqrt(k (k + 1) / (6 N)) (Demsar, J. Mach. Learn. Res. 7, 2006, sec. 3.2.2)."""
 
 
-REPLICATES = 5
-"""Fewer seeds than this are not ranked: the distribution of Friedman's statistic is not known well enough."""
-
-
 def rank_over_replicates(scores: Sequence[Mapping[str, float]]) -> Ranking | None:
     """Ranks of the estimators that every replicate has, by their scores in it, the smaller the better.
 
@@ -207,3 +213,32 @@ def tied_ranks(scores: Array) -> Array:
     with np.errstate(invalid="ignore"):
         groups = np.cumsum(np.append(0, np.diff(scores[order]) >= TIE))
     return rankdata(groups[np.argsort(order, kind="stable")])
+
+
+def profiles(scenarios: Sequence[Mapping[str, Outcomes]]) -> pd.DataFrame:
+    """Which share of all trials each estimator solves at what cost: columns estimator, profile, `at` and share.
+
+    `performance`: at a cost of at most `RATIOS` times the cheapest estimator's (Dolan and Moré, Math. Program. 91,
+    2002). `data`: within `BUDGETS` simulations (Moré and Wild, SIAM J. Optim. 20, 2009). A trial without success costs
+    infinitely much.
+    """
+    import pandas as pd
+
+    spent: dict[str, list[tuple[Array, Array]]] = {}
+    for outcomes in scenarios:
+        costs = {label: np.where(o.success, o.cost, np.inf) for label, o in common(outcomes).items()}
+        best = np.min(list(costs.values()), axis=0) if costs else np.empty(0)
+        for label, cost in costs.items():
+            solved = np.isfinite(cost)
+            # A cost of nothing, without any simulation, is the best there is.
+            ratio = np.divide(cost, best, out=np.where(solved, 1.0, np.inf), where=solved & (best > 0))
+            spent.setdefault(label, []).append((ratio, cost))
+    kinds = ("performance", RATIOS, RATIOS * (1 + 1e-9)), ("data", BUDGETS, BUDGETS)
+    parts = []
+    for label, several in spent.items():
+        for (profile, at, limits), values in zip(kinds, zip(*several, strict=True), strict=True):
+            ordered = np.sort(np.concatenate(values))
+            share = np.searchsorted(ordered, limits, side="right") / max(1, len(ordered))
+            parts.append(pd.DataFrame({"estimator": label, "profile": profile, "at": at, "share": share}))
+    columns = ["estimator", "profile", "at", "share"]
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)

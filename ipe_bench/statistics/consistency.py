@@ -1,7 +1,7 @@
-"""Whether an estimator's errors are as large as it says: limits of means and shares, and a verdict.
+"""Whether errors are as large as an estimator says: limits of means and shares, and a verdict.
 
-Numbers in, numbers out: what was estimated and how is left to others. Source: Bar-Shalom, Li, Kirubarajan, Estimation
-with Applications to Tracking and Navigation, section 5.4; limits of shares are Clopper and Pearson's.
+Sources: Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4;
+Clopper and Pearson, Biometrika 26, 1934.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from ipe_bench.trials.thresholds import FEW, GATE
 
 TOLERATED = 0.01
 """Share of trials outside their own gate above which an estimator is named diverged but confident."""
-
 _BETS = 0.99 * 2.0 ** -np.arange(9)
 """Shares of the stake."""
 
@@ -27,8 +26,7 @@ Verdict = Literal["consistent", "pessimistic", "optimistic", "undecided", "diver
 def mean_limits(degrees: float, trials: int, level: float = 0.95) -> tuple[float, float]:
     """Where the mean over `trials` of chi-square / degrees lies with probability `level`, if all is consistent.
 
-    NEES has n degrees per trial, NIS as many as the trial has readings (Bar-Shalom, Li and Kirubarajan, Estimation with
-    Applications to Tracking and Navigation, 2001, sec. 5.4.2).
+    NEES has n degrees per trial, NIS as many as the trial has readings (Bar-Shalom et al., sec. 5.4.2).
     """
     if trials < 1 or degrees < 1:
         return np.nan, np.nan
@@ -38,10 +36,7 @@ def mean_limits(degrees: float, trials: int, level: float = 0.95) -> tuple[float
 
 
 def clopper_pearson(count: int, trials: int, level: float = 0.95) -> tuple[float, float]:
-    """The exact confidence interval of a share of which `count` in `trials` was seen.
-
-    Clopper and Pearson, Biometrika 26, 1934.
-    """
+    """The exact confidence interval of a share of which `count` in `trials` was seen."""
     if trials < 1:
         return np.nan, np.nan
     tail = (1 - level) / 2
@@ -65,7 +60,7 @@ def verdict(nees: Array, n: int, level: float = 0.95) -> Verdict:
     if len(claims) < FEW:
         return "-"
     x = np.minimum(claims / n, 1e150)
-    above = _above_1(x) >= 2 / (1 - level)
+    above = _evidence_above_1(x) >= 2 / (1 - level)
     outside = int(np.sum(claims > chdtri(n, GATE)))
     if above and clopper_pearson(outside, len(claims), level)[0] > TOLERATED:
         return "diverged but confident"
@@ -75,7 +70,7 @@ def verdict(nees: Array, n: int, level: float = 0.95) -> Verdict:
     return "optimistic" if low[0] > 1 else "pessimistic" if high[0] < 1 else "consistent"
 
 
-def _above_1(x: Array) -> float:
+def _evidence_above_1(x: Array) -> float:
     """Evidence that the mean of numbers (trials,) that are not negative is above 1, whatever their law: the mean
     fortune of those who bet fixed shares on it, which exceeds c with a probability of at most 1 / c otherwise."""
     fortunes = np.log1p(_BETS[:, None] * (x - 1)[None, :]).sum(axis=1)

@@ -1,14 +1,20 @@
-"""Intervals: how far a share, a root mean square error or a NEES may lie from its true value by chance."""
+"""Intervals: how far a share or a root mean square error may lie from its true value by chance.
+
+Those of a fixed number of trials, and confidence sequences, which hold the true value at all numbers of trials at once
+with the stated probability, so that one may look as often as one likes.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 from math import prod
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import betaln, ndtri
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.trials.thresholds import FEW
@@ -21,6 +27,16 @@ HEAVY = 0.01
 """Share of samples of normal errors that are taken for heavy-tailed ones."""
 _ONE_TRIAL = 0.05
 """Share of one trial in the sum of squared squares above which their scatter is not known either."""
+TIGHTEST = 1000
+"""The number of trials at which sequences are about as narrow as they can be; at others they are valid as well."""
+_WEIGHT = TIGHTEST / (2 * math.log(20) + math.log(2 * math.log(20)) + 1)
+"""Of the mixtures, in trials: what makes those of 95 % tightest there (Waudby-Smith et al., 2024, appendix)."""
+_STEPS = 60
+FIRST = 100
+"""Trials from which an asymptotic sequence begins; one that begins earlier misses errors with rare large ones."""
+
+
+# Root mean squares of a fixed number of trials -----------------------------------------------------------------------
 
 
 def rms_interval(squares: Array, used: Array, level: float = LEVEL) -> tuple[Array, Array]:
@@ -85,6 +101,9 @@ def _draws(size: int) -> Array:
     return rng.multinomial(size, np.full(size, 1 / size), size=RESAMPLES).astype(float)
 
 
+# Whether few trials carry a sum --------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class Squares:
     """Squares beside their own size: they may be anything from 1e-200 to 1e200, whose squares are no numbers."""
@@ -109,9 +128,9 @@ class Squares:
         return cls(count, size, mean, ((scaled - mean[:, None]) ** 2).sum(axis=1))
 
     @property
-    def deviation(self) -> Array:
-        """Standard deviation (k,), in units of the size."""
-        return np.sqrt(self.deviations / (self.count - 1)) if self.count > 1 else np.full(len(self.size), np.nan)
+    def rms(self) -> Array:
+        """Root mean square (k,)."""
+        return np.sqrt(self.size) * np.sqrt(self.mean)
 
     @property
     def effective(self) -> Array:
@@ -161,6 +180,69 @@ def _heaviest(trials: int, degrees: int) -> float:
 
 def _rising(x: Fraction, k: int) -> Fraction:
     return prod((x + i for i in range(k)), start=Fraction(1))
+
+
+# However often one looks ---------------------------------------------------------------------------------------------
+
+
+def share_sequence(count: int, trials: int, level: float = LEVEL) -> tuple[float, float]:
+    """A share of which `count` in `trials` was seen: the hull of those p whose likelihood is not beaten by more than
+    1/(1 - level) by that of a share drawn from a Beta distribution about p.
+
+    That ratio is a martingale under p, so by Ville's inequality it ever exceeds this bound with at most the probability
+    1 - level (Robbins, Ann. Math. Statist. 41, 1970; Howard, Ramdas, McAuliffe and Sekhon, Ann. Statist. 49, 2021).
+    """
+    if trials < 1:
+        return np.nan, np.nan
+
+    def beaten(p: float) -> bool:
+        a, b, failures = _WEIGHT * p, _WEIGHT * (1 - p), trials - count
+        mixture = float(betaln(a + count, b + failures) - betaln(a, b))
+        own = (count * math.log(p) if count else 0.0) + (failures * math.log1p(-p) if failures else 0.0)
+        return mixture - own > -math.log(1 - level)
+
+    return _crossing(beaten, count / trials, 0.0), _crossing(beaten, count / trials, 1.0)
+
+
+def _crossing(beaten: Callable[[float], bool], inside: float, outside: float) -> float:
+    """Where, from the share that was seen to that end, shares begin to be beaten."""
+    if inside == outside:
+        return outside
+    for _ in range(_STEPS):
+        middle = (inside + outside) / 2
+        if middle in (0.0, 1.0):
+            return outside
+        inside, outside = (inside, middle) if beaten(middle) else (middle, outside)
+    return outside
+
+
+def mean_sequence(deviation: Array, count: int, level: float = LEVEL) -> Array:
+    """How far a mean of `count` values of that deviation may lie from its true value.
+
+    The asymptotic confidence sequence of a Gaussian mixture (Waudby-Smith, Arbour, Sinha, Kennedy and Ramdas, Ann.
+    Statist. 52, 2024, theorem 2.2), tightest at `TIGHTEST`: what the central limit theorem is to a fixed number of
+    trials.
+    """
+    alpha, rho2 = 1 - level, 1 / _WEIGHT
+    grown = count * rho2 + 1
+    return deviation * math.sqrt(2 * grown / (count**2 * rho2) * math.log(math.sqrt(grown) / alpha))
+
+
+def rms_sequence(squares: Squares, degrees: Array, level: float = LEVEL) -> tuple[Array, Array]:
+    """Root mean square (k,): the sequence of the logarithm of the mean square; NaN below `FIRST`, and where few trials
+    carry the sum; see `few_carry`."""
+    size, mean, count = squares.size, squares.mean, squares.count
+    if count < FIRST:
+        return np.full(len(size), np.nan), np.full(len(size), np.nan)
+    with np.errstate(all="ignore"):
+        reach = mean_sequence(np.sqrt(squares.deviations / (count - 1)) / mean, count, level) / 2
+        root = np.sqrt(size * mean)
+        ends = [np.where(size > 0, root * np.exp(side * reach), 0.0) for side in (-1, 1)]
+    few = few_carry(squares, degrees)
+    return np.where(few, np.nan, ends[0]), np.where(few, np.nan, ends[1])
+
+
+# Quantiles -----------------------------------------------------------------------------------------------------------
 
 
 def quantile(values: Array, q: float) -> float:

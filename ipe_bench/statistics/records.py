@@ -1,8 +1,7 @@
 """Every statistic, each in one record: what it is called and means, over which trials, how it is computed and shown.
 
 `summary.csv`, the appendix of the report, tables and the terminal are read from these lists: who adds a record adds it
-everywhere, and plugins add theirs by `add_statistics`. How trials are read and how numbers are set in type is left
-to others.
+everywhere, and plugins add theirs by `add_statistics`. Formulas longer than a line are in `formulas`.
 """
 
 from __future__ import annotations
@@ -12,17 +11,16 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 import numpy as np
-from scipy.special import betaincinv, chdtri, gammaincinv
 
 from ipe_bench.basics.errors import UserError, place_of
 from ipe_bench.basics.linalg import Array
-from ipe_bench.statistics.calibration import overall_p, overall_words, shared_level
-from ipe_bench.statistics.consistency import clopper_pearson, mean_limits, verdict
-from ipe_bench.statistics.histories import CLOSE, FixedPointBound, fixed_point_bound, observed_constant, orders_of
-from ipe_bench.statistics.intervals import HEAVY, LARGEST_SAMPLE, RESAMPLES, quantile, rms_interval
-from ipe_bench.statistics.sample import AMBIGUOUS, FIT, NIS, NORMAL_95, QUANTILES, Sample
-from ipe_bench.statistics.sequences import FIRST, share_sequence
-from ipe_bench.trials.thresholds import EXPECTED, FEW, FIT_LEVEL, GATE, SAME_ROOT
+from ipe_bench.statistics import formulas as f
+from ipe_bench.statistics.calibration import overall_p
+from ipe_bench.statistics.consistency import clopper_pearson, verdict
+from ipe_bench.statistics.histories import CLOSE, orders_of
+from ipe_bench.statistics.intervals import FIRST, HEAVY, LARGEST_SAMPLE, RESAMPLES, quantile, share_sequence
+from ipe_bench.statistics.sample import NIS, Sample
+from ipe_bench.trials.thresholds import EXPECTED, FEW, GATE, SAME_ROOT
 
 Kind = Literal["count", "share", "number", "physical", "seconds", "probability", "word"]
 """How a value is written; `report.words` knows each."""
@@ -40,7 +38,8 @@ Where = Literal[
 ]
 """A table; its columns are in the order of the records. The overview and the terminal's table show those of plugins
 behind their own."""
-Limits = tuple[Any, Any]
+Given = Literal["", "solved", "common"]
+Limits = f.Limits
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class Statistic:
     each: Callable[[Sample], Array] | None = None
     limits: Callable[[Sample], Limits] | None = None
     each_limits: Callable[[Sample], Limits] | None = None
-    given: Literal["", "solved", "common"] = ""
+    given: Given = ""
     """The trials that it is conditional on: their number is the column `count`."""
     kind: Kind = "number"
     where: tuple[Where, ...] = ()
@@ -88,16 +87,12 @@ class Statistic:
 
     def columns_of(self, sample: Sample) -> dict[str, list[Any]]:
         """Its columns, a value for each parameter and one for all together."""
-        values = [_row_values(self.overall, self.each, sample)]
+        values = [_column(sample.n, self.overall(sample), None if self.each is None else self.each(sample))]
         if self.limits is not None:
             ends = self.limits(sample)
             each = (None, None) if self.each_limits is None else self.each_limits(sample)
             values += [_column(sample.n, end, own) for end, own in zip(ends, each, strict=True)]
         return dict(zip(self.columns, values, strict=True))
-
-
-def _row_values(overall: Callable[[Sample], Any], each: Callable[[Sample], Array] | None, sample: Sample) -> list[Any]:
-    return _column(sample.n, overall(sample), None if each is None else each(sample))
 
 
 def _column(n: int, overall: Any, each: Array | None) -> list[Any]:
@@ -114,360 +109,33 @@ def rows_of(statistics: Sequence[Statistic], sample: Sample) -> list[dict[str, A
     return [{name: values[i] for name, values in columns.items()} for i in range(sample.n + 1)]
 
 
-# How they are computed -----------------------------------------------------------------------------------------------
+def _in_both(values: Callable[[Sample], Array]) -> tuple[Callable[[Sample], float], Callable[[Sample], Array]]:
+    """Values (n,) as a root mean square over parameters of the value over the linear bound, and in their own units."""
+    return f.over_linear_bound(values), f.in_units(values)
 
 
-def _share(mask: Array) -> float:
-    return float(mask.mean())
-
-
-def _success_limits(s: Sample) -> Limits:
-    return clopper_pearson(int(s.scalars["success"].sum()), len(s))
-
-
-def _success_sequence(s: Sample) -> Limits:
-    return share_sequence(int(s.scalars["success"].sum()), len(s))
-
-
-def _rmse_sequence(s: Sample) -> Limits:
-    low, high = s.rmse_sequence
-    return float(low[s.n]), float(high[s.n])
-
-
-def _rmse_sequence_each(s: Sample) -> Limits:
-    low, high = s.rmse_sequence
-    return low[: s.n] * s.sizes, high[: s.n] * s.sizes
-
-
-def _misfit(s: Sample) -> float:
-    # Residuals that are not finite do not fit.
-    known = FIT in s.scalars and np.isfinite(s.scalars[FIT]).any()
-    return _share(~(s.scalars[FIT] >= FIT_LEVEL)) if known else np.nan
-
-
-def _looked(s: Sample) -> Array:
-    """Whether the estimator has looked for several minima (trials,)."""
-    return np.isfinite(s.scalars[AMBIGUOUS]) if AMBIGUOUS in s.scalars else np.zeros(len(s), dtype=bool)
-
-
-def _ambiguous(s: Sample) -> float:
-    return _share(s.scalars[AMBIGUOUS][looked] > 0) if (looked := _looked(s)).any() else np.nan
-
-
-def _failures_flagged(s: Sample) -> float:
-    failed = ~s.scalars["success"]
-    return _share(s.scalars[AMBIGUOUS][failed] > 0) if _looked(s).any() and failed.any() else np.nan
-
-
-def _bias(s: Sample) -> Array:
-    return s.sums.bias
-
-
-def _std(s: Sample) -> Array:
-    return s.sums.std
-
-
-def _rmse_common(s: Sample) -> Array:
-    return s.sums.rmse_common
-
-
-def _crlb(s: Sample) -> Array:
-    return s.sums.crlb
-
-
-def _bayes(s: Sample) -> Array:
-    return s.sums.bayes
-
-
-def _van_trees(s: Sample) -> Array:
-    return s.sums.van_trees
-
-
-def _van_trees_ends(s: Sample) -> tuple[Array, Array]:
-    """Where the bound (n,) lies for truths without end, by the scatter of the information among those it is from."""
-    bound, error = s.sums.van_trees, s.sums.van_trees_error
-    return np.maximum(bound - NORMAL_95 * error, 0.0), bound + NORMAL_95 * error
-
-
-def _median_known(s: Sample, name: str) -> float:
-    values = s.truth[name]
-    return quantile(values[np.isfinite(values)], 0.5)
-
-
-def _van_trees_limits(s: Sample) -> Limits:
-    low, high = _van_trees_ends(s)
-    return _rms(low / s.linear_bound), _rms(high / s.linear_bound)
-
-
-def _van_trees_limits_each(s: Sample) -> Limits:
-    low, high = _van_trees_ends(s)
-    return low * s.sizes, high * s.sizes
-
-
-def _applying_bound(s: Sample) -> Array:
-    return s.sums.bayes if s.bound_kind == "bayes" else s.sums.crlb
-
-
-def _reported(s: Sample) -> Array:
-    return s.sums.reported
-
-
-def _eq_14(s: Sample) -> Array:
-    """Eq. (14): eq. (5) plus the mean square of H+ dN, which at a root of eq. (11) is the error less H+ v."""
-    if s.group.footer.get("equation") != "frozen":
-        return np.full(s.n, np.nan)
-    return np.sqrt(s.linear_bound**2 + s.sums.compensation)
-
-
-def _rms(values: Array) -> float:
-    size = np.abs(values).max(initial=0.0)
-    # Squares of such numbers are none any more.
-    size = size if 1e150 < size < np.inf else 1.0
-    return float(size * np.sqrt(np.mean((values / size) ** 2)))
-
-
-def _predicted(s: Sample) -> tuple[Array, Array]:
-    """Bias (n,) and root mean square error (n,) that theory expects of least squares; NaN of other estimators.
-
-    Where readings come from another model, from each trial's pseudo-true parameters and the scatter about them; where
-    they do not, from the Cramér-Rao bound and Box's bias.
-    """
-    if s.group.footer.get("equation") != "least_squares":
-        return np.full(s.n, np.nan), np.full(s.n, np.nan)
-    if s.group.footer["identity"]["scenario"].get("truth") is not None:
-        return s.sums.predicted[0], np.sqrt(s.sums.predicted[1])
-    bias, square = s.sums.box
-    return bias, np.sqrt(s.sums.crlb_square + np.where(np.isnan(square), 0.0, square))
-
-
-def _predicted_bias(s: Sample) -> Array:
-    return _predicted(s)[0]
-
-
-def _predicted_rmse(s: Sample) -> Array:
-    return _predicted(s)[1]
-
-
-def _over_linear_bound(values: Callable[[Sample], Array]) -> Callable[[Sample], float]:
-    """The root mean square over parameters of values (n,) over the linear bound."""
-    return lambda s: _rms(values(s) / s.linear_bound)
-
-
-def _in_units(values: Callable[[Sample], Array]) -> Callable[[Sample], Array]:
-    return lambda s: values(s) * s.sizes
-
-
-def _ratio(a: Any, b: Any) -> Array:
-    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
-    with np.errstate(all="ignore"):
-        return np.where(b > 0, a / b, np.nan)
-
-
-def _rmse(s: Sample) -> Array:
-    return s.rmse
-
-
-def _rmse_limits(s: Sample) -> Limits:
-    low, high = s.rmse_limits
-    return float(low[s.n]), float(high[s.n])
-
-
-def _rmse_limits_each(s: Sample) -> Limits:
-    low, high = s.rmse_limits
-    return low[: s.n] * s.sizes, high[: s.n] * s.sizes
-
-
-def _efficiency(s: Sample) -> float:
-    bound, rmse = _over_linear_bound(_applying_bound)(s), _over_linear_bound(_rmse)(s)
-    return float(_ratio(bound, rmse))
-
-
-def _efficiency_limits(s: Sample) -> Limits:
-    bound, (low, high) = _over_linear_bound(_applying_bound)(s), _rmse_limits(s)
-    return float(_ratio(bound, high)), float(_ratio(bound, low))
-
-
-def _efficiency_limits_each(s: Sample) -> Limits:
-    bound, (low, high) = _applying_bound(s) * s.sizes, _rmse_limits_each(s)
-    return _ratio(bound, high), _ratio(bound, low)
-
-
-def _rmse_all(s: Sample) -> Array:
-    return s.sums.rmse_all
-
-
-def _bound_all(s: Sample) -> Array:
-    return s.sums.bayes_all if s.bound_kind == "bayes" else s.sums.crlb_all
-
-
-def _efficiency_each(s: Sample) -> Array:
-    return _ratio(_applying_bound(s) * s.sizes, s.rmse * s.sizes)
-
-
-def _error_quantile(q: float) -> tuple[Callable[[Sample], float], Callable[[Sample], Array]]:
-    def overall(s: Sample) -> float:
-        return quantile(s.sums.together, q)
-
-    def each(s: Sample) -> Array:
-        return s.error_quantiles[QUANTILES.index(q)] * s.sizes
-
-    return overall, each
-
-
-def _nees(s: Sample) -> float:
-    known = s.reports_covariance and s.solved.any()
-    return float(np.mean(s.scalars["nees"][s.solved]) / s.n) if known else np.nan
-
-
-def _nees_each(s: Sample) -> Array:
-    if not (s.reports_covariance and s.solved.any()):
-        return np.full(s.n, np.nan)
-    return s.sums.nees
-
-
-def _nees_limits(s: Sample) -> Limits:
-    return mean_limits(s.n, int(s.solved.sum())) if s.reports_covariance else (np.nan, np.nan)
-
-
-def _nees_limits_each(s: Sample) -> Limits:
-    low, high = mean_limits(1, int(s.solved.sum())) if s.reports_covariance else (np.nan, np.nan)
-    return np.full(s.n, low), np.full(s.n, high)
-
-
-def _coverage(s: Sample) -> float:
-    return _share(s.scalars["nees"] <= 2 * gammaincinv(s.n / 2, 0.95)) if s.reports_covariance else np.nan
-
-
-def _coverage_each(s: Sample) -> Array:
-    if not s.reports_covariance:
-        return np.full(s.n, np.nan)
-    return s.sums.covered
-
-
-def _claims(s: Sample) -> int:
-    return int((s.converged & ~np.isnan(s.scalars["nees"])).sum())
-
-
-def _calibration_p_each(s: Sample) -> Array:
-    return np.array([part.p for part in s.calibrations[:-1]] or [np.nan] * s.n)
-
-
-def _excursion(s: Sample) -> float:
-    return s.calibrations[-1].excursion if s.calibrations else np.nan
-
-
-def _excursion_each(s: Sample) -> Array:
-    return np.array([part.excursion for part in s.calibrations[:-1]] or [np.nan] * s.n)
-
-
-def _calibration(s: Sample) -> str:
-    return overall_words(s.calibrations, [str(p["name"]) for p in s.parameters])
-
-
-def _calibration_each(s: Sample) -> Array:
-    level = shared_level(s.calibrations)
-    return np.array([part.words(level) for part in s.calibrations[:-1]] or ["-"] * s.n, dtype=object)
-
-
-def _over_bound(s: Sample) -> Array:
-    """Mahalanobis errors (trials,) over √n: about 1 where the estimate is efficient."""
-    return s.distance / np.sqrt(s.n)
-
-
-def _capped(s: Sample) -> Array:
-    return np.minimum(_over_bound(s), CAP)
-
-
-def _efficiency_capped(s: Sample) -> float:
-    return float(_ratio(1.0, _rms(_capped(s))))
-
-
-def _efficiency_capped_limits(s: Sample) -> Limits:
-    low, high = rms_interval(_capped(s)[:, None] ** 2, np.ones(len(s), dtype=bool))
-    return float(_ratio(1.0, high[0])), float(_ratio(1.0, low[0]))
-
-
-def _nees_median(s: Sample) -> float:
-    return quantile(s.scalars["nees"], 0.5) / (2 * gammaincinv(s.n / 2, 0.5)) if s.reports_covariance else np.nan
-
-
-def _nees_median_limits(s: Sample) -> Limits:
-    """The median of N independent values lies at a beta-distributed probability of their law."""
-    if not s.reports_covariance:
-        return np.nan, np.nan
-    middle = (len(s) + 1) / 2
-    low, high = 2 * gammaincinv(s.n / 2, betaincinv(middle, middle, np.array([0.025, 0.975])))
-    return tuple(np.array([low, high]) / (2 * gammaincinv(s.n / 2, 0.5)))
-
-
-def _failed(s: Sample, *, known: bool) -> float:
-    """Share that fails, by whether the estimator itself gives notice of it."""
-    noticed = ~s.converged
-    if FIT in s.scalars and np.isfinite(s.scalars[FIT]).any():
-        noticed = noticed | ~(s.scalars[FIT] >= FIT_LEVEL)
-    if AMBIGUOUS in s.scalars:
-        noticed = noticed | (s.scalars[AMBIGUOUS] > 0)
-    return _share(~s.scalars["success"] & (noticed == known))
-
-
-def _false_root_distance(s: Sample) -> float:
-    wrong = s.converged & ~s.solved
-    known = "root_distance" in s.scalars and wrong.any()
-    return quantile(s.scalars["root_distance"][wrong], 0.5) if known else np.nan
-
-
-def capped_error(s: Sample, among: Array | None = None) -> float:
-    """Mean Mahalanobis error of the trials that all have (and of `among` alone), each at most the gate's radius."""
-    used = s.present if among is None else s.present & among
-    return float(np.minimum(s.distance[used], gate_radius(s.n)).mean()) if used.any() else np.nan
-
-
-def gate_radius(n: int) -> float:
-    """The Mahalanobis distance at which success ends."""
-    return float(np.sqrt(chdtri(n, GATE)))
-
-
-def _is(s: Sample, method: str) -> bool:
-    """Whether the estimator iterates by that method on the frozen equation; told by its description alone."""
-    target = str((s.group.footer["identity"]["estimator"] or {}).get("_target_", ""))
-    return s.group.footer.get("equation") == "frozen" and target.rpartition(".")[2] == method
-
-
-def _fixed_point_bounds(s: Sample) -> list[FixedPointBound]:
-    """Eq. (18) for each stored history of fixed-point iteration whose K at the truth is below 1."""
-    if not _is(s, "FixedPoint"):
-        return []
-    return [fixed_point_bound(h.iterates, K) for h in s.histories if (K := h.truth["contraction_K"]) < 1]
-
-
-def _constants(s: Sample) -> Array:
-    """(histories, 2): the least M of eq. (23) that explains each stored history of Newton's method, and M at the truth;
-    without those that are over too soon to tell."""
-    if not _is(s, "Newton"):
-        return np.empty((0, 2))
-    pairs = [(observed_constant(h.iterates), h.truth["curvature_M"]) for h in s.histories]
-    return np.array([pair for pair in pairs if np.isfinite(pair).all()]).reshape(-1, 2)
-
-
-def _mean_nis(s: Sample) -> float:
-    values = s.scalars[NIS]
-    return float(np.mean(values[np.isfinite(values)])) if np.isfinite(values).any() else np.nan
-
-
-CAP = 5.0
-"""What a trial's error over the bound counts as at most in `efficiency_capped`: an efficient estimate lies beyond it
-in fewer than one trial in a million."""
-_MEDIAN, _Q95 = _error_quantile(0.5), _error_quantile(0.95)
+_MEDIAN, _Q95 = f.error_quantile(0.5), f.error_quantile(0.95)
 
 STATISTICS: tuple[Statistic, ...] = (
     Statistic("trials", "trials", "all trials", "Their number.", len, kind="count", where=("all_trials",)),
+    Statistic(
+        "no_readings",
+        "no readings",
+        "further trials",
+        "Number whose true parameters the model gives no finite readings at: there is nothing to estimate from, so they"
+        " count neither for nor against an estimator, here or in any other column.",
+        lambda s: len(s.unread),
+        kind="count",
+        where=("overview", "terminal", "all_trials"),
+        rare=True,
+    ),
     Statistic(
         "converged",
         "converged",
         "all trials",
         "Share in which the estimating equation holds within the tolerance. The other endings are named with their"
         " messages.",
-        lambda s: _share(s.converged),
+        lambda s: f.share(s.converged),
         kind="share",
         where=("all_trials",),
     ),
@@ -478,7 +146,7 @@ STATISTICS: tuple[Statistic, ...] = (
         f"Share that converged to the root, within {SAME_ROOT:g} standard deviations, that the same estimating equation"
         " reaches when it is started at the truth. Filters and the linear LSE solve no equation: for them it means that"
         " they finished.",
-        lambda s: _share(s.solved),
+        lambda s: f.share(s.solved),
         kind="share",
         where=("solved_trials",),
     ),
@@ -490,7 +158,7 @@ STATISTICS: tuple[Statistic, ...] = (
         f" {GATE:g} of efficient estimates lie in (chi-square quantile); the Bayesian bound's for estimators that use a"
         " prior. Interval: Clopper and Pearson, Biometrika 26, 1934.",
         lambda s: int(s.scalars["success"].sum()) / len(s),
-        limits=_success_limits,
+        limits=lambda s: clopper_pearson(int(s.scalars["success"].sum()), len(s)),
         kind="share",
     ),
     Statistic(
@@ -501,7 +169,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " one for runs with `precision` (beta-binomial confidence sequence: Robbins, Ann. Math. Statist. 41, 1970;"
         " Howard et al., Ann. Statist. 49, 2021).",
         lambda s: int(s.scalars["success"].sum()) / len(s),
-        limits=_success_sequence,
+        limits=lambda s: share_sequence(int(s.scalars["success"].sum()), len(s)),
         kind="share",
     ),
     Statistic(
@@ -510,7 +178,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "all trials",
         "Share without success of which the estimator itself gives notice: it did not converge, its residuals fail the"
         " test of fit, or several minima fit.",
-        lambda s: _failed(s, known=True),
+        lambda s: f.failed(s, known=True),
         kind="share",
         where=("all_trials",),
     ),
@@ -519,7 +187,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "failed silently",
         "all trials",
         "Share without success that converged to residuals that fit: wrong answers that look right.",
-        lambda s: _failed(s, known=False),
+        lambda s: f.failed(s, known=False),
         kind="share",
         where=("all_trials",),
     ),
@@ -529,23 +197,24 @@ STATISTICS: tuple[Statistic, ...] = (
         "all trials",
         "Median of the error over the bound, sqrt(e' J' R⁻¹ J e / n) at the truth: about 1 where an estimate attains"
         " the Cramér-Rao bound, which is that of estimators with a prior too. What is not finite counts as infinite.",
-        lambda s: quantile(_over_bound(s), 0.5),
+        lambda s: quantile(f.over_bound(s), 0.5),
     ),
     Statistic(
         "error_q95",
         "95 % error",
         "all trials",
         "95 % quantile of the same.",
-        lambda s: quantile(_over_bound(s), 0.95),
+        lambda s: quantile(f.over_bound(s), 0.95),
     ),
     Statistic(
         "efficiency_capped",
         "efficiency",
         "all trials",
-        f"One over the root mean square of the same, each trial counting at most {CAP:g}, so that no single trial"
-        f" decides; {1 / CAP:g} where all count that. Interval: as that of rmse.",
-        _efficiency_capped,
-        limits=_efficiency_capped_limits,
+        f"One over the root mean square of the same, each trial counting at most {f.CAP:g}, so that no single trial"
+        f" decides; {1 / f.CAP:g} where all count that. Interval: as that of rmse, so none where a few trials carry the"
+        " sum.",
+        f.efficiency_capped,
+        limits=f.efficiency_capped_limits,
         where=("all_trials",),
         limits_titles={"all_trials": "95 % of efficiency"},
     ),
@@ -556,8 +225,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "Median of e' P⁻¹ e with the covariance P that the estimator reports, over the median of chi-square with n"
         " degrees: 1 where the covariance is right. What is not finite counts as infinite. Limits: where the median of"
         " as many trials lies in 95 % of cases if it is right.",
-        _nees_median,
-        limits=_nees_median_limits,
+        f.nees_median,
+        limits=f.nees_median_limits,
         where=("calibration",),
         limits_titles={"calibration": "NEES limits"},
     ),
@@ -592,7 +261,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "false root",
         "all trials",
         "Share that converged and is not solved: another root of the same equation.",
-        lambda s: _share(s.converged & ~s.solved),
+        lambda s: f.share(s.converged & ~s.solved),
         kind="share",
         where=("solved_trials", "covariances"),
     ),
@@ -602,7 +271,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "converged trials that are not solved",
         "Median distance from the right root, in standard deviations of the Cramér-Rao bound, of the parameter that is"
         " farthest off.",
-        _false_root_distance,
+        f.false_root_distance,
         where=("covariances",),
     ),
     Statistic(
@@ -610,8 +279,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "bias",
         "solved trials",
         "Mean error.",
-        _over_linear_bound(_bias),
-        _in_units(_bias),
+        *_in_both(f.bias),
         given="solved",
         kind="physical",
         where=("parameters", "theory"),
@@ -621,8 +289,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "std",
         "solved trials",
         "Standard deviation of the error (n - 1).",
-        _over_linear_bound(_std),
-        _in_units(_std),
+        *_in_both(f.std),
         given="solved",
         kind="physical",
         where=("parameters",),
@@ -636,10 +303,9 @@ STATISTICS: tuple[Statistic, ...] = (
         f" estimator; above {LARGEST_SAMPLE} trials, groups of consecutive trials are resampled. None for fewer than"
         f" {FEW} trials, and none where a few trials carry the sum of squares: where its effective number of trials is"
         f" less than that of normal errors in all but {100 * HEAVY:g} % of cases.",
-        _over_linear_bound(_rmse),
-        _in_units(_rmse),
-        limits=_rmse_limits,
-        each_limits=_rmse_limits_each,
+        *_in_both(f.rmse),
+        limits=f.overall_ends(f.rmse_ends),
+        each_limits=f.each_ends(f.rmse_ends),
         given="solved",
         kind="physical",
         where=("parameters", "covariances", "theory"),
@@ -652,10 +318,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "The same root mean square error, with an asymptotic interval of 95 % that stays valid however often one looks"
         f" and whenever one stops (Waudby-Smith et al., Ann. Statist. 52, 2024); none for fewer than {FIRST} trials,"
         " nor where a few trials carry the sum of squares.",
-        _over_linear_bound(_rmse),
-        _in_units(_rmse),
-        limits=_rmse_sequence,
-        each_limits=_rmse_sequence_each,
+        *_in_both(f.rmse),
+        limits=f.overall_ends(f.rmse_ends_anytime),
+        each_limits=f.each_ends(f.rmse_ends_anytime),
         given="solved",
         kind="physical",
     ),
@@ -666,8 +331,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "How many equal ones would share the sum of squared errors as evenly as the trials do, (Σ e²)² / Σ e⁴ (Kish,"
         " Survey Sampling, 1965): a third of the trials for normal errors of one parameter, one where a single trial"
         " carries all.",
-        lambda s: float(s.sums.squares.effective[s.n]),
-        lambda s: s.sums.squares.effective[: s.n],
+        lambda s: float(f.squares(s).effective[s.n]),
+        lambda s: f.squares(s).effective[: s.n],
         given="solved",
         where=("parameters",),
     ),
@@ -676,8 +341,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "rmse, common",
         "trials that every estimator of the scenario solved",
         "Root mean square error.",
-        _over_linear_bound(_rmse_common),
-        _in_units(_rmse_common),
+        *_in_both(f.rmse_common),
         given="common",
         where=("solved_trials",),
     ),
@@ -696,8 +360,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "CRLB",
         "solved trials",
         "Cramér-Rao bound (J' R⁻¹ J)⁻¹ at the truth: root mean square of its standard deviation.",
-        _over_linear_bound(_crlb),
-        _in_units(_crlb),
+        *_in_both(f.crlb),
         given="solved",
         kind="physical",
         where=("parameters", "covariances", "theory"),
@@ -708,8 +371,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "solved trials",
         "(J' R⁻¹ J + P₀⁻¹)⁻¹ at the truth, which estimators that use a prior are compared with: root mean square of its"
         " standard deviation. It is a local bound, for each truth its own, and not Van Trees's.",
-        _over_linear_bound(_bayes),
-        _in_units(_bayes),
+        *_in_both(f.bayes),
         given="solved",
         kind="physical",
         where=("parameters",),
@@ -721,10 +383,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "(E[J' R⁻¹ J] + P₀⁻¹)⁻¹, which no estimator can beat on average over the prior, biased or not (Van Trees,"
         " Detection, Estimation, and Modulation Theory I, 1968, sec. 2.4): standard deviation. The mean E is over"
         f" {EXPECTED} truths of each seed; its interval, 95 %, is that of this mean.",
-        _over_linear_bound(_van_trees),
-        _in_units(_van_trees),
-        limits=_van_trees_limits,
-        each_limits=_van_trees_limits_each,
+        *_in_both(f.van_trees),
+        limits=f.van_trees_limits,
+        each_limits=f.van_trees_limits_each,
         kind="physical",
         where=("parameters",),
     ),
@@ -735,8 +396,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "Mean error that theory expects of least squares: under a wrong model, the distance to the parameters that come"
         " closest to the error-free readings (Vuong, Caltech working paper 652, 1986); under the right one, the bias of"
         " second order (Box, J. R. Stat. Soc. B 33, 1971).",
-        _over_linear_bound(_predicted_bias),
-        _in_units(_predicted_bias),
+        *_in_both(f.predicted_bias),
         given="solved",
         kind="physical",
         where=("theory",),
@@ -749,8 +409,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " that distance and the asymptotic covariance A⁻¹ B A⁻¹ of least squares about it (Vuong, 1986; Richmond and"
         " Horowitz, IEEE Trans. Signal Processing 63, 2015), which is no bound: others may err less; under the right"
         " one, of the Cramér-Rao bound and the bias of second order.",
-        _over_linear_bound(_predicted_rmse),
-        _in_units(_predicted_rmse),
+        *_in_both(f.predicted_rmse),
         given="solved",
         kind="physical",
         where=("theory",),
@@ -761,7 +420,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "the first trials",
         "Median relative curvature of the surface of readings at the truth, within the 95 % region of the bound (Bates"
         " and Watts, J. R. Stat. Soc. B 42, 1980): linear theory holds well below 0.3.",
-        lambda s: _median_known(s, "curvature_intrinsic"),
+        lambda s: f.median_of_truth(s, "curvature_intrinsic"),
         where=("theory",),
     ),
     Statistic(
@@ -769,7 +428,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "parameter curvature",
         "the first trials",
         "The same of the parameters' lines on that surface: how uneven they are.",
-        lambda s: _median_known(s, "curvature_parameter"),
+        lambda s: f.median_of_truth(s, "curvature_parameter"),
         where=("theory",),
     ),
     Statistic(
@@ -778,8 +437,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "solved trials",
         "Root mean square of the standard deviation that the estimator itself reports: eq. (5) for the linear LSE, the"
         " sandwich (H⁺J)⁻¹ H⁺RH⁺' (H⁺J)⁻ᵀ at the estimate for the frozen root.",
-        _over_linear_bound(_reported),
-        _in_units(_reported),
+        *_in_both(f.reported),
         given="solved",
         kind="physical",
         where=("covariances",),
@@ -791,8 +449,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "Standard deviation by eq. (14), eq. (5) with the compensation error N(x) - N(x̂) of a root of eq. (11) added"
         " as if it were independent of the noise. It is not: x̂ is made from the noise, and the cross terms that"
         " eq. (14) leaves out are of the same order. The sandwich has them, to first order.",
-        _over_linear_bound(_eq_14),
-        _in_units(_eq_14),
+        *_in_both(f.eq_14),
         given="solved",
         kind="physical",
         where=("covariances",),
@@ -802,8 +459,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "rmse / bound",
         "solved trials",
         "Root mean square error over the linear bound.",
-        _over_linear_bound(_rmse),
-        lambda s: _ratio(s.rmse * s.sizes, s.linear_bound * s.sizes),
+        f.over_linear_bound(f.rmse),
+        lambda s: f.ratio(f.rmse(s) * s.sizes, s.linear_bound * s.sizes),
         given="solved",
         where=("parameters",),
     ),
@@ -813,10 +470,10 @@ STATISTICS: tuple[Statistic, ...] = (
         "solved trials",
         "Bound over rmse, as standard deviations: 1 for an efficient estimator. The bound is the one at the truth,"
         " Cramér and Rao's or, for estimators that use a prior, the Bayesian one. Interval: from that of rmse.",
-        _efficiency,
-        _efficiency_each,
-        limits=_efficiency_limits,
-        each_limits=_efficiency_limits_each,
+        f.efficiency,
+        f.efficiency_each,
+        limits=f.efficiency_limits,
+        each_limits=f.efficiency_limits_each,
         given="solved",
         where=("solved_trials", "parameters"),
         titles={"solved_trials": "efficiency"},
@@ -827,8 +484,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "rmse, all",
         "all trials",
         "Root mean square error, whatever became of the trial; infinite where one has no finite estimate.",
-        _over_linear_bound(_rmse_all),
-        _in_units(_rmse_all),
+        *_in_both(f.rmse_all),
         kind="physical",
         where=("all_trials", "parameters"),
         titles={"all_trials": "rmse / linear bound"},
@@ -839,8 +495,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "all trials",
         "The same bound over the root mean square error of all trials: it lets nobody off a trial, so it compares"
         " estimators that solve an equation with those that do not.",
-        lambda s: float(_ratio(_over_linear_bound(_bound_all)(s), _over_linear_bound(_rmse_all)(s))),
-        lambda s: _ratio(_bound_all(s), _rmse_all(s)),
+        lambda s: float(f.ratio(f.over_linear_bound(f.bound_all)(s), f.over_linear_bound(f.rmse_all)(s))),
+        lambda s: f.ratio(f.bound_all(s), f.rmse_all(s)),
         where=("all_trials", "parameters"),
         titles={"all_trials": "efficiency, uncapped"},
     ),
@@ -871,10 +527,10 @@ STATISTICS: tuple[Statistic, ...] = (
         " squared error over reported variance. Limits: 95 % chi-square, which honest errors keep within if they are"
         " normal (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, sec."
         " 5.4).",
-        _nees,
-        _nees_each,
-        limits=_nees_limits,
-        each_limits=_nees_limits_each,
+        f.nees,
+        f.nees_each,
+        limits=f.nees_limits,
+        each_limits=f.nees_limits_each,
         given="solved",
         where=("solved_trials", "parameters"),
         titles={"parameters": "NEES", "solved_trials": "NEES / n"},
@@ -886,15 +542,15 @@ STATISTICS: tuple[Statistic, ...] = (
         "all trials",
         "Share whose truth lies inside the estimator's own 95 % ellipsoid; per parameter, interval. What is not finite"
         " counts as not covered.",
-        _coverage,
-        _coverage_each,
+        f.coverage,
+        f.coverage_each,
         kind="share",
         where=("calibration", "parameters"),
     ),
     Statistic(
         "verdict",
         "verdict",
-        "converged trials with a reported covariance",
+        "converged trials with a reported covariance: a trial that the estimator itself gives up on claims nothing",
         "Whether the reported covariance is honest. Diverged but confident: surely more than 1 % of the trials lie"
         f" where it says that a share of {GATE:g} should, and the mean NEES is surely above n; optimistic, pessimistic:"
         " the mean NEES lies surely (95 %, for errors of any law) above or below n; undecided: a few trials carry that"
@@ -908,7 +564,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "claims",
         "all trials",
         "Number that converged and report a covariance: what calibration is over.",
-        _claims,
+        f.claims,
         kind="count",
         where=("calibration",),
     ),
@@ -921,7 +577,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " one leaves anywhere with a stated probability (Säilynoja, Bürkner and Vehtari, Stat. Comput. 32, 2022), and"
         " the smaller p is doubled. Of all, the smallest p of the n parameters and of NEES times n + 1 (Bonferroni).",
         lambda s: overall_p(s.calibrations),
-        _calibration_p_each,
+        f.calibration_p_each,
         kind="probability",
         where=("calibration",),
     ),
@@ -930,8 +586,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "excursion",
         "the same trials",
         "The largest difference between these distribution functions and the uniform one; of all, that of NEES.",
-        _excursion,
-        _excursion_each,
+        f.excursion,
+        f.excursion_each,
         where=("calibration",),
     ),
     Statistic(
@@ -942,8 +598,8 @@ STATISTICS: tuple[Statistic, ...] = (
         " together: shifted is the median of error over reported deviation (estimate less truth); deviations too small"
         " or too large, the median of its size over that of an honest one; far outside, the share beyond the quantile"
         f" that {GATE:g} should lie beyond, after that factor.",
-        _calibration,
-        _calibration_each,
+        f.calibration,
+        f.calibration_each,
         kind="word",
         where=("calibration", "parameters"),
     ),
@@ -955,7 +611,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " if model and noise were right. Its law is chi-square with m - n degrees for least squares and normal noise."
         " For other noise it is simulated; for other estimators it is scaled to the effective degrees of what they"
         " leave, m less the trace of their influence. It needs no truth, so it is known for real readings too.",
-        _misfit,
+        f.misfit,
         kind="share",
         where=("all_trials",),
     ),
@@ -964,7 +620,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "ambiguous",
         "the trials in which the estimator has looked for it",
         "Share in which several distinct minima fit the readings, so that no residual can tell which is the truth.",
-        _ambiguous,
+        f.ambiguous,
         kind="share",
         where=("all_trials",),
         rare=True,
@@ -974,7 +630,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "failures flagged",
         "trials without success of estimators that look for several minima",
         "Share that is flagged as ambiguous.",
-        _failures_flagged,
+        f.failures_flagged,
         kind="share",
         where=("all_trials",),
         rare=True,
@@ -1023,7 +679,7 @@ SCORES: tuple[Statistic, ...] = (
         "Mean Mahalanobis error sqrt(e' J' R⁻¹ J e), the error in standard deviations of the Cramér-Rao bound, about √n"
         " when efficient; each trial's counts at most the radius of the gate of success, so that failing badly is"
         " failing once.",
-        capped_error,
+        f.capped_error,
         where=("all_trials",),
     ),
     Statistic("cost_median", "cost", "all trials", "Median cost of a trial.", lambda s: quantile(s.cost, 0.5)),
@@ -1058,7 +714,7 @@ SCORES: tuple[Statistic, ...] = (
         "K below 1",
         "converged trials of fixed-point iteration with a stored history",
         "Number of those in which the K of eq. (15) at the truth is below 1, so that eq. (18) says something.",
-        lambda s: len(_fixed_point_bounds(s)),
+        lambda s: len(f.fixed_point_bounds(s)),
         kind="count",
         where=("iterations",),
     ),
@@ -1069,7 +725,7 @@ SCORES: tuple[Statistic, ...] = (
         "Share in which no iterate is farther from the limit than K^k / (1 - K) times the first step, eq. (18) with the"
         " k that the print lost (Burden and Faires, Numerical Analysis, have it). K is that at the truth: the theorem"
         " wants the largest on the way, so this is an observation and no proof.",
-        lambda s: _share(np.array([b.holds for b in bounds])) if (bounds := _fixed_point_bounds(s)) else np.nan,
+        lambda s: f.share(np.array([b.holds for b in bounds])) if (bounds := f.fixed_point_bounds(s)) else np.nan,
         kind="share",
         where=("iterations",),
     ),
@@ -1078,7 +734,7 @@ SCORES: tuple[Statistic, ...] = (
         "error / bound of eq. (18)",
         "those trials in which K is below 1",
         "Median of the largest distance of an iterate after the first from the limit, over its bound.",
-        lambda s: quantile(np.array([b.ratio for b in _fixed_point_bounds(s)]), 0.5),
+        lambda s: quantile(np.array([b.ratio for b in f.fixed_point_bounds(s)]), 0.5),
         where=("iterations",),
     ),
     Statistic(
@@ -1087,7 +743,7 @@ SCORES: tuple[Statistic, ...] = (
         "converged trials of Newton's method with a stored history",
         "Median of the least M with which eq. (23), |x_(k+1) - root| <= n² M / 2 |x_k - root|², explains the history;"
         " the last iterate stands for the root.",
-        lambda s: quantile(_constants(s)[:, 0], 0.5),
+        lambda s: quantile(f.constants(s)[:, 0], 0.5),
         where=("iterations",),
     ),
     Statistic(
@@ -1096,7 +752,7 @@ SCORES: tuple[Statistic, ...] = (
         "the same trials",
         "Median of the largest |∂²g_i / ∂x_j ∂x_k| of Newton's g at the truth, by central differences. The theorem"
         " wants the largest over a neighbourhood.",
-        lambda s: quantile(_constants(s)[:, 1], 0.5),
+        lambda s: quantile(f.constants(s)[:, 1], 0.5),
         where=("iterations",),
     ),
     Statistic(
@@ -1104,7 +760,7 @@ SCORES: tuple[Statistic, ...] = (
         "eq. (23) holds",
         "the same trials",
         "Share in which the least M that explains the history is at most M at the truth.",
-        lambda s: _share(constants[:, 0] <= constants[:, 1]) if len(constants := _constants(s)) else np.nan,
+        lambda s: f.share(constants[:, 0] <= constants[:, 1]) if len(constants := f.constants(s)) else np.nan,
         kind="share",
         where=("iterations",),
     ),
@@ -1113,7 +769,7 @@ SCORES: tuple[Statistic, ...] = (
         "NIS",
         "all trials of filters",
         "Mean normalised innovation squared over the number of readings: like NEES, but it needs no truth.",
-        lambda s: _mean_nis(s) if NIS in s.scalars else np.nan,
+        f.mean_nis,
     ),
 )
 """Further columns of `Analysis.scores`."""
@@ -1156,12 +812,10 @@ def fault_of(record: Any) -> str:
             return f"{column!r} is not a name for a column; use letters, digits and underscores"
         if column in taken:
             return f"there is a column {column} already; choose another name"
-    if record.kind not in get_args(Kind):
-        return f"kind={record.kind}: choose from {', '.join(get_args(Kind))}"
-    if wrong := [where for where in record.where if where not in get_args(Where)]:
-        return f"where={wrong[0]}: choose from {', '.join(get_args(Where))}"
-    if record.given not in ("", "solved", "common"):
-        return f"given={record.given}: choose solved, common or nothing"
+    chosen = [("kind", record.kind, Kind), *(("where", where, Where) for where in record.where)]
+    for name, value, choices in [*chosen, ("given", record.given, Given)]:
+        if value not in get_args(choices):
+            return f"{name}={value}: choose from {', '.join(get_args(choices))}"
     return ""
 
 
@@ -1185,14 +839,14 @@ def summary_columns_of(sample: Sample) -> list[dict[str, Any]]:
 
 
 def columns_of_added(record: Statistic, sample: Sample) -> dict[str, list[Any]]:
-    """The columns of a record of somebody else, computed where it can change nothing.
+    """The columns of a record that a plugin adds.
 
     Raises:
         UserError: it raises, or gives something else than a value per parameter and one over all.
     """
     try:
         with np.errstate(all="ignore"):
-            columns = record.columns_of(sample.protected())
+            columns = record.columns_of(sample)
     except Exception as error:
         raise UserError(place_of(error)) from error
     for name, values in columns.items():

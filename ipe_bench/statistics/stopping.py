@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.results import Results
@@ -18,13 +19,78 @@ from ipe_bench.runs.run import MOST_TRIALS, compute, new_name, result_keys, vali
 from ipe_bench.runs.schedule import BLOCK_SIZE, Watcher
 from ipe_bench.runs.store import ResultKey, describe_names
 from ipe_bench.statistics.collect import collect
+from ipe_bench.statistics.formulas import rmse_ends_anytime
+from ipe_bench.statistics.intervals import share_sequence
 from ipe_bench.statistics.records import SCORES, rows_of, summary_columns_of
-from ipe_bench.statistics.sample import Sample, Shared
-from ipe_bench.statistics.sequences import Precision, Reach, next_trials
+from ipe_bench.statistics.sample import Sample, samples
 from ipe_bench.trials.scenario import Scenario
 
 NARROW = "every interval is narrow enough"
 """Why a scenario stops that has come to the precision that was asked for."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Precision:
+    """How near to what is found the truth has to be, at whatever number of trials one looks; None where that is free.
+
+    `success` is a difference of shares, of every estimator; `rmse` a ratio less 1, of the root mean square over
+    parameters of error over bound, of the trials that an estimator solved.
+    """
+
+    success: float | None = None
+    rmse: float | None = None
+
+    @classmethod
+    def of(cls, given: float | Mapping[str, float]) -> Precision:
+        """From a number, which is that of success, or from numbers by name.
+
+        Raises:
+            UserError: it is neither.
+        """
+        known = tuple(f.name for f in dataclasses.fields(cls))
+        named = {str(k): v for k, v in given.items()} if isinstance(given, Mapping) else {"success": given}
+        for name, value in named.items():
+            if name not in known:
+                raise UserError(f"precision.{name}: {unknown(name, known, 'statistic')}")
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1:
+                key = f"precision.{name}" if isinstance(given, Mapping) else "precision"
+                raise UserError(f"{key}={value}: give a number between 0 and 1, such as 0.01")
+        if not named:
+            raise UserError("precision={}: give a number between 0 and 1, such as 0.01")
+        return cls(**named)
+
+    def reached(self, sample: Sample) -> list[Reach]:
+        """How near each statistic that is asked for has come."""
+        found, label = [], sample.group.estimator
+        if self.success is not None:
+            low, high = share_sequence(int(sample.scalars["success"].sum()), len(sample))
+            share = float(sample.scalars["success"].mean())
+            found.append(Reach(label, "success", max(high - share, share - low), self.success))
+        if self.rmse is not None:
+            low, high = (float(end[sample.n]) for end in rmse_ends_anytime(sample))
+            half = float(np.sqrt(high / low)) - 1 if low > 0 else np.inf
+            found.append(Reach(label, "rmse", half if np.isfinite(half) else np.inf, self.rmse))
+        return found
+
+
+@dataclasses.dataclass(frozen=True)
+class Reach:
+    """How near one statistic of an estimator has come to its true value."""
+
+    estimator: str
+    statistic: str
+    width: float
+    wanted: float
+
+    @property
+    def ratio(self) -> float:
+        """Above 1 where it is not near enough yet."""
+        return self.width / self.wanted
+
+    def __str__(self) -> str:
+        if math.isfinite(self.width):
+            return f"{self.estimator}: {self.statistic} ± {100 * self.width:.2g} %"
+        return f"{self.estimator}: {self.statistic} ± anything, since a few trials carry it or there are too few"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,15 +153,14 @@ def compute_until(
             if i in stops:
                 continue
             failed = compute([scenario], estimators, at[i], output, record_as=names[i], **options)
-            reached = _reached(scenario, estimators, Path(output), wanted)
+            reached = [r for s in _stored(scenario, estimators, output) for r in wanted.reached(s)]
             widest = max(reached, key=lambda r: r.ratio, default=None)
             late = time_limit is not None and time.monotonic() - began >= time_limit
-            reason = _reason_to_stop(bool(failed) or widest is None, widest, at[i] >= budget, late)
-            if reason:
+            reason = _reason_to_stop(bool(failed), widest, at[i] >= budget, late)
+            if reason or widest is None:
                 failures += failed
                 stops[i] = Stop(scenario, at[i], reason, str(widest or ""))
             else:
-                assert widest is not None
                 at[i] = next_trials(at[i], widest.ratio, block_size, budget)
     return tuple(failures), tuple(stops[i] for i in range(len(scenarios)))
 
@@ -104,11 +169,20 @@ def _reason_to_stop(failed: bool, widest: Reach | None, spent: bool, late: bool)
     """Empty where there is none."""
     if failed:
         return "some blocks failed"
-    if widest is not None and widest.ratio <= 1:
+    if widest is None:
+        return "no trial has readings"
+    if widest.ratio <= 1:
         return NARROW
     if spent:
         return "there are as many trials as there may be"
     return "the time is over" if late else ""
+
+
+def next_trials(trials: int, ratio: float, block: int, most: int) -> int:
+    """How many trials to have before looking again: what the widths ask for, at most twice as many as now, in whole
+    blocks. Widths shrink with the root of the number."""
+    wanted = 2.0 * trials if not math.isfinite(ratio) else min(2.0 * trials, 1.02 * trials * ratio**2)
+    return min(most, max(trials // block + 1, math.ceil(wanted / block)) * block)
 
 
 def _first_trials(
@@ -122,12 +196,10 @@ def _first_trials(
     return min(most, max(stored, block_size))
 
 
-def _reached(scenario: Scenario, estimators: Mapping[str, Estimator], output: Path, wanted: Precision) -> list[Reach]:
-    """How near every statistic of every estimator has come."""
+def _stored(scenario: Scenario, estimators: Mapping[str, Estimator], output: Path | str) -> Iterator[Sample]:
+    """The stored trials of every estimator that has some."""
     collection = collect([output], {cell.key for cell in result_keys(scenario, estimators)})
-    shared = Shared.among(collection, collection.groups)
-    samples = [Sample.load(collection, group, shared) for group in collection.groups]
-    return [reach for sample in samples if len(sample) for reach in wanted.reached(sample)]
+    return samples(collection, collection.groups)
 
 
 def check_time_limit(time_limit: float | None, precision: Precision | None = None) -> None:
@@ -148,15 +220,12 @@ def objective(
     Raises:
         UserError: nothing is stored, or the number is not known.
     """
-    collection = collect([output], {cell.key for cell in result_keys(scenario, estimators)})
-    shared = Shared.among(collection, collection.groups)
-    for group in collection.groups:
-        sample = Sample.load(collection, group, shared) if group.label == label else ()
-        if isinstance(sample, Sample) and len(sample):
+    for sample in _stored(scenario, estimators, output):
+        if sample.group.label == label:
             value = float((summary_columns_of(sample)[-1] | rows_of(SCORES, sample)[-1])[column])
             if np.isnan(value):
                 raise UserError(
-                    f"objective={label}.{column}: is not known of {describe_names(group.cells[0][0].names)}"
+                    f"objective={label}.{column}: is not known of {describe_names(sample.group.cells[0][0].names)}"
                 )
             return value
     raise UserError(f"objective={label}.{column}: no trials of {label} are stored")

@@ -3,16 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ipe_bench.statistics.collect import ALWAYS_COLUMNS, Collection, collect
+from ipe_bench.statistics.collect import ALWAYS_COLUMNS, Collection, Group, collect
 from ipe_bench.statistics.comparisons import Outcomes, common, may_be_best
-from ipe_bench.statistics.records import STATISTICS, all_statistics, frame_columns, gate_radius, summary_columns_of
-from ipe_bench.statistics.sample import Sample, Shared
+from ipe_bench.statistics.formulas import gate_radius
+from ipe_bench.statistics.records import STATISTICS, all_statistics, frame_columns, summary_columns_of
+from ipe_bench.statistics.sample import Sample, samples
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,61 +32,45 @@ def columns() -> tuple[str, ...]:
 
 
 def summarize(directories: Sequence[Path | str]) -> pd.DataFrame:
-    """The tidy summary of everything stored under the directories; empty where there is nothing."""
-    return summary_of(collect(directories))
-
-
-def summary_of(collection: Collection) -> pd.DataFrame:
-    """The tidy summary of a collection; empty where it is."""
-    return to_frame(rows_of_all(collection))
+    """The summary of everything stored under the directories; empty if there is nothing."""
+    return to_frame(rows_of_all(collect(directories)))
 
 
 def rows_of_all(collection: Collection) -> list[dict[str, Any]]:
     """The rows of the summary of a collection."""
+    scenarios = collection.scenarios.values()
+    return [row for groups in scenarios for row in scenario_rows(collection, groups, lambda *_: None)[0]]
+
+
+def scenario_rows(
+    collection: Collection, groups: Sequence[Group], also: Callable[[Sample, Outcomes], None]
+) -> tuple[list[dict[str, Any]], dict[str, Outcomes]]:
+    """The rows of one scenario, and what is compared of its estimators; `also` is called with each of their samples,
+    which is not kept."""
     rows: list[dict[str, Any]] = []
-    for groups in collection.scenarios.values():
-        shared = Shared.among(collection, groups)
-        own: list[dict[str, Any]] = []
-        outcomes: dict[str, Outcomes] = {}
-        for group in groups:
-            sample = Sample.load(collection, group, shared)
-            own += summary_rows(sample)
-            outcomes[group.estimator] = outcomes_of(sample)
-        mark_best(own, outcomes)
-        rows += own
-    return rows
+    outcomes: dict[str, Outcomes] = {}
+    for sample in samples(collection, groups):
+        group = sample.group
+        head = dict(group.columns) | {"estimator": group.estimator} | dict(group.options)
+        labels = [{"parameter": p["name"], "unit": p["unit"]} for p in sample.parameters]
+        labels.append({"parameter": ALL, "unit": "linear bound"})
+        rows += [head | label | row for label, row in zip(labels, summary_columns_of(sample), strict=True)]
+        outcomes[group.estimator] = outcomes_of(sample)
+        also(sample, outcomes[group.estimator])
+    if outcomes:
+        paired = common(outcomes)
+        best = may_be_best(np.column_stack([outcome.success for outcome in paired.values()]))
+        marks = dict(zip(paired, best.tolist(), strict=True))
+        for row in rows:
+            row[BEST] = marks[row["estimator"]]
+    return rows, outcomes
 
 
 def outcomes_of(sample: Sample) -> Outcomes:
     """What comparisons and profiles need of a sample, by ascending seed and trial."""
-    success = sample.distance <= gate_radius(sample.n)
-    values = (sample.number, sample.distance, success, sample.cost)
-    if np.all(sample.number[1:] > sample.number[:-1]):
-        return Outcomes(*values)
     order = np.argsort(sample.number, kind="stable")
-    return Outcomes(*(v[order] for v in values))
-
-
-def mark_best(rows: Sequence[dict[str, Any]], outcomes: Mapping[str, Outcomes]) -> None:
-    """Adds the column `BEST` to the rows of one scenario, over the trials that all its estimators have."""
-    paired = common({label: outcome for label, outcome in outcomes.items() if len(outcome.ids)})
-    if not paired:
-        return
-    best = may_be_best(np.column_stack([outcome.success for outcome in paired.values()]))
-    marks = dict(zip(paired, best.tolist(), strict=True))
-    for row in rows:
-        row[BEST] = marks[row["estimator"]]
-
-
-def summary_rows(sample: Sample) -> list[dict[str, Any]]:
-    """The rows of one scenario under one estimator; none where it has no trials."""
-    if len(sample) == 0:
-        return []
-    group = sample.group
-    head = dict(group.columns) | {"estimator": group.estimator} | dict(group.options)
-    labels = [{"parameter": p["name"], "unit": p["unit"]} for p in sample.parameters]
-    labels.append({"parameter": ALL, "unit": "linear bound"})
-    return [head | label | row for label, row in zip(labels, summary_columns_of(sample), strict=True)]
+    success = sample.distance <= gate_radius(sample.n)
+    return Outcomes(*(values[order] for values in (sample.number, sample.distance, success, sample.cost)))
 
 
 def to_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:

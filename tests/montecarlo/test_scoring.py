@@ -19,6 +19,7 @@ from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.measurements import Bock
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
+from ipe_bench.statistics import analyse
 from ipe_bench.trials.scoring import Block
 from ipe_bench.trials.thresholds import EXPECTED
 
@@ -181,6 +182,15 @@ def test_trials_whose_truth_has_no_readings_are_told_apart_from_failures_of_esti
     block = Block.draw(Scenario(Gap(), Gaussian(0.1)), 0, 20)
     _, columns = block.estimate(LinearLSE())
     assert ((columns["status"] == "no_readings") == (block.trials.x[:, 0] <= 0.0)).all()
-    table = run(Scenario(Gap(), Gaussian(0.1)), {"lse": LinearLSE()}, trials=20, output=tmp_path)
-    assert "no_readings" in set(ib.load(tmp_path)["status"])
-    assert len(table)
+    table = run(Scenario(Gap(), Gaussian(0.1)), {"lse": LinearLSE(), "map": MapLM()}, trials=20, output=tmp_path)
+    lost = int((columns["status"] == "no_readings").sum())
+    assert 0 < lost < 20
+    assert (ib.load(tmp_path)["status"] == "no_readings").sum() == 2 * lost
+    overall = table[table["parameter"] == "all"]
+    assert overall["trials"].tolist() == [20 - lost] * 2
+    assert overall["no_readings"].tolist() == [lost] * 2
+    assert overall["success"].iloc[0] == columns["success"][columns["status"] != "no_readings"].mean()
+    endings = analyse([tmp_path]).endings
+    endings = endings[endings["status"] == "no_readings"]
+    assert endings["trials"].tolist() == [lost] * 2
+    assert endings["share"].tolist() == [lost / 20] * 2

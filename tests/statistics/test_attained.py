@@ -15,7 +15,7 @@ from ipe_bench.report.certified_tables import certified_tables
 from ipe_bench.report.terminal import render
 from ipe_bench.runs.run import compute, validate
 from ipe_bench.solvers import Auto, Progressive
-from ipe_bench.statistics.attained import attained_table, attained_totals, data_profile
+from ipe_bench.statistics.certified import attained_table, attained_totals, data_profile
 from ipe_bench.statistics.collect import collect
 from ipe_bench.trials.scenario import Scenario
 

@@ -11,8 +11,8 @@ from ipe_bench.priors import GaussianPrior
 from ipe_bench.report import write_report
 from ipe_bench.runs.run import compute, validate
 from ipe_bench.solvers import FixedPoint
+from ipe_bench.statistics.certified import certified_averages, certified_table
 from ipe_bench.statistics.collect import collect
-from ipe_bench.statistics.digits import certified_averages, certified_table
 from ipe_bench.trials.scenario import Scenario
 
 ESTIMATORS = {"linear_lse": LinearLSE(), "fixed_point": FixedPoint(), "multiscale_lm": MultiscaleLM()}

@@ -3,14 +3,17 @@
 import itertools
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 from synthetic_store import Pretender
 
 from ipe_bench.report.tables import all_tables
 from ipe_bench.statistics import analyse
-from ipe_bench.statistics.analysis import _ranking
+from ipe_bench.statistics.analysis import ranking
 from ipe_bench.statistics.comparisons import (
+    BUDGETS,
+    RATIOS,
     REPLICATES,
     TIE,
     Outcomes,
@@ -20,11 +23,11 @@ from ipe_bench.statistics.comparisons import (
     holm,
     may_be_best,
     mcnemar,
+    profiles,
     rank_over_replicates,
     tied_ranks,
 )
 from ipe_bench.statistics.histories import distances_to_limit, iterations_to_limit
-from ipe_bench.statistics.profiles import BUDGETS, RATIOS, Profiles
 
 
 def outcomes(distance, success=None, cost=None, ids=None):
@@ -189,12 +192,12 @@ def test_critical_difference_is_demsars():
     # Demsar 2006, sec. 3.2.2: four classifiers, 14 data sets, q = 2.569, CD = 1.25.
     rng = np.random.default_rng(3)
     scores = [dict(zip("abcd", rng.normal([0, 100, 200, 300], 100), strict=True)) for _ in range(14)]
-    ranking = rank_over_replicates(scores)
-    assert ranking is not None
-    assert ranking.critical_difference == pytest.approx(1.25, abs=0.005)
+    found = rank_over_replicates(scores)
+    assert found is not None
+    assert found.critical_difference == pytest.approx(1.25, abs=0.005)
     table = np.array([[s[k] for k in "abcd"] for s in scores])
-    assert ranking.friedman == pytest.approx(stats.friedmanchisquare(*table.T).pvalue)
-    assert sum(ranking.mean_ranks.values()) == pytest.approx(10)
+    assert found.friedman == pytest.approx(stats.friedmanchisquare(*table.T).pvalue)
+    assert sum(found.mean_ranks.values()) == pytest.approx(10)
 
 
 def test_ranking_needs_replicates_and_two_estimators():
@@ -207,38 +210,31 @@ def test_ranking_needs_replicates_and_two_estimators():
 
 def test_friedmans_test_of_two_is_the_sign_test():
     scores = [{"a": 1.0, "b": 2.0}] * 9 + [{"a": 2.0, "b": 1.0}] + [{"a": 1.0, "b": 1.0}] * 2
-    ranking = rank_over_replicates(scores)
-    assert ranking is not None
-    assert ranking.friedman == pytest.approx(stats.binomtest(9, 10).pvalue)
-    assert ranking.mean_ranks["a"] == pytest.approx((9 * 1 + 2 + 2 * 1.5) / 12)
+    found = rank_over_replicates(scores)
+    assert found is not None
+    assert found.friedman == pytest.approx(stats.binomtest(9, 10).pvalue)
+    assert found.mean_ranks["a"] == pytest.approx((9 * 1 + 2 + 2 * 1.5) / 12)
 
 
 def test_profiles_of_two_estimators_by_hand():
     # Costs: a 1, 4, fails, fails; b 2, 2, 8, fails.
     a = outcomes(np.ones(4), [1, 1, 0, 0], [1, 4, 1, 1])
     b = outcomes(np.ones(4), [1, 1, 1, 0], [2, 2, 8, 1])
-    profiles = Profiles()
-    profiles.add({"a": a, "b": b})
+    tables = profiles([{"a": a, "b": b}]).set_index(["profile", "estimator"])["share"]
 
-    def performance(label, ratio):
-        return profiles.performance(label)[np.searchsorted(RATIOS, ratio, side="right") - 1]
+    def share(profile, label, at):
+        grid = {"performance": RATIOS, "data": BUDGETS}[profile]
+        return tables.loc[profile, label].to_numpy()[np.searchsorted(grid, at, side="right") - 1]
 
-    def data(label, budget):
-        return profiles.data(label)[np.searchsorted(BUDGETS, budget, side="right") - 1]
-
-    assert [performance("a", r) for r in (1, 2.5)] == [0.25, 0.5]
-    assert [performance("b", r) for r in (1, 2.5)] == [0.5, 0.75]
-    assert [data("a", c) for c in (1, 3, 4, 100)] == [0.25, 0.25, 0.5, 0.5]
-    assert [data("b", c) for c in (1, 2, 8, 100)] == [0, 0.5, 0.75, 0.75]
+    assert [share("performance", "a", r) for r in (1, 2.5)] == [0.25, 0.5]
+    assert [share("performance", "b", r) for r in (1, 2.5)] == [0.5, 0.75]
+    assert [share("data", "a", c) for c in (1, 3, 4, 100)] == [0.25, 0.25, 0.5, 0.5]
+    assert [share("data", "b", c) for c in (1, 2, 8, 100)] == [0, 0.5, 0.75, 0.75]
 
 
-def test_profiles_accumulate_over_scenarios():
-    one = outcomes(np.ones(10), cost=np.full(10, 3.0))
-    profiles = Profiles()
-    profiles.add({"a": one})
-    profiles.add({"a": outcomes(np.ones(10), np.zeros(10))})
-    assert profiles.trials == {"a": 20}
-    assert profiles.performance("a")[-1] == 0.5
+def test_profiles_are_over_all_scenarios():
+    found = profiles([{"a": outcomes(np.ones(10), cost=np.full(10, 3.0))}, {"a": outcomes(np.ones(10), np.zeros(10))}])
+    assert found.groupby("profile")["share"].last().to_dict() == {"data": 0.5, "performance": 0.5}
 
 
 def test_iterations_to_the_limit_of_a_halving_sequence():
@@ -339,14 +335,14 @@ def test_seeds_that_tell_equal_estimators_apart_are_one_in_twenty():
     for _ in range(400):
         scores = rng.normal(size=(12, 3))
         replicates = [
-            (scale, seed, label, float(scores[seed, i]) + 0.001 * scale)
+            {"scenario": scale, "seed": seed, "estimator": label, "error": float(scores[seed, i]) + 0.001 * scale}
             for scale in range(5)
             for seed in range(12)
             for i, label in enumerate("abc")
         ]
-        ranking = _ranking(replicates, {"a", "b", "c"})
-        assert ranking is not None
-        rejected += ranking.friedman < 0.05
+        found = ranking(pd.DataFrame(replicates), {"a", "b", "c"})
+        assert found is not None
+        rejected += found.friedman < 0.05
     assert rejected / 400 <= 0.05 + 4 * np.sqrt(0.05 * 0.95 / 400)
 
 

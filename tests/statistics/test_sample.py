@@ -13,7 +13,7 @@ from synthetic_store import Pretender, Seeker, Synthetic
 
 import ipe_bench as ib
 from ipe_bench.runs.store import ResultKey
-from ipe_bench.statistics import analyse, summarize
+from ipe_bench.statistics import analyse, formulas, summarize
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.collect import collect
 from ipe_bench.statistics.sample import Sample, Shared
@@ -129,12 +129,12 @@ def test_matrices_are_what_is_stored_and_cannot_be_changed(store):
     sample = Sample.load(collection, group, Shared.among(collection, collection.groups))
     rows = ib.load(store)
     rows = rows[rows["estimator"] == group.estimator]
-    for kind in ("error", "deviation", "crlb", "linear_error"):
-        expected = rows[[f"{kind}_{n}" for n in "abc"]].to_numpy()
-        np.testing.assert_array_equal(getattr(sample, kind), expected)
+    found = {"error": sample.error, "deviation": sample.deviation, "crlb": sample.crlb}
+    for kind, values in (found | {"linear_error": sample.of_truth("linear_error")}).items():
+        np.testing.assert_array_equal(values, rows[[f"{kind}_{n}" for n in "abc"]].to_numpy())
     np.testing.assert_array_equal(sample.ids, rows[["seed", "trial"]].to_numpy())
-    np.testing.assert_array_equal(sample.truth["curvature_intrinsic"], rows["curvature_intrinsic"].to_numpy())
-    assert np.isnan(sample.van_trees).all()
+    np.testing.assert_array_equal(sample.of_truth("curvature_intrinsic"), rows["curvature_intrinsic"].to_numpy())
+    assert np.isnan(sample.of_truth("van_trees")).all()
     for array in (sample.error, sample.scalars["nees"], sample.number):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0
@@ -154,7 +154,7 @@ def test_a_truth_that_is_missing_is_not_a_number_beside_its_estimates(synthetic)
         trial = sample.ids[:, 1]
         known = ~((trial >= 10) & (trial < 20) | (trial >= 40))
         np.testing.assert_array_equal(np.isfinite(sample.crlb), np.repeat(known[:, None], 3, axis=1))
-        assert np.isnan(sample.linear_error).all()
+        assert np.isnan(sample.of_truth("linear_error")).all()
 
 
 def test_bounds_of_several_seeds_are_pooled_as_squares(tmp_path):
@@ -187,7 +187,7 @@ def test_all_parameters_have_as_many_degrees_as_their_errors_are_apart(synthetic
     synthetic.add(synthetic.scenario(), "one", 0.1 * (shared * common + (1 - shared) * own))
     collection = collect([synthetic.directory])
     group = collection.groups[0]
-    found = Sample.load(collection, group, Shared.among(collection, [group])).sums.degrees
+    found = formulas.degrees(Sample.load(collection, group, Shared.among(collection, [group])))
     assert found[3] in degrees
     assert (np.delete(found, 3) == 1).all()
 

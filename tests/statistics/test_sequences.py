@@ -9,15 +9,8 @@ from scipy.stats import binom
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.statistics.consistency import clopper_pearson
-from ipe_bench.statistics.intervals import Squares
-from ipe_bench.statistics.sequences import (
-    Precision,
-    mean_sequence,
-    next_trials,
-    rms_sequence,
-    rms_sequence_of,
-    share_sequence,
-)
+from ipe_bench.statistics.intervals import Squares, mean_sequence, rms_sequence, share_sequence
+from ipe_bench.statistics.stopping import Precision, next_trials
 
 
 def ever_missed(p: float, step: int, looks: int) -> float:
@@ -81,14 +74,18 @@ def test_the_sequence_of_a_mean_is_as_narrow_as_a_mixture_can_be_at_a_thousand_t
 
 
 def test_a_root_mean_square_scales_with_its_errors_and_narrows_with_trials():
-    squares = np.random.default_rng(0).chisquare(11, (4000, 2)) / 11
-    low, high = rms_sequence(squares)
+    squares = np.random.default_rng(0).chisquare(11, (2, 4000)) / 11
+
+    def ends(squares):
+        return rms_sequence(Squares.of(squares), np.full(len(squares), 11))
+
+    low, high = ends(squares)
     assert np.all((low < 1) & (high > 1))
-    assert rms_sequence(squares * 1e12)[0] == pytest.approx(1e6 * low)
-    few = rms_sequence(squares[:250])
+    assert ends(squares * 1e12)[0] == pytest.approx(1e6 * low)
+    few = ends(squares[:, :250])
     assert np.all(high - low < few[1] - few[0])
-    assert np.isnan(rms_sequence(squares[:99])[0]).all()
-    assert rms_sequence(np.zeros((100, 1)))[1] == 0
+    assert np.isnan(ends(squares[:, :99])[0]).all()
+    assert ends(np.zeros((1, 100)))[1] == 0
 
 
 def test_the_next_number_of_trials():
@@ -178,7 +175,7 @@ def ever_missing(law: str, studies: int) -> tuple[float, float]:
     for k in range(0, studies, 50):
         squares = np.mean(draw(rng, (4000, 50, n)) ** 2, axis=2)
         for look in looks.tolist():
-            low, high = rms_sequence_of(Squares.of(squares[:look].T), np.full(50, n))
+            low, high = rms_sequence(Squares.of(squares[:look].T), np.full(50, n))
             miss[k : k + 50] |= (low > np.sqrt(mean_square)) | (high < np.sqrt(mean_square))
         none += int(np.isnan(low).sum())
     return float(miss.mean()), none / studies

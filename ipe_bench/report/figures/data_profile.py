@@ -11,7 +11,7 @@ from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.profiles import steps
 from ipe_bench.report.figures.views import View
 from ipe_bench.report.style import looks
-from ipe_bench.statistics.attained import data_profile
+from ipe_bench.statistics.certified import data_profile
 
 
 def draw(view: View) -> Iterator[Drawing]:

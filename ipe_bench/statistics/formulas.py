@@ -1,0 +1,510 @@
+"""The formulas of the statistics: each takes a sample, and gives a number or one for each parameter (n,).
+
+Values per parameter are in multiples of the parameters' sizes. A mean over no trials is NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, TypeVar
+
+import numpy as np
+from scipy.special import betaincinv, chdtri, gammaincinv, ndtri
+
+from ipe_bench.basics.linalg import Array
+from ipe_bench.statistics.calibration import overall_words, shared_level
+from ipe_bench.statistics.consistency import mean_limits
+from ipe_bench.statistics.histories import FixedPointBound, fixed_point_bound, observed_constant
+from ipe_bench.statistics.intervals import (
+    Squares,
+    few_carry,
+    grouped,
+    quantile,
+    rms_interval,
+    rms_interval_of,
+    rms_sequence,
+)
+from ipe_bench.statistics.sample import AMBIGUOUS, FIT, NIS, Sample
+from ipe_bench.trials.thresholds import FIT_LEVEL, GATE
+
+T = TypeVar("T")
+Limits = tuple[Any, Any]
+CAP = 5.0
+"""What a trial's error over the bound counts as at most in `efficiency_capped`: an efficient estimate lies beyond it in
+fewer than one trial in a million."""
+NORMAL_95 = float(-ndtri(0.025))
+"""What 95 % of the values of the normal law do not exceed in size."""
+
+
+def once(formula: Callable[[Sample], T]) -> Callable[[Sample], T]:
+    """The same formula, computed once for each sample."""
+
+    @wraps(formula)
+    def kept(s: Sample) -> T:
+        if formula not in s.kept:
+            with np.errstate(all="ignore"):
+                s.kept[formula] = formula(s)
+        return s.kept[formula]
+
+    return kept
+
+
+def mean(values: Array, used: Array | None = None) -> Array:
+    """The mean (k,) of columns (trials, k) over the trials used; NaN where there is none."""
+    chosen = _chosen(values.T, used)
+    return chosen.sum(axis=1) / chosen.shape[1] if chosen.shape[1] else np.full(len(chosen), np.nan)
+
+
+def _chosen(rows: Array, used: Array | None) -> Array:
+    """Rows (k, trials) of the trials used."""
+    return rows if used is None or used.all() else rows[:, used]
+
+
+def share(mask: Array) -> float:
+    return float(mask.mean())
+
+
+def ratio(a: Any, b: Any) -> Array:
+    """a / b; NaN where b is not above 0."""
+    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    with np.errstate(all="ignore"):
+        return np.where(b > 0, a / b, np.nan)
+
+
+def rms(values: Array) -> float:
+    size = np.abs(values).max(initial=0.0)
+    # The squares of larger numbers are infinite.
+    size = size if 1e150 < size < np.inf else 1.0
+    return float(size * np.sqrt(np.mean((values / size) ** 2)))
+
+
+def over_linear_bound(values: Callable[[Sample], Array]) -> Callable[[Sample], float]:
+    """The root mean square over parameters of values (n,) over the linear bound."""
+    return lambda s: rms(values(s) / s.linear_bound)
+
+
+def in_units(values: Callable[[Sample], Array]) -> Callable[[Sample], Array]:
+    """Values (n,) in the parameters' own units."""
+    return lambda s: values(s) * s.sizes
+
+
+# Errors --------------------------------------------------------------------------------------------------------------
+
+
+@once
+def bias(s: Sample) -> Array:
+    return mean(s.error, s.solved)
+
+
+@once
+def rmse(s: Sample) -> Array:
+    return np.sqrt(mean(s.error**2, s.solved))
+
+
+@once
+def rmse_common(s: Sample) -> Array:
+    return np.sqrt(mean(s.error**2, s.solved & s.solved_by_all))
+
+
+@once
+def rmse_all(s: Sample) -> Array:
+    return np.sqrt(mean(np.where(np.isfinite(s.error), s.error**2, np.inf)))
+
+
+@once
+def products(s: Sample) -> Array:
+    """Sums (n, n) over solved trials of products of the deviations of errors from their mean, in multiples of the
+    linear bound: parameters may differ by many orders of magnitude."""
+    chosen = _chosen((s.error / _unit(s)).T, s.solved)
+    centred = chosen - mean(chosen.T)[:, None]
+    return centred @ centred.T
+
+
+def _unit(s: Sample) -> Array:
+    return np.where(s.linear_bound > 0, s.linear_bound, 1.0)
+
+
+@once
+def std(s: Sample) -> Array:
+    """Standard deviation (n - 1)."""
+    count = int(s.solved.sum())
+    return _unit(s) * np.sqrt(np.diag(products(s)) / (count - 1)) if count > 1 else np.full(s.n, np.nan)
+
+
+@once
+def correlation(s: Sample) -> Array:
+    """(n, n), NaN where an error does not vary or there are too few trials."""
+    scale = np.sqrt(np.diag(products(s)))
+    return products(s) / np.outer(scale, scale) if s.solved.sum() > 2 else np.full((s.n, s.n), np.nan)
+
+
+@once
+def together(s: Sample) -> Array:
+    """Root mean square over parameters of error over linear bound (trials,)."""
+    return np.sqrt((s.normalised**2).T.mean(axis=0))
+
+
+def _all_squares(s: Sample) -> Array:
+    """Squared errors (k, trials) of each parameter; then over the linear bound, of all together and of each group."""
+    normalised = (s.normalised**2).T
+    groups = [normalised[members].mean(axis=0) for members in s.members.values()]
+    return np.vstack([(s.error**2).T, normalised.mean(axis=0), *groups])
+
+
+@once
+def squares(s: Sample) -> Squares:
+    """Of the errors of solved trials; then of all parameters together, and of each group, over the linear bound."""
+    return Squares.of(_chosen(_all_squares(s), s.solved))
+
+
+@once
+def degrees(s: Sample) -> Array:
+    """Degrees of freedom of these squares if errors are normal: 1 of each parameter and group, the least there can be;
+    of all parameters what matches the variance (Satterthwaite, Biometrics 2, 1946)."""
+    factors = _unit(s) / s.linear_bound
+    scaled = products(s) * np.outer(factors, factors)
+    matching = np.trace(scaled) ** 2 / np.sum(scaled**2)
+    whole = np.floor(matching + 1e-9) if 1 <= matching <= s.n + 1e-6 else 1.0
+    return np.array([*np.ones(s.n), whole, *np.ones(len(s.members))])
+
+
+@once
+def rmse_ends(s: Sample) -> tuple[Array, Array]:
+    """Ends of the intervals of rmse: per parameter (n), of all over the linear bound, and so of each group of
+    parameters; NaN where few trials carry it, see `intervals.few_carry`."""
+    sums = grouped(np.where(s.solved, _all_squares(s), 0.0))
+    low, high = rms_interval_of(sums, grouped(s.solved[None].astype(float)))
+    few = few_carry(squares(s), degrees(s))
+    return np.where(few, np.nan, low), np.where(few, np.nan, high)
+
+
+@once
+def rmse_ends_anytime(s: Sample) -> tuple[Array, Array]:
+    """Such ends that are valid at all numbers of trials."""
+    return rms_sequence(squares(s), degrees(s))
+
+
+def overall_ends(ends: Callable[[Sample], tuple[Array, Array]]) -> Callable[[Sample], Limits]:
+    def limits(s: Sample) -> Limits:
+        low, high = ends(s)
+        return float(low[s.n]), float(high[s.n])
+
+    return limits
+
+
+def each_ends(ends: Callable[[Sample], tuple[Array, Array]]) -> Callable[[Sample], Limits]:
+    def limits(s: Sample) -> Limits:
+        low, high = ends(s)
+        return low[: s.n] * s.sizes, high[: s.n] * s.sizes
+
+    return limits
+
+
+def error_quantile(q: float) -> tuple[Callable[[Sample], float], Callable[[Sample], Array]]:
+    def overall(s: Sample) -> float:
+        return quantile(together(s), q)
+
+    def each(s: Sample) -> Array:
+        return np.array([quantile(np.abs(e), q) for e in s.error.T]) * s.sizes
+
+    return overall, each
+
+
+def over_bound(s: Sample) -> Array:
+    """Mahalanobis errors (trials,) over √n: about 1 where the estimate is efficient."""
+    return s.distance / np.sqrt(s.n)
+
+
+def _capped(s: Sample) -> Array:
+    return np.minimum(over_bound(s), CAP)
+
+
+def efficiency_capped(s: Sample) -> float:
+    return float(ratio(1.0, rms(_capped(s))))
+
+
+def efficiency_capped_limits(s: Sample) -> Limits:
+    square = _capped(s) ** 2
+    if few_carry(Squares.of(square[None]), np.array([s.n]))[0]:
+        return np.nan, np.nan
+    low, high = rms_interval(square[:, None], np.ones(len(s), dtype=bool))
+    return float(ratio(1.0, high[0])), float(ratio(1.0, low[0]))
+
+
+def capped_error(s: Sample, among: Array | None = None) -> float:
+    """Mean Mahalanobis error of the trials that all have (and of `among` alone), each at most the gate's radius."""
+    used = s.present if among is None else s.present & among
+    return float(np.minimum(s.distance[used], gate_radius(s.n)).mean()) if used.any() else np.nan
+
+
+def gate_radius(n: int) -> float:
+    """The Mahalanobis distance at which success ends."""
+    return float(np.sqrt(chdtri(n, GATE)))
+
+
+def failed(s: Sample, *, known: bool) -> float:
+    """Share that fails, by whether the estimator itself gives notice of it."""
+    noticed = ~s.converged
+    if FIT in s.scalars and np.isfinite(s.scalars[FIT]).any():
+        noticed = noticed | ~(s.scalars[FIT] >= FIT_LEVEL)
+    if AMBIGUOUS in s.scalars:
+        noticed = noticed | (s.scalars[AMBIGUOUS] > 0)
+    return share(~s.scalars["success"] & (noticed == known))
+
+
+def misfit(s: Sample) -> float:
+    # Residuals that are not finite do not fit.
+    known = FIT in s.scalars and np.isfinite(s.scalars[FIT]).any()
+    return share(~(s.scalars[FIT] >= FIT_LEVEL)) if known else np.nan
+
+
+def _looked(s: Sample) -> Array:
+    """Whether the estimator has looked for several minima (trials,)."""
+    return np.isfinite(s.scalars[AMBIGUOUS]) if AMBIGUOUS in s.scalars else np.zeros(len(s), dtype=bool)
+
+
+def ambiguous(s: Sample) -> float:
+    return share(s.scalars[AMBIGUOUS][looked] > 0) if (looked := _looked(s)).any() else np.nan
+
+
+def failures_flagged(s: Sample) -> float:
+    wrong = ~s.scalars["success"]
+    return share(s.scalars[AMBIGUOUS][wrong] > 0) if _looked(s).any() and wrong.any() else np.nan
+
+
+def false_root_distance(s: Sample) -> float:
+    wrong = s.converged & ~s.solved
+    known = "root_distance" in s.scalars and wrong.any()
+    return quantile(s.scalars["root_distance"][wrong], 0.5) if known else np.nan
+
+
+# Bounds and theory ---------------------------------------------------------------------------------------------------
+
+
+@once
+def crlb(s: Sample) -> Array:
+    return np.sqrt(mean(s.crlb**2, s.solved))
+
+
+@once
+def bayes(s: Sample) -> Array:
+    return np.sqrt(mean(s.bayes**2, s.solved))
+
+
+def applying_bound(s: Sample) -> Array:
+    """The bound that the estimator is held against."""
+    return bayes(s) if s.bound_kind == "bayes" else crlb(s)
+
+
+@once
+def bound_all(s: Sample) -> Array:
+    """The same over all trials."""
+    return np.sqrt(mean(s.of_truth(s.bound_kind) ** 2))
+
+
+def efficiency(s: Sample) -> float:
+    return float(ratio(over_linear_bound(applying_bound)(s), over_linear_bound(rmse)(s)))
+
+
+def efficiency_each(s: Sample) -> Array:
+    return ratio(applying_bound(s) * s.sizes, rmse(s) * s.sizes)
+
+
+def efficiency_limits(s: Sample) -> Limits:
+    bound, (low, high) = over_linear_bound(applying_bound)(s), overall_ends(rmse_ends)(s)
+    return float(ratio(bound, high)), float(ratio(bound, low))
+
+
+def efficiency_limits_each(s: Sample) -> Limits:
+    bound, (low, high) = applying_bound(s) * s.sizes, each_ends(rmse_ends)(s)
+    return ratio(bound, high), ratio(bound, low)
+
+
+@once
+def _van_trees(s: Sample) -> tuple[Array, Array]:
+    """The bound (n,) over the first trials of the seeds, and its standard error: of the mean of squared bounds, whose
+    errors are twice the bound times its own."""
+    bound, error = s.of_truth("van_trees"), s.of_truth("van_trees_error")
+    drawn: Array = np.asarray(~np.isnan(bound[:, 0]))
+    middle = np.sqrt(mean(bound**2, drawn))
+    return middle, np.sqrt(mean((2 * bound * error) ** 2, drawn) / max(1, int(drawn.sum()))) / (2 * middle)
+
+
+def van_trees(s: Sample) -> Array:
+    return _van_trees(s)[0]
+
+
+def _van_trees_ends(s: Sample) -> tuple[Array, Array]:
+    """Where the bound (n,) lies for truths without end, by the scatter of the information among those it is from."""
+    bound, error = _van_trees(s)
+    return np.maximum(bound - NORMAL_95 * error, 0.0), bound + NORMAL_95 * error
+
+
+def van_trees_limits(s: Sample) -> Limits:
+    low, high = _van_trees_ends(s)
+    return rms(low / s.linear_bound), rms(high / s.linear_bound)
+
+
+def van_trees_limits_each(s: Sample) -> Limits:
+    low, high = _van_trees_ends(s)
+    return low * s.sizes, high * s.sizes
+
+
+def eq_14(s: Sample) -> Array:
+    """Eq. (14): eq. (5) plus the mean square of H+ dN, which at a root of eq. (11) is the error less H+ v."""
+    if s.group.footer.get("equation") != "frozen":
+        return np.full(s.n, np.nan)
+    return np.sqrt(s.linear_bound**2 + _compensation(s))
+
+
+@once
+def _compensation(s: Sample) -> Array:
+    return mean((s.error - s.of_truth("linear_error")) ** 2, s.solved)
+
+
+@once
+def _predicted(s: Sample) -> tuple[Array, Array]:
+    """Bias (n,) and root mean square error (n,) that theory expects of least squares; NaN of other estimators.
+
+    Where readings come from another model, from each trial's pseudo-true parameters and the scatter about them; where
+    they do not, from the Cramér-Rao bound and Box's bias.
+    """
+    if s.group.footer.get("equation") != "least_squares":
+        return np.full(s.n, np.nan), np.full(s.n, np.nan)
+    if s.group.footer["identity"]["scenario"].get("truth") is not None:
+        wrong, scatter = s.of_truth("pseudo_bias"), s.of_truth("misspecified")
+        used: Array = np.asarray(s.solved & np.isfinite(wrong).all(axis=1) & np.isfinite(scatter).all(axis=1))
+        return mean(wrong, used), np.sqrt(mean(wrong**2 + scatter**2, used))
+    box = s.of_truth("box_bias")
+    known: Array = np.asarray(np.isfinite(box).all(axis=1))
+    square = mean(box**2, known)
+    return mean(box, known), np.sqrt(mean(s.crlb**2, s.solved) + np.where(np.isnan(square), 0.0, square))
+
+
+def predicted_bias(s: Sample) -> Array:
+    return _predicted(s)[0]
+
+
+def predicted_rmse(s: Sample) -> Array:
+    return _predicted(s)[1]
+
+
+def median_of_truth(s: Sample, name: str) -> float:
+    values = s.of_truth(name)
+    return quantile(values[np.isfinite(values)], 0.5)
+
+
+# What estimators claim -----------------------------------------------------------------------------------------------
+
+
+@once
+def reports_covariance(s: Sample) -> bool:
+    return bool(np.isfinite(s.deviation).any())
+
+
+@once
+def reported(s: Sample) -> Array:
+    return np.sqrt(mean(s.deviation**2, s.solved & np.isfinite(s.deviation).all(axis=1)))
+
+
+def nees(s: Sample) -> float:
+    known = reports_covariance(s) and s.solved.any()
+    return float(np.mean(s.scalars["nees"][s.solved]) / s.n) if known else np.nan
+
+
+@once
+def nees_each(s: Sample) -> Array:
+    if not (reports_covariance(s) and s.solved.any()):
+        return np.full(s.n, np.nan)
+    return mean((np.abs(s.error) / s.deviation) ** 2, s.solved)
+
+
+def nees_limits(s: Sample) -> Limits:
+    return mean_limits(s.n, int(s.solved.sum())) if reports_covariance(s) else (np.nan, np.nan)
+
+
+def nees_limits_each(s: Sample) -> Limits:
+    low, high = mean_limits(1, int(s.solved.sum())) if reports_covariance(s) else (np.nan, np.nan)
+    return np.full(s.n, low), np.full(s.n, high)
+
+
+def nees_median(s: Sample) -> float:
+    return quantile(s.scalars["nees"], 0.5) / (2 * gammaincinv(s.n / 2, 0.5)) if reports_covariance(s) else np.nan
+
+
+def nees_median_limits(s: Sample) -> Limits:
+    """The median of N independent values lies at a beta-distributed probability of their law."""
+    if not reports_covariance(s):
+        return np.nan, np.nan
+    middle = (len(s) + 1) / 2
+    low, high = 2 * gammaincinv(s.n / 2, betaincinv(middle, middle, np.array([0.025, 0.975])))
+    return tuple(np.array([low, high]) / (2 * gammaincinv(s.n / 2, 0.5)))
+
+
+def coverage(s: Sample) -> float:
+    return share(s.scalars["nees"] <= 2 * gammaincinv(s.n / 2, 0.95)) if reports_covariance(s) else np.nan
+
+
+@once
+def coverage_each(s: Sample) -> Array:
+    if not reports_covariance(s):
+        return np.full(s.n, np.nan)
+    return mean(np.abs(s.error) / s.deviation <= NORMAL_95)
+
+
+def claims(s: Sample) -> int:
+    return int((s.converged & ~np.isnan(s.scalars["nees"])).sum())
+
+
+def calibration_p_each(s: Sample) -> Array:
+    return np.array([part.p for part in s.calibrations[:-1]] or [np.nan] * s.n)
+
+
+def excursion(s: Sample) -> float:
+    return s.calibrations[-1].excursion if s.calibrations else np.nan
+
+
+def excursion_each(s: Sample) -> Array:
+    return np.array([part.excursion for part in s.calibrations[:-1]] or [np.nan] * s.n)
+
+
+def calibration(s: Sample) -> str:
+    return overall_words(s.calibrations, s.names)
+
+
+def calibration_each(s: Sample) -> Array:
+    level = shared_level(s.calibrations)
+    return np.array([part.words(level) for part in s.calibrations[:-1]] or ["-"] * s.n, dtype=object)
+
+
+def mean_nis(s: Sample) -> float:
+    values = s.scalars[NIS] if NIS in s.scalars else np.empty(0)
+    return float(np.mean(values[np.isfinite(values)])) if np.isfinite(values).any() else np.nan
+
+
+# Iterations ----------------------------------------------------------------------------------------------------------
+
+
+def _uses(s: Sample, method: str) -> bool:
+    """Whether the estimator iterates by that method on the frozen equation; told by its description alone."""
+    target = str((s.group.footer["identity"]["estimator"] or {}).get("_target_", ""))
+    return s.group.footer.get("equation") == "frozen" and target.rpartition(".")[2] == method
+
+
+@once
+def fixed_point_bounds(s: Sample) -> list[FixedPointBound]:
+    """Eq. (18) for each stored history of fixed-point iteration whose K at the truth is below 1."""
+    if not _uses(s, "FixedPoint"):
+        return []
+    return [fixed_point_bound(h.iterates, K) for h in s.histories if (K := h.truth["contraction_K"]) < 1]
+
+
+@once
+def constants(s: Sample) -> Array:
+    """(histories, 2): the least M of eq. (23) that explains each stored history of Newton's method, and M at the truth;
+    without those that are over too soon to tell."""
+    if not _uses(s, "Newton"):
+        return np.empty((0, 2))
+    pairs = [(observed_constant(h.iterates), h.truth["curvature_M"]) for h in s.histories]
+    return np.array([pair for pair in pairs if np.isfinite(pair).all()]).reshape(-1, 2)
