@@ -5,17 +5,36 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
-from collections.abc import Sequence
 from importlib.metadata import version
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import Any
 
-from ipe_bench.report.docs.gallery import write_gallery
-from ipe_bench.report.docs.reference import write_reference
+from ipe_bench.report.docs.generated import write_gallery, write_reference
+
+SETTINGS = {
+    "project": "ipe-bench",
+    "version": version("ipe-bench"),
+    "release": version("ipe-bench"),
+    "copyright": "the authors of ipe-bench",
+    "extensions": ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "ipe_bench.report.docs"],
+    "myst_enable_extensions": ["dollarmath", "deflist", "colon_fence"],
+    "myst_heading_anchors": 3,
+    "html_theme": "pydata_sphinx_theme",
+    "html_title": "ipe-bench",
+    "html_show_sourcelink": False,
+    "html_math_renderer": "mathml",
+    "html_theme_options": {
+        "show_prev_next": False,
+        "navigation_with_keys": False,
+        "secondary_sidebar_items": ["page-toc"],
+    },
+    "autodoc_typehints": "none",
+    "autodoc_member_order": "bysource",
+}
+"""Sphinx's; nothing that a page needs is fetched when it is opened."""
 
 
-def build(output: Path, trials: int, experiments: Sequence[str] | None = None) -> int:
+def build(output: Path, trials: int) -> int:
     """Writes the site to OUTPUT/html and what it is made of beside it; returns Sphinx's exit code.
 
     Experiments that were run before with as many trials are not run again.
@@ -28,43 +47,16 @@ def build(output: Path, trials: int, experiments: Sequence[str] | None = None) -
         shutil.copytree(pages, source)
     print("reference pages ...", flush=True)
     write_reference(source / "reference")
-    write_gallery(source / "gallery", output / "results", trials, experiments)
-    site = Sphinx(
-        source, None, output / "html", output / "doctrees", "html", settings(), warningiserror=True, freshenv=True
-    )
+    write_gallery(source / "gallery", output / "results", trials)
+    places = (output / "html", output / "doctrees")
+    site = Sphinx(source, None, *places, "html", SETTINGS, warningiserror=True, freshenv=True)
     site.build()
     return site.statuscode
-
-
-def settings() -> dict[str, Any]:
-    """Sphinx's; nothing that a page needs is fetched when it is opened."""
-    return {
-        "project": "ipe-bench",
-        "version": version("ipe-bench"),
-        "release": version("ipe-bench"),
-        "copyright": "the authors of ipe-bench",
-        "extensions": ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "ipe_bench.report.docs.mathml"],
-        "myst_enable_extensions": ["dollarmath", "deflist", "colon_fence"],
-        "myst_heading_anchors": 3,
-        "html_theme": "pydata_sphinx_theme",
-        "html_title": "ipe-bench",
-        "html_show_sourcelink": False,
-        "html_math_renderer": "mathml",
-        "html_theme_options": {
-            "show_prev_next": False,
-            "navigation_with_keys": False,
-            "secondary_sidebar_items": ["page-toc"],
-        },
-        "autodoc_typehints": "none",
-        "autodoc_member_order": "bysource",
-        "nitpicky": False,
-    }
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("output", nargs="?", default="outputs/docs", type=Path)
     parser.add_argument("--trials", type=int, default=20, help="of an experiment that has 1000 by itself")
-    parser.add_argument("--experiments", nargs="*", help="those of the gallery; all where it is not given")
     arguments = parser.parse_args()
-    sys.exit(build(arguments.output, arguments.trials, arguments.experiments))
+    sys.exit(build(arguments.output, arguments.trials))
