@@ -36,8 +36,6 @@ LEAST_FIT_P = 1 / (DRAWS + 1)
 _MOST_OUTLIERS = 8
 _FEW = 0.05
 """Share of outliers above which the model is wrong, and a list of readings says nothing."""
-_ALIKE = 0.02
-"""Relative difference of normalised residuals up to which estimators are shown together."""
 _INFLUENCE = ("leverage", "cook", "shift")
 _FITS = {True: "yes", False: "NO", None: "not tested"}
 _COLLINEAR = 10.0
@@ -241,25 +239,20 @@ def _values(values: Mapping[str, float], figures: int = 6) -> str:
 
 
 def _outliers(answer: Answer) -> Iterator[Table]:
-    """The readings that lie farthest off, with what estimators say of each."""
+    """The readings that lie farthest off, each with its largest residual and the estimators that say so."""
     told = [f for f in answer.fits if 0 < f.outliers.sum() <= max(3, _FEW * len(f.outliers))]
     rows = {
-        int(i): {f.label: float(f.normalised[i]) for f in told if f.outliers[i]}
-        for each in told
-        for i in np.flatnonzero(each.outliers)
+        int(i): max((float(f.normalised[i]) for f in told), key=abs) for f in told for i in np.flatnonzero(f.outliers)
     }
     if not rows:
         return
-    largest = {i: max(map(abs, values.values())) for i, values in rows.items()}
-    listed = sorted(sorted(rows), key=lambda i: -largest[i])[:_MOST_OUTLIERS]
-    labels, shown = _reading_labels(answer.model), []
-    for i in listed:
-        (first, value), values = next(iter(rows[i].items())), rows[i].values()
-        if max(values) - min(values) < _ALIKE * largest[i]:
-            shown.append(f"{value:.1f} ({f'{len(values)} estimators' if len(values) > 1 else first})")
-        else:
-            shown.append(", ".join(f"{label} {value:.1f}" for label, value in rows[i].items()))
-    columns = [words("reading", [_where(labels[i]) for i in listed]), words("residual", shown)]
+    listed = sorted(sorted(rows), key=lambda i: -abs(rows[i]))[:_MOST_OUTLIERS]
+    labels = _reading_labels(answer.model)
+    columns = [
+        words("reading", [_where(labels[i]) for i in listed]),
+        texts("residual", [f"{rows[i]:.1f}" for i in listed]),
+        words("of", [", ".join(f.label for f in told if f.outliers[i]) for i in listed]),
+    ]
     more = [f"And {len(rows) - _MOST_OUTLIERS} others: see {RESIDUALS}."] if len(rows) > _MOST_OUTLIERS else []
     title = f"Outliers: normalised residual beyond ±{told[0].outlier_limit:.2f}"
     yield Table("outliers", title, "", columns, notes=more)

@@ -134,8 +134,7 @@ def _panel(ax: Any, rows: Sequence[dict[str, Any]], quantity: str) -> None:
         ax.xaxis.set_major_formatter(lambda v, _: f"{100 * v:+.3g} %".replace("-", "\N{MINUS SIGN}") if v else "0")
         return
     reach = max(1.05, float(np.maximum(ends[ends > 0], 1 / ends[ends > 0]).max()) ** 1.1)
-    ax.set_xscale("log")
-    ax.set_xlim(1 / reach, reach)
+    ax.set(xscale="log", xlim=(1 / reach, reach))
     if reach >= 2:
         common.log_ticks(ax.xaxis, 1 / reach, reach)
     else:

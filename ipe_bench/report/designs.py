@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -145,17 +146,18 @@ def taken(design: Design, way: Way, choice: Choice) -> str:
 
 def _effects(design: Design) -> Table:
     best: dict[tuple[str, str], Effect] = {}
-    for e in design.effects:
+    for e in sorted(design.effects, key=lambda e: e.mean_bound):
         if np.isfinite(e.mean_bound):
-            best[e.column, e.action] = min(best.get((e.column, e.action), e), e, key=lambda e: e.mean_bound)
-    found = [best[key] for key in sorted(best, key=lambda key: ([c for c, _ in best].index(key[0]), key[1]))]
-    columns = [
+            best.setdefault((e.column, e.action), e)
+    columns = list(dict.fromkeys(e.column for e in design.effects))
+    found = [best[key] for key in itertools.product(columns, ("add", "drop")) if key in best]
+    cells = [
         words("what", [f"{e.action} {e.column} {levels_of(design.candidates, e.column, e.entry)}" for e in found]),
         texts("readings", [str(e.readings) for e in found]),
         texts("bound", [f"{e.mean_bound:.3f}" for e in found]),
     ]
     note = "The best to add, and the one that is missed least."
-    return Table("effects", "One more, one less", "", columns, notes=[note])
+    return Table("effects", "One more, one less", "", cells, notes=[note])
 
 
 # Files ---------------------------------------------------------------------------------------------------------------
@@ -182,47 +184,38 @@ def write_design(folder: Path, name: str, design: Design, command: Any) -> list[
 
 def described(design: Design) -> dict[str, Any]:
     """All of it as plain data; bounds in the parameters' own units."""
-    seen, limit = design.observability, design.threshold
+    seen, limit, scenario = design.observability, design.threshold, design.scenario
     sizes = np.array([p.size for p in seen.parameters])
-    each = zip(seen.parameters, seen.bound * sizes, seen.multiple_correlation, strict=True)
+    each = zip(seen.parameters, plain(seen.bound * sizes), plain(seen.multiple_correlation), strict=True)
+    names = ("name", "deviation", "unit", "parameter", "visible", "noticed")
+    shifts = [(s, plain(s.shift * sizes), plain(s.bounds)) for s in design.suspects]
+    bounds = limit and {name: plain(getattr(limit, name) * sizes) for name in ("van_trees", "weiss_weinstein")}
+    ways = [
+        {
+            "by": list(way.units.by),
+            "units": len(way.units.rows),
+            "curve": [picked(c, "readings", "mean_bound") for c in way.curve],
+            **{name: choice and _chosen(design, way, choice) for name, choice in _choices(way).items()},
+        }
+        for way in design.ways
+    ]
     return {
-        "measurement": design.scenario.measurement.name,
-        "error_scale": design.scenario.error_scale,
+        "measurement": scenario.measurement.name,
+        "error_scale": scenario.error_scale,
         "criterion": design.criterion,
-        "readings": design.scenario.measurement.m,
+        "readings": scenario.measurement.m,
         "candidates": design.candidates.m,
         "observable": seen.observable,
         "least_observable_direction": seen.words,
         "singular_values": plain(np.median(seen.singular_values, axis=0)),
-        "parameters": [
-            {**picked(p, "name", "unit"), "bound": plain(bound), "multiple_correlation": plain(r)}
-            for p, bound, r in each
-        ],
+        "parameters": [{**picked(p, "name", "unit"), "bound": b, "multiple_correlation": r} for p, b, r in each],
         "correlation": plain(seen.correlation),
         "suspects": [
-            {
-                **picked(s, "name", "deviation", "unit", "parameter", "visible", "noticed"),
-                "shift": plain(s.shift * sizes),
-                "shift_in_bounds": plain(s.bounds),
-                "direction": s.words,
-            }
-            for s in design.suspects
+            {**picked(s, *names), "shift": shift, "shift_in_bounds": by, "direction": s.words}
+            for s, shift, by in shifts
         ],
-        "threshold": limit
-        and {
-            "van_trees": plain(limit.van_trees * sizes),
-            "weiss_weinstein": plain(limit.weiss_weinstein * sizes),
-            **picked(limit, "false_roots", "runs", "nearest"),
-        },
-        "ways": [
-            {
-                "by": list(way.units.by),
-                "units": len(way.units.rows),
-                "curve": [picked(c, "readings", "mean_bound") for c in way.curve],
-                **{name: choice and _chosen(design, way, choice) for name, choice in _choices(way).items()},
-            }
-            for way in design.ways
-        ],
+        "threshold": bounds and bounds | picked(limit, "false_roots", "runs", "nearest"),
+        "ways": ways,
         "effects": [picked(e, "column", "entry", "action", "readings", "mean_bound") for e in design.effects],
     }
 

@@ -6,7 +6,6 @@ that says so.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
@@ -22,7 +21,6 @@ from ipe_bench.report.tables import all_tables
 from ipe_bench.statistics.analysis import Analysis
 
 T = TypeVar("T")
-_FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 
 
 def guarded(make: Callable[[], T]) -> T:
@@ -48,17 +46,9 @@ def _usable(group: str, problems: list[str], make: Callable[[Option, Any], T]) -
             problems.append(f"{group}={option.name}: {error}; it is left out")
 
 
-def _require(thing: Any, kind: type, says: str = "is") -> None:
+def _require(thing: Any, kind: type, says: str = "gives") -> None:
     if not isinstance(thing, kind):
         raise UserError(f"{says} a {type(thing).__name__} and not a {kind.__name__}")
-
-
-def _require_file_name(name: Any) -> None:
-    if not (isinstance(name, str) and _FILE_NAME.fullmatch(name)):
-        raise UserError(f"{name!r} is not a name for a file; use letters, digits and underscores")
-
-
-# Figures -------------------------------------------------------------------------------------------------------------
 
 
 def figures(problems: list[str]) -> list[tuple[Option, Figure]]:
@@ -72,10 +62,9 @@ def checked_figure(record: Any) -> Figure:
     Raises:
         UserError: it is not.
     """
-    _require(record, Figure)
-    frames = (record.frames,) if isinstance(record.frames, str) else record.frames
-    if isinstance(record.frames, str) or not set(frames) <= set(FRAMES):
-        raise UserError(f"frames={','.join(frames)}: name some of {', '.join(FRAMES)}, in a tuple")
+    _require(record, Figure, "is")
+    if isinstance(record.frames, str) or not set(record.frames) <= set(FRAMES):
+        raise UserError(f"frames={record.frames}: name some of {', '.join(FRAMES)}, in a tuple")
     return record
 
 
@@ -83,30 +72,24 @@ def drawings(figure: Figure, view: View) -> list[Drawing]:
     """The drawings that a plugin's figure makes of a view.
 
     Raises:
-        UserError: it raises, or gives something else than drawings under names of their own.
+        UserError: it raises, or gives something else.
     """
     drawn = guarded(lambda: list(figure.draw(view)))
     for drawing in drawn:
-        _require(drawing, Drawing, "gives")
-        _require_file_name(drawing.name)
-    if len({drawing.name for drawing in drawn}) < len(drawn):
-        raise UserError("two drawings have one name; end each in view.suffix")
+        _require(drawing, Drawing)
     return drawn
-
-
-# Tables and sections -------------------------------------------------------------------------------------------------
 
 
 def report_tables(analysis: Analysis) -> list[Table]:
     """Every table of the report: those on certified readings, ours on simulated trials, and those of plugins."""
     shown = certified_tables(analysis.collection) + all_tables(without_certified(analysis), analysis)
     if not analysis.summary.empty:
-        names = {table.name for table in shown}
-        made = _usable("table", analysis.collection.further, lambda _, record: made_table(record, analysis, names))
-        for _, table in made:
-            if table is not None:
-                names.add(table.name)
-                shown.append(table)
+
+        def make(_: Option, record: Any) -> Table | None:
+            return made_table(record, analysis, [table.name for table in shown])
+
+        for _, table in _usable("table", analysis.collection.further, make):
+            shown += [] if table is None else [table]
     return shown
 
 
@@ -116,21 +99,16 @@ def made_table(record: Any, analysis: Analysis, taken: Iterable[str] = ()) -> Ta
     Raises:
         UserError: it raises, or gives something else than a table under a name of its own.
     """
-    if not callable(record):
-        raise UserError(f"is a {type(record).__name__} and not a function of the analysis")
-    table: Any = guarded(lambda: record(analysis))
+    table = guarded(lambda: record(analysis))
     if table is not None:
-        _require_table(table, taken)
+        _check_table(table, taken)
     return table
 
 
-def _require_table(table: Any, taken: Iterable[str]) -> None:
-    _require(table, Table, "gives")
-    _require_file_name(table.name)
-    if table.name in taken or table.name == "profiles":
+def _check_table(table: Any, taken: Iterable[str]) -> None:
+    _require(table, Table)
+    if table.name in (*taken, "profiles"):
         raise UserError(f"there is a table {table.name} already; choose another name")
-    if not table.columns:
-        raise UserError(f"the table {table.name} has no columns; return None where there is nothing to show")
     guarded(lambda: (markdown(table), latex(table), comma_separated(table)))
 
 
@@ -150,11 +128,11 @@ def made_section(name: str, record: Any, analysis: Analysis, taken: Iterable[str
     Raises:
         UserError: it raises, or gives something else than texts and tables.
     """
-    _require(record, Section)
-    parts = guarded(lambda: list(record.write(analysis)))
+    _require(record, Section, "is")
+    written = Written(name, str(record.title), guarded(lambda: list(record.write(analysis))))
     names = set(taken)
-    for part in parts:
+    for part in written.parts:
         if not isinstance(part, str):
-            _require_table(part, names)
+            _check_table(part, names)
             names.add(part.name)
-    return Written(name, str(record.title), parts)
+    return written

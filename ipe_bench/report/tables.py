@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,36 +16,63 @@ from ipe_bench.statistics.comparisons import ALPHA
 from ipe_bench.statistics.records import SCORES, Where, all_statistics, frame_columns
 from ipe_bench.statistics.summary import ALL
 
+_RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
+    "costs": (
+        "Costs",
+        "Medians per trial over all trials. A Jacobian counts as many simulations as there are parameters. To 0.05 σ of"
+        " limit: cost until all further iterates are within 0.05 standard deviations of the last one, over the"
+        " converged trials with a stored history. Order: the last observed order of convergence of these trials.",
+        lambda rows: rows["trials"] > 0,
+    ),
+    "all_trials": (
+        "All trials",
+        "Over all trials. misfit: residuals fail the test of fit at 0.1 %. ambiguous: several minima fit, as far as the"
+        " estimator has looked. Root mean squares and efficiency here are not capped: one trial may decide them.",
+        lambda rows: rows["trials"] > 0,
+    ),
+    "solved_trials": (
+        "Solved trials",
+        "A diagnostic of estimators that solve an equation, and no comparison with others: each over the trials in"
+        " which it found the root that belongs to the truth, which nobody knows who has readings alone. Their number"
+        " stands in brackets where it is not all. rmse, common: on the trials that every estimator solved. False root:"
+        " it converged to another one.",
+        lambda rows: rows["equation"] != "-",
+    ),
+    "covariances": (
+        "Covariance of the frozen root",
+        "Standard deviations over the linear bound of eq. (5), root mean square over parameters, of the estimators that"
+        " solve eq. (11), over solved trials. rmse is what happened (Monte Carlo); reported is the sandwich at the"
+        " estimate, which holds to first order; eq. (14) takes the compensation error for independent of the noise,"
+        " which it is not. A false root is a converged trial at another root than the truth leads to.",
+        lambda rows: rows["eq_14"].notna(),
+    ),
+    "iterations": (
+        "Bounds on the iterations",
+        "Over the first trials, whose iterates are stored. Eq. (18) bounds fixed-point iteration where K of eq. (15) is"
+        " below 1; eq. (23) bounds Newton's method by the curvature M of its g. Constants are taken at the truth, the"
+        " last iterate stands for the root.",
+        lambda rows: (rows["eq_18_trials"] > 0) | rows["eq_23_observed"].notna(),
+    ),
+}
+"""Title, caption and rows of the tables of scenarios and estimators that are made of recorded statistics alone."""
+
 
 def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]:
     """Every table that the data allow, in the order of the report; `whole` is the analysis whose endings are listed
     if this one leaves some trials out."""
-    if analysis.summary.empty:
-        found = [endings(whole or analysis)]
-    else:
-        totals = _totals(analysis)
-        found = [
-            overview(analysis),
-            _costs(analysis, totals),
-            comparisons(analysis),
-            ranks(analysis),
-            parameters(analysis),
-            calibration(analysis),
-            endings(whole or analysis),
-            _all_trials(analysis, totals),
-            _solved_trials(analysis, totals),
-            contraction(analysis),
-            _covariances(analysis, totals),
-            _theory(analysis),
-            _iterations(analysis, totals),
-        ]
+    found = [endings(whole or analysis)]
+    if not analysis.summary.empty:
+        rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
+        totals = pd.concat([rows, analysis.scores[list(frame_columns(SCORES))]], axis=1)
+        recorded = {
+            where: _recorded(analysis, where, title, caption, totals[chosen(totals)])
+            for where, (title, caption, chosen) in _RECORDED.items()
+        }
+        main = (recorded["costs"], comparisons(analysis), ranks(analysis), parameters(analysis), calibration(analysis))
+        late = (recorded["all_trials"], recorded["solved_trials"], contraction(analysis), recorded["covariances"])
+        late = [*late, theory(analysis), recorded["iterations"]]
+        found = [overview(analysis), *main, *found, *(table and replace(table, appendix=True) for table in late)]
     return [table for table in found if table is not None]
-
-
-def _totals(analysis: Analysis) -> pd.DataFrame:
-    """What is known of each scenario under an estimator over all parameters, the scores among it."""
-    rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
-    return pd.concat([rows, analysis.scores[list(frame_columns(SCORES))]], axis=1)
 
 
 def head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
@@ -86,10 +113,6 @@ def _recorded(
     return Table(where, title, caption, [*columns, *statistics(where, rows)], data)
 
 
-def _appendix(table: Table | None) -> Table | None:
-    return None if table is None else replace(table, appendix=True)
-
-
 def overview(analysis: Analysis) -> Table:
     """How each estimator does over all trials: one population for everybody."""
     rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
@@ -100,47 +123,8 @@ def overview(analysis: Analysis) -> Table:
     return Table("overview", "Overview", "", columns, rows, notes=LEGEND, grouped=len(first))
 
 
-def _costs(analysis: Analysis, totals: pd.DataFrame) -> Table | None:
-    caption = (
-        "Medians per trial over all trials. A Jacobian counts as many simulations as there are"
-        " parameters. To 0.05 σ of limit: cost until all further iterates are within 0.05 standard deviations of the"
-        " last one, over the converged trials with a stored history. Order: the last observed order of convergence of"
-        " these trials, 1 linear and 2 quadratic."
-    )
-    return _recorded(analysis, "costs", "Costs", caption, totals)
-
-
-def _all_trials(analysis: Analysis, totals: pd.DataFrame) -> Table | None:
-    caption = (
-        "Over all trials. misfit: residuals fail the test of fit at 0.1 %. ambiguous: several minima fit, as far as the"
-        " estimator has looked. Root mean squares and efficiency here are not capped: one trial may decide them."
-    )
-    return _appendix(_recorded(analysis, "all_trials", "All trials", caption, totals))
-
-
-def _solved_trials(analysis: Analysis, totals: pd.DataFrame) -> Table | None:
-    caption = (
-        "A diagnostic of estimators that solve an equation, and no comparison with others: each over the trials in"
-        " which it found the root that belongs to the truth, which nobody knows who has readings alone. Their number"
-        " stands in brackets where it is not all. rmse, common: on the trials that every estimator solved. False root:"
-        " it converged to another one."
-    )
-    rows = totals[totals["equation"] != "-"]
-    return _appendix(_recorded(analysis, "solved_trials", "Solved trials", caption, rows))
-
-
-def _covariances(analysis: Analysis, totals: pd.DataFrame) -> Table | None:
-    caption = (
-        "Standard deviations over the linear bound of eq. (5), root mean square over parameters, of the estimators that"
-        " solve eq. (11), over solved trials. rmse is what happened (Monte Carlo); reported is the sandwich at the"
-        " estimate, which holds to first order; eq. (14) takes the compensation error for independent of the noise,"
-        " which it is not. A false root is a converged trial at another root than the truth leads to."
-    )
-    rows = totals[totals["eq_14"].notna()]
-    return _appendix(_recorded(analysis, "covariances", "Covariance of the frozen root", caption, rows))
-
-
-def _theory(analysis: Analysis) -> Table | None:
+def theory(analysis: Analysis) -> Table | None:
+    """What theory expects of least squares, parameter by parameter, beside what happened."""
     caption = (
         "Estimators that minimise the sum of squares, over solved trials, in the parameters' own units; all: over the"
         " linear bound, root mean square over parameters. By theory: without any noise drawn, from the slopes of the"
@@ -148,17 +132,7 @@ def _theory(analysis: Analysis) -> Table | None:
         " say how far linear theory reaches: they are small below 0.3."
     )
     rows = analysis.summary[analysis.summary["predicted_rmse"].notna()]
-    return _appendix(_recorded(analysis, "theory", "Theory beside experiment", caption, rows, ("parameter", "unit")))
-
-
-def _iterations(analysis: Analysis, totals: pd.DataFrame) -> Table | None:
-    caption = (
-        "Over the first trials, whose iterates are stored. Eq. (18) bounds fixed-point iteration where K of eq. (15) is"
-        " below 1; eq. (23) bounds Newton's method by the curvature M of its g. Constants are taken at the truth, the"
-        " last iterate stands for the root."
-    )
-    rows = totals[(totals["eq_18_trials"] > 0) | totals["eq_23_observed"].notna()]
-    return _appendix(_recorded(analysis, "iterations", "Bounds on the iterations", caption, rows))
+    return _recorded(analysis, "theory", "Theory beside experiment", caption, rows, ("parameter", "unit"))
 
 
 def parameters(analysis: Analysis) -> Table | None:
@@ -205,7 +179,7 @@ def contraction(analysis: Analysis) -> Table | None:
         " neighbourhood is sufficient for fixed-point iteration to converge there; the spectral radius below 1 is"
         " necessary and sufficient close to the root, and is the rate at which the error shrinks."
     )
-    return Table("contraction", "Contraction", caption, columns, rows, appendix=True)
+    return Table("contraction", "Contraction", caption, columns, rows)
 
 
 def comparisons(analysis: Analysis) -> Table | None:

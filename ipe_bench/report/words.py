@@ -115,7 +115,7 @@ def shower(kind: Kind, where: Where) -> Callable[[Any], str]:
     }[kind]
 
 
-def applies(record: Statistic, where: Where, row: Mapping[str, Any]) -> bool:
+def _applies(record: Statistic, where: Where, row: Mapping[str, Any]) -> bool:
     """Whether a row can have the statistic: what solves no equation has nothing to say of solved trials. In the table
     of parameters its finished trials stand in for them."""
     return record.given != "solved" or where == "parameters" or row["equation"] != "-"
@@ -130,7 +130,7 @@ def reported(record: Statistic, rows: Sequence[Mapping[str, Any]]) -> bool:
 
 def shown(record: Statistic, where: Where, row: Mapping[str, Any]) -> str:
     """A value as it stands in a table, with the number of trials that it is conditional on unless that is all."""
-    if not applies(record, where, row):
+    if not _applies(record, where, row):
         return "-"
     text = shower(record.kind, where)(row[record.name])
     if record.given and text != "-" and row[record.count] < row["trials"]:
@@ -141,4 +141,4 @@ def shown(record: Statistic, where: Where, row: Mapping[str, Any]) -> str:
 def limits(record: Statistic, where: Where, row: Mapping[str, Any]) -> tuple[float, float]:
     """The ends of a statistic's interval; NaN if it has none."""
     low, high = (float(row[name]) for name in record.columns[1:])
-    return (low, high) if math.isfinite(low) and applies(record, where, row) else (math.nan, math.nan)
+    return (low, high) if math.isfinite(low) and _applies(record, where, row) else (math.nan, math.nan)
