@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements import Measurement, Parameter
+from ipe_bench.measurements import Bock, Measurement, Ode, Parameter
 
 
 @dataclass(frozen=True)
@@ -40,3 +40,14 @@ class Bent(Measurement):
     def simulate(self, x: Array) -> Array:
         y = np.matmul(self.A, x[..., None])[..., 0]
         return y + self.bend * y**2
+
+
+def bock(mu: float) -> Ode:
+    """Bock's problem with unknown initial values, presumed to be (0, pi)."""
+    return Bock(
+        mu=mu,
+        start={"p": 1.0, "a": 0.0, "b": np.pi},
+        size={"p": 0.1, "a": 0.1, "b": 0.1},
+        initial={"x1": "a", "x2": "b"},
+        answer={"p": np.pi, "a": 0.0, "b": np.pi},
+    )

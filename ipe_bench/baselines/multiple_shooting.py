@@ -19,6 +19,7 @@ from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, iterat
 from ipe_bench.estimators.least_squares import Minima
 from ipe_bench.measurements.base import Measurement, SubsetModel
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
+from ipe_bench.measurements.ode.described import Ode
 from ipe_bench.measurements.ode.interval import Interval
 from ipe_bench.measurements.ode.model import OdeMeasurement
 from ipe_bench.measurements.problem import Problem
@@ -86,10 +87,11 @@ class MultipleShooting(Estimator):
 
 
 def _whole(model: Measurement) -> tuple[Measurement, NDArray[np.intp]]:
-    """The model without missing readings, and which of its readings there are."""
+    """The equations, and which of all their readings there are."""
+    kept = np.arange(model.m)
     if isinstance(model, SubsetModel):
-        return model.whole, np.array(model.kept, dtype=np.intp)
-    return model, np.arange(model.m)
+        model, kept = model.whole, np.array(model.kept, dtype=np.intp)
+    return (model.whole if isinstance(model, Ode) else model), kept
 
 
 @dataclass(frozen=True)

@@ -68,3 +68,12 @@ def cache_folder() -> Path:
             return base
     except OSError:
         return Path(tempfile.mkdtemp(prefix="ipe-bench-"))
+
+
+def own_conf() -> Path:
+    """The folder of our configs: inside the installed package, or beside it in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "conf", package.parent / "conf"):
+        if (folder / "config.yaml").is_file():
+            return folder
+    raise FileNotFoundError("the configs of ipe-bench are neither in the package nor beside it; install it again")

@@ -3,22 +3,20 @@
 from ipe_bench.measurements.accelerometer import Accelerometer
 from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, SubsetModel, UsualNoise
 from ipe_bench.measurements.bearings import Bearings
-from ipe_bench.measurements.bock import Bock
-from ipe_bench.measurements.falling_body import FallingBody
 from ipe_bench.measurements.formula import Formula
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.gins_richer import RicherGins
 from ipe_bench.measurements.gnss import Gnss
-from ipe_bench.measurements.lotka_volterra import LotkaVolterra
 from ipe_bench.measurements.mgh import Mgh
 from ipe_bench.measurements.nist import Nist
-from ipe_bench.measurements.ode.described import Ode
+from ipe_bench.measurements.ode.described import Ode, packaged
 from ipe_bench.measurements.ode.model import OdeMeasurement
 from ipe_bench.measurements.polynomial import Polynomial
 from ipe_bench.measurements.ranging import Ranging
-from ipe_bench.measurements.sir import Sir
 from ipe_bench.measurements.six_position import SixPosition
 from ipe_bench.measurements.triad import Triad
+
+Bock, FallingBody, LotkaVolterra, Sir = map(packaged, ("bock", "falling_body", "lotka_volterra", "sir"))
 
 __all__ = [
     "Accelerometer",

@@ -15,6 +15,9 @@ from ipe_bench.basics.options import Positive
 from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise
 from ipe_bench.measurements.triad import Magnitudes, attitudes
 
+_BIAS_SIZE, _SCALE_SIZE, _MISALIGNMENT_SIZE = 50.0, 0.02, 0.01
+"""One unit of error: of a bias in counts, of a scale factor as a fraction of it, of an angle in rad."""
+
 
 @dataclass(frozen=True)
 class Accelerometer(Magnitudes):
@@ -45,12 +48,6 @@ class Accelerometer(Magnitudes):
     """The presumed angles ayz, azy, azx in rad."""
     gravity: Positive = 9.80665
     """Local gravity in m/s^2."""
-    bias_size: Positive = 50.0
-    """What one unit of error of a bias is, in counts."""
-    scale_size: Positive = 0.02
-    """What one unit of error of a scale factor is, as a fraction of it."""
-    misalignment_size: Positive = 0.01
-    """What one unit of error of an angle is, in rad."""
 
     reading_unit = "m/s^2"
     usual_noise = UsualNoise(5e-3)
@@ -58,9 +55,9 @@ class Accelerometer(Magnitudes):
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         return (
-            *(Parameter(f"b{a}", "counts", self.bias_size, "bias") for a in "xyz"),
-            *(Parameter(f"k{a}", "ppm", 1e6 * self.scale_size, "scale factor") for a in "xyz"),
-            *(Parameter(f"a{a}", "mrad", 1e3 * self.misalignment_size, "misalignment") for a in ("yz", "zy", "zx")),
+            *(Parameter(f"b{a}", "counts", _BIAS_SIZE, "bias") for a in "xyz"),
+            *(Parameter(f"k{a}", "ppm", 1e6 * _SCALE_SIZE, "scale factor") for a in "xyz"),
+            *(Parameter(f"a{a}", "mrad", 1e3 * _MISALIGNMENT_SIZE, "misalignment") for a in ("yz", "zy", "zx")),
         )
 
     @cached_property

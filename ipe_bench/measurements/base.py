@@ -285,58 +285,101 @@ class Measurement(Component, Named, ABC):
 
 
 def of_whole(name: str) -> Any:
-    """A property that is that of the model inside."""
+    """An attribute or a method that is that of the model inside."""
     return property(lambda model: getattr(model.whole, name))
 
 
-@dataclass(frozen=True)
+def _readings_of_whole(name: str) -> Any:
+    """A method that computes readings by that of the model inside."""
+    return lambda model, x, *stop: model.own_readings(x, getattr(model.whole, name)(model.whole_x(x), *stop))
+
+
+def _jacobian_of_whole(name: str) -> Any:
+    """A method that computes a Jacobian by that of the model inside."""
+    return lambda model, x, *stop: model.own_jacobian(x, getattr(model.whole, name)(model.whole_x(x), *stop))
+
+
 class WrappedModel(Measurement):
-    """A model that is another one, `whole`, but for what a subclass overrides."""
+    """A model that is another one, `whole`, but for what a subclass overrides.
+
+    Three hooks stand between the two in all that is computed: `whole_x`, `own_readings` and `own_jacobian`.
+    """
 
     whole: Measurement
 
+    name = of_whole("name")
     parameters = of_whole("parameters")
     physical_parameters = of_whole("physical_parameters")
     nominal = of_whole("nominal")
+    nuisance_deviation = of_whole("nuisance_deviation")
+    nuisances = of_whole("nuisances")
     index = of_whole("index")
+    levels = of_whole("levels")
     epochs = of_whole("epochs")
     offset = of_whole("offset")
     m = of_whole("m")
     fixed = of_whole("fixed")
+    inputs = of_whole("inputs")
+    input_columns = of_whole("input_columns")
+    input_columns_known = of_whole("input_columns_known")
+    absent_input = of_whole("absent_input")
+    by_differential_equations = of_whole("by_differential_equations")
+    recorded = of_whole("recorded")
     reading_unit = of_whole("reading_unit")
     reading_name = of_whole("reading_name")
     usual_noise = of_whole("usual_noise")
     own_parameters = of_whole("own_parameters")
+    physical = of_whole("physical")
+    physical_slope = of_whole("physical_slope")
+    near_bounds = of_whole("near_bounds")
+    jacobian_cost = of_whole("jacobian_cost")
+    coarse_jacobian_cost = of_whole("coarse_jacobian_cost")
+    simulate = _readings_of_whole("simulate")
+    simulate_until = _readings_of_whole("simulate_until")
+    coarse_simulate_until = _readings_of_whole("coarse_simulate_until")
+    jacobian = _jacobian_of_whole("jacobian")
+    coarse_jacobian = _jacobian_of_whole("coarse_jacobian")
+    jacobian_until = _jacobian_of_whole("jacobian_until")
+    coarse_jacobian_until = _jacobian_of_whole("coarse_jacobian_until")
 
-    def physical(self, x: Array) -> Array:
-        return self.whole.physical(x)
+    def whole_x(self, x: Array) -> Array:
+        """x (trials, k) as the whole model takes it."""
+        return x
 
-    def physical_slope(self, x: Array) -> Array:
-        return self.whole.physical_slope(x)
+    def own_readings(self, x: Array, z: Array) -> Array:
+        """The readings at x, from those of the whole model."""
+        del x
+        return z
 
-    def near_bounds(self, x: Array) -> Mapping[int, float]:
-        return self.whole.near_bounds(x)
+    def own_jacobian(self, x: Array, J: Array) -> Array:
+        """dh/dx at x, from that of the whole model."""
+        del x
+        return J
 
-    def fixed_at(self, values: Mapping[int, float]) -> Measurement:
-        return replace(self, whole=self.whole.fixed_at(values))
-
-    def unbounded(self, values: Mapping[int, float]) -> Measurement:
-        return replace(self, whole=self.whole.unbounded(values))
-
-    def simulate(self, x: Array) -> Array:
-        return self.whole.simulate(x)
-
-    def jacobian(self, x: Array) -> Array:
-        return self.whole.jacobian(x)
+    def linearization(self) -> Array:
+        return self.own_jacobian(self.nominal[None], self.whole.linearization()[None])[0]
 
     def hindrance(self, x: Array) -> str:
-        return self.whole.hindrance(x)
+        return self.whole.hindrance(self.whole_x(x[None])[0])
+
+    def fixed_at(self, values: Mapping[int, float]) -> Measurement:
+        return self._around(self.whole.fixed_at(values))
+
+    def unbounded(self, values: Mapping[int, float]) -> Measurement:
+        return self._around(self.whole.unbounded(values))
+
+    def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
+        return self._around(self.whole.with_inputs(columns, readings))
+
+    def _around(self, whole: Measurement) -> Measurement:
+        return replace(self, whole=whole)  # type: ignore[type-var]
 
 
 @dataclass(frozen=True)
 class SubsetModel(WrappedModel):
     """Some readings of a model: those of the first epochs, or those that are not missing."""
 
+    whole: Measurement
     kept: tuple[int, ...]
     """Rows of the whole model's z, ascending."""
     stop: int | None = None
@@ -344,9 +387,13 @@ class SubsetModel(WrappedModel):
     coarse: bool = False
     """Whether readings near enough for fits that only start another will do."""
 
-    by_differential_equations = of_whole("by_differential_equations")
-    jacobian_cost = of_whole("jacobian_cost")
-    coarse_jacobian_cost = of_whole("coarse_jacobian_cost")
+    inputs = ()
+    input_columns = Measurement.input_columns
+    recorded = None
+    simulate_until = Measurement.simulate_until
+    coarse_simulate_until = Measurement.coarse_simulate_until
+    jacobian_until = Measurement.jacobian_until
+    coarse_jacobian_until = Measurement.coarse_jacobian_until
 
     def __post_init__(self) -> None:
         """Made in every window and epoch, and of no user's options: there is nothing to check."""
@@ -364,7 +411,7 @@ class SubsetModel(WrappedModel):
     def offset(self) -> Array:
         return self.whole.offset[self._rows]
 
-    @cached_property
+    @property
     def m(self) -> int:
         return len(self.kept)
 
@@ -388,20 +435,21 @@ class SubsetModel(WrappedModel):
         arrived = np.arange(self.whole.m) if self.stop is None else self.whole.rows(self.stop)
         return slice(None) if np.array_equal(arrived, self._rows) else np.searchsorted(arrived, self._rows)
 
+    def _computed(self, name: str, x: Array) -> Array:
+        """What that method of the whole model computes, in the kept rows."""
+        whole = (
+            getattr(self.whole, name)(x) if self.stop is None else getattr(self.whole, f"{name}_until")(x, self.stop)
+        )
+        return whole[:, self._among_arrived]
+
     def simulate(self, x: Array) -> Array:
-        if self.stop is None:
-            z = self.whole.simulate(x)
-        else:
-            z = (self.whole.coarse_simulate_until if self.coarse else self.whole.simulate_until)(x, self.stop)
-        return z[:, self._among_arrived]
+        return self._computed("coarse_simulate" if self.coarse and self.stop is not None else "simulate", x)
 
     def jacobian(self, x: Array) -> Array:
-        J = self.whole.jacobian(x) if self.stop is None else self.whole.jacobian_until(x, self.stop)
-        return J[:, self._among_arrived]
+        return self._computed("jacobian", x)
 
     def coarse_jacobian(self, x: Array) -> Array:
-        J = self.whole.coarse_jacobian(x) if self.stop is None else self.whole.coarse_jacobian_until(x, self.stop)
-        return J[:, self._among_arrived]
+        return self._computed("coarse_jacobian", x)
 
     def linearization(self) -> Array:
         return self.whole.linearization()[self._rows]

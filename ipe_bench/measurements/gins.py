@@ -230,11 +230,9 @@ class Gins(OdeMeasurement):
     def read(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
         return y[0], y[1]
 
-    def simulate_until(self, x: Array, stop: int) -> Array:
-        return self._shown(x, stop, self.offset)
-
-    def coarse_simulate_until(self, x: Array, stop: int) -> Array:
-        return self._shown_coarsely(x, stop, self.offset)
+    @property
+    def _origin(self) -> Array:
+        return self.offset
 
     @cached_property
     def offset(self) -> Array:

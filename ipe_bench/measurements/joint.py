@@ -25,9 +25,9 @@ class Joint(Measurement):
 
     parts: tuple[Measurement, ...]
 
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        return self.parts[0].name
+    name = property(lambda joint: joint.parts[0].name)  # type: ignore[assignment]
+    reading_unit = property(lambda joint: joint.parts[0].reading_unit)  # type: ignore[assignment]
+    reading_name = property(lambda joint: joint.parts[0].reading_name)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -39,9 +39,8 @@ class Joint(Measurement):
     def _places(self) -> tuple[NDArray[np.intp], ...]:
         """Where the parameters of each part stand among those of all."""
         names: dict[str, int] = {}
-        return tuple(
-            np.array([names.setdefault(name, len(names)) for name in self._names(k)]) for k in range(len(self.parts))
-        )
+        each = [[names.setdefault(name, len(names)) for name in self._names(k)] for k in range(len(self.parts))]
+        return tuple(np.array(places) for places in each)
 
     def _names(self, k: int) -> list[str]:
         """What the parameters of part k are called among those of all."""
@@ -51,12 +50,12 @@ class Joint(Measurement):
     @cached_property
     def copies(self) -> Mapping[str, tuple[str, ...]]:
         """What the parameters are called here of which every file has its own, by what the model calls them."""
-        found: dict[str, list[str]] = {}
+        found: dict[str, tuple[str, ...]] = {}
         for k, part in enumerate(self.parts):
             for own, name in zip(part.physical_parameters, self._names(k), strict=True):
                 if own.name in part.own_parameters:
-                    found.setdefault(own.name, []).append(name)
-        return {name: tuple(each) for name, each in found.items()}
+                    found[own.name] = (*found.get(own.name, ()), name)
+        return found
 
     @cached_property
     def _first(self) -> list[tuple[int, int]]:
@@ -67,21 +66,22 @@ class Joint(Measurement):
                 found.setdefault(place, (part, i))
         return [found[j] for j in range(len(found))]
 
-    def _each(self, parameters: Sequence[tuple[Parameter, ...]]) -> tuple[Parameter, ...]:
+    def _each(self, attribute: str) -> tuple[Parameter, ...]:
         named = []
-        for part, i in self._first:
-            own = self.parts[part].physical_parameters[i].name in self.parts[part].own_parameters
-            p = parameters[part][i]
-            named.append(replace(p, name=f"{p.name}_{part + 1}", group=p.group or p.name) if own else p)
+        for k, i in self._first:
+            part = self.parts[k]
+            p: Parameter = getattr(part, attribute)[i]
+            own = part.physical_parameters[i].name in part.own_parameters
+            named.append(replace(p, name=f"{p.name}_{k + 1}", group=p.group or p.name) if own else p)
         return tuple(named)
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        return self._each([part.parameters for part in self.parts])
+        return self._each("parameters")
 
     @cached_property
     def physical_parameters(self) -> tuple[Parameter, ...]:
-        return self._each([part.physical_parameters for part in self.parts])
+        return self._each("physical_parameters")
 
     @cached_property
     def nominal(self) -> Array:
@@ -91,12 +91,17 @@ class Joint(Measurement):
     def fixed(self) -> Mapping[str, float]:
         return {name: value for part in self.parts for name, value in part.fixed.items()}
 
+    def _of_parts(self, method: str, x: Array) -> list[Array]:
+        """What that method of each part gives for its own parameters."""
+        pairs = zip(self.parts, self._places, strict=True)
+        return [getattr(part, method)(x[:, places]) for part, places in pairs]
+
     def physical(self, x: Array) -> Array:
-        values = [part.physical(x[:, places]) for part, places in zip(self.parts, self._places, strict=True)]
+        values = self._of_parts("physical", x)
         return np.stack([values[part][:, i] for part, i in self._first], axis=1)
 
     def physical_slope(self, x: Array) -> Array:
-        slopes = [part.physical_slope(x[:, places]) for part, places in zip(self.parts, self._places, strict=True)]
+        slopes = self._of_parts("physical_slope", x)
         return np.stack([slopes[part][:, i] for part, i in self._first], axis=1)
 
     @cached_property
@@ -132,31 +137,35 @@ class Joint(Measurement):
         return np.concatenate([part.offset for part in self.parts])
 
     @property
-    def reading_unit(self) -> str:  # type: ignore[override]
-        return self.parts[0].reading_unit
-
-    @property
-    def reading_name(self) -> str:  # type: ignore[override]
-        return self.parts[0].reading_name
-
-    @property
     def usual_noise(self) -> UsualNoise | None:  # type: ignore[override]
         """That of the parts, where it is one."""
         known = [part.usual_noise for part in self.parts]
         return known[0] if all(one == known[0] for one in known) else None
 
     def simulate(self, x: Array) -> Array:
-        pairs = zip(self.parts, self._places, strict=True)
-        return np.concatenate([part.simulate(x[:, places]) for part, places in pairs], axis=1)
+        return np.concatenate(self._of_parts("simulate", x), axis=1)
 
     def jacobian(self, x: Array) -> Array:
-        J = np.zeros((len(x), self.m, self.n))
-        for part, places, start in zip(self.parts, self._places, self._starts, strict=False):
-            J[:, start : start + part.m, places] = part.jacobian(x[:, places])
-        return J
+        return self._placed(self._of_parts("jacobian", x))
+
+    def coarse_jacobian(self, x: Array) -> Array:
+        return self._placed(self._of_parts("coarse_jacobian", x))
 
     def linearization(self) -> Array:
-        H = np.zeros((self.m, self.n))
-        for part, places, start in zip(self.parts, self._places, self._starts, strict=False):
-            H[start : start + part.m, places] = part.linearization()
-        return H
+        return self._placed([part.linearization()[None] for part in self.parts])[0]
+
+    def _placed(self, slopes: Sequence[Array]) -> Array:
+        """The slopes (trials, m, n) of the parts in one matrix, zero where a part has not the parameter."""
+        J = np.zeros((len(slopes[0]), self.m, self.n))
+        for slope, places, start in zip(slopes, self._places, self._starts, strict=False):
+            J[:, start : start + slope.shape[1], places] = slope
+        return J
+
+    @property
+    def jacobian_cost(self) -> float:
+        """The mean of the parts, whose simulations are taken to cost alike."""
+        return float(np.mean([part.jacobian_cost for part in self.parts]))
+
+    @property
+    def coarse_jacobian_cost(self) -> float:
+        return float(np.mean([part.coarse_jacobian_cost for part in self.parts]))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.base import Measurement, Parameter, Recorded, WrappedModel, of_whole
+from ipe_bench.measurements.base import Measurement, Parameter, Recorded, WrappedModel
 from ipe_bench.measurements.joint import Joint
 
 _NEAR = 1e-2
@@ -51,7 +51,7 @@ class ParameterInfo:
         bounds = self.bounds
         if not bounds[0] < bounds[1]:
             raise UserError(f"upper={self.upper}: give a number above lower={bounds[0]:g}")
-        others = [k for k in ("nominal", "deviation", "lower", "upper") if getattr(self, k) is not None]
+        others = [key for key in ("nominal", "deviation", "lower", "upper") if getattr(self, key) is not None]
         if self.fixed is not None and (others or self.positive):
             raise UserError(f"fixed={self.fixed}: a fixed parameter has no {(others or ['bounds'])[0]}; leave one out")
 
@@ -76,23 +76,17 @@ def informed(model: Measurement, known: Sequence[ParameterInfo]) -> Measurement:
 
 
 def _of_each_file(known: Sequence[ParameterInfo], model: Joint) -> list[ParameterInfo]:
-    """What is known of parameters by the names that they have among those of all files."""
-    general = [one for one in known if one.name in model.copies]
-    found = {name: replace(one, name=name) for one in general for name in model.copies[one.name]}
-    for one in known:
-        if one.name in found:
-            found[one.name] = _together(found[one.name], one)
-        elif one.name not in model.copies:
-            found[one.name] = one
+    """What is known of parameters by the names that they have among those of all files; a file's own counts."""
+    found: dict[str, ParameterInfo] = {}
+    for general in (one for one in known if one.name in model.copies):
+        found |= {name: replace(general, name=name) for name in model.copies[general.name]}
+    for one in (one for one in known if one.name not in model.copies):
+        general = found.get(one.name)
+        if general is not None and one.fixed is None and general.fixed is None:
+            said = {f.name: getattr(one, f.name) for f in fields(one) if getattr(one, f.name) not in (None, False)}
+            one = replace(general, **said)
+        found[one.name] = one
     return list(found.values())
-
-
-def _together(general: ParameterInfo, own: ParameterInfo) -> ParameterInfo:
-    """What is known of a parameter of one file, where something is known of all: its own counts."""
-    if own.fixed is not None or general.fixed is not None:
-        return own
-    said = {f.name: getattr(own, f.name) for f in fields(own) if getattr(own, f.name) not in (None, False)}
-    return replace(general, **said)
 
 
 @dataclass(frozen=True)
@@ -104,16 +98,10 @@ class ConstrainedModel(WrappedModel):
     size is such that one unit of x moves v by as much at v0 as before.
     """
 
+    whole: Measurement
     known: tuple[ParameterInfo, ...]
 
-    nuisance_deviation = of_whole("nuisance_deviation")
-    inputs = of_whole("inputs")
-    input_columns = of_whole("input_columns")
-    input_columns_known = of_whole("input_columns_known")
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        return self.whole.name
+    by_differential_equations = False  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -121,11 +109,10 @@ class ConstrainedModel(WrappedModel):
         for one in self.known:
             if one.name not in names:
                 raise UserError(f"parameters.{one.name}: {unknown(one.name, names, 'parameter')}")
-        for name, v0, (lower, upper) in zip(names, self._v0, self._bounds, strict=True):
-            if not lower < v0 < upper:
-                raise UserError(
-                    f"parameters.{name}: its start, {v0:g}, is not inside of its bounds; give parameters.{name}.nominal"
-                )
+        for one, v0 in zip(self._known, self._v0, strict=True):
+            if not one.bounds[0] < v0 < one.bounds[1]:
+                key = f"parameters.{one.name}"
+                raise UserError(f"{key}: its start, {v0:g}, is not inside of its bounds; give {key}.nominal")
         if not len(self._free):
             raise UserError("parameters: all are fixed; leave at least one to be estimated")
 
@@ -140,10 +127,6 @@ class ConstrainedModel(WrappedModel):
         return np.flatnonzero([one.fixed is None for one in self._known])
 
     @cached_property
-    def _bounds(self) -> tuple[tuple[float, float], ...]:
-        return tuple(one.bounds for one in self._known)
-
-    @cached_property
     def _v0(self) -> Array:
         """Starts and fixed values of all parameters, in their units."""
         starts = self.whole.nominal * self.whole.sizes
@@ -153,9 +136,10 @@ class ConstrainedModel(WrappedModel):
     @cached_property
     def _transformed(self) -> tuple[_Transformation, ...]:
         """Of the parameters that are left."""
-        whole = zip(self._v0, self._bounds, self.whole.sizes, strict=True)
-        each = [_Transformation(float(v0), *bounds, float(size)) for v0, bounds, size in whole]
-        return tuple(each[i] for i in self._free)
+        sizes = self.whole.sizes
+        return tuple(
+            _Transformation(float(self._v0[i]), self._known[i].bounds, float(sizes[i])) for i in self._free.tolist()
+        )
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -189,13 +173,18 @@ class ConstrainedModel(WrappedModel):
     def physical_slope(self, x: Array) -> Array:
         return np.stack([t.slope(x[:, k]) for k, t in enumerate(self._transformed)], axis=1)
 
+    def inner(self, values: Array) -> Array:
+        """x (trials, n) of values (trials, n) in the parameters' own units."""
+        return np.stack([t.inner(values[:, k]) for k, t in enumerate(self._transformed)], axis=1)
+
     def near_bounds(self, x: Array) -> dict[int, float]:
-        found = {}
-        for k, (t, v) in enumerate(zip(self._transformed, self.physical(x[None])[0], strict=True)):
-            for bound in (t.lower, t.upper):
-                if abs(v - bound) <= _NEAR * abs(t.v0 - bound) < np.inf:
-                    found[k] = bound
-        return found
+        values = self.physical(x[None])[0]
+        return {
+            k: bound
+            for k, (t, v) in enumerate(zip(self._transformed, values, strict=True))
+            for bound in (t.lower, t.upper)
+            if abs(v - bound) <= _NEAR * abs(t.v0 - bound) < np.inf
+        }
 
     def fixed_at(self, values: Mapping[int, float]) -> Measurement:
         return self._with(ParameterInfo(self.physical_parameters[k].name, fixed=value) for k, value in values.items())
@@ -208,54 +197,25 @@ class ConstrainedModel(WrappedModel):
         given = {one.name: one for one in (*self.known, *known)}
         return replace(self, known=tuple(given.values()))
 
-    def inner(self, values: Array) -> Array:
-        """x (trials, n) of values (trials, n) in the parameters' own units."""
-        return np.stack([t.inner(values[:, k]) for k, t in enumerate(self._transformed)], axis=1)
-
-    def _whole_x(self, x: Array) -> Array:
-        """x of the whole model; what comes behind the parameters, a truth's nuisances, stays there."""
+    def whole_x(self, x: Array) -> Array:
+        """What comes behind the parameters, a truth's nuisances, stays there."""
         n, sizes = self.n, self.whole.sizes
         whole = np.repeat((self._v0 / sizes)[None], len(x), axis=0).astype(x.dtype)
         for k, (i, t) in enumerate(zip(self._free, self._transformed, strict=True)):
             whole[:, i] = x[:, k] if t.plain else t.value(x[:, k]) / sizes[i]
         return whole if x.shape[1] == n else np.concatenate([whole, x[:, n:]], axis=1)
 
-    def _slopes(self, x: Array) -> Array:
-        """The derivative (trials, 1, n) of the whole model's x by x."""
+    def own_jacobian(self, x: Array, J: Array) -> Array:
         slopes = [
             np.ones(len(x)) if t.plain else t.slope(x[:, k]) / self.whole.sizes[i]
             for k, (i, t) in enumerate(zip(self._free, self._transformed, strict=True))
         ]
-        return np.stack(slopes, axis=1)[:, None]
-
-    def simulate(self, x: Array) -> Array:
-        return self.whole.simulate(self._whole_x(x))
-
-    def jacobian(self, x: Array) -> Array:
-        return self.whole.jacobian(self._whole_x(x))[:, :, self._free] * self._slopes(x)
-
-    def simulate_until(self, x: Array, stop: int) -> Array:
-        return self.whole.simulate_until(self._whole_x(x), stop)
-
-    def coarse_simulate_until(self, x: Array, stop: int) -> Array:
-        return self.whole.coarse_simulate_until(self._whole_x(x), stop)
-
-    def jacobian_until(self, x: Array, stop: int) -> Array:
-        return self.whole.jacobian_until(self._whole_x(x), stop)[:, :, self._free] * self._slopes(x)
+        return J[:, :, self._free] * np.stack(slopes, axis=1)[:, None]
 
     def linearization(self) -> Array:
         if np.array_equal(self._v0, self.whole.nominal * self.whole.sizes):
-            return self.whole.linearization()[:, self._free] * self._slopes(self.nominal[None])[0]
+            return super().linearization()
         return self.jacobian(self.nominal[None])[0]
-
-    def hindrance(self, x: Array) -> str:
-        return self.whole.hindrance(self._whole_x(x[None])[0])
-
-    def absent_input(self, heading: str, columns: Sequence[str]) -> str:
-        return self.whole.absent_input(heading, columns)
-
-    def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
-        return replace(self, whole=self.whole.with_inputs(columns, readings))
 
     @property
     def recorded(self) -> Recorded | None:
@@ -273,9 +233,11 @@ class _Transformation:
     """From a multiple x of `inner_size` to a value inside of its bounds."""
 
     v0: float
-    lower: float
-    upper: float
+    bounds: tuple[float, float]
     size: float
+
+    lower = property(lambda t: t.bounds[0])
+    upper = property(lambda t: t.bounds[1])
 
     @property
     def plain(self) -> bool:
@@ -318,11 +280,7 @@ class _Transformation:
 
     def slope(self, x: Any) -> Any:
         """dv/dx."""
-        if self.plain:
-            return np.full(np.shape(x), self.size)
-        return self._slope_at(self.value(x)) * self.inner_size
+        return np.full(np.shape(x), self.size) if self.plain else self._slope_at(self.value(x)) * self.inner_size
 
     def inner(self, v: Any) -> Any:
-        if self.plain:
-            return v / self.size
-        return (self._coordinate(v) - self._coordinate(self.v0)) / self.inner_size
+        return v / self.size if self.plain else (self._coordinate(v) - self._coordinate(self.v0)) / self.inner_size

@@ -20,6 +20,8 @@ SENSORS = ("ax", "ay", "az", "gx", "gy", "gz")
 _FORCE, _RATE = [f"f{a} [m/s^2]" for a in "xyz"], [f"w{a} [deg/s]" for a in "xyz"]
 _ANGLES = ("yz", "zy", "xz", "zx", "xy", "yx")
 _GROUPS = ("bias", "scale factor", "misalignment")
+_BIAS_SIZE, _SCALE_SIZE, _MISALIGNMENT_SIZE = 50.0, 0.02, 0.01
+"""One unit of error: of a bias in counts, of a scale factor as a fraction of it, of an angle in rad."""
 
 Vector = tuple[float, float, float]
 
@@ -65,12 +67,6 @@ class SixPosition(Measurement):
         *(0.0076, 0.0076, 0.0076),
     )
     """Presumed scale factors in m/s^2 per count, and in deg/s per count."""
-    bias_size: Positive = 50.0
-    """What one unit of error of a bias is, in counts."""
-    scale_size: Positive = 0.02
-    """What one unit of error of a scale factor is, as a fraction of it."""
-    misalignment_size: Positive = 0.01
-    """What one unit of error of an angle is, in rad."""
 
     analytic = True
     reading_unit = "counts"
@@ -92,9 +88,9 @@ class SixPosition(Measurement):
     def _parameters(self) -> Iterator[Parameter]:
         for kind, triad in (("a", "accelerometer"), ("g", "gyro")):
             bias, scale, angle = (f"{triad} {group}" for group in _GROUPS)
-            yield from (Parameter(f"b{kind}{a}", "counts", self.bias_size, bias) for a in "xyz")
-            yield from (Parameter(f"k{kind}{a}", "ppm", 1e6 * self.scale_size, scale) for a in "xyz")
-            yield from (Parameter(f"{kind}{pair}", "mrad", 1e3 * self.misalignment_size, angle) for pair in _ANGLES)
+            yield from (Parameter(f"b{kind}{a}", "counts", _BIAS_SIZE, bias) for a in "xyz")
+            yield from (Parameter(f"k{kind}{a}", "ppm", 1e6 * _SCALE_SIZE, scale) for a in "xyz")
+            yield from (Parameter(f"{kind}{pair}", "mrad", 1e3 * _MISALIGNMENT_SIZE, angle) for pair in _ANGLES)
 
     @cached_property
     def nominal(self) -> Array:

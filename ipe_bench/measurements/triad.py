@@ -21,6 +21,8 @@ from ipe_bench.basics.options import Positive
 from ipe_bench.measurements.base import Input, Measurement, Parameter, UsualNoise
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
+_BIAS_SIZE, _SCALE_SIZE, _MISALIGNMENT_SIZE = 2e-3, 2e-3, 2e-3
+"""One unit of error: of a bias in multiples of the field, of a scale factor, of a misalignment in rad."""
 
 
 def attitudes() -> Array:
@@ -101,12 +103,6 @@ class Triad(Magnitudes):
     field: Positive = 1.0
     """The magnitude about which sizes are chosen, in `unit`."""
     unit: str = "g"
-    bias_size: Positive = 2e-3
-    """What one unit of error of a bias is, as a fraction of `field`."""
-    scale_size: Positive = 2e-3
-    """What one unit of error of a scale factor is."""
-    misalignment_size: Positive = 2e-3
-    """What one unit of error of a misalignment is, in rad."""
     bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The presumed bias in `unit`; with the two that follow, the nominal point."""
     scale: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -125,9 +121,9 @@ class Triad(Magnitudes):
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         return (
-            *(Parameter(f"b{a}", self.unit, self.bias_size * self.field, "bias") for a in "xyz"),
-            *(Parameter(f"k{a}", "ppm", 1e6 * self.scale_size, "scale factor") for a in "xyz"),
-            *(Parameter(f"m{a}", "mrad", 1e3 * self.misalignment_size, "misalignment") for a in ("xy", "xz", "yz")),
+            *(Parameter(f"b{a}", self.unit, _BIAS_SIZE * self.field, "bias") for a in "xyz"),
+            *(Parameter(f"k{a}", "ppm", 1e6 * _SCALE_SIZE, "scale factor") for a in "xyz"),
+            *(Parameter(f"m{a}", "mrad", 1e3 * _MISALIGNMENT_SIZE, "misalignment") for a in ("xy", "xz", "yz")),
         )
 
     @cached_property

@@ -17,11 +17,10 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, estimate_safely
 from ipe_bench.estimators.ipe import IPE, State, begin
+from ipe_bench.measurements import Polynomial, Sir
 from ipe_bench.measurements.base import Measurement, differentiate
 from ipe_bench.measurements.counted import cost
-from ipe_bench.measurements.polynomial import Polynomial
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.measurements.sir import Sir
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.gaussian import Gaussian
 from ipe_bench.noise.own import ModelNoise

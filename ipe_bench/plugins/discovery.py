@@ -23,6 +23,7 @@ from typing import Any
 import yaml
 
 from ipe_bench.basics.errors import UserError, describe_exception, unknown
+from ipe_bench.basics.files import own_conf
 
 ENTRY_POINTS = "ipe_bench.plugins"
 ESTIMATOR_GROUPS = ("solver", "baseline")
@@ -235,15 +236,6 @@ def explain_yaml(error: Any, path: Path | None = None) -> str:
         where += f", line {mark.line + 1}"
     what = getattr(error, "problem", None) or getattr(error, "reason", None) or describe_exception(error)
     return f"{where}: is not YAML that can be read ({what})"
-
-
-def own_conf() -> Path:
-    """The folder of our configs: inside the installed package, or beside it in a checkout."""
-    package = Path(__file__).resolve().parents[1]
-    for folder in (package / "conf", package.parent / "conf"):
-        if (folder / "config.yaml").is_file():
-            return folder
-    raise FileNotFoundError("the configs of ipe-bench are neither in the package nor beside it; install it again")
 
 
 _added: dict[Path, None] = {}

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from ipe_bench.basics.linalg import Array, Covariance
-from ipe_bench.measurements.base import WrappedModel
+from ipe_bench.measurements.base import Measurement, WrappedModel
 from ipe_bench.measurements.problem import Problem
 
 
@@ -24,7 +24,10 @@ from ipe_bench.measurements.problem import Problem
 class Penalised(WrappedModel):
     """The readings of a model, and behind them x itself, which its prior has measured."""
 
-    epochs = None
+    whole: Measurement
+
+    epochs = recorded = None
+    linearization = Measurement.linearization
 
     def __post_init__(self) -> None:
         """Made of a model that has been checked."""
@@ -45,12 +48,12 @@ class Penalised(WrappedModel):
         """None: an estimate with a prior is not held on a bound."""
         return {}
 
-    def simulate(self, x: Array) -> Array:
-        return np.concatenate([self.whole.simulate(x), x], axis=1)
+    def own_readings(self, x: Array, z: Array) -> Array:
+        return np.concatenate([z, x], axis=1)
 
-    def jacobian(self, x: Array) -> Array:
+    def own_jacobian(self, x: Array, J: Array) -> Array:
         n = x.shape[1]
-        return np.concatenate([self.whole.jacobian(x), np.broadcast_to(np.eye(n), (len(x), n, n))], axis=1)
+        return np.concatenate([J, np.broadcast_to(np.eye(n), (len(x), n, n))], axis=1)
 
 
 def penalised(problem: Problem, z: Array, inflation: float) -> tuple[Problem, Array]:

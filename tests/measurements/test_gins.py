@@ -10,7 +10,7 @@ from scipy.integrate import DOP853, solve_ivp
 
 from ipe_bench.measurements import Gins
 from ipe_bench.measurements.base import SubsetModel
-from ipe_bench.measurements.ode.levels import Search
+from ipe_bench.measurements.ode.steps import Search
 from ipe_bench.noise import Quantization
 from ipe_bench.trials.scenario import Scenario
 

@@ -10,8 +10,8 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import OdeMeasurement, Parameter, Polynomial, ode
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode import tableau
-from ipe_bench.measurements.ode.coarse import contraction
-from ipe_bench.measurements.ode.levels import coarser, ladder
+from ipe_bench.measurements.ode.model import steps_between
+from ipe_bench.measurements.ode.steps import coarser, contraction, ladder
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def test_the_solution_is_of_eighth_order():
     assert ((orders > 7.5) & (orders < 9.5)).all()
 
 
-@pytest.mark.parametrize("model", [Pulse(0.5), Cases(0.5)])
+@pytest.mark.parametrize("model", [Pulse(0.5), Cases(0.5), Cases(0.7)], ids=str)
 def test_readings_and_jacobian_are_those_of_a_plain_loop_with_the_same_coefficients(model):
     rng = np.random.default_rng(1)
     x = rng.normal(size=(3, 2))
@@ -101,6 +101,28 @@ def test_readings_and_jacobian_are_those_of_a_plain_loop_with_the_same_coefficie
         for j, direction in enumerate(np.eye(2)):
             exact = np.imag(rk8(model, row + 1e-100j * direction, model.step)) / 1e-100
             np.testing.assert_allclose(slope[:, j], exact, rtol=1e-11, atol=1e-13)
+
+
+@pytest.mark.parametrize("cases", [1, 4, 5, 9])
+def test_few_lanes_and_many_have_the_same_bits(cases):
+    """Up to four lanes advance in half a vector."""
+
+    class Several(Pulse):
+        @property
+        def cases(self):
+            return np.zeros((cases, 0))
+
+    x = np.random.default_rng(5).normal(size=(3, 2))
+    for method in ("simulate", "jacobian"):
+        whole = getattr(Several(0.7), method)(x)
+        np.testing.assert_array_equal(np.split(whole, cases, axis=1), cases * [getattr(Pulse(0.7), method)(x)])
+        np.testing.assert_array_equal(whole[:1], getattr(Several(0.7), method)(x[:1]))
+
+
+def test_a_fixed_step_is_the_longest_there_is_and_divides_each_interval_evenly():
+    model = Pulse(1.3)
+    assert steps_between(np.array([0.5, 0.5, 4.2, 6.0, 8.6]), 1.3).tolist() == [1, 0, 3, 2, 2]
+    np.testing.assert_array_equal(model._common_steps(np.ones((1, 2))), [1, 3, 2])
 
 
 def test_the_jacobian_agrees_with_differences():
@@ -157,6 +179,18 @@ def test_steps_that_follow_the_parameters_hold_the_tolerance_of_each_output():
     assert off[..., 0].max() < 1e-9
     assert off[..., 1].max() < 1e-6
     assert len(set(model._search(x, np.zeros(12)).places.tolist())) >= 3
+
+
+@pytest.mark.parametrize("column", [0, 1])
+def test_trials_that_share_all_parameters_but_one_have_levels_of_their_own(column):
+    x = np.repeat([[0.3, 0.5]], 12, axis=0)
+    x[:, column] = np.linspace(-6.0, 6.0, 12) if column == 0 else np.geomspace(1e-7, 1e4, 12)
+    model = Chosen()
+    z = np.concatenate([model.simulate(row[None]) for row in x])
+    np.testing.assert_array_equal(z, np.concatenate([Chosen().simulate(row[None]) for row in x]))
+    places = model._search(x, np.zeros(12)).places
+    assert len(set(places.tolist())) > 1
+    np.testing.assert_array_equal(places, Chosen()._search(x, np.zeros(12)).places)
 
 
 def test_a_trial_that_is_not_a_number_does_not_move_where_the_others_begin():

@@ -18,8 +18,8 @@ from ipe_bench.basics import compiled
 from ipe_bench.measurements import LotkaVolterra, Ode, OdeMeasurement, Parameter, SubsetModel
 from ipe_bench.measurements.joint import Joint
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
-from ipe_bench.measurements.ode.coarse import contraction
 from ipe_bench.measurements.ode.interval import Interval
+from ipe_bench.measurements.ode.steps import contraction
 from ipe_bench.measurements.ode.tableau import DOP853
 
 BATCHES = (1, 7, 8, 9, 64, 250)
@@ -412,7 +412,7 @@ def test_equations_that_are_drawn_are_solved_as_a_plain_loop_solves_them_in_many
 
 def test_a_reading_at_the_start_is_the_state_at_the_start():
     model = Ode({"y": "-k*y"}, {"k": 0.25, "y0": 2.0}, {"y": "y0"}, times=(0.0, 1.0, 2.0, 3.0))
-    hares = LotkaVolterra(sampled=(0.0, 1.0, 2.0))
+    hares = LotkaVolterra(times=(0.0, 1.0, 2.0))
     for scale in (1.0, 3.0, 0.5, 1.0):
         x = np.array([[scale, 1.0], [1.0, scale]])
         t, k, y0 = np.arange(4.0), 0.25 * x[:, :1], 2.0 * x[:, 1:]

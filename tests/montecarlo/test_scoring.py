@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from small_models import Bent
+from small_models import Bent, bock
 from synthetic_store import Repeated
 
 import ipe_bench as ib
@@ -16,7 +16,6 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import information, inverse
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
-from ipe_bench.measurements import Bock
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.statistics import analyse
@@ -58,7 +57,7 @@ def test_a_matrix_that_is_no_covariance_covers_nothing():
 @pytest.mark.parametrize("mu", [2.0, 20.0])
 def test_bounds_of_ill_conditioned_models_are_those_of_their_singular_values(mu):
     """Bock's equations at mu = 20: singular values from 1e10 to .2, of which J'J keeps the largest alone."""
-    block = Block.draw(Scenario(Bock(mu=mu, initial=True), Gaussian(0.05)), 0, 5)
+    block = Block.draw(Scenario(bock(mu), Gaussian(0.05)), 0, 5)
     J, columns = block.problem.R.whiten_jacobian(block.jacobian), block.truth_columns()
     prior = np.diag(1 / np.asarray(block.problem.prior_deviation))
     below = np.concatenate([J, np.broadcast_to(prior, (5, 3, 3))], axis=1)

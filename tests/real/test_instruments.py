@@ -225,7 +225,7 @@ def test_a_satellite_file_brings_its_own_sky(tmp_path):
 
 def test_an_epidemic_is_read_when_its_file_says(tmp_path):
     times = (0.7, 2.25, 3.0, 5.5, 9.0, 12.125)
-    truth = Sir(sampled=times)
+    truth = Sir(times=times)
     x = np.array([[0.5, -0.3, 0.2]])
     write_readings(tmp_path / "s.csv", truth, truth.simulate(x)[0])
     lines = (tmp_path / "s.csv").read_text().splitlines()

@@ -291,7 +291,7 @@ def files_of_models() -> Iterator[Case]:
         model=Sir(),
     )
     yield Case("an unknown output", written(Sir(), replaced(3, "infected", "healed")), "output=healed", model=Sir())
-    yield Case("a second epidemic", written(Sir(), replaced(3, "1,", "2,")), "case=2: there are 1 cases", model=Sir())
+    yield Case("no first epidemic", written(Sir(), replaced(3, "1,", "3,")), "case=3: cases are numbered", model=Sir())
     yield Case(
         "half an epoch",
         written(Gnss(), replaced(2, "1,", "1.5,")),

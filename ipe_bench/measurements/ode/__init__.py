@@ -37,5 +37,6 @@ share the parameters and differ in constants c, and `si_sizes` the sizes of para
 
 The method is of eighth order. Each trial's step follows from its own parameters: it is halved until half the step shows
 that the readings hold `tolerance`, and the Jacobian uses the same. `step` fixes it for all trials instead, and
-`fastest_rate` may say where the search begins. `lotka_volterra` is a small model of this kind, `gins` a large one.
+`fastest_rate` may say where the search begins. `gins` is a large model of this kind; small ones need
+no Python: see `described`.
 """

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array
-from ipe_bench.basics.options import Positive
+from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.files import own_conf
+from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.options import Count, Positive
 from ipe_bench.measurements.arithmetic import Arithmetic, read, require_finite, require_parameters
-from ipe_bench.measurements.base import Input, Measurement, Parameter
-from ipe_bench.measurements.ode import sampling
-from ipe_bench.measurements.ode.model import OdeMeasurement
+from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, SubsetModel, UsualNoise, WrappedModel
+from ipe_bench.measurements.ode.model import OdeMeasurement, time_heading
 
 _SHARE = 1e-8
 """Of the largest reading, what the integration may leave unless told otherwise."""
@@ -28,7 +28,7 @@ _COLUMNS = ("case", "time", "output", "reading", "sigma")
 
 
 @dataclass(frozen=True)
-class Ode(Measurement):
+class Ode(WrappedModel):
     """Readings of the solution of differential equations, each a formula of the states, the parameters and t.
 
         states prey and predators with
@@ -37,9 +37,9 @@ class Ode(Measurement):
         outputs  prey: prey
         start    a: 0.5  b: 0.03  c: 0.8  d: 0.02  y0: 6
 
-    A parameter is a name with a start; it has no unit but that which the formulas give it, and its size is the
-    magnitude of its start. `initial` may hold parameters and constants, but neither states nor t; a state that is
-    absent there starts at 0.
+    A parameter is a name with a start; unless told otherwise its size is the magnitude of its start, and it has no unit
+    but that which the formulas give it. `initial` may hold parameters and constants, but neither states nor t; a state
+    that is absent there starts at 0.
     Every other name is a constant of a case, such as a dose, a temperature or an initial state: cases are experiments
     that share the parameters. A readings file has the columns time, reading, one for every such constant, with several
     cases `case` (1, 2, ...), and with several outputs `output`.
@@ -55,8 +55,9 @@ class Ode(Measurement):
     """What is read at each time; none: every state."""
     times: tuple[float, ...] = ()
     """When it is read; a readings file brings its own."""
-    tolerance: Positive | None = None
-    """The error that the integration may leave in a reading; None: 1e-8 of the largest reading at the start."""
+    tolerance: Positive | str | None = None
+    """The error that the integration may leave in a reading, a number or a formula of t and the constants; None: 1e-8
+    of the largest reading at the start."""
     step: Positive | None = None
     """A longest integration step for all, in place of the tolerance."""
     unit: str = ""
@@ -66,6 +67,24 @@ class Ode(Measurement):
     """Parameters of which every file of readings has its own, where there are several."""
     constants: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
     """What is known of each case: a number for each, or one for all; a readings file brings its own."""
+    size: Mapping[str, float] = field(default_factory=dict)
+    """What one unit of error of a parameter is; where absent, the magnitude of its start."""
+    units: Mapping[str, str] = field(default_factory=dict)
+    """Of the parameters."""
+    readings: Count | None = None
+    """Number of times at equal intervals, where `times` are not given."""
+    interval: Positive = 1.0
+    """Between these times."""
+    deviation: Positive | None = None
+    """The usual standard deviation of a reading."""
+    answer: Mapping[str, float] = field(default_factory=dict)
+    """Parameters of which the readings are known exactly, for noise=certified,"""
+    exact: Mapping[str, str] = field(default_factory=dict)
+    """and these readings, for every output a formula of t, the parameters and the constants."""
+    title: str = "ode"
+    """The name of the model in tables."""
+
+    name = property(lambda model: model.title)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -86,10 +105,20 @@ class Ode(Measurement):
         for name in self.start:
             if name not in used:
                 raise UserError(f"start.{name}: appears in no formula")
+        for key, given in (("size", self.size), ("units", self.units), ("answer", self.answer)):
+            require_parameters(key, tuple(given), self.start)
         if not self.start:
             raise UserError("start: is empty, so nothing is to be estimated; give each parameter a start")
         if any(time < 0 for time in self.times) or any(b <= a for a, b in itertools.pairwise(self.times)):
             raise UserError(f"times={list(self.times)}: give ascending numbers from 0 on")
+        if isinstance(self.tolerance, str):
+            for name in read(self.tolerance, "tolerance").names:
+                if name != "t" and name not in self._constants:
+                    raise UserError(f"tolerance: {name} is neither a constant nor t")
+        if (self.answer or self.exact) and not (
+            set(self.answer) == set(self.start) and set(self.exact) == set(self._outputs)
+        ):
+            raise UserError("answer: give all parameters, and in exact a formula for every output")
         require_parameters("own", self.own, self.start)
         self._check_constants()
 
@@ -147,42 +176,42 @@ class Ode(Measurement):
         return {name: read(str(text), f"outputs.{name}") for name, text in shown.items()}
 
     @cached_property
-    def engine(self) -> OdeMeasurement:
+    def whole(self) -> OdeMeasurement:  # type: ignore[override]
         """The equations as the integrator takes them."""
-        if not self.times:
-            raise UserError("measurement.times: is empty; give the times of the readings, or readings=FILE")
-        _ = self.cases
         return _Engine(self)
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        return tuple(Parameter(name, size=abs(float(value)) or 1.0) for name, value in self.start.items())
+        sizes = {name: abs(float(value)) or 1.0 for name, value in self.start.items()} | dict(self.size)
+        return tuple(Parameter(name, self.units.get(name, ""), float(sizes[name])) for name in self.start)
 
     @cached_property
     def nominal(self) -> Array:
-        return np.sign([float(value) for value in self.start.values()])
+        return np.array([float(value) for value in self.start.values()]) / self.sizes
 
     @property
     def reading_unit(self) -> str:  # type: ignore[override]
         return self.unit
 
     @property
+    def usual_noise(self) -> UsualNoise | None:  # type: ignore[override]
+        return None if self.deviation is None else UsualNoise(self.deviation)
+
+    @property
     def own_parameters(self) -> tuple[str, ...]:
         return self.own
-
-    @property
-    def index(self) -> Mapping[str, Sequence[Any]]:
-        return self.engine.index
-
-    @property
-    def epochs(self) -> tuple[NDArray[np.intp], ...] | None:
-        return self.engine.epochs
 
     @property
     def inputs(self) -> tuple[Input, ...]:
         stated = {name: values for name, values in self.constants.items() if not isinstance(values, tuple | list)}
         constants = (Input(name, default=stated.get(name)) for name in self._constants)
-        return *sampling.inputs(self.time_unit, tuple(self._outputs), 1), *constants
+        outputs = tuple(self._outputs)
+        return (
+            Input("case", int, label=True, default=1),
+            Input(time_heading(self.time_unit)),
+            Input("output", str, label=True, default=outputs[0] if len(outputs) == 1 else None),
+            *constants,
+        )
 
     @property
     def input_columns(self) -> Mapping[str, Sequence[Any]]:
@@ -191,11 +220,11 @@ class Ode(Measurement):
 
     @property
     def input_columns_known(self) -> bool:
-        return bool(self.times) and all(name in self.constants for name in self._constants)
+        return bool(self.times or self.readings) and all(name in self.constants for name in self._constants)
 
     def absent_input(self, heading: str, columns: Sequence[str]) -> str:
         if heading not in self._constants:
-            return super().absent_input(heading, columns)
+            return Measurement.absent_input(self, heading, columns)
         return (
             f"there are {', '.join(columns)}. If {heading} is a parameter, give it a start: "
             f"measurement.start.{heading}=VALUE; if it is the same in all cases, measurement.constants.{heading}=VALUE"
@@ -203,25 +232,42 @@ class Ode(Measurement):
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
         del readings
-        count = sampling.cases(columns["case"]) if self._constants else 1
-        constants = {name: sampling.of_cases(name, columns[name], columns["case"], count) for name in self._constants}
-        whole = replace(self, constants=constants)
-        return sampling.sampled(columns, tuple(self._outputs), count, lambda times: replace(whole, times=times))
+        count = _cases(columns["case"]) if self._constants else 1
+        constants = {name: _of_cases(name, columns[name], columns["case"], count) for name in self._constants}
+        outputs, heading = list(self._outputs), time_heading(self.time_unit)
+        rows = list(zip(columns["case"], map(float, columns[heading]), columns["output"], strict=True))
+        seen: set[tuple[Any, ...]] = set()
+        for case, time, output in rows:
+            if output not in outputs:
+                raise UserError(f"output={output}: {unknown(str(output), outputs, 'output')}")
+            if not 1 <= case <= count:
+                raise UserError(f"case={case}: there are {count} cases")
+            if time < 0:
+                raise UserError(f"{heading}={time}: comes before the start, which is at 0")
+            if (case, time, output) in seen:
+                raise UserError(f"case={case}, {heading}={time}, output={output} stands there twice; keep one of them")
+            seen.add((case, time, output))
+        times = sorted({time for _, time, _ in rows})
+        whole = replace(self, constants=constants, times=tuple(times))
+        place = {time: k for k, time in enumerate(times)}
+        kept = [((case - 1) * len(times) + place[t]) * len(outputs) + outputs.index(o) for case, t, o in rows]
+        return whole if kept == list(range(whole.m)) else SubsetModel(whole, tuple(kept))
 
-    def simulate(self, x: Array) -> Array:
-        return self.engine.simulate(x)
+    @property
+    def recorded(self) -> Recorded | None:
+        """The exact readings of the answer."""
+        if not self.answer or self.deviation is None:
+            return None
+        formulas = [read(self.exact[name], f"exact.{name}") for name in self._outputs]
+        z = np.concatenate([[formula({**self.answer, **known}) for formula in formulas] for known in self.known])
+        x = np.array([self.answer[name] for name in self.start]) / self.sizes
+        return Recorded(z, Covariance(np.full(self.m, self.deviation)), x)
 
-    def hindrance(self, x: Array) -> str:
-        return self.engine.hindrance(x)
-
-    def jacobian(self, x: Array) -> Array:
-        return self.engine.jacobian(x)
-
-    def simulate_until(self, x: Array, stop: int) -> Array:
-        return self.engine.simulate_until(x, stop)
-
-    def jacobian_until(self, x: Array, stop: int) -> Array:
-        return self.engine.jacobian_until(x, stop)
+    @cached_property
+    def known(self) -> list[dict[str, float]]:
+        """The constants and t at each time of each case."""
+        constants = [dict(zip(self._constants, case.tolist(), strict=True)) for case in self.cases]
+        return [{**known, "t": t} for known in constants for t in self.whole.times.tolist()]
 
 
 @dataclass(frozen=True)
@@ -230,46 +276,38 @@ class _Engine(OdeMeasurement):
 
     described: Ode
 
-    @property
-    def states(self) -> int:  # type: ignore[override]
-        return len(self.described.rates)
-
-    @property
-    def outputs(self) -> tuple[str, ...]:  # type: ignore[override]
-        return tuple(self.described._outputs)
-
-    @property
-    def time_unit(self) -> str:  # type: ignore[override]
-        return self.described.time_unit
-
-    @property
-    def step(self) -> float | None:  # type: ignore[override]
-        return self.described.step
-
-    @cached_property
-    def tolerance(self) -> float:  # type: ignore[override]
-        if self.described.tolerance is not None:
-            return self.described.tolerance
-        intervals = np.diff(self.times, prepend=0.0)
-        trial = replace(self.described, step=float(intervals[intervals > 0].min()) / _TRIAL_STEPS)
-        largest = float(np.abs(trial.engine.simulate(self.nominal[None])).max())
-        return _SHARE * largest if 0 < largest < np.inf else _SHARE
-
-    @property
-    def cases(self) -> Array:
-        return self.described.cases
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return self.described.parameters
-
-    @property
-    def nominal(self) -> Array:
-        return self.described.nominal
+    states = property(lambda engine: len(engine.described.rates))  # type: ignore[assignment]
+    outputs = property(lambda engine: tuple(engine.described._outputs))  # type: ignore[assignment]
+    time_unit = property(lambda engine: engine.described.time_unit)  # type: ignore[assignment]
+    step = property(lambda engine: engine.described.step)  # type: ignore[assignment]
+    cases = property(lambda engine: engine.described.cases)  # type: ignore[assignment]
+    parameters = property(lambda engine: engine.described.parameters)  # type: ignore[assignment]
+    nominal = property(lambda engine: engine.described.nominal)  # type: ignore[assignment]
 
     @cached_property
     def times(self) -> Array:
-        return np.asarray(self.described.times)
+        described = self.described
+        if not (described.times or described.readings):
+            raise UserError("measurement.times: is empty; give the times of the readings, or readings=FILE")
+        if described.times:
+            return np.asarray(described.times)
+        return described.interval * np.arange(1.0, (described.readings or 0) + 1)
+
+    @cached_property
+    def tolerance(self) -> float:  # type: ignore[override]
+        if isinstance(self.described.tolerance, float):
+            return self.described.tolerance
+        intervals = np.diff(self.times, prepend=0.0)
+        trial = replace(self.described, step=float(intervals[intervals > 0].min()) / _TRIAL_STEPS)
+        largest = float(np.abs(trial.simulate(self.nominal[None])).max())
+        return _SHARE * largest if 0 < largest < np.inf else _SHARE
+
+    @cached_property
+    def _tolerances(self) -> Array:
+        if not isinstance(self.described.tolerance, str):
+            return super()._tolerances
+        formula = read(self.described.tolerance, "tolerance")
+        return np.repeat([float(formula(known)) for known in self.described.known], len(self.outputs))
 
     def _known(self, p: Sequence[Any], c: Sequence[Any]) -> dict[str, Any]:
         return dict(zip(self.described.start, p, strict=True)) | dict(zip(self.described._constants, c, strict=True))
@@ -284,3 +322,45 @@ class _Engine(OdeMeasurement):
     def read(self, t, y, p, c):
         values = {**self._known(p, c), **dict(zip(self.described.rates, y, strict=True)), "t": t}
         return [formula(values) for formula in self.described._outputs.values()]
+
+
+def _cases(numbers: Sequence[int]) -> int:
+    """How many cases a file has, by the column that numbers them."""
+    known = sorted(set(numbers))
+    if known != list(range(1, len(known) + 1)):
+        raise UserError(f"case={known[-1]}: cases are numbered 1, 2 and so on; there are {', '.join(map(str, known))}")
+    return len(known)
+
+
+def _of_cases(name: str, values: Sequence[float], numbers: Sequence[int], count: int) -> tuple[float, ...]:
+    """What a constant is in each of the cases, by the columns of a file: one number in all rows of a case."""
+    found: dict[int, float] = {}
+    for value, case in zip(values, numbers, strict=True):
+        if found.setdefault(case, value) != value:
+            remedy = "" if count > 1 else "; number the cases in a column case"
+            raise UserError(f"case={case}: {name} is {found[case]:g} in one row and {value:g} in another{remedy}")
+    return tuple(found[case] for case in range(1, count + 1))
+
+
+def packaged(name: str) -> Callable[..., Ode]:
+    """The model that `conf/measurement/NAME.yaml` describes, with other options where given.
+
+    They are those of `Ode`, and entries of `constants` and `start` by their own names: `Bock(mu=10.0)`.
+    """
+
+    def model(**options: Any) -> Ode:
+        config = dict(_description(name))
+        for key in ("constants", "start"):
+            config[key] = {entry: options.pop(entry, value) for entry, value in config[key].items()}
+        return Ode(**(config | options))
+
+    model.__name__ = model.__qualname__ = "".join(part.title() for part in name.split("_"))
+    return model
+
+
+@functools.cache
+def _description(name: str) -> dict[str, Any]:
+    import yaml
+
+    config = yaml.safe_load((own_conf() / "measurement" / f"{name}.yaml").read_text(encoding="utf-8"))
+    return {key: value for key, value in config.items() if key != "_target_"}

@@ -23,19 +23,19 @@ _FILLED = 4
 """Numbers of a tangent from which on one alone keeps the processor busy; below, two advance side by side."""
 
 
-def module(plan: Plan, width: int) -> str:
+def integrate(plan: Plan, width: int) -> str:
     """For groups of `width` lanes."""
     return str(_Writer(plan, width).module)
 
 
-def rates(program: Program) -> str:
+def rates(program: Program, width: int) -> str:
     """void rates(double *x, double *si, double *out, int64 trials): one number from the parameters x[i] times si."""
     made: Any = ir.Function(ir.Module("rates"), ir.FunctionType(VOID, [PTR, PTR, PTR, I64]), "rates")
     x, si, out, trials = made.args
     b: Any = ir.IRBuilder(made.append_basic_block())
     n = program.inputs
     with loop(b, integer(0), trials) as i:
-        v = Vectors(b, 1)
+        v = Vectors(b, width)
         row, size = v.load(v.place(x, b.mul(i, integer(n))), range(n)), v.load(si, range(n))
         (rate,) = _run(v, program, [b.fmul(value, unit) for value, unit in zip(row, size, strict=True)])
         put(b, rate, out, i)

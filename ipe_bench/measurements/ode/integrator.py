@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 _WORTH_THREADS = 40_000
 """Steps times lanes times states from which a second thread gains more than it costs, some 150 microseconds."""
+_NARROW = 4
+"""Lanes up to which half of the usual vectors do: one simulation of GINS in two thirds of the time."""
 _EMIT = Path(__file__).with_name("emit.py")
 _ARGUMENTS = tuple(INTEGER if i in (3, 5, 6, 9, 11) else POINTER for i in range(14))
 
@@ -48,6 +50,17 @@ def _pool(workers: int, process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(workers, thread_name_prefix="ode")
 
 
+def _compiled(name: str, source: Plan | Program, width: int, arguments: tuple[Any, ...]) -> Callable[..., None]:
+    """The function of `emit` by that name."""
+
+    def write() -> str:
+        from ipe_bench.measurements.ode import emit
+
+        return getattr(emit, name)(source, width)
+
+    return compiled.load(f"{source} {width} {compiled.digest_of(_EMIT)}", write, name, arguments)
+
+
 @dataclass(frozen=True)
 class Kernel:
     """One kind of integration of some equations by one formula."""
@@ -61,18 +74,17 @@ class Kernel:
         return self.kind(self.equations, self.tableau)
 
     @functools.cached_property
-    def _machine_code(self) -> tuple[Callable[..., None], int]:
-        """The function, and the numbers that it needs room for."""
-        plan, width = self.plan, compiled.width()
-        weights = -(-sum(map(len, plan.tableau.weights)) // width)
+    def _narrow(self) -> tuple[Callable[..., None], int]:
+        return self._machine_code(_NARROW)
 
-        def write() -> str:
-            from ipe_bench.measurements.ode import emit
+    @functools.cached_property
+    def _wide(self) -> tuple[Callable[..., None], int]:
+        return self._machine_code(compiled.width())
 
-            return emit.module(plan, width)
-
-        key = f"{plan} {width} {compiled.digest_of(_EMIT)}"
-        return compiled.load(key, write, "integrate", _ARGUMENTS), (plan.size + weights) * width
+    def _machine_code(self, width: int) -> tuple[Callable[..., None], int]:
+        """The function for groups of so many lanes, and the numbers that it needs room for."""
+        weights = -(-sum(map(len, self.plan.tableau.weights)) // width)
+        return _compiled("integrate", self.plan, width, _ARGUMENTS), (self.plan.size + weights) * width
 
     def run(
         self,
@@ -96,7 +108,7 @@ class Kernel:
         if not compiled.available():
             interpret(self.plan, x, si, cases, rows, times, steps, *more)
             return
-        function, size = self._machine_code
+        function, size = self._narrow if lanes <= _NARROW else self._wide
         given = (at(x), at(si), at(cases), len(cases), at(rows, WHOLE))
         stride = len(offset[0]) // len(cases) if offset else 0
         taken = (at(times), at(steps, WHOLE), len(times), at(offset[0]) if offset else None, stride, at(out))
@@ -226,13 +238,7 @@ class Rates:
 
     @functools.cached_property
     def _machine_code(self) -> Callable[..., None]:
-        def write() -> str:
-            from ipe_bench.measurements.ode import emit
-
-            return emit.rates(self.program)
-
-        key = f"{self.program} {compiled.digest_of(_EMIT)}"
-        return compiled.load(key, write, "rates", (POINTER, POINTER, POINTER, INTEGER))
+        return _compiled("rates", self.program, 1, (POINTER, POINTER, POINTER, INTEGER))
 
     def __call__(self, x: Array, si: Array, out: Array) -> None:
         """Of the parameters x (trials, n) times si."""

@@ -1,12 +1,11 @@
 """Measurement models whose readings are taken from the solution of ordinary differential equations.
 
 The author writes the right-hand side once, in plain arithmetic; the batched compiled integrator and the exact Jacobian
-come from it. Recording is in `trace` and `plan`, integration in `integrator`, the choice of steps in `levels`.
+come from it. Recording is in `trace` and `plan`, integration in `integrator`, the choice of steps in `steps`.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -17,22 +16,24 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, own
-from ipe_bench.measurements.base import Input, Measurement
-from ipe_bench.measurements.ode import sampling
-from ipe_bench.measurements.ode.coarse import CONTRACTION, MOST_RK4, Coarseness, contraction
+from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.ode.integrator import Kernel, Rates
-from ipe_bench.measurements.ode.levels import (
+from ipe_bench.measurements.ode.plan import Equations, Variation, jacobian, simulation
+from ipe_bench.measurements.ode.steps import (
+    CONTRACTION,
+    MOST_RK4,
     ORDER,
     SAFETY,
+    Coarseness,
     Found,
     Indices,
     Remembered,
     Search,
     coarser,
+    contraction,
     grouped,
     ladder,
 )
-from ipe_bench.measurements.ode.plan import Equations, Variation, jacobian, simulation
 from ipe_bench.measurements.ode.stiffness import diagnose
 from ipe_bench.measurements.ode.tableau import DOP853, RK4
 from ipe_bench.measurements.ode.trace import Graph, Program
@@ -59,9 +60,6 @@ class OdeMeasurement(Measurement):
     """The names of what is read at each time."""
     time_unit: ClassVar[str] = "s"
     """The unit of `times`, `step` and t."""
-    sampled: tuple[float, ...] | None = None
-    """Times of the readings in place of the usual ones, where a subclass has a field of that name: a readings file may
-    bring its own."""
     tolerance: float | Sequence[float] | None = None
     """The error that the integration may leave in a reading, in `reading_unit`; or one such error for each output.
     Each trial's step follows from it and from the trial's parameters."""
@@ -120,21 +118,9 @@ class OdeMeasurement(Measurement):
         )
         return {
             "case": cases.ravel().tolist(),
-            sampling.time_heading(self.time_unit): times.ravel().tolist(),
+            time_heading(self.time_unit): times.ravel().tolist(),
             "output": [self.outputs[i] for i in outputs.ravel()],
         }
-
-    @property
-    def inputs(self) -> tuple[Input, ...]:
-        if "sampled" not in getattr(self, "__dataclass_fields__", {}):
-            return ()
-        return sampling.inputs(self.time_unit, self.outputs, len(self.cases))
-
-    def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
-        def at(times: tuple[float, ...]) -> Measurement:
-            return self if np.array_equal(times, self.times) else dataclasses.replace(self, sampled=times)  # type: ignore[type-var]
-
-        return sampling.sampled(columns, self.outputs, len(self.cases), at)
 
     @cached_property
     def epochs(self) -> tuple[NDArray[np.intp], ...]:
@@ -146,23 +132,37 @@ class OdeMeasurement(Measurement):
         return self.simulate_until(x, len(self.times))
 
     def simulate_until(self, x: Array, stop: int) -> Array:
-        return self._shown(x, stop, self._zeros)
+        return self._shown(x, stop, self._origin)
 
     def coarse_simulate_until(self, x: Array, stop: int) -> Array:
-        return self._shown_coarsely(x, stop, self._zeros)
-
-    def _shown_coarsely(self, x: Array, stop: int, offset: Array) -> Array:
-        """`_shown` without the search for the level, which takes the whole span, where a trial's rate says it well.
+        """`simulate_until` without the search for the level, which takes the whole span, if a rate says it well.
 
         On GINS at an error scale of 30,000, with readings of 7e-3 m/s, the median trial is off by 4e-7 m/s at most, the
         worst of 100 by 7e-3; at 2,000 the worst is off by 1e-4.
         """
-        if not self._guessed:
-            return self._shown(x, stop, offset)
+        return self._shown(x, stop, self._origin, coarse=True)
+
+    @property
+    def _origin(self) -> Array:
+        """What readings (m,) are counted from."""
+        return self._zeros
+
+    def _shown(self, x: Array, stop: int, offset: Array, *, coarse: bool = False) -> Array:
+        """Readings less the offset (m,)."""
         x = own(x)
         z = np.empty((len(x), len(self._cases) * stop * len(self.outputs)))
-        for place, rows in grouped(self._guess(x), np.arange(len(x))):
-            self._simulate(x, rows, self._steps(place), offset, z)
+        everyone, common = np.arange(len(x)), self._common_steps(x)
+        if common is not None:
+            groups = [(everyone, common)]
+        elif coarse and self._guessed:
+            groups = self._groups(self._guess(x), everyone)
+        else:
+            found = self._search(x, offset)
+            z[found.computed] = self._prefix(found.z, stop)
+            others = np.delete(everyone, found.computed)
+            groups = self._groups(found.places[others], others)
+        for rows, steps in groups:
+            self._simulate(x, rows, steps, offset, z)
         return z
 
     @property
@@ -175,22 +175,9 @@ class OdeMeasurement(Measurement):
         trusted = self._trusted(x)
         return np.where(trusted < 0, self._first_guess(x), trusted)
 
-    def _shown(self, x: Array, stop: int, offset: Array) -> Array:
-        """Readings less the offset (m,)."""
-        x = own(x)
-        z = np.empty((len(x), len(self._cases) * stop * len(self.outputs)))
-        common = self._common_steps(x)
-        if common is not None:
-            self._simulate(x, np.arange(len(x)), common, offset, z)
-            return z
-        found = self._search(x, offset)
-        if len(found.computed) == len(x):
-            return self._prefix(found.z, stop)
-        z[found.computed] = self._prefix(found.z, stop)
-        others = np.delete(np.arange(len(x)), found.computed)
-        for place, rows in grouped(found.places[others], others):
-            self._simulate(x, rows, self._steps(place), offset, z)
-        return z
+    def _groups(self, places: Indices, rows: Indices) -> list[tuple[Indices, NDArray[np.int64]]]:
+        """The trials that share a level, and the steps of that level to each time."""
+        return [(group, self._ladder[place] * self._parts) for place, group in grouped(places, rows)]
 
     def hindrance(self, x: Array) -> str:
         x = own(x[None, : self.n])
@@ -200,7 +187,7 @@ class OdeMeasurement(Measurement):
             top = len(self._ladder) - 1
             z = np.empty((2, 1, self.m))
             for place, readings in zip((top, coarser(top)), z, strict=True):
-                self._simulate(x, np.arange(1), self._steps(place), self._zeros, readings)
+                self._simulate(x, np.arange(1), self._ladder[place] * self._parts, self._zeros, readings)
             with np.errstate(all="ignore"):
                 left = SAFETY * np.abs(z[0] - z[1]) / (2.0**ORDER - 1.0)
             shortest, held = self._usual_interval / self._ladder[top], bool((left <= _FAR * self._tolerances).all())
@@ -217,21 +204,12 @@ class OdeMeasurement(Measurement):
         times = self._times[: z.shape[1] // (len(self._cases) * len(self.outputs))]
         self._readings_kernel.run(x, self._si_sizes, self._cases, rows, times, steps, offset, z.reshape(-1))
 
-    @cached_property
-    def _zeros(self) -> Array:
-        return np.zeros(self.m)
-
-    @cached_property
-    def _si_sizes(self) -> Array:
-        return own(self.si_sizes)
-
-    @cached_property
-    def _cases(self) -> Array:
-        return own(self.cases)
-
-    @cached_property
-    def _times(self) -> Array:
-        return own(self.times)
+    _zeros = cached_property(lambda self: np.zeros(self.m))
+    _si_sizes = cached_property(lambda self: own(self.si_sizes))
+    _cases = cached_property(lambda self: own(self.cases))
+    _times = cached_property(lambda self: own(self.times))
+    _remembered = cached_property(lambda self: Remembered())
+    _fixed_steps = cached_property(lambda self: steps_between(self.times, self.step))
 
     def _prefix(self, z: Array, stop: int) -> Array:
         if stop == len(self.times):
@@ -297,13 +275,9 @@ class OdeMeasurement(Measurement):
         return max(1, int(self._find(own(self.nominal[None]), np.array([1]), self._zeros).places[0]))
 
     @cached_property
-    def _remembered(self) -> Remembered:
-        return Remembered()
-
-    @cached_property
     def _parts(self) -> NDArray[np.int64]:
         """Steps to each time at level 1: one, more over an interval longer than usual, none over none."""
-        return _steps(self.times, self._usual_interval)
+        return steps_between(self.times, self._usual_interval)
 
     @cached_property
     def _usual_interval(self) -> float:
@@ -325,14 +299,6 @@ class OdeMeasurement(Measurement):
         per_output = np.broadcast_to(np.asarray(self.tolerance, dtype=float), len(self.outputs))
         return np.tile(per_output, self.m // len(self.outputs))
 
-    def _steps(self, place: int) -> NDArray[np.int64]:
-        return self._ladder[place] * self._parts
-
-    @cached_property
-    def _fixed_steps(self) -> NDArray[np.int64]:
-        assert self.step is not None
-        return _steps(self.times, self.step)
-
     def jacobian(self, x: Array) -> Array:
         return self.jacobian_until(x, len(self.times))
 
@@ -342,8 +308,12 @@ class OdeMeasurement(Measurement):
     def jacobian_until(self, x: Array, stop: int) -> Array:
         """dh/dx by the variational equations, integrated by the same formula and steps as the readings of that x."""
         x = own(x)
-        J = self._empty_jacobian(x, stop)
-        for rows, steps in self._grouped_by_steps(x):
+        everyone, common, J = np.arange(len(x)), self._common_steps(x), self._empty_jacobian(x, stop)
+        if common is not None:
+            groups = [(everyone, common)]
+        else:
+            groups = self._groups(self._search(x, self._zeros).places, everyone)
+        for rows, steps in groups:
             self._differentiate(self._jacobian_kernel, x, rows, steps, J)
         return J
 
@@ -373,9 +343,12 @@ class OdeMeasurement(Measurement):
         """Measured at the nominal parameters."""
         x, everything = own(self.nominal[None]), len(self.times)
         level, J = int(self._ladder[self._search(x, self._zeros).places[0]]), self.jacobian(x)
-        rk4 = next(
-            (k for k in range(1, MOST_RK4 + 1) if level <= 2 and self._contraction(x, k, J) <= CONTRACTION), None
-        )
+        rk4, tangents = None, np.empty_like(J)
+        for k in range(1, MOST_RK4 + 1) if level <= 2 else ():
+            self._differentiate(self._rk4_kernel, x, np.arange(1), k * self._parts, tangents)
+            if contraction(tangents[0], J[0]) <= CONTRACTION:
+                rk4 = k
+                break
         # Half the level; where that is half a step, every second reading.
         if level == 1 and len(self._times) == 1:
             return Coarseness(rk4, np.inf)
@@ -390,11 +363,6 @@ class OdeMeasurement(Measurement):
             off = np.abs(z - self._shown(x, everything, self._zeros)[:, rows]) / self._tolerances[rows]
             sensitivity = contraction(coarse[0], J[0, rows]) / off.max()
         return Coarseness(rk4, float(sensitivity) if np.isfinite(sensitivity) else np.inf)
-
-    def _contraction(self, x: Array, rk4: int, J: Array) -> float:
-        coarse = np.empty_like(J)
-        self._differentiate(self._rk4_kernel, x, np.arange(1), rk4 * self._parts, coarse)
-        return contraction(coarse[0], J[0])
 
     def _empty_jacobian(self, x: Array, stop: int) -> Array:
         return np.empty((len(x), len(self._cases) * stop * len(self.outputs), self.n))
@@ -419,29 +387,13 @@ class OdeMeasurement(Measurement):
         kernel, level = self._coarsened(-1 if trusted else place)
         return kernel.plan.operations * level / (self._readings_kernel.plan.operations * int(self._ladder[place]))
 
-    def _grouped_by_steps(self, x: Array) -> list[tuple[Indices, NDArray[np.int64]]]:
-        """The trials that share a level, and its steps."""
-        everyone, common = np.arange(len(x)), self._common_steps(x)
-        if common is not None:
-            return [(everyone, common)]
-        places = self._search(x, self._zeros).places
-        return [(rows, self._steps(place)) for place, rows in grouped(places, everyone)]
-
     def __getstate__(self) -> dict[str, Any]:
         """Without what is compiled and remembered, which stays with a process."""
         return {k: v for k, v in self.__dict__.items() if k not in _STAYS}
 
-    @cached_property
-    def _readings_kernel(self) -> Kernel:
-        return Kernel(simulation, self._equations, DOP853)
-
-    @cached_property
-    def _jacobian_kernel(self) -> Kernel:
-        return Kernel(jacobian, self._equations, DOP853)
-
-    @cached_property
-    def _rk4_kernel(self) -> Kernel:
-        return Kernel(jacobian, self._equations, RK4)
+    _readings_kernel = cached_property(lambda self: Kernel(simulation, self._equations, DOP853))
+    _jacobian_kernel = cached_property(lambda self: Kernel(jacobian, self._equations, DOP853))
+    _rk4_kernel = cached_property(lambda self: Kernel(jacobian, self._equations, RK4))
 
     @cached_property
     def _equations(self) -> Equations:
@@ -449,7 +401,12 @@ class OdeMeasurement(Measurement):
         return Equations(self.states, self.n, constants, outputs, self.start, self.rhs, self.read, self.variation)
 
 
-def _steps(times: Array, longest: float) -> NDArray[np.int64]:
+def time_heading(unit: str) -> str:
+    """The column of the times in a file."""
+    return f"time [{unit}]" if unit else "time"
+
+
+def steps_between(times: Array, longest: float) -> NDArray[np.int64]:
     """The equal steps (times,) from each time to the next, none longer than that."""
     intervals = np.diff(times, prepend=0.0)
     return np.where(intervals > 0.0, np.maximum(np.ceil(intervals / longest - 1e-9), 1), 0).astype(np.int64)

@@ -1,0 +1,258 @@
+"""The models that are described in the configs, against closed forms, invariants and other integrators."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_bvp, solve_ivp
+from scipy.optimize import brentq, curve_fit
+from scipy.special import expi
+from small_models import bock
+
+from ipe_bench.baselines import MultiscaleLM
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Covariance
+from ipe_bench.cli.session import jobs_of, session
+from ipe_bench.cli.words import read
+from ipe_bench.measurements import Bock, FallingBody, LotkaVolterra, Ode, Sir
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.plugins.conformance import check_component
+
+FOOT = 0.3048
+# Boys confined to bed, 22 January to 4 February 1978 (British Medical Journal, 4 March 1978, p. 587).
+IN_BED = np.array([3, 8, 26, 76, 225, 298, 258, 233, 189, 128, 68, 29, 14, 4], dtype=float)
+COUNTED = {"susceptible": "S", "infected": "I", "removed": "population - S - I"}
+PAPER = np.array([0.0, 0.0, 1.0])
+"""The true falling body of both papers, in units of error from the presumed one."""
+MODELS = {
+    "sir": (Sir(), Sir(population=763.0, outputs={"removed": "population-S-I", "infected": "I"}), 1 / 32, 1e-6),
+    "falling_body": (FallingBody(), FallingBody(density_decay=1.7e-4, altitude=9e4), 1 / 16, 1e-5),
+    "lotka_volterra": (LotkaVolterra(), LotkaVolterra(birth=0.6), 1 / 64, 1e-6),
+    "bock": (Bock(mu=10.0), bock(10.0), 1 / 640, 1e-9),
+}
+
+
+def draw(model, trials=20, scale=1.0):
+    return model.nominal + scale * np.random.default_rng(0).normal(size=(trials, model.n))
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_model_is_that_of_its_config_and_keeps_the_promises_of_models(name):
+    model, other, step, tolerance = MODELS[name]
+    with session():
+        (spec,) = jobs_of(read("run", [f"measurement={name}", "trials=4"]), multirun=False).specs
+    assert spec.scenario.measurement.name == model.name == name
+    if name != "bock":
+        assert spec.scenario.measurement == model
+    assert isinstance(other, Ode)
+    assert other != model
+    assert not [f.complaint for one in (model, other) for f in check_component(name, one) if f.complaint]
+    x = draw(model, scale=3.0 if name == "sir" else 1.0)
+    assert np.abs(model.simulate(x) - replace(model, step=step).simulate(x)).max() < tolerance
+
+
+@pytest.mark.parametrize(
+    ("make", "options", "said"),
+    [
+        (Sir, {"step": -1.0}, "step=-1.0"),
+        (Sir, {"size": {"beta": 1.0}}, "size: beta is not a parameter"),
+        (Sir, {"constants": {"population": 763.0}}, "measurement: infection is not known"),
+        (FallingBody, {"readings": 0}, "readings=0"),
+        (Bock, {"tolerance": "1e-13*cosh(nu*t)"}, "tolerance: nu is neither a constant nor t"),
+        (Bock, {"answer": {}, "exact": {"x1": "1"}}, "answer: give all parameters"),
+    ],
+)
+def test_mistakes_are_named(make, options, said):
+    with pytest.raises(UserError, match=said):
+        make(**options).simulate(np.ones((1, 1)))
+
+
+def epidemic(t, beta, gamma, infected, population=763.0):
+    """(S, I) by an adaptive integrator."""
+    return solve_ivp(
+        lambda t, y: [-beta * y[0] * y[1] / population, beta * y[0] * y[1] / population - gamma * y[1]],
+        (0.0, t[-1]),
+        [population - infected, infected],
+        "DOP853",
+        t_eval=t,
+        rtol=1e-12,
+        atol=1e-12,
+    ).y
+
+
+def epidemics(model, x):
+    """beta, gamma and I(0), each (trials,), from x (trials, 3)."""
+    beta, gamma, odds = np.array([1.66, 0.44, 1.0 / 762.0])[:, None] * np.exp(x * model.sizes).T
+    return beta, gamma, 763.0 * odds / (1.0 + odds)
+
+
+def test_an_epidemic_conserves_what_its_equations_conserve_whatever_is_drawn():
+    model = Sir(outputs=COUNTED)
+    x = draw(model, scale=3.0)
+    beta, gamma, infected = (value[:, None] for value in epidemics(model, x))
+    S, I, R = np.moveaxis(model.simulate(x).reshape(len(x), -1, 3), 2, 0)  # noqa: E741
+    start = 763.0 - 763.0 * gamma / beta * np.log(763.0 - infected)
+    np.testing.assert_allclose(S + I - 763.0 * gamma / beta * np.log(S), np.broadcast_to(start, S.shape), rtol=1e-8)
+    np.testing.assert_allclose(S + I + R, 763.0, rtol=1e-14)
+    far = np.vstack([draw(model, 200, scale=10.0), [[0.0, 0.0, 40.0], [0.0, 0.0, -40.0]]])
+    z = model.simulate(far)
+    # People, to the accuracy of the integration at rates up to e^3 times the presumed ones.
+    assert ((z > -1e-3) & (z < 763.001)).all()
+
+
+def test_an_epidemic_that_is_over_has_its_final_size_and_another_is_that_of_scipy():
+    final = brentq(lambda s: np.log(s / 762.0) - 1.66 / 0.44 / 763.0 * (s - 763.0), 1e-6, 500.0)
+    over = Sir(outputs={"susceptible": "S"}, readings=200)
+    assert over.simulate(np.zeros((1, 3)))[0, -1] == pytest.approx(final, rel=1e-8)
+    model = Sir()
+    x = draw(model, 5, scale=3.0)
+    for z, *values in zip(model.simulate(x), *epidemics(model, x), strict=True):
+        np.testing.assert_allclose(z, epidemic(model.whole.times, *values)[1], atol=1e-6)
+
+
+def test_the_boarding_school_is_estimated_as_scipy_estimates_it():
+    model = Sir()
+    estimates = MultiscaleLM().estimate(Problem(model, Covariance(np.full(14, 20.0))), IN_BED[None])
+    assert estimates.status[0] == 0
+    days = np.arange(1.0, 15.0)
+    theirs, _ = curve_fit(lambda t, *p: epidemic(t, *np.exp(p))[1], days, IN_BED, np.log([1.66, 0.44, 1.0]))
+    np.testing.assert_allclose(np.ravel(epidemics(model, estimates.x)), np.exp(theirs), rtol=1e-4)
+    residuals = IN_BED - model.simulate(estimates.x)[0]
+    assert 15.0 < np.sqrt(residuals @ residuals / 11) < 25.0
+
+
+def closed_form(x, mu, t):
+    """x1 = sin(p t) + x1(0) cosh(mu t) + (x2(0) - p) sinh(mu t) / mu and its derivative: (trials, 2 times)."""
+    values = x[:, :, None]
+    p = values[:, 0]
+    x1, x2 = (values[:, 1], values[:, 2]) if x.shape[1] == 3 else (0.0, np.pi)
+    grow, fall = np.cosh(mu * t), np.sinh(mu * t)
+    first = np.sin(p * t) + x1 * grow + (x2 - p) * fall / mu
+    second = p * np.cos(p * t) + x1 * mu * fall + (x2 - p) * grow
+    return np.stack([first, second], axis=2).reshape(len(x), -1)
+
+
+def test_bocks_closed_form_solves_the_equation_as_a_boundary_value_problem():
+    """From the ends, where nothing grows, another solver finds between them what the closed form says."""
+    p, x1, x2, t = 2.5, 0.1, 2.4, np.arange(1, 21) / 20
+    z = closed_form(np.array([[p, x1, x2]]), 10.0, t).reshape(-1, 2)
+    solution = solve_bvp(
+        lambda t, y: np.vstack([y[1], 100.0 * y[0] - (100.0 + p**2) * np.sin(p * t)]),
+        lambda a, b: np.array([a[0] - x1, b[0] - z[-1, 0]]),
+        np.linspace(0, 1, 50),
+        np.zeros((2, 50)),
+        tol=1e-9,
+        max_nodes=100_000,
+    )
+    assert solution.sol(0.0)[1] == pytest.approx(x2, rel=1e-5)
+    np.testing.assert_allclose(solution.sol(t), z.T, rtol=1e-5)
+
+
+@pytest.mark.parametrize("mu", [10.0, 30.0, 60.0])
+@pytest.mark.parametrize("make", [bock, lambda mu: Bock(mu=mu)], ids=["initial", "rate"])
+def test_bocks_readings_are_those_of_the_closed_form_to_round_off_that_has_grown(mu, make):
+    model = make(mu)
+    x, t = draw(model, 10), model.whole.times
+    exact, growth = closed_form(x * model.sizes, mu, t), np.repeat(np.cosh(mu * t), 2)
+    scale = growth * np.abs(exact).max(axis=1, keepdims=True) / growth[-1]
+    assert (np.abs(model.simulate(x) - exact) < 1e-11 * np.maximum(scale, growth)).all()
+
+
+def test_forward_integration_keeps_bocks_true_trajectory_for_a_mild_rate_and_loses_it_for_the_classic_one():
+    lost = {}
+    for mu in (10.0, 60.0):
+        model = Bock(mu=mu)
+        lost[mu] = np.abs(model.simulate(model.recorded.x[None])[0] - model.recorded.z).max()
+    assert lost[10.0] < 1e-9
+    # Whatever arithmetic does, errors of 1e-17 have grown by exp(60) = 1e26.
+    assert 1e4 < lost[60.0] < 1e14
+    mild = Bock(mu=10.0)
+    estimates = MultiscaleLM().estimate(Problem(mild, mild.recorded.R), mild.recorded.z[None])
+    assert (estimates.x[0] * mild.sizes)[0] == pytest.approx(np.pi, abs=1e-9)
+
+
+def test_bocks_recorded_readings_are_the_sine_and_the_answer_is_pi():
+    model = replace(bock(60.0), readings=4, interval=0.25)
+    half = np.sqrt(0.5)
+    expected = [half, np.pi * half, 1.0, 0.0, half, -np.pi * half, 0.0, -np.pi]
+    np.testing.assert_allclose(model.recorded.z, expected, atol=1e-14)
+    np.testing.assert_allclose(model.recorded.x * model.sizes, [np.pi, 0.0, np.pi], rtol=1e-15)
+    np.testing.assert_array_equal(model.recorded.R.deviations, np.full(8, 0.05))
+
+
+def altitude(t, h0, v0, b, gamma):
+    """With u = exp(-gamma h): gamma v0 t = exp(-a u0) (Ei(a u) - Ei(a u0)), a = b / gamma, by separation."""
+    a, u0 = b / gamma, np.exp(-gamma * h0)
+    time = lambda u: np.exp(-a * u0) * (expi(a * u) - expi(a * u0)) / (gamma * v0) - t  # noqa: E731
+    return -np.log(brentq(time, u0, 700.0 / a, xtol=1e-18, rtol=1e-14)) / gamma
+
+
+def test_ranges_of_a_falling_body_are_those_of_the_closed_form():
+    model = FallingBody(readings=20)
+    x = np.vstack([model.nominal + PAPER, draw(model, 4)])
+    for row, z in zip(x, model.simulate(x), strict=True):
+        h0, v0, log_b = row * model.sizes
+        b = 3e-5 / FOOT * np.exp(log_b)
+        h = np.array([altitude(t, h0, v0, b, 5e-5 / FOOT) for t in range(1, 21)])
+        np.testing.assert_allclose(z, np.hypot(1e5 * FOOT, h - 1e5 * FOOT), rtol=1e-9)
+
+
+def test_ranges_agree_with_an_adaptive_integrator_in_the_papers_own_units():
+    """Their true coefficient, 1e-3 / ft, is one unit from the presumed one."""
+    model = FallingBody()
+    solution = solve_ivp(
+        lambda t, y: [-y[1], -np.exp(-5e-5 * y[0]) * y[1] ** 2 * 1e-3],
+        (0.0, 60.0),
+        [3e5, 2e4],
+        "DOP853",
+        t_eval=np.arange(1.0, 61.0),
+        rtol=1e-12,
+        atol=1e-9,
+    )
+    ranges = np.sqrt(1e10 + (solution.y[0] - 1e5) ** 2) * FOOT
+    np.testing.assert_allclose(model.simulate((model.nominal + PAPER)[None])[0], ranges, atol=1e-5)
+
+
+@pytest.mark.parametrize("ln_ballistic", [10.0, 17.0, 18.0])
+def test_a_body_that_is_stopped_at_once_is_followed_as_well(ln_ballistic):
+    """With steps of half a second the ranges are off by 13.5 m at 17, by 297 m at 17.4, and no numbers at 18."""
+    model = FallingBody()
+    x = model.nominal + np.array([0.0, 0.0, ln_ballistic]) / model.sizes
+    b, gamma = 3e-5 / FOOT * np.exp(ln_ballistic), 5e-5 / FOOT
+    solution = solve_ivp(
+        lambda t, y: [-y[1], -b * np.exp(-gamma * y[0]) * y[1] ** 2],
+        (0.0, 60.0),
+        [3e5 * FOOT, 2e4 * FOOT],
+        "Radau",
+        t_eval=np.arange(1.0, 61.0),
+        rtol=1e-11,
+        atol=1e-9,
+    )
+    ranges = np.hypot(1e5 * FOOT, solution.y[0] - 1e5 * FOOT)
+    np.testing.assert_allclose(model.simulate(x[None])[0], ranges, atol=1e-3)
+
+
+def test_predators_and_prey_conserve_what_their_equations_conserve_and_agree_with_scipy():
+    model = LotkaVolterra()
+    x = draw(model, 30, scale=3.0)
+    birth, hunting, death, growth, prey, predators = (x * model.sizes).T[:, :, None]
+    u, v = np.moveaxis(model.simulate(x).reshape(30, -1, 2), 2, 0)
+
+    def conserved(u, v):
+        return growth * u - death * np.log(u) + hunting * v - birth * np.log(v)
+
+    np.testing.assert_allclose(conserved(u, v), np.broadcast_to(conserved(prey, predators), u.shape), rtol=1e-8)
+    for row, z in zip(x[:3], model.simulate(x[:3]), strict=True):
+        b, m, d, g, u0, v0 = row * model.sizes
+        solution = solve_ivp(
+            lambda t, y, b=b, m=m, d=d, g=g: [b * y[0] - m * y[0] * y[1], g * y[0] * y[1] - d * y[1]],
+            (0.0, 20.0),
+            [u0, v0],
+            "DOP853",
+            t_eval=np.arange(1.0, 21.0),
+            rtol=1e-12,
+            atol=1e-12,
+        )
+        np.testing.assert_allclose(z.reshape(-1, 2), solution.y.T, atol=1e-6)
