@@ -31,6 +31,8 @@ class EnKF(Sequential):
     seed: Whole = 0
     """A trial's random stream depends on this and on its readings: on nothing else in the batch."""
 
+    family = "ensembles"
+
     def track(self, P0: Array, Q: Array, z: Array) -> EnKFTrack:
         return EnKFTrack(P0, Q, self.members, own_bits(self.seed, z))
 

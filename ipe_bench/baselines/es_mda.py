@@ -51,6 +51,7 @@ class EsMda(Estimator):
 
     name = "es_mda"
     needs: ClassVar[frozenset[Need]] = frozenset({"prior"})
+    family = "ensembles"
 
     @property
     def equation(self) -> Equation | None:  # type: ignore[override]

@@ -19,6 +19,7 @@ from ipe_bench.measurements.counted import EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
 Need = Literal["differential equations", "epochs", "prior"]
+Family = Literal["IPE", "filters", "least squares", "ensembles"]
 Equation = Literal["frozen", "least_squares", "map"]
 
 
@@ -107,6 +108,9 @@ class Estimator(Component, ABC):
     equation: ClassVar[Equation | None] = None
     """The estimating equation whose root it seeks: that of the frozen H (eq. 11), of least squares, or of the maximum a
     posteriori; None where an estimate is no root of anything."""
+    family: ClassVar[Family | None] = None
+    """The kind of estimator that it is shown with; None where its needs and its equation say: those that take epochs
+    are filters, those that seek the root of the frozen H are IPE, and all others are least squares."""
 
     @abstractmethod
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:

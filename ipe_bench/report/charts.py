@@ -8,10 +8,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import pandas as pd
-
 from ipe_bench.report.figures.views import View
-from ipe_bench.report.style import ON_DARK, Look
+from ipe_bench.report.style import ON_DARK
 from ipe_bench.trials.thresholds import FEW
 
 FIGURES = 5
@@ -70,33 +68,23 @@ def charts(views: Sequence[View]) -> Iterator[Chart]:
             continue
         # With one scale alone there is nothing to see against it.
         across = (_SCALE, _COST) if len(view.scales) > 1 else (_COST, _SCALE)
-        columns = {
-            "trials",
-            *(name for axis in (*across, *shown) for name in (axis.column, axis.low, axis.high) if name),
-        }
-        data = {
-            "x": [asdict(axis) for axis in across],
-            "y": [asdict(axis) for axis in shown],
-            "few": FEW,
-            "series": [
-                _series(label, one, rows[rows["estimator"] == label], columns) for label, one in view.look.items()
-            ],
-        }
+        columns = {name for axis in (*across, *shown) for name in (axis.column, axis.low, axis.high) if name}
+        series = [
+            {
+                "name": label,
+                "color": look.color,
+                "on_dark": ON_DARK.get(look.color, look.color),
+                "marker": look.marker,
+                "dash": list(look.dash or ()),
+                "values": {c: [_short(v) for v in part[c]] for c in sorted(columns | {"trials"})},
+            }
+            for label, look in view.look.items()
+            for part in (rows[rows["estimator"] == label],)
+        ]
+        data = {"x": [asdict(a) for a in across], "y": [asdict(a) for a in shown], "few": FEW, "series": series}
         caption = f"{view.label}. Bars: 95 % intervals, where they are known. Hollow: fewer than {FEW} trials."
         text = json.dumps(data, ensure_ascii=False, separators=(",", ":"))
         yield Chart(f"explore{view.suffix}", "All trials, by any two columns", caption, text)
-
-
-def _series(label: str, look: Look, rows: pd.DataFrame, columns: set[str]) -> dict[str, Any]:
-    rows = rows[rows["estimator"] == label]
-    return {
-        "name": label,
-        "color": look.color,
-        "on_dark": ON_DARK.get(look.color, look.color),
-        "marker": look.marker,
-        "dash": list(look.dash or ()),
-        "values": {name: [_short(v) for v in rows[name]] for name in sorted(columns)},
-    }
 
 
 def _short(value: Any) -> float | int | None:

@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from ipe_bench.report.certified_tables import without_certified
-from ipe_bench.report.figures.views import kind_of
+from ipe_bench.report.figures.views import family_of
 from ipe_bench.report.words import brief, duration, enumerate_few, percent, plain, short
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.certified import attained_totals, certified_averages, certified_table
@@ -64,7 +64,7 @@ def _simulated(analysis: Analysis) -> Iterator[str]:
         yield _ranked(analysis, rows, scales)
         return
     yield from _agreement(
-        rows, scales, {group.estimator: kind_of(group.footer) for group in analysis.collection.groups}
+        rows, scales, {group.estimator: family_of(group.footer) for group in analysis.collection.groups}
     )
     yield from _honesty(rows)
     yield from _reach(rows, scales)

@@ -12,7 +12,7 @@ from typing import Any
 from ipe_bench import __version__
 from ipe_bench.report.charts import Chart
 from ipe_bench.report.definitions import CITATION, definitions
-from ipe_bench.report.figures.gallery import Drawn
+from ipe_bench.report.figures import Drawn
 from ipe_bench.report.headline import about, headline
 from ipe_bench.report.sections import Written
 from ipe_bench.report.table import Table, environment

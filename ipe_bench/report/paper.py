@@ -86,8 +86,7 @@ def inches(table: Table) -> float:
 
 def _figures(analysis: Analysis, folder: Path, names: Sequence[str], width: float, tables: Sequence[str]) -> list[Path]:
     """Writes figures, and captions.md with their captions; returns the files."""
-    from ipe_bench.report.figures.common import column_width
-    from ipe_bench.report.figures.gallery import drawings
+    from ipe_bench.report.figures import drawings
     from ipe_bench.report.style import print_style
 
     if not names:
@@ -95,7 +94,7 @@ def _figures(analysis: Analysis, folder: Path, names: Sequence[str], width: floa
     files: list[Path] = []
     captions: dict[str, str] = {}
     seen: list[str] = []
-    with print_style(), column_width(width):
+    with print_style(width):
         for drawing in drawings(without_certified(analysis), analysis.collection.further):
             seen.append(drawing.name)
             if drawing.name in names:

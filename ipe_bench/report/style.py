@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,8 +31,7 @@ DASHES: tuple[Any, ...] = ("", (5, 2), (1, 1.5), (5, 2, 1, 2))
 """As seaborn and matplotlib take them: lengths on and off, nothing for a solid line."""
 REFERENCE = "linear_lse"
 """The estimator that others are held against: black and crossed, whatever else is there."""
-BOUND_COLOR = "#444444"
-BOUND_DASH = (0, (2, 2))
+BOUND_COLOR, BOUND_DASH = "#444444", (0, (2, 2))
 MOST_FACES = 10
 """Estimators up to which each has a colour; of more, `chosen` ones have, and the others are grey."""
 
@@ -45,14 +45,10 @@ class Look:
     dash: Any = ""
 
     @property
-    def linestyle(self) -> Any:
-        return (0, self.dash) if self.dash else "-"
-
-    @property
     def line(self) -> dict[str, Any]:
         """Arguments of a line with markers."""
-        edge = {"markersize": 5.0, "markeredgecolor": "white", "markeredgewidth": 0.5, "linewidth": 1.4}
-        return {"color": self.color, "marker": self.marker, "linestyle": self.linestyle, **edge}
+        dashes = (0, self.dash) if self.dash else "-"
+        return {"color": self.color, "marker": self.marker, "linestyle": dashes, "markeredgecolor": "white"}
 
 
 def looks(
@@ -63,7 +59,7 @@ def looks(
     11 markers and 4 dashes have a common period of 44; with the colours hundreds of labels differ.
     """
     counts: dict[str, int] = {}
-    found: dict[str, Look] = {}
+    found = {REFERENCE: Look(BLACK, "X", (5, 2))}
     for i, label in enumerate(label for label in labels if label != REFERENCE):
         kind = (kinds or {}).get(label, "")
         family = FAMILIES.get(kind, COLORS)
@@ -71,7 +67,6 @@ def looks(
         color = family[k % len(family)] if chosen is None or label in chosen else GREY
         dash = list(FAMILIES).index(kind) if kind in FAMILIES else i // 11
         found[label] = Look(color, MARKERS[i % len(MARKERS)], DASHES[(dash + k // len(family)) % len(DASHES)])
-    found[REFERENCE] = Look(BLACK, "X", (5, 2))
     return {label: found[label] for label in labels}
 
 
@@ -84,22 +79,33 @@ _HOUSE: dict[str, Any] = {
     "axes.spines.top": False,
     "grid.color": "#e3e3e3",
     "grid.linewidth": 0.6,
+    "lines.linewidth": 1.4,
+    "lines.markersize": 5.0,
+    "lines.markeredgewidth": 0.5,
     "figure.dpi": 150,
     "savefig.dpi": 150,
     "pdf.fonttype": 42,
     "svg.hashsalt": "ipe-bench",
 }
-PRINT: dict[str, Any] = {
+_PRINT: dict[str, Any] = {
     "legend.columnspacing": 1.0,
     "legend.handlelength": 1.6,
     "legend.handletextpad": 0.4,
     "axes.titlepad": 3.0,
     "axes.labelpad": 2.0,
+    "lines.linewidth": 1.0,
+    "lines.markersize": 3.4,
     "figure.constrained_layout.w_pad": 0.02,
     "figure.constrained_layout.h_pad": 0.02,
     "figure.dpi": 300,
     "savefig.dpi": 300,
 }
+_column: ContextVar[float] = ContextVar("column", default=0.0)
+
+
+def column() -> float:
+    """Inches of the column of print that figures are drawn for; 0 for those of the page."""
+    return _column.get()
 
 
 @contextmanager
@@ -114,6 +120,12 @@ def house_style(scale: float = 0.95, more: Mapping[str, Any] | None = None) -> I
         yield
 
 
-def print_style() -> Any:
+@contextmanager
+def print_style(width: float) -> Iterator[None]:
     """The same look in a column of print, where nothing is scaled any more: letters of 7 points, as IEEE's."""
-    return house_style(0.74, PRINT)
+    token = _column.set(width)
+    try:
+        with house_style(0.74, _PRINT):
+            yield
+    finally:
+        _column.reset(token)

@@ -106,6 +106,7 @@ class ResultKey:
             "names": self.names,
             "bound": "bayes" if self.estimator is not None and "prior" in self.estimator.needs else "crlb",
             "equation": None if self.estimator is None else self.estimator.equation,
+            "family": None if self.estimator is None else self.estimator.family,
             "sequential": self.estimator is not None and "epochs" in self.estimator.needs,
             "jacobian_cost": float(getattr(model, "jacobian_cost", model.n)),
             "parameters": [describe(p) for p in model.parameters],

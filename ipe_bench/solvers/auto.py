@@ -60,6 +60,7 @@ class Auto(Estimator):
     """Simulations that a trial may cost, a Jacobian counting n; None: no limit."""
 
     equation = "least_squares"
+    family = "IPE"
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         everyone, m = np.arange(len(z)), z.shape[1]

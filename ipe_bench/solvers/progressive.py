@@ -77,6 +77,7 @@ class Progressive(Estimator):
     """Simulations that a trial may cost, a Jacobian counting n and a window its share; None: no limit."""
 
     equation = "least_squares"
+    family = "IPE"
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         best, tally = self.search(problem, z, history=history)

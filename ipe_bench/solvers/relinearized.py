@@ -64,6 +64,7 @@ class Relinearized(Solver[Round], Estimator):
     """Simulations that a trial may cost, a Jacobian counting n; None: no limit."""
 
     equation = "least_squares"
+    family = "IPE"
 
     def __post_init__(self) -> None:
         super().__post_init__()

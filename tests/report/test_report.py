@@ -23,7 +23,7 @@ from synthetic_store import Filter, Seeker, Synthetic
 from ipe_bench.noise import Quantization
 from ipe_bench.report import write_report
 from ipe_bench.report.definitions import DEFINITIONS
-from ipe_bench.report.figures import consistency, correlation, errors, parameters
+from ipe_bench.report.figures import consistency, errors, parameters
 from ipe_bench.report.figures.views import views
 from ipe_bench.report.headline import about, headline
 from ipe_bench.report.style import house_style, looks
@@ -359,10 +359,10 @@ def test_settings_that_differ_have_figures_of_their_own(synthetic, tmp_path):
         for label in ("linear_lse", "one"):
             synthetic.add(scenario, label, 0.1 * rng.normal(size=(40, 3)))
     result = write_report([synthetic.directory], tmp_path / "out", figures="none")
-    modules = (errors, parameters, correlation, consistency)
+    kinds = (*errors.FIGURES, *parameters.FIGURES, *consistency.FIGURES)
     with house_style():
         parts, _ = views(analyse([synthetic.directory]))
-        drawn = [drawing for view in parts for module in modules for drawing in module.draw(view)]
+        drawn = [drawing for view in parts for kind in kinds for drawing in kind.draw(view)]
     names = {drawing.name for drawing in drawn}
     assert not [drawing.name for drawing in drawn if re.search(r"\bnan\b", drawing.caption)]
     settings = ("gaussian-0.2", "gaussian-0.4", "quantization")

@@ -240,7 +240,7 @@ def test_summary_table_and_figures_say_so(synthetic):
     assert [cell.text for cell in shown.columns[1].cells] == ["boaster", "honest"] * 2
     (view,), _ = views(analysis)
     with house_style():
-        drawings = {d.name: d for d in figure.draw(view)}
+        drawings = {d.name: d for kind in figure.FIGURES for d in kind.draw(view)}
     assert set(drawings) == {"calibration", "consistency"}
     assert "boaster: deviations 2.0 times too small" in drawings["calibration"].caption
 

@@ -20,7 +20,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.plugins.description import described
 from ipe_bench.plugins.discovery import ESTIMATOR_GROUPS, Option, options
 from ipe_bench.report.definitions import DEFINITIONS
-from ipe_bench.report.figures.gallery import INDEX
+from ipe_bench.report.figures import INDEX
 from ipe_bench.report.words import duration
 from ipe_bench.statistics.records import STATISTICS
 

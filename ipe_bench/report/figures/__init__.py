@@ -1,22 +1,110 @@
-"""Figures: each module draws one kind of figure from what it declares to read; `gallery` keeps a folder of them."""
+"""The figures of a report: each module declares what it draws from; here they are drawn and written into one folder."""
 
 from __future__ import annotations
 
-from ipe_bench.report.figures.drawing import FORMATS, Drawing, Figure
-from ipe_bench.report.figures.gallery import Drawn, draw_all
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
+from pathlib import Path
 
-__all__ = ["FIGURES", "FORMATS", "Drawing", "Drawn", "Figure", "draw_all"]
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.files import make_folder, write_text
+from ipe_bench.report.choice import FORMATS, PAGE, Which
+from ipe_bench.report.figures.drawing import Drawing
+from ipe_bench.report.figures.views import views
+from ipe_bench.report.style import house_style
+from ipe_bench.statistics.analysis import Analysis
 
-FIGURES = (
-    "headline",
-    "errors",
-    "costs",
-    "data_profile",
-    "parameters",
-    "settings",
-    "consistency",
-    "convergence",
-    "profiles",
-    "correlation",
-)
-"""The modules, in the order of the report; a new figure is a module with a FIGURE, and its name here."""
+FIGURES = ("headline", "errors", "costs", "profiles", "parameters", "consistency", "convergence")
+"""The modules in the order of the report; each holds its kinds of figures in FIGURES."""
+INDEX = "index.json"
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure in its folder."""
+
+    name: str
+    title: str
+    caption: str
+    files: tuple[Path, ...]
+    """One file per format; the first is the page's."""
+
+
+def draw_all(
+    analysis: Analysis,
+    folder: Path,
+    *,
+    which: Which = "main",
+    formats: Sequence[str] = (PAGE,),
+    problems: list[str] | None = None,
+) -> list[Drawn]:
+    """The figures that the data allow, in the order of the report, as files in the folder.
+
+    `index.json` in the folder names each with its title and caption; figures of an earlier report are removed. One of a
+    plugin that cannot be drawn is left out, with a line added to the `problems`.
+    """
+    from ipe_bench.report.extensions import guarded
+
+    problems = [] if problems is None else problems
+    old, drawn = _names(folder), []
+    with house_style():
+        for drawing, plugin in _drawings(analysis, which, problems):
+            make_folder(folder)
+            save = partial(drawing.save, folder, formats)
+            try:
+                files = guarded(save) if plugin else save()
+            except UserError as error:
+                problems.append(f"{plugin}: {error}; it is left out")
+            else:
+                drawn.append(Drawn(drawing.name, str(drawing.title), str(drawing.caption), files))
+    written = {path.name for one in drawn for path in one.files}
+    for name in {f"{name}.{kind}" for name in old for kind in FORMATS} - written:
+        (folder / name).unlink(missing_ok=True)
+    index = [{"name": one.name, "title": one.title, "caption": one.caption} for one in drawn]
+    if index or old:
+        write_text(folder / INDEX, json.dumps(index, indent=1, ensure_ascii=False) + "\n")
+    return drawn
+
+
+def drawings(analysis: Analysis, problems: list[str]) -> Iterator[Drawing]:
+    """Every figure that the data allow, drawn and not saved."""
+    return (drawing for drawing, _ in _drawings(analysis, "all", problems))
+
+
+def _drawings(analysis: Analysis, which: Which, problems: list[str]) -> Iterator[tuple[Drawing, str]]:
+    """Figures of every setting, or of all of them together, ours first; with the plugin that draws one, if any."""
+    from ipe_bench.report import extensions
+
+    # Plugins that cannot be used are told of even if nothing is drawn.
+    others = [(figure, f"figure={option.name}") for option, figure in extensions.figures(problems)]
+    if which == "none" or (not analysis.collection.groups and analysis.attained.empty):
+        return
+    ours = [(figure, "") for name in FIGURES for figure in import_module(f"{__name__}.{name}").FIGURES]
+    parts, whole = views(analysis)
+    taken: set[str] = set()
+    for figure, plugin in [*ours, *others]:
+        for view in ([whole] if figure.together else parts) if figure.main or which == "all" else ():
+            shown = view.only(figure.frames)
+            try:
+                found = extensions.drawings(figure, shown) if plugin else figure.draw(shown)
+            except UserError as error:
+                problems.append(f"{plugin}: {error}; it is left out")
+                continue
+            for drawing in found:
+                if drawing.name in taken:
+                    problems.append(f"{plugin}: there is a figure {drawing.name} already; it is left out")
+                else:
+                    taken.add(drawing.name)
+                    yield drawing, plugin
+
+
+def _names(folder: Path) -> list[str]:
+    """Names of the figures of an earlier report; none if its index is missing, damaged or of another version."""
+    try:
+        names = [entry["name"] for entry in json.loads((folder / INDEX).read_text(encoding="utf-8"))]
+        return [name for name in names if Path(name).name == name]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []

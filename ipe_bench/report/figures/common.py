@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Mapping, Sequence
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, GREY, MOST_FACES, Look
+from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, GREY, Look, column
 from ipe_bench.report.words import enumerate_few as enumerate_few
 from ipe_bench.report.words import plain
 from ipe_bench.trials.thresholds import FEW
@@ -23,64 +21,37 @@ if TYPE_CHECKING:
 
 REACH = 0.3
 """Part of the span of the points that intervals may add to an axis at either end."""
-LETTER, PRINTED_LETTER = 0.08, 0.062
-"""Inches of a letter under an axis, with the space around it: on the page, and in print."""
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
-
-_column: ContextVar[float | None] = ContextVar("column", default=None)
-
-
-def text(value: Any) -> str:
-    """A name as it stands in a figure: never read as mathematics, never longer than a line."""
-    words, most = str(value), 42 if _column.get() is None else 16
-    words = words if len(words) <= most else words[: most - 1] + "…"
-    words = words.replace("\\", "\\\\").replace("$", r"\$")
-    # A leading underscore would hide the name from legends.
-    return "\u200b" + words if words.startswith("_") else words
-
-
-@contextmanager
-def column_width(inches: float) -> Iterator[None]:
-    """Figures that are drawn meanwhile are as wide as a column of print."""
-    token = _column.set(inches)
-    try:
-        yield
-    finally:
-        _column.reset(token)
+# Panels --------------------------------------------------------------------------------------------------------------
 
 
 def figure(width: float, height: float) -> Figure:
     """An empty figure; in print as wide as the column, in the same shape."""
     from matplotlib.figure import Figure
 
-    column = _column.get()
-    size = (width, height) if column is None else (column, max(1.9, height * column / width))
+    size = (column(), max(1.9, height * column() / width)) if column() else (width, height)
     return Figure(figsize=size, layout="constrained")
 
 
 def most_panels() -> int:
     """Panels of a figure: six on the page, two rows in a column of print."""
-    column = _column.get()
-    return 6 if column is None or column > 5 else 4
+    return 4 if 0 < column() <= 5 else 6
 
 
-def panels(
-    count: int, look: Mapping[str, Look] | None = None, *, height: float = 2.7, most_across: int | None = None
-) -> tuple[Figure, list[Axes]]:
+def panels(count: int, look: Mapping[str, Look] | None = None, *, height: float = 2.7) -> tuple[Figure, list[Axes]]:
     """A figure with that many panels, in print in at most two rows, and room for the legend of the estimators."""
-    column = _column.get()
-    if column is None:
-        across = min(count, most_across or {4: 2, 7: 4, 8: 4}.get(count, 3))
-        down = -(-count // across)
-        width = {1: 5.2, 2: 8.0, 3: 9.2}.get(across, 11.0)
-        size = width, height * down + 0.4 + 0.2 * len(look or ()) / 5
-    else:
-        across = min(count, max(2, -(-count // 2)) if column < 5 or count == 4 else 3)
-        down = -(-count // across)
-        size = column, max(1.5, 0.85 * column / across) * down + 0.16 * len(look or ()) / 3 + 0.2
     from matplotlib.figure import Figure
 
+    entries = len(look or ())
+    if column():
+        across = min(count, max(2, -(-count // 2)) if column() < 5 or count == 4 else 3)
+        down = -(-count // across)
+        size = column(), max(1.5, 0.85 * column() / across) * down + 0.055 * entries + 0.2
+    else:
+        across = min(count, {4: 2, 7: 4, 8: 4}.get(count, 3))
+        down = -(-count // across)
+        size = {1: 5.2, 2: 8.0, 3: 9.2}.get(across, 11.0), height * down + 0.4 + 0.04 * entries
     fig = Figure(figsize=size, layout="constrained")
     axes: list[Axes] = list(fig.subplots(down, across, squeeze=False).flat)
     for ax in axes[count:]:
@@ -88,17 +59,46 @@ def panels(
     return fig, axes[:count]
 
 
-def title(ax: Axes, words: str) -> None:
-    """Sets the title of a panel, in as many lines as its width needs."""
-    letters = max(12, int(_inches(ax) / (0.078 if _column.get() is None else 0.056)))
-    broken = max(map(len, words.split()), default=0) > 20
-    ax.set_title(fill(words.replace("$", r"\$"), letters, break_long_words=broken))
+def spread(values: Sequence[Any], most: int | None = None) -> list[Any]:
+    """At most that many of the values, evenly spread and with both ends."""
+    count = min(most or most_panels(), len(values))
+    return [values[round(i)] for i in np.linspace(0, len(values) - 1, count)]
+
+
+def at_scale(frame: pd.DataFrame, scale: float) -> pd.DataFrame:
+    return frame[frame["error_scale"] == scale]
+
+
+# Words ---------------------------------------------------------------------------------------------------------------
+
+
+def text(value: Any) -> str:
+    """A name as it stands in a figure: never read as mathematics, never longer than a line."""
+    words, most = str(value), 16 if column() else 42
+    words = words if len(words) <= most else words[: most - 1] + "…"
+    words = words.replace("\\", "\\\\").replace("$", r"\$")
+    # A leading underscore would hide the name from legends.
+    return "\u200b" + words if words.startswith("_") else words
+
+
+def _letter(size: Any) -> float:
+    """Inches of a letter in this one of matplotlib's settings of size, with the space around it."""
+    from matplotlib import rcParams
+
+    return 0.0085 * float(rcParams[size])
 
 
 def _inches(ax: Axes) -> float:
     """About the width of a panel: in print its labels take a fourth of what the layout has not given them yet."""
     width = ax.get_position().width * ax.figure.get_figwidth()  # type: ignore[union-attr]
-    return width if _column.get() is None else min(0.75 * width, width - 0.45)
+    return min(0.75 * width, width - 0.45) if column() else width
+
+
+def title(ax: Axes, words: str) -> None:
+    """Sets the title of a panel, in as many lines as its width needs."""
+    broken = max(map(len, words.split()), default=0) > 20
+    letters = max(12, int(_inches(ax) / _letter("axes.titlesize")))
+    ax.set_title(fill(words.replace("$", r"\$"), letters, break_long_words=broken))
 
 
 def axis_labels(fig: Figure, x: str, y: str) -> None:
@@ -109,16 +109,30 @@ def axis_labels(fig: Figure, x: str, y: str) -> None:
         ax.set(xlabel="", ylabel="")
 
 
-def spread(values: Sequence[Any], most: int | None = None) -> list[Any]:
-    """At most that many of the values, evenly spread and with both ends."""
-    most = most or most_panels()
-    if len(values) <= most:
-        return list(values)
-    return [values[i] for i in np.unique(np.linspace(0, len(values) - 1, most).round().astype(int))]
+def power_of_ten(value: float) -> str:
+    """10⁻³ in plain letters, which take a fraction of the time that mathematics does."""
+    return "10" + f"{round(np.log10(value))}".translate(_RAISED)
 
 
-def at_scale(frame: pd.DataFrame, scale: float) -> pd.DataFrame:
-    return frame[frame["error_scale"] == scale]
+def number(value: float) -> str:
+    """A number of an axis: 0.05, 200 or 5·10⁻⁷, with the minus that typography has."""
+    digits, _, exponent = f"{value:g}".partition("e")
+    words = f"{digits}·10{str(int(exponent)).translate(_RAISED)}" if exponent else digits
+    return words.removeprefix("1·").replace("-", "\N{MINUS SIGN}")
+
+
+def values_of(rows: pd.DataFrame, column: str, *, most: int = 20) -> str:
+    """'a 1.02, b 3.4': a column by estimator, in three figures."""
+    pairs = zip(rows["estimator"], rows[column], strict=True)
+    return enumerate_few([f"{e} {v:.3g}" for e, v in pairs if np.isfinite(v)], most)
+
+
+def sentence(*parts: str) -> str:
+    """The parts of a caption that say something, one after another."""
+    return " ".join(part for part in parts if part)
+
+
+# Axes ----------------------------------------------------------------------------------------------------------------
 
 
 def scale_axis(ax: Axes, scales: Sequence[float], labels: Sequence[str]) -> None:
@@ -128,23 +142,21 @@ def scale_axis(ax: Axes, scales: Sequence[float], labels: Sequence[str]) -> None
         ax.set_xlim(-0.6, len(labels) - 0.4)
         return
     positive = sorted(s for s in scales if s > 0)
+    zero = len(positive) < len(scales)
     # A scale of zero has no place on a logarithmic axis: a decade below the smallest is as near as it gets.
-    least = positive[0] / 10 if len(positive) < len(scales) else positive[0]
-    ax.set_xscale("symlog", linthresh=positive[0], linscale=0.5) if least < positive[0] else ax.set_xscale("log")
+    least = positive[0] / 10 if zero else positive[0]
+    ax.set_xscale("symlog", linthresh=positive[0], linscale=0.5) if zero else ax.set_xscale("log")
     span = np.log10(positive[-1] / least)
-    # Names at the ends of lines take their room, too.
-    inches = _inches(ax) - (0.8 if len(labels) > MOST_FACES else 0.0)
-    kept = [0.0] * (least < positive[0]) + _labelled(positive, span / max(inches, 0.3))
+    kept = [0.0] * zero + labelled(positive, span * _letter("xtick.labelsize") / max(_inches(ax), 0.3))
     ax.set_xticks(kept, [plain(s) for s in kept])
     ax.set_xticks([], minor=True)
     margin = 10 ** max(0.06 * span, 0.15)
-    ax.set_xlim(-0.3 * positive[0] if least < positive[0] else least / margin, positive[-1] * margin)
+    ax.set_xlim(-0.3 * positive[0] if zero else least / margin, positive[-1] * margin)
     ax.set_xlabel("error scale")
 
 
-def _labelled(scales: Sequence[float], decades_an_inch: float) -> list[float]:
-    """Those of ascending scales whose labels have room: both ends, and what fits between them."""
-    letter = decades_an_inch * (LETTER if _column.get() is None else PRINTED_LETTER)
+def labelled(scales: Sequence[float], letter: float) -> list[float]:
+    """Those of ascending scales whose labels have room, a letter taking so many decades: both ends, and what fits."""
 
     def apart(a: float, b: float) -> bool:
         return np.log10(b / a) > letter * (len(plain(a)) + len(plain(b)) + 1) / 2
@@ -153,7 +165,7 @@ def _labelled(scales: Sequence[float], decades_an_inch: float) -> list[float]:
     for scale in scales[1:-1]:
         if apart(kept[-1], scale) and apart(scale, scales[-1]):
             kept.append(scale)
-    return [*kept, scales[-1]] if len(scales) > 1 else kept
+    return [*kept, *scales[1:][-1:]]
 
 
 def decades(ax: Axes, values: Any, least: float = 10.0, *, ends: Any = ()) -> None:
@@ -162,7 +174,8 @@ def decades(ax: Axes, values: Any, least: float = 10.0, *, ends: Any = ()) -> No
     The `ends` of intervals widen it by no more than `REACH` of the values' own span, or a decade: those of heavy tails,
     which may be as wide as numbers go, end at the panel's edge.
     """
-    values, ends = (_positive(v) for v in (values, ends))
+    values, ends = (np.asarray(v, dtype=float).ravel() for v in (values, ends))
+    values, ends = (v[np.isfinite(v) & (v > 0)] for v in (values, ends))
     if len(values) == 0:
         # A logarithmic axis without anything to show makes matplotlib warn.
         return
@@ -178,27 +191,14 @@ def decades(ax: Axes, values: Any, least: float = 10.0, *, ends: Any = ()) -> No
     log_ticks(ax.yaxis, low, high)
 
 
-def _positive(values: Any) -> Any:
-    values = np.asarray(values, dtype=float).ravel()
-    return values[np.isfinite(values) & (values > 0)]
-
-
 def log_ticks(axis: Axis, low: float, high: float) -> None:
     """Labels that do not crowd: powers of ten, and 2 and 5 between if those are few."""
     from matplotlib.ticker import LogLocator, NullLocator
 
-    if high / low < 200:
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axis.set_major_formatter("{x:g}")
-    else:
-        axis.set_major_locator(LogLocator(numticks=7))
-        axis.set_major_formatter(lambda value, _: power_of_ten(value))
+    few = high / low < 200
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)) if few else LogLocator(numticks=7))
+    axis.set_major_formatter(lambda value, _: number(value) if few else power_of_ten(value))
     axis.set_minor_locator(NullLocator())
-
-
-def power_of_ten(value: float) -> str:
-    """10⁻³ in plain letters, which take a fraction of the time that mathematics does."""
-    return "10" + f"{round(np.log10(value))}".translate(_RAISED)
 
 
 def shares(ax: Axes, label: str) -> None:
@@ -208,17 +208,39 @@ def shares(ax: Axes, label: str) -> None:
     ax.set_ylabel(label)
 
 
+def bound_line(ax: Axes, at: float, label: str) -> None:
+    ax.axhline(at, color=BOUND_COLOR, linestyle=BOUND_DASH, linewidth=1.0, label=label, zorder=1)
+
+
+# Curves --------------------------------------------------------------------------------------------------------------
+
+
 def seaborn_style(look: Mapping[str, Look], by: str = "estimator") -> dict[str, Any]:
-    """Arguments of seaborn's functions that give every label its own colour, marker and dash; grey ones lie below."""
+    """Arguments of seaborn's functions that give every label its own colour and marker; grey ones lie below."""
     order = sorted(look, key=lambda label: look[label].color != GREY)
-    return {
-        "hue": by,
-        "hue_order": order,
-        "palette": {label: one.color for label, one in look.items()},
-        "style": by,
-        "style_order": order,
-        "legend": False,
-    }
+    style: dict[str, Any] = {"hue": by, "hue_order": order, "style": by, "style_order": order, "legend": False}
+    style["palette"] = {label: one.color for label, one in look.items()}
+    style["markers"] = {label: one.marker for label, one in look.items()}
+    return style
+
+
+def lines(ax: Axes, rows: pd.DataFrame, x: str, y: str, look: Mapping[str, Look], **style: Any) -> None:
+    """A line per estimator through points that are already dense."""
+    import seaborn as sns
+
+    dashes = {label: one.dash for label, one in look.items()}
+    style = {**seaborn_style(look), "markers": False, "dashes": dashes, "estimator": None, "sort": False, **style}
+    sns.lineplot(rows, x=x, y=y, ax=ax, **style)
+    ax.set(xlabel="", ylabel="")
+
+
+def steps(ax: Axes, rows: pd.DataFrame, x: str, y: str, look: Mapping[str, Look], low: float, high: float) -> None:
+    """Shares that rise in steps from `low` to `high` on a logarithmic axis."""
+    lines(ax, rows, x, y, look, drawstyle="steps-post")
+    ax.set_xscale("log")
+    ax.set_xlim(low, high)
+    log_ticks(ax.xaxis, low, high)
+    shares(ax, "")
 
 
 def curves(
@@ -246,23 +268,15 @@ def curves(
     rows = rows.assign(run=rows.groupby(by)[y].transform(lambda values: values.isna().cumsum()))
     rows = rows[np.isfinite(rows[y])]
     if not rows.empty:
-        style = seaborn_style(look, by) | {
-            "markers": {label: one.marker for label, one in look.items()},
-            "dashes": {label: one.dash for label, one in look.items()},
-        }
-        size, thick = (5.0, 1.4) if _column.get() is None else (3.4, 1.0)
-        width = {"linewidth": thick if len(scales) > 1 else 0, "markersize": size, "markeredgewidth": 0.5}
-        sns.lineplot(rows, x="x", y=y, units="run", estimator=None, ax=ax, **width, **style)
-        few = rows[trials] < FEW
+        style = seaborn_style(look, by) | {"dashes": {label: one.dash for label, one in look.items()}}
+        style |= {"markeredgewidth": 0.5} | ({"linewidth": 0} if len(scales) == 1 else {})
+        sns.lineplot(rows, x="x", y=y, units="run", estimator=None, ax=ax, **style)
+        few, colors = rows[trials] < FEW, np.array([look[label].color for label in rows[by]])
         if interval is not None:
-            low, high = interval
-            plain_grey = rows[by].map(lambda label: look[str(label)].color == GREY)
-            sure = rows[~few & ~plain_grey & np.isfinite(rows[low]) & np.isfinite(rows[high])]
-            colors = [look[e].color for e in sure[by]]
-            ax.vlines(sure["x"], sure[low], sure[high], colors=colors, linewidth=1.0, alpha=0.8)
-        _hollow(ax, rows[few | (rows[trials] < rows["trials"].max())], y, look, by, size)
-        if by == "estimator" and len(look) > MOST_FACES and len(scales) > 1 and most_panels() > 4:
-            direct_labels(ax, rows, y, look, by)
+            sure = ~few & (colors != GREY) & np.isfinite(rows[[*interval]]).all(axis=1)
+            low, high = (rows.loc[sure, end] for end in interval)
+            ax.vlines(rows.loc[sure, "x"], low, high, colors=colors[sure].tolist(), linewidth=1.0, alpha=0.8)
+        _hollow(ax, rows[few | (rows[trials] < rows["trials"].max())], y, look, by)
     ax.set(xlabel="error scale" if len(scales) > 1 else "", ylabel="")
 
 
@@ -271,60 +285,18 @@ def _places(rows: pd.DataFrame, by: str, labels: Sequence[str], scales: Sequence
     order = rows[by].map({label: i for i, label in enumerate(labels)}).to_numpy(dtype=float)
     if len(scales) == 1:
         return order
-    positive = np.log10([s for s in sorted(scales) if s > 0])
-    gap = float(np.diff(positive).min(initial=1.0))
+    gap = float(np.diff(np.log10([s for s in sorted(scales) if s > 0])).min(initial=1.0))
     return rows["error_scale"] * 10 ** (0.3 * gap * ((order + 0.5) / len(labels) - 0.5))
 
 
-def _hollow(ax: Axes, rows: pd.DataFrame, y: str, look: Mapping[str, Look], by: str, size: float) -> None:
+def _hollow(ax: Axes, rows: pd.DataFrame, y: str, look: Mapping[str, Look], by: str) -> None:
     """Empties the markers of these points, and says in the legend what that means."""
-    empty = {"linestyle": "none", "markerfacecolor": "white", "markersize": size, "markeredgewidth": 1.1, "zorder": 3}
+    empty = {"linestyle": "none", "markerfacecolor": "white", "markeredgewidth": 1.1, "zorder": 3}
     for label, part in rows.groupby(by, sort=False):
         one = look[str(label)]
         ax.plot(part["x"], part[y], marker=one.marker, markeredgecolor=one.color, **empty)
     if len(rows):
         ax.plot([], [], marker="o", markeredgecolor=BOUND_COLOR, label="hollow: trials missing, or few", **empty)
-
-
-def direct_labels(ax: Axes, rows: pd.DataFrame, y: str, look: Mapping[str, Look], by: str) -> None:
-    """Names at the right ends of the lines: those in colour each, grey ones together where they end together."""
-    last = rows[rows["error_scale"] == rows["error_scale"].max()]
-    transform = ax.yaxis.get_transform().transform
-    low, high = transform(np.array(ax.get_ylim()))
-    ends = (transform(last[y].to_numpy(dtype=float)) - low) / (high - low)
-    groups: list[tuple[float, list[str], str]] = []
-    for end, label in sorted(zip(ends, last[by], strict=True)):
-        color = look[label].color
-        if color == GREY and groups and groups[-1][2] == GREY and end - groups[-1][0] < 0.05:
-            groups[-1][1].append(label)
-        else:
-            groups.append((float(end), [label], color))
-    longest = 24 if _column.get() is None else 10
-    gap = 0.11 / (ax.get_position().height * ax.figure.get_figheight())  # type: ignore[union-attr]
-    at = np.array([end for end, *_ in groups])
-    for i in range(1, len(at)):
-        at[i] = max(at[i], at[i - 1] + gap)
-    for i in reversed(range(len(at))):
-        at[i] = min(at[i], 1.0 if i == len(at) - 1 else at[i + 1] - gap)
-    for y_at, (_, labels, color) in zip(at, groups, strict=True):
-        words = labels[0] if len(labels) == 1 else f"{labels[0]} and {len(labels) - 1} more"
-        words = words if len(words) <= longest else words[: longest - 1] + "…"
-        place = {"xycoords": "axes fraction", "va": "center", "fontsize": 6.5, "annotation_clip": False}
-        ax.annotate(text(words), (1.01, y_at), color=color if color != GREY else "#808080", **place)
-
-
-def lines(ax: Axes, rows: pd.DataFrame, x: str, y: str, look: Mapping[str, Look], **style: Any) -> None:
-    """A line per estimator through points that are already dense."""
-    import seaborn as sns
-
-    rows = rows[np.isfinite(rows[x]) & np.isfinite(rows[y])]
-    rows = rows[rows["estimator"].isin(list(look))]
-    dashes = {label: one.dash for label, one in look.items()}
-    sns.lineplot(rows, x=x, y=y, ax=ax, estimator=None, dashes=dashes, linewidth=1.4, **(seaborn_style(look) | style))
-
-
-def bound_line(ax: Axes, at: float, label: str) -> None:
-    ax.axhline(at, color=BOUND_COLOR, linestyle=BOUND_DASH, linewidth=1.0, label=label, zorder=1)
 
 
 def legend(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | None = None) -> None:
@@ -334,32 +306,20 @@ def legend(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | None = 
     colored = {label: one for label, one in (look or {}).items() if one.color != GREY}
     handles: dict[str, Any] = {text(label): Line2D([], [], **one.line) for label, one in colored.items()}
     if len(colored) < len(look or ()):
-        handles[f"{len(look or ()) - len(colored)} others"] = Line2D([], [], color=GREY, linewidth=1.4)
+        handles[f"{len(look or ()) - len(colored)} others"] = Line2D([], [], color=GREY)
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     if handles:
-        columns = _legend_columns(list(handles), fig.get_figwidth())
+        columns = _legend_columns([len(label) for label in handles], fig.get_figwidth())
         fig.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=columns)
 
 
-def _legend_columns(labels: Sequence[str], width: float) -> int:
-    """As many as fit side by side, each as wide as its longest label."""
-    handle, letter = (0.55, 0.075) if _column.get() is None else (0.38, 0.06)
+def _legend_columns(lengths: Sequence[int], width: float) -> int:
+    """The most columns that fit side by side, each as wide as its longest label."""
+    letter = _letter("legend.fontsize")
 
     def needed(columns: int) -> float:
-        parts = np.array_split(np.array([len(label) for label in labels]), columns)
-        return sum(handle + letter * float(part.max()) for part in parts)
+        return sum(letter * (7 + int(part.max())) for part in np.array_split(np.array(lengths), columns))
 
-    return next((n for n in range(len(labels), 1, -1) if needed(n) <= width), 1)
-
-
-def values_of(rows: pd.DataFrame, column: str, *, most: int = 20) -> str:
-    """'a 1.02, b 3.4': a column by estimator, in three figures."""
-    pairs = zip(rows["estimator"], rows[column], strict=True)
-    return enumerate_few([f"{e} {v:.3g}" for e, v in pairs if np.isfinite(v)], most)
-
-
-def sentence(*parts: str) -> str:
-    """The parts of a caption that say something, one after another."""
-    return " ".join(part for part in parts if part)
+    return next((n for n in range(len(lengths), 1, -1) if needed(n) <= width), 1)

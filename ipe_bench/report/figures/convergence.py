@@ -27,9 +27,8 @@ def draw(view: View) -> Iterator[Drawing]:
     if view["convergence"].empty:
         return
     medians = median_distances(view["convergence"])
-    # A filter's epochs are no iterations; what solves no equation has no limit that it could approach.
+    # A filter's epochs are no iterations, and a direct estimate has a start and an end, and nothing between.
     iterating = [label for label, equation in view.equations.items() if equation is not None]
-    # A direct estimate has a start and an end, and nothing between: there is no convergence to see.
     longest = medians.groupby("estimator")["iteration"].transform("max")
     medians = medians[medians["estimator"].isin(iterating) & (longest > 0)]
     if medians.empty:
@@ -37,31 +36,25 @@ def draw(view: View) -> Iterator[Drawing]:
     look = view.with_look(medians["estimator"])
     shown = sorted(look, key=lambda label: look[label].color == GREY)[: common.most_panels()]
     scales = sorted(set(medians["error_scale"]))
+    names = {scale: f"error scale {plain(scale)}" for scale in scales}
     colors = sns.color_palette("crest", len(scales)).as_hex()
-    by_scale = {
-        f"error scale {plain(scale)}": Look(color, MARKERS[i % len(MARKERS)])
-        for i, (scale, color) in enumerate(zip(scales, colors, strict=True))
-    }
-    medians = medians.assign(scale=[f"error scale {plain(scale)}" for scale in medians["error_scale"]])
+    by_scale = {name: Look(colors[i], MARKERS[i % len(MARKERS)]) for i, name in enumerate(names.values())}
+    medians = medians.assign(scale=medians["error_scale"].map(names))
+    style = {**common.seaborn_style(by_scale, "scale"), "dashes": False, "estimator": None, "linewidth": 1.2}
     fig, axes = common.panels(len(shown), by_scale)
     bottom, top = medians["distance"].min() / 3, medians["distance"].max() * 3
     for label, ax in zip(shown, axes, strict=True):
         rows = medians[medians["estimator"] == label]
-        style = common.seaborn_style(by_scale, "scale") | {
-            "markers": {name: one.marker for name, one in by_scale.items()},
-            "dashes": False,
-        }
         end = int(rows["iteration"].max())
-        sns.lineplot(rows, x="iteration", y="distance", estimator=None, ax=ax, markevery=1 + end // 12, **style)
+        sns.lineplot(rows, x="iteration", y="distance", ax=ax, markevery=1 + end // 12, **style)
         ax.set_yscale("log")
         ax.set_ylim(bottom, top)
         common.log_ticks(ax.yaxis, bottom, top)
         common.bound_line(ax, CLOSE, f"{CLOSE:g} standard deviations")
+        ax.set_xlim(-0.03 * end - 0.2, 1.03 * end + 0.2)
         if end > LONG:
             ax.set_xscale("symlog", linthresh=10)
-            ax.set_xlim(-0.5, end * 1.1)
         else:
-            ax.set_xlim(-0.03 * end - 0.2, 1.03 * end + 0.2)
             ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         common.title(ax, f"{label}, logarithmic from 10" if end > LONG else label)
     common.axis_labels(fig, "iteration", "distance to own limit [σ]")
@@ -75,7 +68,7 @@ def draw(view: View) -> Iterator[Drawing]:
         " definition, is not drawn: a curve ends where half of the trials have ended.",
         f"Iterations until the median is within {CLOSE:g} standard deviations at scale {plain(scales[-1])}:"
         f" {common.enumerate_few(seen, 20)}.",
-        f"{len(look) - len(shown)} further estimators are not shown." if len(look) > len(shown) else "",
+        f"{len(look) - len(shown)} further estimators are not shown." * (len(look) > len(shown)),
         f"{view.label}.",
     )
     yield Drawing(f"convergence{view.suffix}", "Convergence, converged trials", caption, fig)
@@ -84,19 +77,14 @@ def draw(view: View) -> Iterator[Drawing]:
 def median_distances(frame: pd.DataFrame) -> pd.DataFrame:
     """Per error scale, estimator and iteration, the median distance of the trials from their last iterates, as long as
     less than half of them have come to their last one; those that have are nearer than any other."""
-    keys = ["error_scale", "estimator"]
-    rows = frame.assign(distance=frame["distance"].where(np.isfinite(frame["distance"]), np.inf))
-    last = rows.groupby([*keys, "trial"])["iteration"].transform("max")
-    trials = rows.groupby(keys)["trial"].transform("nunique")
-    underway = rows.assign(trials=trials)[rows["iteration"] < last]
     found = []
-    for key, part in underway.groupby([*keys, "iteration"], sort=True):
-        count = int(part["trials"].iloc[0])
-        values = np.concatenate([np.zeros(count - len(part)), part["distance"].to_numpy()])
-        middle = float(np.sort(values)[(count - 1) // 2])
-        if 0 < middle < np.inf:
-            found.append((*key, max(middle, FLOOR)))
-    return pd.DataFrame(found, columns=[*keys, "iteration", "distance"])
+    for key, part in frame.groupby(["error_scale", "estimator"]):
+        part = part.assign(distance=part["distance"].where(np.isfinite(part["distance"]), np.inf))
+        # Behind its last iterate, whose distance is zero, a trial stays there.
+        table = part.pivot_table(index="iteration", columns="trial", values="distance").fillna(0.0)
+        middle = np.sort(table, axis=1)[:, (table.shape[1] - 1) // 2]
+        found += [(*key, k, max(d, FLOOR)) for k, d in zip(table.index, middle, strict=True) if 0 < d < np.inf]
+    return pd.DataFrame(found, columns=["error_scale", "estimator", "iteration", "distance"])
 
 
-FIGURE = Figure(draw, ("convergence",))
+FIGURES = (Figure(draw, ("convergence",)),)

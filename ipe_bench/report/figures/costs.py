@@ -1,4 +1,4 @@
-"""What accuracy costs: cost against error, and performance and data profiles."""
+"""What accuracy costs: the error of each estimator against its simulations."""
 
 from __future__ import annotations
 
@@ -23,25 +23,22 @@ def draw(view: View) -> Iterator[Drawing]:
     import seaborn as sns
 
     rows = quantiles(view, MOST).merge(view["scores"][["error_scale", "estimator", "cost_median"]])
-    rows = rows.assign(
-        cost=np.maximum(rows["cost_median"], LEAST_COST), shown=np.clip(rows["error"].fillna(np.inf), None, _HIGHEST)
-    )
+    rows = rows.assign(cost=rows["cost_median"].clip(lower=LEAST_COST), error=rows["error"].clip(upper=_HIGHEST))
     rows = rows[np.isfinite(rows["cost"])]
     if rows.empty:
         return
-    look = view.with_look(rows["estimator"])
-    scales = common.spread(view.scales)
+    look, scales = view.with_look(rows["estimator"]), common.spread(view.scales)
     fig, axes = common.panels(len(scales), look)
+    style = {**common.seaborn_style(look), "edgecolor": "white", "linewidth": 0.6, "zorder": 3}
     # Equal points lie upon each other: the later ones are smaller, so that all are seen.
-    order = common.seaborn_style(look)["hue_order"]
-    areas = dict(zip(order, np.linspace(90, 40, len(order)) / (1 if common.most_panels() > 4 else 2), strict=True))
-    areas |= {label: 20.0 for label, one in look.items() if one.color == GREY}
-    markers = {label: one.marker for label, one in look.items()}
+    areas = np.linspace(90, 40, len(look)) / (1 if common.most_panels() > 4 else 2)
+    sizes = {
+        label: a if look[label].color != GREY else 20.0 for label, a in zip(style["hue_order"], areas, strict=True)
+    }
     for scale, ax in zip(scales, axes, strict=True):
+        common.decades(ax, [*rows["error"], 1.0])
         here = common.at_scale(rows, scale)
-        common.decades(ax, [*rows["shown"], 1.0])
-        style = {**common.seaborn_style(look), "markers": markers, "size": "estimator", "sizes": areas}
-        sns.scatterplot(here, x="cost", y="shown", ax=ax, zorder=3, edgecolor="white", linewidth=0.6, **style)
+        sns.scatterplot(here, x="cost", y="error", ax=ax, size="estimator", sizes=sizes, **style)
         common.bound_line(ax, 1.0, "Cramér-Rao bound")
         ax.set_xscale("log")
         ax.set_xlim(rows["cost"].min() / 1.5, rows["cost"].max() * 1.5)
@@ -50,17 +47,15 @@ def draw(view: View) -> Iterator[Drawing]:
     common.axis_labels(fig, "simulations per trial (median)", "95 % error / efficient estimator's")
     common.legend(fig, axes, look)
     last = common.at_scale(rows, view.scales[-1])
-    good = last[last["shown"] <= last["shown"].min() * 1.05].sort_values("cost_median", kind="stable").iloc[0]
+    good = last[last["error"] <= last["error"].min() * 1.05].sort_values("cost_median", kind="stable").iloc[0]
     caption = common.sentence(
         "Median cost of a trial in simulations, a Jacobian counting what it costs, against what 95 % of all trials err"
         " by at most, over the same of an efficient estimator; down and left is better.",
-        f"Errors beyond {common.power_of_ten(_HIGHEST)} stand at the edge."
-        if (rows["shown"] >= _HIGHEST).any()
-        else "",
+        f"Errors beyond {common.power_of_ten(_HIGHEST)} stand at the edge." * bool((rows["error"] == _HIGHEST).any()),
         f"The cheapest within 5 % of the least error at scale {plain(view.scales[-1])}: {good['estimator']}"
         f" ({good['cost_median']:g} simulations). {view.label}.",
     )
     yield Drawing(f"cost_against_accuracy{view.suffix}", "Cost against accuracy, all trials", caption, fig)
 
 
-FIGURE = Figure(draw, ("summary", "distributions", "scores"), main=True)
+FIGURES = (Figure(draw, ("summary", "distributions", "scores"), main=True),)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from ipe_bench.trials.observability import Observability, truths_of
 
 _WORST = 10.0
 """Bounds above this many times today's are off the picture."""
+_TODAY = "#C00000"
 
 
 def draw_design(design: Design) -> Iterator[Drawing]:
@@ -26,46 +26,33 @@ def draw_design(design: Design) -> Iterator[Drawing]:
     with house_style():
         fig = common.figure(9.6, 4.2)
         left, right = fig.subplots(1, 2, width_ratios=(1.25, 1.0))
-        look = looks([way.title for way in design.ways])
-        _curves(left, design, look)
-        _by_parameter(right, design, look)
+        look, today = looks([way.title for way in design.ways]), design.scenario.measurement.m
+        shown = [c for way in design.ways for c in way.curve if c.mean_bound <= _WORST]
+        counts = [today, *(c.readings for c in shown)]
+        rows, offset = np.arange(len(design.observability.parameters)), (len(design.ways) - 1) / 2
+        for k, way in enumerate(design.ways):
+            chosen = [choice for choice in (way.saving, way.sharpest) if choice]
+            curve = [*(c for c in way.curve if c.mean_bound <= _WORST), *chosen]
+            least = {c.readings: c.mean_bound for c in sorted(curve, key=lambda c: -c.mean_bound)}
+            left.plot(sorted(least), [least[readings] for readings in sorted(least)], **look[way.title].line)
+            ratio = bounds_of(design, chosen[0]) / design.observability.bound
+            right.plot(ratio, rows + 0.12 * (k - offset), **look[way.title].line | {"linestyle": "none"})
+        left.plot(today, 1.0, marker="*", color=_TODAY, markersize=13, linestyle="none", zorder=5, label="today")
+        across = np.geomspace(min(counts), max(counts), 30)
+        same = {"color": BOUND_COLOR, "linestyle": BOUND_DASH, "linewidth": 1.0, "zorder": 1}
+        left.plot(across, np.sqrt(today / across), label="more of the same: 1 / root of the number", **same)
+        left.set_xscale("log")
+        common.log_ticks(left.xaxis, min(counts), max(counts))
+        common.decades(left, [1.0, *(c.mean_bound for c in shown)], 3.0)
+        left.set(xlabel="readings", ylabel="mean bound, as a share of today's")
+        right.axvline(1.0, color=_TODAY, linewidth=1.0, zorder=1)
+        right.set_yticks(rows, [common.text(p.name) for p in design.observability.parameters])
+        right.invert_yaxis()
+        numbers = {(way.saving or way.sharpest).readings for way in design.ways}
+        chosen_words = f"{numbers.pop()} readings" if len(numbers) == 1 else "what is chosen"
+        right.set(xlabel=f"bound with {chosen_words}, as a share of today's")
         common.legend(fig, [left, right], look)
         yield Drawing("design", "What to measure next", _caption(design), fig)
-
-
-def _curves(ax: Any, design: Design, look: Any) -> None:
-    today = design.scenario.measurement.m
-    for way in design.ways:
-        shown = [c for c in way.curve if c.mean_bound <= _WORST]
-        chosen = [choice for choice in (way.saving, way.sharpest) if choice]
-        points = {c.readings: c.mean_bound for c in sorted((*shown, *chosen), key=lambda c: -c.mean_bound)}
-        line = {**look[way.title].line, "markersize": 4.5, "markeredgewidth": 0.4}
-        ax.plot(sorted(points), [points[readings] for readings in sorted(points)], **line)
-    ax.plot(today, 1.0, marker="*", color="#C00000", markersize=13, linestyle="none", zorder=5, label="today")
-    counts = [c.readings for way in design.ways for c in way.curve if c.mean_bound <= _WORST] + [today]
-    across = np.geomspace(min(counts), max(counts), 30)
-    same = {"color": BOUND_COLOR, "linestyle": BOUND_DASH, "linewidth": 1.0, "zorder": 1}
-    ax.plot(across, np.sqrt(today / across), label="more of the same: 1 / root of the number", **same)
-    ax.set_xscale("log")
-    common.log_ticks(ax.xaxis, min(counts), max(counts))
-    common.decades(ax, [c.mean_bound for way in design.ways for c in way.curve if c.mean_bound <= _WORST] + [1.0], 3.0)
-    ax.set(xlabel="readings", ylabel="mean bound, as a share of today's")
-
-
-def _by_parameter(ax: Any, design: Design, look: Any) -> None:
-    names = [common.text(p.name) for p in design.observability.parameters]
-    ax.axvline(1.0, color="#C00000", linewidth=1.0)
-    rows = np.arange(len(names))
-    for k, way in enumerate(design.ways):
-        choice = way.saving or way.sharpest
-        ratio = bounds_of(design, choice) / design.observability.bound
-        style = {**look[way.title].line, "linestyle": "none"}
-        ax.plot(ratio, rows + 0.12 * (k - (len(design.ways) - 1) / 2), **style)
-    ax.set_yticks(rows, names)
-    ax.invert_yaxis()
-    counts = {(way.saving or way.sharpest).readings for way in design.ways}
-    chosen = f"{counts.pop()} readings" if len(counts) == 1 else "what is chosen"
-    ax.set(xlabel=f"bound with {chosen}, as a share of today's")
 
 
 def bounds_of(design: Design, choice: Choice) -> Array:
@@ -76,13 +63,11 @@ def bounds_of(design: Design, choice: Choice) -> Array:
 
 
 def _caption(design: Design) -> str:
-    best = design.best
+    best, scenario, today = design.best, design.scenario, design.scenario.measurement.m
     assert best is not None
-    scenario, today = design.scenario, design.scenario.measurement.m
-    few = best.saving
     saved = (
-        f"{few.readings} readings, chosen {best.title}, are worth as much as today's {today}"
-        if few
+        f"{best.saving.readings} readings, chosen {best.title}, are worth as much as today's {today}"
+        if best.saving
         else f"no choice of fewer readings is worth as much as today's {today}"
     )
     return common.sentence(

@@ -16,15 +16,13 @@ if TYPE_CHECKING:
 
     from ipe_bench.report.figures.views import View
 
-FORMATS = ("png", "pdf")
-"""Formats of the figures of commands that draw few; those of the report are in `choice`."""
 _METADATA: dict[str, Any] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 """The same figure is the same file whenever it is drawn."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A kind of figure; a module of this folder holds one under the name FIGURE."""
+    """A kind of figure: what it reads, and how it is drawn."""
 
     draw: Callable[[View], Iterator[Drawing]]
     """Draws what a view allows; nothing if it would be empty."""
@@ -45,12 +43,8 @@ class Drawing:
     caption: str
     figure: Canvas
 
-    def save(self, folder: Path, formats: Sequence[str] = FORMATS) -> tuple[Path, ...]:
+    def save(self, folder: Path, formats: Sequence[str] = ("png", "pdf")) -> tuple[Path, ...]:
         """Writes the figure in these formats, named for it; no file is ever seen half written."""
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-        if self.figure.canvas.__class__.__name__ == "FigureCanvasBase":
-            FigureCanvasAgg(self.figure)
         paths = []
         for kind in formats:
             content = BytesIO()

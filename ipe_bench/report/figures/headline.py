@@ -26,15 +26,13 @@ def draw(view: View) -> Iterator[Drawing]:
     claims = totals[totals["nees_median"].notna()]
     fig, axes = common.panels(3 if len(claims) else 2, view.look, height=3.3)
     success, error = axes[:2]
-    common.shares(success, "share of all trials")
-    ends = ("success_low", "success_high")
-    common.curves(success, totals, "success", view.look, view.scales, interval=ends, trials="trials")
+    common.shares(success, "")
+    common.curves(success, totals, "success", view.look, view.scales, interval=("success_low", "success_high"))
     common.shares(success, "share of all trials")
     common.title(success, "success")
     common.decades(error, totals[["error_median", "error_q95"]].clip(lower=0.5), least=4.0)
     common.bound_line(error, 1.0, "1: the bound, an honest covariance")
-    ends = ("error_median", "error_q95")
-    common.curves(error, totals, "error_median", view.look, view.scales, interval=ends, trials="trials")
+    common.curves(error, totals, "error_median", view.look, view.scales, interval=("error_median", "error_q95"))
     common.title(error, "error over the bound")
     error.set_ylabel("median, bar to 95 %")
     if len(claims):
@@ -48,7 +46,7 @@ def _consistency(ax: common.Axes, claims: pd.DataFrame, view: View) -> None:
     common.bound_line(ax, 1.0, "1: the bound, an honest covariance")
     low, high = claims["nees_median_low"].min(), claims["nees_median_high"].max()
     ax.axhspan(low, high, color=BOUND_COLOR, alpha=0.15, linewidth=0, label="limits of an honest one, 95 %")
-    common.curves(ax, claims, "nees_median", view.look, view.scales, trials="trials")
+    common.curves(ax, claims, "nees_median", view.look, view.scales)
     common.title(ax, "squared error over claimed variance")
     ax.set_ylabel("NEES, median")
 
@@ -71,4 +69,4 @@ def _caption(view: View, totals: pd.DataFrame, beyond: bool) -> str:
     )
 
 
-FIGURE = Figure(draw, ("summary",), main=True)
+FIGURES = (Figure(draw, ("summary",), main=True),)

@@ -41,49 +41,45 @@ def draw_fits(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]:
 
 
 def _residuals(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look]) -> Iterator[Drawing]:
+    import seaborn as sns
+    from matplotlib.ticker import MaxNLocator
+
     shown = [one for one in fits if np.isfinite(one.normalised).any()][:MOST_ESTIMATORS]
     if not shown:
         return
     x, heading = _abscissa(model)
-    fig, axes = common.panels(len(shown), height=2.6, most_across={2: 2, 4: 2}.get(len(shown), 3))
+    limit = shown[0].outlier_limit
+    fig, axes = common.panels(len(shown), height=2.6)
     for one, ax in zip(shown, axes, strict=True):
-        _residual_panel(ax, x, one, look[one.label].color)
+        r, out = one.normalised, one.outliers
+        ax.axhline(0.0, color=BOUND_COLOR, linewidth=0.6, zorder=1)
+        common.bound_line(ax, limit, "limit for outliers")
+        common.bound_line(ax, -limit, "")
+        good, style = np.isfinite(r) & ~out, {"color": look[one.label].color, "legend": False, "ax": ax}
+        sns.scatterplot(x=x[good], y=r[good], s=9, alpha=0.75, linewidth=0, rasterized=len(x) > _MANY, **style)
+        if out.any():
+            sns.scatterplot(x=x[out], y=r[out], s=25, marker="x", linewidth=1.2, label="outlier", **style)
+        largest = float(np.nanmax(np.abs(r)))
+        if largest > _BENT:
+            ax.set_yscale("symlog", linthresh=10.0, linscale=1.0)
+            ax.set_ylim(-1.6 * largest, 1.6 * largest)
+        else:
+            edge = 1.15 * max(largest, limit)
+            ax.set_ylim(-edge, edge)
+            ax.yaxis.set_major_locator(MaxNLocator(7, integer=True))
+        ax.xaxis.set_major_locator(MaxNLocator(6, integer=heading in ("reading", "epoch")))
         tests = f"fit p {p_value(one.p_value)}, white p {p_value(one.whiteness.p_value, LEAST_P)}"
         ax.set_title(f"{common.text(one.label)}\n{tests}")
-        ax.set(xlabel=common.text(heading), ylabel="residual / its deviation")
+    common.axis_labels(fig, common.text(heading), "residual / its deviation")
     common.legend(fig, axes)
     parts = [f"{one.label} {int(one.outliers.sum())}" for one in shown]
     caption = common.sentence(
         "Normalised residuals of the readings; each is standard normal where the model and the noise are right."
-        f" Beyond ±{shown[0].outlier_limit:.2f} a reading is an outlier: {common.enumerate_few(parts, 12)}."
+        f" Beyond ±{limit:.2f} a reading is an outlier: {common.enumerate_few(parts, 12)}."
         " p is that of chi-square, white that of the Ljung-Box test.",
-        f"{len(fits) - len(shown)} further estimators: see residuals.csv." if len(fits) > len(shown) else "",
+        f"{len(fits) - len(shown)} further estimators: see residuals.csv." * (len(fits) > len(shown)),
     )
     yield Drawing("residuals", "Residuals", caption, fig)
-
-
-def _residual_panel(ax: Any, x: Array, one: Fit, color: str) -> None:
-    import seaborn as sns
-    from matplotlib.ticker import MaxNLocator
-
-    known, out, limit = np.isfinite(one.normalised), one.outliers, one.outlier_limit
-    ax.axhline(0.0, color=BOUND_COLOR, linewidth=0.6, zorder=1)
-    common.bound_line(ax, limit, "limit for outliers")
-    common.bound_line(ax, -limit, "")
-    good = known & ~out
-    dots = {"s": 9, "alpha": 0.75, "linewidth": 0, "rasterized": len(x) > _MANY}
-    style = {"color": color, "legend": False, "ax": ax}
-    sns.scatterplot(x=x[good], y=one.normalised[good], **dots, **style)
-    if out.any():
-        sns.scatterplot(x=x[out], y=one.normalised[out], s=25, marker="x", linewidth=1.2, label="outlier", **style)
-    largest = float(np.abs(one.normalised[known]).max())
-    if largest > _BENT:
-        ax.set_yscale("symlog", linthresh=10.0, linscale=1.0)
-        ax.set_ylim(-1.6 * largest, 1.6 * largest)
-    else:
-        edge = 1.15 * max(largest, limit)
-        ax.set_ylim(-edge, edge)
-        ax.yaxis.set_major_locator(MaxNLocator(7, integer=True))
 
 
 def _abscissa(model: Measurement) -> tuple[Array, str]:
@@ -105,9 +101,8 @@ def _abscissa(model: Measurement) -> tuple[Array, str]:
 
 def most_correlated(correlation: Array, most: int = MOST_PAIRS) -> list[tuple[int, int]]:
     """Pairs of parameters by falling magnitude of correlation (n, n); all of them where they are few."""
-    pairs = list(combinations(range(len(correlation)), 2))
-    pairs.sort(key=lambda pair: -np.nan_to_num(abs(correlation[pair])))
-    return pairs[:most]
+    pairs = combinations(range(len(correlation)), 2)
+    return sorted(pairs, key=lambda pair: -np.nan_to_num(abs(correlation[pair])))[:most]
 
 
 def ellipse(P: Array, level: float = LEVEL, points: int = 181, edge: float | None = None) -> Array:
@@ -128,7 +123,7 @@ def _ellipses(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look])
         return
     best = min(converged, key=lambda f: f.chi_square)
     pairs = most_correlated(best.correlation)
-    fig, axes = common.panels(len(pairs), look, most_across={4: 2}.get(len(pairs), 3))
+    fig, axes = common.panels(len(pairs), look)
     seen: set[str] = set()
     away: set[str] = set()
     for pair, ax in zip(pairs, axes, strict=True):
@@ -136,10 +131,8 @@ def _ellipses(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look])
         seen |= near
         away |= {f.label for f in converged} - near
         for set_label, k in zip((ax.set_xlabel, ax.set_ylabel), pair, strict=True):
-            parameter = model.physical_parameters[k]
-            unit = f" [{parameter.unit}]" if parameter.unit else ""
             sign = "+" if best.x[k] < 0 else "−"
-            set_label(common.text(f"{parameter.name} {sign} {abs(best.x[k]):.5g}{unit}"))
+            set_label(_axis_words(model, k, f" {sign} {abs(best.x[k]):.5g}"))
         ax.set_title(f"correlation {best.correlation[pair]:.3f}".replace("-", "−"))
     common.legend(fig, axes, {label: one for label, one in look.items() if label in seen})
     count = model.n * (model.n - 1) // 2
@@ -153,6 +146,11 @@ def _ellipses(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look])
     yield Drawing("ellipses", "Covariance ellipses", caption, fig)
 
 
+def _axis_words(model: Measurement, k: int, more: str = "") -> str:
+    parameter = model.physical_parameters[k]
+    return common.text(f"{parameter.name}{more}{f' [{parameter.unit}]' if parameter.unit else ''}")
+
+
 def _ellipse_panel(ax: Any, pair: list[int], best: Fit, fits: Sequence[Fit], look: Mapping[str, Look]) -> set[str]:
     """Draws the ellipses of two parameters whose centres are near the best fit's; returns whose they are."""
     from matplotlib.ticker import MaxNLocator
@@ -162,9 +160,9 @@ def _ellipse_panel(ax: Any, pair: list[int], best: Fit, fits: Sequence[Fit], loo
     outlines = []
     for one, linewidth in zip(near, np.linspace(4.0 if len(near) > 1 else 1.6, 1.0, len(near)), strict=True):
         outlines.append(offsets[one.label] + ellipse(one.covariance[np.ix_(pair, pair)], edge=one.region(2, LEVEL)))
-        style = look[one.label]
-        ax.plot(*outlines[-1].T, color=style.color, linestyle=style.linestyle, linewidth=linewidth)
-        ax.plot(*offsets[one.label], color=style.color, marker=style.marker, markersize=5, markeredgecolor="white")
+        line = look[one.label].line
+        ax.plot(*outlines[-1].T, **line | {"marker": "", "linewidth": linewidth})
+        ax.plot(*offsets[one.label], **line)
     edges = np.concatenate(outlines)
     low, high = edges.min(axis=0), edges.max(axis=0)
     margin = 0.08 * (high - low)
@@ -177,27 +175,23 @@ def _ellipse_panel(ax: Any, pair: list[int], best: Fit, fits: Sequence[Fit], loo
 
 def draw_profiles(found: Examination) -> Iterator[Drawing]:
     """A panel for each parameter whose interval from the standard error is off by more than a tenth."""
-    names = found.model.physical_parameters
     bent = [i for i, one in enumerate(found.profiles) if one.bent][:MOST_PROFILES]
     if not bent:
         return
     with house_style():
-        across = {1: 1, 2: 2, 3: 3, 4: 2}.get(len(bent), 3)
-        fig, axes = common.panels(len(bent), height=2.6, most_across=across)
+        fig, axes = common.panels(len(bent), height=2.6)
         for i, ax in zip(bent, axes, strict=True):
-            one, estimate, deviation = found.profiles[i], found.x[i], found.standard_errors[i]
+            one = found.profiles[i]
             known = np.isfinite(one.zeta) & (np.abs(one.zeta) <= 2.5 * found.half_width)
             values = one.values[known]
             line = np.linspace(values[0], values[-1], 200)
+            parabola = ((line - found.x[i]) / found.standard_errors[i]) ** 2
             ax.plot(values, one.zeta[known] ** 2, marker="o", markersize=3, label="profile")
-            parabola = ((line - estimate) / deviation) ** 2
             ax.plot(line, parabola, color=BOUND_COLOR, linewidth=0.8, label="standard error")
             common.bound_line(ax, found.half_width**2, f"limit of {CONFIDENCE:.0%}".replace("%", " %"))
-            ax.set_ylim(0, 2.5 * found.half_width**2)
-            unit = f" [{names[i].unit}]" if names[i].unit else ""
-            ax.set_xlabel(common.text(f"{names[i].name}{unit}"))
-            ax.set_ylabel("rise of chi-square")
+            ax.set(ylim=(0, 2.5 * found.half_width**2), xlabel=_axis_words(found.model, i), ylabel="rise of chi-square")
         common.legend(fig, axes)
+    names = found.model.physical_parameters
     told = "; ".join(f"{names[i].name} {found.profiles[i].low:.4g} to {found.profiles[i].high:.4g}" for i in bent)
     caption = (
         "How chi-square rises when one parameter is held and the others adapt to it, beside the parabola that a"

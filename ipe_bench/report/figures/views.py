@@ -1,18 +1,14 @@
-"""What figures are drawn from: the analysis seen setting by setting, with what a figure may know of its estimators.
-
-A figure gets a `View` that holds the frames which it declared and nothing else.
-"""
+"""What figures are drawn from: the analysis seen setting by setting, with what a figure may know of its estimators."""
 
 from __future__ import annotations
 
 import hashlib
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from ipe_bench.report.style import MOST_FACES, Look, looks
@@ -55,8 +51,6 @@ class View:
     """Correlation (n, n) of the linear bound's covariance, if it is known."""
     paper: bool = False
     """Whether this is the setting of the paper: the gimballed INS with quantised readings."""
-    parts: Sequence[View] = field(default=())
-    """The settings one by one, in a view of all."""
 
     def __getitem__(self, frame: str) -> pd.DataFrame:
         return self.frames[frame]
@@ -85,77 +79,39 @@ class View:
 
     def only(self, names: Sequence[str]) -> View:
         """The same with those frames alone."""
-        frames = {name: self.frames[name] for name in names}
-        return replace(self, frames=frames, parts=tuple(part.only(names) for part in self.parts))
+        return replace(self, frames={name: self.frames[name] for name in names})
 
 
 def views(analysis: Analysis) -> tuple[list[View], View]:
     """The settings of an analysis, at most `MOST_SETTINGS`, and all of them together."""
-    look = _looks(analysis)
+    look, columns = _looks(analysis), analysis.setting_columns
     equations = {g.estimator: g.footer.get("equation") for g in analysis.collection.groups}
-    columns = analysis.setting_columns
-    keys = {name: _keys(getattr(analysis, name), columns) for name in FRAMES}
-    groups = list(dict.fromkeys(keys["scores"]))
-    varying = [c for i, c in enumerate(columns) if len({key[i] for key in groups}) > 1]
+    whole: dict[str, Any] = {name: getattr(analysis, name) for name in FRAMES}
+    split = {name: _split(frame, columns) for name, frame in whole.items()}
     footers = {tuple(_word(g.columns.get(c)) for c in columns): g.footer for g in analysis.collection.groups}
+    settings = [dict(zip(columns, key, strict=True)) for key in split["scores"]]
+    varying = [c for c in columns if len({setting[c] for setting in settings}) > 1]
     parts: list[View] = []
-    for number, key in enumerate(groups[:MOST_SETTINGS], 1):
-        frames = {
-            name: getattr(analysis, name).loc[np.array([k == key for k in keys[name]], dtype=bool)] for name in FRAMES
-        }
-        there = set(frames["scores"]["estimator"])
-        label = _label(dict(zip(columns, key, strict=True)), varying)
-        if number == MOST_SETTINGS < len(groups):
-            label += f" ({len(groups) - number} further settings are in the tables)"
-        suffix = _suffix(dict(zip(columns, key, strict=True)), varying, [part.suffix for part in parts])
-        seen = {label: one for label, one in look.items() if label in there}
-        solve = {label: equations[label] for label in seen}
-        footer, names = footers[key], dict(zip(columns, key, strict=True))
-        paper = (names.get("measurement"), names.get("noise")) == ("gins", "quantization")
-        known = footer["parameters"], footer.get("linear_correlation"), paper
-        parts.append(View(suffix, label, frames, seen, solve, *known))
-    frames = {name: getattr(analysis, name) for name in FRAMES}
-    return parts, View("", "", frames, look, equations, parts=tuple(parts))
+    for setting in settings[:MOST_SETTINGS]:
+        key = tuple(setting.values())
+        frames = {name: split[name].get(key, frame.iloc[:0]) for name, frame in whole.items()}
+        seen = {label: one for label, one in look.items() if label in set(frames["scores"]["estimator"])}
+        label = _label(setting, varying)
+        if len(parts) + 1 == MOST_SETTINGS < len(settings):
+            label += f" ({len(settings) - MOST_SETTINGS} further settings are in the tables)"
+        suffix = _suffix(setting, varying, [part.suffix for part in parts])
+        paper = (setting.get("measurement"), setting.get("noise")) == ("gins", "quantization")
+        known = footers[key]["parameters"], footers[key].get("linear_correlation"), paper
+        parts.append(View(suffix, label, frames, seen, {e: equations[e] for e in seen}, *known))
+    return parts, View("", "", whole, look, equations)
 
 
-def _looks(analysis: Analysis) -> dict[str, Look]:
-    """A look for each estimator, in the family of its kind; of more than `MOST_FACES` the two best of each kind and the
-    reference are in colour."""
-    labels = analysis.collection.estimators
-    kinds = {g.estimator: kind_of(g.footer) for g in analysis.collection.groups}
-    if len(labels) <= MOST_FACES or analysis.summary.empty:
-        return looks(labels, kinds)
-    totals = analysis.summary[analysis.summary["parameter"] == ALL]
-    success = totals.groupby("estimator")["success"].mean()
-    ranked = sorted(labels, key=lambda label: -success.get(label, 0.0))
-    best = [label for label in labels if label in [e for e in ranked if kinds.get(e) == kinds.get(label)][:2]]
-    return looks(labels, kinds, chosen=best)
-
-
-def kind_of(footer: Mapping[str, Any]) -> str:
-    """The kind of estimator, one of `FAMILIES`, from what is stored of it."""
-    path = str(footer["identity"]["estimator"]["_target_"])
-    if ".enkf." in path or ".es_mda." in path:
-        return "ensembles"
-    if footer.get("sequential"):
-        return "filters"
-    return "IPE" if ".solvers." in path or footer.get("equation") == "frozen" else "least squares"
-
-
-def _keys(frame: pd.DataFrame, columns: Sequence[str]) -> list[tuple[str, ...]]:
-    """What each row's setting is; frames over all settings have none."""
-    if not set(columns) <= set(frame.columns):
-        return [()] * len(frame)
-    return list(zip(*(_words(frame[c]) for c in columns), strict=True)) if columns else [()] * len(frame)
-
-
-def _words(column: pd.Series) -> Any:
-    """What `_word` makes of a column of few different values."""
-    if column.dtype == object:
-        # True and 1 are two settings here, and one value there.
-        return column.map(_word)
-    codes, values = pd.factorize(column, use_na_sentinel=False)
-    return np.array([_word(value) for value in values], dtype=object)[codes]
+def _split(frame: pd.DataFrame, columns: Sequence[str]) -> dict[tuple[str, ...], pd.DataFrame]:
+    """The rows of each setting; none of a frame over all settings."""
+    if not set(columns) <= set(frame.columns) or frame.empty:
+        return {}
+    grouped = frame.groupby([*columns], sort=False, dropna=False) if columns else [((), frame)]
+    return {tuple(map(_word, key)): part for key, part in grouped}
 
 
 def _word(value: Any) -> str:
@@ -166,18 +122,38 @@ def _word(value: Any) -> str:
     return plain(value) if isinstance(value, float) and float(plain(value)) == value else str(value)
 
 
-def _label(named: Mapping[str, str], varying: Sequence[str]) -> str:
+def _label(setting: Mapping[str, str], varying: Sequence[str]) -> str:
     # An option that this setting does not have is not spoken of.
-    shown = [named[c] for c in ("measurement", "noise") if named.get(c, "-") != "-"]
-    others = [c for c in varying if c not in ("measurement", "noise") and named[c] != "-"]
-    return ", ".join([*shown, *(f"{c}={named[c]}" for c in others)])
+    shown = [setting[c] for c in ("measurement", "noise") if setting.get(c, "-") != "-"]
+    others = [c for c in varying if c not in ("measurement", "noise") and setting[c] != "-"]
+    return ", ".join([*shown, *(f"{c}={setting[c]}" for c in others)])
 
 
-def _suffix(named: Mapping[str, str], varying: Sequence[str], taken: Sequence[str]) -> str:
+def _suffix(setting: Mapping[str, str], varying: Sequence[str], taken: Sequence[str]) -> str:
     if not varying:
         return ""
-    words = "_".join(named[c] for c in varying if named[c] != "-")
+    words = "_".join(setting[c] for c in varying if setting[c] != "-")
     safe = re.sub(r"[^A-Za-z0-9.]+", "-", words).strip("-.")
     if len(safe) > MOST_LETTERS or not safe or f"_{safe}" in taken:
-        safe = f"{safe[: MOST_LETTERS - 9]}-{hashlib.sha256(repr(named).encode()).hexdigest()[:8]}".strip("-")
+        safe = f"{safe[: MOST_LETTERS - 9]}-{hashlib.sha256(repr(setting).encode()).hexdigest()[:8]}".strip("-")
     return f"_{safe}"
+
+
+def _looks(analysis: Analysis) -> dict[str, Look]:
+    """A look for each estimator, in the colours of its family; of more than `MOST_FACES` the two best of each family
+    and the reference are in colour."""
+    labels = analysis.collection.estimators
+    families = {g.estimator: family_of(g.footer) for g in analysis.collection.groups}
+    if len(labels) <= MOST_FACES or analysis.summary.empty:
+        return looks(labels, families)
+    totals = analysis.summary[analysis.summary["parameter"] == ALL]
+    success = totals.groupby("estimator")["success"].mean()
+    ranked = sorted(labels, key=lambda label: -success.get(label, 0.0))
+    best = [label for label in labels if label in [e for e in ranked if families.get(e) == families.get(label)][:2]]
+    return looks(labels, families, chosen=best)
+
+
+def family_of(footer: Mapping[str, Any]) -> str:
+    """The family of an estimator, one of `FAMILIES`: the one that it declares, else by what it takes and solves."""
+    known = "filters" if footer.get("sequential") else "IPE" if footer.get("equation") == "frozen" else "least squares"
+    return footer.get("family") or known
