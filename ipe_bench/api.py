@@ -451,7 +451,7 @@ def _check_records(options: Sequence[Option]) -> list[Finding]:
         compute(scenarios, estimators, 25, f"{folder}/sweep")
         compute(scenarios[-1:], estimators, 1, f"{folder}/single")
         analyses = [analyse([f"{folder}/{name}"]) for name in ("sweep", "single")]
-        return [finding for option in options for finding in check_record(option, analyses)]
+        return [check_record(option, analyses) for option in options]
 
 
 def _paths(directories: Directories) -> list[Path]:

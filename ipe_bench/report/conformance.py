@@ -6,7 +6,7 @@ Components are checked by `plugins.conformance`; whoever asks computes the small
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,77 +17,57 @@ from ipe_bench.plugins.conformance import Finding
 from ipe_bench.plugins.discovery import Option
 from ipe_bench.plugins.extensions import find_record
 from ipe_bench.report import extensions
-from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import views
 from ipe_bench.report.style import house_style
 from ipe_bench.report.tables import all_tables
 from ipe_bench.statistics.analysis import Analysis
-from ipe_bench.statistics.records import Statistic, columns_of_added, fault_of
+from ipe_bench.statistics.records import columns_of_added, fault_of
 from ipe_bench.statistics.sample import Sample, Shared
 
 
-def check_record(option: Option, analyses: Sequence[Analysis]) -> Iterator[Finding]:
-    """Runs the checks on the record that an option names; one that is not there is a finding."""
-    name, title = f"{option.group}={option.name}", "Can be found from its config"
+def check_record(option: Option, analyses: Sequence[Analysis]) -> Finding:
+    """Checks the record that an option names; one that is not there is a finding as well."""
+    name, check = f"{option.group}={option.name}", _CHECKS[option.group]
     try:
-        record = find_record(option)
-        for check in _CHECKS[option.group]:
-            title = (check.__doc__ or "").strip().rstrip(".")
-            check(option.name, record, analyses)
-            yield Finding(name, title)
+        check(option.name, find_record(option), analyses)
     except (UserError, AssertionError) as error:
-        yield Finding(name, title, str(error) or "it does not")
+        return Finding(name, (check.__doc__ or "").rstrip("."), str(error))
+    return Finding(name, (check.__doc__ or "").rstrip("."))
 
 
-def is_a_statistic(_: str, record: Any, __: Sequence[Analysis]) -> None:
-    """Is a Statistic whose columns, kind and tables there can be."""
+def has_values(_: str, record: Any, analyses: Sequence[Analysis]) -> None:
+    """Has a value, or NaN, for every parameter and for all, however the trials ended; the same twice; in its limits."""
     if fault := fault_of(record):
         raise UserError(fault)
-
-
-def has_values(_: str, record: Statistic, analyses: Sequence[Analysis]) -> None:
-    """Has a value, or NaN, for every parameter and for all, however the trials ended; the same twice; in its limits."""
-    for analysis in analyses:
-        for groups in analysis.collection.scenarios.values():
-            shared = Shared.among(analysis.collection, groups)
+    for collection in [analysis.collection for analysis in analyses]:
+        for groups in collection.scenarios.values():
+            shared = Shared.among(collection, groups)
             for group in groups:
-                _check_values(record, Sample.load(analysis.collection, group, shared))
-
-
-def _check_values(record: Statistic, sample: Sample) -> None:
-    first, second = (columns_of_added(record, sample) for _ in range(2))
-    whose = f"of {sample.group.estimator}"
-    for name, values in first.items():
-        numbers = record.kind != "word"
-        same = np.array_equal(values, second[name], equal_nan=numbers)
-        assert same, f"{name} {whose} is another value each time"
-    for value, low, high in zip(*first.values(), strict=True) if record.limits else ():
-        inside = not np.isfinite([value, low, high]).all() or low <= value <= high
-        assert inside, f"{value:g} {whose} is not within its interval, {low:g} to {high:g}"
+                sample = Sample.load(collection, group, shared)
+                first, second = (columns_of_added(record, sample) for _ in range(2))
+                for name, values in first.items():
+                    same = np.array_equal(values, second[name], equal_nan=record.kind != "word")
+                    assert same, f"{name} of {group.estimator} is another value each time"
+                for value, low, high in zip(*first.values(), strict=True) if record.limits else ():
+                    inside = not np.isfinite([value, low, high]).all() or low <= value <= high
+                    where = f"of {group.estimator} is not within its interval, {low:g} to {high:g}"
+                    assert inside, f"{value:g} {where}"
 
 
 def can_be_drawn(_: str, record: Any, analyses: Sequence[Analysis]) -> None:
-    """Is drawn and written for any run, of one trial or with estimators that fail, or gives nothing."""
+    """Is drawn and written for any run, of one trial or with estimators that fail, and shows something of a sweep."""
     extensions.checked_figure(record)
     with tempfile.TemporaryDirectory(prefix="ipe-bench-") as folder, house_style():
-        for drawing in [drawing for analysis in analyses for drawing in _drawn(record, analysis)]:
-            assert drawing.title.strip(), f"{drawing.name} has no title"
-            assert drawing.caption.strip(), f"{drawing.name} has no caption"
-            extensions.guarded(lambda drawing=drawing: drawing.save(Path(folder)))
-
-
-def draws_a_sweep(_: str, record: Any, analyses: Sequence[Analysis]) -> None:
-    """Draws something of an ordinary sweep, named for each of its settings."""
-    with house_style():
-        names = [drawing.name for drawing in _drawn(record, analyses[0])]
-    assert names, "it draws nothing of polynomial at three error scales by four estimators"
-    assert len(set(names)) == len(names), "two settings share a name; end each in view.suffix"
-
-
-def _drawn(record: Any, analysis: Analysis) -> list[Drawing]:
-    parts, whole = views(analysis)
-    seen = [view.only(record.frames) for view in ([whole] if record.together else parts)]
-    return [drawing for view in seen for drawing in extensions.drawings(record, view)]
+        for number, analysis in enumerate(analyses):
+            parts, whole = views(analysis)
+            seen = [view.only(record.frames) for view in ([whole] if record.together else parts)]
+            drawn = [drawing for view in seen for drawing in extensions.drawings(record, view)]
+            for drawing in drawn:
+                assert drawing.title.strip(), f"{drawing.name} has no title"
+                assert drawing.caption.strip(), f"{drawing.name} has no caption"
+                extensions.guarded(lambda drawing=drawing: drawing.save(Path(folder)))
+            assert drawn or number, "it draws nothing of polynomial at three error scales by four estimators"
+            assert len({drawing.name for drawing in drawn}) == len(drawn), "two drawings share a name"
 
 
 def makes_a_table(_: str, record: Any, analyses: Sequence[Analysis]) -> None:
@@ -102,9 +82,4 @@ def can_be_read(name: str, record: Any, analyses: Sequence[Analysis]) -> None:
         extensions.made_section(name, record, analysis, [table.name for table in all_tables(analysis)])
 
 
-_CHECKS: dict[str, tuple[Callable[[str, Any, Sequence[Analysis]], None], ...]] = {
-    "statistic": (is_a_statistic, has_values),
-    "figure": (can_be_drawn, draws_a_sweep),
-    "table": (makes_a_table,),
-    "section": (can_be_read,),
-}
+_CHECKS = {"statistic": has_values, "figure": can_be_drawn, "table": makes_a_table, "section": can_be_read}

@@ -50,39 +50,31 @@ def render_page(
         "cite": ("How to cite", True),
     }
     commands = dict.fromkeys(run["command"] for run in runs if run["command"] not in (_PYTHON, _UNKNOWN))
-    script, style = (
-        resources.files("ipe_bench.report").joinpath("templates", name).read_text(encoding="utf-8")
-        for name in ("report.js", "report.css")
-    )
-    return (
-        environment()
-        .get_template("report.html.j2")
-        .render(
-            version=__version__,
-            script=Markup(script),
-            style=Markup(style),
-            policy=_policy(script, style),
-            about=about(analysis),
-            headline=headline(analysis),
-            directories=[str(d) for d in collection.directories],
-            expected=collection.expected,
-            complete=collection.complete,
-            problems=[*collection.problems, *collection.stale],
-            title=", ".join(d.resolve().name or str(d) for d in collection.directories),
-            computed=_minute(collection.runs[-1]) if collection.runs else "",
-            commands=list(commands)[:MOST_COMMANDS],
-            sections=[(name, title) for name, (title, there) in sections.items() if there],
-            tables=main,
-            written=written,
-            appendix=appendix,
-            figures=[_picture(figure) for figure in figures],
-            charts=charts,
-            nothing_failed=nothing_failed,
-            runs=runs[:MOST_RUNS],
-            older_runs=max(0, len(runs) - MOST_RUNS),
-            citation=CITATION,
-            definitions=definitions(),
-        )
+    templates = resources.files("ipe_bench.report") / "templates"
+    script, style = ((templates / name).read_text(encoding="utf-8") for name in ("report.js", "report.css"))
+    page = environment().get_template("report.html.j2")
+    return page.render(
+        version=__version__,
+        script=Markup(script),
+        style=Markup(style),
+        policy=_policy(script, style),
+        about=about(analysis),
+        headline=headline(analysis),
+        collection=collection,
+        title=", ".join(d.resolve().name or str(d) for d in collection.directories),
+        computed=_minute(collection.runs[-1]) if collection.runs else "",
+        commands=list(commands)[:MOST_COMMANDS],
+        sections=[(name, title) for name, (title, there) in sections.items() if there],
+        tables=main,
+        written=written,
+        appendix=appendix,
+        figures=[_picture(figure) for figure in figures],
+        charts=charts,
+        nothing_failed=nothing_failed,
+        runs=runs[:MOST_RUNS],
+        older_runs=max(0, len(runs) - MOST_RUNS),
+        citation=CITATION,
+        definitions=definitions(),
     )
 
 

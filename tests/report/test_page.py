@@ -57,14 +57,11 @@ def click(page, table: str, index: int) -> None:
     page.run(f"document.querySelectorAll('#table-{table} th [role=button]')[{index}].click()")
 
 
-def test_there_are_no_errors_no_dialogs_and_no_requests(desktop):
+def test_there_are_no_errors_no_dialogs_no_requests_and_all_figures(desktop, page_file):
     assert desktop.messages == []
     outside = [url for url in desktop.requests if not url.startswith(("file:", "data:"))]
     assert outside == []
     assert HOSTILE in desktop.run("document.body.innerText")
-
-
-def test_every_figure_is_decoded(desktop, page_file):
     widths = desktop.run("Array.from(document.images, i => i.naturalWidth)")
     drawn = {path.stem for path in (page_file.parent / "figures").glob("*.png")}
     assert "headline" in drawn
@@ -217,12 +214,7 @@ def test_a_phone_never_scrolls_the_page_sideways(browser, page_file):
     assert browser.run(f"{box}.getBoundingClientRect().right") <= 390
 
 
-def test_the_answer_prints_on_a_few_pages(browser, page_file):
-    browser.go(page_file)
-    assert len(re.findall(rb"/Type\s*/Page\b", browser.pdf())) <= 4
-
-
-def test_it_prints(desktop):
+def test_it_prints_and_the_answer_on_a_few_pages(browser, page_file, desktop):
     assert len(re.findall(rb"/Type\s*/Page\b", desktop.pdf())) <= 60
     # Nothing runs off the paper: 297 mm less two margins of 12 mm, at 96 pixels an inch.
     width = round((297 - 24) / 25.4 * 96)
@@ -232,3 +224,5 @@ def test_it_prints(desktop):
         assert desktop.run("document.documentElement.scrollWidth") <= width
     finally:
         desktop.call("Emulation.setEmulatedMedia", media="")
+    browser.go(page_file)
+    assert len(re.findall(rb"/Type\s*/Page\b", browser.pdf())) <= 4

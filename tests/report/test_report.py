@@ -7,11 +7,8 @@ import io
 import re
 import shutil
 import subprocess
-import sys
 from dataclasses import replace
 from html import unescape
-from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -21,19 +18,15 @@ from rich.console import Console
 from synthetic_store import Filter, Seeker, Synthetic
 
 from ipe_bench.noise import Quantization
-from ipe_bench.report import write_report
+from ipe_bench.report import figures, write_report
 from ipe_bench.report.definitions import DEFINITIONS
-from ipe_bench.report.figures import consistency, errors, parameters
-from ipe_bench.report.figures.views import views
 from ipe_bench.report.headline import about, headline
-from ipe_bench.report.style import house_style, looks
 from ipe_bench.report.table import (
     Strong,
     Table,
     column,
     comma_separated,
     html,
-    interval,
     latex,
     markdown,
     terminal,
@@ -80,16 +73,6 @@ def test_what_is_written_is_whole(result):
     for path in (*result.figures, *result.tables, result.report):
         assert path.stat().st_size > 100
     assert not list(result.report.parent.rglob("*.tmp"))
-
-
-@pytest.mark.slow
-def test_all_figures_are_written_whole(synthetic):
-    fill(synthetic, scales=(1.0, 10.0), seeds=5)
-    result = write_report([synthetic.directory], synthetic.directory, figures="all", formats="pdf")
-    test_what_is_written_is_whole(result)
-    expected = ("parameter_errors_linear_lse", "error_against_scale", "error_distributions", "consistency")
-    for name in (*expected, "cost_against_accuracy", "profiles", "correlation"):
-        assert {f"{name}.png", f"{name}.pdf"} <= {p.name for p in result.figures}
 
 
 def test_the_page_stands_alone_and_says_the_headline(result):
@@ -184,44 +167,17 @@ def test_nothing_stored_gives_a_page_that_says_so(tmp_path):
     assert len(result.problems) == 1
 
 
-def test_the_table_in_the_terminal_fits_100_columns(synthetic):
-    fill(synthetic, labels=("linear_lse", "fixed_point", "levenberg_marquardt"))
-    rows = analyse([synthetic.directory]).summary
-    out = io.StringIO()
-    Console(file=out, width=100).print(render(rows))
-    lines = out.getvalue().splitlines()
-    assert max(map(len, lines)) <= 100
-    text = out.getvalue()
-    assert "…" not in text
-    assert text.count("fixed_point") == 3
-    assert text.count("levenberg_marquardt") == 3
-
-
 @pytest.mark.parametrize("figures", ["main", pytest.param("all", marks=pytest.mark.slow)])
 def test_hostile_names_are_shown_and_not_run(synthetic, figures):
-    fill(
-        synthetic,
-        labels=("linear_lse", HOSTILE, "$x_1$ & \\frac{a}{b} | *b*"),
-        names=(HOSTILE, "_b%", "c#~^\u03b1"),
-        scales=(1.0, 10.0),
-    )
+    labels = ("linear_lse", HOSTILE, "$x_1$ & \\frac{a}{b} | *b*")
+    fill(synthetic, labels=labels, names=(HOSTILE, "_b%", "c#~^\u03b1"), scales=(1.0, 10.0))
     result = write_report([synthetic.directory], synthetic.directory / "out", figures=figures)
+    drawn = {path.stem for path in result.figures}
+    assert figures == "main" or {"error_against_scale", "consistency", "profiles", "correlation"} <= drawn
     page = result.report.read_text(encoding="utf-8")
     assert HOSTILE not in page
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
-
-    class Tags(HTMLParser):
-        count = 0
-
-        def handle_starttag(self, tag, attrs):
-            self.count += tag == "script"
-
-    tags = Tags()
-    tags.feed(page)
-    assert tags.count == 1
-    out = io.StringIO()
-    Console(file=out, width=120).print(render(result.summary))
-    assert "<script>" in out.getvalue()
+    assert page.count("<script") == 1
     for path in result.tables:
         if path.suffix == ".md":
             assert "<script>" not in path.read_text(encoding="utf-8")
@@ -232,15 +188,6 @@ def test_markdown_rows_have_as_many_cells_as_their_head(synthetic):
     for table in all_tables(analyse([synthetic.directory])):
         lines = [line for line in markdown(table).splitlines() if line.startswith("|")]
         assert len({len(re.findall(r"(?<!\\)\|", line)) for line in lines}) == 1
-
-
-def test_latex_escapes_every_special_character():
-    shown = words("a & b_c", ["a_b & 50 % $x$ {y} #1 ~ ^ \\ < > µ 中"])
-    head, cell = re.findall(r"^(.*) \\\\$", latex(Table("t", "T", "", [shown], pd.DataFrame())), re.MULTILINE)
-    text = head + cell
-    assert re.sub(r"\\([&%$#{}_]|[a-zA-Z]+)", "", text).count("$") == 0
-    assert r"\&" in text
-    assert r"\texttt{U+4E2D}" in text
 
 
 def test_a_record_is_all_that_a_statistic_needs(result):
@@ -260,22 +207,6 @@ def test_a_record_is_all_that_a_statistic_needs(result):
             elif where in tables:
                 assert {*headings, ""} <= {*(c.title for c in tables[where].columns), ""}
     assert set(frame_columns(STATISTICS)) <= set(result.summary.columns)
-
-
-def test_latex_intervals_read_right():
-    shown = [
-        interval("95 %", [0.996, 1234.5], [1.0, 14520.0], percent),
-        interval("twice", [1.5e-7, float("nan")], [2.0, 1.0], short),
-        interval("twice", [0.0, -1.25], [0.00004, 2.0], short),
-    ]
-    text = latex(Table("t", "T", "", shown, pd.DataFrame()))
-    assert r"\num{99.6}\,\% to \num{100}\,\%" in text
-    assert r"\num{1.5e-07} to \num{2}" in text
-    assert r"\num{-1.250} to \num{2}" in text
-    assert "to\\num" not in text
-    assert text.count("twice") == 2
-    for part in ("toprule", "midrule", "bottomrule"):
-        assert text.count(part) == 1
 
 
 @pytest.mark.slow
@@ -298,76 +229,27 @@ def test_latex_tables_compile(synthetic, tmp_path):
     assert (tmp_path / "t.pdf").stat().st_size > 1000
 
 
-def test_estimators_keep_their_look_and_no_two_look_alike():
-    labels = ["linear_lse", *(f"e{i}" for i in range(25))]
-    look = looks(labels)
-    assert list(look) == labels
-    assert len({(one.color, one.marker, str(one.dash)) for one in look.values()}) == len(labels)
-    # In grey, marker and dash alone must tell the first ones apart.
-    assert len({(one.marker, str(one.dash)) for one in list(look.values())[:10]}) == 10
-
-
 def test_numbers_are_written_for_readers():
-    assert [percent(v) for v in (1.0, 0.9999, 0.974, 0.0, 0.0001, float("nan"))] == [
-        "100 %",
-        ">99.9 %",
-        "97.4 %",
-        "0 %",
-        "<0.1 %",
-        "-",
-    ]
+    shares = [percent(v) for v in (1.0, 0.9999, 0.974, 0.0, 0.0001, float("nan"))]
+    assert shares == ["100 %", ">99.9 %", "97.4 %", "0 %", "<0.1 %", "-"]
     assert [short(v) for v in (1.00234, 14520.3, 3.0, float("inf"))] == ["1.002", "14,520", "3", "inf"]
     assert [duration(v) for v in (2.0, 0.0123, 9.4e-6)] == ["2.00 s", "12.3 ms", "9.40 µs"]
     assert [duration(v, 2) for v in (0.00096, 0.123, 0.9996, 0.0)] == ["960 µs", "120 ms", "1.0 s", "0 s"]
     assert [compact(v) for v in (0.945, 12195, 999.7, 1.6e6, 3e-5)] == ["0.945", "12.2k", "1.00k", "1.60M", "3.0e-05"]
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the peak of memory is read from /proc")
-def test_ten_million_rows_take_less_than_two_gibibytes(tmp_path):
-    """20 estimators, 5 scenarios: the figure for time is in the log, memory is bounded here."""
-    store = Synthetic(tmp_path / "store")
-    names = tuple(f"p{i}" for i in range(4))
-    rng = np.random.default_rng(0)
-    trials = 100_000
-    for k in range(5):
-        scenario = store.scenario(error_scale=10.0**k, names=names)
-        base = 0.1 * rng.normal(size=(trials, 4))
-        for i in range(20):
-            solved = rng.random(trials) < 0.99
-            store.add(scenario, f"e{i:02d}", base * (1 + 0.02 * i), block=25_000, solved=solved)
-    store.record(trials)
-    # Not `ru_maxrss`: Linux hands a new program the peak of the process that started it, here that of pytest.
-    script = (
-        "import re, time; from ipe_bench.report import write_report; began = time.time();"
-        f"r = write_report([{str(store.directory)!r}], {str(tmp_path / 'out')!r}); assert not r.problems;"
-        "peak = re.search(r'VmHWM:\\s+(\\d+)', open('/proc/self/status').read());"
-        "print(int(peak[1]) / 2**20, time.time() - began)"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=1200)
-    memory, seconds = map(float, done.stdout.split())
-    print(f"{memory:.2f} GiB, {seconds:.0f} s")
-    assert memory < 2.0
-
-
-def test_settings_that_differ_have_figures_of_their_own(synthetic, tmp_path):
+def test_settings_that_differ_have_figures_of_their_own(synthetic, tmp_path, monkeypatch):
     rng = np.random.default_rng(1)
     gaussian = [synthetic.scenario(sigma=s, error_scale=e) for s in (0.2, 0.4) for e in (1.0, 10.0)]
-    quantized = [replace(s, noise=Quantization(0.7)) for s in gaussian[:2]]
     synthetic.bound = lambda scenario: np.full(3, 0.1)
-    for scenario in (*gaussian, *quantized):
-        for label in ("linear_lse", "one"):
-            synthetic.add(scenario, label, 0.1 * rng.normal(size=(40, 3)))
-    result = write_report([synthetic.directory], tmp_path / "out", figures="none")
-    kinds = (*errors.FIGURES, *parameters.FIGURES, *consistency.FIGURES)
-    with house_style():
-        parts, _ = views(analyse([synthetic.directory]))
-        drawn = [drawing for view in parts for kind in kinds for drawing in kind.draw(view)]
-    names = {drawing.name for drawing in drawn}
-    assert not [drawing.name for drawing in drawn if re.search(r"\bnan\b", drawing.caption)]
-    settings = ("gaussian-0.2", "gaussian-0.4", "quantization")
-    for kind in ("error_by_parameter", "error_against_scale", "error_distributions", "correlation", "consistency"):
-        assert {n for n in names if n.startswith(f"{kind}_")} == {f"{kind}_{s}" for s in settings}
+    for scenario in (*gaussian, *(replace(s, noise=Quantization(0.7)) for s in gaussian[:2])):
+        synthetic.add(scenario, "one", 0.1 * rng.normal(size=(40, 3)))
+    monkeypatch.setattr(figures, "FIGURES", ("errors", "parameters"))
+    result = write_report([synthetic.directory], tmp_path / "out", figures="all")
+    names = {path.stem for path in result.figures}
+    for kind in ("error_against_scale", "correlation"):
+        settings = {name.removeprefix(f"{kind}_") for name in names if name.startswith(f"{kind}_")}
+        assert settings == {"gaussian-0.2", "gaussian-0.4", "quantization"}
     page = re.sub(r'base64,[^"]*', "", result.report.read_text(encoding="utf-8"))
     assert not re.search(r"\bnan\b", page)
 
@@ -389,11 +271,8 @@ def test_every_renderer_has_every_cell():
     places = [next(i for i, line in enumerate(lines) if line.split() == " ".join(row).split()) for row in rows]
     assert places == sorted(places)
     page = html([table, Strong("Stands out"), "does not"])
-    assert [unescape(text) for text in re.findall(r"<td[^>]*>(?:<b>)?(.*?)(?:</b>)?</td>", page)] == [
-        *rows[0],
-        *rows[1],
-        *rows[2],
-    ]
+    cells = re.findall(r"<td[^>]*>(?:<b>)?(.*?)(?:</b>)?</td>", page)
+    assert [unescape(text) for text in cells] == [cell for row in rows for cell in row]
     assert HOSTILE not in page
     assert "<b>2</b>" in page
     assert "<b>Stands out</b>" in page
