@@ -102,7 +102,9 @@ def load(
     if content[: 2 * _DIGEST] != made_of + hashlib.sha256(code).digest():
         _LOG.info("compiling %s, once per machine: it is kept in %s", what, path.parent)
         code = _object_code(write())
-        _keep(path, made_of + hashlib.sha256(code).digest() + code)
+        content = made_of + hashlib.sha256(code).digest() + code
+        with contextlib.suppress(StorageError):
+            write_atomically(path, lambda temporary: (temporary.write_bytes(content), temporary.chmod(0o600)))
     library = llvm.JITLibraryBuilder().add_object_img(code).export_symbol(name)
     for called, address in _addresses().items():
         library.import_symbol(called, address)
@@ -111,15 +113,6 @@ def load(
     function = ctypes.CFUNCTYPE(None, *arguments)(tracker[name])
     function.keeps = engine, tracker  # type: ignore[attr-defined]
     return function
-
-
-def _keep(path: Path, content: bytes) -> None:
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(content)
-        temporary.chmod(0o600)
-
-    with contextlib.suppress(StorageError):
-        write_atomically(path, write)
 
 
 def _own_bytes(path: Path) -> bytes:

@@ -18,7 +18,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.arithmetic import Arithmetic, read, require_finite, require_parameters
 from ipe_bench.measurements.base import Input, Measurement, Parameter
-from ipe_bench.measurements.ode.trace import Expression, Graph, tangent
+from ipe_bench.measurements.ode.trace import Expression, Graph, in_order, operands, tangent
 
 _UFUNCS: dict[str, Any] = {"add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide}
 _UFUNCS |= {"pow": np.power, "neg": np.negative}
@@ -86,17 +86,9 @@ class Formula(Measurement):
     def nominal(self) -> Array:
         return np.sign([float(self.start[name]) for name in self._names])
 
-    @property
-    def reading_unit(self) -> str:  # type: ignore[override]
-        return self.unit
-
-    @property
-    def reading_name(self) -> str:
-        return self.reading
-
-    @property
-    def own_parameters(self) -> tuple[str, ...]:
-        return self.own
+    reading_unit = property(lambda model: model.unit)  # type: ignore[assignment]
+    reading_name = property(lambda model: model.reading)  # type: ignore[assignment]
+    own_parameters = property(lambda model: model.own)  # type: ignore[assignment]
 
     @cached_property
     def inputs(self) -> tuple[Input, ...]:
@@ -178,42 +170,27 @@ def carry_out(outputs: Sequence[Expression], values: Mapping[str, Array]) -> lis
 
     What no later operation needs is let go of: a formula on a million rows keeps few arrays.
     """
-    order = _in_order(outputs)
-    users = Counter(a.order for e in order for a in e.operands if isinstance(a, Expression))
+    order = in_order(outputs)
+    users = Counter(a.order for e in order for a in operands(e))
     users.update(e.order for e in outputs)
     found: dict[int, Any] = {}
     for e in order:
-        operands = [a for a in e.operands if isinstance(a, Expression)]
-        found[e.order] = _operation(e, operands, [found[a.order] for a in operands], values)
-        for a in operands:
+        found[e.order] = _operation(e, [found[a.order] for a in operands(e)], values)
+        for a in operands(e):
             users[a.order] -= 1
             if not users[a.order]:
                 del found[a.order]
     return [found[e.order] for e in outputs]
 
 
-def _operation(
-    e: Expression, operands: Sequence[Expression], arrays: Sequence[Any], values: Mapping[str, Array]
-) -> Any:
+def _operation(e: Expression, arrays: Sequence[Any], values: Mapping[str, Array]) -> Any:
     if e.operation == "input":
         return values[e.operands[0]]
     if e.operation == "constant":
         return e.value
-    if e.operation == "mul" and operands[1].operation == "log" and operands[0].operation == "pow":
-        power, logarithm = operands
-        if power.operands[0] is logarithm.operands[0]:
+    if e.operation == "mul":
+        power, logarithm = operands(e)
+        if logarithm.operation == "log" and power.operation == "pow" and power.operands[0] is logarithm.operands[0]:
             # d(a^b)/db = a^b log(a), which is 0 where a = 0 and b > 0, and not 0 times infinity.
             return np.where(arrays[0] == 0.0, 0.0, arrays[0] * arrays[1])
     return (_UFUNCS.get(e.operation) or getattr(np, e.operation))(*arrays)
-
-
-def _in_order(outputs: Sequence[Expression]) -> list[Expression]:
-    """Every expression that the outputs need, operands before their users."""
-    needed: dict[int, Expression] = {}
-    waiting = list(outputs)
-    while waiting:
-        e = waiting.pop()
-        if e.order not in needed:
-            needed[e.order] = e
-            waiting += [a for a in e.operands if isinstance(a, Expression)]
-    return [needed[order] for order in sorted(needed)]

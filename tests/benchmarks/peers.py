@@ -39,8 +39,6 @@ def simulators(model: OdeMeasurement, steps: int) -> Iterator[tuple[str, Simulat
         yield "heyoka, Taylor series, 8 lanes, tolerance 1e-10", _by_heyoka(model, 1e-10)
     if importlib.util.find_spec("jax"):
         yield "JAX, the same formula and steps by scan", _by_jax(model, steps)
-    if importlib.util.find_spec("diffrax"):
-        yield "diffrax Dopri8, rtol 1e-8", _by_diffrax(model, 1e-8)
 
 
 def one_thread() -> None:
@@ -157,44 +155,6 @@ def jax_readings(model: OdeMeasurement, steps: int) -> Callable[[Any], Any]:
 def _moved(y: list[Any], h: Any, weights: Sequence[float], k: list[list[Any]]) -> list[Any]:
     terms = [(w, slope) for w, slope in zip(weights, k, strict=False) if w]
     return [v + h * sum(w * slope[i] for w, slope in terms) if terms else v for i, v in enumerate(y)]
-
-
-def _by_diffrax(model: OdeMeasurement, rtol: float) -> Simulate:
-    jax = _jax()
-    jnp, diffrax = jax.numpy, __import__("diffrax")
-    begin, slope, shown = _programs(model)
-    states = model.states
-    times = jnp.asarray(model.times)
-
-    def rate(t: Any, y: Any, fixed: Any) -> Any:
-        return jnp.stack([jnp.asarray(v) for v in _run(slope, [t, *y, *fixed], jnp)])
-
-    def solve(first: Any) -> Any:
-        found = diffrax.diffeqsolve(
-            diffrax.ODETerm(rate),
-            diffrax.Dopri8(),
-            0.0,
-            float(model.times[-1]),
-            None,
-            first[:states],
-            args=first[states:],
-            saveat=diffrax.SaveAt(ts=times),
-            # Interpolated readings would be a thousand times worse.
-            stepsize_controller=diffrax.ClipStepSizeController(
-                diffrax.PIDController(rtol=rtol, atol=1e-12), step_ts=times
-            ),
-            max_steps=10_000,
-        )
-        return found.ys
-
-    batched = jax.jit(jax.vmap(solve))
-
-    def simulate(x: Array) -> Array:
-        first = _begun(model, begin, x)
-        y = np.asarray(batched(first.T))
-        return _shown(model, shown, y.transpose(1, 2, 0), first[states:])
-
-    return simulate
 
 
 def optimistix_estimator(problem: Problem, steps: int, tolerance: float) -> Simulate | None:

@@ -84,7 +84,9 @@ class Ode(WrappedModel):
     title: str = "ode"
     """The name of the model in tables."""
 
-    name = property(lambda model: model.title)
+    name = property(lambda model: model.title)  # type: ignore[assignment]
+    reading_unit = property(lambda model: model.unit)  # type: ignore[assignment]
+    own_parameters = property(lambda model: model.own)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -190,16 +192,8 @@ class Ode(WrappedModel):
         return np.array([float(value) for value in self.start.values()]) / self.sizes
 
     @property
-    def reading_unit(self) -> str:  # type: ignore[override]
-        return self.unit
-
-    @property
     def usual_noise(self) -> UsualNoise | None:  # type: ignore[override]
         return None if self.deviation is None else UsualNoise(self.deviation)
-
-    @property
-    def own_parameters(self) -> tuple[str, ...]:
-        return self.own
 
     @property
     def inputs(self) -> tuple[Input, ...]:

@@ -8,7 +8,8 @@ exactly in forward mode (`tangent`). Turning programs into machine code is left 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+import operator
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -17,7 +18,6 @@ import numpy as np
 Operand: TypeAlias = "Expression | float"
 
 _FUNCTIONS = ("sin", "cos", "tan", "arctan", "exp", "log", "sqrt", "sinh", "cosh", "tanh")
-_IN_MATH = {"arctan": "atan"}
 _BINARY = ("add", "sub", "mul", "div")
 _UFUNCS = {"add": "add", "subtract": "sub", "multiply": "mul", "divide": "div", "true_divide": "div", "power": "pow"}
 
@@ -50,7 +50,7 @@ class Graph:
         args = [a if isinstance(a, Expression) else self.constant(a) for a in operands]
         values = [a.value for a in args]
         if all(v is not None for v in values):
-            return self.constant(_evaluate(operation, [v for v in values if v is not None]))
+            return self.constant(float(_NUMBERS[operation](*values)))
         simpler = self._simplify(operation, args, values)
         return simpler if simpler is not None else self._node(operation, *args)
 
@@ -81,6 +81,14 @@ class Graph:
         return None
 
 
+def _operator(name: str) -> Any:
+    return lambda self, other: self.graph.apply(name, self, other)
+
+
+def _reflected(name: str) -> Any:
+    return lambda self, other: self.graph.apply(name, other, self)
+
+
 class Expression:
     """A quantity that is not known yet: supports + - * / **, and NumPy's elementary functions."""
 
@@ -97,35 +105,11 @@ class Expression:
         """The number this is, where it is a constant."""
         return float.fromhex(self.operands[0]) if self.operation == "constant" else None
 
-    def __add__(self, other: Operand) -> Expression:
-        return self.graph.apply("add", self, other)
-
-    def __radd__(self, other: Operand) -> Expression:
-        return self.graph.apply("add", other, self)
-
-    def __sub__(self, other: Operand) -> Expression:
-        return self.graph.apply("sub", self, other)
-
-    def __rsub__(self, other: Operand) -> Expression:
-        return self.graph.apply("sub", other, self)
-
-    def __mul__(self, other: Operand) -> Expression:
-        return self.graph.apply("mul", self, other)
-
-    def __rmul__(self, other: Operand) -> Expression:
-        return self.graph.apply("mul", other, self)
-
-    def __truediv__(self, other: Operand) -> Expression:
-        return self.graph.apply("div", self, other)
-
-    def __rtruediv__(self, other: Operand) -> Expression:
-        return self.graph.apply("div", other, self)
-
-    def __pow__(self, exponent: Operand) -> Expression:
-        return self.graph.apply("pow", self, exponent)
-
-    def __rpow__(self, base: Operand) -> Expression:
-        return self.graph.apply("pow", base, self)
+    __add__, __radd__ = _operator("add"), _reflected("add")
+    __sub__, __rsub__ = _operator("sub"), _reflected("sub")
+    __mul__, __rmul__ = _operator("mul"), _reflected("mul")
+    __truediv__, __rtruediv__ = _operator("div"), _reflected("div")
+    __pow__, __rpow__ = _operator("pow"), _reflected("pow")
 
     def __neg__(self) -> Expression:
         return self.graph.apply("neg", self)
@@ -155,24 +139,31 @@ class Expression:
         raise AttributeError(name)
 
 
-def _evaluate(operation: str, values: Sequence[float]) -> float:
-    match operation:
-        case "add":
-            return values[0] + values[1]
-        case "sub":
-            return values[0] - values[1]
-        case "mul":
-            return values[0] * values[1]
-        case "div":
-            return values[0] / values[1]
-        case "pow":
-            return values[0] ** values[1]
-        case "neg":
-            return -values[0]
-    return float(getattr(math, _IN_MATH.get(operation, operation))(*values))
+_NUMBERS: dict[str, Callable[..., Any]] = {
+    "add": operator.add,
+    "sub": operator.sub,
+    "mul": operator.mul,
+    "div": operator.truediv,
+    "pow": operator.pow,
+    "neg": operator.neg,
+    "arctan": math.atan,
+} | {name: getattr(math, name) for name in _FUNCTIONS if name != "arctan"}
+_DERIVATIVES: dict[str, Callable[[Any, Any, Any], Any]] = {
+    "tan": lambda e, a, one: one + e * e,
+    "sin": lambda e, a, one: np.cos(a),
+    "cos": lambda e, a, one: -np.sin(a),
+    "arctan": lambda e, a, one: one / (one + a * a),
+    "exp": lambda e, a, one: e,
+    "log": lambda e, a, one: one / a,
+    "sqrt": lambda e, a, one: 0.5 / e,
+    "sinh": lambda e, a, one: np.cosh(a),
+    "cosh": lambda e, a, one: np.sinh(a),
+    "tanh": lambda e, a, one: one - e * e,
+}
+"""Of e, a function of a."""
 
 
-def _partials(e: Expression) -> list[Expression]:
+def _partials(e: Expression) -> list[Any]:
     """The derivatives of one operation with respect to its operands."""
     a: Any = e.operands[0]
     b: Any = e.operands[-1]
@@ -191,27 +182,7 @@ def _partials(e: Expression) -> list[Expression]:
             return [b * a ** (b - 1.0), to_exponent]
         case "neg":
             return [-one]
-        case "sin":
-            return [np.cos(a)]
-        case "cos":
-            return [-np.sin(a)]
-        case "tan":
-            return [one + e * e]
-        case "arctan":
-            return [one / (one + a * a)]
-        case "exp":
-            return [e]
-        case "log":
-            return [one / a]
-        case "sqrt":
-            return [0.5 / e]
-        case "sinh":
-            return [np.cosh(a)]
-        case "cosh":
-            return [np.sinh(a)]
-        case "tanh":
-            return [one - e * e]
-    raise TypeError(f"no derivative is known for {e.operation}")
+    return [_DERIVATIVES[e.operation](e, a, one)]
 
 
 def in_order(outputs: Iterable[Expression], stop: Collection[Expression] = ()) -> list[Expression]:
