@@ -435,7 +435,7 @@ def _check_records(options: Sequence[Option]) -> list[Finding]:
     """The findings on what reports are made of, from a small sweep and from a single trial."""
     from ipe_bench.baselines import EKF, LinearLSE
     from ipe_bench.measurements.polynomial import Polynomial
-    from ipe_bench.noise.gaussian import Gaussian
+    from ipe_bench.noise.white import Gaussian
     from ipe_bench.plugins.extensions import use_statistics
     from ipe_bench.report.conformance import check_record
     from ipe_bench.solvers import FixedPoint, Newton

@@ -69,31 +69,26 @@ class CountingModel:
         """dh/dx (trials, m, n) for the trials `rows` of the tally. Where it is only for steps `coarse` will do, which
         counts as what it costs beside an exact one."""
         if self.coarse_share == 1.0 or not np.any(coarse):
-            return self._exact_jacobian(x, rows)
-        if np.all(coarse):
-            return self._coarse_jacobian(x, rows)
-        J = np.empty((len(x), self.measurement.m, self.measurement.n))
-        J[coarse] = self._coarse_jacobian(x[coarse], rows[coarse])
-        J[~coarse] = self._exact_jacobian(x[~coarse], rows[~coarse])
-        return J
-
-    def _coarse_jacobian(self, x: Array, rows: NDArray[np.intp]) -> Array:
-        self.tally.jacobians[rows] += self.share * self.coarse_share
-        shape = (self.measurement.m, self.measurement.n)
-        J = self._each_if_raising(self.measurement.coarse_jacobian, x, rows, shape)
+            return self._jacobian(self.measurement.jacobian, 1.0, x, rows)
+        if not np.all(coarse):
+            J = np.empty((len(x), self.measurement.m, self.measurement.n))
+            J[coarse] = self.jacobian(x[coarse], rows[coarse], coarse=True)
+            J[~coarse] = self.jacobian(x[~coarse], rows[~coarse])
+            return J
+        J = self._jacobian(self.measurement.coarse_jacobian, self.coarse_share, x, rows)
         # Far away the longer steps of a coarse one may overflow where those of the readings do not.
         lost = ~finite(J)
-        return put(J, lost, self._exact_jacobian(x[lost], rows[lost])) if lost.any() else J
+        return put(J, lost, self.jacobian(x[lost], rows[lost])) if lost.any() else J
+
+    def _jacobian(self, method: Callable[[Array], Array], cost: float, x: Array, rows: NDArray[np.intp]) -> Array:
+        self.tally.jacobians[rows] += self.share * cost
+        return self._each_if_raising(method, x, rows, (self.measurement.m, self.measurement.n))
 
     @cached_property
     def coarse_share(self) -> float:
         """What a coarse Jacobian costs beside an exact one; 1 where the model has none that is cheaper."""
         coarse, exact = self.measurement.coarse_jacobian_cost, self.measurement.jacobian_cost
         return coarse / exact if coarse < exact else 1.0
-
-    def _exact_jacobian(self, x: Array, rows: NDArray[np.intp]) -> Array:
-        self.tally.jacobians[rows] += self.share
-        return self._each_if_raising(self.measurement.jacobian, x, rows, (self.measurement.m, self.measurement.n))
 
     def _each_if_raising(
         self, function: Callable[[Array], Array], x: Array, rows: NDArray[np.intp], shape: tuple[int, ...]

@@ -10,7 +10,6 @@ import time
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import component_classes
 from ipe_bench.measurements.base import Measurement
 
@@ -40,35 +39,26 @@ def require_repeatable(model: Measurement) -> None:
 @functools.lru_cache(maxsize=256)
 def _irregularity(model: Measurement) -> str:
     """What differs; empty where nothing does, and where a call raises, which is told of by the trials that it ends."""
-    try:
-        return _tried("simulate", model) or _tried("jacobian", model)
-    except Exception:
-        return ""
-
-
-def _tried(method: str, model: Measurement) -> str:
     rng = np.random.default_rng(11)
     x, other = (model.nominal + 0.1 * rng.standard_normal((trials, model.n)) for trials in (4, 7))
-    call = getattr(model, method)
-    call(x)  # the first call may compile
-    began = time.perf_counter()
-    first = call(x)
-    if time.perf_counter() - began > _PATIENCE_S:
-        return ""
-    call(other)
-    ways = {
-        "after another x": call(x),
-        "in another batch": np.concatenate([call(x[:1]), call(x[1:])]),
-        "on a fresh object": getattr(_fresh(model), method)(x),
-    }
-    differing = [way for way, found in ways.items() if not _same(found, first)]
-    return f"{method}(x) has other bits {' and '.join(differing)}" if differing else ""
-
-
-def _fresh(model: Measurement) -> Measurement:
-    """The model as constructed, without what it has kept since."""
-    return dataclasses.replace(model) if dataclasses.is_dataclass(model) else copy.copy(model)  # type: ignore[type-var]
-
-
-def _same(a: Array, b: Array) -> bool:
-    return np.shape(a) == np.shape(b) and np.array_equal(a, b, equal_nan=True)
+    fresh = dataclasses.replace(model) if dataclasses.is_dataclass(model) else copy.copy(model)  # type: ignore[type-var]
+    for method in ("simulate", "jacobian"):
+        call = getattr(model, method)
+        try:
+            call(x)  # the first call may compile
+            began = time.perf_counter()
+            first = call(x)
+            if time.perf_counter() - began > _PATIENCE_S:
+                continue
+            call(other)
+            ways = {
+                "after another x": call(x),
+                "in another batch": np.concatenate([call(x[:1]), call(x[1:])]),
+                "on a fresh object": getattr(fresh, method)(x),
+            }
+        except Exception:
+            return ""
+        differing = [way for way, z in ways.items() if not np.array_equal(z, first, equal_nan=True)]
+        if differing:
+            return f"{method}(x) has other bits {' and '.join(differing)}"
+    return ""

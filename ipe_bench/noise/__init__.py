@@ -1,13 +1,9 @@
 """Noise: adds errors to readings, and knows the covariance that estimators assume. Config group `noise`."""
 
 from ipe_bench.noise.base import Noise
-from ipe_bench.noise.certified import Certified
 from ipe_bench.noise.colored import Colored, Correlated
-from ipe_bench.noise.gaussian import Gaussian, NoNoise
-from ipe_bench.noise.outliers import Outliers
-from ipe_bench.noise.own import ModelNoise, Unknown
-from ipe_bench.noise.quantization import Quantization
-from ipe_bench.noise.student_t import StudentT
+from ipe_bench.noise.own import Certified, ModelNoise, Unknown
+from ipe_bench.noise.white import Gaussian, NoNoise, Outliers, Quantization, StudentT
 
 __all__ = [
     "Certified",

@@ -1,4 +1,4 @@
-"""The noise that a measurement model names as its own, and noise of which nobody knows the level."""
+"""Noise that is not of its own options: that which a model names, that of real readings, and one of unknown level."""
 
 from __future__ import annotations
 
@@ -11,8 +11,23 @@ from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.options import Positive
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.noise.base import Noise
-from ipe_bench.noise.gaussian import Gaussian
-from ipe_bench.noise.quantization import Quantization
+from ipe_bench.noise.white import Gaussian, Quantization
+
+
+@dataclass(frozen=True)
+class Certified(Noise):
+    """Readings are those that come with the measurement model, its certified answer stands for the truth, and no prior.
+
+    A scenario with it has one trial. R is what the model states of its readings.
+    """
+
+    real = True
+
+    def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
+        raise UserError("noise=certified: has real readings only; choose another noise to simulate some")
+
+    def covariance(self, m: int) -> Covariance:
+        raise UserError("noise=certified: knows no R of its own; choose another noise")
 
 
 @dataclass(frozen=True)

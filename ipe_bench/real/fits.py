@@ -18,7 +18,7 @@ from ipe_bench.measurements.base import Measurement, SubsetModel
 from ipe_bench.measurements.counted import cost
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
-from ipe_bench.noise.gaussian import Gaussian
+from ipe_bench.noise.white import Gaussian
 from ipe_bench.real.profiles import Released, half_width, wald_interval
 from ipe_bench.real.residuals import Whiteness, explained, normalised, outlier_limit, whiteness
 from ipe_bench.trials.fit_test import fit_probability, inflation_of, spread_of

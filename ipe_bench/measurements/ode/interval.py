@@ -24,9 +24,7 @@ class Interval(OdeMeasurement):
     step: float | None = 0.125
     """Share of the interval."""
 
-    @property
-    def states(self) -> int:  # type: ignore[override]
-        return self.whole.states
+    states = property(lambda interval: interval.whole.states)  # type: ignore[assignment]
 
     @property
     def outputs(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -34,32 +32,24 @@ class Interval(OdeMeasurement):
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        return tuple(Parameter(f"x{i}") for i in range(self._begin.stop + self._constants + 2))
+        return tuple(Parameter(f"x{i}") for i in range(self.whole.n + self.states + self.whole.cases.shape[1] + 2))
 
     @property
     def times(self) -> Array:
         return np.ones(1)
 
     def start(self, p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
-        return list(p[self._begin])
+        return self._split(p)[1]
 
     def rhs(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
-        own, constants, t0, length = self._split(p)
+        own, _, constants, t0, length = self._split(p)
         return [length * slope for slope in self.whole.rhs(t0 + length * t, y, own, constants)]
 
     def read(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
-        own, constants, t0, length = self._split(p)
+        own, _, constants, t0, length = self._split(p)
         return [*y, *self.whole.read(t0 + length * t, y, own, constants)]
 
-    @property
-    def _begin(self) -> slice:
-        """Where the state at the beginning stands in x."""
-        return slice(self.whole.n, self.whole.n + self.whole.states)
-
-    @property
-    def _constants(self) -> int:
-        return self.whole.cases.shape[1]
-
-    def _split(self, p: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any], Any, Any]:
-        end = self._begin.stop + self._constants
-        return p[: self.whole.n], p[self._begin.stop : end], p[end], p[end + 1]
+    def _split(self, p: Sequence[Any]) -> tuple[list[Any], list[Any], list[Any], Any, Any]:
+        """The parameters, the state at the beginning, the constants, the time of the beginning, and the length."""
+        n, end = self.whole.n, self.whole.n + self.states
+        return list(p[:n]), list(p[n:end]), list(p[end:-2]), p[-2], p[-1]
