@@ -6,11 +6,9 @@ from scipy.linalg import polar
 from scipy.optimize import least_squares
 
 from ipe_bench.baselines import GaussNewton
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.measurements import Accelerometer, Triad
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.plugins.conformance import check_component
 
 GRAVITY = 9.8
 BIAS = np.array([33124.0, 33275.0, 32364.0])
@@ -75,16 +73,3 @@ def test_a_calibration_with_noise_is_scipys(held):
 def test_the_presumed_triad_of_the_default_sees_gravity():
     model = Accelerometer(misalignment=(0.01, -0.02, 0.005), scale=(0.002, 0.003, 0.0025))
     np.testing.assert_allclose(model.simulate(model.nominal[None]), 9.80665, rtol=1e-13)
-
-
-def test_it_keeps_the_promises_of_models(held):
-    for model in (Accelerometer(), model_of(held)):
-        assert not [f.complaint for f in check_component("accelerometer", model) if f.complaint]
-
-
-@pytest.mark.parametrize(
-    ("field", "value"), [("counts", ((1.0, 0.0, 0.0),) * 9), ("scale", (0.0, 1.0, 1.0)), ("gravity", -9.8)]
-)
-def test_mistakes_are_named(field, value):
-    with pytest.raises(UserError, match=rf"^{field}"):
-        Accelerometer(**{field: value})

@@ -64,9 +64,3 @@ def test_a_turn_makes_it_observable():
     estimates = Newton(tolerance=1e-9).estimate(problem(model), model.simulate(x))
     assert (estimates.status == 0).all()
     np.testing.assert_allclose(estimates.x, x, atol=1e-7)
-
-
-@pytest.mark.parametrize("options", [{"interval": 0.0}, {"legs": ((1.0, 2.0),)}, {"target": (1.0, 2.0)}])
-def test_mistakes_are_named(options):
-    with pytest.raises(UserError, match=rf"^{next(iter(options))}"):
-        Bearings(**options)

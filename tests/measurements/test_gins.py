@@ -10,7 +10,6 @@ from scipy.integrate import DOP853, solve_ivp
 
 from ipe_bench.measurements import Gins
 from ipe_bench.measurements.base import SubsetModel
-from ipe_bench.measurements.ode.steps import Search
 from ipe_bench.noise import Quantization
 from ipe_bench.trials.scenario import Scenario
 
@@ -160,17 +159,6 @@ def test_the_jacobian_takes_the_steps_of_the_simulation():
         np.testing.assert_allclose(z, fixed.simulate(row[None]), atol=1e-8)
 
 
-def test_one_search_serves_a_simulation_and_the_jacobian_at_the_same_point(monkeypatch):
-    searches = []
-    run = Search.run
-    monkeypatch.setattr(Search, "run", lambda self, start: searches.append(len(start)) or run(self, start))
-    model, x = Gins(), draw(3000.0, 7, seed=11)
-    model.simulate(x)
-    model.jacobian(x[2:])
-    model.simulate_until(x[:5], 3)
-    assert searches == [7]
-
-
 @pytest.mark.parametrize("scale", [1e5, 1e7, 1e12, np.inf, np.nan])
 def test_what_diverges_costs_no_more_than_the_shortest_step(scale):
     x = np.concatenate([scale * np.ones((2, 11)), draw(33.0, 2)])
@@ -273,19 +261,6 @@ def test_the_linear_bound_is_the_reference(gins):
     deviation = np.sqrt(np.diag(np.linalg.inv(H.T @ H))) * STEP / np.sqrt(12)
     np.testing.assert_allclose(deviation, LINEAR_BOUND, rtol=5e-4)
     assert np.linalg.cond(H) == pytest.approx(19.99, abs=0.01)
-
-
-def test_columns_of_h_are_readings_at_unit_inputs(gins):
-    assert (gins.simulate(np.eye(11)) == gins.linearization().T).all()
-
-
-def test_bits_do_not_depend_on_the_batch_or_on_the_number_of_threads(gins, monkeypatch):
-    x = draw(100.0, 40, seed=3)
-    z, J = gins.simulate(x), gins.jacobian(x)
-    for threads in ("1", "2", "3"):
-        monkeypatch.setenv("IPE_BENCH_THREADS", threads)
-        assert (np.concatenate([gins.simulate(x[i : i + 1]) for i in range(40)]) == z).all()
-        assert (np.concatenate([gins.jacobian(x[i : i + 13]) for i in range(0, 40, 13)]) == J).all()
 
 
 def test_epochs_are_the_times_with_all_cases_and_axes(gins):

@@ -1,16 +1,13 @@
 """Pseudo-ranges against the flight of light in inertial axes, the ellipsoid's formulas, and SciPy's solution."""
 
 import numpy as np
-import pytest
 from scipy.optimize import brentq, least_squares
 
 from ipe_bench.baselines import GaussNewton
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.measurements import Gnss, Ranging
 from ipe_bench.measurements.gnss import east_north_up
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.plugins.conformance import check_component
 
 LIGHT, EARTH_RATE = 299792458.0, 7.2921151467e-5
 
@@ -144,24 +141,3 @@ def test_clocks_belong_to_epochs_and_offsets_to_constellations():
     epoch, galileo = np.array(model.index["epoch"]), np.array(model.index["constellation"]) == "galileo"
     np.testing.assert_array_equal(difference, np.array([epoch == 1, epoch == 2, galileo], dtype=float))
     assert [len(rows) for rows in model.epochs] == [10, 10]
-
-
-@pytest.mark.parametrize("options", [{}, {"rounds": 3}, {"frame": "ecef"}])
-def test_it_keeps_the_promises_of_models(options):
-    assert not [f.complaint for f in check_component("gnss", Gnss(**options)) if f.complaint]
-
-
-@pytest.mark.parametrize(
-    ("message", "options"),
-    [
-        ("satellites: 3 readings", {"satellites": ((2e7, 0.0, 0.0),) * 3}),
-        (r"satellites\[0\]=\[2.*, 0\.0\]: give a list of 3 numbers", {"satellites": ((2e7, 0.0),) * 9}),
-        ("times: 2 entries", {"satellites": ((2e7, 0.0, 0.0),) * 9, "times": (1, 2)}),
-        ("constellations: give", {"constellations": ("gps",)}),
-        ("position:", {"position": (0.0, 0.0, 0.0)}),
-        ("rounds=0", {"rounds": 0}),
-    ],
-)
-def test_mistakes_are_named(message, options):
-    with pytest.raises(UserError, match=f"^{message}"):
-        Gnss(**options)

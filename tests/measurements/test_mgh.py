@@ -8,7 +8,6 @@ import pytest
 from scipy.optimize import least_squares
 
 from ipe_bench.baselines import MultiscaleLM
-from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Mgh
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.mgh import functions, score
@@ -211,9 +210,3 @@ def test_what_is_no_minimum_is_none():
     assert not score(model, nearly).solved
     local = Mgh("freudenstein_roth")
     assert score(local, np.array(local.minima[1].x) / local.sizes).minimum == 1
-
-
-@pytest.mark.parametrize(("field", "options"), [("function", {"function": "rosen"}), ("start", {"start": 0.0})])
-def test_mistakes_are_named(field, options):
-    with pytest.raises(UserError, match=rf"^{field}="):
-        Mgh(**{"function": "bard", **options})

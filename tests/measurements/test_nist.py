@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Nist
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.nist import datasets, digits, score
@@ -82,9 +81,3 @@ def test_digits_are_the_fewest_over_the_parameters_capped_and_zero_where_wrong()
     assert digits([2.0], [2.0]) == 11.0
     assert digits([1.5], [1.0]) == 0.0
     assert digits([np.nan, 1.0], [1.0, 1.0]) == 0.0
-
-
-@pytest.mark.parametrize(("field", "options"), [("dataset", {"dataset": "misra"}), ("start", {"start": 3})])
-def test_mistakes_are_named(field, options):
-    with pytest.raises(UserError, match=rf"^{field}="):
-        Nist(**{"dataset": "Misra1a", **options})

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import DOP853
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.measurements import OdeMeasurement, Parameter, Polynomial, ode
+from ipe_bench.measurements import OdeMeasurement, Parameter, ode
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode import tableau
 from ipe_bench.measurements.ode.model import steps_between
@@ -125,25 +125,12 @@ def test_a_fixed_step_is_the_longest_there_is_and_divides_each_interval_evenly()
     np.testing.assert_array_equal(model._common_steps(np.ones((1, 2))), [1, 3, 2])
 
 
-def test_the_jacobian_agrees_with_differences():
-    x = np.array([[1.0, 1.0], [-0.5, 2.0]])
-    model = Cases(0.5)
-    np.testing.assert_allclose(model.jacobian(x), differentiate(model.simulate, x, analytic=False), atol=1e-8)
-
-
 def test_readings_are_ordered_by_case_time_and_output():
     index = Cases().index
     assert index["case"] == [1] * 6 + [2] * 6
     assert index["time [s]"][:4] == [0.5, 0.5, 4.0, 4.0]
     assert index["output"][:3] == ["y", "rate", "y"]
     assert [rows.tolist() for rows in Cases().epochs][1] == [2, 3, 8, 9]
-
-
-def test_a_prefix_of_the_epochs_is_the_same_bits():
-    model, x = Cases(0.5), np.random.default_rng(2).normal(size=(5, 2))
-    for stop in (1, 2):
-        assert (model.simulate_until(x, stop) == model.simulate(x)[:, model.rows(stop)]).all()
-        assert (model.jacobian_until(x, stop) == model.jacobian(x)[:, model.rows(stop)]).all()
 
 
 def test_bits_do_not_depend_on_the_batch_or_on_the_number_of_threads(monkeypatch):
@@ -229,17 +216,6 @@ def test_the_contraction_of_a_scaled_jacobian_is_known():
     assert contraction(1.25 * J, J) == pytest.approx(0.2)
     assert contraction(J, J) < 1e-14
     assert contraction(np.nan * J, J) == np.inf
-
-
-def test_other_models_state_what_their_jacobians_cost():
-    assert Polynomial().jacobian_cost == (Polynomial().n if Polynomial().analytic else 2 * Polynomial().n)
-    x = Polynomial().nominal[None]
-    assert (Polynomial().coarse_jacobian(x) == Polynomial().jacobian(x)).all()
-
-    class Differences(Polynomial):
-        analytic = False
-
-    assert Differences().jacobian_cost == 2 * Polynomial().n
 
 
 @dataclass(frozen=True)

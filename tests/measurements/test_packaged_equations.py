@@ -12,7 +12,6 @@ from scipy.special import expi
 from small_models import bock
 
 from ipe_bench.baselines import MultiscaleLM
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.cli.session import jobs_of, session
 from ipe_bench.cli.words import read
@@ -51,22 +50,6 @@ def test_a_model_is_that_of_its_config_and_keeps_the_promises_of_models(name):
     assert not [f.complaint for one in (model, other) for f in check_component(name, one) if f.complaint]
     x = draw(model, scale=3.0 if name == "sir" else 1.0)
     assert np.abs(model.simulate(x) - replace(model, step=step).simulate(x)).max() < tolerance
-
-
-@pytest.mark.parametrize(
-    ("make", "options", "said"),
-    [
-        (Sir, {"step": -1.0}, "step=-1.0"),
-        (Sir, {"size": {"beta": 1.0}}, "size: beta is not a parameter"),
-        (Sir, {"constants": {"population": 763.0}}, "measurement: infection is not known"),
-        (FallingBody, {"readings": 0}, "readings=0"),
-        (Bock, {"tolerance": "1e-13*cosh(nu*t)"}, "tolerance: nu is neither a constant nor t"),
-        (Bock, {"answer": {}, "exact": {"x1": "1"}}, "answer: give all parameters"),
-    ],
-)
-def test_mistakes_are_named(make, options, said):
-    with pytest.raises(UserError, match=said):
-        make(**options).simulate(np.ones((1, 1)))
 
 
 def epidemic(t, beta, gamma, infected, population=763.0):

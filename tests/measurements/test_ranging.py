@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.measurements import Ranging
 from ipe_bench.measurements.problem import Problem
@@ -54,8 +53,3 @@ def test_a_clock_bias_adds_to_every_range_and_rounds_repeat():
     assert z[0, 0] == np.hypot(1000.0, 300.0)
     assert (z[:, :7] == z[:, 7:]).all()
     assert [len(rows) for rows in model.epochs] == [7, 7]
-
-
-def test_too_few_beacons_are_refused():
-    with pytest.raises(UserError, match=r"^beacons:"):
-        Ranging(beacons=((0.0, 0.0, 1.0),), rounds=4)

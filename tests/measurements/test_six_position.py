@@ -4,13 +4,11 @@ import numpy as np
 import pytest
 
 from ipe_bench.baselines import GaussNewton
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.measurements import SixPosition
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
-from ipe_bench.plugins.conformance import check_component
 from ipe_bench.real.fits import fit
 from ipe_bench.real.readings import open_together, write_readings
 
@@ -104,23 +102,3 @@ def test_a_scale_factor_of_nothing_spoils_its_own_trial_only():
     z = model.simulate(x)
     assert not np.isfinite(z[0]).all()
     assert np.array_equal(z[1], model.simulate(x[1:])[0])
-
-
-def test_it_keeps_the_promises_of_models():
-    assert not [f.complaint for f in check_component("six_position", SixPosition()) if f.complaint]
-
-
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ({"sensors": ("ax",)}, "sensors: give force and rate with them"),
-        (
-            {"sensors": ("ux",), "force": ((0.0, 0.0, 9.8),), "rate": ((0.0,) * 3,)},
-            "sensor=ux: there is no such sensor",
-        ),
-        ({"gravity": 0.0}, "gravity=0"),
-    ],
-)
-def test_mistakes_are_named(options, expected):
-    with pytest.raises(UserError, match=expected):
-        SixPosition(**options)

@@ -1,9 +1,7 @@
 """The triad against a recorded calibration with a known answer, and against the algebraic fit of a quadric."""
 
 import numpy as np
-import pytest
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.measurements import Triad
 from ipe_bench.measurements.problem import Problem
@@ -88,8 +86,3 @@ def test_nothing_but_magnitude_and_bias_is_seen_without_errors():
     model = Triad()
     np.testing.assert_allclose(model.simulate(np.zeros((1, 9))), 1.0, atol=1e-15)
     assert np.linalg.cond(model.linearization()) < 2.0
-
-
-def test_too_few_attitudes_are_refused():
-    with pytest.raises(UserError, match=r"^outputs"):
-        Triad(outputs=((1.0, 0.0, 0.0),) * 9)

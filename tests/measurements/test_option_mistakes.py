@@ -1,0 +1,71 @@
+"""Options of models and noises that cannot be, each refused by its name."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.measurements import (
+    Accelerometer,
+    Bearings,
+    Bock,
+    FallingBody,
+    Gnss,
+    Mgh,
+    Nist,
+    Polynomial,
+    Ranging,
+    RicherGins,
+    Sir,
+    SixPosition,
+    Triad,
+)
+from ipe_bench.noise import Colored, Correlated, Outliers, StudentT
+
+FEW = ((1.0, 0.0, 0.0),) * 9
+HIGH = ((2e7, 0.0, 0.0),) * 9
+MISTAKES = [
+    (lambda: Mgh("rosen"), "function="),
+    (lambda: Mgh("bard", start=0.0), "start="),
+    (lambda: Nist("misra"), "dataset="),
+    (lambda: Nist(start=3), "start="),
+    (lambda: Bearings(interval=0.0), "interval"),
+    (lambda: Bearings(legs=((1.0, 2.0),)), "legs"),
+    (lambda: Bearings(target=(1.0, 2.0)), "target"),
+    (lambda: Ranging(beacons=FEW[:1], rounds=4), "beacons:"),
+    (lambda: Polynomial(4, 4), "count=4"),
+    (lambda: RicherGins(gyro_random_walk=-1.0), "gyro_random_walk="),
+    (lambda: Triad(outputs=FEW), "outputs"),
+    (lambda: Accelerometer(counts=FEW), "counts"),
+    (lambda: Accelerometer(scale=(0.0, 1.0, 1.0)), "scale"),
+    (lambda: Accelerometer(gravity=-9.8), "gravity"),
+    (lambda: SixPosition(sensors=("ax",)), "sensors: give force and rate with them"),
+    (lambda: SixPosition(sensors=("ux",), force=FEW[:1], rate=FEW[:1]), "sensor=ux: there is no such sensor"),
+    (lambda: SixPosition(gravity=0.0), "gravity=0"),
+    (lambda: Gnss(satellites=HIGH[:3]), "satellites: 3 readings"),
+    (lambda: Gnss(satellites=((2e7, 0.0),) * 9), r"satellites\[0\]=\[2.*, 0\.0\]: give a list of 3 numbers"),
+    (lambda: Gnss(satellites=HIGH, times=(1, 2)), "times: 2 entries"),
+    (lambda: Gnss(constellations=("gps",)), "constellations: give"),
+    (lambda: Gnss(position=(0.0, 0.0, 0.0)), "position:"),
+    (lambda: Gnss(rounds=0), "rounds=0"),
+    (lambda: Sir(step=-1.0), "step=-1.0"),
+    (lambda: Sir(size={"beta": 1.0}), "size: beta is not a parameter"),
+    (lambda: Sir(constants={"population": 763.0}).simulate(np.ones((1, 3))), "measurement: infection is not known"),
+    (lambda: FallingBody(readings=0), "readings=0"),
+    (lambda: Bock(tolerance="1e-13*cosh(nu*t)"), "tolerance: nu is neither a constant nor t"),
+    (lambda: Bock(answer={}, exact={"x1": "1"}), "answer: give all parameters"),
+    (lambda: StudentT(1.0, 2.0), "degrees_of_freedom=2.0"),
+    (lambda: Outliers(1.0, share=1.5), "share=1.5"),
+    (lambda: Colored(1.0, 1.0), "correlation=1.0"),
+    (lambda: Colored(1.0, 0.5, channels=3).covariance(10), "channels=3"),
+    (lambda: Correlated(1.0, 0.5, block=7).covariance(10), "block=7"),
+    (lambda: Correlated(matrix=((1.0, 2.0), (2.0, 1.0))).covariance(2), "matrix"),
+    (lambda: Correlated(matrix=((1.0,),)).covariance(2), "matrix"),
+]
+
+
+@pytest.mark.parametrize(("make", "said"), MISTAKES, ids=[said for _, said in MISTAKES])
+def test_mistakes_are_named(make, said):
+    with pytest.raises(UserError, match=f"^{said}"):
+        make()
