@@ -82,52 +82,6 @@ def test_no_text_is_read_as_a_number_that_it_does_not_say(tmp_path, text):
     )
 
 
-def test_decimal_commas_between_commas_are_refused_with_the_row(tmp_path):
-    """1,1,1017,1189 was read as 1017, and the receiver stood 150 standard errors off, converged."""
-    model = Ranging()
-    path = written(tmp_path, model, model.simulate(model.nominal[None])[0])
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join([lines[0], *(line.replace(".", ",") for line in lines[1:])]))
-    assert (
-        refusal(path, model)
-        == "row 2: has 4 cells and the header 3; with decimal commas, separate the cells by semicolons"
-    )
-
-
-@pytest.mark.parametrize(
-    ("text", "separator", "complaint"),
-    [
-        ("1_0", ",", "row 4, column reading [m]: '1_0' is not a number; correct it"),
-        ("１２", ",", "row 4, column reading [m]: '１２' is not a number"),
-        ("٣", ",", "'٣' is not a number"),
-        ('"1,5"', ",", "row 4, column reading [m]: '1,5' is not a number"),
-        ("1,5", ",", "row 4: has 3 cells and the header 2; with decimal commas, separate the cells by semicolons"),
-        ("0x1F", ",", "'0x1F' is not a number"),
-        ("1e", ",", "'1e' is not a number"),
-        ("1 000", ",", "'1 000' is not a number"),
-        ("1.2.3", ",", "'1.2.3' is not a number"),
-        ("−1", ",", "'−1' is not a number"),
-        ("inf", ",", "row 4, column reading [m]: inf is not a reading; leave the cell empty"),
-        ("-Infinity", ",", "-Infinity is not a reading"),
-        ("nan", ",", "nan is not a reading"),
-        ("1e999", ",", "1e999 is not a reading"),
-        ("1.234,5", ";", "row 4, column reading [m]: '1.234,5' is not a number"),
-    ],
-)
-def test_what_is_not_plainly_a_number_is_refused(tmp_path, text, separator, complaint):
-    assert complaint in refusal(with_reading(tmp_path, text, separator), Bent(count=5))
-
-
-def test_points_and_commas_in_one_file_are_refused(tmp_path):
-    """Either could stand between thousands."""
-    complaint = "row 2, column reading [m]: '0.25' is not a number, with decimal commas"
-    assert complaint in refusal(with_reading(tmp_path, "1,234", ";"), Bent(count=5))
-
-
-def test_semicolons_with_points_are_read_too(tmp_path):
-    assert open_together([with_reading(tmp_path, "1.234", ";")], Bent(count=5)).z[2] == 1.234
-
-
 ROWS = ["1,0.25", "2,0.25", "3,0.25", "4,0.25", "5,0.25"]
 
 
@@ -149,12 +103,6 @@ def test_a_table_of_another_shape_is_refused(tmp_path, heading, rows, complaint)
     path = tmp_path / "readings.csv"
     path.write_text("\n".join([heading, *rows]) + "\n", encoding="utf-8")
     assert complaint in refusal(path, Bent(count=5))
-
-
-def test_a_file_in_another_encoding_is_refused(tmp_path):
-    path = tmp_path / "readings.csv"
-    path.write_bytes("number,reading [µm]\n1,0.25\n".encode("latin-1"))
-    assert "is not a readable CSV file" in refusal(path, Bent(count=5))
 
 
 def test_labels_are_compared_as_what_they_say(tmp_path):

@@ -22,10 +22,9 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.measurements.repeatable import require_repeatable
 from ipe_bench.noise import Certified, Gaussian, ModelNoise, Noise, Unknown
 from ipe_bench.priors import GaussianPrior, Prior, prior_of
-from ipe_bench.real.covariances import read_covariance
 from ipe_bench.real.examination import Examination, examinations
 from ipe_bench.real.fits import Fit, fit
-from ipe_bench.real.readings import SIGMA, LeftOut, Readings, open_together, require_enough
+from ipe_bench.real.readings import SIGMA, LeftOut, Readings, open_together, read_covariance, require_enough
 from ipe_bench.trials.scenario import Scenario
 
 

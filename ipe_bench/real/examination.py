@@ -8,24 +8,31 @@ one. Profiles have a page of their own, and so has the prior.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import chdtri, fdtri
 
-from ipe_bench.basics.linalg import Array, Covariance, Mask, deviations
+from ipe_bench.basics.linalg import Array, Mask, deviations
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.driver import Limits
 from ipe_bench.estimators.least_squares import Minima, Objective, inverse_factor, minimize
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.real.fits import Fit, falls_beyond, holding, present_part
+from ipe_bench.real.fits import Fit, at_rows, falls_beyond, holding, present_part, scaled, sum_of_squares
 from ipe_bench.real.penalised import penalised
-from ipe_bench.real.profiles import Profile, Released, half_width, natural_limits, profiles, wald_interval
+from ipe_bench.real.profiles import (
+    CONFIDENCE,
+    Profile,
+    Released,
+    half_width,
+    joint_region,
+    natural_limits,
+    profiles,
+    wald_interval,
+)
 
-CONFIDENCE = 0.95
 BOOTSTRAPS = 500
 STARTS = 64
 """Points that the search for other minima begins from."""
@@ -35,8 +42,6 @@ _WORK = 20_000_000
 """Entries of Jacobians that one iteration of all draws or starts may come to: of very many readings there are fewer."""
 _FEWEST = 4
 """The least number of draws or starts."""
-_ENTRIES = 4_000_000
-"""Entries of Jacobians that are in memory at a time."""
 _TOLERANCE = 1e-8
 _MOST_STEPS = 200
 _SAME = 1e-2
@@ -97,8 +102,6 @@ class Bootstrap:
 class OnBound:
     """A parameter whose estimate is on a bound, because the readings want it beyond."""
 
-    place: int
-    """The place of the parameter among those of the fit."""
     parameter: Parameter
     bound: float
     other: float
@@ -148,28 +151,42 @@ class Examination:
 
 def examinations(problem: Problem, z: Array, fits: list[Fit]) -> tuple[Examination, ...]:
     """Of the least-squares minimum, and of that with the prior: those that estimators have found."""
-    found = examine(problem, z, fits), examine_with_prior(problem, z, fits)
+    found = examine(problem, z, fits), examine(problem, z, fits, with_prior=True)
     return tuple(one for one in found if one is not None)
 
 
-def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BOOTSTRAPS) -> Examination | None:
-    """Examines the least of the minima that the estimators found; None where none of them is one, as with a prior."""
-    told = [one for one in _converged(fits) if not one.with_prior]
-    if not told:
+def examine(
+    problem: Problem, z: Array, fits: list[Fit], *, with_prior: bool = False, bootstraps: int = BOOTSTRAPS
+) -> Examination | None:
+    """Examines the least of the minima that the estimators found, or of those that estimators `with_prior` did; None
+    where none of them found one."""
+    told = [one for one in fits if one.status is Status.CONVERGED and np.isfinite(one.chi_square)]
+    told = [one for one in told if one.with_prior == with_prior]
+    rows = np.flatnonzero(np.isfinite(z))
+    if not told or (with_prior and problem.prior_deviation is None):
         return None
-    whole, best = problem, min(told, key=_sum_of_squares)
-    rows, on_bounds = np.flatnonzero(np.isfinite(z)), best.held_at
+    if with_prior:
+        best = min(told, key=lambda one: _sum_with_prior(problem, one))
+        part = present_part(problem, rows, best.level)
+        least = _Least.near(*penalised(part, z[rows], best.prior_inflation), best, readings=len(rows))
+        return None if least is None else least.examined(best.label, problem, rows, bootstraps)
+    whole, best = problem, min(told, key=sum_of_squares)
+    on_bounds = best.held_at
     if best.held is not None:
         # What is on its bound has no error; the others are examined with it held there.
         problem, best = holding(problem, on_bounds), best.held
     least = _Least.near(present_part(problem, rows, best.level), z[rows], best)
     if least is None:
         return None
-    if not on_bounds:
-        return least.examined(best.label, problem, rows, bootstraps)
-    released = _released(whole, rows, least, best.level, on_bounds)
+    released = _released(whole, rows, least, best.level, on_bounds) if on_bounds else None
     found = least.examined(best.label, problem, rows, bootstraps, released)
     return replace(found, on_bounds=tuple(_on_bounds(whole, z, rows, least, best.level, on_bounds)))
+
+
+def _sum_with_prior(problem: Problem, one: Fit) -> float:
+    prior = problem.prior_covariance(one.prior_inflation)
+    assert prior is not None
+    return sum_of_squares(one) / (one.level or 1.0) ** 2 + float(np.sum(prior.whiten(one.inner - problem.x0) ** 2))
 
 
 def _released(
@@ -189,30 +206,6 @@ def _released(
     return Released(given, x, inverse_U @ inverse_U.T, places, inwards)
 
 
-def examine_with_prior(
-    problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BOOTSTRAPS
-) -> Examination | None:
-    """Examines the minimum with the prior that is least where the estimators with one have ended; None without any."""
-    told = [one for one in _converged(fits) if one.with_prior]
-    if not told or problem.prior_deviation is None:
-        return None
-    rows = np.flatnonzero(np.isfinite(z))
-
-    def sum_of_all(one: Fit) -> float:
-        prior = problem.prior_covariance(one.prior_inflation)
-        assert prior is not None
-        return _sum_of_squares(one) / (one.level or 1.0) ** 2 + float(np.sum(prior.whiten(one.inner - problem.x0) ** 2))
-
-    best = min(told, key=sum_of_all)
-    part = present_part(problem, rows, best.level)
-    least = _Least.near(*penalised(part, z[rows], best.prior_inflation), best, readings=len(rows))
-    return None if least is None else least.examined(best.label, problem, rows, bootstraps)
-
-
-def _converged(fits: list[Fit]) -> list[Fit]:
-    return [one for one in fits if one.status is Status.CONVERGED and np.isfinite(one.chi_square)]
-
-
 def _on_bounds(
     problem: Problem, z: Array, rows: Array, least: _Least, level: float | None, values: Mapping[int, float]
 ) -> Iterator[OnBound]:
@@ -225,15 +218,10 @@ def _on_bounds(
         part = _released(holding(problem, others) if others else problem, rows, least, level, {k: bound})
         other = np.nan
         if part is not None:
-            sign, towards = int(part.inwards[0]), {"confidence": CONFIDENCE, "freedom": least.freedom}
-            asked = part.problem, z[rows][None], part.x[None], part.P[None]
-            ((found,),) = profiles(*asked, places=(k,), signs=(sign,), **towards)
+            sign, asked = int(part.inwards[0]), (part.problem, z[rows][None], part.x[None], part.P[None])
+            ((found,),) = profiles(*asked, freedom=least.freedom, places=(k,), signs=(sign,))
             other = np.nan if found.lower_minimum else (found.low, found.high)[sign > 0]
-        yield OnBound(place, model.physical_parameters[place], bound, float(np.clip(other, lower[place], upper[place])))
-
-
-def _sum_of_squares(one: Fit) -> float:
-    return one.chi_square * (1.0 if one.level is None else one.level**2)
+        yield OnBound(model.physical_parameters[place], bound, float(np.clip(other, lower[place], upper[place])))
 
 
 @dataclass(frozen=True)
@@ -259,7 +247,7 @@ class _Least:
         if best.level is not None and readings == len(z):
             # The minimum's own level, where the estimator's was a little higher.
             factor = float(np.sqrt(minima.chi_square[0] / free))
-            problem = replace(problem, R=Covariance(problem.R.factor * factor))
+            problem = scaled(problem, factor)
             minima = replace(minima, covariance=minima.covariance * factor**2, chi_square=minima.chi_square / factor**2)
         level = None if best.level is None else free
         return cls(problem, z, minima.x[0], minima.covariance[0], float(minima.chi_square[0]), level, readings)
@@ -284,7 +272,7 @@ class _Least:
         h, raw = whole.measurement.simulate(x)[0], whole.measurement.jacobian(x)[0]
         errors = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", raw, self.P, raw), 0.0))
         known = self.problem.R.deviations[: self.readings]
-        deviations = _at(rows, known, m)
+        deviations = at_rows(rows, known, m)
         if np.ptp(known) == 0:
             # Where all readings are as good, so is one that is missing; else nobody knows.
             deviations[:] = known[0]
@@ -295,15 +283,7 @@ class _Least:
             model.physical(x)[0],
             deviation * np.abs(model.physical_slope(x)[0]),
             wald_interval(model, self.x, deviation, q),
-            profiles(
-                self.problem,
-                self.z[None],
-                x,
-                self.P[None],
-                confidence=CONFIDENCE,
-                freedom=self.freedom,
-                released=released,
-            )[0],
+            profiles(self.problem, self.z[None], x, self.P[None], freedom=self.freedom, released=released)[0],
             self.bootstrap(bootstraps, released),
             self.direction(),
             self.influence(rows, m),
@@ -334,7 +314,7 @@ class _Least:
             cook = w**2 * leverage / (n * left**2)
             moved = self.P @ self.J.T * (w / left)
         shift = np.abs(moved / np.sqrt(np.diag(self.P))[:, None]).max(axis=0)
-        return Influence(*(_at(rows, values[: self.readings], m) for values in (leverage, cook, shift)))
+        return Influence(*(at_rows(rows, values[: self.readings], m) for values in (leverage, cook, shift)))
 
     def bootstrap(self, draws: int, released: Released | None = None) -> Bootstrap:
         """Estimates from readings simulated at the estimate, started there, with noise of R; the draws are always the
@@ -381,9 +361,7 @@ class _Least:
         return self._told_apart(minima)
 
     def _told_apart(self, minima: Minima) -> list[Minimum]:
-        limit = float(chdtri(len(self.x), 1 - CONFIDENCE))
-        if self.freedom is not None:
-            limit = float(len(self.x) * fdtri(len(self.x), self.freedom, CONFIDENCE))
+        limit = joint_region(len(self.x), CONFIDENCE, self.freedom)
         usable = minima.converged & np.isfinite(minima.chi_square) & np.isfinite(minima.covariance).all(axis=(1, 2))
         order = np.flatnonzero(usable)[np.argsort(minima.chi_square[usable], kind="stable")]
         found: list[Minimum] = []
@@ -436,18 +414,6 @@ def _affordable(wanted: int, entries: int) -> int:
 
 
 def _minimise(problem: Problem, z: Array, x: Array) -> Minima:
-    at_once = max(1, _ENTRIES // (z.shape[1] * x.shape[1]))
-    if len(x) > at_once:
-        parts = [_minimise(problem, z[k : k + at_once], x[k : k + at_once]) for k in range(0, len(x), at_once)]
-        names = [f.name for f in fields(Minima) if f.name != "history"]
-        joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-        return Minima(**joined, history=None)
     with np.errstate(all="ignore"):
         objective = Objective.of(problem, z, prior=False)
         return minimize(objective, LevenbergMarquardtMethod(1e-3), x, Limits(_TOLERANCE, _MOST_STEPS))
-
-
-def _at(rows: Array, values: Array, m: int) -> Array:
-    whole = np.full(m, np.nan)
-    whole[rows] = values
-    return whole

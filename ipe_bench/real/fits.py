@@ -19,7 +19,7 @@ from ipe_bench.measurements.counted import cost
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.white import Gaussian
-from ipe_bench.real.profiles import Released, half_width, wald_interval
+from ipe_bench.real.profiles import Released, half_width, joint_region, wald_interval
 from ipe_bench.real.residuals import Whiteness, explained, normalised, outlier_limit, whiteness
 from ipe_bench.trials.fit_test import fit_probability, inflation_of, spread_of
 from ipe_bench.trials.observability import in_words
@@ -34,6 +34,7 @@ _SAME_LEVEL = 1e-3
 _SMALLEST_LEVEL = 1e-8
 """As a share of the readings, the level that estimators are told at least."""
 _FARTHEST = 40.0
+"""A normal deviate beyond every limit."""
 _OPEN = 1e-4
 """A combination of parameters that changes the readings by less than this share of what others do may be open."""
 _DOUBTED = 0.05
@@ -62,28 +63,25 @@ class Fit:
     whiteness: Whiteness
     iterations: int
     p_value: float
-    """Chance of a chi-square at least this large if the model and R are right: tiny means that they are not. Its law is
-    that of the noise and of what the estimator leaves; see `ipe_bench.trials.fit_test`. NaN where that cannot be tested
-    (`testable`)."""
+    """Chance of a chi-square at least this large if the model and R are right (`ipe_bench.trials.fit_test`); NaN where
+    that cannot be tested."""
     simulations: float
     """Evaluations of the model, a Jacobian counting n."""
     model: Measurement
     """What was fitted, without the readings that are missing."""
     inner: Array
-    """The estimates (n,) as the estimator knows them: in multiples of sizes, of logarithms where parameters have
-    bounds."""
+    """The estimates (n,) as the estimator knows them: in multiples of sizes, or logarithms of distances to bounds."""
     inner_covariance: Array
     """Of those (n, n)."""
     level: float | None = None
-    """The factor by which the readings are noisier than R says, where it is estimated from the residuals; R and all
-    that rests on it, the covariance included, have been multiplied by it already. None: R is known."""
+    """The estimated factor by which the readings are noisier than R says, which is in all other fields; None: R is
+    known."""
     held: Fit | None = None
-    """Where parameters are on their bounds: the fit of the model in which they are held there. Errors of the others are
-    from it; those on a bound have none."""
+    """The fit of the model in which parameters are held on their bounds; those have no errors."""
     with_prior: bool = False
     """Whether the estimator was told a prior, so that x is not the least-squares estimate."""
     prior_inflation: float = 1.0
-    """The factor by which the estimator widened the prior's deviations."""
+    """The factor by which the estimator widened the prior's standard deviations."""
     beaten_by: str = ""
     """The estimator with the least sum of squares, where it is so much smaller that chance does not explain it."""
     undetermined: tuple[str, ...] = ()
@@ -135,23 +133,20 @@ class Fit:
         """Whether this is an answer: the estimator converged, and nothing says that the model does not fit."""
         return self.status is Status.CONVERGED and self.fits is not False
 
-    def half_width(self, confidence: float = 0.95) -> float:
-        """Half the width of a confidence interval in standard errors: of the normal distribution, or of Student's t
-        where the level of the noise is estimated."""
-        return half_width(confidence, None if self.level is None else self.degrees_of_freedom)
+    @property
+    def _freedom(self) -> int | None:
+        """The degrees of freedom that the level of the noise is estimated from; None where it is known."""
+        return None if self.level is None else self.degrees_of_freedom
 
     def interval(self, confidence: float = 0.95) -> tuple[Array, Array]:
         """Confidence intervals (n,), (n,) from the standard errors; inside of its bounds where a parameter has some."""
         with np.errstate(invalid="ignore"):
             deviation = np.sqrt(np.diagonal(self.inner_covariance))
-        return wald_interval(self.model, self.inner, deviation, self.half_width(confidence))
+        return wald_interval(self.model, self.inner, deviation, half_width(confidence, self._freedom))
 
     def region(self, parameters: int, confidence: float = 0.95) -> float:
-        """The squared distance, in standard errors, to the edge of a joint region of so many parameters: chi-square, or
-        F where the level of the noise is estimated."""
-        if self.level is None:
-            return float(chdtri(parameters, 1 - confidence))
-        return float(parameters * fdtri(parameters, self.degrees_of_freedom, confidence))
+        """The squared distance, in standard errors, to the edge of a joint region of so many parameters."""
+        return joint_region(parameters, confidence, self._freedom)
 
     @property
     def outlier_limit(self) -> float:
@@ -169,31 +164,31 @@ def fit(
     z: Array,
     estimators: Mapping[str, Estimator],
     noise: Noise = _NORMAL,
-    *,
-    level_unknown: bool | None = None,
 ) -> list[Fit]:
-    """Lets every estimator loose on the readings z (m,), of which those that are NaN are missing; `noise` states the
-    law of their whitened errors.
+    """Has every estimator estimate from the readings z (m,), of which those that are NaN are missing.
 
-    `level_unknown`: R is known up to a factor, which is estimated from the residuals of each fit; None: as the noise
-    says.
+    `noise` states the law of their whitened errors; or that R is known up to a factor, which is then estimated from the
+    residuals of each fit.
     """
     present = np.flatnonzero(~np.isnan(z))
-    given = problem if len(present) == len(z) else _restricted(problem, present)
+    given = replace(present_part(problem, present), doubted=1.0 if noise.estimated else _DOUBTED)
     where = present, len(z), _succession(problem.measurement, present)
-    unknown = noise.estimated if level_unknown is None else level_unknown
-    given = replace(given, doubted=1.0 if unknown else _DOUBTED)
-    if unknown:
+    if noise.estimated:
         found = [_fit_with_level(label, one, given, z[present], *where) for label, one in estimators.items()]
     else:
         found = [_fit_one(label, one, given, z[present], *where, noise=noise) for label, one in estimators.items()]
     return _compared(found)
 
 
+def sum_of_squares(one: Fit) -> float:
+    """Of the residuals, whitened by R as it was stated."""
+    return one.chi_square * (1.0 if one.level is None else one.level**2)
+
+
 def _compared(fits: list[Fit]) -> list[Fit]:
     """The fits, marked where they lie outside of the joint confidence region of the best (Bates and Watts, Nonlinear
     Regression Analysis and Its Applications, 1988, section 6.1)."""
-    sums = [one.chi_square * (1.0 if one.level is None else one.level**2) for one in fits]
+    sums = [sum_of_squares(one) for one in fits]
     known = [value if np.isfinite(value) else np.inf for value in sums]
     if not np.isfinite(known).any():
         return fits
@@ -213,7 +208,7 @@ def _fit_with_level(label: str, estimator: Estimator, problem: Problem, z: Array
     level, found = spread or 1.0, None
     for _ in range(_MOST_LEVELS):
         assumed = level
-        again = _fit_one(label, estimator, _scaled(problem, assumed), z, *where, noise=None)
+        again = _fit_one(label, estimator, scaled(problem, assumed), z, *where, noise=None)
         if found is not None and again.status is not Status.CONVERGED and found.status is Status.CONVERGED:
             break
         found = again
@@ -233,7 +228,8 @@ def _fit_with_level(label: str, estimator: Estimator, problem: Problem, z: Array
     return found
 
 
-def _scaled(problem: Problem, level: float) -> Problem:
+def scaled(problem: Problem, level: float) -> Problem:
+    """The problem with readings that are noisier by a factor."""
     return replace(problem, R=Covariance(problem.R.factor * level))
 
 
@@ -264,13 +260,10 @@ def _with_level(found: Fit, factor: float, level: float) -> Fit:
 
 def present_part(problem: Problem, rows: NDArray[np.intp], level: float | None = None) -> Problem:
     """The problem of the readings that are there, R multiplied by an estimated level."""
-    part = problem if len(rows) == problem.R.m else _restricted(problem, rows)
-    return part if level is None else _scaled(part, level)
-
-
-def _restricted(problem: Problem, rows: Array) -> Problem:
-    model = SubsetModel(problem.measurement, tuple(rows.tolist()))
-    return replace(problem, measurement=model, R=problem.R.restricted(rows))
+    if len(rows) < problem.R.m:
+        model = SubsetModel(problem.measurement, tuple(rows.tolist()))
+        problem = replace(problem, measurement=model, R=problem.R.restricted(rows))
+    return problem if level is None else scaled(problem, level)
 
 
 def _succession(model: Measurement, present: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -366,16 +359,14 @@ def _fit_inside(
                 J = model.jacobian(estimates.x)[0]
             except Exception as error:
                 message = message or f"the residuals are unknown: {error}"
-    w = problem.R.whiten(r)
-    open_ones: tuple[str, ...] = ()
+    w, p = problem.R.whiten(r), np.nan
+    open_ones, deviates, white = (), np.full(len(z), np.nan), Whiteness(np.nan, 0, np.nan)
     if np.isfinite(w).all() and np.isfinite(J).all():
         Q = explained(J, problem.R)
-        open_ones = undetermined(model, problem.R.whiten_jacobian(J), estimates.x[0])
-        scaled, white = normalised(w, Q, problem.R), whiteness(w, Q, order)
-    else:
-        scaled, white = np.full(len(z), np.nan), Whiteness(np.nan, 0, np.nan)
+        deviates, white = normalised(w, Q, problem.R), whiteness(w, Q, order)
+        if "prior" not in estimator.needs:
+            open_ones = undetermined(model, problem.R.whiten_jacobian(J), estimates.x[0])
     chi_square = float(np.sum(w**2))
-    p = np.nan
     if noise is not None:
         spread = spread_of(estimator, problem, J[None])
         p = fit_probability(np.array([chi_square]), spread, noise, problem.H, problem.R)[0]
@@ -387,8 +378,8 @@ def _fit_inside(
         message,
         model.physical(estimates.x)[0],
         P * np.outer(slope, slope),
-        _at(rows, r, m),
-        _at(rows, scaled, m),
+        at_rows(rows, r, m),
+        at_rows(rows, deviates, m),
         chi_square,
         len(z) - n,
         white,
@@ -400,7 +391,7 @@ def _fit_inside(
         P,
         with_prior="prior" in estimator.needs,
         prior_inflation=inflation_of(estimator),
-        undetermined=() if "prior" in estimator.needs else open_ones,
+        undetermined=open_ones,
     )
 
 
@@ -421,7 +412,8 @@ def undetermined(model: Measurement, J: Array, x: Array) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _at(rows: NDArray[np.intp], values: Array, m: int) -> Array:
+def at_rows(rows: NDArray[np.intp], values: Array, m: int) -> Array:
+    """Values of some of m readings; NaN of the others."""
     whole = np.full(m, np.nan)
     whole[rows] = values
     return whole

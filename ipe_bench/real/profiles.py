@@ -9,11 +9,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
+from scipy.special import chdtri, fdtri, stdtrit
 
 from ipe_bench.basics.linalg import Array, Mask, squared
 from ipe_bench.estimators.driver import Limits
@@ -23,6 +22,7 @@ from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
+CONFIDENCE = 0.95
 _FIRST = (0.5, 1.0, 1.5)
 """Where a profile is looked at first on either side, in multiples of the half-width from standard errors."""
 _ROUNDS = 24
@@ -70,6 +70,14 @@ def half_width(level: float, freedom: int | None) -> float:
     return float(stdtrit(np.inf if freedom is None else freedom, (1 + level) / 2))
 
 
+def joint_region(parameters: int, level: float, freedom: int | None) -> float:
+    """The squared distance, in standard errors, to the edge of a joint confidence region of so many parameters:
+    chi-square, or F where the level of the noise is estimated from `freedom` degrees of freedom."""
+    if freedom is None:
+        return float(chdtri(parameters, 1 - level))
+    return float(parameters * fdtri(parameters, freedom, level))
+
+
 def natural_limits(model: Measurement) -> tuple[Array, Array]:
     """The lower and the upper bounds (n,) of the parameters in their own units; infinite where there are none."""
     ends = model.physical(np.stack([np.full(model.n, -np.inf), np.full(model.n, np.inf)]))
@@ -100,7 +108,6 @@ def profiles(
     P: Array,
     *,
     levels: Array | None = None,
-    confidence: float = 0.95,
     freedom: int | None = None,
     places: Sequence[int] | None = None,
     signs: Sequence[int] = (-1, 1),
@@ -117,34 +124,43 @@ def profiles(
     same quantile as inside of bounds: beyond the bound the true value may be anywhere, and an estimate on the bound is
     only nearer to it, so that the interval holds it at least as often as it says.
     """
-    q, least = half_width(confidence, freedom), squared(problem.R.whiten(problem.measurement.simulate(x) - z))
+    q, least = half_width(CONFIDENCE, freedom), squared(problem.R.whiten(problem.measurement.simulate(x) - z))
     levels = np.ones(len(x)) if levels is None else levels
     where = range(x.shape[1]) if places is None else places
-    looked = [
-        [_Looked(problem, z[k], x[k], P[k], float(levels[k]), float(least[k]), j, q) for j in where]
+    searches = [
+        [_Search(problem.measurement, z[k], x[k], P[k], float(levels[k]), float(least[k]), j, q) for j in where]
         for k in range(len(x))
     ]
-    every = [one for row in looked for one in row]
+    every = [one for row in searches for one in row]
     asked = [(one, one.centre + s * f * q * one.deviation) for one in every for s in signs for f in _FIRST]
     for _ in range(_ROUNDS + 1):
         _look(problem, asked, released)
         asked = [(one, at) for one in every for sign in signs if (at := one.next(sign)) is not None]
         if not asked:
             break
-    return [[one.profile() for one in row] for row in looked]
+    return [[one.profile() for one in row] for row in searches]
 
 
-class _Looked:
+@dataclass
+class _Search:
     """What has been seen of the profile of one parameter of one set of readings."""
 
-    def __init__(
-        self, problem: Problem, z: Array, x: Array, P: Array, level: float, least: float, place: int, q: float
-    ) -> None:
-        self.model, self.z, self.x, self.P, self.level, self.least = problem.measurement, z, x, P, level, least
-        self.place, self.q = place, q
-        self.centre, self.deviation = float(x[place]), float(np.sqrt(P[place, place]))
-        self.seen: dict[float, tuple[float, Array]] = {self.centre: (0.0, x)}
-        self.open = {-1: False, 1: False}
+    model: Measurement
+    z: Array
+    x: Array
+    P: Array
+    level: float
+    least: float
+    """The sum of squares at the estimate."""
+    place: int
+    q: float
+    """The rise of root chi-square at the ends."""
+
+    def __post_init__(self) -> None:
+        self.centre, self.deviation = float(self.x[self.place]), float(np.sqrt(self.P[self.place, self.place]))
+        # By value of the parameter: the signed root of the rise, and the other parameters with it.
+        self.seen: dict[float, tuple[float, Array]] = {self.centre: (0.0, self.x)}
+        self.open: set[int] = set()
         self.lower = False
 
     def note(self, at: float, total: float, point: Array) -> None:
@@ -164,36 +180,32 @@ class _Looked:
         start[self.place] = at
         return start
 
-    def side(self, sign: int) -> list[tuple[float, float]]:
-        """(distance, abs zeta) on one side, outwards from the estimate."""
+    def crossing(self, sign: int) -> tuple[tuple[float, float], tuple[float, float] | None]:
+        """On one side, as (distance, abs zeta): the first neighbours between which the profile rises over q; or the
+        farthest look and None, where it has not risen yet."""
         found = [(v - self.centre, abs(zeta)) for v, (zeta, _) in self.seen.items() if sign * (v - self.centre) >= 0]
-        return sorted((abs(distance), zeta) for distance, zeta in found)
-
-    def crossing(self, sign: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
-        """The first neighbours between which the profile rises over q."""
-        points = self.side(sign)
-        return next(((a, b) for a, b in itertools.pairwise(points) if a[1] < self.q <= b[1]), None)
+        points = sorted((abs(distance), zeta) for distance, zeta in found)
+        return next(((a, b) for a, b in itertools.pairwise(points) if a[1] < self.q <= b[1]), (points[-1], None))
 
     def end(self, sign: int) -> float:
         """The distance to the end of the interval, by linear interpolation."""
-        found = self.crossing(sign)
-        if found is None:
+        (near, below), beyond = self.crossing(sign)
+        if beyond is None:
             return np.inf
-        (near, below), (far, above) = found
+        far, above = beyond
         return far if above == below else near + (far - near) * (self.q - below) / (above - below)
 
     def next(self, sign: int) -> float | None:
         """Where to look next for an end; None where it is known, or there is none."""
-        found = self.crossing(sign)
-        if self.lower or self.open[sign]:
+        if self.lower or sign in self.open:
             return None
-        if found is None:
-            distance, zeta = self.side(sign)[-1]
-            if not np.isfinite(zeta) or distance > 1e6 * self.q * self.deviation:
-                self.open[sign] = True
+        (near, below), beyond = self.crossing(sign)
+        if beyond is None:
+            if not np.isfinite(below) or near > 1e6 * self.q * self.deviation:
+                self.open.add(sign)
                 return None
-            return self.centre + sign * distance * min(_STRETCH, max(1.1, 1.05 * self.q / max(zeta, 1e-3)))
-        (near, below), (far, above) = found
+            return self.centre + sign * near * min(_STRETCH, max(1.1, 1.05 * self.q / max(below, 1e-3)))
+        far, above = beyond
         distance = self.end(sign) if np.isfinite(above) else (near + far) / 2
         close = min(self.q - below, above - self.q) <= _PRECISION * self.q
         if close or far - near <= _PRECISION * self.q * self.deviation * 1e-3:
@@ -205,15 +217,15 @@ class _Looked:
         inner = np.array(sorted(self.seen))
         zeta = np.array([self.seen[v][0] for v in inner])
         with np.errstate(invalid="ignore"):
-            low, high = sorted(self._natural(np.array([self.centre - self.end(-1), self.centre + self.end(1)])))
-            values = self._natural(inner)
-        deviation = np.sqrt(np.diag(self.P))
-        wald = tuple(float(end[self.place]) for end in wald_interval(self.model, self.x, deviation, self.q))
+            low, high = sorted(self.physical(np.array([self.centre - self.end(-1), self.centre + self.end(1)])))
+            values = self.physical(inner)
+        low_wald, high_wald = wald_interval(self.model, self.x, np.sqrt(np.diag(self.P)), self.q)
+        wald = float(low_wald[self.place]), float(high_wald[self.place])
         order = np.argsort(values)
         zeta = zeta if values[-1] >= values[0] else -zeta
-        return Profile(values[order], zeta[order], float(low), float(high), wald, self.lower)  # type: ignore[arg-type]
+        return Profile(values[order], zeta[order], float(low), float(high), wald, self.lower)
 
-    def _natural(self, values: Array) -> Array:
+    def physical(self, values: Array) -> Array:
         """Values of the parameter in its own unit, on a bound where they are as near as round-off."""
         points = np.repeat(self.x[None], len(values), axis=0)
         points[:, self.place] = values
@@ -226,21 +238,22 @@ class _Looked:
         return found
 
 
-_Asked: TypeAlias = "Sequence[tuple[_Looked, float]]"
-"""Which profiles are to be looked at, and where."""
-
-
-def _look(problem: Problem, asked: _Asked, released: Released | None) -> None:
+def _look(problem: Problem, asked: Sequence[tuple[_Search, float]], released: Released | None) -> None:
     """Minimises over the other parameters at every place that is asked for, all in one batch."""
     places, values = np.array([one.place for one, _ in asked]), np.array([at for _, at in asked])
     z, begin = np.stack([one.z for one, _ in asked]), np.stack([one.start(at) for one, at in asked])
-    full, sums = _fit_others(problem, places, values, z, begin)
-    for (one, at), total, point in zip(asked, sums.tolist(), full, strict=True):
+    points, sums = _fit_others(problem, places, values, z, begin)
+    for (one, at), total, point in zip(asked, sums.tolist(), points, strict=True):
         one.note(at, total, point)
     if released is None:
         return
-    inside, sums = released.fits(places, values, z)
-    for (one, at), total, within, point in zip(asked, sums.tolist(), inside, full, strict=True):
+    places = np.setdiff1d(np.arange(len(released.x)), released.places)[places]
+    moved = (values - released.x[places]) / released.P[places, places]
+    freed, sums = _fit_others(
+        released.problem, places, values, z, released.x + released.P[:, places].T * moved[:, None]
+    )
+    inside = released.inside(freed).all(axis=1)
+    for (one, at), total, within, point in zip(asked, sums.tolist(), inside, points, strict=True):
         if within and np.isfinite(total):
             one.note(at, total, point)
 
@@ -264,18 +277,9 @@ class Released:
         """Which of the points x (points, n) are within all of these bounds, (points, bounds)."""
         return (x - self.x)[:, self.places] * self.inwards >= 0
 
-    def fits(self, places: NDArray[np.intp], values: Array, z: Array) -> tuple[Mask, Array]:
-        """Where (asked,) the minima with those of the other parameters at `values` (asked,) lie inwards, and the sums
-        of squares there (asked,)."""
-        places = np.setdiff1d(np.arange(len(self.x)), self.places)[places]
-        moved = (values - self.x[places]) / self.P[places, places]
-        begin = self.x + self.P[:, places].T * moved[:, None]
-        x, sums = _fit_others(self.problem, places, values, z, begin)
-        return np.asarray(self.inside(x).all(axis=1)), sums
-
 
 @dataclass(frozen=True, kw_only=True)
-class Pinned(CountingModel):
+class _Pinned(CountingModel):
     """A model in which one parameter of each trial has a value of its own, and x are the others."""
 
     places: NDArray[np.intp]
@@ -308,7 +312,7 @@ def _fit_others(
     """The minima (asked, n) with the parameters `places` at `values` (asked,), and the sums of squares there (asked,),
     for readings z (asked, m), from `begin` (asked, n)."""
     rows = np.arange(len(values))
-    model = Pinned(problem.measurement, EvaluationCount.zeros(len(values)), places=places, values=values)
+    model = _Pinned(problem.measurement, EvaluationCount.zeros(len(values)), places=places, values=values)
     x = np.stack([np.delete(start, place) for start, place in zip(begin, places, strict=True)])
     with np.errstate(all="ignore"):
         if x.shape[1]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import datetime
 import functools
+import logging
 import platform
 import subprocess
 import uuid
@@ -25,10 +26,12 @@ from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.parts import TRUTH, Unusable
 from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.runs.results import Results
-from ipe_bench.runs.schedule import Watcher, block_size_for, book, logged_to, plan, run_task, run_tasks, warn
+from ipe_bench.runs.schedule import Watcher, block_size_for, plan, run_tasks
 from ipe_bench.runs.store import ResultKey, Store
 from ipe_bench.trials.bounds import linear_bound
 from ipe_bench.trials.scenario import Scenario
+
+log = logging.getLogger(__name__)
 
 TRIALS = 1000
 """Number of trials if neither a number nor a precision is given."""
@@ -69,11 +72,7 @@ def compute(
     # What is stored of a scenario shows that its numbers can be computed with, without drawing any.
     stored = {part.key for part in store.parts()}
     untried = [scenario for scenario in scenarios if ResultKey(scenario).key not in stored]
-    execution = execution or Serial()
     block_size = block_size_for(trials) if block_size is None else block_size
-    if block_size > 0:
-        # Workers start while this process looks at what is asked for.
-        execution.warm_up(run_task, len(untried) * -(-trials // block_size))
     validate(scenarios, estimators, trials, block_size, untried=untried)
     store.prepare()
     of_scenarios = [result_keys(scenario, estimators) for scenario in scenarios]
@@ -81,22 +80,20 @@ def compute(
     results = Results.read([store.directory], keys={cell.key for cell in cells})
     aside = results.set_aside()
     tasks = [task for several in of_scenarios for task in plan(store.directory, several, results, trials, block_size)]
-    execution.warm_up(run_task, len(tasks))
+    record = None
     if tasks or aside or record_as or not results.announces(cells, trials):
-        record = {"started": _now(), **_record(scenarios, estimators, trials), **(further or {})}
-        written = store.write_run(record_as or new_name(), record | {"command": command, "blocks": len(tasks)})
-    else:
-        written = results.runs[-1].path
-    with logged_to(store.directory / "log" / f"{written.stem}.log"):
-        for line in aside:
-            warn(line)
-        failures = run_tasks(tasks, execution, store, watch or (lambda progress: None))
-        for key in {cell.key for cell in cells}:
-            try:
-                store.merge(key)
-            except (Unusable, StorageError) as error:
-                book.info(f"{key}: its parts stay as they are: {error}")
-    if not written.is_file():
+        facts = _record(scenarios, estimators, trials) | dict(further or {})
+        facts |= {"command": command, "blocks": len(tasks)}
+        record = store.write_run(record_as or new_name(), {"started": _now(), **facts})
+    for line in aside:
+        log.warning(line)
+    failures = run_tasks(tasks, execution or Serial(), store, watch or (lambda progress: None))
+    for key in {cell.key for cell in cells}:
+        try:
+            store.merge(key)
+        except (Unusable, StorageError) as error:
+            log.warning(f"{store.directory}: the files of {key} stay as they are: {error}")
+    if record is not None and not record.is_file():
         raise StorageError(f"{store.directory}: lost the record of this run; the same command computes what is missing")
     return failures
 

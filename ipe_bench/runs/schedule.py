@@ -30,10 +30,6 @@ from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import HISTORIES, Block
 
 log = logging.getLogger(__name__)
-book = logging.getLogger(f"{__name__}.book")
-"""What is written into the log file of a run, and nowhere else."""
-book.propagate = False
-book.setLevel(logging.INFO)
 
 BLOCK_SIZE = 250
 """Trials: at the least, where nobody says how many."""
@@ -67,7 +63,6 @@ class Done:
     """One cell of a task is finished: stored, or failed."""
 
     cell: int
-    seconds: float
     failure: Failure | None = None
 
 
@@ -142,7 +137,6 @@ def run_task(task: Task) -> Iterator[Done | str]:
         except BaseException:  # what it raises now, it raises again where that is its own failure
             log.debug("%s: raised while it was prepared", describe_names(cell.names), exc_info=True)
         yield PREPARED
-        began = time.perf_counter()
         failure = None
         try:
             with _alone():
@@ -153,7 +147,7 @@ def run_task(task: Task) -> Iterator[Done | str]:
             if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
                 raise  # a user's Ctrl-C; where it is ignored, in worker processes, there can be none
             failure = Failure.of(error)
-        yield Done(index, time.perf_counter() - began, failure)
+        yield Done(index, failure)
 
 
 _recent: dict[str, ResultKey] = {}
@@ -227,29 +221,6 @@ def _history_columns(scenario: Scenario, history: Sequence[np.ndarray]) -> dict[
     }
 
 
-@contextlib.contextmanager
-def logged_to(path: Path) -> Iterator[None]:
-    """Has what `book` is told written into a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handler = logging.FileHandler(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s  %(message)s", "%Y-%m-%d %H:%M:%S"))
-    # A log that cannot be written must not be what ends a run: the results will say so.
-    handler.handleError = lambda record: None
-    book.addHandler(handler)
-    try:
-        yield
-    finally:
-        book.removeHandler(handler)
-        with contextlib.suppress(OSError):
-            handler.close()
-
-
-def warn(text: str) -> None:
-    """Tells the log file and whoever listens to the warnings of this package."""
-    book.info(text)
-    log.warning(text)
-
-
 class RunProgress:
     """What has become of the cells of a run's tasks."""
 
@@ -270,16 +241,12 @@ class RunProgress:
             self.began = time.monotonic()
             self.tell()
 
-    def close(self, task: Task, cell: ResultKey, failure: Failure | None, seconds: float | None = None) -> None:
+    def close(self, task: Task, cell: ResultKey, failure: Failure | None) -> None:
         """Notes that a cell of a task is stored, or has failed for good."""
         self.left[id(cell.scenario), task.start, task.stop] -= 1
         self.trials += _weight(task, cell)
-        what = _described(task, cell)
-        if failure is None:
-            book.info(f"{what}: stored" + ("" if seconds is None else f" after {seconds:.3g} s"))
-        else:
-            self.failures.append(f"{what}: {failure.message}")
-            book.info(f"{what}: failed: {failure.message}\n{failure.detail}".rstrip())
+        if failure is not None:
+            self.failures.append(f"{_described(task, cell)}: {failure.message}")
             self.store.write_failure(cell, task.start, task.stop, failure)
         self.tell()
 
@@ -297,7 +264,6 @@ def run_tasks(tasks: Sequence[Task], execution: Execution, store: Store, watch: 
     Raises:
         StorageError: nothing can be stored any more.
     """
-    book.info(f"{len(tasks)} blocks to compute with execution {execution}")
     progress = RunProgress(store, tasks, watch)
     tries: Counter[tuple[str, int]] = Counter()
     while tasks:
@@ -310,7 +276,7 @@ def run_tasks(tasks: Sequence[Task], execution: Execution, store: Store, watch: 
                 cell, failure = task.cells[event.step.cell], event.step.failure
                 if failure is None and not store.has(cell, task.start, task.stop):
                     failure = Failure("died", "was said to be stored and is not; run the same command again")
-                progress.close(task, cell, failure, event.step.seconds)
+                progress.close(task, cell, failure)
             elif event.step == PREPARED:
                 progress.begin()
             if event.failure is None:
@@ -326,14 +292,13 @@ def run_tasks(tasks: Sequence[Task], execution: Execution, store: Store, watch: 
             for cell in culprits:
                 tries[cell.key, task.start] += 1
                 if event.failure.status == "died" and tries[cell.key, task.start] < TRIES:
-                    warn(f"{_described(task, cell)}: {event.failure.message}; trying it again")
+                    log.warning(f"{_described(task, cell)}: {event.failure.message}; trying it again")
                     again.append(replace(task, cells=(cell,)))
                 else:
                     progress.close(task, cell, event.failure)
             if rest:
                 again.append(replace(task, cells=tuple(rest)))
         tasks = again
-    book.info(f"done, {len(progress.failures)} failed")
     return tuple(progress.failures)
 
 

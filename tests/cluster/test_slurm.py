@@ -71,20 +71,11 @@ def kill_a_job(process: subprocess.Popen[str], environment: dict[str, str], fold
     """Kills one job of two once something is stored; returns its number."""
     for jobs in seen(process, environment):
         if len(jobs) == 2 and any(folder.glob("out/trials/*.parquet")):
+            assert set(jobs.values()) == set(slurm.NODES)
             job = min(jobs)
             subprocess.run(["scancel", "--signal=KILL", "--full", job], env=environment, check=True)
             return job
     raise AssertionError(f"the command ended before there were two jobs: {process.communicate()}")
-
-
-def test_workers_that_are_jobs_compute_the_rows_of_one_process(tmp_path, environment, serial):
-    pytest.importorskip("dask_jobqueue")
-    process = start(tmp_path, environment, *DASK, OPTIONS, "error_scale=3", "trials=200")
-    nodes = {node for jobs in seen(process, environment) for node in jobs.values()}
-    _, error = process.communicate()
-    assert process.returncode == 0, error
-    assert nodes == set(slurm.NODES)
-    pd.testing.assert_frame_equal(rows(tmp_path / "out"), serial(200, (3.0,)), check_exact=True)
 
 
 def test_a_killed_job_of_workers_loses_nothing(tmp_path, environment, serial):
@@ -94,16 +85,6 @@ def test_a_killed_job_of_workers_loses_nothing(tmp_path, environment, serial):
     _, error = process.communicate()
     assert process.returncode == 0, error
     pd.testing.assert_frame_equal(rows(tmp_path / "out"), serial(1000, (3.0,)), check_exact=True)
-
-
-@pytest.mark.skipif(importlib.util.find_spec("submitit") is None, reason="hydra-submitit-launcher is not installed")
-def test_a_sweep_whose_jobs_are_slurms_computes_the_rows_of_one_process(tmp_path, environment, serial):
-    process = start(tmp_path, environment, "-m", "error_scale=1,3", *SUBMITIT, "trials=100")
-    nodes = {node for jobs in seen(process, environment) for node in jobs.values()}
-    _, error = process.communicate()
-    assert process.returncode == 0, error
-    assert nodes == set(slurm.NODES)
-    pd.testing.assert_frame_equal(rows(tmp_path / "out"), serial(100, (1.0, 3.0)), check_exact=True)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("submitit") is None, reason="hydra-submitit-launcher is not installed")

@@ -8,7 +8,6 @@ import subprocess
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -21,7 +20,7 @@ _begun: set[int] = set()
 class Rogue(Estimator):
     """Estimates nothing but zeros, or does what it says; `until` names a file from whose existence on it behaves."""
 
-    does: Literal["behave", "sleep", "exit", "sys_exit", "kill", "memory", "raise", "shape", "row", "once"]
+    does: str
     until: str = ""
 
     def estimate(self, problem, z, *, history=False):
@@ -29,14 +28,19 @@ class Rogue(Estimator):
         if not (self.until and Path(self.until).exists()):
             if self.until and self.does == "kill":
                 Path(self.until).touch()
-            self.misbehave()
+            self.misbehave(problem, z)
             if self.does == "shape":
                 n += 1
             if self.does == "row":
                 return Estimates(np.zeros(n), np.zeros(len(z), dtype=np.int8))
-        return Estimates(np.zeros((len(z), n)), np.zeros(len(z), dtype=np.int8))
+        estimates = Estimates(np.zeros((len(z), n)), np.zeros(len(z), dtype=np.int8))
+        if self.does == "boast":
+            estimates.x[0] = np.nan
+        if self.does.startswith("simulations"):
+            estimates.simulations = np.full(len(z), float(self.does.split()[1]))
+        return estimates
 
-    def misbehave(self):
+    def misbehave(self, problem, z):
         match self.does:
             case "sleep":
                 time.sleep(3600)
@@ -56,6 +60,11 @@ class Rogue(Estimator):
                     time.sleep(0.5)
             case "raise":
                 raise ArithmeticError("rogue")
+            case "stop":  # the user presses Ctrl-C
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(0.01)
+            case "z" | "H" | "R" | "x0":
+                {"z": z, "H": problem.H, "R": problem.R.factor, "x0": problem.x0}[self.does][...] += 1.0
 
 
 def surroundings(task):

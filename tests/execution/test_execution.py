@@ -16,7 +16,7 @@ import rogues
 from rogues import Rogue
 from small_models import Bent
 
-from ipe_bench import Scenario, run
+from ipe_bench import Scenario
 from ipe_bench.baselines import LinearLSE
 from ipe_bench.basics.errors import StorageError, UserError  # noqa: F401
 from ipe_bench.noise import Gaussian
@@ -106,6 +106,10 @@ def test_a_run_completes_when_a_worker_is_killed(tmp_path, reference, execution)
         pytest.param("kill", {}, "SIGKILL", marks=pytest.mark.slow),
         ("shape", {}, "x of shape (10, 4)"),
         ("row", {}, "x of shape (3,)"),
+        *(
+            (f"simulations {value}", {}, "simulations that are not finite numbers from 0 up")
+            for value in (-1, "nan", "inf")
+        ),
         ("sleep", {"block_timeout_s": 3.0}, "block_timeout_s=3"),
         pytest.param(
             *("memory", {"memory_limit_gb": 1.0}, "MemoryError"),
@@ -129,6 +133,40 @@ def test_an_exception_in_an_estimator_is_a_status_and_no_failure(tmp_path):
     rows = results.load(next(cell for cell in results.stored.values() if cell.label == "rogue"), None)
     assert set(rows["status"]) == {"error"}
     assert set(rows["message"]) == {"ArithmeticError: rogue"}
+
+
+def test_an_estimate_that_is_not_finite_has_not_converged(tmp_path):
+    assert compute([scenario()], {"rogue": Rogue("boast")}, 5, tmp_path) == ()
+    results = Results.read([tmp_path])
+    rows = results.load(next(cell for cell in results.stored.values() if cell.label == "rogue"), ["status"])
+    assert rows["status"].tolist() == ["nonfinite"] + ["converged"] * 4
+
+
+def test_an_estimator_cannot_change_the_readings_and_the_problem_of_the_others(tmp_path, reference):
+    estimators = {name: Rogue(name) for name in ("z", "H", "R", "x0")}
+    assert compute([scenario()], {**estimators, **GOOD}, 40, tmp_path, block_size=10) == ()
+    there = stored(tmp_path)
+    assert_same({name: there[name] for name in reference}, reference)
+    results = Results.read([tmp_path])
+    for cell in results.stored.values():
+        if cell.label in estimators:
+            rows = results.load(cell, ["status", "message"])
+            assert set(rows["status"]) == {"error"}
+            assert all("read-only" in message for message in rows["message"])
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="sends POSIX signals")
+def test_ctrl_c_stops_a_serial_run(tmp_path):
+    code = f"""
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which what runs in the background ignores
+from test_execution import *
+try:
+    compute([scenario()], {{"rogue": Rogue("stop")}}, 20, {str(tmp_path)!r})
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+    assert subprocess.run([sys.executable, "-c", code], env=environment(), check=False).returncode == 130
 
 
 def test_what_is_said_to_be_stored_and_is_not_is_a_failure(tmp_path, monkeypatch):
@@ -314,47 +352,6 @@ def test_source_that_changed_since_the_run_began_is_not_mixed_in(tmp_path, monke
     assert len(failures) == 2
     assert "numerical source" in failures[0]
     assert not Results.read([tmp_path]).stored
-
-
-@pytest.mark.slow
-def test_two_runs_at_once_in_one_directory_agree(tmp_path, reference):
-    code = f"""
-import sys
-sys.path[:0] = {sys.path!r}
-from test_execution import *
-assert compute([scenario()], GOOD, 40, {str(tmp_path)!r}, execution=Processes(2), block_size=10) == ()
-"""
-    runs = [subprocess.Popen([sys.executable, "-c", code], env=environment()) for _ in range(2)]
-    assert [one.wait() for one in runs] == [0, 0]
-    assert_same(stored(tmp_path), reference)
-    assert Results.read([tmp_path]).problems == []
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="kills with POSIX signals")
-def test_a_run_that_is_killed_and_resumed_has_the_summary_of_one_that_was_not(tmp_path):
-    code = f"""
-import sys
-sys.path[:0] = {sys.path!r}
-from test_execution import *
-scenarios = [scenario(error_scale=s) for s in (0.1, 1.0, 3.0)]
-compute(scenarios, GOOD, 2000, {str(tmp_path)!r}, execution=Processes(2), block_size=20)
-"""
-    killed = 0
-    for wait in (2.5, 3.0, 3.5, None):
-        one = subprocess.Popen([sys.executable, "-c", code], env=environment())
-        try:
-            assert one.wait(wait) == 0
-        except subprocess.TimeoutExpired:
-            one.send_signal(signal.SIGKILL)
-            one.wait()
-            killed += 1
-    assert killed > 0
-    scenarios = [scenario(error_scale=s) for s in (0.1, 1.0, 3.0)]
-    resumed = run(scenarios, GOOD, 2000, output=tmp_path)
-    whole = run(scenarios, GOOD, 2000, block_size=500)
-    columns = [c for c in whole.columns if not c.startswith("time")]
-    assert resumed[columns].equals(whole[columns])
 
 
 def test_a_missing_dask_is_said_in_a_line(monkeypatch):

@@ -81,7 +81,7 @@ def test_nist_answers_come_from_the_formula_with_an_unknown_noise(dataset, tmp_p
     found = open_together([path], Formula(NIST[dataset], start))
     order = [[p.name for p in found.model.parameters].index(name) for name in start]
     estimators = {"lm": LeastSquares(method="lm", start="nominal", ftol=1e-15, xtol=1e-15, gtol=1e-15, max_nfev=5000)}
-    result = fit(Problem(found.model, Unknown().covariance(len(found.z))), found.z, estimators, level_unknown=True)[0]
+    result = fit(Problem(found.model, Unknown().covariance(len(found.z))), found.z, estimators, Unknown())[0]
     assert digits(result.x[order], nist.certified.parameters) >= 6
     if dataset == "Lanczos1":
         # Generated without noise to 14 digits: the certified sum of squares, 1.4e-25, is of their rounding.

@@ -8,6 +8,7 @@ import pytest
 import ipe_bench as ib
 from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
 from ipe_bench.measurements import Formula, Mgh, Ode, Polynomial, Sir
+from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Unknown
 from ipe_bench.real.examination import examine
@@ -21,9 +22,9 @@ TIMES = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
 SATURATION = Formula("a*(1-exp(-b*t))", {"a": 10.0, "b": 0.4}, {"t": TIMES})
 
 
-def examined(model, z, noise, level_unknown=False):
+def examined(model, z, noise):
     problem = Problem(model, noise.covariance(model.m))
-    return examine(problem, z, fit(problem, z, LM, level_unknown=level_unknown))
+    return examine(problem, z, fit(problem, z, LM, noise))
 
 
 def test_profiles_of_a_linear_model_are_the_intervals_of_its_standard_errors():
@@ -47,7 +48,7 @@ def test_bootstrap_with_an_estimated_level_is_as_wide_as_students_t(readings):
     model = Formula("a+b*t", {"a": 0.0, "b": 0.0}, {"t": t})
     z = 1.0 + 2.0 * np.array(t) + 0.1 * np.random.default_rng(8).standard_normal(readings)
     problem = Problem(model, Gaussian(1.0).covariance(readings))
-    found = examine(problem, z, fit(problem, z, LM, level_unknown=True), bootstraps=4000)
+    found = examine(problem, z, fit(problem, z, LM, Unknown()), bootstraps=4000)
     low, high = found.wald
     assert found.bootstrap.high - found.bootstrap.low == pytest.approx(high - low, rel=0.1)
     assert found.bootstrap.bias == pytest.approx(0.0, abs=4 * found.standard_errors.max() / np.sqrt(4000))
@@ -68,6 +69,18 @@ def test_ends_of_a_profile_are_where_chi_square_has_risen_by_the_quantile():
     for end in (found.profiles[1].low, found.profiles[1].high):
         assert chi_square(end) - least == pytest.approx(1.959964**2, rel=2e-3)
     assert found.profiles[1].bent or found.profiles[0].bent
+
+
+def test_values_of_a_profile_are_on_a_bound_where_they_are_as_near_as_round_off():
+    """And no others: of a positive parameter that starts at 1, 10^-8.6 is a value, and 10^-12.9 is 0."""
+    model = informed(Formula("b*t", {"b": 1.0}, {"t": (1.0,)}), (ParameterInfo("b", positive=True),))
+    deviation = 8.6 * np.log(10) / 1.959964
+    problem = Problem(model, Gaussian(20.0).covariance(1))
+    ((found,),) = profiles(problem, np.array([[1.0]]), np.zeros((1, 1)), np.array([[[deviation**2]]]))
+    assert found.values[found.values < 1] == pytest.approx([0.0] * np.sum(found.values == 0) + [10**-8.6, 10**-4.3])
+    assert pytest.approx(min(found.values[found.values > 0]), rel=1e-4) == 10**-8.6
+    assert np.sum(found.values == 0) > 0
+    assert found.low == 0.0
 
 
 def test_a_parameter_that_the_readings_do_not_bound_has_an_open_interval():
@@ -161,7 +174,7 @@ def test_rows_without_a_reading_are_predicted_with_their_band(unknown):
     t = np.array([0.0, 1.0, 2.0, 3.0, 7.0, 20.0])
     z = np.array([0.8, 2.3, 2.9, 4.2, np.nan, np.nan])
     model = Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)})
-    found = examined(model, z, Unknown() if unknown else Gaussian(0.5), level_unknown=unknown)
+    found = examined(model, z, Unknown() if unknown else Gaussian(0.5))
     b, a = np.polyfit(t[:4], z[:4], 1)
     assert found.fitted == pytest.approx(a + b * t, rel=1e-7)
     sigma = np.sqrt(np.sum((z[:4] - a - b * t[:4]) ** 2) / 2) if unknown else 0.5

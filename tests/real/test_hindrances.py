@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 
 from ipe_bench.cli.main import main
-from ipe_bench.measurements import Gnss
 
 LM = ("solver=[]", "baseline=[levenberg_marquardt]")
 
@@ -52,22 +51,6 @@ def test_run_does_not_ignore_a_file_of_readings(ipe_bench):
     assert "readings: is for `ipe-bench estimate`: run simulates its readings" in printed
 
 
-def test_a_model_is_simulated_with_its_own_noise(ipe_bench):
-    """Ranges of a beacon had the quantisation of an inertial platform."""
-    code, printed = ipe_bench("run", "measurement=ranging", "trials=2", "--dry-run")
-    assert code == 0
-    assert "ranging, gaussian" in printed
-
-
-@pytest.mark.slow
-def test_an_example_of_the_help_gives_the_certified_answer(ipe_bench):
-    """b1 was -3.3e11 by default, with exit code 0."""
-    code, printed = ipe_bench("estimate", "measurement=nist/misra1a")
-    assert code == 0, printed
-    assert answer("auto")["estimates"]["b1"] == pytest.approx(2.3894212918e02, rel=1e-6)
-    assert "linear_lse: MISFIT" in printed
-
-
 @pytest.mark.slow
 def test_an_answer_to_a_trial_of_any_scale_needs_no_scale(ipe_bench):
     """Integrated with a step for error scale 1, the readings of scale 3000 were fitted by parameters that were nine
@@ -78,77 +61,6 @@ def test_an_answer_to_a_trial_of_any_scale_needs_no_scale(ipe_bench):
     found, known = answer("progressive"), truth("t.truth.csv")
     off = [abs(found["estimates"][name] - known[name]) / found["standard_errors"][name] for name in known]
     assert max(off) < 4
-
-
-def test_decimal_commas_are_not_cut_off(ipe_bench, tmp_path):
-    """A range of 1017.12 m between commas was 1017 m."""
-    assert ipe_bench("run", "measurement=ranging", "error_scale=10", "write_readings=r.csv")[0] == 0
-    with_commas = (tmp_path / "r.csv").read_text().replace(".", ",")
-    (tmp_path / "c.csv").write_text(with_commas)
-    code, printed = ipe_bench("estimate", "measurement=ranging", "readings=c.csv", *LM)
-    assert code == 2
-    assert "row 2: has 4 cells and the header 3; with decimal commas, separate the cells by semicolons" in printed
-    semicolons = (tmp_path / "r.csv").read_text().replace(",", ";").replace(".", ",")
-    (tmp_path / "s.csv").write_text(semicolons)
-    code, printed = ipe_bench("estimate", "measurement=ranging", "readings=s.csv", *LM)
-    assert code == 0, printed
-    found, known = answer(), truth("r.truth.csv")
-    assert all(abs(found["estimates"][name] - known[name]) < 5 * found["standard_errors"][name] for name in known)
-
-
-@pytest.mark.parametrize(
-    ("cell", "said"),
-    [
-        ("1_0", "'1_0' is not a number"),
-        ("\uff11\uff10", "is not a number"),
-        ("1e400", "1e400 is not a reading"),
-        ("nan", "nan is not"),
-    ],
-)
-def test_what_is_not_plainly_a_number_is_refused_with_its_row(ipe_bench, tmp_path, cell, said):
-    (tmp_path / "a.csv").write_text(f"t,y\n1,2\n2,{cell}\n3,4\n")
-    line = ("measurement=formula", "measurement.expression=a*t", "measurement.start.a=1")
-    code, printed = ipe_bench("estimate", *line, "readings=a.csv", *LM)
-    assert code == 2
-    assert "row 3, column y" in printed
-    assert said in printed
-    assert len(printed.strip().splitlines()) == 1
-
-
-def test_satellites_come_with_the_readings(ipe_bench):
-    """They stood in the config alone: a matrix of 30 numbers on the command line."""
-    code, printed = ipe_bench("list", "measurement/gnss")
-    assert code == 0
-    assert "header: epoch,constellation,satellite,x [m],y [m],z [m],reading [m]" in printed
-    assert ipe_bench("run", "measurement=gnss", "write_readings=g.csv")[0] == 0
-    code, printed = ipe_bench("estimate", "measurement=gnss", "readings=g.csv", *LM)
-    assert code == 0, printed
-    found, known = answer(), truth("g.truth.csv")
-    assert set(found["estimates"]) == {p.name for p in Gnss().parameters}
-    assert all(abs(found["estimates"][name] - known[name]) < 5 * found["standard_errors"][name] for name in known)
-
-
-def test_readings_are_taken_when_the_file_says(ipe_bench, tmp_path):
-    """Days 3, 4.5 and so on of an epidemic were no days of the model."""
-    rows = ["time [day],reading [people]", "3,26", "4.5,140", "6,293", "7.25,285", "9,190", "11,65"]
-    (tmp_path / "s.csv").write_text("\n".join(rows))
-    code, printed = ipe_bench("estimate", "measurement=sir", "readings=s.csv", *LM)
-    assert code == 0, printed
-    assert 0.02 < answer()["standard_errors"]["ln_beta"] < 0.3
-
-
-@pytest.mark.slow
-def test_draws_respect_what_is_known_of_parameters(ipe_bench, tmp_path):
-    """A predator that is born at a negative rate is no trial: at a prior of twice the rate a third of them were."""
-    words = ("measurement=lotka_volterra", "parameters.birth.positive=true", "parameters.birth.deviation=1.1")
-    births = []
-    for trial in range(4):
-        name = f"w{trial}.csv"
-        code, printed = ipe_bench("run", *words, f"write_readings={name}", f"write_readings_trial={trial}")
-        assert code == 0, printed
-        births.append(truth(f"w{trial}.truth.csv")["birth"])
-    assert min(births) > 0
-    assert max(births) / min(births) > 2
 
 
 def test_a_start_that_is_far_off_may_be_given(ipe_bench, tmp_path):
@@ -162,20 +74,6 @@ def test_a_start_that_is_far_off_may_be_given(ipe_bench, tmp_path):
     code, printed = ipe_bench("estimate", *near, "readings=w.csv", "noise.deviation=0.02", *LM)
     assert code == 0, printed
     assert answer()["estimates"]["w"] == pytest.approx(2.0, abs=0.01)
-
-
-def test_names_are_not_broken_over_lines(ipe_bench, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
-    code, printed = ipe_bench("list", "measurement/gins_misaligned")
-    assert code == 0
-    assert "measurement=gins_misaligned\n" in printed
-    assert "measurement=gins_misaligne\n" not in printed
-
-
-def test_an_option_is_found_by_its_name_alone(ipe_bench):
-    code, printed = ipe_bench("list", "newton")
-    assert code == 2
-    assert "newton: write solver/newton" in printed
 
 
 CASES = {

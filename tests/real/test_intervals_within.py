@@ -14,7 +14,7 @@ from ipe_bench.measurements import Formula
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.noise import Gaussian, Unknown
 from ipe_bench.priors import GaussianPrior
-from ipe_bench.real.examination import examine, examine_with_prior
+from ipe_bench.real.examination import examine
 from ipe_bench.real.fits import fit
 from ipe_bench.real.penalised import penalised
 from ipe_bench.real.profiles import profiles
@@ -33,7 +33,7 @@ def test_profiles_and_bootstrap_with_a_prior_are_the_posterior_of_a_linear_model
     z[4] = np.nan
     map_lm = MapLM(tolerance=1e-10, prior_inflation=inflation)
     fits = fit(bench.problem, z, {"map": map_lm, "ekf": EKF(prior_inflation=inflation)})
-    found = examine_with_prior(bench.problem, z, fits, bootstraps=4000)
+    found = examine(bench.problem, z, fits, with_prior=True, bootstraps=4000)
     assert found is not None
     A = np.delete(np.asarray(bench.measurement.A), 4, axis=0)  # type: ignore[attr-defined]
     d = inflation * np.array([1.0, 0.3, 2.0])

@@ -15,7 +15,7 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.priors import GaussianPrior, prior_of
-from ipe_bench.real.covariances import read_covariance
+from ipe_bench.real.readings import read_covariance
 from ipe_bench.trials.fit_test import spread_of
 from ipe_bench.trials.posterior import sample_posterior
 from ipe_bench.trials.scenario import Scenario

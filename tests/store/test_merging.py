@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +20,6 @@ from ipe_bench.runs import parts
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import compute
 from ipe_bench.runs.store import Store
-from ipe_bench.statistics import summarize
 
 TRIALS, BLOCK = 100, 3
 
@@ -191,33 +188,6 @@ def test_rows_that_go_away_for_good_are_missed(tmp_path):
     assert len(rows["trial"]) == TRIALS - BLOCK
     (line,) = results.problems
     assert "went away while they were read" in line
-
-
-@pytest.mark.slow
-def test_summaries_while_files_are_merged_are_all_the_same(tmp_path):
-    """Folders are merged as fast as they can be filled, and read at the same time."""
-    filled(tmp_path / "of")
-    expected = summarize([tmp_path / "of"])
-    small = {path: path.read_bytes() for path in (tmp_path / "of" / "trials").iterdir()}
-    stop = threading.Event()
-
-    def churn() -> None:
-        while not stop.is_set():
-            merge(tmp_path / "of")
-            for path, content in small.items():
-                temporary = path.with_name(f".{path.name}.tmp")
-                temporary.write_bytes(content)
-                os.replace(temporary, path)
-
-    thread = threading.Thread(target=churn)
-    thread.start()
-    try:
-        for _ in range(40):
-            found = summarize([tmp_path / "of"])
-            assert found.equals(expected)
-    finally:
-        stop.set()
-        thread.join()
 
 
 def test_a_run_in_many_blocks_leaves_few_files_and_computes_nothing_again(tmp_path):

@@ -4,27 +4,30 @@ from __future__ import annotations
 
 import os
 import pickle
-import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from small_models import Bent
 
-from ipe_bench import Scenario, load, run
+import ipe_bench.runs.provenance
+from ipe_bench import Scenario
 from ipe_bench.baselines import LinearLSE
+from ipe_bench.basics.errors import UserError
+from ipe_bench.cli.main import main
+from ipe_bench.cli.status import main as status
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.runs.parts import as_array
-from ipe_bench.runs.results import Results
+from ipe_bench.runs.results import Results, require_results
 from ipe_bench.runs.run import compute
 from ipe_bench.runs.schedule import Task, _recalled, block_size_for
-from ipe_bench.runs.store import ResultKey, Store
+from ipe_bench.runs.store import ResultKey, Store, gaps
 from ipe_bench.solvers import FixedPoint, Newton
 
 
@@ -132,49 +135,12 @@ class Mine(FixedPoint):
     assert digest(code) == digest(code)
 
 
-@pytest.mark.parametrize("damage", ["truncated", "flipped"])
-def test_a_damaged_file_is_set_aside_and_computed_again(tmp_path, damage):
-    estimators = {"linear_lse": LinearLSE()}
-    compute([scenario()], estimators, 10, tmp_path)
-    cell = ResultKey(scenario(), "linear_lse", LinearLSE())
-    path = next((tmp_path / "trials").glob(f"{cell.key}-*.parquet"))
-    whole = rows(Store(tmp_path), cell)
-    data = path.read_bytes()
-    flipped = data[:4] + bytes(b ^ 255 for b in data[4:200]) + data[200:]
-    path.write_bytes(data[:200] if damage == "truncated" else flipped)
-    compute([scenario()], estimators, 10, tmp_path)
-    assert len(list(path.parent.glob(f"{path.stem}.damaged-*"))) == 1
-    for name, values in rows(Store(tmp_path), cell).items():
-        np.testing.assert_array_equal(values, whole[name])
-
-
 def test_the_footer_says_what_the_file_holds(tmp_path):
     compute([scenario()], {"linear_lse": LinearLSE()}, 10, tmp_path)
     footers = [cell.footer for cell in Results.read([tmp_path]).stored.values()]
     assert {f["names"]["estimator"] for f in footers} == {"truth", "linear_lse"}
     assert all(f["identity"]["scenario"]["measurement"]["bend"] == 0.02 for f in footers)
     assert all(set(f["versions"]) >= {"ipe_bench"} for f in footers)
-
-
-def test_a_raising_estimator_is_a_status_and_the_others_are_complete(tmp_path):
-    from ipe_bench.estimators.base import Estimator
-
-    class Broken(Estimator):
-        def estimate(self, problem, z, *, history=False):
-            raise RuntimeError("out of order")
-
-    from dataclasses import dataclass
-
-    frame = run(
-        scenario(), {"linear_lse": LinearLSE(), "broken": dataclass(frozen=True)(Broken)()}, 10, output=tmp_path
-    )
-    rates = frame[frame["parameter"] == "all"].set_index("estimator")["converged"]
-    assert rates["linear_lse"] == 1.0
-    assert rates["broken"] == 0.0
-    results = Results.read([tmp_path])
-    stored = results.load(next(c for c in results.stored.values() if c.label == "broken"), None)
-    assert set(stored["status"]) == {"error"}
-    assert set(stored["message"]) == {"RuntimeError: out of order"}
 
 
 @pytest.mark.parametrize("cut", [slice(None), slice(3, 11), slice(0, 0)])
@@ -218,16 +184,76 @@ print(*[len(results.load(cell, None)["trial"]) for cell in results.current], "pa
     assert done.stdout.split() == ["20", "20", "False"]
 
 
-@pytest.mark.slow
-def test_killed_and_run_again_it_ends_as_if_never_killed(tmp_path):
-    command = [sys.executable, "-m", "ipe_bench", "run", "error_scale=33", "trials=600", "block_size=20"]
-    reference, killed = tmp_path / "reference", tmp_path / "killed"
-    subprocess.run([*command, f"output={reference}"], check=True, capture_output=True)
-    for wait in (4.0, 5.0):
-        process = subprocess.Popen([*command, f"output={killed}"], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-        time.sleep(wait)
-        os.kill(process.pid, signal.SIGKILL)
-        process.communicate()
-    subprocess.run([*command, f"output={killed}"], check=True, capture_output=True)
-    ours, theirs = load(killed), load(reference)
-    pd.testing.assert_frame_equal(ours.drop(columns="time_s"), theirs.drop(columns="time_s"))
+# What is done, failed, missing and stale
+
+RANGES = st.lists(st.tuples(st.integers(0, 40), st.integers(1, 20)).map(lambda r: (r[0], r[0] + r[1])))
+
+
+@given(RANGES, st.integers(0, 30), st.integers(0, 30))
+def test_gaps_are_what_no_range_holds(covered, start, length):
+    held = np.zeros(200, dtype=bool)
+    for first, last in covered:
+        held[first:last] = True
+    expected = [t for t in range(start, start + length) if not held[t]]
+    found = gaps(covered, start, start + length)
+    assert [t for first, last in found for t in range(first, last)] == expected
+    assert all(first < last for first, last in found)
+
+
+def test_a_complete_run_is_complete(tmp_path, capsys):
+    compute([scenario()], {"linear_lse": LinearLSE()}, 20, tmp_path, block_size=10)
+    results = Results.read([tmp_path])
+    assert results.problems == []
+    assert [(c.names["estimator"], c.expected, c.done) for c in results.cells] == [
+        ("truth", 20, 20),
+        ("linear_lse", 20, 20),
+    ]
+    assert status([str(tmp_path)]) == 0
+    assert "complete" in capsys.readouterr().out
+
+
+def test_a_block_that_is_gone_is_missing_and_a_cut_one_is_damaged(tmp_path, capsys):
+    compute([scenario()], {"linear_lse": LinearLSE()}, 30, tmp_path, block_size=10)
+    gone, cut = sorted((tmp_path / "trials").glob("*.parquet"))
+    gone.unlink()
+    cut.write_bytes(cut.read_bytes()[:100])
+    results = Results.read([tmp_path])
+    assert list(results.damaged) == [cut]
+    assert [(c.done, c.missing, c.failed) for c in results.cells] == [(0, 30, 0)] * 2
+    assert status([str(tmp_path)]) == 1
+    assert "damaged" in capsys.readouterr().out
+    compute([scenario()], {"linear_lse": LinearLSE()}, 30, tmp_path, block_size=10)
+    assert Results.read([tmp_path]).problems == []
+    assert len(list(cut.parent.glob(f"{cut.stem}.damaged-*"))) == 1
+
+
+def test_results_of_other_source_are_stale_and_not_done(tmp_path, monkeypatch):
+    compute([scenario()], {"linear_lse": LinearLSE()}, 20, tmp_path)
+    original = ipe_bench.runs.provenance.fingerprint
+    changed = lambda parts: {**original(parts), "source": "a fix"}  # noqa: E731
+    monkeypatch.setattr("ipe_bench.runs.store.fingerprint", changed)
+    monkeypatch.setattr("ipe_bench.runs.schedule.fingerprint", changed)
+    compute([scenario()], {"linear_lse": LinearLSE()}, 10, tmp_path)
+    assert [(c.expected, c.done, c.stale) for c in Results.read([tmp_path]).cells] == [(10, 10, 20), (10, 10, 20)]
+
+
+def test_a_refused_job_of_a_sweep_stays_in_the_books_until_it_is_accepted(tmp_path, capsys, monkeypatch):
+    output, sweep = f"output={tmp_path}", ["run", "-m", "measurement=polynomial", "noise=gaussian", "trials=5"]
+    sweep += ["solver=[]", "baseline=[linear_lse]", "figures=none", "execution=serial", output]
+    job = "measurement=polynomial noise=gaussian noise.deviation=1e-102"
+    assert main([*sweep, "noise.deviation=0.02,1e-102"]) == 2
+    assert f"choose another scale of the noise (refused: {job})" in capsys.readouterr().err
+    assert main(["status", str(tmp_path)]) == 1
+    assert f"refused: {job}: noise=gaussian" in capsys.readouterr().out.replace("\n", "")
+    results = Results.read([tmp_path])
+    assert (results.complete, results.expected) == (2, 4)
+    assert f"refused: {job}" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    monkeypatch.setattr("ipe_bench.runs.run.LARGEST", 1e300)
+    assert main([*sweep, "noise.deviation=0.02,1e-102"]) == 0
+    results = Results.read([tmp_path])
+    assert (results.complete, results.expected, results.problems) == (4, 4, [])
+
+
+def test_a_folder_without_results_is_a_mistake(tmp_path):
+    with pytest.raises(UserError, match="holds no results"):
+        require_results([tmp_path])

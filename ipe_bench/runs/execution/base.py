@@ -95,9 +95,6 @@ class Execution(Component, Named, ABC):
         Closing the iterator, or an exception of `FATAL`, stops what is under way.
         """
 
-    def warm_up(self, work: Work, tasks: int) -> None:
-        """Starts what takes time to start before so many tasks can run, without waiting for it. May be left out."""
-
 
 @dataclass(frozen=True)
 class Serial(Execution):

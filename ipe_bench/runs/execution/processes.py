@@ -16,7 +16,6 @@ import pickle
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -46,9 +45,6 @@ class Processes(LimitedExecution):
         threads = 1 if self.workers else max(1, cores() // max(workers, 1))
         return supervise(work, tasks, workers, threads, self.limits)
 
-    def warm_up(self, work: Work, tasks: int) -> None:
-        _warm_up(min(self.workers or cores(), tasks), work.__module__)
-
 
 @dataclass(frozen=True)
 class Auto(Processes):
@@ -61,10 +57,6 @@ class Auto(Processes):
         if len(tasks) == 1 and self.limits == Limits() and tasks[0].trusted:
             return Serial().run(work, tasks)
         return super().run(work, tasks)
-
-    def warm_up(self, work: Work, tasks: int) -> None:
-        if tasks > 1:
-            super().warm_up(work, tasks)
 
 
 def supervise(work: Work, tasks: Sequence[Task], workers: int, threads: int, limits: Limits) -> Iterator[Event]:
@@ -79,7 +71,7 @@ def supervise(work: Work, tasks: Sequence[Task], workers: int, threads: int, lim
         while waiting or busy:
             while waiting and len(busy) < workers:
                 index = waiting.popleft()
-                worker = _begun(index, (sys.path, threads, (limits, cloudpickle.dumps((work, tasks[index])))))
+                worker = _begun(index, (sys.path, threads, limits, cloudpickle.dumps((work, tasks[index]))))
                 busy[worker.connection] = worker
             deadline = min(worker.deadline for worker in busy.values())
             patience = None if deadline == math.inf else max(0.0, deadline - time.monotonic())
@@ -94,7 +86,7 @@ def supervise(work: Work, tasks: Sequence[Task], workers: int, threads: int, lim
                 else:
                     del busy[worker.connection]
                     if kind != "died":
-                        _give_back(worker)
+                        _idle[os.getpid()].append(worker)
                     if kind == "fatal":
                         raise value
                     yield Event(worker.index, ended=True, failure=value)
@@ -162,46 +154,26 @@ class _Worker:
 def _describe_exit(code: int) -> str:
     if code >= 0:
         return f"ended itself with exit code {code}"
-    try:
-        name = signal.Signals(-code).name
-    except ValueError:
-        name = f"signal {-code}"
+    name = signal.Signals(-code).name
     hint = "; the system may have run out of memory" if name == "SIGKILL" else ""
     return f"was ended by {name}{hint}"
 
 
 _idle: dict[int, list[_Worker]] = {}
 """By process: workers of another one, that this one was forked from, are not ours."""
-_lock = threading.Lock()
 
 
 def _begun(index: int, message: Any) -> _Worker:
     """An idle worker, else a new one, that was handed a task."""
+    kept = _idle.setdefault(os.getpid(), [])
     while True:
-        with _lock:
-            kept = _idle.setdefault(os.getpid(), [])
-            worker = kept.pop() if kept else _Worker()
+        worker = kept.pop() if kept else _Worker()
         worker.index, worker.deadline = index, math.inf
         try:
             worker.connection.send(message)
             return worker
         except OSError:  # an idle one has ended in the meantime
             worker.end()
-
-
-def _give_back(worker: _Worker) -> None:
-    with _lock:
-        _idle.setdefault(os.getpid(), []).append(worker)
-
-
-def _warm_up(workers: int, module: str) -> None:
-    """Starts workers that are not there yet; they import the module while this process does other things."""
-    with _lock:
-        kept = _idle.setdefault(os.getpid(), [])
-        for _ in range(workers - len(kept)):
-            kept.append(_Worker())
-            with contextlib.suppress(OSError):
-                kept[-1].connection.send((sys.path, 1, module))
 
 
 @atexit.register

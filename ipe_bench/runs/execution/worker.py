@@ -6,8 +6,6 @@ and ends when its parent ends.
 
 from __future__ import annotations
 
-import contextlib
-import importlib
 import os
 import pickle
 import queue
@@ -32,14 +30,10 @@ def main(handle: int) -> None:
     # Reading in a thread, so that the end of the parent is noticed in the middle of a task.
     threading.Thread(target=_listen, args=(connection, messages), daemon=True).start()
     while True:
-        path, threads, payload = messages.get()
+        path, threads, limits, payload = messages.get()
         sys.path[:] = path
         os.environ["IPE_BENCH_THREADS"] = str(threads)
-        if isinstance(payload, str):
-            with contextlib.suppress(Exception):
-                importlib.import_module(payload)
-        else:
-            connection.send(_perform(connection, *payload))
+        connection.send(_perform(connection, limits, payload))
 
 
 def _listen(connection: Connection, messages: queue.SimpleQueue[Any]) -> None:
