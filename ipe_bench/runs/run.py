@@ -81,7 +81,7 @@ def compute(
     aside = results.set_aside()
     tasks = [task for several in of_scenarios for task in plan(store.directory, several, results, trials, block_size)]
     record = None
-    if tasks or aside or record_as or not results.announces(cells, trials):
+    if tasks or aside or not results.announces(cells, trials):
         facts = _record(scenarios, estimators, trials) | dict(further or {})
         facts |= {"command": command, "blocks": len(tasks)}
         record = store.write_run(record_as or new_name(), {"started": _now(), **facts})
