@@ -27,7 +27,7 @@ def main(arguments: Sequence[str]) -> int:
     print_problems([*frame.attrs["problems"], *frame.attrs["stale"], *frame.attrs["notes"]])
     if "output" in keys:
         out.print(f"\nTable   {Path(keys['output']) / 'comparison.csv'}", markup=False, soft_wrap=True)
-        out.print(f"Figure  {Path(keys['output']) / 'comparison.png'}", markup=False, soft_wrap=True)
+        out.print(f"Page    {Path(keys['output']) / 'comparison.html'}", markup=False, soft_wrap=True)
     for line in frame.attrs["worse"]:
         out.print(f"worse: {line}", markup=False, soft_wrap=True)
     return 1 if frame.attrs["worse"] or frame.attrs["problems"] else 0

@@ -57,8 +57,9 @@ Nothing is simulated with noise and nothing estimated: all follows from the mode
 prior. Errors that the model leaves out are those of truth_measurement=, or of every option of measurement= that is the
 same model with more errors.
 
-Files: design.json, readings.csv (the readings that each choice takes), and as PNG and PDF the bound against the number
-of readings. They go to output=DIR, or to outputs/design-MODEL unless another command has written there.
+Files: design.json, readings.csv (the readings that each choice takes), as PNG and PDF the bound against the number of
+readings, and design.html with all of it. They go to output=DIR, or to outputs/design-MODEL unless another command has
+written there.
 """
 
 _POSTERIOR = """
@@ -69,8 +70,8 @@ For the first trials of a scenario (trials=3 unless given), the posterior itself
 by sequential Monte Carlo: particles go from the prior to the posterior as the likelihood is let in. Each estimator's
 estimate and covariance are then held against it. It takes seconds to a minute a trial.
 
-Files: posterior.json, and as PNG and PDF a corner picture of each trial (corner_0, corner_1, ...). They go to
-output=DIR, or to outputs/posterior-MODEL unless another command has written there.
+Files: posterior.json, as PNG and PDF a corner picture of each trial (corner_0, corner_1, ...), and posterior.html with
+all of it. They go to output=DIR, or to outputs/posterior-MODEL unless another command has written there.
 """
 
 

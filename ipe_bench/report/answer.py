@@ -203,9 +203,13 @@ def _notes(answer: Answer) -> Iterator[str]:
         if one.beaten_by:
             yield f"{one.label}: {one.beaten_by} found a better fit, by more than chance explains; this is no answer."
         if one.undetermined:
+            lacking = "; ".join(one.undetermined)
+            yield f"{one.label}: the readings do not determine {lacking}; fix parameters, or give prior, until they do."
+        if one.held is not None:
+            at = {one.model.physical_parameters[k].name: value for k, value in one.held_at.items()}
             yield (
-                f"{one.label}: the readings do not determine {'; '.join(one.undetermined)}; fix parameters, or give"
-                " prior, until they do."
+                f"{one.label}: on its bound: {_values(at)}; the readings want it beyond. It has no error, and those of"
+                " the others are with it held there."
             )
     if any(one.level is not None for one in fits):
         yield (
@@ -219,13 +223,6 @@ def _notes(answer: Answer) -> Iterator[str]:
         )
     if told := [one.label for one in fits if one.with_prior]:
         yield f"{', '.join(told)}: with a prior, which counts in the standard errors as further readings would."
-    for one in fits:
-        if one.held is not None:
-            at = {one.model.physical_parameters[k].name: value for k, value in one.held_at.items()}
-            yield (
-                f"{one.label}: on its bound: {_values(at)}; the readings want it beyond. It has no error, and those of"
-                " the others are with it held there."
-            )
     if answer.model.fixed:
         yield f"Fixed: {_values(answer.model.fixed)}"
     if answer.left_out:

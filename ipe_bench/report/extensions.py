@@ -24,11 +24,7 @@ T = TypeVar("T")
 
 
 def guarded(make: Callable[[], T]) -> T:
-    """Runs the code of a plugin.
-
-    Raises:
-        UserError: it raises, in a line that says where.
-    """
+    """Runs the code of a plugin; if it raises, raises UserError in a line that says where."""
     try:
         return make()
     except (UserError, StorageError):
@@ -57,11 +53,7 @@ def figures(problems: list[str]) -> list[tuple[Option, Figure]]:
 
 
 def checked_figure(record: Any) -> Figure:
-    """The record, if it is a figure of frames that exist.
-
-    Raises:
-        UserError: it is not.
-    """
+    """The record, or UserError if it is no figure of frames that exist."""
     _require(record, Figure, "is")
     if isinstance(record.frames, str) or not set(record.frames) <= set(FRAMES):
         raise UserError(f"frames={record.frames}: name some of {', '.join(FRAMES)}, in a tuple")
@@ -69,11 +61,7 @@ def checked_figure(record: Any) -> Figure:
 
 
 def drawings(figure: Figure, view: View) -> list[Drawing]:
-    """The drawings that a plugin's figure makes of a view.
-
-    Raises:
-        UserError: it raises, or gives something else.
-    """
+    """The drawings that a plugin's figure makes of a view, or UserError if it raises or gives something else."""
     drawn = guarded(lambda: list(figure.draw(view)))
     for drawing in drawn:
         _require(drawing, Drawing)
@@ -94,11 +82,8 @@ def report_tables(analysis: Analysis) -> list[Table]:
 
 
 def made_table(record: Any, analysis: Analysis, taken: Iterable[str] = ()) -> Table | None:
-    """The table that a plugin's function makes of the analysis; None if there is nothing to show.
-
-    Raises:
-        UserError: it raises, or gives something else than a table under a name of its own.
-    """
+    """The table that a plugin's function makes of the analysis, None if there is nothing to show, or UserError if it
+    raises or gives something else than a table under a name of its own."""
     table = guarded(lambda: record(analysis))
     if table is not None:
         _check_table(table, taken)
@@ -123,11 +108,8 @@ def sections(analysis: Analysis, taken: Iterable[str], problems: list[str]) -> l
 
 
 def made_section(name: str, record: Any, analysis: Analysis, taken: Iterable[str] = ()) -> Written:
-    """The texts and tables that a plugin's section makes of the analysis.
-
-    Raises:
-        UserError: it raises, or gives something else than texts and tables.
-    """
+    """The texts and tables that a plugin's section makes of the analysis, or UserError if it raises or gives something
+    else."""
     _require(record, Section, "is")
     written = Written(name, str(record.title), guarded(lambda: list(record.write(analysis))))
     names = set(taken)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-from ipe_bench.report.table import Table
+from ipe_bench.report.table import Part, Table
 from ipe_bench.statistics.analysis import Analysis
 
 
@@ -14,7 +14,7 @@ class Section:
     """A section of report.html, behind our tables; its tables are written to files as ours are."""
 
     title: str
-    write: Callable[[Analysis], Iterator[str | Table]]
+    write: Callable[[Analysis], Iterator[Part]]
     """Yields paragraphs of plain text and tables; nothing if the section would be empty."""
 
 
@@ -24,7 +24,7 @@ class Written:
 
     name: str
     title: str
-    parts: Sequence[str | Table]
+    parts: Sequence[Part]
 
     @property
     def tables(self) -> list[Table]:

@@ -70,9 +70,8 @@ def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table
         title = f"{title}: {counts[0]} trial{'s' * (counts[0] != 1)} per row"
     for record in all_statistics():
         if "terminal" in record.where and reported(record, rows):
-            columns.append(
-                texts(record.titles.get("terminal", record.title), [shown(record, "terminal", row) for row in rows])
-            )
+            values = [shown(record, "terminal", row) for row in rows]
+            columns.append(texts(record.titles.get("terminal", record.title), values))
             if "terminal" in record.limits_titles:
                 ends = [limits(record, "terminal", row) for row in rows]
                 written = [f"{compact(low)}-{compact(high)}" if math.isfinite(low) else "-" for low, high in ends]
@@ -97,6 +96,9 @@ def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *,
     def points(share: float) -> str:
         return percent(share).removesuffix(" %")
 
+    def success(row: Mapping[str, Any]) -> str:
+        return f"{points(row['success'])} ({100 * row['success_low']:.0f}-{100 * row['success_high']:.0f})"
+
     def efficiency(row: Mapping[str, Any]) -> str:
         # Where half of the trials are capped, it is a limit and no value.
         return f"{'<' * (row['error_median'] > CAP)}{row['efficiency_capped']:.2f}"
@@ -104,17 +106,14 @@ def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *,
     def nees(row: Mapping[str, Any]) -> str:
         return f"{brief(row['nees_median'])} {_VERDICTS.get(row['verdict'], (row['verdict'], '?'))[narrow]}".strip()
 
+    def failed(row: Mapping[str, Any]) -> str:
+        return f"{points(row['failed_known'])} / {points(row['failed_silent'])}"
+
     slash = "/" if narrow else " / "
-    failed = cells("failed", "failed_silent", lambda r: f"{points(r['failed_known'])} / {points(r['failed_silent'])}")
     return [
         words("estimator", [row["estimator"] for row in rows], best),
-        cells(
-            "success",
-            "success",
-            lambda r: f"{points(r['success'])} ({100 * r['success_low']:.0f}-{100 * r['success_high']:.0f})",
-            best,
-        ),
-        *([] if narrow else [failed]),
+        cells("success", "success", success, best),
+        *([] if narrow else [cells("failed", "failed_silent", failed)]),
         cells("error", "error_median", lambda r: f"{brief(r['error_median'])}{slash}{brief(r['error_q95'])}"),
         cells("eff." if narrow else "efficiency", "efficiency_capped", efficiency),
         cells("NEES", "nees_median", nees),

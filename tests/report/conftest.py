@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from synthetic_store import Synthetic
 
-FLAGS = (
+FLAGS = [
     "--headless=new",
     "--no-sandbox",
     "--disable-gpu",
@@ -29,11 +29,14 @@ FLAGS = (
     "--disable-dev-shm-usage",
     "--hide-scrollbars",
     "--remote-debugging-pipe",
-)
+]
+
+
+TROUBLE = ("Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded", "Page.javascriptDialogOpening")
 
 
 class Page:
-    """One tab: `go`, `run` JavaScript, `screenshot`, `pdf`; `messages` holds console errors and exceptions."""
+    """One tab: `go`, `run` JavaScript, `pdf`; `messages` holds console errors and exceptions."""
 
     def __init__(self, read: int, write: int) -> None:
         self.reader, self.write = os.fdopen(read, "rb", buffering=0), write
@@ -68,18 +71,11 @@ class Page:
         line, self.rest = self.rest.split(b"\0", 1)
         event = json.loads(line)
         method, parameters = event.get("method"), event.get("params", {})
-        if method == "Page.loadEventFired":
-            self.loaded = True
-        elif method == "Runtime.exceptionThrown":
-            self.messages.append(str(parameters["exceptionDetails"].get("text")))
-        elif method == "Runtime.consoleAPICalled":
-            self.messages.append(f"{parameters['type']}: {parameters['args']}")
-        elif method == "Log.entryAdded":
-            self.messages.append(parameters["entry"]["text"])
-        elif method == "Page.javascriptDialogOpening":
-            self.messages.append(f"dialog: {parameters['message']}")
-        elif method == "Network.requestWillBeSent":
+        self.loaded |= method == "Page.loadEventFired"
+        if method == "Network.requestWillBeSent":
             self.requests.append(parameters["request"]["url"])
+        elif method in TROUBLE:
+            self.messages.append(f"{method}: {parameters}")
         return event
 
     def go(self, path: Path, width: int = 1280, height: int = 900, *, phone: bool = False) -> None:
@@ -93,10 +89,6 @@ class Page:
         result = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")
-
-    def screenshot(self, path: Path, *, whole: bool = False) -> None:
-        answer = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)
-        path.write_bytes(base64.b64decode(answer["data"]))
 
     def pdf(self) -> bytes:
         answer = self.call("Page.printToPDF", preferCSSPageSize=True, printBackground=True)
