@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,7 +42,7 @@ class Analysis:
     endings: pd.DataFrame
     """How trials ended that did not converge: status, message, number, and the first such trial."""
     pairs: pd.DataFrame
-    """Every pair of estimators on every scenario; see `comparisons.Pair`."""
+    """Every pair of estimators on every scenario; see `comparisons.compare_pairs`."""
     scores: pd.DataFrame
     """Per scenario and estimator: capped mean error, and median costs."""
     ranking: Ranking | None
@@ -146,18 +146,15 @@ class Begun:
         import pandas as pd
 
         everywhere = _everywhere(self.collection)
-        pairs = [(where, pair) for where, outcomes in self.compared for pair in compare_pairs(outcomes)]
         # Corrected over all scenarios: a sweep asks all its questions at once.
-        final = corrected([pair for _, pair in pairs])
+        pairs = [where | pair for where, outcomes in self.compared for pair in compare_pairs(outcomes)]
         rows = self.rows
         return Analysis(
             collection=self.collection,
             summary=to_frame(self.summary),
             by_group=pd.DataFrame(rows["by_group"]),
             endings=pd.DataFrame(rows["endings"]),
-            pairs=pd.DataFrame(
-                [where | asdict(p) | {"closer": p.closer} for (where, _), p in zip(pairs, final, strict=True)]
-            ),
+            pairs=pd.DataFrame(corrected(pairs)),
             scores=pd.DataFrame(rows["scores"]),
             ranking=ranking(pd.DataFrame(rows["replicates"]), everywhere),
             profiles=profiles([{k: o for k, o in several.items() if k in everywhere} for _, several in self.compared]),

@@ -1,12 +1,12 @@
 """Is the second better than the first? Two folders of results, or two estimators, trial by trial.
 
-Which scenarios and trials belong together is found here; tests of the numbers are in `statistics.paired`.
+This module finds the scenarios and trials that belong together; the tests are in `statistics.paired`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,10 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.provenance import canonical_json
 from ipe_bench.statistics.collect import Collection, Group, config_leaves, differing, shown_leaf
-from ipe_bench.statistics.comparisons import ALPHA, Outcomes, differences, holm
+from ipe_bench.statistics.comparisons import ALPHA, differences, holm
 from ipe_bench.statistics.formulas import gate_radius
 from ipe_bench.statistics.paired import Effect, no_drift, no_lean, ratio_effect, success_effect
 from ipe_bench.statistics.sample import Sample, Shared
-from ipe_bench.statistics.summary import outcomes_of
 
 JUDGED = ("success", "error", "cost")
 """Those that are tested. Time is not: the trials of a block share theirs evenly, and machines differ."""
@@ -47,45 +46,6 @@ def _plain(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-@dataclass(frozen=True)
-class Match:
-    """Two groups of trials that are compared."""
-
-    first: Group
-    second: Group
-    setting: Mapping[str, tuple[Any, Any]]
-    """The keys of the config in which their scenarios differ, with both values."""
-
-    @property
-    def columns(self) -> dict[str, Any]:
-        """What tells this comparison from the others: what both have, then what differs, with both values."""
-        columns = {k: v for k, v in self.first.columns.items() if k not in self.setting}
-        for key, values in self.setting.items():
-            # A component is called by its name, not by its class.
-            named = [group.columns.get(key, value) for group, value in zip(self._both, values, strict=True)]
-            shown = [_SAYS_NOTHING.get(_plain(v), _plain(v)) for v in named]
-            if shown != ["-", "-"]:
-                columns[key] = BOTH.join(shown)
-        return columns | self.options
-
-    @property
-    def options(self) -> dict[str, str]:
-        """The options in which estimators of one label differ."""
-        if self.first.label != self.second.label:
-            return {}
-        configs = [{"estimator": group.footer["identity"]["estimator"]} for group in self._both]
-        leaves = [config_leaves(config) for config in configs]
-        found = {}
-        for key in differing(configs):
-            values = [_plain(shown_leaf(own[key][1])) if key in own else "-" for own in leaves]
-            found[key] = BOTH.join(_SAYS_NOTHING.get(v, v) for v in values)
-        return found
-
-    @property
-    def _both(self) -> tuple[Group, Group]:
-        return self.first, self.second
-
-
 def compared(
     first: Collection,
     second: Collection,
@@ -101,7 +61,7 @@ def compared(
     Raises:
         UserError: there is nothing to compare.
     """
-    rows = [row for match in matches(first, second, labels) for row in _rows(match, first, second, alpha)]
+    rows = [row for match in _matches(first, second, labels) for row in _rows(*match, alpha)]
     judged = [row for row in rows if row["quantity"] in JUDGED]
     for row, p in zip(judged, holm([row["p"] for row in judged]), strict=True):
         row["p"] = float(p)
@@ -116,87 +76,81 @@ def _direction(row: Mapping[str, Any]) -> str:
     return "better" if row["second_value"] < row["first_value"] else "worse"
 
 
-def _rows(match: Match, first: Collection, second: Collection, alpha: float) -> Iterator[dict[str, Any]]:
-    a, b = _loaded(first, match.first), _loaded(second, match.second)
+def _rows(a: Sample, b: Sample, setting: _Setting, alpha: float) -> Iterator[dict[str, Any]]:
     if a.n != b.n:
         raise UserError(
-            f"{match.first.label}: has {a.n} parameters in the first and {b.n} in the second; compare results on the"
+            f"{a.group.label}: has {a.n} parameters in the first and {b.n} in the second; compare results on the"
             " same measurement"
         )
-    one, other, by_trial = a.beside(b)
-    trials = len(one[1])
-    if not trials:
-        raise UserError(f"{match.first.estimator}: has no trials to compare; run more of them")
-    head = match.columns | {
-        "first": match.first.estimator,
-        "second": match.second.estimator,
-        "trials": trials,
+    if not len(a) or not len(b):
+        raise UserError(f"{a.group.estimator}: has no trials to compare; run more of them")
+    _, one, other = np.intersect1d(a.number, b.number, assume_unique=True, return_indices=True)
+    by_trial = len(one) > 0
+    if not by_trial:
+        # With other seeds trials are matched in their order: right, since all are independent, but nothing is gained.
+        order = np.arange(min(len(a), len(b)))
+        one, other = np.argsort(a.number, kind="stable")[order], np.argsort(b.number, kind="stable")[order]
+    head = _head(a.group, b.group, setting) | {
+        "first": a.group.estimator,
+        "second": b.group.estimator,
+        "trials": len(one),
         "matched_by": "trial" if by_trial else "order",
     }
-    for quantity, effect in _effects(one, other, a.n, alpha).items():
-        yield head | {
-            "quantity": quantity,
-            "first_value": effect.first,
-            "second_value": effect.second,
-            "change": effect.change,
-            "low": effect.low,
-            "high": effect.high,
-            "p": effect.p,
-            "e": effect.e,
-            "finding": "",
-        }
+    for quantity, effect in _effects(a, one, b, other, alpha).items():
+        yield head | {"quantity": quantity} | asdict(effect) | {"finding": ""}
 
 
-@dataclass(frozen=True)
-class _Loaded:
-    n: int
-    trials: Outcomes
-    seconds: Array
-
-    def at(self, rows: Array) -> tuple[Outcomes, Array]:
-        return self.trials.at(self.trials.ids[rows]), self.seconds[rows]
-
-    def beside(self, other: _Loaded) -> tuple[tuple[Outcomes, Array], tuple[Outcomes, Array], bool]:
-        """Both on the same trials, and whether they are the same: where they share none, as with other seeds, they are
-        matched in their order, which is right, since all are independent, but gains nothing."""
-        ids = self.trials.ids, other.trials.ids
-        _, mine, theirs = np.intersect1d(*ids, assume_unique=True, return_indices=True)
-        if by_trial := len(mine) > 0:
-            return self.at(mine), other.at(theirs), by_trial
-        order = np.arange(min(map(len, ids)))
-        return self.at(order), other.at(order), by_trial
+def _head(first: Group, second: Group, setting: _Setting) -> dict[str, Any]:
+    """What tells a comparison from the others: what both have, then what differs, with both values."""
+    columns = {k: v for k, v in first.columns.items() if k not in setting}
+    both = (first, second)
+    # A component is called by its name, not by its class.
+    differ = {k: [g.columns.get(k, v) for g, v in zip(both, values, strict=True)] for k, values in setting.items()}
+    if first.label == second.label:
+        configs = [{"estimator": group.footer["identity"]["estimator"]} for group in both]
+        leaves = [config_leaves(config) for config in configs]
+        differ |= {k: [shown_leaf(own[k][1]) if k in own else "-" for own in leaves] for k in differing(configs)}
+    for key, values in differ.items():
+        shown = [_SAYS_NOTHING.get(_plain(v), _plain(v)) for v in values]
+        if shown != ["-", "-"]:
+            columns[key] = BOTH.join(shown)
+    return columns
 
 
-def _loaded(collection: Collection, group: Group) -> _Loaded:
-    sample = Sample.load(collection, group, Shared.among(collection, [group]))
-    return _Loaded(sample.n, outcomes_of(sample), sample.scalars["time_s"][np.argsort(sample.number, kind="stable")])
-
-
-def _effects(one: tuple[Outcomes, Array], other: tuple[Outcomes, Array], n: int, alpha: float) -> dict[str, Effect]:
-    (first, seconds), (second, other_seconds) = one, other
-    radius = gate_radius(n)
-    a, b = np.minimum(first.distance, radius), np.minimum(second.distance, radius)
-    d = differences(b, a)
+def _effects(a: Sample, one: Array, b: Sample, other: Array, alpha: float) -> dict[str, Effect]:
+    """Of the rows `one` of the first sample and `other` of the second, in the same order."""
+    radius = gate_radius(a.n)
+    success = a.distance[one] <= radius, b.distance[other] <= radius
+    error = np.minimum(a.distance[one], radius), np.minimum(b.distance[other], radius)
+    cost = a.cost[one], b.cost[other]
+    d = differences(error[1], error[0])
     # The first trial's cost is the unit: whoever looks later divides by the same.
-    unit = float(first.cost[0] + second.cost[0]) or 1.0
-    medians = float(np.median(seconds)), float(np.median(other_seconds))
-    time = medians[1] / medians[0] if medians[0] > 0 else np.nan
+    unit = float(cost[0][0] + cost[1][0]) or 1.0
+    seconds = float(np.median(a.scalars["time_s"][one])), float(np.median(b.scalars["time_s"][other]))
+    time = seconds[1] / seconds[0] if seconds[0] > 0 else np.nan
     return {
-        "success": success_effect(first.success, second.success, alpha),
-        "error": ratio_effect(a, a + d, alpha, no_drift(d, radius), radius),
-        "cost": ratio_effect(first.cost, second.cost, alpha, no_lean(second.cost - first.cost, unit)),
-        "time": Effect(*medians, time, np.nan, np.nan, np.nan, np.nan),
+        "success": success_effect(*success, alpha),
+        "error": ratio_effect(error[0], error[0] + d, alpha, no_drift(d, radius), radius),
+        "cost": ratio_effect(*cost, alpha, no_lean(cost[1] - cost[0], unit)),
+        "time": Effect(*seconds, time, np.nan, np.nan, np.nan, np.nan),
     }
 
 
 # Which scenarios and estimators belong together ----------------------------------------------------------------------
 
 
-def matches(first: Collection, second: Collection, labels: tuple[str | None, str | None] = (None, None)) -> list[Match]:
-    """The groups that are compared: of the same scenario but for its seed, under the labels, or those that both have.
+_Leaves = tuple[tuple[str, str], ...]
+_Setting = Mapping[str, tuple[str, str]]
 
-    Where no scenario is in both, those are the same that differ only in what is one value throughout the first and
-    another throughout the second, such as a scale of the noise.
+
+def _matches(
+    first: Collection, second: Collection, labels: tuple[str | None, str | None]
+) -> Iterator[tuple[Sample, Sample, _Setting]]:
+    """The samples that are compared, of the same scenario but for its seed, under the labels or those that both have,
+    with the settings in which their scenarios differ.
+
+    If no scenario is in both, those are the same that differ only in what is one value throughout the first and another
+    throughout the second, such as a scale of the noise.
 
     Raises:
         UserError: there is none.
@@ -207,20 +161,36 @@ def matches(first: Collection, second: Collection, labels: tuple[str | None, str
                 f"{_where(collection)}: holds no trials to compare; `ipe-bench status` says what is missing"
             )
     a, b = _by_scenario(first), _by_scenario(second)
-    setting: dict[str, tuple[Any, Any]] = {}
+    setting: _Setting = {}
     if not a.keys() & b.keys():
-        setting = _setting(a, b)
-        a, b = _without(a, setting), _without(b, setting)
+        setting = _differing_setting(a, b)
+        a, b = (
+            {tuple(leaf for leaf in leaves if leaf[0] not in setting): groups for leaves, groups in scenarios.items()}
+            for scenarios in (a, b)
+        )
     shared = [key for key in a if key in b]
     if not shared:
         raise UserError(
             f"{_where(first)}, {_where(second)}: have no scenario in common, nor differ in one setting; compare runs of"
             " the same measurement, noise and error scales"
         )
-    found = [Match(*pair, setting) for key in shared for pair in _by_label(a[key], b[key], labels)]
+    wanted = labels[0] or labels[1], labels[1] or labels[0]
+    found = [
+        (one, other)
+        for key in shared
+        for one in a[key]
+        for other in b[key]
+        if (
+            one.estimator == other.estimator
+            if wanted[0] is None
+            else wanted[0] in (one.estimator, one.label) and wanted[1] in (other.estimator, other.label)
+        )
+    ]
     if not found:
-        raise _no_estimator(first, second, labels)
-    return found
+        raise _no_estimator(first, second, wanted)
+    for one, other in found:
+        samples = [Sample.load(c, g, Shared.among(c, [g])) for c, g in ((first, one), (second, other))]
+        yield samples[0], samples[1], setting
 
 
 def left_out(first: Collection, second: Collection) -> list[str]:
@@ -234,9 +204,6 @@ def left_out(first: Collection, second: Collection) -> list[str]:
     return lines
 
 
-_Leaves = tuple[tuple[str, str], ...]
-
-
 def _by_scenario(collection: Collection) -> dict[_Leaves, list[Group]]:
     found: dict[_Leaves, list[Group]] = {}
     for group in collection.groups:
@@ -246,41 +213,17 @@ def _by_scenario(collection: Collection) -> dict[_Leaves, list[Group]]:
     return found
 
 
-def _setting(a: Mapping[_Leaves, Any], b: Mapping[_Leaves, Any]) -> dict[str, tuple[Any, Any]]:
+def _differing_setting(a: Mapping[_Leaves, Any], b: Mapping[_Leaves, Any]) -> _Setting:
     """The keys that have one value throughout the first and another throughout the second."""
-
-    def values(scenarios: Mapping[_Leaves, Any], key: str) -> set[str]:
-        return {dict(leaves).get(key, "-") for leaves in scenarios}
-
     found = {}
     for key in dict.fromkeys(k for leaves in (*a, *b) for k, _ in leaves):
-        here, there = values(a, key), values(b, key)
+        here, there = ({dict(leaves).get(key, "-") for leaves in scenarios} for scenarios in (a, b))
         if len(here) == len(there) == 1 and here != there:
             found[key] = (here.pop().strip('"'), there.pop().strip('"'))
     return found
 
 
-def _without(scenarios: Mapping[_Leaves, list[Group]], setting: Mapping[str, Any]) -> dict[_Leaves, list[Group]]:
-    return {tuple(leaf for leaf in leaves if leaf[0] not in setting): groups for leaves, groups in scenarios.items()}
-
-
-def _by_label(
-    a: Sequence[Group], b: Sequence[Group], labels: tuple[str | None, str | None]
-) -> Iterator[tuple[Group, Group]]:
-    first, second = labels[0] or labels[1], labels[1] or labels[0]
-    if first is None:
-        yield from ((one, other) for one in a for other in b if one.estimator == other.estimator)
-        return
-    yield from (
-        (one, other)
-        for one in a
-        for other in b
-        if first in (one.estimator, one.label) and second in (other.estimator, other.label)
-    )
-
-
-def _no_estimator(first: Collection, second: Collection, labels: tuple[str | None, str | None]) -> UserError:
-    wanted = labels[0] or labels[1], labels[1] or labels[0]
+def _no_estimator(first: Collection, second: Collection, wanted: tuple[str | None, str | None]) -> UserError:
     for name, label, collection in zip(("first", "second"), wanted, (first, second), strict=True):
         known = {g.estimator for g in collection.groups} | {g.label for g in collection.groups}
         if label is not None and label not in known:

@@ -2,14 +2,13 @@
 
 Under an honest one the probability integral transform of the truth is uniform; its empirical distribution function less
 the uniform one is held against bands that it leaves anywhere with a stated probability (Säilynoja, Bürkner, Vehtari,
-Stat. Comput. 32, 2022, after Talts et al., arXiv 1804.06788). Numbers in, numbers and words out: what was estimated and
-how is left to others.
+Stat. Comput. 32, 2022, after Talts et al., arXiv 1804.06788).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -116,13 +115,8 @@ class Curve:
         return float(self.difference[np.argmax(np.abs(self.difference))])
 
 
-def curves(u: Array) -> list[Curve]:
-    """The curve of each row of u (curves, trials), with trials above 0."""
-    return _curves_of([np.searchsorted(row, POINTS, side="right") for row in np.sort(u, axis=1)], u.shape[1])
-
-
-def _curves_of(below: Sequence[Array], trials: int) -> list[Curve]:
-    """The curves of which so many of the trials lie at each of `POINTS` or below."""
+def curves(below: Sequence[Array], trials: int) -> list[Curve]:
+    """The curves of which so many of the trials, one or more, lie at each of `POINTS` or below."""
     counts = np.array(below)
     reached = np.where(counts > 0, bdtrc(np.maximum(counts - 1, 0), trials, POINTS), 1.0)
     tails = np.minimum(bdtr(counts, trials, POINTS), reached).min(axis=1)
@@ -138,9 +132,7 @@ def _curves_of(below: Sequence[Array], trials: int) -> list[Curve]:
 class Calibration:
     """The normalised errors of one parameter, or NEES of all together, as distribution functions with a verdict."""
 
-    claims: int
-    """Their number."""
-    z: Array = field(repr=False)
+    z: Array
     """(claims,), ascending: error over reported deviation, or the square root of NEES; infinite where the claim is
     void."""
     degrees: int
@@ -167,16 +159,11 @@ class Calibration:
 
     def band(self, level: float) -> tuple[Array, Array]:
         """What `shown` is held against; where two curves share the level, each has half of what it leaves."""
-        return band(self.claims, level if self.place is None else (1 + level) / 2)
+        return band(len(self.z), level if self.place is None else (1 + level) / 2)
 
     def words(self, level: float) -> str:
         """What is wrong, if anything surely is. An estimate that is shifted by +1 deviations lies above the truth."""
-        if level not in self._told:
-            self._told[level] = "; ".join(self._faults(level)) or self._leaning() if self.p < 1 - level else INSIDE
-        return self._told[level]
-
-    _told: dict[float, str] = field(default_factory=dict, repr=False, compare=False)
-    """What was said at each level: it takes longer than all else."""
+        return INSIDE if self.p >= 1 - level else "; ".join(self._faults(level)) or self._leaning()
 
     def _faults(self, level: float) -> list[str]:
         """Shift, scale and tails, as far as each is sure by itself; by order statistics, which no outlier moves."""
@@ -230,9 +217,9 @@ def calibrations(error: Array, deviation: Array, nees: Array, claimed: Array) ->
     least, radius, whole = -ndtri(POINTS), np.sqrt(chdtri(1, 1 - POINTS)), np.sqrt(chdtri(n, 1 - POINTS))
     place = [trials - np.searchsorted(z, least) for z in each]
     size = [np.searchsorted(z, radius, side="right") - np.searchsorted(z, -radius) for z in each]
-    found = _curves_of([*place, *size, np.searchsorted(together, whole, side="right")], trials)
-    parts = [Calibration(trials, z, 1, found[n + i], found[i]) for i, z in enumerate(each)]
-    return [*parts, Calibration(trials, together, n, found[-1])]
+    found = curves([*place, *size, np.searchsorted(together, whole, side="right")], trials)
+    parts = [Calibration(z, 1, found[n + i], found[i]) for i, z in enumerate(each)]
+    return [*parts, Calibration(together, n, found[-1])]
 
 
 def _normalised(e: Array, d: Array) -> Array:

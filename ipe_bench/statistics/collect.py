@@ -104,22 +104,17 @@ def trials_frame(collection: Collection) -> pd.DataFrame:
 
 def config_leaves(description: Any, prefix: str = "") -> dict[str, tuple[str, Any]]:
     """Dotted keys with (class that holds the leaf, plain value); a component's own class stands under its own key."""
+    if isinstance(description, list) and any(isinstance(v, Mapping) for v in description):
+        description = {str(i): v for i, v in enumerate(description)}
     if not isinstance(description, Mapping):
-        if isinstance(description, list) and any(isinstance(v, Mapping) for v in description):
-            description = {str(i): v for i, v in enumerate(description)}
-        else:
-            # A list is one value, however long: two of different lengths differ.
-            value = canonical_json(description) if isinstance(description, list) else description
-            return {prefix: ("", value)}
+        # A list is one value, however long: two of different lengths differ.
+        return {prefix: ("", canonical_json(description) if isinstance(description, list) else description)}
     holder = str(description.get(TARGET, ""))
-    result: dict[str, tuple[str, Any]] = {}
-    if TARGET in description and prefix:
-        result[prefix] = ("", holder)
+    result: dict[str, tuple[str, Any]] = {prefix: ("", holder)} if TARGET in description and prefix else {}
     for key, value in description.items():
-        if key == TARGET:
-            continue
-        inner = config_leaves(value, f"{prefix}.{key}" if prefix else str(key))
-        result |= {k: (f"{holder}/{h}", v) for k, (h, v) in inner.items()}
+        if key != TARGET:
+            inner = config_leaves(value, f"{prefix}.{key}" if prefix else str(key))
+            result |= {k: (f"{holder}/{h}", v) for k, (h, v) in inner.items()}
     return result
 
 
@@ -128,50 +123,41 @@ def differing(descriptions: Sequence[Mapping[str, Any]]) -> list[str]:
 
     Options of different classes are not compared: there the class differs, and is the leaf to show.
     """
-    flat = [config_leaves(d) for d in descriptions]
-    keys = dict.fromkeys(key for leaves in flat for key in leaves)
-    result = []
-    for key in keys:
-        by_class: dict[str, set[str]] = {}
-        for leaves in flat:
-            if key in leaves:
-                holder, value = leaves[key]
-                by_class.setdefault(holder, set()).add(canonical_json(value))
-        if any(len(values) > 1 for values in by_class.values()):
-            result.append(key)
-    return result
+    by_key: dict[str, dict[str, set[str]]] = {}
+    for description in descriptions:
+        for key, (holder, value) in config_leaves(description).items():
+            by_key.setdefault(key, {}).setdefault(holder, set()).add(canonical_json(value))
+    return [key for key, holders in by_key.items() if any(len(values) > 1 for values in holders.values())]
 
 
 def _groups(cells: Sequence[StoredCell], runs: Sequence[Run]) -> tuple[Group, ...]:
     """One group per scenario and estimator: what was constructed decides which those are, and names only show it."""
     truths = {cell.scenario_id: cell for cell in cells if cell.label == TRUTH}
-    estimates = [cell for cell in cells if cell.label != TRUTH]
-    extra = [k for k in differing([_scenario(cell) for cell in estimates]) if k != "error_scale"]
-    extra = [k for k in extra if not _stands_in_a_name(k, estimates)]
-    options = _option_columns(estimates)
     found: dict[tuple[str, str, str], list[StoredCell]] = {}
-    for cell in estimates:
-        what = canonical_json(_scenario(cell)), cell.label, canonical_json(cell.footer["identity"]["estimator"])
-        found.setdefault(what, []).append(cell)
-    groups: dict[tuple[str, str, str], Group] = {}
-    for what, members in found.items():
+    for cell in cells:
+        if cell.label != TRUTH:
+            what = canonical_json(_scenario(cell)), cell.label, canonical_json(cell.footer["identity"]["estimator"])
+            found.setdefault(what, []).append(cell)
+    firsts = [members[0] for members in found.values()]
+    extra = [k for k in differing([_scenario(cell) for cell in firsts]) if k != "error_scale"]
+    extra = [k for k in extra if not _stands_in_a_name(k, firsts)]
+    options = _options(firsts)
+    groups = []
+    for members in found.values():
         first = members[0]
-        leaves = config_leaves(_scenario(first))
-        columns = {k: first.names[k] for k in ("measurement", "noise")}
-        columns |= {k: shown_leaf(leaves[k][1]) if k in leaves else None for k in extra}
-        columns["error_scale"] = first.names["error_scale"]
-        own = config_leaves(first.footer["identity"]["estimator"])
-        chosen = {k: shown_leaf(own[k][1]) if k in own else None for k in options.get(first.label, ())}
+        chosen = _shown(first.footer["identity"]["estimator"], options.get(first.label, ()))
+        columns = {k: first.names[k] for k in ("measurement", "noise")} | _shown(_scenario(first), extra)
         label = first.label + (f" ({', '.join(f'{k}={v}' for k, v in chosen.items())})" if chosen else "")
         pairs = tuple((m, truths.get(m.scenario_id)) for m in sorted(members, key=lambda m: (m.seed, m.key)))
-        groups[what] = Group(columns, label, {f"estimator.{k}": v for k, v in chosen.items()}, pairs)
-    order = _estimator_order(runs)
-    return tuple(
-        sorted(
-            _told_apart(groups),
-            key=lambda g: (*map(_sortable, g.columns.values()), order.get(g.label, len(order)), g.estimator),
-        )
-    )
+        columns["error_scale"] = first.names["error_scale"]
+        groups.append(Group(columns, label, {f"estimator.{k}": v for k, v in chosen.items()}, pairs))
+    labels = dict.fromkeys(str(cell["names"].get("estimator")) for run in runs for cell in run.record["cells"])
+    order = {label: i for i, label in enumerate(labels)}
+
+    def place(group: Group) -> tuple[Any, ...]:
+        return (*map(_sortable, group.columns.values()), order.get(group.label, len(order)), group.estimator)
+
+    return tuple(sorted(_told_apart(list(found), groups), key=place))
 
 
 def _scenario(cell: StoredCell) -> dict[str, Any]:
@@ -179,20 +165,27 @@ def _scenario(cell: StoredCell) -> dict[str, Any]:
     return {key: value for key, value in cell.footer["identity"]["scenario"].items() if key != "seed"}
 
 
-def _told_apart(groups: Mapping[tuple[str, str, str], Group]) -> list[Group]:
+def _shown(description: Any, keys: Iterable[str]) -> dict[str, Any]:
+    """Some leaves of a description as they stand in a table; None for those that it lacks."""
+    leaves = config_leaves(description)
+    return {k: shown_leaf(leaves[k][1]) if k in leaves else None for k in keys}
+
+
+def _told_apart(identities: Sequence[tuple[str, str, str]], groups: Sequence[Group]) -> list[Group]:
     """The groups; those that no column tells apart get one that does, a digest of their config."""
     scenarios: dict[str, set[str]] = {}
     estimators: dict[tuple[str, str], set[str]] = {}
-    for (scenario, _, estimator), group in groups.items():
+    for (scenario, _, estimator), group in zip(identities, groups, strict=True):
         scenarios.setdefault(canonical_json(group.columns), set()).add(scenario)
         estimators.setdefault((scenario, group.estimator), set()).add(estimator)
     alike = any(len(different) > 1 for different in scenarios.values())
     result = []
-    for (scenario, _, estimator), group in groups.items():
+    for (scenario, _, estimator), group in zip(identities, groups, strict=True):
         if alike:
-            scale = group.columns["error_scale"]
+            # The error scale stays last.
             columns = {k: v for k, v in group.columns.items() if k != "error_scale"}
-            group = replace(group, columns=columns | {"config": digest(scenario)[:6], "error_scale": scale})
+            columns |= {"config": digest(scenario)[:6], "error_scale": group.columns["error_scale"]}
+            group = replace(group, columns=columns)
         if len(estimators[scenario, group.estimator]) > 1:
             group = replace(group, estimator=f"{group.estimator} (#{digest(estimator)[:6]})")
         result.append(group)
@@ -211,23 +204,14 @@ def _stands_in_a_name(key: str, cells: Sequence[StoredCell]) -> bool:
     return all(len(v) == 1 for v in values.values())
 
 
-def _option_columns(cells: Sequence[StoredCell]) -> dict[str, list[str]]:
-    """By label, the options that differ where one label stands for several configs."""
+def _options(cells: Sequence[StoredCell]) -> dict[str, list[str]]:
+    """By label, the options that differ if one label stands for several configs."""
     by_label: dict[str, dict[str, Any]] = {}
     for cell in cells:
         config = cell.footer["identity"]["estimator"]
-        by_label.setdefault(cell.label, {})[canonical_json(config)] = {"": config}
-    result = {}
-    for label, configs in by_label.items():
-        if len(configs) > 1:
-            keys = differing([c[""] for c in configs.values()])
-            result[label] = keys or [TARGET]
-    return result
-
-
-def _estimator_order(runs: Iterable[Run]) -> dict[str, int]:
-    labels = dict.fromkeys(str(cell["names"].get("estimator")) for run in runs for cell in run.record["cells"])
-    return {label: i for i, label in enumerate(labels)}
+        by_label.setdefault(cell.label, {})[canonical_json(config)] = config
+    several = {label: list(configs.values()) for label, configs in by_label.items() if len(configs) > 1}
+    return {label: differing(configs) or [TARGET] for label, configs in several.items()}
 
 
 def shown_leaf(value: Any) -> Any:

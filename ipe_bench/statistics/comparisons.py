@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import bdtr
@@ -60,71 +60,39 @@ def common(outcomes: Mapping[str, Outcomes]) -> dict[str, Outcomes]:
     return {} if shared is None else {label: outcome.at(shared) for label, outcome in outcomes.items()}
 
 
-@dataclass(frozen=True)
-class Pair:
-    """Two estimators on one scenario's common trials; a win is a smaller error by more than `TIE`."""
+def compare_pairs(outcomes: Mapping[str, Outcomes]) -> list[dict[str, Any]]:
+    """A row for every pair of estimators of one scenario on their common trials; see `corrected`.
 
-    first: str
-    second: str
-    trials: int
-    wins: int
-    ties: int
-    losses: int
-    median_difference: float
-    """Median of first's error less second's, in standard deviations of the bound."""
-    p_error: float
-    """Wilcoxon's signed-rank test of the differences that are not ties."""
-    favours: str
-    """Whose side the sum of the signed ranks is on; empty where it is on neither's."""
-    only_first: int
-    """Trials in which the first alone succeeds."""
-    only_second: int
-    p_success: float
-    """McNemar's exact test of those two numbers."""
-
-    @property
-    def closer(self) -> str:
-        """The estimator that is significantly closer to the truth; empty where neither is."""
-        return self.favours if self.p_error < ALPHA else ""
-
-
-def compare_pairs(outcomes: Mapping[str, Outcomes]) -> list[Pair]:
-    """Every pair of estimators of one scenario, each p by itself; see `corrected`."""
-    paired = common(outcomes)
-    return [_compare(a, b, paired[a], paired[b]) for a, b in itertools.combinations(paired, 2)]
-
-
-def corrected(pairs: Sequence[Pair]) -> list[Pair]:
-    """The pairs with each kind of p Holm-corrected over all of them."""
-    p_error = holm([p.p_error for p in pairs])
-    p_success = holm([p.p_success for p in pairs])
-    return [
-        replace(pair, p_error=float(error), p_success=float(success))
-        for pair, error, success in zip(pairs, p_error, p_success, strict=True)
-    ]
-
-
-def _compare(first: str, second: str, a: Outcomes, b: Outcomes) -> Pair:
+    A win is an error of the first smaller by more than `TIE`; `median_difference` is the median of first's error less
+    second's, `p_error` Wilcoxon's signed-rank test of the differences that are not ties, `favours` the one on whose
+    side the sum of the signed ranks is. `only_first` counts the trials in which the first alone succeeds; `p_success`
+    is McNemar's exact test of these numbers.
+    """
     from scipy.stats import rankdata, wilcoxon  # late: takes longer to load than all else here
 
-    d = differences(a.distance, b.distance)
-    differing = d[d != 0]
-    side = float(np.sign(differing) @ rankdata(np.abs(differing)))
-    only_a, only_b = int((a.success & ~b.success).sum()), int((b.success & ~a.success).sum())
-    return Pair(
-        first,
-        second,
-        trials=len(d),
-        wins=int((d < 0).sum()),
-        ties=len(d) - len(differing),
-        losses=int((d > 0).sum()),
-        median_difference=float(np.median(d)) if len(d) else float("nan"),
-        p_error=float(np.asarray(wilcoxon(differing))[1]) if len(differing) else 1.0,
-        favours=first if side < 0 else second if side > 0 else "",
-        only_first=only_a,
-        only_second=only_b,
-        p_success=mcnemar(only_a, only_b),
-    )
+    rows = []
+    for (first, a), (second, b) in itertools.combinations(common(outcomes).items(), 2):
+        d = differences(a.distance, b.distance)
+        differing = d[d != 0]
+        side = float(np.sign(differing) @ rankdata(np.abs(differing)))
+        alone = int((a.success & ~b.success).sum()), int((b.success & ~a.success).sum())
+        row = {"first": first, "second": second, "trials": len(d)}
+        row |= {"wins": int((d < 0).sum()), "ties": len(d) - len(differing), "losses": int((d > 0).sum())}
+        row["median_difference"] = float(np.median(d)) if len(d) else float("nan")
+        row["p_error"] = float(np.asarray(wilcoxon(differing))[1]) if len(differing) else 1.0
+        row["favours"] = first if side < 0 else second if side > 0 else ""
+        rows.append(row | {"only_first": alone[0], "only_second": alone[1], "p_success": mcnemar(*alone)})
+    return rows
+
+
+def corrected(pairs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The rows with each kind of p Holm-corrected over all of them, and `closer`: the estimator that is significantly
+    closer to the truth, or empty."""
+    p_error, p_success = (holm([pair[name] for pair in pairs]).tolist() for name in ("p_error", "p_success"))
+    return [
+        {**pair, "p_error": error, "p_success": success, "closer": pair["favours"] if error < ALPHA else ""}
+        for pair, error, success in zip(pairs, p_error, p_success, strict=True)
+    ]
 
 
 def differences(first: Array, second: Array) -> Array:
@@ -148,9 +116,9 @@ def holm(p: Sequence[float]) -> Array:
     values = np.asarray(p, dtype=float)
     order = np.argsort(values, kind="stable")
     steps = values[order] * np.arange(len(values), 0, -1)
-    corrected = np.empty(len(values))
-    corrected[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
-    return corrected
+    result = np.empty(len(values))
+    result[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
+    return result
 
 
 def may_be_best(success: Array, level: float = ALPHA) -> Array:

@@ -1,13 +1,12 @@
 """What iterations did on their way to the limit: cost of coming close, orders of convergence, and the paper's bounds.
 
-A history is the iterates (iterates, n) of one converged trial, in multiples of the parameters' units; the last one
-stands for the limit.
+Iterates are (iterates, n), in multiples of the parameters' units; the last one stands for the limit.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,8 +22,6 @@ FLOOR = 1e-9
 class History:
     """How a converged trial came to its limit."""
 
-    row: int
-    """The trial's row in its sample."""
     trial: str
     """The trial as readers name it."""
     iterates: Array
@@ -32,7 +29,7 @@ class History:
     """(iterates,) from the last iterate, in deviations of the bound."""
     cost: float
     """Of the whole trial."""
-    truth: Mapping[str, float] = field(default_factory=dict)
+    truth: Mapping[str, float]
     """What the paper's theorems ask of the model at the truth, by its column; NaN where it is not stored."""
 
     @property
@@ -41,14 +38,10 @@ class History:
         return self.cost * (iterations_to_limit(self.distances) + 1) / len(self.iterates)
 
 
-def trial_label(seed: int, trial: int) -> str:
-    return f"seed {seed}, trial {trial}"
-
-
-def distances_to_limit(history: Array, deviation: Array) -> Array:
-    """Largest component of each iterate's (iterates, n) distance from the last one, in standard deviations (n,)."""
+def distances_to_limit(iterates: Array, deviation: Array) -> Array:
+    """Largest component of each iterate's distance from the last one, in standard deviations (n,)."""
     with np.errstate(invalid="ignore"):
-        return np.abs((history - history[-1]) / deviation).max(axis=1)
+        return np.abs((iterates - iterates[-1]) / deviation).max(axis=1)
 
 
 def iterations_to_limit(distances: Array) -> int:
@@ -84,15 +77,14 @@ class FixedPointBound:
     @property
     def ratio(self) -> float:
         """The largest error over its bound among the iterates between the first and the last."""
-        between = slice(1, -1)
+        error = self.error[1:-1]
         with np.errstate(all="ignore"):
-            ratios = self.error[between] / self.bound[between]
-        return float(ratios[self.error[between] > FLOOR].max(initial=0.0))
+            return float((error / self.bound[1:-1])[error > FLOOR].max(initial=0.0))
 
 
 def fixed_point_bound(iterates: Array, K: float, limit: Array | None = None) -> FixedPointBound:
-    """Eq. (18) for iterates (iterates, n) with a constant K that holds along them; at a single point K is not a
-    proven bound. `limit` (n,) is the last iterate where it is not given."""
+    """Eq. (18) with a constant K that holds along the iterates; at a single point K is not a proven bound. `limit` (n,)
+    is the last iterate unless it is given."""
     limit = iterates[-1] if limit is None else limit
     step = np.abs(iterates[1] - iterates[0]).max()
     powers = K ** np.arange(len(iterates))
@@ -102,7 +94,7 @@ def fixed_point_bound(iterates: Array, K: float, limit: Array | None = None) -> 
 
 def observed_constant(iterates: Array, limit: Array | None = None, floor: float = FLOOR) -> float:
     """The largest 2 e_(k+1) / (n^2 e_k^2) above the floor: the least M with which eq. (23),
-    e_(k+1) <= n^2 M / 2 e_k^2, explains the iterates (iterates, n); NaN where they are over too soon."""
+    e_(k+1) <= n^2 M / 2 e_k^2, explains the iterates; NaN where they are over too soon."""
     limit = iterates[-1] if limit is None else limit
     errors = np.abs(iterates - limit).max(axis=1)
     usable = (errors[:-1] > floor) & (errors[1:] > floor)

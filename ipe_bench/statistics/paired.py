@@ -1,7 +1,4 @@
-"""Two columns of numbers of the same trials: ratios of means with intervals, and evidence that may be looked at daily.
-
-Numbers in, numbers out: what they are numbers of, and which trials belong together, is left to `statistics.between`.
-"""
+"""Two columns of numbers of the same trials: their effects with intervals, and evidence that may be looked at daily."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.special import betaln, ndtri
+from scipy.special import betaln, logsumexp, ndtri
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.comparisons import ALPHA, mcnemar
@@ -23,8 +20,8 @@ LARGEST_SAMPLE = 1000
 _STEPS = 50
 _BETS = np.concatenate([-(2.0 ** -np.arange(9)), 2.0 ** -np.arange(9)]) * 0.99
 """Shares of the stake, on either side."""
-_TILTS = 2.0 ** np.arange(-12, 5)
-"""Multiples of the inverse unit by which differences are tilted."""
+_TILTS = np.concatenate([-(2.0 ** np.arange(-12, 5)), 2.0 ** np.arange(-12, 5)])
+"""Multiples of the inverse unit by which differences are tilted, to either side."""
 RARE = 10
 """Number of trials from which a sample shows well enough what an unusual trial is like."""
 
@@ -33,8 +30,8 @@ RARE = 10
 class Effect:
     """What the second has over the first, with its interval, the p of no effect, and the evidence against none."""
 
-    first: float
-    second: float
+    first_value: float
+    second_value: float
     change: float
     """A ratio or a difference, as the function that made it says."""
     low: float
@@ -42,6 +39,9 @@ class Effect:
     p: float
     e: float
     """An e-value: by chance it exceeds 1/alpha, at whatever number of trials one looks, in a share alpha of cases."""
+
+
+# Effects -------------------------------------------------------------------------------------------------------------
 
 
 def success_effect(first: Array, second: Array, alpha: float = ALPHA) -> Effect:
@@ -56,27 +56,30 @@ def success_effect(first: Array, second: Array, alpha: float = ALPHA) -> Effect:
     low, high = _tango(only_first, only_second, trials, alpha), -_tango(only_second, only_first, trials, alpha)
     if p >= alpha:
         low, high = min(low, 0.0), max(high, 0.0)
-    change = (only_second - only_first) / trials
-    evidence = fair_coin(only_first, only_second)
-    return Effect(float(first.mean()), float(second.mean()), change, low, high, p, evidence)
+    change, e = (only_second - only_first) / trials, fair_coin(only_first, only_second)
+    return Effect(float(first.mean()), float(second.mean()), change, low, high, p, e)
 
 
 def _tango(losses: int, gains: int, trials: int, alpha: float) -> float:
     """The least difference of shares at which the score, with the likeliest shares of that difference, is not beyond
-    the normal quantile; by bisection."""
+    the normal quantile."""
     quantile = -float(ndtri(alpha / 2))
 
-    def beyond(difference: float) -> bool:
+    def inside(difference: float) -> bool:
         b = losses + gains + difference * (gains - losses - 2 * trials)
         root = max(b * b + 8 * trials * losses * difference * (1 - difference), 0.0)
         lost = (b + np.sqrt(root)) / (4 * trials)
         variance = trials * max(2 * lost + difference * (1 - difference), 0.0)
-        return gains - losses - trials * difference > quantile * np.sqrt(variance)
+        return bool(gains - losses - trials * difference <= quantile * np.sqrt(variance))
 
-    low, high = -1.0, (gains - losses) / trials
+    return _least(inside, -1.0, (gains - losses) / trials)
+
+
+def _least(holds: Callable[[float], bool], low: float, high: float) -> float:
+    """The least value from which on something holds, by bisection."""
     for _ in range(_STEPS):
         middle = (low + high) / 2
-        low, high = (middle, high) if beyond(middle) else (low, middle)
+        low, high = (low, middle) if holds(middle) else (middle, high)
     return high
 
 
@@ -96,21 +99,12 @@ def ratio_effect(
     over a ratio of 1 that the test rejects.
     """
     a, b = _grouped(first), _grouped(second)
-    signs = _signs(len(a))
-    flipped_a, flipped_b = signs @ a, signs @ b
+    means, p_equal = (float(first.mean()), float(second.mean())), _p_of_ratio(a, b)(1.0)
     total_a, total_b = float(a.sum()), float(b.sum())
-
-    def p(ratio: float) -> float:
-        return _extreme(b - ratio * a, flipped_b - ratio * flipped_a, total_b + ratio * total_a)
-
-    def p_inverse(ratio: float) -> float:
-        return _extreme(a - ratio * b, flipped_a - ratio * flipped_b, total_a + ratio * total_b)
-
-    means, p_equal = (float(first.mean()), float(second.mean())), p(1.0)
     if not total_a > 0 or not total_b > 0:
         return Effect(*means, total_b / total_a if total_a > 0 else np.nan, np.nan, np.nan, p_equal, evidence)
     value = total_b / total_a
-    low, least = _end(p, value, alpha), _end(p_inverse, 1 / value, alpha)
+    low, least = _least_ratio(a, b, alpha), _least_ratio(b, a, alpha)
     high = 1 / least if least > 0 else np.inf
     if unseen := _unseen(first, second, alpha):
         reach = unseen * (max(first.max(), second.max()) if largest is None else largest) / means[0]
@@ -118,6 +112,28 @@ def ratio_effect(
         low = min(low, max(low - reach, 1.0 if sure and value > 1 else 0.0))
         high = max(high, min(high + reach, 1.0 if sure and value < 1 else np.inf))
     return Effect(*means, value, low, high, p_equal, evidence)
+
+
+def _p_of_ratio(a: Array, b: Array) -> Callable[[float], float]:
+    """The p of b being r times a: the share of sums with random signs at least as far from 0 as the sum of b - r a,
+    that one among them; where it is alone, Hoeffding's bound of the same share (J. Amer. Statist. Assoc. 58, 1963)."""
+    signs = _signs(len(a))
+    flipped_a, flipped_b, size_a, size_b = signs @ a, signs @ b, float(a.sum()), float(b.sum())
+
+    def p(ratio: float) -> float:
+        d, flipped, roundoff = b - ratio * a, flipped_b - ratio * flipped_a, 1e-12 * (size_b + ratio * size_a)
+        total = abs(float(d.sum()))
+        count = int((np.abs(flipped) >= total - roundoff).sum())
+        least = 1 / (FLIPS + 1)
+        return (1 + count) * least if count else min(least, 2 * float(np.exp(-(total**2) / (2 * float(d @ d)))))
+
+    return p
+
+
+def _least_ratio(a: Array, b: Array, alpha: float) -> float:
+    """The least ratio of b over a that is not rejected."""
+    p = _p_of_ratio(a, b)
+    return 0.0 if p(0.0) >= alpha else _least(lambda ratio: p(ratio) >= alpha, 0.0, float(b.sum() / a.sum()))
 
 
 def _unseen(first: Array, second: Array, alpha: float) -> float:
@@ -133,38 +149,20 @@ def _unseen(first: Array, second: Array, alpha: float) -> float:
 
 
 def _grouped(values: Array) -> Array:
-    if len(values) <= LARGEST_SAMPLE:
-        return values.astype(float)
-    return np.add.reduceat(
-        values.astype(float), np.linspace(0, len(values), LARGEST_SAMPLE, endpoint=False).astype(int)
-    )
+    values, trials = values.astype(float), len(values)
+    if trials <= LARGEST_SAMPLE:
+        return values
+    return np.add.reduceat(values, np.linspace(0, trials, LARGEST_SAMPLE, endpoint=False).astype(int))
 
 
 @lru_cache(maxsize=2)
 def _signs(size: int) -> Array:
-    """(FLIPS, size) of 1 and -1, the same whoever asks."""
+    """(FLIPS, size) of 1 and -1, the same for all comparisons."""
     rng = np.random.Generator(np.random.Philox(size))
     return rng.integers(0, 2, (FLIPS, size)) * 2.0 - 1
 
 
-def _extreme(d: Array, flipped: Array, size: float) -> float:
-    """The share of sums with random signs at least as far from 0 as the sum of d, that one among them; where it is
-    alone, Hoeffding's bound of the same share (J. Amer. Statist. Assoc. 58, 1963). `size` is what round-off is of."""
-    total = abs(float(d.sum()))
-    count = int((np.abs(flipped) >= total - 1e-12 * size).sum())
-    least = 1 / (FLIPS + 1)
-    return (1 + count) * least if count else min(least, 2 * float(np.exp(-(total**2) / (2 * float(d @ d)))))
-
-
-def _end(p: Callable[[float], float], value: float, alpha: float) -> float:
-    """The least ratio below the value that is not rejected, by bisection."""
-    if p(0.0) >= alpha:
-        return 0.0
-    low, high = 0.0, value
-    for _ in range(_STEPS):
-        middle = (low + high) / 2
-        low, high = (low, middle) if p(middle) >= alpha else (middle, high)
-    return high
+# Evidence ------------------------------------------------------------------------------------------------------------
 
 
 def fair_coin(heads: int, tails: int) -> float:
@@ -178,19 +176,20 @@ def fair_coin(heads: int, tails: int) -> float:
 def no_drift(differences: Array, largest: float) -> float:
     """Evidence against a mean of 0 of differences (trials,) that are never beyond `largest`: the mean fortune of those
     who bet a fixed share on either sign (Waudby-Smith and Ramdas, J. R. Stat. Soc. B 86, 2024)."""
-    fortunes = np.log1p(_BETS[:, None] * (differences / largest)[None, :]).sum(axis=1)
-    top = float(fortunes.max())
-    return _exp(top + float(np.log(np.mean(np.exp(fortunes - top)))))
+    return _mean_fortune(np.log1p(_BETS[:, None] * (differences / largest)[None, :]))
 
 
 def no_lean(differences: Array, unit: float) -> float:
     """Evidence against differences (trials,) that are as likely to have the other sign, of any size: the mean of
     exp(t d) / cosh(t d) over both signs of t, which is a martingale under such signs (de la Peña, Ann. Probab. 27,
     1999). It exceeds 1 only on the side of their sum. `unit` is about what differences are of, and knows no signs."""
-    tilts = np.concatenate([-_TILTS, _TILTS])[:, None] * (differences / unit)[None, :]
-    fortunes = (tilts - np.logaddexp(tilts, -tilts) + np.log(2)).sum(axis=1)
-    top = float(fortunes.max())
-    return _exp(top + float(np.log(np.mean(np.exp(fortunes - top)))))
+    tilts = _TILTS[:, None] * (differences / unit)[None, :]
+    return _mean_fortune(tilts - np.logaddexp(tilts, -tilts) + np.log(2))
+
+
+def _mean_fortune(log_gains: Array) -> float:
+    """The mean over bets of what each has made of 1, from the logarithms of its gains (bets, trials)."""
+    return _exp(float(logsumexp(log_gains.sum(axis=1))) - np.log(len(log_gains)))
 
 
 def _exp(value: float) -> float:

@@ -15,7 +15,7 @@ from ipe_bench.measurements.counted import cost
 from ipe_bench.runs.results import StoredCell
 from ipe_bench.statistics.calibration import Calibration, calibrations
 from ipe_bench.statistics.collect import Collection, Group
-from ipe_bench.statistics.histories import History, distances_to_limit, trial_label
+from ipe_bench.statistics.histories import History, distances_to_limit
 
 FIT = "fit_p"
 NIS = "extra_nis"
@@ -271,7 +271,6 @@ class Sample:
         truth = {name: self.of_truth(name) for name in TRUTH}
         return [
             History(
-                row,
                 label_of(self.number[row]),
                 iterates,
                 distances_to_limit(iterates, crlb[row]),
@@ -284,7 +283,8 @@ class Sample:
 
 def label_of(number: Any) -> str:
     """A trial as readers name it."""
-    return trial_label(*divmod(int(number), _SEED))
+    seed, trial = divmod(int(number), _SEED)
+    return f"seed {seed}, trial {trial}"
 
 
 def samples(collection: Collection, groups: Sequence[Group]) -> Iterator[Sample]:

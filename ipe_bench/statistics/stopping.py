@@ -29,68 +29,46 @@ NARROW = "every interval is narrow enough"
 """Why a scenario stops that has come to the precision that was asked for."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Precision:
-    """How near to what is found the truth has to be, at whatever number of trials one looks; None where that is free.
+STATISTICS = ("success", "rmse")
+"""What a precision can be asked for: success as a difference of shares, of every estimator; rmse as a ratio less 1, of
+the root mean square over parameters of error over bound, of the trials that an estimator solved."""
 
-    `success` is a difference of shares, of every estimator; `rmse` a ratio less 1, of the root mean square over
-    parameters of error over bound, of the trials that an estimator solved.
+
+def precision_of(given: float | Mapping[str, float]) -> dict[str, float]:
+    """How near to what is found the truth has to be, at whatever number of trials one looks, by statistic; from a
+    number, which is that of success, or from numbers by name.
+
+    Raises:
+        UserError: it is neither.
     """
+    named = {str(k): v for k, v in given.items()} if isinstance(given, Mapping) else {"success": given}
+    for name, value in named.items():
+        if name not in STATISTICS:
+            raise UserError(f"precision.{name}: {unknown(name, STATISTICS, 'statistic')}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1:
+            key = f"precision.{name}" if isinstance(given, Mapping) else "precision"
+            raise UserError(f"{key}={value}: give a number between 0 and 1, such as 0.01")
+    if not named:
+        raise UserError("precision={}: give a number between 0 and 1, such as 0.01")
+    return named
 
-    success: float | None = None
-    rmse: float | None = None
 
-    @classmethod
-    def of(cls, given: float | Mapping[str, float]) -> Precision:
-        """From a number, which is that of success, or from numbers by name.
-
-        Raises:
-            UserError: it is neither.
-        """
-        known = tuple(f.name for f in dataclasses.fields(cls))
-        named = {str(k): v for k, v in given.items()} if isinstance(given, Mapping) else {"success": given}
-        for name, value in named.items():
-            if name not in known:
-                raise UserError(f"precision.{name}: {unknown(name, known, 'statistic')}")
-            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1:
-                key = f"precision.{name}" if isinstance(given, Mapping) else "precision"
-                raise UserError(f"{key}={value}: give a number between 0 and 1, such as 0.01")
-        if not named:
-            raise UserError("precision={}: give a number between 0 and 1, such as 0.01")
-        return cls(**named)
-
-    def reached(self, sample: Sample) -> list[Reach]:
-        """How near each statistic that is asked for has come."""
-        found, label = [], sample.group.estimator
-        if self.success is not None:
-            low, high = share_sequence(int(sample.scalars["success"].sum()), len(sample))
+def reached(sample: Sample, wanted: Mapping[str, float]) -> list[tuple[float, str]]:
+    """How far each statistic is from the precision that is wanted, as a ratio that is above 1 where it is not near
+    enough yet, and in words."""
+    found = []
+    for statistic, precision in wanted.items():
+        if statistic == "success":
             share = float(sample.scalars["success"].mean())
-            found.append(Reach(label, "success", max(high - share, share - low), self.success))
-        if self.rmse is not None:
+            low, high = share_sequence(int(sample.scalars["success"].sum()), len(sample))
+            width = max(high - share, share - low)
+        else:
             low, high = (float(end[sample.n]) for end in rmse_ends_anytime(sample))
-            half = float(np.sqrt(high / low)) - 1 if low > 0 else np.inf
-            found.append(Reach(label, "rmse", half if np.isfinite(half) else np.inf, self.rmse))
-        return found
-
-
-@dataclasses.dataclass(frozen=True)
-class Reach:
-    """How near one statistic of an estimator has come to its true value."""
-
-    estimator: str
-    statistic: str
-    width: float
-    wanted: float
-
-    @property
-    def ratio(self) -> float:
-        """Above 1 where it is not near enough yet."""
-        return self.width / self.wanted
-
-    def __str__(self) -> str:
-        if math.isfinite(self.width):
-            return f"{self.estimator}: {self.statistic} ± {100 * self.width:.2g} %"
-        return f"{self.estimator}: {self.statistic} ± anything, since a few trials carry it or there are too few"
+            width = float(np.sqrt(high / low)) - 1 if low > 0 else np.inf
+        known = math.isfinite(width)
+        shown = f"{100 * width:.2g} %" if known else "anything, since a few trials carry it or there are too few"
+        found.append((width / precision if known else np.inf, f"{sample.group.estimator}: {statistic} ± {shown}"))
+    return found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,14 +115,14 @@ def compute_until(
         UserError: what was asked for cannot be computed; nothing is computed then.
         StorageError: nothing can be stored any more.
     """
-    wanted, budget, began = Precision.of(precision), MOST_TRIALS if most is None else most, time.monotonic()
-    check_time_limit(time_limit, wanted)
+    wanted, budget, began = precision_of(precision), MOST_TRIALS if most is None else most, time.monotonic()
+    check_time_limit(time_limit, precision)
     if any(scenario.noise.real for scenario in scenarios):
         raise UserError(f"precision={precision}: certified readings are one trial; leave it out")
     validate(scenarios, estimators, budget, block_size)
     block_size = BLOCK_SIZE if block_size is None else block_size
     options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
-    options |= {"further": {"precision": dataclasses.asdict(wanted)}, "command": command}
+    options |= {"further": {"precision": wanted}, "command": command}
     at = [_first_trials(s, estimators, Path(output), block_size, budget) for s in scenarios]
     names, failures = [new_name() for _ in scenarios], []
     stops: dict[int, Stop] = {}
@@ -153,29 +131,25 @@ def compute_until(
             if i in stops:
                 continue
             failed = compute([scenario], estimators, at[i], output, record_as=names[i], **options)
-            reached = [r for s in _stored(scenario, estimators, output) for r in wanted.reached(s)]
-            widest = max(reached, key=lambda r: r.ratio, default=None)
-            late = time_limit is not None and time.monotonic() - began >= time_limit
-            reason = _reason_to_stop(bool(failed), widest, at[i] >= budget, late)
-            if reason or widest is None:
+            ratios = [one for sample in _stored(scenario, estimators, output) for one in reached(sample, wanted)]
+            ratio, widest = max(ratios, key=lambda one: one[0], default=(np.inf, ""))
+            reason = ""
+            if failed:
+                reason = "some blocks failed"
+            elif not ratios:
+                reason = "no trial has readings"
+            elif ratio <= 1:
+                reason = NARROW
+            elif at[i] >= budget:
+                reason = "there are as many trials as there may be"
+            elif time_limit is not None and time.monotonic() - began >= time_limit:
+                reason = "the time is over"
+            if reason:
                 failures += failed
-                stops[i] = Stop(scenario, at[i], reason, str(widest or ""))
+                stops[i] = Stop(scenario, at[i], reason, widest)
             else:
-                at[i] = next_trials(at[i], widest.ratio, block_size, budget)
+                at[i] = next_trials(at[i], ratio, block_size, budget)
     return tuple(failures), tuple(stops[i] for i in range(len(scenarios)))
-
-
-def _reason_to_stop(failed: bool, widest: Reach | None, spent: bool, late: bool) -> str:
-    """Empty where there is none."""
-    if failed:
-        return "some blocks failed"
-    if widest is None:
-        return "no trial has readings"
-    if widest.ratio <= 1:
-        return NARROW
-    if spent:
-        return "there are as many trials as there may be"
-    return "the time is over" if late else ""
 
 
 def next_trials(trials: int, ratio: float, block: int, most: int) -> int:
@@ -202,7 +176,7 @@ def _stored(scenario: Scenario, estimators: Mapping[str, Estimator], output: Pat
     return samples(collection, collection.groups)
 
 
-def check_time_limit(time_limit: float | None, precision: Precision | None = None) -> None:
+def check_time_limit(time_limit: float | None, precision: Any = None) -> None:
     """Raises UserError if a time limit is not above 0, or comes without a precision."""
     if time_limit is not None and precision is None:
         raise UserError(f"time_limit={time_limit}: goes with precision; give that, or leave it out")
