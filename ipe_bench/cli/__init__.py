@@ -35,6 +35,12 @@ def discard_output() -> None:
         os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 
+def say(*lines: str) -> None:
+    """Prints lines as they are, which a terminal may fold."""
+    for line in lines:
+        console().print(line, markup=False, soft_wrap=True)
+
+
 def print_problems(lines: Iterable[str]) -> None:
     """Says on stderr what is wrong, a line each."""
     sys.stdout.flush()
@@ -54,7 +60,7 @@ def given_keys(command: str, words: Sequence[str], keys: Collection[str]) -> dic
     """The words KEY=VALUE after a command that Hydra does not read.
 
     Raises:
-        UserError: a key is none of `keys`, or stands there twice.
+        UserError: a key is none of `keys`, stands there twice, or has no value.
     """
     found: dict[str, str] = {}
     for word in words:
@@ -63,5 +69,7 @@ def given_keys(command: str, words: Sequence[str], keys: Collection[str]) -> dic
             raise UserError(f"{command}: {word}: {unknown(key, keys, 'key')}")
         if key in found:
             raise UserError(f"{command}: {word}: {key} stands there twice; give it once")
+        if not value:
+            raise UserError(f"{command}: {word}: give it a value")
         found[key] = value
     return found

@@ -6,25 +6,23 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import console, print_problems
+from ipe_bench.cli import given_keys, print_problems, say
 from ipe_bench.runs.bundles import SUFFIX, Bundle, is_bundle, read_bundle, write_bundle
 from ipe_bench.runs.results import Results
 
 
 def main(arguments: Sequence[str]) -> int:
     """Writes the archive, or checks one; exit code 1 where the folders lack something that was asked for."""
-    outputs = [word.removeprefix("output=") for word in arguments if word.startswith("output=")]
     paths = [Path(word) for word in arguments if not word.startswith("output=")]
+    output = given_keys("bundle", [w for w in arguments if w.startswith("output=")], ("output",)).get("output")
     if not paths:
         raise UserError("bundle: name at least one folder of results, such as outputs/paper, or a bundle to check")
-    if len(outputs) > 1:
-        raise UserError(f"bundle: {' '.join(f'output={o}' for o in outputs)}: give one file to write to")
     if any(map(is_bundle, paths)):
-        if len(paths) > 1 or outputs:
+        if len(paths) > 1 or output:
             raise UserError("bundle: one file is checked by itself; name folders to make a bundle of")
         _show(read_bundle(paths[0]), "Whole")
         return 0
-    path = Path(outputs[0]) if outputs else paths[0].with_name(paths[0].resolve().name + SUFFIX)
+    path = Path(output) if output else paths[0].with_name(paths[0].resolve().name + SUFFIX)
     from ipe_bench.report.definitions import CITATION
 
     bundle = write_bundle(paths, path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX), {"citation": CITATION})
@@ -35,8 +33,6 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _show(bundle: Bundle, title: str) -> None:
-    lines = (
-        f"{title:<8}{bundle.path} ({len(bundle.files)} files of {', '.join(bundle.folders)}; {bundle.size:,} bytes)",
-        f"{'Digest':<8}sha256:{bundle.digest}",
-    )
-    console().print("\n".join(lines), markup=False, soft_wrap=True)
+    folders = ", ".join(bundle.folders)
+    say(f"{title:<8}{bundle.path} ({len(bundle.files)} files of {folders}; {bundle.size:,} bytes)")
+    say(f"Digest  sha256:{bundle.digest}")

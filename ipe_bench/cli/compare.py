@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import console, given_keys, print_problems, show
+from ipe_bench.cli import given_keys, print_problems, say, show
 
 KEYS = ("first", "second", "alpha", "anytime", "fail_on", "output")
 
@@ -15,7 +15,8 @@ KEYS = ("first", "second", "alpha", "anytime", "fail_on", "output")
 def main(arguments: Sequence[str]) -> int:
     """Prints the table; exit code 1 where the second is worse, or lacks what was asked for."""
     folders = [a for a in arguments if "=" not in a or Path(a).is_dir()]
-    keys = _keys([a for a in arguments if a not in folders])
+    given = given_keys("compare", [a for a in arguments if a not in folders], KEYS)
+    keys = {key: _value(key, value) for key, value in given.items()}
     if not 1 <= len(folders) <= 2:
         raise UserError("compare: name one or two folders of results, such as outputs/before outputs/after")
     from ipe_bench.api import compare
@@ -23,23 +24,12 @@ def main(arguments: Sequence[str]) -> int:
 
     frame = compare(*folders, **keys)
     show(contents(frame, keys.get("alpha", 0.05)))
-    out = console()
     print_problems([*frame.attrs["problems"], *frame.attrs["stale"], *frame.attrs["notes"]])
     if "output" in keys:
-        out.print(f"\nTable   {Path(keys['output']) / 'comparison.csv'}", markup=False, soft_wrap=True)
-        out.print(f"Page    {Path(keys['output']) / 'comparison.html'}", markup=False, soft_wrap=True)
-    for line in frame.attrs["worse"]:
-        out.print(f"worse: {line}", markup=False, soft_wrap=True)
+        say(f"\nTable   {Path(keys['output']) / 'comparison.csv'}")
+        say(f"Page    {Path(keys['output']) / 'comparison.html'}")
+    say(*(f"worse: {line}" for line in frame.attrs["worse"]))
     return 1 if frame.attrs["worse"] or frame.attrs["problems"] else 0
-
-
-def _keys(words: Sequence[str]) -> dict[str, Any]:
-    """The keys as `compare` takes them."""
-    found = given_keys("compare", words, KEYS)
-    for key, value in found.items():
-        if not value:
-            raise UserError(f"compare: {key}=: give it a value")
-    return {key: _value(key, value) for key, value in found.items()}
 
 
 def _value(key: str, value: str) -> Any:

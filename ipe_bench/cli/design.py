@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 from ipe_bench.api import design
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import console, show
-from ipe_bench.cli.single import OF_FILES, OF_MANY_TRIALS, single
+from ipe_bench.cli import show
+from ipe_bench.cli.single import OF_FILES, OF_MANY_TRIALS, say_files, single
 from ipe_bench.plugins.extensions import richer_models
 from ipe_bench.runs.provenance import describe
 from ipe_bench.trials.design import Criterion
@@ -16,12 +16,7 @@ from ipe_bench.trials.design import Criterion
 _OF_RUNS = (*OF_MANY_TRIALS, "figures", "trials", "solver", "baseline", "estimators")
 
 
-def main(
-    arguments: Sequence[str],
-    by: Sequence[str] | None = None,
-    readings: int | None = None,
-    criterion: Criterion = "A",
-) -> int:
+def main(arguments: Sequence[str], by: Sequence[str] | None, readings: int | None, criterion: Criterion) -> int:
     """Prints tables and writes files; exit code 1 where the readings do not determine every parameter."""
     if any(word.lstrip("+").startswith("readings=") for word in arguments):
         raise UserError("readings: is for `ipe-bench estimate`; the number to choose is --readings NUMBER")
@@ -33,7 +28,6 @@ def main(
     found = design(scenario, by=by, readings=readings, criterion=criterion, errors=errors)
 
     from ipe_bench.report.designs import FILES, NAME, contents, write_design
-    from ipe_bench.report.writer import claim
 
     command = {
         "scenario": describe(dataclasses.replace(scenario, truth=None)),
@@ -42,8 +36,8 @@ def main(
         "readings": readings,
         "criterion": criterion,
     }
-    folder = claim(asked.folder, NAME, command, elsewhere=not asked.named, files=FILES)
+    folder = asked.folder(NAME, command, FILES)
     files = write_design(folder, asked.measurement, found, command)
     show(contents(asked.measurement, found))
-    console().print(f"In {folder}: {', '.join(path.name for path in files)}", markup=False, soft_wrap=True)
+    say_files(files)
     return 0 if found.observability.observable else 1

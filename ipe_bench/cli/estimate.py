@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from ipe_bench.basics.machine import library_versions
-from ipe_bench.cli import console, show
-from ipe_bench.cli.single import OF_MANY_TRIALS, single
+from ipe_bench.cli import show
+from ipe_bench.cli.single import OF_MANY_TRIALS, say_files, single
 from ipe_bench.real.estimation import Opened
 from ipe_bench.runs.provenance import describe, fingerprint
 
@@ -23,17 +23,14 @@ def main(arguments: Sequence[str]) -> int:
     opened = asked.spec.question(asked.words.keys).opened()
 
     from ipe_bench.report.answer import FILES, NAME, Answer, contents, write_answer
-    from ipe_bench.report.writer import claim
 
     command = _command(opened)
-    folder = claim(asked.folder, NAME, command, elsewhere=not asked.named, files=FILES)
+    folder = asked.folder(NAME, command, FILES)
     answer = Answer.to(opened, asked.measurement)
     written = {"measurement": asked.measurement, "config": asked.config, **_provenance(opened)}
     files = write_answer(folder, answer, command, written, which=asked.spec.figures)
     show(contents(answer))
-    out = console()
-    out.print(f"\nIn {folder}:", markup=False, soft_wrap=True)
-    out.print(", ".join(path.name for path in files), markup=False)
+    say_files(files)
     return 0 if answer.passes else 1
 
 

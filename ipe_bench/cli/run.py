@@ -14,24 +14,21 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from ipe_bench.basics.errors import StorageError, UserError
-from ipe_bench.cli import console, interrupts
+from ipe_bench.cli import interrupts, say
 from ipe_bench.cli import words as w
 from ipe_bench.cli.dry_run import DryRun
 from ipe_bench.cli.parser import INFO_TOPICS, parsers
 from ipe_bench.cli.progress import shown_progress
 from ipe_bench.cli.report import show_command
-from ipe_bench.cli.session import STANDARD_FILTERS, Jobs, by_default, complete, jobs_of, session, show, spec_of, suited
+from ipe_bench.cli.session import Jobs, complete, jobs_of, session, show, spec_of
 from ipe_bench.cli.single import OF_FILES
-from ipe_bench.cli.spec import Spec
+from ipe_bench.cli.spec import STANDARD_FILTERS, Spec
 from ipe_bench.measurements import Nist
-from ipe_bench.runs.execution import Execution, Serial
+from ipe_bench.runs.execution import Serial
 from ipe_bench.runs.execution.processes import end_idle
 from ipe_bench.runs.provenance import digest
 from ipe_bench.runs.run import accept, compute, record_refusal, result_keys
-from ipe_bench.runs.schedule import Watcher
 from ipe_bench.runs.store import describe_names
-
-_OWN_LAUNCHER = ".BasicLauncher"
 
 
 @dataclass(frozen=True)
@@ -73,7 +70,7 @@ def main(arguments: Sequence[str]) -> int:
         if flags.shell_completion:
             complete(flags.overrides)
             return 0
-        words = w.read("run", flags.overrides, [] if folder is None else [folder])
+        words = w.read("run", flags.overrides, folder)
         named = w.read("run", [f"default_name='{w.default_name(words.overrides)}'"])
         jobs = jobs_of(w.Words(words.overrides + named.overrides), multirun=flags.multirun)
         if flags.cfg or flags.info:
@@ -82,27 +79,28 @@ def main(arguments: Sequence[str]) -> int:
         jobs.words.refuse(OF_FILES, "is for `ipe-bench estimate`: run simulates its readings")
         for one in jobs.specs:
             _ = one.scenario  # whose parts may not suit one another
-        standard = by_default(words)
-        if standard:
-            jobs = replace(jobs, specs=[suited(one) for one in jobs.specs])
+        if words.standard_baselines:
+            jobs = replace(jobs, specs=[one.suited() for one in jobs.specs])
         if flags.dry_run:
             dry = DryRun()
             for one in jobs.specs:
                 print(dry.add(one, title(one, words.text)))
             print(dry.summary())
             return 0
-        if standard and (line := _left_out(jobs.specs)):
-            console().print(line, markup=False, soft_wrap=True)
-        task = Task(shlex.join(["ipe-bench", "run", *arguments]), standard)
-        outcomes = jobs.launch(task) or task.outcomes
+        if words.standard_baselines:
+            say(*_left_out(jobs.specs))
+        task = Task(shlex.join(["ipe-bench", "run", *arguments]), words.standard_baselines)
+        for told, spec in jobs.here():
+            task.compute(told, spec, jobs.specs[0].output)
+        outcomes = task.outcomes if jobs.overrides else jobs.launch(task) or task.outcomes
     return _conclude(jobs, outcomes)
 
 
-def _left_out(jobs: Sequence[Spec]) -> str:
+def _left_out(jobs: Sequence[Spec]) -> list[str]:
     """A line on the standard filters that do not suit every job."""
     models = dict.fromkeys(job.measurement.name for job in jobs if not set(STANDARD_FILTERS) <= job.estimators.keys())
     filters = " and ".join(STANDARD_FILTERS)
-    return f"{filters} are left out for {', '.join(models)}: filters need epochs and a prior" if models else ""
+    return [f"{filters} are left out for {', '.join(models)}: filters need epochs and a prior"] if models else []
 
 
 def _flags(arguments: Sequence[str]) -> Namespace:
@@ -113,9 +111,7 @@ def _flags(arguments: Sequence[str]) -> Namespace:
         if word in ("-i", "--info") and (i + 1 == len(waiting) or waiting[i + 1] not in INFO_TOPICS):
             waiting[i] = "--info=all"
     flags = parsers()[1]["run"].parse(waiting)
-    asked = [
-        f"--{name.replace('_', '-')}" for name in ("multirun", "cfg", "info", "shell_completion") if vars(flags)[name]
-    ]
+    asked = [f"--{name}" for name in ("multirun", "cfg", "info", "shell_completion") if vars(flags)[name]]
     if len(asked) > 1:
         raise UserError(f"run: {' '.join(asked).replace('_', '-')}: do not go together; choose one")
     if flags.resolve and not flags.cfg:
@@ -126,8 +122,7 @@ def _flags(arguments: Sequence[str]) -> Namespace:
 
 
 class Task:
-    """One job of Hydra's. What is a mistake in one stops no other; where nothing can be stored any more, no other is
-    begun in this process."""
+    """Computes jobs. A mistake in one stops no other; once nothing can be stored, no other is begun in this process."""
 
     def __init__(self, command: str, standard: bool) -> None:
         self.command = command
@@ -139,57 +134,63 @@ class Task:
         """Of the jobs in this process: a sweeper that optimises keeps to itself what they return."""
 
     def __call__(self, config: DictConfig) -> Outcome:
-        self.outcomes.append(self._outcome(config))
-        return self.outcomes[-1]
-
-    def _outcome(self, config: DictConfig) -> Outcome:
-        words = tuple(HydraConfig.get().overrides.task)
-        begun = Outcome(str(config.output), words, full=self.full)
-        if self.full:
-            return begun
+        """Computes a job that Hydra has composed and launched."""
+        hydra = HydraConfig.get()
+        # Where a launcher plugin (joblib, submitit) runs the jobs, the cores are its to share out.
+        elsewhere = hydra.mode == RunMode.MULTIRUN and not hydra.launcher["_target_"].endswith(".BasicLauncher")
         try:
-            job = spec_of(config)
-            done = _computed(suited(job) if self.standard else job, begun, self.command)
-            accept(done.output, done.job)
-            return done
+            spec = spec_of(config)
+            if elsewhere:
+                spec = replace(spec, execution=Serial())
+        except UserError as error:
+            spec = error
+        return self.compute(hydra.overrides.task, spec, str(config.output))
+
+    def compute(self, words: Sequence[str], spec: Spec | UserError, output: str) -> Outcome:
+        """Computes a job, or notes why there is none; `output` is where it would go then."""
+        done = Outcome(output if isinstance(spec, UserError) else spec.output, tuple(words), full=self.full)
+        try:
+            if isinstance(spec, UserError):
+                raise spec
+            if not self.full:
+                done = _computed(spec.suited() if self.standard else spec, done, self.command)
+                accept(done.output, done.job)
         except StorageError as error:
             self.full = str(error)
-            return replace(begun, full=self.full)
+            done = replace(done, full=self.full)
         except UserError as error:
-            return replace(begun, mistake=str(error))
+            done = replace(done, mistake=str(error))
+        self.outcomes.append(done)
+        return done
 
 
 def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
+    """Computes the trials that are asked for, or just enough."""
     if job.write_readings is not None:
         write_trial(job, Path(job.write_readings), job.write_readings_trial)
         return begun
     interrupts.begin_work()
     name = title(job, begun.words)
+    asked: Any = ([job.scenario], job.estimators, job.count, job.output)
+    options: dict[str, Any] = {"execution": job.execution, "block_size": job.block_size, "command": command}
     with shown_progress(name) as watch:
-        execution = Serial() if _launched_elsewhere() else job.execution
-        failures, stop, missed = _compute(job, execution, watch, command)
+        if job.precision is None:
+            done = replace(begun, failures=compute(*asked, **options, watch=watch))
+        else:
+            from ipe_bench.statistics.stopping import compute_until
+
+            options |= {"precision": job.precision, "time_limit": job.time_limit}
+            failures, (stop,) = compute_until(*asked, **options, watch=watch)
+            verdict = "" if stop.reached else "the precision is not reached: "
+            said = f"{name}: {stop.trials} trials; {verdict}{stop.reason} ({stop.widest})"
+            done = replace(begun, failures=failures, stop=said, precision_missed=not stop.reached)
     value = None
     if job.objective is not None:
         from ipe_bench.statistics.stopping import objective
 
         value = objective(job.scenario, job.estimators, *job.aim, job.output)
     cells = {one.key: describe_names(one.names) for one in result_keys(job.scenario, job.estimators)}
-    said = f"{name}: {stop}" if stop else ""
-    return replace(begun, cells=cells, failures=failures, stop=said, precision_missed=missed, objective=value)
-
-
-def _compute(job: Spec, execution: Execution, watch: Watcher, command: str) -> tuple[tuple[str, ...], str, bool]:
-    """Computes the trials that are asked for, or just enough: what failed, and of a precision why it stopped, and
-    whether short of it."""
-    options: dict[str, Any] = {"execution": execution, "block_size": job.block_size, "watch": watch, "command": command}
-    if job.precision is None:
-        return compute([job.scenario], job.estimators, job.count, job.output, **options), "", False
-    from ipe_bench.statistics.stopping import compute_until
-
-    options |= {"precision": job.precision, "time_limit": job.time_limit}
-    failures, (stop,) = compute_until([job.scenario], job.estimators, job.count, job.output, **options)
-    verdict = "" if stop.reached else "the precision is not reached: "
-    return failures, f"{stop.trials} trials; {verdict}{stop.reason} ({stop.widest})", not stop.reached
+    return replace(done, cells=cells, objective=value)
 
 
 def _conclude(jobs: Jobs, outcomes: list[Outcome]) -> int:
@@ -207,11 +208,7 @@ def _conclude(jobs: Jobs, outcomes: list[Outcome]) -> int:
     for output, cells in folders.items():
         if (Path(output) / "trials").is_dir() and first.write_readings is None:
             code = max(code, show_command(Path(output), cells, first.figures, first.formats))
-    if line := _best(outcomes, jobs.maximises):
-        console().print(line, markup=False, soft_wrap=True)
-    for one in outcomes:
-        if one.stop:
-            console().print(one.stop, markup=False, soft_wrap=True)
+    say(*_best(outcomes, jobs.maximises), *(one.stop for one in outcomes if one.stop))
     if refused := [one for one in outcomes if one.mistake]:
         raise UserError(_refused(refused, told=jobs.multirun and len(outcomes) > 1))
     return code
@@ -235,27 +232,16 @@ def _note_refusals(jobs: Jobs, outcomes: Sequence[Outcome]) -> None:
             record_refusal(one.output, one.job, one.mistake, *parts)
 
 
-def _own_words(outcome: Outcome, outcomes: Sequence[Outcome]) -> str:
-    """Those words of a job that not all jobs have."""
-    common = set.intersection(*(set(other.words) for other in outcomes))
-    return " ".join(word.lstrip("+") for word in outcome.words if word not in common)
-
-
-def _best(outcomes: Sequence[Outcome], maximises: bool) -> str:
-    """The best job in a line; empty where no job has an objective."""
+def _best(outcomes: Sequence[Outcome], maximises: bool) -> list[str]:
+    """The best job in a line, with those of its words that not all jobs have; none where no job has an objective."""
     known = [one for one in outcomes if one.objective is not None and not one.mistake]
     if not known:
-        return ""
+        return []
     best = (max if maximises else min)(known, key=float)
     of = f", the {'greatest' if maximises else 'least'} of {len(known)} jobs" if len(known) > 1 else ""
-    own = _own_words(best, known)
-    return f"Objective {float(best):.6g}{of}" + (own and f": {own}")
-
-
-def _launched_elsewhere() -> bool:
-    """Whether a launcher plugin of Hydra (joblib, submitit) runs the jobs: then the cores are its to share out."""
-    launcher = HydraConfig.get().launcher
-    return HydraConfig.get().mode == RunMode.MULTIRUN and not launcher["_target_"].endswith(_OWN_LAUNCHER)
+    common = set.intersection(*(set(one.words) for one in known))
+    own = " ".join(word.lstrip("+") for word in best.words if word not in common)
+    return [f"Objective {float(best):.6g}{of}" + (own and f": {own}")]
 
 
 _IN_EVERY_TITLE = {"measurement", "measurement.dataset", w.HYDRAS_TRUTH, "noise", "error_scale", "seed"}
@@ -287,8 +273,7 @@ def write_trial(job: Spec, path: Path, trial: int) -> None:
     """Writes the simulated readings of one trial, and its true parameters beside them."""
     from ipe_bench.real.readings import write_readings, write_truth
 
-    drawn = job.scenario.draw(trial, trial + 1)
-    model = job.scenario.measurement
+    drawn, model = job.scenario.draw(trial, trial + 1), job.scenario.measurement
     if not path.name:
         raise UserError(f"write_readings={path}: name a file")
     truth = path.with_name(f"{path.stem}.truth.csv")

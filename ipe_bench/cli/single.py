@@ -1,17 +1,19 @@
-"""One job outside of a run: for the commands that look at a single scenario and write one folder."""
+"""The one job of a command that looks at a single scenario and writes one folder."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ipe_bench.cli import say
 from ipe_bench.cli import words as w
 from ipe_bench.cli.session import composed, jobs_of, session
 from ipe_bench.cli.spec import Spec
 from ipe_bench.cli.words import Words
 from ipe_bench.measurements import Nist
+from ipe_bench.report.writer import claim
 
 OF_MANY_TRIALS = ("precision", "time_limit", "block_size", "formats", "execution", "write_readings")
 OF_MANY_TRIALS += ("write_readings_trial", "objective")
@@ -24,16 +26,28 @@ OF_FILES = ("readings", "ignore_rows", "ignore_columns")
 class Single:
     """What a command was asked for."""
 
+    command: str
     words: Words
     spec: Spec
-    measurement: str
-    """The model, as it was asked for."""
-    named: bool
-    """Whether the folder was named; else it is named after the command and the model."""
-    folder: Path
-    """Where the files are to go."""
-    config: dict[str, Any] = field(default_factory=dict)
+    config: dict[str, Any]
     """As it was composed."""
+
+    @property
+    def measurement(self) -> str:
+        """The model, as it was asked for."""
+        model = self.spec.measurement
+        if isinstance(model, Nist):
+            return f"nist/{model.dataset.lower()}"
+        return self.words.chosen("measurement") or model.name
+
+    def folder(self, name: str, identity: Any, files: Sequence[str] = ()) -> Path:
+        """Reserves the folder that was named, or one that is named after the command and the model.
+
+        `identity` tells this command from others, as NAME.json says it; `files` are further files of the command.
+        """
+        output, named = Path(self.spec.output), not {"name", "output"}.isdisjoint(self.words.keys)
+        folder = output if named else output.with_name(f"{self.command}-{self.measurement.replace('/', '-')}")
+        return claim(folder, name, identity, elsewhere=not named, files=files)
 
 
 def single(command: str, arguments: Sequence[str], standard: Sequence[str] = (), **refused: Sequence[str]) -> Single:
@@ -49,9 +63,9 @@ def single(command: str, arguments: Sequence[str], standard: Sequence[str] = (),
             words.refuse(keys, f"is for `ipe-bench {whose}`, and nothing in `ipe-bench {command}`")
         given = w.read(command, [one for one in standard if one.partition("=")[0] not in words.keys])
         jobs = jobs_of(Words(given.overrides + words.overrides), multirun=False)
-        spec, model = jobs.specs[0], jobs.specs[0].measurement
-        config = composed(jobs.words)
-    name = f"nist/{model.dataset.lower()}" if isinstance(model, Nist) else words.chosen("measurement") or model.name
-    named = not {"name", "output"}.isdisjoint(words.keys)
-    folder = Path(spec.output) if named else Path(spec.output).with_name(f"{command}-{name.replace('/', '-')}")
-    return Single(words, spec, name, named, folder, config)
+        return Single(command, words, jobs.specs[0], composed(jobs.words))
+
+
+def say_files(files: Sequence[Path]) -> None:
+    """Says which files a command has written into its folder."""
+    say(f"\nIn {files[0].parent}: {', '.join(path.name for path in files)}")

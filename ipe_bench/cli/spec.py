@@ -1,9 +1,9 @@
-"""All that a command is told, as typed plain data that is read once: the keys of the config besides Hydra's own."""
+"""All that a command is told, as typed plain data: the keys of the config besides Hydra's own."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,8 @@ PARTS: dict[str, type] = {
     "execution": Execution,
 }
 """Keys that hold a component, with its kind."""
+STANDARD_FILTERS = ("ekf", "ukf")
+"""Baselines of a plain run that suit only models with epochs and a prior."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,6 +151,13 @@ class Spec(Component):
         assert measurement is not None
         prior = prior_stated(self.prior, measurement, self.prior_covariance)
         return Scenario(measurement, self.noise, prior, self.error_scale, self.seed, truth)
+
+    def suited(self) -> Spec:
+        """The job without the standard filters if its model lacks what they need."""
+        problem = self.scenario.problem
+        unsuited = {label for label in STANDARD_FILTERS if (e := self.estimators.get(label)) and e.missing(problem)}
+        kept = {label: one for label, one in self.estimators.items() if label not in unsuited}
+        return replace(self, estimators=kept) if unsuited else self
 
     def question(self, stated: Collection[str]) -> Question:
         """What is asked of real readings; `stated` are the keys that a user has given, and a part that stands there by

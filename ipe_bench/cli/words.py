@@ -1,7 +1,7 @@
 """The words KEY=VALUE of a command, read once, by Hydra's grammar.
 
-What Hydra would answer in words of its own, or take without a word and not do, is refused here by a line that names the
-word and the remedy. What the values of options may be is checked where a job is constructed.
+What Hydra would answer in words of its own, or take and not do, is refused here by a line that names the word and the
+remedy. What the values of options may be is checked where a job is constructed.
 """
 
 from __future__ import annotations
@@ -37,6 +37,9 @@ _FORMULA = re.compile(
 _FILE = re.compile(rf"\+*(?:(measurement|{TRUTH})\.file|(parameters))=(?![{{$]|null$)(.*)", re.DOTALL)
 _UNDERSCORED = re.compile(r"(?:^|[\[,:(\s])[-+]?[\d.]+_[\d_.eE+-]*(?=$|[\],})\s])")
 
+Groups = dict[str, list[str]]
+"""The names of the options of each group."""
+
 
 @dataclass(frozen=True)
 class Words:
@@ -54,6 +57,11 @@ class Words:
         """The first part of each key, in the order of the words."""
         return [_first(one) for one in self.overrides]
 
+    @property
+    def standard_baselines(self) -> bool:
+        """Whether nothing that was typed chooses the baselines."""
+        return {"baseline", "experiment"}.isdisjoint(self.keys)
+
     def chosen(self, group: str) -> str | None:
         """The option that is chosen last."""
         found = [one for one in self.overrides if one.key_or_group == group and one.package is None]
@@ -67,13 +75,12 @@ class Words:
         """
         for one in self.overrides:
             if (first := _first(one)) in keys:
-                whole = one.key_or_group if "." in one.key_or_group else first
-                raise UserError(f"{whole}: {why}; leave it out")
+                raise UserError(f"{one.key_or_group if '.' in one.key_or_group else first}: {why}; leave it out")
 
 
 def _first(override: Override) -> str:
     key = TRUTH if override.package == TRUTH else override.key_or_group
-    return key.split(".")[0].split("/")[0]
+    return re.split("[./]", key)[0]
 
 
 def forced(override: Override) -> str:
@@ -89,13 +96,13 @@ def chooses(override: Override) -> bool:
     return chosen or override.is_delete() or override.is_hydra_override()
 
 
-def read(command: str, words: Sequence[str], folders: Sequence[Path] = ()) -> Words:
-    """The words of a command; `folders` hold configs besides ours.
+def read(command: str, words: Sequence[str], folder: Path | None = None) -> Words:
+    """The words of a command; `folder` holds configs besides ours.
 
     Raises:
         UserError: a word is none, or Hydra would not do what it says.
     """
-    groups = _groups(folders)
+    groups = _groups(folder)
     found = [_parse(command, part, groups) for word in words for part in _expanded(word)]
     for override in found:
         _check(override, groups)
@@ -106,14 +113,13 @@ def read(command: str, words: Sequence[str], folders: Sequence[Path] = ()) -> Wo
     return Words(tuple(found))
 
 
-def _groups(folders: Sequence[Path] = ()) -> dict[str, list[str]]:
-    """The names of the options of each group."""
-    found: dict[str, list[str]] = {}
+def _groups(folder: Path | None) -> Groups:
+    found: Groups = {}
     for option in plugins.options():
         found.setdefault(option.group, []).append(option.name)
-    for path in (path for folder in folders for path in sorted(folder.glob("*/**/*.yaml"))):
-        relative = next(path.relative_to(f) for f in folders if path.is_relative_to(f)).with_suffix("")
-        found.setdefault(relative.parts[0], []).append("/".join(relative.parts[1:]))
+    for path in [] if folder is None else sorted(folder.glob("*/**/*.yaml")):
+        group, *name = path.relative_to(folder).with_suffix("").parts  # type: ignore[arg-type]
+        found.setdefault(group, []).append("/".join(name))
     found["measurement"] += [f"nist/{name.lower()}" for name in datasets()]
     return found
 
@@ -175,8 +181,10 @@ def _literal(value: Any, where: str) -> str:
         return "[" + ",".join(_literal(v, where) for v in value) + "]"
     if isinstance(value, str):
         return _quoted(value)
-    if value is None or isinstance(value, bool | int | float):
-        return json.dumps(value) if value is None or isinstance(value, bool) else repr(value)
+    if value is None or isinstance(value, bool):
+        return json.dumps(value)
+    if isinstance(value, int | float):
+        return repr(value)
     raise UserError(f"{where}: {value!r} is neither text nor number")
 
 
@@ -184,7 +192,7 @@ def _quoted(text: str) -> str:
     return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 
 
-def _parse(command: str, word: str, groups: dict[str, list[str]]) -> Override:
+def _parse(command: str, word: str, groups: Groups) -> Override:
     key, equals, value = word.partition("=")
     if not equals and not word.startswith("~"):
         remedy = f"see `ipe-bench {command} --help`"
@@ -216,9 +224,9 @@ def _parse(command: str, word: str, groups: dict[str, list[str]]) -> Override:
 # Checking
 
 
-def _check(override: Override, groups: dict[str, list[str]]) -> None:
+def _check(override: Override, groups: Groups) -> None:
     group = override.key_or_group
-    if group.split("/")[0].split(".")[0] == "hydra":
+    if re.split("[./]", group)[0] == "hydra":
         return
     if override.is_delete():
         _check_deletion(override)
@@ -239,7 +247,7 @@ def _check_deletion(override: Override) -> None:
         raise UserError(f"{said(override)}: only estimators.LABEL can be left out; give the key another value")
 
 
-def _check_key(override: Override, groups: dict[str, list[str]]) -> None:
+def _check_key(override: Override, groups: Groups) -> None:
     key, word = override.key_or_group, said(override)
     first = key.split(".")[0]
     if override.package is not None or ("/" in key and first.split("/")[0] in groups):
@@ -261,24 +269,21 @@ def _check_place(override: Override) -> None:
     """Whether a part lands where something looks for it."""
     group, package, word = override.key_or_group, override.package, said(override)
     added = override.is_add() or override.is_force_add()
-    if package is None:
-        if group == "experiment" and not added:
-            raise UserError(f"{word}: an experiment is added, not overridden; write +experiment=NAME")
-        if group != "experiment" and added:
-            raise UserError(f"{word}: {group} is there to be chosen, not added; leave out the +")
-    elif group in plugins.ESTIMATOR_GROUPS:
-        home, _, label = package.partition(".")
-        if home != "estimators" or not label or "." in label:
-            raise UserError(f"{word}: goes nowhere; write +{group}@estimators.LABEL=NAME")
+    if group == "experiment" and package is None:
         if not added:
-            raise UserError(f"{word}: a label of its own is added; write +{group}@{package}=NAME")
-    elif (group, package) != ("measurement", TRUTH):
+            raise UserError(f"{word}: an experiment is added, not overridden; write +experiment=NAME")
+    elif package is None or (group, package) == ("measurement", TRUTH):
+        if added:
+            raise UserError(f"{word}: {package or group} is there to be chosen, not added; leave out the +")
+    elif group not in plugins.ESTIMATOR_GROUPS:
         raise UserError(f"{word}: goes nowhere; write {group}=NAME")
-    elif added:
-        raise UserError(f"{word}: {TRUTH} is there to be chosen, not added; leave out the +")
+    elif not re.fullmatch(r"estimators\.[^.]+", package):
+        raise UserError(f"{word}: goes nowhere; write +{group}@estimators.LABEL=NAME")
+    elif not added:
+        raise UserError(f"{word}: a label of its own is added; write +{group}@{package}=NAME")
 
 
-def _check_choice(override: Override, groups: dict[str, list[str]]) -> None:
+def _check_choice(override: Override, groups: Groups) -> None:
     """Whether each value is an option of the group that can be used."""
     group, word = override.key_or_group, said(override)
     several = group in plugins.ESTIMATOR_GROUPS and override.package is None
@@ -304,17 +309,16 @@ def _check_choice(override: Override, groups: dict[str, list[str]]) -> None:
                 raise UserError(f"{word}: {name} stands there twice and would run once; {remedy}")
 
 
-def no_option(group: str, name: str, groups: dict[str, list[str]]) -> str:
+def no_option(group: str, name: str, groups: Groups) -> str:
     """What to write in place of an option that its group lacks: its own group, where another group has it."""
     for other, names in groups.items():
         if name in names and other != group:
             shown = f"[{name}]" if other in plugins.ESTIMATOR_GROUPS else name
             return f"{name} is no {group} but a {other}; write {other}={shown}"
-    known = groups[group]
-    same = [one for one in known if one.lower() == name.lower()]
-    if name.lower().startswith("nist/") and group == "measurement":
-        return unknown(name.lower(), [one for one in known if one.startswith("nist/")], "data set")
-    return unknown(same[0] if same else name, [one for one in known if not one.startswith("nist/")], "option")
+    nist = group == "measurement" and name.lower().startswith("nist/")
+    known = [one for one in groups[group] if one.startswith("nist/") == nist]
+    meant = next((one for one in known if one.lower() == name.lower()), name)
+    return unknown(meant.lower() if nist else meant, known, "data set" if nist else "option")
 
 
 def _check_range(override: Override) -> None:
@@ -355,15 +359,6 @@ def jobs(overrides: Sequence[Override]) -> Iterator[list[Override]]:
     return map(list, itertools.product(*axes.values()))
 
 
-def count(overrides: Sequence[Override]) -> int:
-    """How many jobs a sweep has."""
-    axes = {one.get_key_element(): one for one in overrides}
-    number = 1
-    for one in axes.values():
-        number *= sum(1 for _ in one.sweep_string_iterator()) if one.is_discrete_sweep() else 1
-    return number
-
-
 def settled(overrides: Sequence[Override]) -> list[Override]:
     """One job of a sweep: the first, without what only a sweeper can choose."""
     return next(jobs([copy.copy(one) for one in overrides if not one.is_interval_sweep()]), [])
@@ -375,6 +370,8 @@ def settled(overrides: Sequence[Override]) -> list[Override]:
 _NO_PART_OF_A_NAME = ("name", "output", "trials", "block_size", "seed", "execution", "experiment", "hydra", "readings")
 _NO_PART_OF_A_NAME += ("precision", "time_limit", "write_readings", "write_readings_trial", "default_name", "objective")
 _NO_PART_OF_A_NAME += ("figures", "formats")
+_BARE = ("measurement", "measurement.dataset", "noise", *plugins.ESTIMATOR_GROUPS)
+"""Keys whose values speak for themselves."""
 _LONGEST_NAME = 80
 
 
@@ -387,8 +384,7 @@ def default_name(overrides: Sequence[Override]) -> str:
     experiment = ""
     for override in overrides:
         key, _, value = (override.input_line or "").partition("=")
-        key = key.lstrip("+~").replace(HYDRAS_TRUTH, "truth").partition("@estimators.")
-        key = key[2] or key[0]
+        key = key.lstrip("+~").replace(HYDRAS_TRUTH, "truth").rpartition("@estimators.")[2]
         text = re.sub(r"[\[\]'\" ]", "", value.replace("],[", ";").replace(",", "+") if "[" in value else value)
         if override.key_or_group == "experiment":
             experiment = text
@@ -396,10 +392,9 @@ def default_name(overrides: Sequence[Override]) -> str:
             parts[key] = f"no_{key}" if override.is_delete() or text == "" else text
     if experiment and parts["measurement"] == "gins":
         parts["measurement"] = experiment
-    order = ["measurement", "measurement.dataset", "truth", "noise", *plugins.ESTIMATOR_GROUPS]
+    order = [*_BARE[:2], "truth", *_BARE[2:]]
     keys = sorted(parts, key=lambda k: (order.index(k) if k in order else len(order), k))
-    bare = ("measurement", "measurement.dataset", "noise", *plugins.ESTIMATOR_GROUPS)
-    full = "-".join(parts[k] if k in bare else f"{k.removeprefix('estimators.')}={parts[k]}" for k in keys)
+    full = "-".join(parts[k] if k in _BARE else f"{k.removeprefix('estimators.')}={parts[k]}" for k in keys)
     full = full.replace("/", "-")
     short = re.sub(r"[^\w.,=+-]", "_", full, flags=re.ASCII)
     if short == full and len(full) <= _LONGEST_NAME:
