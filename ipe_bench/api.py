@@ -53,17 +53,15 @@ def run(
 ) -> pd.DataFrame:
     """Runs every estimator on the same trials of every scenario and summarises what is known of them.
 
-    `estimators` maps labels to estimators. What `output` holds already is not computed again; without `output` nothing
-    is kept. Returns the tidy summary: a row per scenario, estimator and parameter, plus the parameter `all`, the root
-    mean square over parameters of error over bound; `rmse` and its kin are in the parameter's own unit. What could not
-    be computed is left out, with a warning that says why.
+    What `output` holds already is not computed again; without `output` nothing is kept. Returns a row per scenario,
+    estimator and parameter, plus the parameter `all`, the root mean square over parameters of error over bound; `rmse`
+    and its kin are in the parameter's own unit. What could not be computed is left out, with a warning that says why.
 
     There are 1000 `trials` unless another number is given. With `precision` there are just enough, and `trials` is the
-    most there may be (100,000 unless given): blocks are added to what is stored until every success share is known to
-    within that number, or what is named, as in {"success": 0.01, "rmse": 0.05}, to within its own (rmse: relative), or
-    until `time_limit` seconds are over. What is then known to that precision is `success_anytime` and `rmse_anytime`,
-    whose intervals stay valid under such looking. `attrs["stops"]` says how many trials each scenario took, and why no
-    more.
+    most there may be (100,000 unless given): blocks are added until every success share is known to within that number,
+    or what is named, as in {"success": 0.01, "rmse": 0.05}, to within its own (rmse: relative), or `time_limit` seconds
+    are over. `success_anytime` and `rmse_anytime` have intervals that stay valid under such looking; `attrs["stops"]`
+    says how many trials each scenario took, and why no more.
 
     >>> import ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -106,12 +104,11 @@ def run(
 def load(directories: Directories) -> pd.DataFrame:
     """Every stored trial of one directory or bundle, or of several: a row per trial and estimator.
 
-    Columns that say what a row belongs to: measurement, noise, prior, error_scale, seed, estimator, every key of the
-    config that differs between scenarios, and `estimator.KEY` for options that differ under one label. Then what the
-    trial came to: `error_NAME` and `deviation_NAME` (as the estimator reports it) per parameter, status, message,
-    iterations, simulations, jacobians, time_s, crlb_distance, nees, fit_p, solved, success; and the truth `x_NAME` with
-    its bounds `crlb_NAME` and `bayes_NAME`. Parameters are in multiples of their sizes. What a row does not have is
-    NaN. What is missing or damaged is a warning, and stale results are left out.
+    A row belongs to a measurement, noise, prior, error_scale, seed and estimator, and to every key of the config that
+    differs (`estimator.KEY` for options under one label). It has `error_NAME` and `deviation_NAME` (as the estimator
+    reports it) per parameter, status, message, iterations, simulations, jacobians, time_s, crlb_distance, nees, fit_p,
+    solved, success, and the truth `x_NAME` with its bounds `crlb_NAME` and `bayes_NAME`, all in multiples of the
+    parameters' sizes. What is missing or damaged is a warning, and stale results are left out.
 
     >>> import tempfile, ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -146,10 +143,8 @@ def report(
 ) -> ReportResult:
     """Writes summary.csv, tables/, figures/ and report.html from what is stored, into `output` or the first directory.
 
-    `figures` are all that the data allow, main (the few that answer the question) or none. They are PNG files; with
-    `formats` such as "pdf" or ["pdf", "svg"] they are written so as well.
-
-    The result names the files, and has the summary itself and a line per piece that is missing, failed or damaged.
+    `figures` are all that the data allow, main (the few that answer the question) or none, as PNG files and in further
+    `formats` such as "pdf" or ["pdf", "svg"]. The result names the files, and has the summary and the problems.
 
     >>> import ipe_bench as ib
     >>> ib.report("outputs/nowhere")
@@ -180,16 +175,14 @@ def compare(
 
     Compares every estimator that both directories have, on every scenario that both have, or `first` of the first with
     `second` of the second; without a second directory both are in the first one. Where no scenario is in both, those
-    are compared that differ in one setting alone. Trials are matched by seed and number; those of other seeds in their
-    order, which is right and gains nothing.
+    are compared that differ in one setting alone. Trials are matched by seed and number, else in their order.
 
     Returns a row per comparison and quantity: success (share; `change` is a difference), error (mean Mahalanobis error,
     each trial's at most the radius of the gate; a ratio), cost in simulations (a ratio), and time, which is not tested.
     `low` and `high` are the ends of the row's own interval, `p` is corrected over all rows (Holm), and `e` is evidence
-    that may be looked at after any number of trials; `finding` says what the second is: better, worse or neither
-    surely, by p below `alpha`, or by e where `anytime`. `attrs["worse"]` has a line for everything in `fail_on` that is
-    worse, `attrs["problems"]` for what is missing, `attrs["stale"]` for what older code computed, `attrs["notes"]` for
-    what is left out. With `output`, comparison.csv and figures are written there.
+    that may be looked at after any number of trials; `finding` says what the second is, by p below `alpha`, or by e
+    where `anytime`. `attrs` has lines on what of `fail_on` is `worse`, and on `problems`, `stale` results and `notes`.
+    With `output`, comparison.csv, a page and figures are written there.
 
     >>> import tempfile, ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -202,7 +195,10 @@ def compare(
     Raises:
         UserError: there is nothing to compare.
     """
-    from ipe_bench.statistics.between import JUDGED
+    import pandas as pd
+
+    from ipe_bench.statistics.between import JUDGED, compared, described, left_out
+    from ipe_bench.statistics.collect import collect
 
     if not 0 < alpha < 1:
         raise UserError(f"alpha={alpha}: give a number between 0 and 1")
@@ -217,7 +213,16 @@ def compare(
             f"compare: {label} is compared with itself; name another folder, or first=LABEL and second=LABEL"
         )
     with opened(paths[0]) as one, opened(paths[1]) as other:
-        frame = _compared([one, other], (first, second), alpha, anytime, fail_on)
+        for part in (one, other):
+            require_results(part)
+        collections = [collect(part) for part in (one, other)]
+        frame = pd.DataFrame(compared(collections[0], collections[1], (first, second), alpha=alpha, anytime=anytime))
+    worse = frame[(frame["finding"] == "worse") & frame["quantity"].isin(list(fail_on))]
+    rows = [{str(name): value for name, value in row.items()} for row in worse.to_dict("records")]
+    frame.attrs["worse"] = [f"{row['second']} in {row['quantity']}, {described(row)}" for row in rows]
+    for name in ("problems", "stale"):
+        frame.attrs[name] = list(dict.fromkeys(line for c in collections for line in getattr(c, name)))
+    frame.attrs["notes"] = left_out(*collections)
     if output is not None:
         from ipe_bench.report.comparison import write_comparison
 
@@ -225,38 +230,11 @@ def compare(
     return frame
 
 
-def _compared(
-    paths: Sequence[Sequence[Path]],
-    labels: tuple[str | None, str | None],
-    alpha: float,
-    anytime: bool,
-    fail_on: Sequence[str],
-) -> pd.DataFrame:
-    """What `compare` returns of two lists of folders."""
-    import pandas as pd
-
-    from ipe_bench.statistics.between import compared, described, left_out
-    from ipe_bench.statistics.collect import collect
-
-    for part in paths:
-        require_results(part)
-    collections = [collect(part) for part in paths]
-    frame = pd.DataFrame(compared(collections[0], collections[1], labels, alpha=alpha, anytime=anytime))
-    worse = frame[(frame["finding"] == "worse") & frame["quantity"].isin(list(fail_on))]
-    rows = [{str(name): value for name, value in row.items()} for row in worse.to_dict("records")]
-    frame.attrs["worse"] = [f"{row['second']} in {row['quantity']}, {described(row)}" for row in rows]
-    for name in ("problems", "stale"):
-        frame.attrs[name] = list(dict.fromkeys(line for c in collections for line in getattr(c, name)))
-    frame.attrs["notes"] = left_out(*collections)
-    return frame
-
-
 def status(directories: Directories) -> pd.DataFrame:
-    """How far everything is that runs asked for: a row per scenario and estimator.
+    """How far everything is that runs asked for: a row per scenario and estimator (`truth`: the truth and its bounds).
 
-    Columns: measurement, noise, prior, error_scale, seed, estimator (`truth` for the truth and its bounds); the numbers
-    of trials `expected`, `done`, `missing`, `failed` and `stale`; and `messages`, why trials failed. The list
-    `attrs["problems"]` has a line for everything that is missing, failed or damaged; it is empty where all is there.
+    It has the numbers of trials `expected`, `done`, `missing`, `failed` and `stale`, and `messages`, why trials failed.
+    `attrs["problems"]` has a line for everything that is missing, failed or damaged.
 
     >>> import tempfile, ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -298,15 +276,13 @@ def estimate(
     """Parameters from real readings, by every estimator: estimates, standard errors, residuals and a test of the fit.
 
     `readings` is a CSV file (see `ipe_bench.real.readings`), several that share parameters, or an array z (m,) in the
-    model's order and unit; NaN is missing. None: those that come with the model. Without `estimators`: `linear_lse`,
-    `levenberg_marquardt` and `auto`, as in the command. `noise` states R. Without it R is what the file says in its
-    column sigma, or the model of its own noise; where neither does, the readings are taken for independent and equally
-    noisy, and the level is estimated from the residuals (`Unknown`): then their size cannot test the fit. Filters and
-    `map_lm` need to know how far from the model's nominal point the parameters may be: `error_scale` is the standard
-    deviation of each in multiples of its size, and `prior` widens or narrows some, or makes them depend on each other
-    (`ipe_bench.priors.prior_of` makes one of a covariance). `ignore_rows` and `ignore_columns` of the files are left
-    out (see `LeftOut`). `x` and `covariance` of a fit are in the parameters' own units. The answer is the sequence of
-    the fits; it shows itself in a notebook, and `table()` is a frame.
+    model's order and unit, NaN where missing; None: those that come with the model. `noise` states R; without it R is
+    what the file says in its column sigma, or the model of its own noise, or else one level for all is estimated from
+    the residuals (`Unknown`), whose size then cannot test the fit. Filters and `map_lm` need a prior:
+    `error_scale` is the standard deviation of each parameter in multiples of its size, and `prior` widens or narrows
+    some, or makes them depend on each other (`ipe_bench.priors.prior_of` makes one of a covariance). `ignore_rows` and
+    `ignore_columns` of the files are left out. `x` and `covariance` of a fit are in the parameters' own units. The
+    answer is the sequence of the fits; it shows itself in a notebook, and `table()` is a frame.
 
     >>> import ipe_bench as ib
     >>> model = ib.measurements.Polynomial()
@@ -350,13 +326,11 @@ def design(
     The result has `observability` (singular values, bounds, correlations, the least observable direction),
     `suspects` (what each error of the richer models `errors` does to the estimates, and whether a test of residuals
     will notice), `ways` and `effects`. The richer models are the scenario's truth, or every option of `measurement`
-    that is the same model with more errors, unless others are given. A way chooses by one column of the model's index,
-    all else as today, or reading by reading; `by` names the columns of one way instead. Its `saving` is the choice of
-    fewest readings whose mean bound is not above today's, its `sharpest` the smallest mean bound with `readings`
-    readings (today's number where it is None); units that gain most are taken one after another.
-    `measurement(choice)` is the model with those readings.
-    Bounds are averaged over truths from the prior: as squares over parameters in units of today's bound
-    (`criterion` A), or as the volume of the ellipsoid (D).
+    that is the same model with more errors, unless others are given. A way chooses by one column of the model's index
+    or reading by reading; `by` names the columns of one way instead. Its `saving` has the fewest readings whose
+    mean bound is not above today's, its `sharpest` the smallest mean bound with `readings` readings (today's number
+    where it is None), of which `measurement(choice)` is the model. Bounds are averaged over truths from the prior: as
+    squares over parameters in units of today's bound (`criterion` A), or as the volume of the ellipsoid (D).
 
     >>> import ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -383,11 +357,10 @@ def posterior(
 ) -> list[Reference]:
     """What the readings of a scenario's first trials really say, and how far each estimator's Gaussian is from it.
 
-    The posterior is sampled by sequential Monte Carlo, with nothing linearised, for the normal errors of covariance R
-    that estimators are told. A result has the trial's `truth` (n,), the `posterior` (draws `x` (draws, n) in multiples
-    of the parameters' sizes, `mean`, `covariance`, `modes` with their `shares`, and whether it has `settled`: two
-    populations of particles agree), and for each estimator its `estimates` and a `divergences` entry: `kl` in nats,
-    `shift`, `width` and `energy`.
+    The posterior is sampled by sequential Monte Carlo for normal errors of the covariance R that estimators assume. A
+    result has the `truth` (n,), the `posterior` (draws `x` (draws, n) in multiples of the parameters' sizes, `mean`,
+    `covariance`, `modes` with their `shares`, and whether it has `settled`: two populations agree), and for
+    each estimator its `estimates` and a `divergences` entry: `kl` in nats, `shift`, `width` and `energy`.
 
     >>> import ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ipe_bench.api import check
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import console, print_problems
+from ipe_bench.cli import print_problems, say
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.conformance import Finding
 
@@ -22,18 +22,16 @@ def main(folders: Sequence[str]) -> int:
     for folder in folders:
         plugins.options_in(Path(folder))  # a mistake in the second is said before the first is checked
     print_problems(plugins.take_problems())
-    return 1 if sum(_check_plugin(folder) for folder in folders) else 0
-
-
-def _check_plugin(folder: str) -> int:
-    out = console()
-    findings = [*check(folder), *_check_experiments(folder)]
-    for finding in findings:
-        out.print(_line(finding), markup=False, soft_wrap=True)
-    failed = sum(bool(finding.complaint) for finding in findings)
-    verdict = f"{failed} of {len(findings)} checks failed" if failed else "all checks passed"
-    out.print(f"{folder}: {verdict}", markup=False)
-    return failed
+    failed = 0
+    for folder in folders:
+        findings = [*check(folder), *_check_experiments(folder)]
+        for one in findings:
+            complaint = f" -- {one.complaint}" if one.complaint else ""
+            say(f"{'FAILED' if complaint else 'ok':7}{one.component}: {one.check}{complaint}")
+        wrong = sum(bool(finding.complaint) for finding in findings)
+        say(f"{folder}: {f'{wrong} of {len(findings)} checks failed' if wrong else 'all checks passed'}")
+        failed += wrong
+    return 1 if failed else 0
 
 
 def _check_experiments(folder: str) -> Iterator[Finding]:
@@ -42,18 +40,10 @@ def _check_experiments(folder: str) -> Iterator[Finding]:
 
     for option in plugins.options_in(Path(folder)):
         if option.group == "experiment" and option.fault is None:
-            name, what = f"experiment={option.name}", "Asks for what there is"
+            complaint = ""
             with tempfile.TemporaryDirectory(prefix="ipe-bench-") as output, redirect_stdout(io.StringIO()):
                 try:
                     run([f"+experiment={option.name}", f"output={output}/out", "--dry-run"])
                 except UserError as error:
-                    yield Finding(name, what, str(error))
-                else:
-                    yield Finding(name, what)
-
-
-def _line(finding: Finding) -> str:
-    verdict = "FAILED" if finding.complaint else "ok"
-    return f"{verdict:7}{finding.component}: {finding.check}" + (
-        f" -- {finding.complaint}" if finding.complaint else ""
-    )
+                    complaint = str(error)
+            yield Finding(f"experiment={option.name}", "Asks for what there is", complaint)

@@ -31,45 +31,43 @@ class DryRun:
     workers: int = 1
     most: str = ""
     """Says so where a precision may stop a job earlier."""
-    _tried: dict[tuple[str, str, float], float] = field(default_factory=dict)
+    tried: dict[tuple[str, str, float], float] = field(default_factory=dict)
     """Seconds per trial, by what they depend on most."""
 
     def add(self, job: Spec, title: str) -> str:
         """Notes what a job lacks; a line for people."""
         validate([job.scenario], job.estimators, job.count, job.block_size)
-        cells = result_keys(job.scenario, job.estimators)
-        output = Path(job.output)
+        cells, output = result_keys(job.scenario, job.estimators), Path(job.output)
         results = Results.read([output] if output.is_dir() else [], keys={cell.key for cell in cells})
-        lacking = {cell.key: 0 for cell in cells}
+        lacking = dict.fromkeys((cell.key for cell in cells if cell.estimator is not None), 0)
         for task in plan(output, cells, results, job.count, job.block_size):
             for cell in task.cells:
-                lacking[cell.key] += task.stop - task.start
-        estimates = [cell for cell in cells if cell.estimator is not None]
-        missing = sum(lacking[cell.key] for cell in estimates)
-        stored = job.count * len(estimates) - missing
-        seconds = sum(lacking[c.key] * self._per_trial(c, results) for c in estimates if lacking[c.key])
-        self.stored, self.missing, self.seconds = self.stored + stored, self.missing + missing, self.seconds + seconds
+                if cell.key in lacking:
+                    lacking[cell.key] += task.stop - task.start
+        asked, missing = job.count * len(lacking), sum(lacking.values())
+        seconds = sum(lacking[c.key] * self._per_trial(c, results) for c in cells if lacking.get(c.key))
+        self.stored += asked - missing
+        self.missing += missing
+        self.seconds += seconds
         most = "" if job.precision is None else "at most "
         self.most = self.most or most
         self.workers = getattr(job.execution, "workers", None) or cores()
-        return f"{title}: {stored} of {job.count * len(estimates)} estimates are stored" + (
-            f", {most}{missing} are missing (on one core {duration(seconds)})" if missing else ""
-        )
+        more = f", {most}{missing} are missing (on one core {duration(seconds)})" if missing else ""
+        return f"{title}: {asked - missing} of {asked} estimates are stored{more}"
 
     def _per_trial(self, cell: ResultKey, results: Results) -> float:
         """Seconds: those of the trials that are stored, else of some that are tried here."""
-        known = results.stored.get(cell.key)
+        known, scenario = results.stored.get(cell.key), cell.scenario
         if known is not None:
             return float(np.nanmean(results.load(known, ("time_s",))["time_s"]))
-        scenario = cell.scenario
         place = (cell.label, scenario.measurement.name, scenario.error_scale)
-        if place not in self._tried and cell.estimator is not None:
+        if place not in self.tried and cell.estimator is not None:
             block = Block.draw(scenario, 0, 1 if scenario.noise.real else _TRIED)
             block.estimate(cell.estimator)  # compiled code is loaded
             began = time.perf_counter()
             block.estimate(cell.estimator)
-            self._tried[place] = (time.perf_counter() - began) / len(block.trials.x)
-        return self._tried[place]
+            self.tried[place] = (time.perf_counter() - began) / len(block.trials.x)
+        return self.tried[place]
 
     def summary(self) -> str:
         """What it comes to, in a line."""

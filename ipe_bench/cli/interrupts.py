@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from types import FrameType
+from typing import Any
 
 EXIT_CODE = 130
 STOPPED = "stopped; what was computed is kept, and the same command goes on from there"
@@ -31,7 +31,7 @@ def came() -> bool:
     return _state["came"]
 
 
-def _listen(number: int, frame: FrameType | None) -> None:
+def _listen(*_: Any) -> None:
     _state["came"] = True
     if _state["working"]:
         raise KeyboardInterrupt

@@ -9,23 +9,12 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
+from ipe_bench.basics.errors import StorageError, UserError, shortened, unknown
 from ipe_bench.cli import discard_output, interrupts
+from ipe_bench.cli.parser import COMMANDS, parsers
 
-COMMANDS = (
-    "run",
-    "estimate",
-    "design",
-    "posterior",
-    "report",
-    "compare",
-    "bundle",
-    "status",
-    "list",
-    "check",
-    "new",
-    "schema",
-)
 GONE = {
     "completion": 'eval "$(ipe-bench -sc install=bash)"'
     " lets bash complete (install=zsh, install=fish likewise); "
@@ -65,7 +54,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _explain(error: BaseException) -> tuple[int, str]:
     """The exit code and the line for what ended the command; raises again what is a bug."""
-    from ipe_bench.basics.errors import StorageError, UserError
     from ipe_bench.plugins.discovery import blame
 
     if isinstance(error, KeyboardInterrupt) or interrupts.came():
@@ -73,39 +61,29 @@ def _explain(error: BaseException) -> tuple[int, str]:
     if isinstance(error, UserError | StorageError):
         return 2 if isinstance(error, UserError) else 1, " ".join(str(error).split())
     if isinstance(error, OSError):
-        return _explain_os_error(error)
+        reason = error.strerror or str(error)
+        where = "a file" if error.filename is None else shortened(str(error.filename))
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return 1, f"{where}: {reason}; what was stored before is whole, and the same command goes on from there"
+        return 2, f"{where}: cannot be used ({reason}); choose another file or folder, for results with output="
     line = blame(error)
     if line is None:
         raise error
     return 2, line
 
 
-def _show_warning(message: Warning | str, category: type[Warning], *where: object, **options: object) -> None:
+def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     print(f"ipe-bench: warning: {' '.join(str(message).split())}", file=sys.stderr)
 
 
-def _explain_os_error(error: OSError) -> tuple[int, str]:
-    """The exit code and the line for a file or folder that cannot be read or written."""
-    from ipe_bench.basics.errors import shortened
-
-    reason = error.strerror or str(error)
-    where = shortened(str(error.filename)) if error.filename is not None else "a file"
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return 1, f"{where}: {reason}; what was stored before is whole, and the same command goes on from there"
-    return 2, f"{where}: cannot be used ({reason}); choose another file or folder, for results with output="
-
-
 def _dispatch(words: list[str]) -> int:
-    # Late, so that Ctrl-C is listened to while they load.
-    from ipe_bench import __version__
-    from ipe_bench.basics.errors import UserError, unknown
-    from ipe_bench.cli.parser import parsers
-
     command, *rest = words or ["--help"]
     if command in ("-h", "--help", "help"):
         parsers()[0].print_help()
         return 0
     if command == "--version":
+        from ipe_bench import __version__
+
         print(f"ipe-bench {__version__}")
         return 0
     if command in ("-sc", "--shell-completion"):  # asked of the bare program; only `run` has anything to complete

@@ -21,6 +21,35 @@ def main(kind: str, name: str) -> int:
     """Writes plugins/NAME in the working folder."""
     if kind not in KINDS:
         raise UserError(f"{kind}: {unknown(kind, KINDS, 'kind')}")
+    _check_name(kind, name)
+    folder, package = Path("plugins") / name, f"ipe_bench_{name}"
+    if folder.exists():
+        raise UserError(f"{folder}: is there already and is not overwritten; choose another name")
+    class_name = "".join(part.title() for part in name.split("_"))
+    words = {"kind": kind, "name": name, "package": package, "Class": class_name, "record": RECORDS.get(kind, "")}
+    family = "record_" if kind in RECORDS else "experiment_" if kind == "experiment" else ""
+    texts = {
+        "pyproject.toml": "pyproject.toml",
+        "README.md": f"{family}readme.md" if family else "README.md",
+        f"{package}/__init__.py": f"{family}init.py",
+        f"{package}/{name}.py": f"{kind}.py",
+        f"{package}/conf/{kind}/{name}.yaml": "record.yaml" if kind in RECORDS else f"{kind}.yaml",
+        f"tests/test_{name}.py": f"{family}test.py",
+    }
+    if kind == "experiment":  # it has no class
+        del texts[f"{package}/{name}.py"]
+    for target, source in texts.items():
+        path = folder / target
+        path.parent.mkdir(parents=True, exist_ok=True)
+        template = files("ipe_bench.plugins") / "templates" / f"{source}.template"
+        path.write_text(Template(template.read_text(encoding="utf-8")).substitute(words), encoding="utf-8")
+    choices = {"solver": f'"solver=[{name}]"', "baseline": f'"baseline=[{name}]"', "experiment": f"+experiment={name}"}
+    choose = "" if kind in RECORDS else choices.get(kind, f"{kind}={name}") + " "
+    print(f"{folder} is ready. Try:\n  ipe-bench check {folder}\n  ipe-bench run {choose}trials=100")
+    return 0
+
+
+def _check_name(kind: str, name: str) -> None:
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise UserError(f"{name}: give a name of small letters, digits and underscores that starts with a letter")
     if len(name) > LONGEST:
@@ -30,51 +59,9 @@ def main(kind: str, name: str) -> int:
     rivals = plugins.ESTIMATOR_GROUPS if kind in plugins.ESTIMATOR_GROUPS else (kind,)
     for option in plugins.options():
         if option.group in rivals and option.name == name:
-            raise UserError(
-                f"{name}: {option.group}={name} is there already ({option.source.origin}); choose another name"
-            )
-    _refuse_column(kind, name)
-    folder = Path("plugins") / name
-    if folder.exists():
-        raise UserError(f"{folder}: is there already and is not overwritten; choose another name")
-    package = f"ipe_bench_{name}"
-    class_name = "".join(part.title() for part in name.split("_"))
-    words = {"kind": kind, "name": name, "package": package, "Class": class_name, "record": RECORDS.get(kind, "")}
-    texts = {
-        "pyproject.toml": "pyproject.toml",
-        "README.md": "README.md",
-        f"{package}/__init__.py": "init.py",
-        f"{package}/{name}.py": f"{kind}.py",
-        f"{package}/conf/{kind}/{name}.yaml": f"{kind}.yaml",
-        f"tests/test_{name}.py": "test.py",
-    }
-    if kind == "experiment":  # it has no class
-        texts = {
-            "pyproject.toml": "pyproject.toml",
-            "README.md": "experiment_readme.md",
-            f"{package}/__init__.py": "experiment_init.py",
-            f"{package}/conf/experiment/{name}.yaml": "experiment.yaml",
-            f"tests/test_{name}.py": "experiment_test.py",
-        }
-    elif kind in RECORDS:
-        own = {"README.md": "record_readme.md", f"{package}/__init__.py": "record_init.py"}
-        own |= {f"{package}/conf/{kind}/{name}.yaml": "record.yaml", f"tests/test_{name}.py": "record_test.py"}
-        texts |= own
-    templates = files("ipe_bench.plugins") / "templates"
-    for target, source in texts.items():
-        path = folder / target
-        path.parent.mkdir(parents=True, exist_ok=True)
-        text = (templates / f"{source}.template").read_text(encoding="utf-8")
-        path.write_text(Template(text).substitute(words), encoding="utf-8")
-    choices = {"solver": f'"solver=[{name}]"', "baseline": f'"baseline=[{name}]"', "experiment": f"+experiment={name}"}
-    choose = "" if kind in RECORDS else choices.get(kind, f"{kind}={name}") + " "
-    print(f"{folder} is ready. Try:\n  ipe-bench check {folder}\n  ipe-bench run {choose}trials=100")
-    return 0
-
-
-def _refuse_column(kind: str, name: str) -> None:
-    """A statistic is a column of the summary, which has ours already."""
-    if kind == "statistic":
+            origin = option.source.origin
+            raise UserError(f"{name}: {option.group}={name} is there already ({origin}); choose another name")
+    if kind == "statistic":  # a column of the summary
         from ipe_bench.statistics.records import SCORES, STATISTICS, frame_columns
 
         if name in frame_columns([*STATISTICS, *SCORES]):

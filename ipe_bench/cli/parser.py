@@ -22,10 +22,59 @@ _CODES = """\
 `ipe-bench COMMAND --help` says more of one command.
 Exit codes: 0 done; 1 done, but some pieces failed or are missing; 2 a mistake in what was asked for; 130 Ctrl-C.
 """
-_ESTIMATE = """
+KINDS = ("solver", "baseline", "measurement", "noise", "prior", "execution")
+KINDS += ("statistic", "figure", "table", "section", "experiment")
+"""Of plugins that `new` makes."""
+INFO_TOPICS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
+_MISSING = "0 done; 1 done, but something that was asked for is missing"
+
+Argument = tuple[tuple[str, ...], dict[str, Any]]
+
+
+def _argument(*names: str, **options: Any) -> Argument:
+    return names, options
+
+
+def _several(name: str, metavar: str, what: str) -> Argument:
+    return _argument(name, metavar=metavar, nargs="*", help=what)
+
+
+def _verbose(what: str) -> Argument:
+    return _argument("-v", "--verbose", action="store_true", help=what)
+
+
+COMMANDS: dict[str, tuple[str, str, str, tuple[Argument, ...]]] = {
+    "run": (
+        "simulate, estimate, store and report",
+        "0 done; 1 done, but something failed",
+        """
+  ipe-bench run error_scale=33 "solver=[fixed_point,newton]" "baseline=[linear_lse]"
+  ipe-bench run +experiment=paper                               an experiment, which may be a sweep
+  ipe-bench run -m error_scale=1,10,100 seed=1,2                a job for each combination
+  ipe-bench run +solver@estimators.second=newton estimators.second.tolerance=1e-3
+
+`ipe-bench list keys` has all keys, `ipe-bench list` the options of measurement=, noise=, solver= and the other groups.
+""",
+        (
+            _several("overrides", "KEY=VALUE", "see `ipe-bench list keys` and `ipe-bench list`"),
+            _argument(
+                "--dry-run", action="store_true", help="say what is stored, what is missing and how long it takes"
+            ),
+            _argument("-m", "--multirun", action="store_true", help="run all jobs of a sweep"),
+            _argument("-c", "--cfg", choices=("job", "hydra", "all"), help="print the config, and run nothing"),
+            _argument("-p", "--package", help="with --cfg: the part of the config to print"),
+            _argument("--resolve", action="store_true", help="with --cfg: replace interpolations"),
+            _argument("-i", "--info", nargs="?", const="all", choices=INFO_TOPICS, help="what Hydra finds where"),
+            _argument("-cd", "--config-dir", metavar="DIR", help="a folder with options and experiments of your own"),
+            _argument("-sc", "--shell-completion", action="store_true", help="install=SHELL or uninstall=SHELL"),
+        ),
+    ),
+    "estimate": (
+        "parameters from real readings, and whether the model fits them",
+        "0 some estimator has an answer; 1 none has, or the model fits none",
+        """
   ipe-bench estimate readings=FILE.csv                          the default model, gins
-  ipe-bench estimate measurement=ranging readings=FILE.parquet
-  ipe-bench estimate measurement=gins readings=FILE.csv "solver=[newton]" "baseline=[gauss_newton,ekf]"
+  ipe-bench estimate measurement=gins readings=FILE.parquet "solver=[newton]" "baseline=[gauss_newton,ekf]"
   ipe-bench estimate measurement=nist/misra1a                   readings that come with the model
   ipe-bench estimate measurement=formula "measurement.expression=a*(1-exp(-b*t))" measurement.start.a=5 \\
       measurement.start.b=0.3 readings=FILE.csv                 your own formula of parameters and columns
@@ -46,9 +95,13 @@ output=DIR          where the files go: outputs/estimate-MODEL unless given, or 
 Files: estimate.json (estimates, standard errors, correlations, tests, versions), residuals.csv, and as PNG and PDF
 residuals (normalised, by time), ellipses (95 % regions of the most correlated pairs of parameters) and, where the model
 bends, likelihood (profiles); estimate.html has all of it on one page.
-"""
-_DESIGN = """
-  ipe-bench design                                              the default model, gins
+""",
+        (_several("arguments", "KEY=VALUE", "whatever `ipe-bench run` takes"),),
+    ),
+    "design": (
+        "what the readings will say of each parameter, and which to take instead",
+        "0 the readings determine every parameter; 1 they do not",
+        """
   ipe-bench design measurement=ranging error_scale=10
   ipe-bench design measurement=gins --by time                   the same cases and axes, at other times
   ipe-bench design measurement=gins truth_measurement=gins_tilted
@@ -57,12 +110,25 @@ Nothing is simulated with noise and nothing estimated: all follows from the mode
 prior. Errors that the model leaves out are those of truth_measurement=, or of every option of measurement= that is the
 same model with more errors.
 
-Files: design.json, readings.csv (the readings that each choice takes), as PNG and PDF the bound against the number of
-readings, and design.html with all of it. They go to output=DIR, or to outputs/design-MODEL unless another command has
-written there.
-"""
-
-_POSTERIOR = """
+Files: design.json, readings.csv (the readings of each choice), design.html, and as PNG and PDF the bound against the
+number of readings. They go to output=DIR, or to outputs/design-MODEL unless another command has written there.
+""",
+        (
+            _several("arguments", "KEY=VALUE", "the scenario, as for `ipe-bench run`"),
+            _argument("--by", metavar="COLUMN", action="append", help="choose by this column of the readings alone"),
+            _argument("--readings", metavar="NUMBER", type=int, help="how many there may be; as many as now"),
+            _argument(
+                "--criterion",
+                choices=("A", "D"),
+                default="A",
+                help="mean squared bound (A) or volume of the ellipsoid (D)",
+            ),
+        ),
+    ),
+    "posterior": (
+        "what the readings of a few trials really say, and how far estimators are from it",
+        "0 the populations of particles agree; 1 in some trial they do not",
+        """
   ipe-bench posterior error_scale=300 "solver=[newton]" "baseline=[gauss_newton,ekf]"
   ipe-bench posterior measurement=triad noise=gaussian noise.deviation=0.01 trials=1
 
@@ -70,12 +136,18 @@ For the first trials of a scenario (trials=3 unless given), the posterior itself
 by sequential Monte Carlo: particles go from the prior to the posterior as the likelihood is let in. Each estimator's
 estimate and covariance are then held against it. It takes seconds to a minute a trial.
 
-Files: posterior.json, as PNG and PDF a corner picture of each trial (corner_0, corner_1, ...), and posterior.html with
-all of it. They go to output=DIR, or to outputs/posterior-MODEL unless another command has written there.
-"""
-
-
-_REPORT = """
+Files: posterior.json, posterior.html, and as PNG and PDF a corner picture of each trial (corner_0, corner_1, ...). They
+go to output=DIR, or to outputs/posterior-MODEL unless another command has written there.
+""",
+        (
+            _several("arguments", "KEY=VALUE", "whatever `ipe-bench run` takes"),
+            _argument("--particles", metavar="NUMBER", type=int, default=1000, help="1000 unless given"),
+        ),
+    ),
+    "report": (
+        "tables, figures and report of what is stored",
+        _MISSING,
+        """
 Nothing is computed again.
 
   ipe-bench report DIR                            into DIR itself
@@ -88,22 +160,13 @@ width=INCHES         of a figure or table: 3.5 for one column, 7.16 for two
 
 figures=all          which to draw: all, main (the few that answer the question; unless told otherwise) or none
 formats=pdf,svg      as these as well; figures are PNG files, and others are written when they are asked for
-"""
-
-
-_BUNDLE = """
-  ipe-bench bundle outputs/paper                  outputs/paper.zip: all results, and a manifest with their digests
-  ipe-bench bundle outputs/a outputs/b output=both.zip
-  ipe-bench bundle both.zip                       is it whole, and what is its digest?
-
-The same results give the same file, so that the digest may stand in a paper. Others read it beside their own results:
-
-  ipe-bench report outputs/mine both.zip output=outputs/together
-  ipe-bench compare outputs/mine both.zip
-"""
-
-
-_COMPARE = """
+""",
+        (_several("arguments", "DIR", "folders of results, such as outputs/paper"),),
+    ),
+    "compare": (
+        "whether a second version, setting or estimator is better or worse than a first",
+        "0 not worse; 1 the second is worse, or something that was asked for is missing",
+        """
 Nothing is computed: run both first. The same trials are compared one by one; folders of other seeds, in their order.
 
   ipe-bench compare outputs/before outputs/after               two versions, or two settings, of the same estimators
@@ -113,29 +176,73 @@ Nothing is computed: run both first. The same trials are compared one by one; fo
 alpha=0.05           the chance that anything is found where there is no difference
 anytime=true         judge by e-values: then it may be looked at as often as one likes, while trials are added
 fail_on=success,error  what the second may not be worse in: success, error, cost
-output=DIR           writes comparison.csv and comparison as PNG and PDF there
-"""
+output=DIR           writes comparison.csv, comparison.html, and comparison as PNG and PDF there
+""",
+        (_several("arguments", "DIR", "one or two folders of results"),),
+    ),
+    "bundle": (
+        "results in one archive to share, or whether such an archive is whole",
+        _MISSING,
+        """
+  ipe-bench bundle outputs/paper                  outputs/paper.zip: all results, and a manifest with their digests
+  ipe-bench bundle outputs/a outputs/b output=both.zip
+  ipe-bench bundle both.zip                       is it whole, and what is its digest?
 
+The same results give the same file, so that the digest may stand in a paper. Others read it beside their own results:
 
-KINDS = ("solver", "baseline", "measurement", "noise", "prior", "execution")
-KINDS += ("statistic", "figure", "table", "section", "experiment")
-"""Of plugins that `new` makes."""
-_SCHEMA = """
+  ipe-bench report outputs/mine both.zip output=outputs/together
+  ipe-bench compare outputs/mine both.zip
+""",
+        (_several("arguments", "DIR", "folders of results, or one bundle to check"),),
+    ),
+    "status": (
+        "what is done, missing, failed and stale in folders of results",
+        "0 complete; 1 not complete",
+        "",
+        (
+            _several("arguments", "DIR", "folders of results, such as outputs/paper"),
+            _verbose("with what is complete, too"),
+        ),
+    ),
+    "list": (
+        "what there is to choose from, and where it comes from",
+        "",
+        "",
+        (
+            _several("names", "GROUP", "solver, measurement, ... or keys; solver/newton: its options"),
+            _verbose("with each one's options, and the parameters and readings file of measurements"),
+        ),
+    ),
+    "check": (
+        "whether a plugin keeps the promises that every component makes",
+        "0 all checks passed; 1 some failed",
+        "",
+        (_several("folders", "DIR", "folders of plugins, such as plugins/my_plugin"),),
+    ),
+    "new": (
+        "a working plugin to start from, in plugins/NAME",
+        "",
+        "",
+        (
+            _argument("kind", metavar="KIND", help=f"{', '.join(KINDS[:-1])} or {KINDS[-1]}"),
+            _argument("name", metavar="NAME", help="small letters, digits and underscores"),
+        ),
+    ),
+    "schema": (
+        "a JSON schema of config files, for editors that complete and check them",
+        "",
+        """
   ipe-bench schema > ipe-bench.schema.json
 
 Visual Studio Code with its YAML extension, in settings.json:
                     "yaml.schemas": {"ipe-bench.schema.json": "**/conf/**/*.yaml"}
 Any editor with yaml-language-server, in a file: # yaml-language-server: $schema=ipe-bench.schema.json
 Options of plugins are in it as far as they are found from here; write it again after a new one.
-"""
-_RUN = """
-  ipe-bench run error_scale=33 "solver=[fixed_point,newton]" "baseline=[linear_lse]"
-  ipe-bench run +experiment=paper                               an experiment, which may be a sweep
-  ipe-bench run -m error_scale=1,10,100 seed=1,2                a job for each combination
-  ipe-bench run +solver@estimators.second=newton estimators.second.tolerance=1e-3
-
-`ipe-bench list keys` has all keys, `ipe-bench list` the options of measurement=, noise=, solver= and the other groups.
-"""
+""",
+        (),
+    ),
+}
+"""Each command's line, its exit codes besides 2, what its help says more, and its arguments."""
 _OWN_CONFIGS = "put options and experiments of your own into a folder and name it with --config-dir"
 _GONE = {
     **dict.fromkeys(("-cp", "--config-path", "-cn", "--config-name"), _OWN_CONFIGS),
@@ -144,7 +251,6 @@ _GONE = {
     **dict.fromkeys(("-r", "--run"), "leave it out"),
 }
 """Flags of earlier versions, and what to use instead."""
-INFO_TOPICS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
 
 class Parser(argparse.ArgumentParser):
@@ -155,9 +261,6 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise UserError(f"{self.command}: {message}; see `{self.prog} --help`")
-
-    summary: str = ""
-    """What the command does, in a line."""
 
     @property
     def command(self) -> str:
@@ -171,23 +274,19 @@ class Parser(argparse.ArgumentParser):
             UserError: a flag or a word that the command does not take, or one that it wants is not there.
         """
         values, surplus = self.parse_known_intermixed_args(words)
-        for word in surplus:
-            if self.command == "run" and word.partition("=")[0] in _GONE:
-                raise UserError(f"run: {word}: is no flag any more; {_GONE[word.partition('=')[0]]}")
-            if word.startswith("-") and "=" in word and not word.startswith("--config"):
-                raise UserError(
-                    f"{self.command}: {word}: there is no such flag; keys have no dashes: {word.lstrip('-')}"
-                )
-            takes_keys = any(action.metavar == "KEY=VALUE" for action in self._actions)
-            if word.startswith("--") and takes_keys and word[2:].isidentifier() and not word.startswith("--config"):
-                raise UserError(
-                    f"{self.command}: {word}: there is no such flag; keys have no dashes: write {word[2:]}=VALUE"
-                )
-            if word.startswith("-"):
-                flags = [flag for action in self._actions for flag in action.option_strings]
-                raise UserError(f"{self.command}: {word}: {unknown(word, flags, 'flag')}")
-            raise UserError(f"{self.command}: {word}: is a word too many; see `{self.prog} --help`")
-        return values
+        if not surplus:
+            return values
+        word, (flag, equals, _) = surplus[0], surplus[0].partition("=")
+        if self.command == "run" and flag in _GONE:
+            raise UserError(f"run: {word}: is no flag any more; {_GONE[flag]}")
+        takes_keys = equals or any(action.metavar == "KEY=VALUE" for action in self._actions)
+        if word.startswith("-" if equals else "--") and takes_keys and flag.lstrip("-").isidentifier():
+            said = word.lstrip("-") if equals else f"write {word[2:]}=VALUE"
+            raise UserError(f"{self.command}: {word}: there is no such flag; keys have no dashes: {said}")
+        if word.startswith("-"):
+            flags = [flag for action in self._actions for flag in action.option_strings]
+            raise UserError(f"{self.command}: {word}: {unknown(word, flags, 'flag')}")
+        raise UserError(f"{self.command}: {word}: is a word too many; see `{self.prog} --help`")
 
 
 def parsers() -> tuple[Parser, dict[str, Parser]]:
@@ -196,102 +295,11 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     program.add_argument("--version", action="store_true", help="print the version")
     commands = program.add_subparsers(metavar="COMMAND", title="commands", prog="ipe-bench", parser_class=Parser)
     found: dict[str, Parser] = {}
-
-    def add(name: str, what: str, codes: str = "", more: str = "") -> Parser:
+    for name, (what, codes, more, arguments) in COMMANDS.items():
         epilog = f"Exit codes: {codes}; 2 a mistake in what was asked for." if codes else None
         found[name] = commands.add_parser(
             name, help=what, description=f"ipe-bench {name}: {what}\n{more}", epilog=epilog
         )
-        found[name].summary = what
-        return found[name]
-
-    _add_run(add("run", "simulate, estimate, store and report", "0 done; 1 done, but something failed", _RUN))
-    estimate = add(
-        "estimate",
-        "parameters from real readings, and whether the model fits them",
-        "0 some estimator has an answer; 1 none has, or the model fits none",
-        _ESTIMATE,
-    )
-    estimate.add_argument("arguments", metavar="KEY=VALUE", nargs="*", help="whatever `ipe-bench run` takes")
-    design = add(
-        "design",
-        "what the readings will say of each parameter, and which to take instead",
-        "0 the readings determine every parameter; 1 they do not",
-        _DESIGN,
-    )
-    design.add_argument("arguments", metavar="KEY=VALUE", nargs="*", help="the scenario, as for `ipe-bench run`")
-    design.add_argument("--by", metavar="COLUMN", action="append", help="choose by this column of the readings alone")
-    design.add_argument("--readings", metavar="NUMBER", type=int, help="how many there may be; as many as now")
-    design.add_argument(
-        "--criterion", choices=("A", "D"), default="A", help="mean squared bound (A) or volume of the ellipsoid (D)"
-    )
-    posterior = add(
-        "posterior",
-        "what the readings of a few trials really say, and how far estimators are from it",
-        "0 the populations of particles agree; 1 in some trial they do not",
-        _POSTERIOR,
-    )
-    posterior.add_argument("arguments", metavar="KEY=VALUE", nargs="*", help="whatever `ipe-bench run` takes")
-    posterior.add_argument("--particles", metavar="NUMBER", type=int, default=1000, help="1000 unless given")
-    report = add(
-        "report",
-        "tables, figures and report of what is stored",
-        "0 done; 1 done, but something that was asked for is missing",
-        _REPORT,
-    )
-    report.add_argument("arguments", metavar="DIR", nargs="*", help="folders of results, such as outputs/paper")
-    bundle = add(
-        "bundle",
-        "results in one archive to share, or whether such an archive is whole",
-        "0 done; 1 done, but something that was asked for is missing",
-        _BUNDLE,
-    )
-    bundle.add_argument("arguments", metavar="DIR", nargs="*", help="folders of results, or one bundle to check")
-    compare = add(
-        "compare",
-        "whether a second version, setting or estimator is better or worse than a first",
-        "0 not worse; 1 the second is worse, or something that was asked for is missing",
-        _COMPARE,
-    )
-    compare.add_argument("arguments", metavar="DIR", nargs="*", help="one or two folders of results")
-    status = add(
-        "status", "what is done, missing, failed and stale in folders of results", "0 complete; 1 not complete"
-    )
-    status.add_argument("arguments", metavar="DIR", nargs="*", help="folders of results, such as outputs/paper")
-    status.add_argument("-v", "--verbose", action="store_true", help="with what is complete, too")
-    options = add("list", "what there is to choose from, and where it comes from")
-    options.add_argument(
-        "names", metavar="GROUP", nargs="*", help="solver, measurement, ... or keys; solver/newton: its options"
-    )
-    options.add_argument(
-        *("-v", "--verbose"),
-        action="store_true",
-        help="with each one's options, and the parameters and readings file of measurements",
-    )
-    new = add("new", "a working plugin to start from, in plugins/NAME")
-    new.add_argument(
-        "kind",
-        metavar="KIND",
-        help=f"{', '.join(KINDS[:-1])} or {KINDS[-1]}",
-    )
-    new.add_argument("name", metavar="NAME", help="small letters, digits and underscores")
-    check = add(
-        "check",
-        "whether a plugin keeps the promises that every component makes",
-        "0 all checks passed; 1 some failed",
-    )
-    check.add_argument("folders", metavar="DIR", nargs="*", help="folders of plugins, such as plugins/my_plugin")
-    add("schema", "a JSON schema of config files, for editors that complete and check them", more=_SCHEMA)
+        for names, options in arguments:
+            found[name].add_argument(*names, **options)
     return program, found
-
-
-def _add_run(run: Parser) -> None:
-    run.add_argument("overrides", metavar="KEY=VALUE", nargs="*", help="see `ipe-bench list keys` and `ipe-bench list`")
-    run.add_argument("--dry-run", action="store_true", help="say what is stored, what is missing and how long it takes")
-    run.add_argument("-m", "--multirun", action="store_true", help="run all jobs of a sweep")
-    run.add_argument("-c", "--cfg", choices=("job", "hydra", "all"), help="print the config, and run nothing")
-    run.add_argument("-p", "--package", help="with --cfg: the part of the config to print")
-    run.add_argument("--resolve", action="store_true", help="with --cfg: replace interpolations")
-    run.add_argument("-i", "--info", nargs="?", const="all", choices=INFO_TOPICS, help="what Hydra finds where")
-    run.add_argument("-cd", "--config-dir", metavar="DIR", help="a folder with options and experiments of your own")
-    run.add_argument("-sc", "--shell-completion", action="store_true", help="install=SHELL or uninstall=SHELL")

@@ -68,12 +68,7 @@ def _bar_watcher(bar: Bar, title: str) -> Watcher:
     line = bar.add_task(title, total=None, state="")
 
     def watch(progress: Progress) -> None:
-        state = f"block {progress.done}/{progress.tasks}"
-        if progress.failures:
-            state += f", {len(progress.failures)} failed"
-        state += _told(progress)
-        if not progress.tasks:
-            state = "nothing left to compute"
+        state = _state(progress) if progress.tasks else "nothing left to compute"
         # A job without estimators to run still has its truth to store: then blocks stand in for trials.
         total, done = (progress.total, progress.trials) if progress.total else (progress.tasks, progress.done)
         bar.update(line, total=total or 1, completed=done if total else 1, state=state)
@@ -81,12 +76,14 @@ def _bar_watcher(bar: Bar, title: str) -> Watcher:
     return watch
 
 
-def _told(progress: Progress) -> str:
-    """The rate and the forecast, once there are any."""
-    if progress.preparing:
-        return ", compiling, once"
+def _state(progress: Progress) -> str:
+    """How far a job is, with the rate and the forecast once there are any."""
+    failed = f", {len(progress.failures)} failed" if progress.failures else ""
     rate = f", {_rounded(progress.rate)} estimates/s" if progress.rate else ""
-    return rate + ("" if progress.seconds_left is None else f", {_duration(progress.seconds_left)} left")
+    left = "" if progress.seconds_left is None else f", {_duration(progress.seconds_left)} left"
+    return f"block {progress.done}/{progress.tasks}{failed}" + (
+        ", compiling, once" if progress.preparing else rate + left
+    )
 
 
 def _line_watcher(console: Console, title: str) -> Watcher:
@@ -106,7 +103,7 @@ def _line_watcher(console: Console, title: str) -> Watcher:
             say(f"{blocks}{failed} in {_duration(now - began)}, {_rounded(progress.rate)} estimates/s")
         elif now - spoken >= LINE_EVERY_S:
             spoken = now
-            say(f"block {progress.done}/{progress.tasks}{_told(progress)}")
+            say(_state(progress))
 
     return watch
 

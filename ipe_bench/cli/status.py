@@ -44,6 +44,9 @@ def _table(directory: str, cells: Sequence[CellState]) -> Table:
         texts("scenario", [cell.title for cell in cells], numeric=False),
         texts("estimator", ["(truth)" if name == TRUTH else name for name in names], numeric=False),
         texts("done", [f"{cell.done} of {cell.expected or cell.done}" for cell in cells]),
-        *(texts(count, [str(getattr(cell, count) or "") for cell in cells]) for count in ("missing", "failed", "stale")),
+        *(
+            texts(count, [str(getattr(cell, count) or "") for cell in cells])
+            for count in ("missing", "failed", "stale")
+        ),
     ]
     return Table("status", directory, "", columns, grouped=1)

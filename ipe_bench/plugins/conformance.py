@@ -1,12 +1,13 @@
 """The promises that every component makes, as checks that anybody can run on theirs.
 
-Third parties test their solvers, estimators, models and noises with the same checks as ours are tested with. A check is
-a function that raises an AssertionError whose message is for the author; its docstring opens with the promise.
+Third parties test their solvers, estimators, models and noises with the checks that ours are tested with. A check is a
+function that raises an AssertionError whose message is for the author; its docstring opens with the promise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import json
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
@@ -66,13 +67,12 @@ def check_component(name: str, component: Any) -> Iterator[Finding]:
         yield Finding(name, "is a component", "it is neither measurement, noise, prior, solver, baseline nor execution")
         return
     if isinstance(component, Measurement) and not component.input_columns_known:
-        made_up = _with_columns(component)
-        if made_up is None:
+        component = _with_columns(component)
+        if component is None:
             yield Finding(name, "Takes columns of a file that cannot be made up, and is tried where there is one")
             return
-        component = made_up
     for check in (describes_itself, *checks):
-        title = (check.__doc__ or check.__name__).strip().splitlines()[0].rstrip(".")
+        title, complaint = (check.__doc__ or "").strip().splitlines()[0].rstrip("."), ""
         try:
             with np.errstate(all="ignore"):
                 check(component)
@@ -80,11 +80,10 @@ def check_component(name: str, component: Any) -> Iterator[Finding]:
             yield Finding(name, title, f"{error}; the other checks have to wait for that")
             return
         except AssertionError as error:
-            yield Finding(name, title, str(error) or "it does not")
+            complaint = str(error) or "it does not"
         except Exception as error:
-            yield Finding(name, title, f"it raises {describe_exception(error)}")
-        else:
-            yield Finding(name, title)
+            complaint = f"it raises {describe_exception(error)}"
+        yield Finding(name, title, complaint)
 
 
 def check_option(option: Option) -> Iterator[Finding]:
@@ -93,11 +92,8 @@ def check_option(option: Option) -> Iterator[Finding]:
     Of what is no component, such as an experiment, the file alone is looked at.
     """
     name = f"{option.group}={option.name}"
-    if option.fault is not None:
-        yield Finding(name, "Has a config that can be read", option.fault)
-        return
-    if option.group not in COMPONENT_GROUPS:
-        yield Finding(name, "Has a config that can be read")
+    if option.fault is not None or option.group not in COMPONENT_GROUPS:
+        yield Finding(name, "Has a config that can be read", option.fault or "")
         return
     try:
         config = composed(option)
@@ -126,17 +122,23 @@ def _required(config: dict[str, Any], where: str) -> list[str]:
 def describes_itself(component: Any) -> None:
     """Is a frozen dataclass whose fields are its config and its identity."""
     parameters = getattr(type(component), "__dataclass_params__", None)
-    assert parameters is not None, "decorate the class with @dataclass(frozen=True)"
-    assert parameters.frozen, "decorate the class with @dataclass(frozen=True)"
-    description = describe(component)
-    import json
-
+    assert parameters is not None and parameters.frozen, "decorate the class with @dataclass(frozen=True)"  # noqa: PT018
     try:
-        json.dumps(description)
+        json.dumps(describe(component))
     except TypeError as error:
         raise AssertionError(
             f"a field is not plain data ({error}); give it numbers, texts, lists or components"
         ) from None
+
+
+def _shaped(what: str, value: Any, wanted: tuple[int, ...], meaning: str = "") -> None:
+    """Whether an array has the shape that it should have."""
+    shape = np.shape(value)
+    assert shape == wanted, (
+        f"{what} has shape {shape}, and not "
+        + (meaning and f"{meaning}, which is ")
+        + (f"{wanted} here" if meaning else f"{wanted}")
+    )
 
 
 # Estimators
@@ -149,10 +151,9 @@ def _scenario(estimator: Estimator, strength: float = 0.005) -> Scenario:
     return Scenario(Polynomial(strength=strength), Gaussian(0.01), GaussianPrior(), error_scale=1.0, seed=5)
 
 
-def _readings(estimator: Estimator, trials: int = TRIALS) -> tuple[Problem, Array, Array]:
+def _readings(estimator: Estimator) -> tuple[Problem, Array]:
     scenario = _scenario(estimator)
-    drawn = scenario.draw(0, trials)
-    return scenario.problem, drawn.x, drawn.z
+    return scenario.problem, scenario.draw(0, TRIALS).z
 
 
 def _ask(estimator: Estimator, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
@@ -162,12 +163,12 @@ def _ask(estimator: Estimator, problem: Problem, z: Array, *, history: bool = Fa
 
 def leaves_its_input_alone(estimator: Estimator) -> None:
     """Does not write into the readings, H, R, the prior or the model."""
-    problem, _, z = _readings(estimator)
-    given = {"its readings": z.copy(), "H": problem.H, "R": problem.R.factor, "the prior": problem.prior_deviation}
+    problem, z = _readings(estimator)
+    given = {"its readings": z, "H": problem.H, "R": problem.R.factor, "the prior": problem.prior_deviation}
     before = {name: array.copy() for name, array in given.items() if array is not None}
     model = describe(problem.measurement)
     try:
-        estimator.estimate(problem, given["its readings"])
+        estimator.estimate(problem, z)
     except ValueError as error:
         if "read-only" in str(error):
             raise Spoiled("it writes into H, R, the prior or the nominal point: work on copies") from None
@@ -181,7 +182,7 @@ def leaves_its_input_alone(estimator: Estimator) -> None:
 
 def answers_alike(estimator: Estimator) -> None:
     """Gives the same answer to the same readings twice."""
-    problem, _, z = _readings(estimator)
+    problem, z = _readings(estimator)
     first, second = (_ask(estimator, problem, z) for _ in range(2))
     assert np.array_equal(first.x, second.x, equal_nan=True), (
         "a second call with the same readings gave another answer: it draws random numbers (draw them from a stream "
@@ -193,14 +194,12 @@ def steps_to_a_state(estimator: Estimator) -> None:
     """Returns from step() a state with x and F of the trials."""
     if not isinstance(estimator, IPE):
         return
-    problem, _, z = _readings(estimator)
+    problem, z = _readings(estimator)
     x, system = begin(problem, z, "linear_lse")
-    state = estimator.begin(system, x)
-    after = estimator.step(system, state)
+    after = estimator.step(system, estimator.begin(system, x))
     assert isinstance(after, State), f"step returns {_noun(after)}, and not a State: return State(x, system.F(x))"
     for name in ("x", "F"):
-        shape = np.shape(getattr(after, name))
-        assert shape == x.shape, f"step returns a State whose {name} has shape {shape}, and not {x.shape}"
+        _shaped(f"step returns a State whose {name}", getattr(after, name), x.shape)
 
 
 def _noun(value: Any) -> str:
@@ -213,7 +212,7 @@ def finds_the_parameters(estimator: Estimator) -> None:
     drawn = scenario.draw(0, TRIALS)
     estimates = _ask(estimator, scenario.problem, drawn.z)
     assert isinstance(estimates, Estimates), f"estimate returns {_noun(estimates)}, and not Estimates"
-    assert np.shape(estimates.x) == drawn.x.shape, f"x has shape {np.shape(estimates.x)}, and not {drawn.x.shape}"
+    _shaped("x", estimates.x, drawn.x.shape)
     H = scenario.problem.R.whiten_jacobian(scenario.problem.H)
     bound = np.sqrt(np.diag(np.linalg.inv(H.T @ H)))
     worst = float((np.abs(estimates.x - drawn.x) / bound).max())
@@ -222,7 +221,7 @@ def finds_the_parameters(estimator: Estimator) -> None:
 
 def a_batch_is_its_trials(estimator: Estimator) -> None:
     """Gives a trial the same bits in a batch and alone."""
-    problem, _, z = _readings(estimator)
+    problem, z = _readings(estimator)
     whole = _ask(estimator, problem, z)
     if not np.array_equal(whole.x, _ask(estimator, problem, z).x, equal_nan=True):
         return  # it is random, which another check says
@@ -232,21 +231,17 @@ def a_batch_is_its_trials(estimator: Estimator) -> None:
             a, b = getattr(whole, name), getattr(alone, name)
             if a is None or np.array_equal(a[i], b[0], equal_nan=True):
                 continue
+            remedy = "by more than rounding: what it does to a trial must not depend on the others of the batch"
             if np.allclose(a[i], b[0], rtol=_ROUND_OFF, atol=_ROUND_OFF, equal_nan=True):
                 remedy = "by rounding alone: use stacked matmul, einsum or batched solve, one per trial"
-            else:
-                remedy = "by more than rounding: what it does to a trial must not depend on the others of the batch"
             raise AssertionError(f"{name} of trial {i} differs, {remedy}")
 
 
 def a_bad_trial_disturbs_no_other(estimator: Estimator) -> None:
     """Ends a trial of NaN readings as a status, and leaves the others as they were."""
-    problem, _, z = _readings(estimator)
-    spoiled = z.copy()
-    spoiled[2] = np.nan
-    before = estimate_safely(estimator, problem, z)
-    again = estimate_safely(estimator, problem, z)
-    after = estimate_safely(estimator, problem, spoiled)
+    problem, z = _readings(estimator)
+    spoiled = np.where(np.arange(len(z))[:, None] == 2, np.nan, z)
+    before, again, after = (estimate_safely(estimator, problem, readings) for readings in (z, z, spoiled))
     assert Status(int(after.status[2])) is not Status.CONVERGED, "a trial of NaN readings counts as converged"
     others = [i for i in range(len(z)) if i != 2]
     random = not np.array_equal(before.x, again.x, equal_nan=True)
@@ -256,14 +251,12 @@ def a_bad_trial_disturbs_no_other(estimator: Estimator) -> None:
 def states_its_scatter(estimator: Estimator) -> None:
     """Reports covariances that agree with the scatter of its estimates on a linear model."""
     scenario = _scenario(estimator, strength=0.0)
-    drawn = scenario.draw(0, SCATTERED)
+    drawn, n = scenario.draw(0, SCATTERED), scenario.measurement.n
     estimates = _ask(estimator, scenario.problem, drawn.z)
     P = estimates.covariance
     if P is None:
         return
-    n = scenario.measurement.n
-    wanted = (SCATTERED, n, n)
-    assert np.shape(P) == wanted, f"covariance has shape {np.shape(P)}, and not (trials, n, n), which is {wanted} here"
+    _shaped("covariance", P, (SCATTERED, n, n), "(trials, n, n)")
     squared = nees(estimates.x - drawn.x, P)[estimates.status == Status.CONVERGED]
     squared = squared[np.isfinite(squared)]
     if len(squared) < SCATTERED // 2:
@@ -277,7 +270,7 @@ def states_its_scatter(estimator: Estimator) -> None:
 
 def accounts_for_itself(estimator: Estimator) -> None:
     """Reports known statuses, counts of its cost, and a symmetric, positive covariance."""
-    problem, _, z = _readings(estimator)
+    problem, z = _readings(estimator)
     estimates = _ask(estimator, problem, z)
     known = {int(status) for status in Status if status is not Status.RUNNING}
     assert set(estimates.status.tolist()) <= known, "a status is not one of ipe_bench.Status"
@@ -285,14 +278,14 @@ def accounts_for_itself(estimator: Estimator) -> None:
     assert (spent > 0).all(), "simulations and jacobians are not counted"
     P = estimates.covariance
     if P is not None and np.shape(P) == (*estimates.x.shape, estimates.x.shape[1]):
-        usable = np.isfinite(P).all(axis=(1, 2))
-        assert np.allclose(P[usable], P[usable].swapaxes(1, 2), rtol=1e-6), "a covariance is not symmetric"
-        assert (np.diagonal(P[usable], axis1=1, axis2=2) > 0).all(), "a variance is not positive"
+        P = P[np.isfinite(P).all(axis=(1, 2))]
+        assert np.allclose(P, P.swapaxes(1, 2), rtol=1e-6), "a covariance is not symmetric"
+        assert (np.diagonal(P, axis1=1, axis2=2) > 0).all(), "a variance is not positive"
 
 
 def keeps_a_history_if_asked(estimator: Estimator) -> None:
     """Returns the iterates that lead to the estimate, where it keeps any."""
-    problem, _, z = _readings(estimator)
+    problem, z = _readings(estimator)
     estimates = _ask(estimator, problem, z, history=True)
     if estimates.history is None:
         return
@@ -324,9 +317,9 @@ def _with_columns(model: Measurement) -> Measurement | None:
     return None
 
 
-def _points(model: Measurement, trials: int = 4) -> Array:
+def _points(model: Measurement) -> Array:
     """A tenth of a unit around the nominal point, where every model makes sense."""
-    return model.nominal + 0.1 * np.random.default_rng(11).standard_normal((trials, model.n))
+    return model.nominal + 0.1 * np.random.default_rng(11).standard_normal((4, model.n))
 
 
 def names_its_readings(model: Measurement) -> None:
@@ -334,10 +327,8 @@ def names_its_readings(model: Measurement) -> None:
     assert model.m >= model.n, f"{model.m} readings are too few for {model.n} parameters"
     lengths = {name: len(column) for name, column in model.index.items()}
     assert set(lengths.values()) == {model.m}, f"the columns of index have lengths {lengths}, and not {model.m}"
-    labels = list(zip(*model.index.values(), strict=True))
-    assert len(set(labels)) == model.m, "two readings have one label in index"
-    names = [p.name for p in model.parameters]
-    assert len(set(names)) == model.n, "two parameters have one name"
+    assert len(set(zip(*model.index.values(), strict=True))) == model.m, "two readings have one label in index"
+    assert len({p.name for p in model.parameters}) == model.n, "two parameters have one name"
     assert (model.sizes > 0).all(), "a parameter's size is not above 0"
 
 
@@ -351,7 +342,7 @@ def simulates_batches(model: Measurement) -> None:
         if "read-only" in str(error):
             raise Spoiled("simulate writes into x: work on a copy") from None
         raise
-    assert z.shape == (len(x), model.m), f"simulate returns {z.shape}, and not {(len(x), model.m)}"
+    _shaped("what simulate returns", z, (len(x), model.m))
     assert np.isfinite(z).all(), "a reading near the nominal point is not finite"
     for i in range(len(x)):
         alone = model.simulate(x[i : i + 1])[0]
@@ -362,8 +353,7 @@ def differentiates(model: Measurement) -> None:
     """Has the Jacobian that differences of its readings show."""
     x = _points(model)
     J = model.jacobian(x)
-    wanted = (len(x), model.m, model.n)
-    assert np.shape(J) == wanted, f"jacobian returns {np.shape(J)}, and not (trials, m, n), which is {wanted} here"
+    _shaped("what jacobian returns", J, (len(x), model.m, model.n), "(trials, m, n)")
     differences = differentiate(model.simulate, x, analytic=False)
     # Differences cannot tell more than the round-off of h over their step.
     round_off = 10 * np.finfo(float).eps ** (2 / 3) * np.abs(model.simulate(x)).max()
@@ -371,23 +361,22 @@ def differentiates(model: Measurement) -> None:
     off = off / (np.abs(differences).max(axis=1, keepdims=True) + 1e-300)
     # What is not a number is worst of all.
     off = np.where(np.isfinite(off), off, np.inf)
-    t, i, j = (int(k) for k in np.unravel_index(int(off.argmax()), off.shape))
+    t, i, j = _largest(off)
     reading = ", ".join(f"{name}={column[i]}" for name, column in model.index.items())
-    assert off[t, i, j] < 1e-5, (
-        f"it is off by {off[t, i, j]:.1e} of a column's largest entry, most for parameter {model.parameters[j].name} "
-        f"in reading {reading}: it says {J[t, i, j]:.6g}, and differences {differences[t, i, j]:.6g}"
-        + _complex_hint(model)
-    )
-
-
-def _complex_hint(model: Measurement) -> str:
-    """Why a complex step may have failed, where it is what the Jacobian is made of."""
-    if not model.analytic or type(model).jacobian is not Measurement.jacobian:
-        return ""
-    return (
+    hint = (
         "; `analytic` is set, so it is a complex step, which np.abs, np.sign, np.maximum, np.angle and the like do not "
         "survive: write np.where(u.real < 0, -u, u) for np.abs(u), or leave `analytic` out"
     )
+    assert off[t, i, j] < 1e-5, (
+        f"it is off by {off[t, i, j]:.1e} of a column's largest entry, most for parameter {model.parameters[j].name} "
+        f"in reading {reading}: it says {J[t, i, j]:.6g}, and differences {differences[t, i, j]:.6g}"
+        + (hint if model.analytic and type(model).jacobian is Measurement.jacobian else "")
+    )
+
+
+def _largest(values: Array) -> tuple[int, ...]:
+    """The place of the largest entry."""
+    return tuple(int(k) for k in np.unravel_index(int(values.argmax()), values.shape))
 
 
 def orders_its_epochs(model: Measurement) -> None:
@@ -397,12 +386,12 @@ def orders_its_epochs(model: Measurement) -> None:
     rows = np.sort(np.concatenate(model.epochs))
     assert np.array_equal(rows, np.arange(model.m)), "the epochs do not hold every reading once"
     x, stop = _points(model), max(1, len(model.epochs or ()) // 2)
-    prefix, whole = model.simulate_until(x, stop), model.simulate(x)[:, model.rows(stop)]
-    assert np.allclose(prefix, whole, rtol=1e-12, atol=1e-12 * np.abs(whole).max()), "a prefix differs from the whole"
-    coarse = model.coarse_simulate_until(x, stop)
-    assert np.allclose(coarse, whole, rtol=1e-3, atol=1e-3 * np.abs(whole).max()), (
-        "a coarse prefix is far from the whole"
-    )
+    whole = model.simulate(x)[:, model.rows(stop)]
+    for name, found, error in (
+        ("a prefix differs", model.simulate_until(x, stop), 1e-12),
+        ("a coarse prefix is far", model.coarse_simulate_until(x, stop), 1e-3),
+    ):
+        assert np.allclose(found, whole, rtol=error, atol=error * np.abs(whole).max()), f"{name} from the whole"
 
 
 # Noise
@@ -418,6 +407,15 @@ def _count(noise: Noise) -> int:
             continue
         return m
     return _SOME
+
+
+def _whitened_errors(noise: Noise, draws: int, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Errors that the noise draws, and the same whitened by R (draws, m); h is spread over many steps of rounding."""
+    m = _count(noise)
+    R = noise.covariance(m)
+    h = rng.uniform(-1000.0, 1000.0, (draws, m)) * R.deviations
+    v = np.array([noise.corrupt(row.copy(), np.zeros(m), rng) - row for row in h])
+    return v, R.whiten(v)
 
 
 def states_its_covariance(noise: Noise) -> None:
@@ -440,11 +438,15 @@ def corrupts_reproducibly(noise: Noise) -> None:
     if _draws_nothing(noise):
         return
     m = _count(noise)
-    h, offset = np.linspace(-1.0, 1.0, m), np.zeros(m)
-    copy = h.copy()
-    first, second = (noise.corrupt(h, offset, np.random.default_rng(3)) for _ in range(2))
-    assert np.array_equal(h, copy), "corrupt writes into h"
-    assert first.shape == h.shape, f"corrupt returns {first.shape}, and not {h.shape}"
+    _repeatable("corrupt", np.linspace(-1.0, 1.0, m), lambda h, rng: noise.corrupt(h, np.zeros(m), rng))
+
+
+def _repeatable(name: str, given: Array, draw: Callable[[Array, np.random.Generator], Array]) -> None:
+    """Whether a function draws alike from one stream, and leaves alone what it is given."""
+    copy = given.copy()
+    first, second = (draw(given, np.random.default_rng(3)) for _ in range(2))
+    assert np.array_equal(given, copy), f"{name} writes into what it is given"
+    _shaped(f"what {name} returns", first, given.shape)
     assert np.array_equal(first, second), "it uses randomness besides the stream that it is given"
 
 
@@ -452,31 +454,23 @@ def draws_what_it_states(noise: Noise) -> None:
     """Draws errors of mean zero whose variances and correlations are those of R."""
     if _draws_nothing(noise) or not noise.true_covariance:
         return
-    m = _count(noise)
-    R, rng = noise.covariance(m), np.random.default_rng(7)
-    # Spread over many steps of whatever rounds or repeats.
-    h = rng.uniform(-1000.0, 1000.0, (DRAWS, m)) * R.deviations
-    v = np.array([noise.corrupt(row.copy(), np.zeros(m), rng) - row for row in h])
-    w = R.whiten(v)
+    v, w = _whitened_errors(noise, DRAWS, np.random.default_rng(7))
+    R = noise.covariance(v.shape[1])
     mean, limit = w.mean(axis=0), 6 * w.std(axis=0) / np.sqrt(DRAWS) + 0.02
     assert (np.abs(mean) < limit).all(), f"the errors' mean is {np.abs(mean).max():.3g} of the deviation that R states"
     w = w[:, :_MOST]
     products = w[:, :, None] * w[:, None, :]
-    C = products.mean(axis=0)
-    off = np.abs(C - np.eye(w.shape[1])) - 6 * products.std(axis=0) / np.sqrt(DRAWS) - 0.05
-    if (np.diag(off) > 0).any():
-        i = int(np.diag(off).argmax())
-        raise AssertionError(
-            f"the errors of reading {i + 1} have the standard deviation {v[:, i].std():.4g}, and R says "
-            f"{R.deviations[i]:.4g} (Covariance takes standard deviations, or the Cholesky factor of R)"
-        )
-    if (off > 0).any():
-        i, j = (int(k) for k in np.unravel_index(int(off.argmax()), off.shape))
-        stated = R.matrix()[i, j] / (R.deviations[i] * R.deviations[j])
-        raise AssertionError(
-            f"the errors of readings {i + 1} and {j + 1} have the correlation {np.corrcoef(v.T)[i, j]:.2f}, and R says "
-            f"{stated:.2f}"
-        )
+    off = np.abs(products.mean(axis=0) - np.eye(w.shape[1])) - 6 * products.std(axis=0) / np.sqrt(DRAWS) - 0.05
+    i = int(np.diag(off).argmax())
+    assert off[i, i] <= 0, (
+        f"the errors of reading {i + 1} have the standard deviation {v[:, i].std():.4g}, and R says "
+        f"{R.deviations[i]:.4g} (Covariance takes standard deviations, or the Cholesky factor of R)"
+    )
+    i, j = _largest(off)
+    assert off[i, j] <= 0, (
+        f"the errors of readings {i + 1} and {j + 1} have the correlation {np.corrcoef(v.T)[i, j]:.2f}, and R says "
+        f"{R.matrix()[i, j] / (R.deviations[i] * R.deviations[j]):.2f}"
+    )
 
 
 def states_its_law(noise: Noise) -> None:
@@ -485,13 +479,10 @@ def states_its_law(noise: Noise) -> None:
 
     if _draws_nothing(noise) or not noise.true_covariance:
         return
-    m, draws = _count(noise), DRAWS // 5
     rng = np.random.default_rng(9)
-    R = noise.covariance(m)
-    h = rng.uniform(-1000.0, 1000.0, (draws, m)) * R.deviations
-    w = R.whiten(np.array([noise.corrupt(row.copy(), np.zeros(m), rng) - row for row in h]))
-    stated = noise.whitened((draws, m), rng)
-    law = rng.standard_normal((draws, m)) if stated is None else stated
+    _, w = _whitened_errors(noise, DRAWS // 5, rng)
+    stated = noise.whitened(w.shape, rng)
+    law = rng.standard_normal(w.shape) if stated is None else stated
     # Of each trial its chi-square, which is what the test of fit looks at, and one reading: trials are independent.
     for what, found, said in (("reading", w[:, 0], law[:, 0]), ("chi-square", (w**2).sum(1), (law**2).sum(1))):
         p = float(tuple(ks_2samp(found, said))[1])  # type: ignore[arg-type]
@@ -504,20 +495,16 @@ def states_its_law(noise: Noise) -> None:
 # Priors
 
 
-_MANY = 4
-"""Parameters that priors are tried with."""
-
-
 def _x0_and_deviation(prior: Prior, error_scale: float = 1.0) -> tuple[Array, Array]:
-    given = getattr(prior, "deviations", None) or getattr(prior, "correlations", None)
-    n = len(given or [1.0] * _MANY)
+    """A point of four parameters, or as many as the prior is made for, and the deviations there."""
+    n = len(getattr(prior, "deviations", None) or getattr(prior, "correlations", None) or range(4))
     return np.linspace(-1.0, 1.0, n), np.asarray(prior.deviation(n, error_scale))
 
 
 def states_its_deviations(prior: Prior) -> None:
     """States a standard deviation for each parameter, which grows with the error scale."""
     x0, deviation = _x0_and_deviation(prior)
-    assert deviation.shape == x0.shape, f"deviation returns {deviation.shape}, and not {x0.shape}"
+    _shaped("what deviation returns", deviation, x0.shape)
     assert np.isfinite(deviation).all(), "a deviation is not finite"
     assert (deviation >= 0).all(), "a deviation is negative"
     assert deviation.any(), "every deviation is 0"
@@ -529,12 +516,7 @@ def states_its_deviations(prior: Prior) -> None:
 
 def draws_reproducibly(prior: Prior) -> None:
     """Draws the same parameters from the same random stream, and leaves x0 alone."""
-    x0, _ = _x0_and_deviation(prior)
-    copy = x0.copy()
-    first, second = (prior.draw(x0, 2.0, np.random.default_rng(3)) for _ in range(2))
-    assert np.array_equal(x0, copy), "draw writes into x0"
-    assert np.shape(first) == x0.shape, f"draw returns {np.shape(first)}, and not {x0.shape}"
-    assert np.array_equal(first, second), "it uses randomness besides the stream that it is given"
+    _repeatable("draw", _x0_and_deviation(prior)[0], lambda x0, rng: prior.draw(x0, 2.0, rng))
 
 
 def draws_what_is_told(prior: Prior) -> None:
@@ -543,21 +525,18 @@ def draws_what_is_told(prior: Prior) -> None:
     from scipy.stats import kstest
 
     x0, deviation = _x0_and_deviation(prior, 2.0)
-    stated = prior.correlation(len(x0))
+    stated, varies = prior.correlation(len(x0)), deviation > 0
     C = np.eye(len(x0)) if stated is None else stated
-    assert C.shape == (len(x0),) * 2, f"correlation returns {C.shape}, and not {(len(x0),) * 2}"
-    C = C[np.ix_(deviation > 0, deviation > 0)]
+    _shaped("what correlation returns", C, (len(x0),) * 2)
+    C = C[np.ix_(varies, varies)]
     rng = np.random.default_rng(7)
     x = np.array([prior.draw(x0.copy(), 2.0, rng) for _ in range(DRAWS)]) - x0
-    assert np.array_equal(x[:, deviation == 0], np.zeros((DRAWS, int((deviation == 0).sum())))), (
-        "a parameter of deviation 0 varies"
-    )
-    w = x[:, deviation > 0] / deviation[deviation > 0]
+    assert not x[:, ~varies].any(), "a parameter of deviation 0 varies"
+    w = x[:, varies] / deviation[varies]
     off = np.abs(w.mean(axis=0)) - 6 * w.std(axis=0) / np.sqrt(DRAWS)
     assert (off < 0).all(), f"the mean is off x0 by up to {np.abs(w.mean(axis=0)).max():.3g} of the stated deviation"
     products = w[:, :, None] * w[:, None, :]
-    off = np.abs(products.mean(axis=0) - C) - 6 * products.std(axis=0) / np.sqrt(DRAWS)
-    i, j = (int(k) for k in np.unravel_index(int(off.argmax()), off.shape))
+    i, j = _largest(off := np.abs(products.mean(axis=0) - C) - 6 * products.std(axis=0) / np.sqrt(DRAWS))
     assert off[i, j] < 0 or i != j, (
         f"the draws have {w[:, i].std():.3g} times the stated deviation, on average over {DRAWS} draws"
     )
@@ -584,10 +563,8 @@ class _Errand:
 def _run_errand(errand: _Errand) -> Iterator[tuple[int, int]]:
     for step in range(errand.steps):
         yield errand.number, step
-    if errand.end == "error":
-        raise ValueError(f"errand {errand.number}")
-    if errand.end == "mistake":
-        raise UserError(f"errand {errand.number}")
+    if errand.end != "well":
+        raise (ValueError if errand.end == "error" else UserError)(f"errand {errand.number}")
 
 
 def does_every_task(execution: Execution) -> None:
@@ -600,7 +577,7 @@ def fails_a_task_alone(execution: Execution) -> None:
     _account(execution, [_Errand(0), _Errand(1, end="error"), _Errand(2)])
 
 
-def _account(execution: Execution, errands: list[_Errand]) -> None:
+def _account(execution: Execution, errands: Sequence[_Errand]) -> None:
     events = list(execution.run(_run_errand, errands))
     for i, errand in enumerate(errands):
         own = [event for event in events if event.index == i]
@@ -634,9 +611,7 @@ def ends_with_the_run(execution: Execution) -> None:
     close()
 
 
-Check = Callable[[Any], None]
-
-_CHECKS: dict[type, tuple[Check, ...]] = {
+_CHECKS: dict[type, tuple[Callable[[Any], None], ...]] = {
     Estimator: (
         leaves_its_input_alone,
         steps_to_a_state,

@@ -24,22 +24,17 @@ def register_package(name: str) -> None:
 
 
 def construct(config: Any, where: str) -> Any:
-    """The component that a config describes: `_target_` names the class, the other keys are its fields.
-
-    `where` is the config key, for messages.
+    """The component that a config describes; `where` is the config key, for messages.
 
     Raises:
         UserError: an unknown class or option, or a value of the wrong type, by its key.
     """
-    if isinstance(config, Mapping):
-        if TARGET not in config:
-            return {str(k): construct(v, f"{where}.{k}") for k, v in config.items()}
-        cls = find_class(config[TARGET], where)
-        options = {str(k): construct(v, f"{where}.{k}") for k, v in config.items() if k != TARGET}
-        return instantiate(cls, options, where)
     if isinstance(config, list | tuple):
         return tuple(construct(v, f"{where}[{i}]") for i, v in enumerate(config))
-    return config
+    if not isinstance(config, Mapping):
+        return config
+    options = {str(k): construct(v, f"{where}.{k}") for k, v in config.items() if k != TARGET}
+    return instantiate(find_class(config[TARGET], where), options, where) if TARGET in config else options
 
 
 def find_class(target: Any, where: str) -> type:
@@ -70,12 +65,15 @@ def find_object(target: Any, where: str) -> Any:
         raise UserError(f"{where}: only classes of these packages are constructed: {known}")
     try:
         return getattr(importlib.import_module(module_name), name)
+    except ModuleNotFoundError as error:
+        remedy = "" if (error.name or "").startswith(module_name.split(".")[0]) else "; install what the plugin needs"
+        raise UserError(f"{where}: {error.msg.splitlines()[0]}{remedy}") from None
     except (ImportError, AttributeError) as error:
-        raise UserError(f"{where}: {_first_line(error)}") from None
+        raise UserError(f"{where}: {(str(error).splitlines() or [type(error).__name__])[0]}") from None
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # a plugin may do anything while it is imported, sys.exit() too
-        if _is_ours(module_name):
+        if module_name.startswith("ipe_bench."):
             raise
         raise UserError(f"{where}: its module cannot be imported: {place_of(error)}") from None
 
@@ -99,17 +97,9 @@ def instantiate(cls: type, options: Mapping[str, Any], where: str) -> Any:
         raise UserError(f"{prefix}{error}") from None
     except KeyboardInterrupt:
         raise
+    except ValueError as error:  # how classes that know nothing of ours refuse an option
+        raise UserError(f"{where}: {' '.join(str(error).split())}") from error
     except BaseException as error:
-        if isinstance(error, ValueError):  # how classes that know nothing of ours refuse an option
-            raise UserError(f"{where}: {' '.join(str(error).split())}") from error
-        if _is_ours(cls.__module__):
+        if cls.__module__.startswith("ipe_bench."):
             raise
         raise UserError(f"{where}: {cls.__name__} cannot be made: {place_of(error)}") from None
-
-
-def _is_ours(module: str) -> bool:
-    return module.split(".")[0] == "ipe_bench"
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]

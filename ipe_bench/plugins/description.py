@@ -26,7 +26,7 @@ class Described:
     hint: Any
     """Its type with its constraints; None where it is not known."""
     meaning: str
-    """The docstring of its field, or the comment behind it in the config."""
+    """The docstring of its field."""
 
     @property
     def value(self) -> str:
@@ -50,27 +50,19 @@ def described(option: Option) -> list[Described]:
         return []
     if option.target is None:
         return [Described(str(key), value, None, "") for key, value in config.items() if key != "defaults"]
-    return options_of(find_class(option.target, f"{option.group}.{option.name}"), config, option.comments)
+    return options_of(find_class(option.target, f"{option.group}.{option.name}"), config)
 
 
-def options_of(cls: type, config: Mapping[str, Any], comments: Mapping[str, str]) -> list[Described]:
-    """The options of a dataclass; what `config` says of one stands in place of its default, and `comments` say what is
-    meant where the class does not."""
+def options_of(cls: type, config: Mapping[str, Any]) -> list[Described]:
+    """The options of a dataclass; what `config` says of one stands in place of its default."""
     kinds, texts = option_types(cls), meanings(cls)
-    return [
-        Described(
-            field.name,
-            config.get(field.name, _default(field)),
-            kinds[field.name],
-            texts.get(field.name) or comments.get(field.name, ""),
-        )
-        for field in dataclasses.fields(cls)  # type: ignore[arg-type]
-        if field.init
-    ]
-
-
-def _default(field: dataclasses.Field[Any]) -> Any:
-    return field.default if field.default_factory is MISSING else field.default_factory()
+    found = []
+    for field in dataclasses.fields(cls):  # type: ignore[arg-type]
+        if field.init:
+            default = field.default if field.default_factory is MISSING else field.default_factory()
+            value = config.get(field.name, default)
+            found.append(Described(field.name, value, kinds[field.name], texts.get(field.name, "")))
+    return found
 
 
 def written(value: Any) -> str:
@@ -90,9 +82,7 @@ def written(value: Any) -> str:
 def meanings(cls: type) -> dict[str, str]:
     """By field, the text below it, of the class and its bases."""
     found: dict[str, str] = {}
-    for base in reversed(cls.__mro__):
-        if not dataclasses.is_dataclass(base):
-            continue
+    for base in filter(dataclasses.is_dataclass, reversed(cls.__mro__)):
         try:
             body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
         except (OSError, TypeError, SyntaxError, IndexError):

@@ -13,7 +13,6 @@ import importlib.util
 import os
 import re
 import sys
-import tomllib
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -66,9 +65,7 @@ def read_yaml(text: str) -> Any:
     """
     try:
         return yaml.load(text, _Loader)
-    except RecursionError:
-        raise yaml.YAMLError("it is nested too deeply") from None
-    except ValueError as error:  # a control character, or a number that is none
+    except (RecursionError, ValueError) as error:  # nested too deeply, a control character, a number that is none
         raise yaml.YAMLError(describe_exception(error)) from None
 
 
@@ -84,6 +81,16 @@ def read_yaml_file(path: Path, key: str) -> Any:
         raise UserError(f"{key}: cannot be read ({error.__class__.__name__}); name a YAML file") from None
     except yaml.YAMLError as error:
         raise UserError(f"{key}: {explain_yaml(error, path)}") from None
+
+
+def explain_yaml(error: Any, path: Path | None = None) -> str:
+    """A YAML error in one line: the file, the line and what is wrong."""
+    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+    where = str(path or getattr(mark, "name", "config"))
+    if mark is not None:
+        where += f", line {mark.line + 1}"
+    what = getattr(error, "problem", None) or getattr(error, "reason", None) or describe_exception(error)
+    return f"{where}: is not YAML that can be read ({what})"
 
 
 @dataclass(frozen=True)
@@ -107,6 +114,11 @@ class Option:
     rival: Path | None = None
     """The file of another option that would run in its place, or it in place of that."""
 
+    @property
+    def label(self) -> str:
+        """What an estimator is called in tables."""
+        return Path(self.name).name
+
     @functools.cached_property
     def text(self) -> str:
         """What stands in the file; what is not UTF-8 is replaced, and told by `fault`."""
@@ -118,10 +130,8 @@ class Option:
     @property
     def summary(self) -> str:
         """The first line of comment in the file that is not a header."""
-        for line in self.text.splitlines():
-            if line.startswith("#") and not _PACKAGE_HEADER.match(line):
-                return line.lstrip("# ").strip()
-        return ""
+        comments = (line for line in self.text.splitlines() if line.startswith("#"))
+        return next((line.lstrip("# ").strip() for line in comments if not _PACKAGE_HEADER.match(line)), "")
 
     @property
     def config(self) -> Any:
@@ -140,24 +150,6 @@ class Option:
         found = _TARGET_LINE.search(self.text)
         return found.group(1) if found else None
 
-    @property
-    def comments(self) -> dict[str, str]:
-        """By key, the comment at the end of its line, or else the one above it, which several keys may share."""
-        found: dict[str, str] = {}
-        block: list[str] = []
-        commenting = False
-        for line in self.text.splitlines():
-            if line.startswith("#"):
-                block = [*block, line] if commenting else [line]
-            key, colon, rest = line.partition(":")
-            if colon and key == "_target_":
-                block = []
-            elif colon and key.isidentifier():
-                shared = " ".join(part.lstrip("# ").strip() for part in block)
-                found[key] = rest.partition(" #")[2].strip() or shared
-            commenting = line.startswith("#")
-        return found
-
     @functools.cached_property
     def fault(self) -> str | None:
         """Why it cannot be used, in a line with the remedy; None where it can, as far as the file tells."""
@@ -165,83 +157,24 @@ class Option:
             return f"{self.rival} and {self.path} offer it both; rename one of the two files"
         try:
             text = self.path.read_bytes().decode("utf-8")
+            if self.group in ESTIMATOR_GROUPS and self.package != f"estimators.{self.label}":
+                return f"{self.path}: its first line must be '# @package estimators.{self.label}', or it never runs"
+            return None if _is_mapping(text) else f"{self.path}: holds no keys; write KEY: VALUE lines"
         except UnicodeDecodeError as error:
             return f"{self.path}: is not UTF-8 ({error.reason} at byte {error.start}); save it as UTF-8"
         except OSError as error:
             return f"{self.path}: cannot be read ({error.strerror})"
-        if self.group in ESTIMATOR_GROUPS and self.package != f"estimators.{self.label}":
-            return f"{self.path}: its first line must be '# @package estimators.{self.label}', or it never runs"
-        return _yaml_fault(self.path, text) or self._lack()
-
-    def _lack(self) -> str | None:
-        """What has to be installed before a plugin in a folder can be used."""
-        home = self.source.conf.parent.parent
-        lacking = " and ".join(_not_installed(home / "pyproject.toml"))
-        return f"needs {lacking}, not installed here; pip install {_shown(home)}" if lacking else None
-
-    @property
-    def label(self) -> str:
-        """What an estimator is called in tables."""
-        return Path(self.name).name
-
-
-@functools.cache
-def _not_installed(project: Path) -> tuple[str, ...]:
-    """The distributions that a pyproject.toml names as needed and that are not here, as far as can be told."""
-    try:
-        needed = tomllib.loads(project.read_text(encoding="utf-8"))["project"]["dependencies"]
-        names = [re.split(r"[^\w.-]", str(line))[0] for line in needed if ";" not in str(line)]
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):
-        return ()
-    return tuple(name for name in names if name and not _is_installed(name))
-
-
-def _is_installed(name: str) -> bool:
-    try:
-        importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        # One that is on the path without having been installed will do.
-        return name.replace("-", "_").isidentifier() and _has_module(name.replace("-", "_"))
-    return True
-
-
-def _has_module(name: str) -> bool:
-    try:
-        found = importlib.util.find_spec(name)
-    except (ImportError, ValueError):
-        return False
-    return found is not None and found.origin is not None  # a mere folder of that name has none
-
-
-def _shown(folder: Path) -> Path:
-    """A folder as one would type it from here."""
-    here = Path.cwd()
-    return folder.relative_to(here) if folder.is_relative_to(here) else folder
+        except yaml.YAMLError as error:
+            return explain_yaml(error, self.path)
 
 
 @functools.lru_cache(maxsize=1024)
-def _yaml_fault(path: Path, text: str) -> str | None:
-    try:
-        content = read_yaml(text)
-    except yaml.YAMLError as error:
-        return explain_yaml(error, path)
-    return None if isinstance(content, dict) else f"{path}: holds no keys; write KEY: VALUE lines"
-
-
-def explain_yaml(error: Any, path: Path | None = None) -> str:
-    """A YAML error in one line: the file, the line and what is wrong."""
-    mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
-    where = str(path or getattr(mark, "name", "config"))
-    if mark is not None:
-        where += f", line {mark.line + 1}"
-    what = getattr(error, "problem", None) or getattr(error, "reason", None) or describe_exception(error)
-    return f"{where}: is not YAML that can be read ({what})"
+def _is_mapping(text: str) -> bool:
+    return isinstance(read_yaml(text), dict)
 
 
 _added: dict[Path, None] = {}
 """Folders of plugins besides those in `plugins/`."""
-
-
 _problems: dict[str, None] = {}
 
 
@@ -256,42 +189,34 @@ def take_problems() -> list[str]:
 @functools.cache
 def sources() -> tuple[Source, ...]:
     """Ours first, then the installed plugins, then the folders `plugins/*/`; their packages become importable."""
-    found = installed_sources()
-    for folder in dict.fromkeys([*_folders(), *_added]):
-        try:
-            found += _in_folder(folder)
-        except (OSError, RuntimeError) as error:  # RuntimeError: a loop of links
-            _problems[f"plugin {folder}: cannot be read ({describe_exception(error)}); it is left out"] = None
-    unique: dict[str, Source] = {}
-    for source in found:
+    found: dict[str, Source] = {}
+    folders = sorted(Path("plugins").resolve().iterdir()) if Path("plugins").is_dir() else []
+    of_folders = [source for folder in dict.fromkeys([*folders, *_added]) for source in _in_folder(folder)]
+    for source in [*installed_sources(), *of_folders]:
+        known = found.setdefault(source.name, source)
         # A plugin that is installed from its folder is found twice.
-        known = unique.setdefault(source.name, source)
-        if known is not source and not _same_file(known.conf, source.conf):
-            _problems[
-                f"plugin {source.conf.parent}: {known.conf.parent} is called {source.name} too; it is left out"
-            ] = None
-    return tuple(unique.values())
+        if known.conf.resolve() != source.conf.resolve():
+            line = f"plugin {source.conf.parent}: {known.conf.parent} is called {source.name} too; it is left out"
+            _problems[line] = None
+    return tuple(found.values())
 
 
 def installed_sources() -> list[Source]:
     """Ours, then the installed plugins: what is the same in every folder."""
-    return [Source("ipe-bench", own_conf(), "built in"), *_installed()]
-
-
-def _same_file(a: Path, b: Path) -> bool:
-    try:
-        return a.samefile(b)
-    except OSError:
-        return False
-
-
-def _folders() -> list[Path]:
-    plugins = Path("plugins")
-    try:
-        return sorted(plugins.resolve().iterdir()) if plugins.is_dir() else []
-    except (OSError, RuntimeError) as error:
-        _problems[f"plugins: cannot be read ({describe_exception(error)}); they are left out"] = None
-        return []
+    found = [Source("ipe-bench", own_conf(), "built in")]
+    for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
+        reason = f"there is no package {entry.value}"
+        try:
+            spec = importlib.util.find_spec(entry.value)
+        except Exception as error:  # its parent package is imported, which may raise anything
+            spec, reason = None, describe_exception(error)
+        if spec is None or not spec.submodule_search_locations:
+            _problems[f"plugin {entry.name}: {reason}; it is left out, install it again"] = None
+            continue
+        _register(entry.value.split(".")[0])
+        origin = f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.name
+        found.append(Source(entry.value, Path(spec.submodule_search_locations[0]) / "conf", origin))
+    return found
 
 
 def add_folder(folder: Path) -> bool:
@@ -301,30 +226,12 @@ def add_folder(folder: Path) -> bool:
     return bool(list(_in_folder(folder.resolve())))
 
 
-def _installed() -> Iterator[Source]:
-    for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
-        try:
-            spec = importlib.util.find_spec(entry.value)
-        except Exception as error:  # its parent package is imported, which may raise anything
-            spec, reason = None, describe_exception(error)
-        else:
-            reason = f"there is no package {entry.value}"
-        if spec is None or not spec.submodule_search_locations:
-            _problems[f"plugin {entry.name}: {reason}; it is left out, install it again"] = None
-            continue
-        _register(entry.value.split(".")[0])
-        version = f" {entry.dist.version}" if entry.dist else ""
-        conf = Path(spec.submodule_search_locations[0]) / "conf"
-        yield Source(entry.value, conf, f"{entry.dist.name if entry.dist else entry.name}{version}")
-
-
 def _in_folder(folder: Path) -> Iterator[Source]:
     for conf in sorted(folder.glob("*/conf")):
-        package = conf.parent.name
         if (conf.parent / "__init__.py").is_file():
-            _make_importable(folder)
-            _register(package)
-            yield Source(package, conf, f"{folder.parent.name}/{folder.name}")
+            _make_importable(str(folder.resolve()))
+            _register(conf.parent.name)
+            yield Source(conf.parent.name, conf, f"{folder.parent.name}/{folder.name}")
 
 
 def _register(package: str) -> None:
@@ -334,9 +241,8 @@ def _register(package: str) -> None:
     register_package(package)
 
 
-def _make_importable(folder: Path) -> None:
+def _make_importable(path: str) -> None:
     """Puts the folder on the import path of this process and of the workers it starts."""
-    path = str(folder.resolve())
     if path not in sys.path:
         sys.path.append(path)
     inherited = [p for p in os.environ.get("PYTHONPATH", "").split(os.pathsep) if p]
@@ -351,17 +257,14 @@ def options(group: str | None = None) -> list[Option]:
     related = ("",) if group is None else ESTIMATOR_GROUPS if group in ESTIMATOR_GROUPS else (group,)
     for source in sources():
         for path in sorted(path for name in related for path in (source.conf / name).rglob("*.yaml")):
-            relative = path.relative_to(source.conf).with_suffix("")
-            if len(relative.parts) < 2:
+            folder, *name = path.relative_to(source.conf).with_suffix("").parts
+            if not name:
                 continue
-            option = Option(relative.parts[0], "/".join(relative.parts[1:]), path, source)
+            option = Option(folder, "/".join(name), path, source)
             # Solvers and baselines share their labels: of two with one label, only one would run.
-            kind = "estimator" if option.group in ESTIMATOR_GROUPS else option.group
-            place = (kind, option.label if kind == "estimator" else option.name)
-            known = found.get(place)
-            if known is None:
-                found[place] = option
-            elif known.rival is None:
+            place = ("estimator", option.label) if folder in ESTIMATOR_GROUPS else (folder, option.name)
+            known = found.setdefault(place, option)
+            if known is not option and known.rival is None:
                 found[place] = dataclasses.replace(known, rival=path)
     return [o for o in found.values() if group is None or o.group == group]
 
@@ -377,9 +280,8 @@ def composed(option: Option, seen: Sequence[str] = ()) -> dict[str, Any]:
     defaults = config.pop("defaults", [])
     if not isinstance(defaults, list):
         raise UserError(f"{option.path}: defaults is not a list; write defaults: [NAME]")
-    names = [*defaults, *([] if "_self_" in defaults else ["_self_"])]
     found: dict[str, Any] = {}
-    for entry in names:
+    for entry in defaults if "_self_" in defaults else [*defaults, "_self_"]:
         if entry == "_self_":
             found = _merged(found, config)
             continue
@@ -397,11 +299,8 @@ def composed(option: Option, seen: Sequence[str] = ()) -> dict[str, Any]:
 
 def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
     """Both, the second in the place of the first but where both are mappings."""
-    result = dict(first)
-    for key, value in second.items():
-        both = isinstance(value, Mapping) and isinstance(result.get(key), Mapping)
-        result[key] = _merged(result[key], value) if both else value
-    return result
+    both = {k for k, v in second.items() if isinstance(v, Mapping) and isinstance(first.get(k), Mapping)}
+    return {**first, **second, **{key: _merged(first[key], second[key]) for key in both}}
 
 
 def options_in(folder: Path) -> list[Option]:

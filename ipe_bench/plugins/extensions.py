@@ -1,8 +1,6 @@
-"""What plugins add: richer models of an instrument, and to a report statistics, figures, tables and sections, each a
-record that a config file names.
+"""What plugins add: richer models of an instrument, and statistics, figures, tables and sections of a report.
 
-The file `conf/figure/NAME.yaml` has one key, `_target_`, the dotted name of the record in the plugin's package. What
-a record of each kind is, the rooms say that compute and show it.
+Each of those is a record: `conf/figure/NAME.yaml` has one key, `_target_`, its dotted name in the plugin's package.
 """
 
 from __future__ import annotations
@@ -10,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 from ipe_bench.basics.errors import UserError
@@ -86,24 +83,12 @@ def use_statistics() -> list[str]:
     return problems + add_statistics(found)
 
 
-def code_digest(option: Option) -> str:
-    """Changes with any file of the package that an option belongs to."""
-    package = option.source.conf.parent
-    digest = hashlib.sha256(f"{option.target};".encode())
-    for path in sorted(package.rglob("*")):
-        if path.is_file() and "__pycache__" not in path.parts:
-            digest.update(f"{path.relative_to(package)} {_digest_of(path)};".encode())
-    return digest.hexdigest()
-
-
 def digest_of_all() -> str:
     """Changes with the code of any plugin that adds to reports."""
-    chosen = [option for group in RECORD_GROUPS for option in options(group)]
-    return hashlib.sha256("".join(f"{o.group}={o.name} {code_digest(o)};" for o in chosen).encode()).hexdigest()
-
-
-def _digest_of(path: Path) -> str:
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError:
-        return ""
+    digest = hashlib.sha256()
+    for option in (option for group in RECORD_GROUPS for option in options(group)):
+        digest.update(f"{option.group}={option.name} {option.target};".encode())
+        for path in sorted(option.source.conf.parent.rglob("*")):
+            if path.is_file() and "__pycache__" not in path.parts:
+                digest.update(f"{path}{hashlib.sha256(path.read_bytes()).hexdigest()};".encode())
+    return digest.hexdigest()
