@@ -10,7 +10,7 @@ from ipe_bench.measurements.base import Measurement
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct
 from ipe_bench.plugins.description import Described, described
-from ipe_bench.report.table import Table, texts
+from ipe_bench.report.table import Table, words
 
 
 def main(names: Sequence[str], verbose: bool) -> int:
@@ -59,7 +59,7 @@ def _show_group(group: str, verbose: bool) -> None:
 
 
 def _show(title: str, columns: dict[str, list[str]]) -> None:
-    show([Table("list", title, "", [texts(heading, cells, numeric=False) for heading, cells in columns.items()])])
+    show([Table("list", title, "", [words(heading, cells) for heading, cells in columns.items()])])
 
 
 def _show_keys(title: str, prefix: str, rows: Sequence[Described]) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import console, given_keys, print_problems
+from ipe_bench.cli import console, given_keys, print_problems, say
 from ipe_bench.report import begin_report
 from ipe_bench.report.choice import PAGE, Which
 from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
@@ -32,26 +32,21 @@ def main(arguments: Sequence[str]) -> int:
     output = Path(keys["output"]) if "output" in keys else None
     if not named:
         raise UserError("report: name at least one directory of results, such as outputs/paper")
-    if output is None and any(map(is_bundle, named)):
-        raise UserError(
-            f"report: {next(filter(is_bundle, named))}: is a bundle; say where the report goes with output=DIR"
-        )
+    if output is None and (bundles := [name for name in named if is_bundle(name)]):
+        raise UserError(f"report: {bundles[0]}: is a bundle; say where the report goes with output=DIR")
     if output is None and len(named) > 1 and not for_paper:
         raise UserError("report: several directories need output=DIR, as the report on all is not that of the first")
     with opened(named, None if output is None else output / BUNDLES) as folders:
         require_results(folders)
-        return _paper(folders, keys) if for_paper else _report(folders, output, keys)
-
-
-def _report(folders: Sequence[Path], output: Path | None, keys: Mapping[str, str]) -> int:
-    figures: Any = keys.get("figures", "main")
-    report = begin_report(folders, output, figures=figures, formats=keys.get("formats", PAGE))
-    collection = report.begun.collection
-    _print_table(report.begun.summary, collection)
-    report.write_unless_current()
-    print_problems([*collection.problems, *collection.stale])
-    _print_places(report.output)
-    return 1 if collection.problems else 0
+        if for_paper:
+            return _paper(folders, keys)
+        report = begin_report(folders, output, figures=keys.get("figures", "main"), formats=keys.get("formats", PAGE))
+        collection = report.begun.collection
+        _print_table(report.begun.summary, collection)
+        report.write_unless_current()
+        print_problems([*collection.problems, *collection.stale])
+        _print_places(report.output)
+        return 1 if collection.problems else 0
 
 
 def show_command(output: Path, cells: Mapping[str, str], figures: Which, formats: tuple[str, ...]) -> int:
@@ -60,29 +55,28 @@ def show_command(output: Path, cells: Mapping[str, str], figures: Which, formats
     `cells` has a line for people by key; where it is empty, everything is printed.
     """
     report = begin_report([output], figures=figures, formats=formats)
-    collection = report.begun.collection
+    collection, rows = report.begun.collection, report.begun.summary
     others = sum(cell.key not in cells and cell.label != TRUTH for cell in collection.current) if cells else 0
+    shown = collection
     if others:
         from ipe_bench.statistics.collect import collect
         from ipe_bench.statistics.summary import rows_of_all
 
-        own = collect([output], cells.keys())
-        _print_table(rows_of_all(own), own)
-    else:
-        _print_table(report.begun.summary, collection)
+        shown = collect([output], cells.keys())
+        rows = rows_of_all(shown)
+    _print_table(rows, shown)
     report.write_unless_current()
-    problems = collection.problems
     # What is wrong with a file or a folder may concern anybody; what other commands lack does not.
-    of_cells = [p for p in problems if p.startswith(("missing: ", "failed: "))]
+    of_cells = [p for p in collection.problems if p.startswith(("missing: ", "failed: "))]
     elsewhere = [p for p in of_cells if cells and not any(line in p for line in cells.values())]
-    print_problems([p for p in problems if p not in elsewhere])
+    print_problems([p for p in collection.problems if p not in elsewhere])
     if elsewhere:
-        told = f"{_counted(len(elsewhere), 'problem')} of other commands; `ipe-bench status {output}` lists them"
-        print_problems([f"{output}: {told}"])
+        counted = _counted(len(elsewhere), "problem")
+        print_problems([f"{output}: {counted} of other commands; `ipe-bench status {output}` lists them"])
     _print_places(output)
     if others:
         print(f"Here too  {_counted(others, 'result')} of other commands; `ipe-bench report {output}` shows all")
-    return 1 if problems else 0
+    return 1 if collection.problems else 0
 
 
 def _print_table(rows: Sequence[Mapping[str, Any]], collection: Collection) -> None:
@@ -100,8 +94,9 @@ def _print_table(rows: Sequence[Mapping[str, Any]], collection: Collection) -> N
 
 def _print_places(output: Path) -> None:
     figures = f"\nFigures  {output / 'figures'}" if any(output.glob("figures/*.png")) else ""
-    places = f"\nSummary  {output / 'summary.csv'}\nTables   {output / 'tables'}{figures}"
-    console().print(f"{places}\nReport   {output / 'report.html'}", markup=False, soft_wrap=True)
+    say(
+        f"\nSummary  {output / 'summary.csv'}\nTables   {output / 'tables'}{figures}\nReport   {output / 'report.html'}"
+    )
 
 
 def _counted(number: int, noun: str) -> str:
@@ -110,7 +105,11 @@ def _counted(number: int, noun: str) -> str:
 
 def _paper(folders: Sequence[Path], keys: Mapping[str, str]) -> int:
     """Writes tables and figures as a paper wants them; exit code 1 where a table is too wide, or data are missing."""
-    names = _listed(keys.get("paper", ""))
+    from ipe_bench.plugins.extensions import use_statistics
+    from ipe_bench.report.paper import export
+    from ipe_bench.statistics import analyse
+
+    names, columns = _listed(keys.get("paper", "")), _listed(keys.get("columns", ""))
     if not names:
         raise UserError("paper=: name tables and figures, such as paper=overview,error_against_scale")
     width = {}
@@ -119,18 +118,11 @@ def _paper(folders: Sequence[Path], keys: Mapping[str, str]) -> int:
             width["width"] = float(keys["width"].removesuffix("in"))
         except ValueError:
             raise UserError(f"width={keys['width']}: give inches, such as 3.5 or 7.16") from None
-    from ipe_bench.plugins.extensions import use_statistics
-    from ipe_bench.report.paper import export
-    from ipe_bench.statistics import analyse
-
     faults = use_statistics()
     analysis = analyse(folders)
     analysis.collection.further += faults
-    done = export(
-        analysis, Path(keys.get("output", folders[0] / "paper")), names, _listed(keys.get("columns", "")), **width
-    )
-    for path in done.files:
-        console().print(str(path), markup=False, soft_wrap=True)
+    done = export(analysis, Path(keys.get("output", folders[0] / "paper")), names, columns, **width)
+    say(*map(str, done.files))
     print_problems([*analysis.problems, *analysis.stale, *done.too_wide])
     return 1 if analysis.problems or done.too_wide else 0
 

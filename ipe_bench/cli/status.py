@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import say, show
-from ipe_bench.report.table import Table, texts
+from ipe_bench.report.table import Table, texts, words
 from ipe_bench.runs.bundles import opened
 from ipe_bench.runs.parts import TRUTH
 from ipe_bench.runs.results import CellState, Results, require_results
@@ -41,8 +41,8 @@ def _show(directory: str, results: Results, verbose: bool) -> None:
 def _table(directory: str, cells: Sequence[CellState]) -> Table:
     names = [cell.names["estimator"] for cell in cells]
     columns = [
-        texts("scenario", [cell.title for cell in cells], numeric=False),
-        texts("estimator", ["(truth)" if name == TRUTH else name for name in names], numeric=False),
+        words("scenario", [cell.title for cell in cells]),
+        words("estimator", ["(truth)" if name == TRUTH else name for name in names]),
         texts("done", [f"{cell.done} of {cell.expected or cell.done}" for cell in cells]),
         *(
             texts(count, [str(getattr(cell, count) or "") for cell in cells])

@@ -82,7 +82,7 @@ def written(value: Any) -> str:
 def meanings(cls: type) -> dict[str, str]:
     """By field, the text below it, of the class and its bases."""
     found: dict[str, str] = {}
-    for base in filter(dataclasses.is_dataclass, reversed(cls.__mro__)):
+    for base in (base for base in reversed(cls.__mro__) if dataclasses.is_dataclass(base)):
         try:
             body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0]
         except (OSError, TypeError, SyntaxError, IndexError):

@@ -65,7 +65,9 @@ def read_yaml(text: str) -> Any:
     """
     try:
         return yaml.load(text, _Loader)
-    except (RecursionError, ValueError) as error:  # nested too deeply, a control character, a number that is none
+    except RecursionError:
+        raise yaml.YAMLError("it is nested too deeply") from None
+    except ValueError as error:  # a control character, or a number that is none
         raise yaml.YAMLError(describe_exception(error)) from None
 
 

@@ -64,7 +64,7 @@ def test_all_kinds_of_plugins_are_made_checked_run_and_seen(installed, tmp_path)
         assert text in page
     for text in ("own_statistic", "figure-own_figure", "table-own_table", "What own_section says"):
         assert text in page
-    assert "own_execution" in (tmp_path / "out" / "log" / ".hydra" / "config.yaml").read_text(encoding="utf-8")
+    assert "own_execution" in run("run", *chosen, "--cfg", "job")
     printed = run("run", "+experiment=own_experiment", "trials=5", "output=other")
     assert "Report" in printed
 

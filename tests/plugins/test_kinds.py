@@ -326,20 +326,19 @@ def test_the_posterior_is_not_sampled_under_a_prior_that_is_not_normal():
 
 def test_a_plugin_without_its_library_stops_no_run_and_says_what_to_install(capsys):
     assert main(["new", "solver", "mine"]) == 0
-    project = Path("plugins/mine/pyproject.toml")
-    text = project.read_text().replace('["ipe-bench"]', '["ipe-bench", "no-such-library>=2", "numpy"]')
-    project.write_text(text)
     Path("plugins/mine/ipe_bench_mine/mine.py").write_text("import no_such_library\n")
     discovery.sources.cache_clear()
     capsys.readouterr()
+    remedy = "No module named 'no_such_library'; install what the plugin needs"
     assert main(["list", "solver"]) == 0
-    written = capsys.readouterr()
-    remedy = "needs no-such-library, not installed here; pip install plugins/mine"
-    assert written.err.splitlines() == [f"ipe-bench: solver=mine: {remedy}"]
-    assert "newton" in written.out
+    assert "mine" in capsys.readouterr().out
     assert main(["run", *SMALL, "figures=none", "solver=[newton]"]) == 0
     assert "mine" not in capsys.readouterr().err
-    assert main(["run", *SMALL, "figures=none", "solver=[mine]"]) == 2
-    assert capsys.readouterr().err.splitlines() == [f"ipe-bench: solver=mine: {remedy}"]
-    assert main(["check", "plugins/mine"]) == 1
-    assert remedy in capsys.readouterr().out
+    for words, code in (
+        (["run", *SMALL, "solver=[mine]"], 2),
+        (["list", "solver", "-v"], 0),
+        (["check", "plugins/mine"], 1),
+    ):
+        assert main(words) == code
+        written = capsys.readouterr()
+        assert remedy in written.out + written.err
