@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ipe_bench.cli import say
+from ipe_bench.cli import console, say
 from ipe_bench.cli import words as w
 from ipe_bench.cli.session import composed, jobs_of, session
 from ipe_bench.cli.spec import Spec
@@ -68,4 +68,5 @@ def single(command: str, arguments: Sequence[str], standard: Sequence[str] = (),
 
 def say_files(files: Sequence[Path]) -> None:
     """Says which files a command has written into its folder."""
-    say(f"\nIn {files[0].parent}: {', '.join(path.name for path in files)}")
+    say(f"\nIn {files[0].parent}:")
+    console().print(", ".join(path.name for path in files), markup=False)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import ipe_bench as ib
-from ipe_bench.cli.main import main
+from ipe_bench.cli.main import COMMANDS, main
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.report import figures
 
@@ -29,22 +29,6 @@ def ipe_bench(*arguments: str, folder: Path, **environment: str) -> subprocess.C
         timeout=300,
         check=False,
     )
-
-
-@pytest.fixture
-def in_process(monkeypatch, capsys):
-    """Runs the command in this process: quicker, for commands that end before any work."""
-    for variable in ("HYDRA_FULL_ERROR", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        monkeypatch.setenv(variable, "1")
-
-    def run(arguments: list[str], folder: Path) -> tuple[int, str]:
-        monkeypatch.chdir(folder)
-        monkeypatch.setattr(sys, "argv", ["ipe-bench"])
-        plugins.sources.cache_clear()
-        code = main(arguments)
-        return code, capsys.readouterr().err
-
-    return run
 
 
 @pytest.fixture
@@ -90,8 +74,6 @@ def test_a_sweep_leaves_tables_figures_and_a_report(tmp_path, here, monkeypatch)
 
 
 def test_estimates_from_a_file_find_the_parameters_that_made_it(readings, here):
-    import re
-
     result = here("estimate", f"readings={readings}", "error_scale=10", "figures=none", folder=readings.parent)
     assert result.returncode == 0, result.stderr
     truth = {
@@ -108,28 +90,18 @@ def test_estimates_from_a_file_find_the_parameters_that_made_it(readings, here):
 
 MISTAKES = {
     "unknown estimator": (["run", "solver=[newtn]"], "solver=newtn: there is no such option; did you mean newton?"),
-    "unknown measurement": (["run", "measurement=gims"], "did you mean gins?"),
     "unknown key": (["run", "eror_scale=1"], "did you mean error_scale?"),
     "unknown option": (["run", "estimators.fixed_point.tolerence=1"], "estimators.fixed_point.tolerence"),
     "negative scale": (["run", "error_scale=-1"], "error_scale=-1.0: give a number above 0"),
-    "zero scale": (["run", "error_scale=0"], "error_scale=0.0: give a number above 0"),
-    "infinite scale": (["run", "error_scale=inf"], "error_scale=inf: give a number above 0"),
     "huge seed": (["run", "seed=99999999999999999999"], "seed=99999999999999999999: give a whole number from 0 to"),
-    "negative noise": (["run", "noise.step=-1"], "noise.step=-1.0: give a number above 0"),
     "noise that is not a number": (["run", "noise=gaussian", "noise.deviation=nan"], "noise.deviation=nan"),
-    "prior of two": (["run", "prior.deviations=[1,2]"], "prior.deviations: has 2 numbers; give one for each of 11"),
-    "negative prior": (["run", "prior.deviations=[-1]"], "prior.deviations[0]=-1.0: give 0 or a number above"),
-    "negative budget": (["run", "estimators.fixed_point.budget=-1"], "estimators.fixed_point.budget=-1.0"),
     "infinite tolerance": (["run", "estimators.fixed_point.tolerance=inf"], "tolerance=inf: give a number above 0"),
     "label truth": (["run", "+solver@estimators.truth=newton"], "estimators.truth: is what the truth itself"),
     "options that are none": (["run", "estimators.fixed_point=3"], "estimators.fixed_point=3: set its options"),
     "impossible folder": (["run", "output=/proc/x"], "choose another"),
     "taken name": (["new", "solver", "newton"], "newton: solver=newton is there already"),
     "word of Python": (["new", "solver", "class"], "class: is a word of Python"),
-    "no trials": (["run", "trials=0"], "trials=0: give a whole number above 0"),
-    "text for a number": (["run", "trials=many"], "trials=many: give a whole number"),
     "no estimator": (["run", "solver=[]", "baseline=[]"], "there is no estimator"),
-    "chosen twice": (["run", "solver=[newton,newton]"], "newton stands there twice"),
     "foreign target": (["run", "noise._target_=os.system"], "only classes of these packages"),
     "two experiments": (["run", "-m", "+experiment=paper,paper"], "run them one by one"),
     "added key": (["run", "+trails=3"], "did you mean trials?"),
@@ -171,23 +143,20 @@ MISTAKES = {
 }
 
 
+def is_refused(result: subprocess.CompletedProcess[str], expected: str) -> None:
+    assert result.returncode == 2
+    assert expected in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+
+
 QUICK = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "trials=4", "execution=serial")
 
 
 @pytest.mark.parametrize("case", MISTAKES)
-def test_a_mistake_is_one_line_with_exit_code_2(tmp_path, in_process, case):
+def test_a_mistake_is_one_line_with_exit_code_2(tmp_path, here, case):
     arguments, expected = MISTAKES[case]
-    code, error = in_process(arguments, tmp_path)
-    assert code == 2
-    assert expected in error
-    assert len(error.strip().splitlines()) == 1
+    is_refused(here(*arguments, folder=tmp_path), expected)
     assert not (tmp_path / "outputs").exists() or not list((tmp_path / "outputs").rglob("*.parquet"))
-
-
-def test_a_sweep_whose_patterns_match_nothing_says_so(tmp_path, here):
-    result = here("run", "-m", "solver=glob(nothing*)", folder=tmp_path)
-    assert result.returncode == 2
-    assert "the sweep has no jobs" in result.stderr
 
 
 SPOILED = {
@@ -209,14 +178,11 @@ SPOILED = {
 
 
 @pytest.mark.parametrize("case", SPOILED)
-def test_a_spoiled_readings_file_is_named_by_row_and_column(readings, tmp_path, in_process, case):
+def test_a_spoiled_readings_file_is_named_by_row_and_column(readings, tmp_path, here, case):
     spoil, expected = SPOILED[case]
     path = tmp_path / "spoiled.csv"
     path.write_text("\n".join(spoil(readings.read_text().splitlines())))
-    code, error = in_process(["estimate", f"readings={path}"], tmp_path)
-    assert code == 2
-    assert expected in error
-    assert len(error.strip().splitlines()) == 1
+    is_refused(here("estimate", f"readings={path}", folder=tmp_path), expected)
 
 
 def test_a_missing_reading_is_an_empty_cell(readings, tmp_path, here):
@@ -246,7 +212,7 @@ def test_nothing_is_overwritten(readings, here):
         (["-m", "measurement=polynomial,nist/enso", "noise.deviation=1"], ["", "ENSO"]),
     ],
 )
-def test_a_data_set_may_be_written_as_an_option_of_its_own(words, expected, tmp_path, in_process, capsys):
+def test_a_data_set_may_be_written_as_an_option_of_its_own(words, expected, tmp_path, capsys):
     noise = [] if "noise.deviation=1" in words else ["noise=certified"]
     assert main(["run", *words, *noise, "trials=1", f"output={tmp_path}", "--dry-run"]) == 0
     *lines, _ = capsys.readouterr().out.splitlines()
@@ -353,13 +319,12 @@ def test_an_estimate_draws_nothing_where_no_figures_are_asked_for(tmp_path, here
     assert "<img" not in (tmp_path / "out" / "estimate.html").read_text(encoding="utf-8")
 
 
-def test_estimate_overwrites_no_other_command(readings, tmp_path, in_process):
+def test_estimate_overwrites_no_other_command(readings, tmp_path, here):
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / "residuals.csv").write_text("mine")
-    code, error = in_process(["estimate", f"readings={readings}", "output=mine"], tmp_path)
-    assert code == 2
-    assert "output=mine: holds results of another command" in error
+    result = here("estimate", f"readings={readings}", "output=mine", folder=tmp_path)
+    is_refused(result, "output=mine: holds results of another command")
     assert (folder / "residuals.csv").read_text() == "mine"
 
 
@@ -372,42 +337,20 @@ SPOILED_PARQUET = {
 
 
 @pytest.mark.parametrize("case", SPOILED_PARQUET)
-def test_a_spoiled_parquet_file_is_named_by_row_and_column(readings, tmp_path, in_process, case):
+def test_a_spoiled_parquet_file_is_named_by_row_and_column(readings, tmp_path, here, case):
     change, expected = SPOILED_PARQUET[case]
     path = as_parquet(readings, tmp_path / "spoiled.parquet", change)
-    code, error = in_process(["estimate", f"readings={path}"], tmp_path)
-    assert code == 2
-    assert expected in error
-    assert len(error.strip().splitlines()) == 1
+    is_refused(here("estimate", f"readings={path}", folder=tmp_path), expected)
 
 
-@pytest.mark.parametrize(
-    "command", ["estimate", "design", "posterior", "report", "status", "list", "new", "check", "compare", "bundle"]
-)
-def test_every_command_has_help(tmp_path, monkeypatch, capsys, command):
-    monkeypatch.chdir(tmp_path)
-    assert main([command, "--help"]) == 0
-    assert f"ipe-bench {command}" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("words", [[], ["help"], ["-h"]])
-def test_the_bare_program_says_what_there_is(capsys, words):
-    assert main(words) == 0
-    text = capsys.readouterr().out
-    for command in (
-        "run",
-        "estimate",
-        "design",
-        "posterior",
-        "report",
-        "status",
-        "list",
-        "new",
-        "check",
-        "compare",
-        "bundle",
-    ):
-        assert re.search(rf"\n    {command}\s", text)
+def test_the_bare_program_and_every_command_have_help(capsys):
+    for words in ([], ["help"], ["-h"]):
+        assert main(words) == 0
+        text = capsys.readouterr().out
+        assert all(re.search(rf"\n    {command}\s", text) for command in COMMANDS)
+    for command in COMMANDS:
+        assert main([command, "--help"]) == 0
+        assert f"ipe-bench {command}" in capsys.readouterr().out
 
 
 def test_flags_stand_anywhere_among_the_words_of_a_command(tmp_path, monkeypatch, capsys):

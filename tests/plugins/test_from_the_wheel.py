@@ -67,15 +67,3 @@ def test_all_kinds_of_plugins_are_made_checked_run_and_seen(installed, tmp_path)
     assert "own_execution" in run("run", *chosen, "--cfg", "job")
     printed = run("run", "+experiment=own_experiment", "trials=5", "output=other")
     assert "Report" in printed
-
-
-def test_another_application_of_hydra_finds_our_configs(installed, tmp_path):
-    (tmp_path / "app.py").write_text(
-        "import hydra\n"
-        "@hydra.main(version_base='1.3', config_path='conf', config_name='config')\n"
-        "def main(config):\n    print(config.measurement._target_)\nmain()\n"
-    )
-    (tmp_path / "conf").mkdir()
-    (tmp_path / "conf" / "config.yaml").write_text("defaults: [measurement: gins]\nhydra: {run: {dir: .}}\n")
-    done = python("app.py", cwd=tmp_path, PYTHONPATH=str(installed))
-    assert done.stdout.splitlines() == ["ipe_bench.measurements.Gins"], done.stderr
