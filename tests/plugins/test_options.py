@@ -220,5 +220,7 @@ def test_conf_says_what_the_class_says(option):
     fields = {f.name: f for f in dataclasses.fields(component) if f.init}
     assert set(config) - {"_target_"} <= set(fields)
     assert option.group in ("measurement", "execution") or set(fields) <= set(config), "an option that nobody sees"
+    if any(f.default is f.default_factory for f in fields.values()):
+        return  # a model that a file describes: the class alone is none
     differs = {name for name in fields if getattr(component, name) != getattr(type(component)(), name)}
     assert differs == PRESETS.get((option.group, option.name), set())
