@@ -70,17 +70,6 @@ class NoRoot(Square):
         return np.stack([a**2 + 1, b], axis=1)
 
 
-class Temperamental(Square):
-    """Cubic, but raises where a > 100, overflows where a < -100, and has no slope where a is 50."""
-
-    def simulate(self, x: Array) -> Array:
-        if (np.real(x[:, 0]) > 100).any():
-            raise ArithmeticError("too hot\nsecond line")
-        z = Cubic().simulate(x)
-        z[np.real(x[:, 0]) < -100] = np.inf
-        return np.where((np.real(x[:, :1]) == 50), 1.0 + 0 * z, z)
-
-
 def system_of(model: Measurement, trials: int) -> FrozenSystem:
     """h(x) = 0 for each trial."""
     unit = np.eye(model.n)[None]

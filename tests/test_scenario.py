@@ -10,21 +10,22 @@ from ipe_bench.priors import GaussianPrior
 from ipe_bench.trials.scenario import Scenario
 
 
-@pytest.mark.parametrize("noise", [Gaussian(0.1), StudentT(0.1), Colored(0.1, 0.5), Quantization(0.1, dither=True)])
-def test_a_trial_is_the_same_in_every_block(noise):
-    scenario = Scenario(Ranging(), noise, GaussianPrior(), 2.0, seed=3)
+@pytest.mark.parametrize(
+    ("model", "noise"),
+    [
+        *((Ranging(), n) for n in (Gaussian(0.1), StudentT(0.1), Colored(0.1, 0.5), Quantization(0.1, dither=True))),
+        (Gins(), Quantization(0.02286)),
+    ],
+    ids=str,
+)
+def test_a_trial_is_the_same_in_every_block(model, noise):
+    scenario = Scenario(model, noise, GaussianPrior(), 2.0, seed=3)
     whole = scenario.draw(0, 40)
     for bounds in ((0, 1), (7, 20), (39, 40)):
         part = scenario.draw(*bounds)
         assert (part.x == whole.x[slice(*bounds)]).all()
         assert (part.z == whole.z[slice(*bounds)]).all()
         assert (part.start, part.stop) == bounds
-
-
-def test_gins_trials_are_the_same_in_every_block():
-    scenario = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), 33.0)
-    whole = scenario.draw(0, 30)
-    assert (scenario.draw(11, 13).z == whole.z[11:13]).all()
 
 
 def test_seeds_and_trials_are_independent():

@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.baselines.batched import Rows, Stack, correct
-from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric, turned
-from ipe_bench.basics.linalg import Array, Mask, cholesky
+from ipe_bench.baselines.batched import Stack
+from ipe_bench.baselines.epochs import Rows, symmetric
+from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, turned
+from ipe_bench.basics.linalg import Array, cholesky
+from ipe_bench.measurements.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -19,8 +21,8 @@ class CKF(Sequential):
     def track(self, P0: Array, Q: Array, z: Array) -> CKFTrack:
         return CKFTrack(P0, Q)
 
-    def stack(self, P0: Array, Q: Array, z: Array) -> CKFStack:
-        return CKFStack(P0, Q, len(z))
+    def stack(self, P0: Array, Q: Array, problem: Problem, z: Array) -> CKFStack:
+        return CKFStack(P0, Q, problem, z)
 
 
 class CKFTrack(Track):
@@ -75,16 +77,16 @@ class CKFTrack(Track):
 class CKFStack(Stack):
     """The same filter for all trials at once."""
 
-    def __init__(self, P0: Array, Q: Array, trials: int) -> None:
-        super().__init__(P0, Q, trials)
-        self.away = np.zeros((trials, 2 * len(P0), len(P0)))
+    def __init__(self, P0: Array, Q: Array, problem: Problem, z: Array) -> None:
+        super().__init__(P0, Q, problem, z)
+        self.away = np.zeros((len(z), 2 * len(P0), len(P0)))
 
     def points(self, at: Rows) -> Array:
         U = cholesky(self.P[at]) * np.sqrt(self.P.shape[1])
         self.away[at] = np.concatenate([U, -U], axis=1)
         return self.x[at][:, None] + self.away[at]
 
-    def update(self, at: Rows, z: Array, h: Array, H: Array | None) -> Mask:
+    def update(self, at: Rows, z: Array, h: Array, H: Array | None) -> bool:
         weights = np.full(h.shape[1], 1 / h.shape[1])
-        correct(self, at, self.away[at], z, h, weights, weights)
-        return np.ones(len(at), dtype=bool)
+        self.correct(at, self.away[at], z, h, weights, weights)
+        return True

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.baselines.batched import Rows, Stack, gain_of, principal_axes, squared_innovations
+from ipe_bench.baselines.batched import Stack, gain_of, principal_axes, squared_innovations
+from ipe_bench.baselines.epochs import Rows
 from ipe_bench.baselines.sequential import Sequential, Track, refuse_overflow, squared_innovation
 from ipe_bench.basics.linalg import Array, Mask, multiply
+from ipe_bench.measurements.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -21,8 +23,8 @@ class EKF(Sequential):
     def track(self, P0: Array, Q: Array, z: Array) -> EKFTrack:
         return EKFTrack(P0, Q)
 
-    def stack(self, P0: Array, Q: Array, z: Array) -> EKFStack:
-        return EKFStack(P0, Q, len(z))
+    def stack(self, P0: Array, Q: Array, problem: Problem, z: Array) -> EKFStack:
+        return EKFStack(P0, Q, problem, z)
 
 
 class EKFTrack(Track):
@@ -70,14 +72,15 @@ def turned_by_slopes(z: Array, h: Array, H: Array, P: Array) -> tuple[Array, Arr
 class EKFStack(Stack):
     """The same filter for all trials at once."""
 
+    slopes = True
+
     def points(self, at: Rows) -> Array:
         return self.x[at][:, None]
 
-    def update(self, at: Rows, z: Array, h: Array, H: Array | None) -> Mask:
+    def update(self, at: Rows, z: Array, h: Array, H: Array | None) -> Mask | bool:
         assert H is not None
-        y = self.linear_update(at, self.x[at], self.P[at], z - h[:, 0], H)
-        self.nis[at] += y
-        return np.ones(len(at), dtype=bool)
+        self.nis[at] += self.linear_update(at, self.x[at], self.P[at], z - h[:, 0], H)
+        return True
 
     def linear_update(self, at: Rows, x: Array, P: Array, y: Array, H: Array) -> Array:
         """From the priors x and P and the innovations y (trials, m); returns y' S^-1 y (trials,)."""

@@ -11,12 +11,13 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Gt
 
-from ipe_bench.baselines.batched import Rows, Stack, gain_of, squared_innovations
-from ipe_bench.baselines.batched import symmetric as symmetric_each
-from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, symmetric, turned
-from ipe_bench.basics.linalg import Array, Mask, multiply
+from ipe_bench.baselines.batched import Stack, gain_of, squared_innovations
+from ipe_bench.baselines.epochs import Rows, symmetric
+from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, turned
+from ipe_bench.basics.linalg import Array, multiply
 from ipe_bench.basics.options import Whole
 from ipe_bench.basics.streams import own_bits
+from ipe_bench.measurements.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,8 @@ class EnKF(Sequential):
     def track(self, P0: Array, Q: Array, z: Array) -> EnKFTrack:
         return EnKFTrack(P0, Q, self.members, own_bits(self.seed, z))
 
-    def stack(self, P0: Array, Q: Array, z: Array) -> EnKFStack:
-        return EnKFStack(P0, Q, self.members, [own_bits(self.seed, row) for row in z])
+    def stack(self, P0: Array, Q: Array, problem: Problem, z: Array) -> EnKFStack:
+        return EnKFStack(P0, Q, problem, z, self)
 
 
 class EnKFTrack(Track):
@@ -82,11 +83,11 @@ class EnKFTrack(Track):
 class EnKFStack(Stack):
     """The same filter for all trials at once, with the same draws."""
 
-    def __init__(self, P0: Array, Q: Array, members: int, streams: list[np.random.Philox]) -> None:
-        super().__init__(P0, Q, len(streams))
-        self.members, self.draws = members, [np.random.RandomState(stream) for stream in streams]
+    def __init__(self, P0: Array, Q: Array, problem: Problem, z: Array, given: EnKF) -> None:
+        super().__init__(P0, Q, problem, z)
+        self.members, self.draws = given.members, [np.random.RandomState(own_bits(given.seed, row)) for row in z]
         self.root_Q = _root(Q)
-        self.ensemble = self._drawn(np.arange(len(streams)), _root(P0))
+        self.ensemble = self._drawn(np.arange(len(z)), _root(P0))
 
     def _drawn(self, at: Rows, root: Array) -> Array:
         """Gaussian draws (trials, members, size) of covariance root' root, from each trial's own stream."""
@@ -102,7 +103,7 @@ class EnKFStack(Stack):
     def points(self, at: Rows) -> Array:
         return self.ensemble[at]
 
-    def update(self, at: Rows, z: Array, h: Array, H: Array | None) -> Mask:
+    def update(self, at: Rows, z: Array, h: Array, H: Array | None) -> bool:
         centre = h.mean(axis=1, keepdims=True)
         spread = h - centre
         # The perturbations are drawn along these axes, so they are those of `turned` to the sign.
@@ -116,9 +117,9 @@ class EnKFStack(Stack):
         innovations = z[:, None] + self._drawn(at, _root(I)) - spread
         self.ensemble[at] += np.matmul(innovations, K.swapaxes(1, 2))
         self.x[at] = self.ensemble[at].mean(axis=1)
-        self.P[at] = symmetric_each(self.P[at] - np.matmul(np.matmul(K, S), K.swapaxes(1, 2)))
+        self.P[at] = symmetric(self.P[at] - np.matmul(np.matmul(K, S), K.swapaxes(1, 2)))
         self.nis[at] += squared_innovations(z, S)
-        return np.ones(len(at), dtype=bool)
+        return True
 
 
 def _root(P: Array) -> Array:

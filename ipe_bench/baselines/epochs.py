@@ -1,19 +1,38 @@
-"""The readings as a filter meets them: epoch by epoch, each a model of its own that computes nothing later."""
+"""The readings as a filter meets them, epoch by epoch, and a batch on its way through them."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.baselines.ensemble import read_members
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.linalg import Array, Covariance, finite
+from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.measurements.base import Measurement, SubsetModel
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
+
+Rows = NDArray[np.intp]
+
+POINTS_AT_ONCE = 8192
+"""Points of one call of the model: bounds the memory that a large ensemble takes."""
+
+
+def read_members(model: CountingModel, R: Covariance, x: Array, rows: Rows) -> Array:
+    """Whitened h (trials, members, m) at x (trials, members, n), for the trials `rows` of the model's tally."""
+    trials, members, n = x.shape
+    counted = CountingModel(model.measurement, model.tally, model.share * members)
+    count = min(trials, -(-trials * members // POINTS_AT_ONCE))
+    pieces = np.array_split(np.arange(trials), count)
+    h = [R.whiten(counted.simulate(x[p].reshape(-1, n), np.repeat(rows[p], members))) for p in pieces]
+    # In C order whatever the model returned: BLAS rounds otherwise where the strides are other.
+    return np.ascontiguousarray(np.concatenate(h)).reshape(trials, members, -1)
 
 
 @dataclass(frozen=True)
@@ -22,7 +41,7 @@ class Epoch:
 
     number: int
     model: Measurement
-    rows: NDArray[np.intp]
+    rows: Rows
     R: Covariance
     share: float
     """The cost of this model's readings over that of all."""
@@ -32,11 +51,10 @@ class Epoch:
         return CountingModel(self.model, tally, self.share)
 
     def whitened(self, z: Array) -> Array:
+        """The epoch's part of all readings z (..., m), whitened."""
         return self.R.whiten(z[..., self.rows])
 
-    def read(
-        self, x: Array, trials: NDArray[np.intp], tally: EvaluationCount, *, slopes: bool
-    ) -> tuple[Array, Array | None]:
+    def read(self, x: Array, trials: Rows, tally: EvaluationCount, *, slopes: bool) -> tuple[Array, Array | None]:
         """Whitened h (trials, points, m) at x (trials, points, n), and dh/dx (trials, m, n) where it is asked for."""
         h = read_members(self.counted(tally), self.R, x, trials)
         if not slopes:
@@ -63,7 +81,7 @@ def arrivals(problem: Problem) -> Iterator[Epoch]:
         yield Epoch(number, part, rows, problem.R.restricted(rows), stop / len(whole.epochs))
 
 
-def _refuse_correlation(R: Covariance, rows: NDArray[np.intp]) -> None:
+def _refuse_correlation(R: Covariance, rows: Rows) -> None:
     if R.factor.ndim == 1:
         return
     across = R.matrix()[rows]
@@ -72,3 +90,109 @@ def _refuse_correlation(R: Covariance, rows: NDArray[np.intp]) -> None:
         raise UserError(
             "noise: its errors are correlated between epochs, which a filter cannot use; choose a batch estimator"
         )
+
+
+def require_needs(estimator: Estimator, problem: Problem) -> None:
+    """Raises UserError unless the problem has what the estimator needs."""
+    for need in estimator.missing(problem):
+        raise UserError(f"measurement={problem.measurement.name}: has no {need}, which this estimator needs")
+
+
+class Walk(ABC):
+    """A batch of filters on its way through the epochs: a subclass says how they take one in.
+
+    States are distances from the nominal point in prior deviations, and readings are whitened (R = I), so that P starts
+    near the unit matrix whatever the parameters' units.
+    """
+
+    def __init__(self, problem: Problem, z: Array) -> None:
+        self.problem, self.z, self.d = problem, z, np.array(problem.prior_deviation, dtype=float)
+        trials = len(z)
+        self.tally = EvaluationCount.zeros(trials)
+        self.epochs = list(arrivals(problem))
+        self.status = np.full(trials, Status.RUNNING, dtype=np.int8)
+        self.messages: dict[int, str] = {}
+        self.nis = np.zeros(trials)
+        """The squared innovations y' S^-1 y, summed over the epochs so far: chi-square where the filter is consistent
+        (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4)."""
+        for trial in np.flatnonzero(~finite(z)):
+            row = int(np.flatnonzero(~np.isfinite(z[trial]))[0])
+            self.end([trial], Status.NONFINITE, f"reading {row + 1} is not a finite number")
+
+    @abstractmethod
+    def take_in(self, epoch: Epoch, at: Rows) -> None:
+        """Takes the readings of an epoch in for the trials `at`; `end` ends those that it loses."""
+
+    @abstractmethod
+    def state(self, at: Rows) -> tuple[Array, Array]:
+        """The means (trials, n) and covariances (trials, n, n) of the trials `at`."""
+
+    def covariance(self, at: Rows) -> Array:
+        """P (trials, n, n) of the trials `at`, in multiples of the parameters' units."""
+        return symmetric(self.state(at)[1] * self.d * self.d[:, None])
+
+    @property
+    def going(self) -> Rows:
+        """The trials that no failure has ended."""
+        return np.flatnonzero(self.status == Status.RUNNING)
+
+    def end(self, trials: Any, status: Status, message: str) -> None:
+        """Ends some trials, with what went wrong."""
+        for trial in trials:
+            self.status[trial] = status
+            self.messages[int(trial)] = message
+
+    def read(self, epoch: Epoch, s: Array, at: Rows, *, slopes: bool) -> tuple[Rows, Array, Array | None]:
+        """Whitened h (trials, points, m) at the states s (trials, points, n) of the trials `at`, and dh/dx (trials, m,
+        n), for those that the model does not end."""
+        h, H = epoch.read(self.problem.x0 + s * self.d, at, self.tally, slopes=slopes)
+        H = None if H is None else H * self.d
+        raised = self.tally.failed(at)
+        for trial in at[raised]:
+            self.end([trial], Status.ERROR, self.tally.messages[int(trial)])
+        overflowed = ~raised & ~(finite(h) & (True if H is None else finite(H)))
+        self.end(at[overflowed], Status.NONFINITE, f"the model overflowed at epoch {epoch.number}")
+        kept = ~(raised | overflowed)
+        return at[kept], h[kept], None if H is None else H[kept]
+
+    def estimates(self, *, history: bool) -> Estimates:
+        """The estimates after all epochs, with the squared innovations over their number as extra `nis`."""
+        x, taken = np.zeros((len(self.z), len(self.d))), np.zeros(len(self.z), dtype=np.int64)
+        path = [x]
+        for epoch in self.epochs:
+            if len(self.going):
+                self.take_in(epoch, self.going)
+            at = self.going
+            now, P = self.state(at)
+            x = x.copy()
+            x[at] = now
+            taken[at] += 1
+            path.append(x)
+            lost = at[~(finite(now) & finite(P))]
+            self.end(lost, Status.NONFINITE, f"the filter's state overflowed at epoch {epoch.number}")
+        self.status[self.going] = Status.CONVERGED
+        finished = np.flatnonzero(self.status == Status.CONVERGED)
+        P = np.full((*x.shape, len(self.d)), np.nan)
+        P[finished] = self.covariance(finished)
+        nis = np.full(len(x), np.nan)
+        nis[finished] = self.nis[finished] / self.z.shape[1]
+        iterates = None
+        if history:
+            physical = self.problem.x0 + np.stack(path, axis=1) * self.d
+            iterates = [rows[: count + 1] for rows, count in zip(physical, taken, strict=True)]
+        return Estimates(
+            x=self.problem.x0 + x * self.d,
+            status=self.status,
+            covariance=P,
+            iterations=taken,
+            simulations=self.tally.simulations,
+            jacobians=self.tally.jacobians,
+            messages=self.messages | self.tally.messages,
+            history=iterates,
+            extras={"nis": nis},
+        )
+
+
+def symmetric(P: Array) -> Array:
+    """(P + P') / 2 of each trial: what rounding took from P - K S K'."""
+    return (P + P.swapaxes(-1, -2)) / 2

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 from annotated_types import Gt, Le
 
-from ipe_bench.baselines.ensemble import read_members
+from ipe_bench.baselines.epochs import read_members
 from ipe_bench.baselines.recursive_update import geometric_weights
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Mask, finite, solve

@@ -2,7 +2,7 @@
 
 The covariance is kept as a square root U of P^-1 = U'U, which a QR decomposition updates (Bierman, Factorization
 Methods for Discrete Sequential Estimation, 1977, ch. V): no S to invert and no P - K S K' to cancel, however wide the
-prior is beside the noise. What a filter makes of an epoch's readings is left to its own page.
+prior is beside the noise.
 """
 
 from __future__ import annotations
@@ -12,12 +12,9 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ipe_bench.baselines.ensemble import read_members
-from ipe_bench.baselines.epochs import Epoch, arrivals
+from ipe_bench.baselines.epochs import Epoch, Rows, Walk, read_members, require_needs
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Mask, finite, inverse, multiply, squared
 from ipe_bench.basics.options import Positive
 from ipe_bench.basics.statuses import Status
@@ -72,7 +69,7 @@ class EpochReadings:
     """Of the scenario's prior (n,), in multiples of the parameters' units."""
     tally: EvaluationCount
     z: Array
-    rows: NDArray[np.intp]
+    rows: Rows
     belief: Belief
 
     @property
@@ -91,7 +88,7 @@ class EpochReadings:
         """h - z (trials, points, m) at points (trials, points, n), whitened."""
         return read_members(self.model, self.epoch.R, self.physical(points), self.rows) - self.z[:, None]
 
-    def subset(self, kept: NDArray[np.bool_]) -> EpochReadings:
+    def subset(self, kept: Mask) -> EpochReadings:
         return replace(self, z=self.z[kept], rows=self.rows[kept], belief=take(self.belief, kept))
 
     def physical(self, x: Array) -> Array:
@@ -117,73 +114,39 @@ class InformationFilter(Estimator):
         """What is believed after an epoch's readings, and the squared innovations (trials,) of the prediction."""
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        for need in self.missing(problem):
-            raise UserError(f"measurement={problem.measurement.name}: has no {need}, which a filter needs")
+        require_needs(self, problem)
         with np.errstate(all="ignore"):
-            return _Pass(self, problem, z).estimates(history=history)
+            return _Beliefs(self, problem, z).estimates(history=history)
 
 
-class _Pass:
-    """One batch on its way through the epochs."""
+class _Beliefs(Walk):
+    """What is believed of the trials of a batch; those that fail keep what they believed before the epoch."""
 
     def __init__(self, filter: InformationFilter, problem: Problem, z: Array) -> None:
-        self.filter, self.problem, self.z = filter, problem, z
-        trials, n = len(z), problem.measurement.n
-        deviation = problem.prior_used()
-        assert deviation is not None
-        self.deviation = deviation
-        self.tally = EvaluationCount.zeros(trials)
+        super().__init__(problem, z)
+        self.filter, self.d = filter, np.array(problem.prior_used())
         # U0' U0 = P0^-1, in deviations of the prior.
         U0 = np.linalg.cholesky(np.linalg.inv(problem.scaled_prior)).T / filter.prior_inflation
-        self.belief = Belief(np.zeros((trials, n)), np.repeat(U0[None], trials, axis=0))
-        self.nis = np.zeros(trials)
-        self.status = np.where(finite(z), Status.RUNNING, Status.NONFINITE).astype(np.int8)
-        self.messages = {int(i): "a reading is not a finite number" for i in np.flatnonzero(~finite(z))}
-        self.epochs = np.zeros(trials, np.int64)
-        self.path = [self.belief.mean]
+        self.belief = Belief(np.zeros((len(z), len(U0))), np.repeat(U0[None], len(z), axis=0))
 
-    def estimates(self, *, history: bool) -> Estimates:
-        for epoch in arrivals(self.problem):
-            rows = np.flatnonzero(self.status == Status.RUNNING)
-            if len(rows):
-                self.take_in(epoch, rows)
-        self.status[self.status == Status.RUNNING] = Status.CONVERGED
-        return self.report(history=history)
-
-    def take_in(self, epoch: Epoch, rows: NDArray[np.intp]) -> None:
-        """One epoch for the trials `rows`; those that fail keep what they believed before it."""
-        belief = take(self.belief, rows)
-        z = epoch.whitened(self.z[rows])
-        readings = EpochReadings(epoch, self.problem, self.deviation, self.tally, z, rows, belief)
+    def take_in(self, epoch: Epoch, at: Rows) -> None:
+        z = epoch.whitened(self.z[at])
+        readings = EpochReadings(epoch, self.problem, self.d, self.tally, z, at, take(self.belief, at))
         after, nis = self.filter.update(readings)
-        raised, singular = self.tally.failed(rows), ~finite(after.root()) & after.usable
+        raised, singular = self.tally.failed(at), ~finite(after.root()) & after.usable
         good = after.usable & np.isfinite(nis) & ~raised & ~singular
-        self.belief = put(self.belief, rows[good], take(after, good))
-        self.nis[rows[good]] += nis[good]
-        self.epochs[rows[good]] += 1
-        self.path.append(self.belief.mean)
+        self.belief = put(self.belief, at[good], take(after, good))
+        self.nis[at[good]] += nis[good]
         lost = f"the model or the filter overflowed at epoch {epoch.number}"
-        self.end(rows[~good & ~raised & ~singular], Status.NONFINITE, lost)
-        self.end(rows[singular & ~raised], Status.SINGULAR, f"the information became singular at epoch {epoch.number}")
-        self.status[rows[raised]] = Status.ERROR
+        self.end(at[~good & ~raised & ~singular], Status.NONFINITE, lost)
+        self.end(at[singular & ~raised], Status.SINGULAR, f"the information became singular at epoch {epoch.number}")
+        self.status[at[raised]] = Status.ERROR
 
-    def end(self, rows: NDArray[np.intp], status: Status, message: str) -> None:
-        self.status[rows] = status
-        self.messages |= {int(i): message for i in rows}
+    def state(self, at: Rows) -> tuple[Array, Array]:
+        belief = take(self.belief, at)
+        S = belief.root()
+        return belief.mean, np.matmul(S, S.swapaxes(1, 2))
 
-    def report(self, *, history: bool) -> Estimates:
-        finished = self.status == Status.CONVERGED
-        S = self.belief.root() * self.deviation[:, None]
-        P = np.where(finished[:, None, None], np.matmul(S, S.swapaxes(1, 2)), np.nan)
-        path = self.problem.x0 + np.array(self.path) * self.deviation
-        return Estimates(
-            x=path[-1],
-            status=self.status,
-            covariance=P,
-            iterations=self.epochs,
-            simulations=self.tally.simulations,
-            jacobians=self.tally.jacobians,
-            messages=self.messages | self.tally.messages,
-            history=[path[: count + 1, i] for i, count in enumerate(self.epochs)] if history else None,
-            extras={"nis": np.where(finished, self.nis / self.z.shape[1], np.nan)},
-        )
+    def covariance(self, at: Rows) -> Array:
+        S = take(self.belief, at).root() * self.d[:, None]
+        return np.matmul(S, S.swapaxes(1, 2))

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ipe_bench.baselines.batched import Rows
 from ipe_bench.baselines.ekf import EKFStack, EKFTrack, turned_by_slopes
+from ipe_bench.baselines.epochs import Rows
 from ipe_bench.baselines.sequential import Sequential, squared_innovation
 from ipe_bench.basics.linalg import Array, Mask, deviations, multiply
 from ipe_bench.basics.options import Count, Positive
+from ipe_bench.measurements.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -26,19 +27,18 @@ class IteratedEKF(Sequential):
     slopes = True
 
     def track(self, P0: Array, Q: Array, z: Array) -> IteratedEKFTrack:
-        return IteratedEKFTrack(P0, Q, self.max_iterations, self.tolerance)
+        return IteratedEKFTrack(P0, Q, self)
 
-    def stack(self, P0: Array, Q: Array, z: Array) -> IteratedEKFStack:
-        return IteratedEKFStack(P0, Q, len(z), self.max_iterations, self.tolerance)
+    def stack(self, P0: Array, Q: Array, problem: Problem, z: Array) -> IteratedEKFStack:
+        return IteratedEKFStack(P0, Q, problem, z, self)
 
 
 class IteratedEKFTrack(EKFTrack):
     """filterpy's update, begun again from the epoch's prior with the readings linearised at the last estimate."""
 
-    def __init__(self, P0: Array, Q: Array, max_iterations: int, tolerance: float) -> None:
+    def __init__(self, P0: Array, Q: Array, given: IteratedEKF) -> None:
         super().__init__(P0, Q)
-        self.max_iterations, self.tolerance = max_iterations, tolerance
-        self.iteration = 0
+        self.given, self.iteration = given, 0
 
     def predict(self) -> None:
         super().predict()
@@ -56,17 +56,16 @@ class IteratedEKFTrack(EKFTrack):
             # The innovation of the prediction; later ones have seen z.
             self.nis += squared_innovation(f.y, f.SI)
         change = np.abs(f.x - at) / np.sqrt(np.diag(f.P))
-        return self.iteration >= self.max_iterations or bool(change.max() <= self.tolerance)
+        return self.iteration >= self.given.max_iterations or bool(change.max() <= self.given.tolerance)
 
 
 class IteratedEKFStack(EKFStack):
     """The same filter for all trials at once."""
 
-    def __init__(self, P0: Array, Q: Array, trials: int, max_iterations: int, tolerance: float) -> None:
-        super().__init__(P0, Q, trials)
-        self.max_iterations, self.tolerance = max_iterations, tolerance
-        self.x_prior, self.P_prior = self.x.copy(), self.P.copy()
-        self.iteration = 0
+    def __init__(self, P0: Array, Q: Array, problem: Problem, z: Array, given: IteratedEKF) -> None:
+        super().__init__(P0, Q, problem, z)
+        self.given, self.iteration = given, 0
+        self.x_prior, self.P_prior = self.x, self.P
 
     def predict(self, at: Rows) -> None:
         super().predict(at)
@@ -82,4 +81,4 @@ class IteratedEKFStack(EKFStack):
             # The innovation of the prediction; later ones have seen z.
             self.nis[at] += squared
         change = (np.abs(self.x[at] - before) / deviations(self.P[at])).max(axis=1)
-        return (change <= self.tolerance) | (self.iteration >= self.max_iterations)
+        return (change <= self.given.tolerance) | (self.iteration >= self.given.max_iterations)

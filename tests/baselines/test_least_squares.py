@@ -9,7 +9,6 @@ import pytest
 from scipy.optimize import curve_fit
 
 from ipe_bench.baselines import LeastSquares
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement, Parameter
@@ -87,21 +86,6 @@ def test_gins_reaches_the_minimum_that_gauss_newton_has_from_the_truth(method):
     assert low < nees(found.x - trials.x, found.covariance).mean() / 11 < high
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_a_batch_is_its_trials_one_by_one(method):
-    problem, trials = decay()
-    together = LeastSquares(method=method).estimate(problem, trials.z, history=True)
-    assert together.history is not None
-    for i in range(len(trials.z)):
-        alone = LeastSquares(method=method).estimate(problem, trials.z[[i]], history=True)
-        assert alone.history is not None
-        for name in ("x", "status", "covariance", "iterations", "simulations", "jacobians"):
-            assert np.array_equal(getattr(alone, name)[0], getattr(together, name)[i]), name
-        assert np.array_equal(alone.history[0], together.history[i])
-        assert np.array_equal(alone.history[0][-1], alone.x[0])
-        assert len(alone.history[0]) == alone.iterations[0] + 1
-
-
 @dataclass(frozen=True)
 class Counting(Decay):
     calls: tuple[list[int], list[int]] = ((), ())  # type: ignore[assignment]
@@ -143,22 +127,6 @@ def test_the_root_of_a_robust_loss_is_not_that_of_least_squares():
     assert LeastSquares(loss="huber").equation is None
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_a_trial_that_fails_has_a_status_and_disturbs_no_other(method):
-    problem, trials = decay(trials=4)
-    z = trials.z.copy()
-    z[1, 3] = np.nan
-    z[2] = 2.0 * np.exp(-200.0 * T)  # wants b = 200
-    estimator = LeastSquares(method=method, start="nominal")
-    found = estimator.estimate(problem, z)
-    assert [Status(s) for s in found.status[[0, 1, 3]]] == [Status.CONVERGED, Status.NONFINITE, Status.CONVERGED]
-    assert found.status[2] == Status.ERROR
-    assert found.messages[2] == "ValueError: decays too fast"
-    assert found.simulations[2] > 1
-    for i in (0, 3):
-        assert np.array_equal(found.x[i], estimator.estimate(problem, z[[i]]).x[0])
-
-
 def test_runs_out_of_evaluations():
     problem, trials = decay()
     for method in METHODS:
@@ -174,20 +142,3 @@ def test_parameters_that_cannot_be_told_apart_are_singular():
 
     found = LeastSquares(start="nominal").estimate(Problem(Sum(), Covariance(np.ones(25))), 1.0 + T[None] ** 2)
     assert found.status[0] == Status.SINGULAR
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"method": "bfgs"}, "method=bfgs: choose one of"),
-        ({"start": "zero"}, "start=zero: choose one of"),
-        ({"loss": "l1"}, "loss=l1: choose one of"),
-        ({"method": "lm", "loss": "huber"}, "loss=huber: method=lm knows loss=linear only"),
-        ({"ftol": 0.0}, "ftol=0.0: give"),
-        ({"f_scale": 0.0}, "f_scale=0.0: give"),
-        ({"max_nfev": 0}, "max_nfev=0: give"),
-    ],
-)
-def test_a_wrong_option_is_named(options, message):
-    with pytest.raises(UserError, match=message):
-        LeastSquares(**options)

@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pytest
 
 from ipe_bench.baselines import LevenbergMarquardt, Multistart
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
@@ -96,35 +94,6 @@ def test_it_stops_at_the_first_fit_if_nothing_is_to_be_confirmed():
     assert (more.simulations > found.simulations).all()
 
 
-def test_after_the_first_fit_as_many_starts_follow_as_are_to_confirm_it(monkeypatch):
-    problem, trials = draw(Wave(), 0.1, 1.0, 6)
-    descended, descend = np.zeros(6, dtype=int), Multistart._descend
-
-    def counting(self, objective, *rest):
-        descended[objective.rows] += 1
-        return descend(self, objective, *rest)
-
-    monkeypatch.setattr(Multistart, "_descend", counting)
-    Multistart(starts=15, confirmations=0).estimate(problem, trials.z)
-    until_fit = descended.copy()
-    descended[:] = 0
-    Multistart(starts=15, confirmations=3).estimate(problem, trials.z)
-    assert until_fit.max() > 4
-    np.testing.assert_array_equal(descended, np.minimum(until_fit + 3, 15))
-
-
-def test_a_trial_draws_its_own_starts():
-    """Whatever else stands in the batch, and in whatever order."""
-    problem, trials = draw(Wave(), 0.1, 1.0, 5)
-    estimator = Multistart(starts=5)
-    whole = estimator.estimate(problem, trials.z)
-    turned = estimator.estimate(problem, trials.z[::-1])
-    np.testing.assert_array_equal(whole.x, turned.x[::-1])
-    np.testing.assert_array_equal(whole.simulations, turned.simulations[::-1])
-    other = Multistart(starts=5, seed=1).estimate(problem, trials.z)
-    assert (other.simulations != whole.simulations).any()
-
-
 def test_a_budget_ends_the_search():
     problem, trials = draw(Wave(), 0.1, 3.0, 20)
     free, bounded = (Multistart(starts=20, budget=b).estimate(problem, trials.z) for b in (None, 40.0))
@@ -139,12 +108,6 @@ def test_parts_are_joined_with_their_alternatives():
     parts[1].alternatives = None
     joined = Estimates.join(parts)
     assert [len(others) for others in joined.alternatives] == [1, 0, 1, 1]
-
-
-@pytest.mark.parametrize("option", ["starts", "max_iterations", "tolerance", "damping"])
-def test_mistakes_are_named(option):
-    with pytest.raises(UserError, match=rf"^{option}=0"):
-        Multistart(**{option: 0})
 
 
 def test_without_readings_that_fit_every_start_is_tried():

@@ -54,13 +54,6 @@ def test_a_coarse_jacobian_counts_as_what_it_costs():
     np.testing.assert_array_equal(J[1], model.jacobian(x[1:2])[0])
 
 
-def test_a_model_without_a_cheaper_one_computes_the_exact_one():
-    model, x = Crude(0.01, cheap=1.0), np.ones((3, 3))
-    counted = CountingModel(model, EvaluationCount.zeros(3))
-    np.testing.assert_array_equal(counted.jacobian(x, np.arange(3), coarse=True), model.jacobian(x))
-    assert (counted.tally.jacobians == 1).all()
-
-
 @pytest.mark.parametrize("solver", [Newton(tolerance=1e-12), DampedNewton(tolerance=1e-12)], ids=repr)
 def test_newtons_method_is_coarse_far_away_and_of_order_two_near_a_root(solver):
     """A Jacobian that is off by one part in a hundred would gain a factor of a hundred in a step."""

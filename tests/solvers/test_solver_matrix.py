@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from square_systems import BurdenFaires, Cubic, NoRoot, Rosenbrock, Temperamental, system_of
+from square_systems import BurdenFaires, Cubic, NoRoot, Rosenbrock, system_of
 
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.driver import Limits, iterate
@@ -81,18 +81,6 @@ def test_without_noise_the_truth_of_a_polynomial_is_the_root(solver):
     np.testing.assert_allclose(estimates.x, trials.x, atol=1e-8)
 
 
-@pytest.mark.parametrize("solver", ALL, ids=repr)
-def test_a_batch_equals_its_trials_one_by_one(solver):
-    scenario = Scenario(Polynomial(strength=0.05), Gaussian(0.1), GaussianPrior(), 10.0)
-    trials = scenario.draw(0, 12)
-    with np.errstate(all="ignore"):
-        batch = solver.estimate(scenario.problem, trials.z)
-        single = [solver.estimate(scenario.problem, z[None]) for z in trials.z]
-    np.testing.assert_array_equal(batch.x, np.concatenate([s.x for s in single]))
-    np.testing.assert_array_equal(batch.status, np.concatenate([s.status for s in single]))
-    np.testing.assert_array_equal(batch.simulations, np.concatenate([s.simulations for s in single]))
-
-
 def _errors(solver, model, start, root, **options):
     roots, _ = roots_of(model, solver, start, tolerance=1e-13, history=True, **options)
     return np.abs(roots.history[0] - np.asarray(root)).max(axis=1)
@@ -144,23 +132,6 @@ def test_a_singular_slope_is_named(solver):
 def test_an_expansion_ends_as_diverged_or_nonfinite():
     roots, _ = roots_of(Rosenbrock(), FixedPoint(), [(-1.2, 1.0)])
     assert roots.status[0] in (Status.DIVERGED, Status.NONFINITE)
-
-
-@pytest.mark.parametrize("solver", ALL, ids=repr)
-def test_a_trial_that_fails_has_a_status_and_disturbs_no_other(solver):
-    good = np.random.default_rng(1).uniform(-1, 1, (4, 2))
-    starts = np.concatenate([good[:2], [[200.0, 0.0], [-200.0, 0.0], [50.0, 0.0]], good[2:]])
-    mixed, tally = roots_of(Temperamental(), solver, starts, max_iterations=100)
-    alone, _ = roots_of(Temperamental(), solver, good, max_iterations=100)
-    kept = [0, 1, 5, 6]
-    np.testing.assert_array_equal(mixed.x[kept], alone.x)
-    np.testing.assert_array_equal(mixed.status[kept], alone.status)
-    assert (alone.status == Status.CONVERGED).all()
-    assert mixed.status[2] == Status.ERROR
-    assert tally.messages[2] == "ArithmeticError: too hot"
-    assert mixed.status[3] in (Status.NONFINITE, Status.SINGULAR)  # infinite, so of no slope either
-    if solver in (Newton(), Broyden(), DampedNewton()):
-        assert mixed.status[4] == Status.SINGULAR
 
 
 def test_the_budget_ends_a_trial():
