@@ -71,12 +71,11 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
     else:
         change, ends = _ratio(row["change"]), f"{_ratio(row['low'])} to {_ratio(row['high'])}"
     p, e = row["p"], row["e"]
-    evidence = f"{e:.2g}" if e < 1e4 else f"{e:.0e}".replace("e+0", "e").replace("e+", "e")
     return (
         *(quantity, show(row["first_value"]), show(row["second_value"]), change),
         ends if math.isfinite(row["low"]) else "-",
         p_value(p) if math.isfinite(p) else "",
-        evidence if math.isfinite(e) else "",
+        compact(e) if math.isfinite(e) else "",
         row["finding"] or ("-" if quantity != "time" else ""),
     )
 

@@ -97,30 +97,28 @@ def _minute(run: Run) -> str:
 
 
 def _runs(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """What was computed, by command, the last first: a sweep has a record per job, and what found everything stored
-    computed nothing."""
+    """What was computed, by command, the last first: everything that its jobs have in common, and the configuration of
+    each. What found everything stored computed nothing."""
     commands: dict[tuple[str, str], list[Run]] = {}
     for run in runs:
         if run.record.get("blocks", 1):
             command = run.record.get("command", _UNKNOWN)
             key = (_PYTHON, run.path.name) if command is None else (str(command), "")
             commands.setdefault(key, []).append(run)
-    return [_command(command, own) for (command, _), own in reversed(commands.items())]
-
-
-def _command(command: str, runs: Sequence[Run]) -> dict[str, Any]:
-    """Everything that its jobs have in common, and each job's configuration."""
-    last = runs[-1].record
-    facts = {
-        "runs": ", ".join(run.path.stem for run in runs),
-        "trials": ", ".join(dict.fromkeys(str(run.record.get("trials")) for run in runs)),
-        "cells": sum(len(run.record.get("cells", ())) for run in runs),
-        "git commit": last.get("git_commit") or "unknown",
-        "source": last.get("source"),
-        "machine": ", ".join(f"{k} {v}" for k, v in (last.get("machine") or {}).items()),
-        "versions": ", ".join(f"{k} {v}" for k, v in (last.get("libraries") or {}).items()),
-    }
-    scenarios = [scenario for run in runs for scenario in run.record.get("scenarios", ())]
-    config = {"scenarios": scenarios, "estimators": last.get("estimators", {})}
-    config_text = json.dumps(config, indent=1, ensure_ascii=False)
-    return {"command": command, "started": _minute(runs[0]), "facts": facts, "config": config_text}
+    found = []
+    for (command, _), own in reversed(commands.items()):
+        last = own[-1].record
+        facts = {
+            "runs": ", ".join(run.path.stem for run in own),
+            "trials": ", ".join(dict.fromkeys(str(run.record.get("trials")) for run in own)),
+            "cells": sum(len(run.record.get("cells", ())) for run in own),
+            "git commit": last.get("git_commit") or "unknown",
+            "source": last.get("source"),
+            "machine": ", ".join(f"{k} {v}" for k, v in (last.get("machine") or {}).items()),
+            "versions": ", ".join(f"{k} {v}" for k, v in (last.get("libraries") or {}).items()),
+        }
+        scenarios = [scenario for run in own for scenario in run.record.get("scenarios", ())]
+        config = {"scenarios": scenarios, "estimators": last.get("estimators", {})}
+        shown = {"command": command, "started": _minute(own[0]), "facts": facts}
+        found.append(shown | {"config": json.dumps(config, indent=1, ensure_ascii=False)})
+    return found

@@ -33,11 +33,9 @@ def contents(name: str, found: Sequence[Reference]) -> list[Table]:
         words("estimator", [label for _, label, _ in rows]),
         words("status", [_status(one, label) for one, label, _ in rows]),
         words("honest", [honesty(d, one.posterior) for one, _, d in rows]),
-        texts("diverg.", [compact(d.kl) for *_, d in rows]),
-        texts("shift", [compact(d.shift) for *_, d in rows]),
-        texts("width", [compact(d.width) for *_, d in rows]),
-        texts("energy", [compact(d.energy) for *_, d in rows]),
     ]
+    numbers = {"kl": "diverg.", "shift": "shift", "width": "width", "energy": "energy"}
+    columns += [texts(title, [compact(getattr(d, key)) for *_, d in rows]) for key, title in numbers.items()]
     title = f"{name}: estimators beside the posterior"
     return [Table("posterior", title, "", columns, notes=list(_notes(found)), grouped=3)]
 

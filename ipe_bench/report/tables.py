@@ -200,9 +200,9 @@ def comparisons(analysis: Analysis) -> Table | None:
     ]
     caption = (
         "On the trials that both have. A win is a Mahalanobis error of the first smaller by more than 0.001 standard"
-        " deviations; p of error: Wilcoxon's signed-rank test without the ties. First, second alone: trials in which"
-        " only that one succeeds; p of success: McNemar's exact test. Both Holm-corrected over all pairs of all"
-        " scenarios. Success is the gate of the Cramér-Rao bound here, prior or not."
+        " deviations; first, second alone: trials in which only that one succeeds, by the gate of the Cramér-Rao bound,"
+        " prior or not. p: Wilcoxon's signed-rank and McNemar's exact test, Holm-corrected over all pairs of all"
+        " scenarios."
     )
     return Table("comparisons", "Paired comparisons", caption, columns, rows)
 

@@ -22,10 +22,6 @@ def enumerate_few(items: Sequence[str], most: int = 6) -> str:
     return ", ".join(items[:most]) + more
 
 
-def _not_finite(value: float) -> str:
-    return "inf" if value == math.inf else "-"
-
-
 def percent(share: float) -> str:
     """A share in per cent; 100 and 0 only if it is all or none."""
     if not math.isfinite(share):
@@ -39,7 +35,7 @@ def percent(share: float) -> str:
 def short(value: float) -> str:
     """About four figures."""
     if not math.isfinite(value):
-        return _not_finite(value)
+        return "inf" if value == math.inf else "-"
     if value == int(value) and abs(value) < 1000:
         return str(int(value))
     if abs(value) >= 1e6 or 0 < abs(value) < 1e-3:
@@ -52,7 +48,7 @@ def short(value: float) -> str:
 def brief(value: float) -> str:
     """Two decimals below ten, three figures above, in at most five characters."""
     if not math.isfinite(value):
-        return _not_finite(value)
+        return "inf" if value == math.inf else "-"
     if value == int(value) and value < 1000:
         return str(int(value))
     if value >= 999.5e6:
@@ -63,7 +59,7 @@ def brief(value: float) -> str:
 def compact(value: float) -> str:
     """Three figures in at most five characters if possible: thousands as k, millions as M."""
     if not math.isfinite(value):
-        return _not_finite(value)
+        return "inf" if value == math.inf else "-"
     rounded = float(f"{value:.2e}")
     if rounded == 0 or not 1e-2 <= abs(rounded) < 1e9:
         return f"{value:.1e}" if rounded else "0"
@@ -102,13 +98,12 @@ def p_value(p: float, least: float = 0.0) -> str:
 
 def shower(kind: Kind, where: Where) -> Callable[[Any], str]:
     """How values of that kind are written in that table."""
-    # Physical units are of any size.
-    physical = (lambda v: f"{v:.4g}" if math.isfinite(v) else _not_finite(v)) if where == "parameters" else short
     return {
         "count": lambda v: f"{int(v):d}" if math.isfinite(v) else "-",
         "share": percent,
         "number": short,
-        "physical": physical,
+        # Physical units are of any size.
+        "physical": (lambda v: f"{v:.4g}" if math.isfinite(v) else short(v)) if where == "parameters" else short,
         "seconds": (lambda v: duration(v, 2)) if where == "terminal" else duration,
         "probability": p_value,
         "word": str,
