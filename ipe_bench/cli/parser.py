@@ -89,12 +89,8 @@ parameters.NAME.fixed=X, .lower=X, .upper=X   what is known of a parameter; para
 error_scale=X       how far the parameters may lie from the nominal point: the prior of filters and map_lm.
 prior_covariance=F  the same in the parameters' own units: a CSV file of the covariance, headed by their names.
 figures=none        draws nothing.
-output=DIR          where the files go: outputs/estimate-MODEL unless given, or outputs/estimate-MODEL-2 and so on
-                    where another command has written there. Nothing of another command is overwritten.
-
-Files: estimate.json (estimates, standard errors, correlations, tests, versions), residuals.csv, and as PNG and PDF
-residuals (normalised, by time), ellipses (95 % regions of the most correlated pairs of parameters) and, where the model
-bends, likelihood (profiles); estimate.html has all of it on one page.
+output=DIR          where the files go, which are named at the end: outputs/estimate-MODEL unless given, or
+                    outputs/estimate-MODEL-2 and so on. Nothing of another command is overwritten.
 """,
         (_several("arguments", "KEY=VALUE", "whatever `ipe-bench run` takes"),),
     ),
@@ -108,10 +104,7 @@ bends, likelihood (profiles); estimate.html has all of it on one page.
 
 Nothing is simulated with noise and nothing estimated: all follows from the model's slopes at truths drawn from the
 prior. Errors that the model leaves out are those of truth_measurement=, or of every option of measurement= that is the
-same model with more errors.
-
-Files: design.json, readings.csv (the readings of each choice), design.html, and as PNG and PDF the bound against the
-number of readings. They go to output=DIR, or to outputs/design-MODEL unless another command has written there.
+same model with more errors. output=DIR says where files go.
 """,
         (
             _several("arguments", "KEY=VALUE", "the scenario, as for `ipe-bench run`"),
@@ -134,10 +127,7 @@ number of readings. They go to output=DIR, or to outputs/design-MODEL unless ano
 
 For the first trials of a scenario (trials=3 unless given), the posterior itself is sampled, with nothing linearised,
 by sequential Monte Carlo: particles go from the prior to the posterior as the likelihood is let in. Each estimator's
-estimate and covariance are then held against it. It takes seconds to a minute a trial.
-
-Files: posterior.json, posterior.html, and as PNG and PDF a corner picture of each trial (corner_0, corner_1, ...). They
-go to output=DIR, or to outputs/posterior-MODEL unless another command has written there.
+estimate and covariance are then held against it. It takes seconds to a minute a trial. output=DIR says where files go.
 """,
         (
             _several("arguments", "KEY=VALUE", "whatever `ipe-bench run` takes"),

@@ -67,27 +67,22 @@ def installed(tmp_path) -> Path:
     return tmp_path / "site"
 
 
-def test_it_composes_our_configs_beside_its_own(application, installed):
+def test_it_composes_our_configs_beside_its_own_which_come_first(application, installed):
+    """Plugins in a folder are for our commands alone."""
     done = run(application, "measurement.rounds=7", "estimators.newton.max_iterations=9", path=[ROOT, installed])
     assert done.returncode == 0, done.stderr
-    first, second = done.stdout.splitlines()
-    assert first == "Ranging 49 7 0.25 {'a': 1} ['fixed_point', 'newton']"
-    assert second == "9"
+    assert done.stdout.splitlines() == ["Ranging 49 7 0.25 {'a': 1} ['fixed_point', 'newton']", "9"]
     assert done.stderr == ""
-
-
-def test_its_own_configs_come_first(application, installed):
-    (application / "my_conf" / "noise").mkdir()
-    (application / "my_conf" / "noise" / "gaussian.yaml").write_text("_target_: builtins.dict\ndeviation: 9\n")
+    for package, text in (
+        ("my_conf/noise/gaussian.yaml", "_target_: builtins.dict\ndeviation: 9\n"),
+        ("plugins/mine/some_package/__init__.py", ""),
+        ("plugins/mine/some_package/conf/noise/odd.yaml", "_target_: some_package.Odd\n"),
+    ):
+        path = application / package
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
     done = run(application, "--cfg", "job", "-p", "noise", path=[ROOT, installed])
     assert "_target_: builtins.dict" in done.stdout
-
-
-def test_plugins_in_a_folder_are_for_our_commands_alone(application, installed):
-    home = application / "plugins" / "mine" / "some_package"
-    (home / "conf" / "noise").mkdir(parents=True)
-    (home / "__init__.py").touch()
-    (home / "conf" / "noise" / "odd.yaml").write_text("_target_: some_package.Odd\n")
     done = run(application, "noise=odd", "--cfg", "job", path=[ROOT, installed])
     assert done.returncode == 1
     assert "noise/odd" in done.stderr

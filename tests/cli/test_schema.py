@@ -42,10 +42,6 @@ def read(text: str) -> Any:
     return yaml.load(text, discovery._Loader)
 
 
-def test_all_there_is_is_looked_at():
-    assert len(SHIPPED) > 60
-
-
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: "/".join(path.parts[-2:]))
 def test_what_we_ship_fits(path, validator):
     assert [error.message for error in validator.iter_errors(read(path.read_text(encoding="utf-8")))] == []
@@ -58,23 +54,12 @@ def test_what_we_ship_fits(path, validator):
         "_target_: ipe_bench.solvers.Newton\ntolerence: 1.0",
         "_target_: ipe_bench.solvers.Newton\ntolerance: 0",
         "_target_: ipe_bench.solvers.newton.Newton\ntolerance: small",
-        "_target_: ipe_bench.solvers.Newton\nmax_iterations: 1.5",
-        "_target_: ipe_bench.solvers.Newton\nmax_iterations: true",
         "_target_: ipe_bench.solvers.Newton\nstart: here",
-        "_target_: ipe_bench.solvers.Newton\nbudget: -1",
-        "_target_: ipe_bench.solvers.Progressive\ngrowth: 1",
-        "_target_: ipe_bench.measurements.Ranging\nbeacons: [[0, 0]]",
-        "_target_: ipe_bench.noise.Quantization\nstep: [1, wide]",
-        "_target_: ipe_bench.runs.execution.Processes\nworkers: 0",
-        "_target_: ipe_bench.priors.GaussianPrior\ndeviations: 1",
         "defaults: [{override /measurement: gin}]",
         "defaults: [{override /mesurement: gins}]",
-        "defaults: [{override /solver: newton_}]",
         "defaults: [{override /solver: [newtn]}]",
         EXPERIMENT + "trials: 0",
         EXPERIMENT + "trails: 5",
-        EXPERIMENT + "error_scale: -1",
-        EXPERIMENT + "seed: 1.5",
         EXPERIMENT + "estimators: {newton: {tolerence: 1}}",
         EXPERIMENT + "estimators: {newton: 5}",
         EXPERIMENT + "measurement: {rounds: 5}",

@@ -115,12 +115,6 @@ def test_a_dry_run_says_what_is_missing_and_computes_nothing(command):
     assert set(Path("dry").rglob("*")) == stored
 
 
-def test_a_dry_run_finds_the_mistakes_of_a_run(command):
-    code, _, error = command("run", *SMALL, "solver=[]", "--dry-run")
-    assert code == 2
-    assert "there is no estimator" in error
-
-
 def test_status_says_complete_in_a_line(command):
     assert command("run", *SMALL, "solver=[newton]", "trials=8", "output=whole")[0] == 0
     code, out, _ = command("status", "whole")
@@ -167,28 +161,6 @@ def test_an_experiment_of_ones_own_sweeps_as_ours_do(command):
     assert code == 0
     assert rows_of(out, "newton") == 3
     assert [path.name for path in Path("outputs").iterdir()] == ["mine"]
-
-
-def test_a_new_experiment_runs(command):
-    assert command("new", "experiment", "mine")[0] == 0
-    code, out, _ = command("run", "+experiment=mine", "trials=2", "--dry-run")
-    assert code == 0
-    assert "0 estimates are stored, 24 would be computed" in out
-    assert "mine" in command("list", "experiment")[1]
-
-
-def test_a_narrow_terminal_keeps_the_names(command):
-    assert command("run", *SMALL, "solver=[newton,fixed_point]", "trials=8", "output=wide")[0] == 0
-    summary = pd.read_csv("wide/summary.csv")
-    for width in (40, 60, 80, 100, 120):
-        console = Console(width=width)
-        with console.capture() as shown:
-            console.print(render(summary, width=width))
-        lines = shown.get().splitlines()
-        assert max(map(len, lines)) <= width
-        for name in ("newton", "fixed_point"):
-            row = next(line for line in lines if name in line.split())
-            assert "…" not in row
 
 
 @pytest.mark.parametrize("width", [60, 80, 100, 120])

@@ -19,7 +19,7 @@ from ipe_bench.cli.new import KINDS, RECORDS
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins import discovery
 from ipe_bench.plugins.conformance import check_component
-from ipe_bench.priors import GaussianPrior, Prior
+from ipe_bench.priors import Prior
 from ipe_bench.report import figures
 from ipe_bench.runs.execution import Event, Execution
 from ipe_bench.statistics.records import add_statistics
@@ -234,43 +234,26 @@ def test_a_statistic_under_the_name_of_ours_is_refused(capsys):
     assert "rmse: is a statistic of ours; choose another name" in capsys.readouterr().err
 
 
+DRAWS = {
+    "flat": lambda x0, scale, rng: x0 + np.sqrt(3) * scale * rng.uniform(-1, 1, len(x0)),
+    "wide": lambda x0, scale, rng: x0 + 1.1 * scale * rng.standard_normal(len(x0)),
+    "shifted": lambda x0, scale, rng: x0 + 0.1 * scale + scale * rng.standard_normal(len(x0)),
+    "common": lambda x0, scale, rng: x0 + scale * rng.standard_normal(),
+}
+
+
 @dataclass(frozen=True)
-class Flat(Prior):
-    """Says that it is normal."""
+class Faulty(Prior):
+    """Says that it draws independent normal numbers."""
+
+    draws: str = "flat"
+    power: float = 1.0
 
     def deviation(self, n, error_scale):
-        return np.full(n, error_scale)
+        return np.full(n, error_scale**self.power)
 
     def draw(self, x0, error_scale, rng):
-        return x0 + np.sqrt(3) * error_scale * rng.uniform(-1, 1, len(x0))
-
-
-@dataclass(frozen=True)
-class Wide(GaussianPrior):
-    def draw(self, x0, error_scale, rng):
-        return super().draw(x0, 1.1 * error_scale, rng)
-
-
-@dataclass(frozen=True)
-class Shifted(GaussianPrior):
-    def draw(self, x0, error_scale, rng):
-        return super().draw(x0 + 0.1 * error_scale, error_scale, rng)
-
-
-@dataclass(frozen=True)
-class Common(GaussianPrior):
-    """Draws one number for all parameters."""
-
-    def draw(self, x0, error_scale, rng):
-        return x0 + error_scale * rng.standard_normal()
-
-
-@dataclass(frozen=True)
-class Deaf(GaussianPrior):
-    """Does not listen to the error scale."""
-
-    def deviation(self, n, error_scale):
-        return np.ones(n)
+        return DRAWS[self.draws](x0, error_scale, rng)
 
 
 @dataclass(frozen=True)
@@ -300,15 +283,15 @@ class Hasty(Execution):
 @pytest.mark.parametrize(
     ("faulty", "complaint"),
     [
-        (Flat(), "the draws are not normal"),
-        (Wide(), "1.1 times the stated deviation"),
-        (Shifted(), "the mean is off x0"),
-        (Common(), "two parameters have the correlation"),
-        (Deaf(), "at ten times the error scale"),
+        (Faulty(), "the draws are not normal"),
+        (Faulty("wide"), "1.1 times the stated deviation"),
+        (Faulty("shifted"), "the mean is off x0"),
+        (Faulty("common"), "two parameters have the correlation"),
+        (Faulty(power=0.0), "at ten times the error scale"),
         (Swallowing(), "ends without a Failure"),
         (Hasty(), "it tells the steps []"),
     ],
-    ids=lambda value: type(value).__name__ if not isinstance(value, str) else "",
+    ids=repr,
 )
 def test_a_faulty_prior_or_execution_is_found(faulty, complaint):
     assert complaint in " ".join(finding.complaint for finding in check_component("mine", faulty))
@@ -317,7 +300,7 @@ def test_a_faulty_prior_or_execution_is_found(faulty, complaint):
 def test_the_posterior_is_not_sampled_under_a_prior_that_is_not_normal():
     from ipe_bench.basics.errors import UserError
 
-    class Uniform(Flat):
+    class Uniform(Faulty):
         normal = False
 
     with pytest.raises(UserError, match="prior=uniform: is not normal"):
