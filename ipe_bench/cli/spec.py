@@ -193,7 +193,7 @@ DEFAULTS["estimators"] = {}
 
 def keys_of_a_run() -> list[Described]:
     """The keys besides the groups, with their types, defaults and meanings."""
-    return [one for one in options_of(Spec, DEFAULTS) if one.name not in (*PARTS, "estimators")]
+    return [one for one in options_of(Spec, DEFAULTS, {}) if one.name not in (*PARTS, "estimators")]
 
 
 def spec(plain: Mapping[Any, Any]) -> Spec:

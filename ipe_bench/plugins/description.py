@@ -26,7 +26,7 @@ class Described:
     hint: Any
     """Its type with its constraints; None where it is not known."""
     meaning: str
-    """The docstring of its field."""
+    """The docstring of its field, or the comment behind it in the config."""
 
     @property
     def value(self) -> str:
@@ -50,12 +50,13 @@ def described(option: Option) -> list[Described]:
         return []
     if option.target is None:
         return [Described(str(key), value, None, "") for key, value in config.items() if key != "defaults"]
-    return options_of(find_class(option.target, f"{option.group}.{option.name}"), config)
+    return options_of(find_class(option.target, f"{option.group}.{option.name}"), config, option.comments)
 
 
-def options_of(cls: type, config: Mapping[str, Any]) -> list[Described]:
-    """The options of a dataclass; what `config` says of one stands in place of its default."""
-    kinds, texts = option_types(cls), meanings(cls)
+def options_of(cls: type, config: Mapping[str, Any], comments: Mapping[str, str]) -> list[Described]:
+    """The options of a dataclass; what `config` says of one stands in place of its default, and what `comments` say
+    where the class does not say what is meant."""
+    kinds, texts = option_types(cls), {**comments, **meanings(cls)}
     found = []
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         if field.init:

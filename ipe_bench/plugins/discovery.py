@@ -152,6 +152,23 @@ class Option:
         found = _TARGET_LINE.search(self.text)
         return found.group(1) if found else None
 
+    @property
+    def comments(self) -> dict[str, str]:
+        """By key, the comment at the end of its line, or else the one above it, which several keys may share."""
+        found: dict[str, str] = {}
+        above: list[str] = []
+        previous = ""
+        for line in self.text.splitlines():
+            key, _, value = line.partition(":")
+            if line.startswith("#"):
+                above = [*(above if previous.startswith("#") else []), line.lstrip("# ").strip()]
+            elif key == "_target_":
+                above = []
+            elif key.isidentifier():
+                found[key] = value.partition(" #")[2].strip() or " ".join(above)
+            previous = line
+        return found
+
     @functools.cached_property
     def fault(self) -> str | None:
         """Why it cannot be used, in a line with the remedy; None where it can, as far as the file tells."""
