@@ -63,6 +63,7 @@ class Ode(WrappedModel):
     unit: str = ""
     """Of the readings."""
     time_unit: str = ""
+    """Of the times: s, min, day."""
     own: tuple[str, ...] = ()
     """Parameters of which every file of readings has its own, where there are several."""
     constants: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
