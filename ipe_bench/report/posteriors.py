@@ -76,7 +76,7 @@ def write_posteriors(
 ) -> list[Path]:
     """Writes posteriors with a corner picture of each trial, and returns the files; `name` is the model's and
     `scenario` says what was sampled."""
-    from ipe_bench.report.figures.posterior import draw_corners
+    from ipe_bench.report.figures.readings import draw_corners
 
     trials = [_described(model, one) for one in found]
     content = {"schema": SCHEMA, "command": command, "trials": trials, "measurement": name}

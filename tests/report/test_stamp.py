@@ -58,7 +58,7 @@ def test_the_report_has_the_figures_and_formats_that_were_asked_for_last(
     assert "multirun" not in "".join(path.name for path in tmp_path.iterdir())
     assert drawn() == {f"cost_against_accuracy.{kind}" for kind in ("png", "pdf", "svg")}
     assert run(tmp_path, "figures=all", "formats=[pdf]") == 0
-    assert {"cost_against_accuracy.pdf", "error_by_parameter.png"} <= drawn()
+    assert {"cost_against_accuracy.pdf", "correlation.png"} <= drawn()
     assert {name.rpartition(".")[2] for name in drawn()} == {"png", "pdf"}
     assert run(tmp_path, "figures=main") == 0
     assert drawn() == {"cost_against_accuracy.png"}

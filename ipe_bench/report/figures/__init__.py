@@ -17,7 +17,7 @@ from ipe_bench.report.figures.views import views
 from ipe_bench.report.style import house_style
 from ipe_bench.statistics.analysis import Analysis
 
-FIGURES = ("headline", "errors", "costs", "profiles", "parameters", "consistency", "convergence")
+FIGURES = ("errors", "costs", "parameters", "consistency", "convergence")
 """The modules in the order of the report; each holds its kinds of figures in FIGURES."""
 INDEX = "index.json"
 

@@ -69,14 +69,22 @@ def at_scale(frame: pd.DataFrame, scale: float) -> pd.DataFrame:
     return frame[frame["error_scale"] == scale]
 
 
+def panels_of_scales(rows: pd.DataFrame, look: Mapping[str, Look]) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
+    """A figure with a panel for each error scale, and the panels, each with its rows."""
+    scales = spread(sorted(set(rows["error_scale"])))
+    fig, axes = panels(len(scales), look)
+    for scale, ax in zip(scales, axes, strict=True):
+        title(ax, f"error scale {plain(scale)}")
+    return fig, [(ax, at_scale(rows, scale)) for scale, ax in zip(scales, axes, strict=True)]
+
+
 # Words ---------------------------------------------------------------------------------------------------------------
 
 
 def text(value: Any) -> str:
     """A name as it stands in a figure: never read as mathematics, never longer than a line."""
     words, most = str(value), 16 if column() else 42
-    words = words if len(words) <= most else words[: most - 1] + "…"
-    words = words.replace("\\", "\\\\").replace("$", r"\$")
+    words = (words if len(words) <= most else words[: most - 1] + "…").replace("$", r"\$")
     # A leading underscore would hide the name from legends.
     return "\u200b" + words if words.startswith("_") else words
 
@@ -260,43 +268,28 @@ def curves(
     where a value is missing; a point that some of the trials or fewer than `FEW` carry is hollow, and without an
     interval if they are fewer than `FEW`.
     """
-    import seaborn as sns
-
     scale_axis(ax, scales, list(look))
-    rows = rows[rows[by].isin(list(look))].sort_values("error_scale", kind="stable")
-    rows = rows.assign(x=_places(rows, by, list(look), scales))
-    rows = rows.assign(run=rows.groupby(by)[y].transform(lambda values: values.isna().cumsum()))
-    rows = rows[np.isfinite(rows[y])]
-    if not rows.empty:
-        style = seaborn_style(look, by) | {"dashes": {label: one.dash for label, one in look.items()}}
-        style |= {"markeredgewidth": 0.5} | ({"linewidth": 0} if len(scales) == 1 else {})
-        sns.lineplot(rows, x="x", y=y, units="run", estimator=None, ax=ax, **style)
-        few, colors = rows[trials] < FEW, np.array([look[label].color for label in rows[by]])
-        if interval is not None:
-            sure = ~few & (colors != GREY) & np.isfinite(rows[[*interval]]).all(axis=1)
-            low, high = (rows.loc[sure, end] for end in interval)
-            ax.vlines(rows.loc[sure, "x"], low, high, colors=colors[sure].tolist(), linewidth=1.0, alpha=0.8)
-        _hollow(ax, rows[few | (rows[trials] < rows["trials"].max())], y, look, by)
-    ax.set(xlabel="error scale" if len(scales) > 1 else "", ylabel="")
-
-
-def _places(rows: pd.DataFrame, by: str, labels: Sequence[str], scales: Sequence[float]) -> Any:
-    """Where points stand along the axis: a little beside their scale, each label at the same side of all of them."""
-    order = rows[by].map({label: i for i, label in enumerate(labels)}).to_numpy(dtype=float)
-    if len(scales) == 1:
-        return order
     gap = float(np.diff(np.log10([s for s in sorted(scales) if s > 0])).min(initial=1.0))
-    return rows["error_scale"] * 10 ** (0.3 * gap * ((order + 0.5) / len(labels) - 0.5))
-
-
-def _hollow(ax: Axes, rows: pd.DataFrame, y: str, look: Mapping[str, Look], by: str) -> None:
-    """Empties the markers of these points, and says in the legend what that means."""
-    empty = {"linestyle": "none", "markerfacecolor": "white", "markeredgewidth": 1.1, "zorder": 3}
-    for label, part in rows.groupby(by, sort=False):
-        one = look[str(label)]
-        ax.plot(part["x"], part[y], marker=one.marker, markeredgecolor=one.color, **empty)
-    if len(rows):
-        ax.plot([], [], marker="o", markeredgecolor=BOUND_COLOR, label="hollow: trials missing, or few", **empty)
+    most, emptied = rows["trials"].max(), {"linestyle": "none", "markerfacecolor": "white", "markeredgewidth": 1.1}
+    hollow = False
+    for i, label in enumerate(look):
+        one, part = look[label], rows[rows[by] == label].sort_values("error_scale", kind="stable")
+        beside = 10 ** (0.3 * gap * ((i + 0.5) / len(look) - 0.5))
+        x, values = (part["error_scale"] * beside if len(scales) > 1 else np.full(len(part), i)), part[y]
+        few = part[trials] < FEW
+        ends = None
+        if interval and one.color != GREY:
+            sizes = np.array([values - part[interval[0]], part[interval[1]] - values]).clip(min=0)
+            ends = np.where(np.isfinite(sizes).all(axis=0) & ~few, sizes, np.nan)
+        line = one.line | ({"linestyle": "none"} if len(scales) == 1 else {}) | {"zorder": 2 - (one.color == GREY)}
+        ax.errorbar(x, values.where(np.isfinite(values)), ends, elinewidth=0.8, **line)
+        empty = few | (part[trials] < most)
+        hollow |= bool(empty.any())
+        ax.plot(x[empty], values[empty], marker=one.marker, markeredgecolor=one.color, zorder=3, **emptied)
+    if hollow:
+        words = "hollow: trials missing, or few"
+        ax.plot([], [], marker="o", markeredgecolor=BOUND_COLOR, label=words, **emptied)
+    ax.set(xlabel="error scale" if len(scales) > 1 else "", ylabel="")
 
 
 def legend(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | None = None) -> None:

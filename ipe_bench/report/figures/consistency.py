@@ -49,14 +49,16 @@ def draw_consistency(view: View) -> Iterator[Drawing]:
     common.legend(fig, axes, look)
     inside = (totals["low"] <= 1) & (totals["high"] >= 1)
     always = [e for e in look if inside[totals["estimator"] == e].all()]
-    caption = common.sentence(
+    yield view.drawing(
+        fig,
+        "consistency",
+        "Consistency of the reported covariance, all trials",
         "All trials. First panel: median normalised estimation error squared over that of chi-square, 1 where the"
         " reported covariance is right; a bar that does not reach 1 is outside its 95 % limits. Second panel: how often"
         " the truth lies inside the estimator's own 95 % ellipsoid.",
         "Third panel: the filters' innovations against the covariance that they expect of them." * bool(len(counted)),
-        f"Inside the limits at every scale: {common.enumerate_few(always, 20) or 'no estimator'}. {view.label}.",
+        f"Inside the limits at every scale: {common.enumerate_few(always, 20) or 'no estimator'}.",
     )
-    yield Drawing(f"consistency{view.suffix}", "Consistency of the reported covariance, all trials", caption, fig)
 
 
 def draw_calibration(view: View) -> Iterator[Drawing]:
@@ -65,31 +67,31 @@ def draw_calibration(view: View) -> Iterator[Drawing]:
     if rows.empty:
         return
     rows = rows[rows["parameter"] == ALL]
-    look, scales = view.with_look(rows["estimator"]), common.spread(sorted(set(rows["error_scale"])))
-    fig, axes = common.panels(len(scales), look)
+    look, top = view.with_look(rows["estimator"]), rows["error_scale"].max()
+    fig, panels = common.panels_of_scales(rows, look)
     reach = 1.15 * max(LINEAR, float(rows[["difference", "low", "high"]].abs().max().max()))
     ticks: Sequence[float] = [t for t in (-1.0, -0.3, -0.1, -0.05, 0.0, 0.05, 0.1, 0.3, 1.0) if abs(t) <= reach]
-    for scale, ax in zip(scales, axes, strict=True):
+    for ax, part in panels:
         ax.set_yscale("asinh", linear_width=LINEAR / 2)
         ax.set(xlim=(0, 1), ylim=(-reach, reach))
         ax.set_yticks(ticks, [common.number(t) for t in ticks])
         ax.set_yticks([], minor=True)
-        part = common.at_scale(rows, scale)
         _bands(ax, part)
         common.lines(ax, part, "at", "difference", look)
-        common.title(ax, f"error scale {plain(scale)}")
     common.axis_labels(fig, "nominal probability", "observed − nominal")
-    common.legend(fig, axes, look)
+    common.legend(fig, fig.axes, look)
     each = view.totals.set_index(["error_scale", "estimator"])["calibration"]
-    last = [f"{label}: {each[scales[-1], label]}" for label in look if (scales[-1], label) in each.index]
-    caption = common.sentence(
+    last = [f"{label}: {each[top, label]}" for label in look if (top, label) in each.index]
+    yield view.drawing(
+        fig,
+        "calibration",
+        "Calibration of NEES, converged trials",
         "NEES of the converged trials: the share of trials below each quantile of chi-square less its nominal"
         " probability. Grey: what chance explains (simultaneous bands, in which all parameters and NEES of an honest"
         " estimator stay in 95 % of cases; light where fewer trials converged). Below 0 in the middle: standard"
         f" deviations too small; above: too large. The vertical axis is logarithmic beyond ±{LINEAR / 2:g}.",
-        f"At scale {plain(scales[-1])}, parameters included, {common.enumerate_few(last, 4)}. {view.label}.",
+        f"At scale {plain(top)}, parameters included, {common.enumerate_few(last, 4)}.",
     )
-    yield Drawing(f"calibration{view.suffix}", "Calibration of NEES, converged trials", caption, fig)
 
 
 def _bands(ax: Any, rows: pd.DataFrame) -> None:

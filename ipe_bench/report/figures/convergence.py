@@ -62,16 +62,17 @@ def draw(view: View) -> Iterator[Drawing]:
     last = common.at_scale(medians, scales[-1])
     arrived = last[last["distance"] > CLOSE].groupby("estimator", sort=False)["iteration"].max().add(1)
     seen = [f"{label} {arrived.get(label, 0):g}" for label in look if label in set(last["estimator"])]
-    caption = common.sentence(
+    yield view.drawing(
+        fig,
+        "convergence",
+        "Convergence, converged trials",
         "Largest component of an iterate's distance from the trial's last one, in standard deviations of the"
         " Cramér-Rao bound: median over the first converged trials. The last iterate itself, whose distance is zero by"
         " definition, is not drawn: a curve ends where half of the trials have ended.",
         f"Iterations until the median is within {CLOSE:g} standard deviations at scale {plain(scales[-1])}:"
         f" {common.enumerate_few(seen, 20)}.",
         f"{len(look) - len(shown)} further estimators are not shown." * (len(look) > len(shown)),
-        f"{view.label}.",
     )
-    yield Drawing(f"convergence{view.suffix}", "Convergence, converged trials", caption, fig)
 
 
 def median_distances(frame: pd.DataFrame) -> pd.DataFrame:

@@ -1,4 +1,4 @@
-"""Errors of all trials: against the error scale, in decades and near the bound, and their distributions."""
+"""Errors of all trials: the headline of success, error and honesty, errors against the scale, and distributions."""
 
 from __future__ import annotations
 
@@ -13,13 +13,61 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
 from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH
-from ipe_bench.report.words import plain
+from ipe_bench.report.words import percent, plain
 from ipe_bench.trials.thresholds import GATE
 
 NEAR = 2.0
 """Panels that zoom on the bound show errors up to this multiple of it."""
 HALF, MOST = 0.5, 0.95
 """Shares of the trials whose errors lie below what is drawn."""
+
+
+CEILING = {"error_median": 100.0, "error_q95": 100.0, "nees_median": 30.0}
+"""What lies beyond is drawn there: how far a diverged estimate is off tells nothing, and the bound needs the room."""
+
+
+def draw_headline(view: View) -> Iterator[Drawing]:
+    totals = view.totals
+    if totals.empty:
+        return
+    beyond = bool((totals[list(CEILING)] > pd.Series(CEILING)).any(axis=None))
+    totals = totals.assign(**{name: totals[name].clip(upper=most) for name, most in CEILING.items()})
+    claims = totals[totals["nees_median"].notna()]
+    fig, axes = common.panels(3 if len(claims) else 2, view.look, height=3.3)
+    success, error = axes[:2]
+    common.shares(success, "")
+    common.curves(success, totals, "success", view.look, view.scales, interval=("success_low", "success_high"))
+    common.shares(success, "share of all trials")
+    common.title(success, "success")
+    common.decades(error, totals[["error_median", "error_q95"]].clip(lower=0.5), least=4.0)
+    common.bound_line(error, 1.0, "1: the bound, an honest covariance")
+    common.curves(error, totals, "error_median", view.look, view.scales, interval=("error_median", "error_q95"))
+    common.title(error, "error over the bound")
+    error.set_ylabel("median, bar to 95 %")
+    if len(claims):
+        nees = axes[2]
+        common.decades(nees, np.append(claims["nees_median"].clip(lower=0.5), 1.0), least=4.0)
+        common.bound_line(nees, 1.0, "1: the bound, an honest covariance")
+        limits = claims["nees_median_low"].min(), claims["nees_median_high"].max()
+        nees.axhspan(*limits, color=BOUND_COLOR, alpha=0.15, linewidth=0, label="limits of an honest one, 95 %")
+        common.curves(nees, claims, "nees_median", view.look, view.scales)
+        common.title(nees, "squared error over claimed variance")
+        nees.set_ylabel("NEES, median")
+    common.legend(fig, axes, view.look)
+    over = "over error scales" if len(view.scales) > 1 else f"at error scale {plain(view.scales[0])}"
+    last = common.at_scale(totals, view.scales[-1]).sort_values("success", ascending=False, kind="stable")
+    ranked = [f"{e} {percent(v)}" for e, v in zip(last["estimator"], last["success"], strict=True)]
+    most = f"What exceeds {CEILING['error_median']:g} bounds, or {CEILING['nees_median']:g} times the claimed variance"
+    yield view.drawing(
+        fig,
+        "headline",
+        f"Success, error and honesty {over}",
+        "All trials of everybody. Left: share whose error lies inside the gate of the bound, with Clopper-Pearson 95 %"
+        " intervals. Middle: median error over the bound at the truth, with a bar up to the 95 % quantile. Right:"
+        " squared error over the variance that the estimator claims, 1 where it is honest.",
+        f"{most}, stands at the top." if beyond else "",
+        f"At scale {plain(view.scales[-1])} succeed: {common.enumerate_few(ranked, 20)}.",
+    )
 
 
 def efficient(share: float, n: int) -> float:
@@ -67,48 +115,48 @@ def draw_against_scale(view: View) -> Iterator[Drawing]:
     common.axis_labels(fig, "error scale" if several else "", "error / efficient estimator's")
     common.legend(fig, axes, look)
     last = common.at_scale(quantiles(view, MOST), view.scales[-1])
-    caption = common.sentence(
+    yield view.drawing(
+        fig,
+        "error_against_scale",
+        "Error against error scale, all trials" if several else f"Error at error scale {top}, all trials",
         "Mahalanobis error of all trials, those that failed included, over that of an efficient estimator: median"
         " above, 95 % quantile below; decades left, and right the same near the bound, up to"
         f" {plain(NEAR)}. Bars: 95 % intervals by order statistics.",
         f"95 % of the trials at scale {top} err by less than, in bounds:"
-        f" {common.values_of(last, 'error') or 'no finite number'}. {view.label}.",
+        f" {common.values_of(last, 'error') or 'no finite number'}.",
     )
-    title = "Error against error scale" if several else f"Error at error scale {top}"
-    yield Drawing(f"error_against_scale{view.suffix}", f"{title}, all trials", caption, fig)
 
 
 def draw_distributions(view: View) -> Iterator[Drawing]:
     frame = view["distributions"].assign(error=view["distributions"]["distance"] / np.sqrt(view.n))
     if frame.empty:
         return
-    rows = frame[np.isfinite(frame["error"]) & (frame["error"] > 0)]
-    look, scales = view.with_look(frame["estimator"]), common.spread(view.scales)
-    fig, axes = common.panels(len(scales), look)
+    look = view.with_look(frame["estimator"])
+    fig, panels = common.panels_of_scales(frame[np.isfinite(frame["error"]) & (frame["error"] > 0)], look)
     x = np.geomspace(efficient(0.001, view.n), efficient(0.9999, view.n), 200)
     gate = efficient(1 - GATE, view.n) / np.sqrt(view.n)
-    for scale, ax in zip(scales, axes, strict=True):
+    for ax, here in panels:
         band = {"color": BOUND_COLOR, "linewidth": 4, "alpha": 0.25, "label": "efficient estimator (chi)"}
         ax.plot(x / np.sqrt(view.n), gammainc(view.n / 2, x**2 / 2), **band)
-        here = common.at_scale(rows, scale)
         ends = min(here["error"].min(), 0.5) / 1.2, max(here["error"].max(), 2.5) * 1.2
         common.steps(ax, here, "error", "probability", look, *ends)
         ax.axvline(gate, color=BOUND_COLOR, linestyle=BOUND_DASH, linewidth=1.0, label="gate of success")
-        common.title(ax, f"error scale {plain(scale)}")
     common.axis_labels(fig, "Mahalanobis error / √n", "share of all trials below")
-    common.legend(fig, axes, look)
+    common.legend(fig, fig.axes, look)
     last = common.at_scale(frame, view.scales[-1])
-    caption = common.sentence(
+    yield view.drawing(
+        fig,
+        "error_distributions",
+        "Distribution of errors, all trials",
         "Share of all trials whose Mahalanobis error (in standard deviations of the Cramér-Rao bound, over the root of"
         " the number of parameters) is below the abscissa; a curve that ends below 100 % belongs to an estimator some"
         " of whose estimates are not finite.",
-        f"Medians at scale {plain(view.scales[-1])}:"
-        f" {common.values_of(last[last['probability'] == HALF], 'error')}. {view.label}.",
+        f"Medians at scale {plain(view.scales[-1])}: {common.values_of(last[last['probability'] == HALF], 'error')}.",
     )
-    yield Drawing(f"error_distributions{view.suffix}", "Distribution of errors, all trials", caption, fig)
 
 
 FIGURES = (
+    Figure(draw_headline, ("summary",), main=True),
     Figure(draw_against_scale, ("summary", "distributions"), main=True),
     Figure(draw_distributions, ("summary", "distributions"), main=True),
 )

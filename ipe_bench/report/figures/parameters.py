@@ -1,4 +1,4 @@
-"""Errors parameter by parameter: figures 2 and 3 of the paper, all estimators side by side, and correlations."""
+"""Errors parameter by parameter, figures 2 and 3 of the paper, and their correlations."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ from ipe_bench.report.style import BLACK, BOUND_DASH, COLORS, GREY, MARKERS, REF
 from ipe_bench.report.words import plain
 from ipe_bench.statistics.summary import ALL
 
-MOST_PARAMETERS, MOST_GROUPS, MOST_NUMBERED = 30, 8, 15
-"""Parameters of a heat map, groups that have panels, and parameters up to which numbers stand in the cells."""
-WORST = 100.0
-"""Errors of this many bounds and more have one colour."""
+MOST_GROUPS, MOST_PARAMETERS, MOST_NUMBERED = 8, 30, 15
+"""Groups that have panels, parameters of a map of correlations, and those up to which numbers stand in its cells."""
 
 
 def draw(view: View) -> Iterator[Drawing]:
@@ -28,8 +26,6 @@ def draw(view: View) -> Iterator[Drawing]:
     for label in (REFERENCE, *sorted(iterated, key=lambda e: e != "fixed_point")[:1]):
         if label in view.look:
             yield _of_one(view, label)
-    if 2 <= view.n <= MOST_PARAMETERS:
-        yield _of_all(view)
 
 
 def _of_one(view: View, estimator: str) -> Drawing:
@@ -70,15 +66,16 @@ def _of_one(view: View, estimator: str) -> Drawing:
         ax.set_ylabel(common.text(f"[{unit}]" if unit else ""))
     common.legend(fig, axes[-1:], {"all parameters together": together})
     at = [f"{v:.3g} at scale {plain(s)}" for s, v in totals[["error_scale", "rmse"]].dropna().to_numpy()]
-    caption = common.sentence(
+    number = 2 if estimator == REFERENCE else 3
+    of_paper = f"Figure {number} of the paper: " if view.paper else ""
+    return view.drawing(
+        fig,
+        f"figure_{number}" if view.paper else f"parameter_errors_{estimator}",
+        f"{of_paper}error of {estimator}, solved trials",
         f"Root mean square error of {estimator} over the trials that it solved ({_missing(totals)}), with 95 %"
         " bootstrap intervals; dotted: the linear bound. Last panel: the same over the bounds, and all together",
-        f"at {'; '.join(at) or 'no scale'}. {view.label}.",
+        f"at {'; '.join(at) or 'no scale'}.",
     )
-    number = 2 if estimator == REFERENCE else 3
-    name = f"figure_{number}" if view.paper else f"parameter_errors_{estimator}"
-    of_paper = f"Figure {number} of the paper: " if view.paper else ""
-    return Drawing(f"{name}{view.suffix}", f"{of_paper}error of {estimator}, solved trials", caption, fig)
 
 
 def _groups(parameters: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
@@ -105,67 +102,10 @@ def _missing(totals: pd.DataFrame) -> str:
     return common.enumerate_few(seen, 12) or f"all of {totals['trials'].min():.0f}"
 
 
-# Heat maps -----------------------------------------------------------------------------------------------------------
-
-
-def _heat(ax: Any, table: pd.DataFrame, cells: pd.DataFrame, title: str, **style: Any) -> None:
-    """A table in colours, with its numbers where there is room."""
-    import seaborn as sns
-
-    numbered = len(table.columns) <= MOST_NUMBERED and common.most_panels() > 4
-    style = {"annot": cells if numbered else False, "fmt": "", "annot_kws": {"fontsize": 6.5}, **style}
-    sns.heatmap(table, ax=ax, cbar=False, linewidths=0.5, xticklabels=False, yticklabels=False, **style)
-    ax.set(xlabel="", ylabel="")
-    ax.set_xticks(np.arange(len(table.columns)) + 0.5, [common.text(name) for name in table.columns], rotation=90)
-    ax.set_yticks(np.arange(len(table)) + 0.5, [common.text(name) for name in table.index], rotation=0)
-    ax.grid(visible=False)
-    common.title(ax, title)
-
-
-def _of_all(view: View) -> Drawing:
-    """A heat map per error scale: estimators by parameters."""
-    from matplotlib.colors import LogNorm
-
-    scales, labels = common.spread(view.scales, 4), list(view.look)
-    rows = view["summary"].query("parameter != @ALL")
-    # 1.96 deviations hold 95 % of normal errors.
-    rows = rows.assign(ratio=rows["q95_abs_error"] / (1.96 * rows["crlb"]))
-    down, across = -(-len(scales) // 2), min(2, len(scales))
-    fig = common.figure(9.6, 1.2 + down * (0.5 + 0.2 * len(labels)))
-    axes = list(fig.subplots(down, across, squeeze=False, sharex=True, sharey=True).flat)
-    for ax in axes[len(scales) :]:
-        ax.set_axis_off()
-    norm = LogNorm(1.0, WORST, clip=True)
-    for scale, ax in zip(scales, axes, strict=False):
-        table = common.at_scale(rows, scale).pivot_table(index="estimator", columns="parameter", values="ratio")
-        table = table.reindex(index=labels, columns=[p["name"] for p in view.parameters])
-        shown = table.clip(lower=0.01).replace(np.inf, 1e300)
-        _heat(ax, shown, table.map(_short), f"error scale {plain(scale)}", cmap="rocket_r", norm=norm)
-    bar = fig.colorbar(axes[0].collections[0], ax=axes, label="95 % error / bound's", shrink=0.8, extend="max")
-    bar.outline.set_linewidth(0)
-    last = common.at_scale(rows, scales[-1])
-    ratios = last["ratio"].replace(np.inf, np.nan)
-    worst: Any = last.loc[ratios.idxmax()] if ratios.notna().any() else None
-    caption = common.sentence(
-        "What 95 % of all trials err by at most in each parameter, over 1.96 deviations of its Cramér-Rao bound: 1 for"
-        f" an efficient estimator; one colour from {plain(WORST)} on.",
-        ""
-        if worst is None
-        else f"Largest at scale {plain(scales[-1])}: {worst['parameter']} by {worst['estimator']},"
-        f" {worst['ratio']:.3g}.",
-        f"{view.label}.",
-    )
-    return Drawing(f"error_by_parameter{view.suffix}", "Error by parameter, all trials", caption, fig)
-
-
-def _short(value: float) -> str:
-    if not np.isfinite(value):
-        return "∞" if value > 0 else ""
-    return f"{value:.1f}" if value < 9.95 else f"{value:.0f}" if value < 999.5 else common.power_of_ten(value)
-
-
 def draw_correlations(view: View) -> Iterator[Drawing]:
     """Correlation of the parameters' errors, beside that of the bound."""
+    import seaborn as sns
+
     if not 2 <= view.n <= MOST_PARAMETERS or view["correlations"].empty:
         return
     scale, names = view.scales[-1], [p["name"] for p in view.parameters]
@@ -185,20 +125,28 @@ def draw_correlations(view: View) -> Iterator[Drawing]:
     across, down = (1, len(tables)) if common.most_panels() <= 4 else (len(tables), 1)
     fig = common.figure(min(11.0, (side + 0.4) * across + 0.6), min(5.4, side + 0.3) * down)
     axes = list(fig.subplots(down, across, squeeze=False).flat)
-    hidden = ~np.tri(view.n, k=-1, dtype=bool)
+    hidden, numbered = ~np.tri(view.n, k=-1, dtype=bool), view.n <= MOST_NUMBERED and common.most_panels() > 4
+    style: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -1, "vmax": 1, "square": True, "linewidths": 0.5, "cbar": False}
+    style |= {"fmt": "", "annot_kws": {"fontsize": 6.5}, "xticklabels": False, "yticklabels": False}
     for (title, one), ax in zip(tables.items(), axes, strict=True):
-        _heat(ax, one, one.map(two_decimals), title, cmap="RdBu_r", vmin=-1, vmax=1, square=True, mask=hidden)
+        sns.heatmap(one, ax=ax, mask=hidden, annot=one.map(two_decimals) if numbered else False, **style)
+        ax.set_xticks(np.arange(view.n) + 0.5, [common.text(name) for name in names], rotation=90)
+        ax.set_yticks(np.arange(view.n) + 0.5, [common.text(name) for name in names], rotation=0)
         # The first row and the last column are empty without the diagonal.
-        ax.set(xlim=(0, view.n - 1), ylim=(view.n, 1))
+        ax.set(xlim=(0, view.n - 1), ylim=(view.n, 1), xlabel="", ylabel="")
+        ax.grid(visible=False)
+        common.title(ax, title)
     fig.colorbar(axes[0].collections[0], ax=axes, label="correlation", shrink=0.8).outline.set_linewidth(0)
     values = np.abs(np.tril(table.to_numpy(), -1))
     i, j = map(int, np.unravel_index(np.nanargmax(values), values.shape))
-    caption = common.sentence(
+    yield view.drawing(
+        fig,
+        "correlation",
+        "Correlation of parameter errors, solved trials",
         f"Correlation of the parameters' errors of {best['estimator']} at error scale {plain(scale)} over its solved"
         " trials" + (", beside that of the linear bound." if len(tables) > 1 else "."),
-        f"Strongest: {names[i]} with {names[j]}, {table.iloc[i, j]:.2f}. {view.label}.",
+        f"Strongest: {names[i]} with {names[j]}, {table.iloc[i, j]:.2f}.",
     )
-    yield Drawing(f"correlation{view.suffix}", "Correlation of parameter errors, solved trials", caption, fig)
 
 
 def two_decimals(value: float) -> str:

@@ -1,4 +1,4 @@
-"""Figures of estimates from real readings: residuals, covariance ellipses of pairs, and profiles of the likelihood."""
+"""Figures of estimates from readings: residuals, covariance ellipses, profiles of the likelihood, and posteriors."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import BOUND_COLOR, Look, house_style, looks
 from ipe_bench.report.words import p_value
+from ipe_bench.trials.posterior import Reference
 
 MOST_ESTIMATORS = 12
 """Estimators with a panel of residuals; `residuals.csv` has all."""
@@ -30,6 +31,12 @@ _BENT = 30.0
 """Normalised residuals beyond this are drawn on a logarithmic axis: a model that does not fit at all."""
 _NEAR = 10.0
 """Ellipses whose centres lie within so many deviations of the best fit's are in view."""
+MOST_CORNERS = 12
+"""Parameters in the picture of a posterior: if there are more, those in which estimators differ most from it."""
+_VIEW = 5.0
+"""Standard deviations of the posterior to either side of its mean."""
+_DRAWS = 2000
+_DRAW_COLOR = "#9a9a9a"
 
 
 def draw_fits(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]:
@@ -124,24 +131,19 @@ def _ellipses(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look])
     best = min(converged, key=lambda f: f.chi_square)
     pairs = most_correlated(best.correlation)
     fig, axes = common.panels(len(pairs), look)
-    seen: set[str] = set()
-    away: set[str] = set()
     for pair, ax in zip(pairs, axes, strict=True):
-        near = _ellipse_panel(ax, list(pair), best, converged, look)
-        seen |= near
-        away |= {f.label for f in converged} - near
+        _ellipse_panel(ax, list(pair), best, converged, look)
         for set_label, k in zip((ax.set_xlabel, ax.set_ylabel), pair, strict=True):
             sign = "+" if best.x[k] < 0 else "−"
             set_label(_axis_words(model, k, f" {sign} {abs(best.x[k]):.5g}"))
         ax.set_title(f"correlation {best.correlation[pair]:.3f}".replace("-", "−"))
-    common.legend(fig, axes, {label: one for label, one in look.items() if label in seen})
+    common.legend(fig, axes, {f.label: look[f.label] for f in converged})
     count = model.n * (model.n - 1) // 2
     which = f"the {len(pairs)} most correlated of {count} pairs" if count > len(pairs) else "each pair of parameters"
-    out_of_view = common.enumerate_few([label for label in look if label in away])
     caption = common.sentence(
         f"Regions that hold the true values with {LEVEL:.0%} probability if the model and the noise are right, for"
-        f" {which}, about the estimates of {best.label}. Equal ones are drawn narrower upon each other.",
-        f"Out of view in some panels: {out_of_view}." if away else "",
+        f" {which}, about the estimates of {best.label}. Equal ones are drawn narrower upon each other; what is"
+        f" more than {_NEAR:g} deviations off is not drawn.",
     )
     yield Drawing("ellipses", "Covariance ellipses", caption, fig)
 
@@ -151,26 +153,19 @@ def _axis_words(model: Measurement, k: int, more: str = "") -> str:
     return common.text(f"{parameter.name}{more}{f' [{parameter.unit}]' if parameter.unit else ''}")
 
 
-def _ellipse_panel(ax: Any, pair: list[int], best: Fit, fits: Sequence[Fit], look: Mapping[str, Look]) -> set[str]:
-    """Draws the ellipses of two parameters whose centres are near the best fit's; returns whose they are."""
+def _ellipse_panel(ax: Any, pair: list[int], best: Fit, fits: Sequence[Fit], look: Mapping[str, Look]) -> None:
+    """The ellipses of two parameters whose centres are near the best fit's."""
     from matplotlib.ticker import MaxNLocator
 
-    offsets = {one.label: one.x[pair] - best.x[pair] for one in fits}
-    near = [f for f in fits if (np.abs(offsets[f.label]) <= _NEAR * best.standard_errors[pair]).all()]
-    outlines = []
+    near = [f for f in fits if (np.abs(f.x - best.x) <= _NEAR * best.standard_errors)[pair].all()]
     for one, linewidth in zip(near, np.linspace(4.0 if len(near) > 1 else 1.6, 1.0, len(near)), strict=True):
-        outlines.append(offsets[one.label] + ellipse(one.covariance[np.ix_(pair, pair)], edge=one.region(2, LEVEL)))
-        line = look[one.label].line
-        ax.plot(*outlines[-1].T, **line | {"marker": "", "linewidth": linewidth})
-        ax.plot(*offsets[one.label], **line)
-    edges = np.concatenate(outlines)
-    low, high = edges.min(axis=0), edges.max(axis=0)
-    margin = 0.08 * (high - low)
-    ax.set(xlim=(low[0] - margin[0], high[0] + margin[0]), ylim=(low[1] - margin[1], high[1] + margin[1]))
+        centre, line = one.x[pair] - best.x[pair], look[one.label].line
+        outline = centre + ellipse(one.covariance[np.ix_(pair, pair)], edge=one.region(2, LEVEL))
+        ax.plot(*outline.T, **line | {"marker": "", "linewidth": linewidth})
+        ax.plot(*centre, **line)
     ax.xaxis.set_major_locator(MaxNLocator(4))
     ax.yaxis.set_major_locator(MaxNLocator(5))
     ax.ticklabel_format(style="sci", scilimits=(-3, 4), useMathText=True)
-    return {one.label for one in near}
 
 
 def draw_profiles(found: Examination) -> Iterator[Drawing]:
@@ -198,3 +193,84 @@ def draw_profiles(found: Examination) -> Iterator[Drawing]:
         f" standard error stands for. The interval is where the profile stays below the line: {told}."
     )
     yield Drawing("likelihood", "Profiles of the likelihood", caption, fig)
+
+
+# Posteriors ----------------------------------------------------------------------------------------------------------
+
+
+def draw_corners(model: Measurement, found: Sequence[Reference]) -> Iterator[Drawing]:
+    """A picture for each trial."""
+    with house_style():
+        for one in found:
+            yield _corner(model, one)
+
+
+def _corner(model: Measurement, one: Reference) -> Drawing:
+    """Everything in standard deviations of the posterior about its mean."""
+    mean, d = one.posterior.mean, one.posterior.deviation
+    off = [np.abs(e.x[0] - mean) / d for e in one.estimates.values()]
+    worst = np.nan_to_num(np.max([np.zeros(len(d)), *off], axis=0), nan=np.inf)
+    shown = sorted(np.argsort(-worst, kind="stable")[:MOST_CORNERS].tolist())
+    look, k = looks(list(one.estimates)), len(shown)
+    names = [common.text(p.name) for p in model.parameters]
+    draws = (one.posterior.x - mean) / d
+    draws = draws[np.linspace(0, len(draws) - 1, min(_DRAWS, len(draws))).round().astype(int)]
+    truth, modes = (one.truth - mean) / d, (one.posterior.modes - mean) / d
+    fig = common.figure(1.6 + 0.85 * k, 1.8 + 0.85 * k)
+    axes = fig.subplots(k, k, squeeze=False, sharex=True)
+    for row, i in enumerate(shown):
+        for column, j in enumerate(shown):
+            ax = axes[row, column]
+            ax.grid(False)
+            ax.tick_params(labelsize=6)
+            if column > row:
+                ax.set_axis_off()
+                continue
+            if column == row:
+                ax.hist(draws[:, i], bins=np.linspace(-_VIEW, _VIEW, 41), density=True, color=_DRAW_COLOR, linewidth=0)
+                ax.axvline(truth[i], color="black", linewidth=0.7)
+                ax.set(xlim=(-_VIEW, _VIEW), ylim=(0, 0.75), yticks=[])
+                ax.set_title(names[i], fontsize=8, pad=4)
+            else:
+                ax.scatter(*draws[:, [j, i]].T, s=1.2, color=_DRAW_COLOR, linewidth=0, alpha=0.6, rasterized=True)
+                if len(modes) > 1:
+                    ax.plot(*modes[:, [j, i]].T, linestyle="none", marker="x", color="#C00000", markersize=4)
+                ax.plot(truth[j], truth[i], linestyle="none", marker="+", color="black", markersize=6)
+                ax.set(ylim=(-_VIEW, _VIEW), yticks=[-4, 0, 4] if column == 0 else [])
+            for label in one.estimates:
+                _estimate(ax, one, label, look[label], [i] if row == column else [j, i])
+        axes[-1, row].set_xlabel(names[i], fontsize=8)
+        if row > 0:
+            axes[row, 0].set_ylabel(names[i], fontsize=8)
+    fig.supxlabel("deviations of the posterior about its mean", fontsize=8)
+    axes[0, 0].plot([], [], linestyle="none", marker="o", markersize=4, color=_DRAW_COLOR, label="posterior")
+    axes[0, 0].plot([], [], linestyle="none", marker="+", markersize=7, color="black", label="truth")
+    common.legend(fig, [axes[0, 0]], {label: Look(look[label].color, "", look[label].dash) for label in look})
+    told = [f"{label} {d.kl:.3g}" for label, d in one.divergences.items() if np.isfinite(d.kl)]
+    caption = common.sentence(
+        f"Draws of the posterior of trial {one.trial} of {model.name}, and the 95 % ellipses that estimators report, in"
+        f" deviations of the posterior about its mean; what is more than {_VIEW:g} of them off is not in view.",
+        f"Divergence in nats: {common.enumerate_few(told, 12)}." if told else "",
+        f"{len(modes)} modes, crossed." if len(modes) > 1 else "",
+        f"The {k} parameters in which estimators are farthest off." if k < model.n else "",
+        "" if one.posterior.settled else "The populations of particles do not agree: give more.",
+    )
+    return Drawing(f"corner_{one.trial}", f"Posterior of trial {one.trial}", caption, fig)
+
+
+def _estimate(ax: Any, one: Reference, label: str, look: Look, which: list[int]) -> None:
+    """An estimator's Gaussian: its density of one parameter, its 95 % ellipse of two, or its estimate alone."""
+    d, estimates = one.posterior.deviation[which], one.estimates[label]
+    centre = (estimates.x[0][which] - one.posterior.mean[which]) / d
+    P = np.full((len(d), len(d)), np.nan)
+    if estimates.covariance is not None:
+        P = estimates.covariance[0][np.ix_(which, which)] / np.outer(d, d)
+    style = {"color": look.color, "linestyle": look.line["linestyle"], "linewidth": 1.0}
+    if np.isfinite(P).all() and np.isfinite(centre).all() and np.linalg.eigvalsh(P)[0] > 0:
+        if len(which) == 1:
+            x = np.linspace(-_VIEW, _VIEW, 201)
+            ax.plot(x, np.exp(-0.5 * (x - centre[0]) ** 2 / P[0, 0]) / np.sqrt(2 * np.pi * P[0, 0]), **style)
+        else:
+            ax.plot(*(centre + ellipse(P)).T, **style)
+    elif len(which) == 2 and np.isfinite(centre).all():
+        ax.plot(*centre, color=look.color, marker=look.marker, markersize=3)

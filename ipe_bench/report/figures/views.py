@@ -5,32 +5,27 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
+from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import MOST_FACES, Look, looks
 from ipe_bench.report.words import plain
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.summary import ALL
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
+
 MOST_SETTINGS = 6
 """Settings that have figures of their own; the tables have all."""
 MOST_LETTERS = 80
 """Of a setting in a file name; longer ones end in a digest instead of being cut to the same beginning."""
-FRAMES = (
-    "summary",
-    "by_group",
-    "scores",
-    "distributions",
-    "correlations",
-    "convergence",
-    "calibration",
-    "profiles",
-    "attained",
-)
+FRAMES = tuple(field.name for field in fields(Analysis) if field.type == "pd.DataFrame")
+"""The tables of an analysis that a figure may ask for."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +71,13 @@ class View:
         """The looks of those of the estimators that are here."""
         present = set(estimators)
         return {label: look for label, look in self.look.items() if label in present}
+
+    def drawing(self, figure: Canvas, name: str, title: str, *caption: str) -> Drawing:
+        """A figure of this setting: the parts of its caption that say something, and the setting's own label."""
+        words = [part for part in caption if part]
+        return Drawing(
+            f"{name}{self.suffix}", title, " ".join([*words, f"{self.label}."] if self.label else words), figure
+        )
 
     def only(self, names: Sequence[str]) -> View:
         """The same with those frames alone."""
