@@ -6,7 +6,9 @@ the batch. A singular matrix spoils its own trial only.
 
 from __future__ import annotations
 
+import contextlib
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -74,29 +76,25 @@ def inverse(A: Array) -> tuple[Array, Mask]:
 def _solve_columns(A: Array, b: Array) -> tuple[Array, Mask]:
     usable = finite(A) & finite(b)
     x = np.full(b.shape, np.nan)
-    try:
-        x[usable] = np.linalg.solve(A[usable], b[usable])
-    except np.linalg.LinAlgError:
-        for i in np.flatnonzero(usable):
-            try:
-                x[i] = np.linalg.solve(A[i], b[i])
-            except np.linalg.LinAlgError:
-                continue
+    x[usable] = _of_each(np.linalg.solve, A[usable], b[usable])
     return x, ~finite(x)
 
 
 def cholesky(P: Array) -> Array:
     """The upper factors U with U' U = P of each P (trials, n, n); NaN where P is not positive definite."""
+    return _of_each(np.linalg.cholesky, P).swapaxes(1, 2)
+
+
+def _of_each(function: Callable[..., Array], *batches: Array) -> Array:
+    """What a function of NumPy makes of each matrix; NaN where it refuses one."""
     try:
-        return np.linalg.cholesky(P).swapaxes(1, 2)
+        return function(*batches)
     except np.linalg.LinAlgError:
-        U = np.full(P.shape, np.nan)
-        for i, matrix in enumerate(P):
-            try:
-                U[i] = np.linalg.cholesky(matrix).T
-            except np.linalg.LinAlgError:
-                continue
-        return U
+        made = np.full(batches[-1].shape, np.nan)
+        for i, matrices in enumerate(zip(*batches, strict=True)):
+            with contextlib.suppress(np.linalg.LinAlgError):
+                made[i] = function(*matrices)
+        return made
 
 
 def deviations(P: Array) -> Array:

@@ -44,9 +44,9 @@ class Formula(Measurement):
     readings: int | None = None
     """Number of readings; None: the length of the columns."""
     reading: str = "y"
-    """What the column of the readings is called in a file (or `reading`),"""
+    """What the column of the readings is called in a file; `reading` is understood too."""
     unit: str = ""
-    """and its unit."""
+    """Unit of the readings."""
     own: tuple[str, ...] = ()
     """Parameters of which every file of readings has its own, where there are several."""
 

@@ -182,7 +182,7 @@ class ConstrainedModel(WrappedModel):
         return {
             k: bound
             for k, (t, v) in enumerate(zip(self._transformed, values, strict=True))
-            for bound in (t.lower, t.upper)
+            for bound in t.bounds
             if abs(v - bound) <= _NEAR * abs(t.v0 - bound) < np.inf
         }
 
@@ -236,16 +236,13 @@ class _Transformation:
     bounds: tuple[float, float]
     size: float
 
-    lower = property(lambda t: t.bounds[0])
-    upper = property(lambda t: t.bounds[1])
-
     @property
     def plain(self) -> bool:
-        return self.lower == -np.inf and self.upper == np.inf
+        return not np.isfinite(self.bounds).any()
 
     @property
     def prefix(self) -> str:
-        return "logit" if self.lower > -np.inf and self.upper < np.inf else "ln"
+        return "logit" if np.isfinite(self.bounds).all() else "ln"
 
     @property
     def inner_size(self) -> float:
@@ -254,29 +251,26 @@ class _Transformation:
 
     def _slope_at(self, v: Any) -> Any:
         """The derivative of the value by its logarithm or logit."""
-        if self.upper == np.inf:
-            return v - self.lower
-        if self.lower == -np.inf:
-            return self.upper - v
-        return (v - self.lower) * (self.upper - v) / (self.upper - self.lower)
+        lower, upper = self.bounds
+        if upper == np.inf:
+            return v - lower
+        return upper - v if lower == -np.inf else (v - lower) * (upper - v) / (upper - lower)
 
     def _coordinate(self, v: Any) -> Any:
-        if self.upper == np.inf:
-            return np.log(v - self.lower)
-        if self.lower == -np.inf:
-            return -np.log(self.upper - v)
-        return np.log((v - self.lower) / (self.upper - v))
+        lower, upper = self.bounds
+        if upper == np.inf:
+            return np.log(v - lower)
+        return -np.log(upper - v) if lower == -np.inf else np.log((v - lower) / (upper - v))
 
     def value(self, x: Any) -> Any:
         if self.plain:
             return x * self.size
+        lower, upper = self.bounds
         u = self._coordinate(self.v0) + x * self.inner_size
         with np.errstate(over="ignore"):
-            if self.upper == np.inf:
-                return self.lower + np.exp(u)
-            if self.lower == -np.inf:
-                return self.upper - np.exp(-u)
-            return self.lower + (self.upper - self.lower) / (1.0 + np.exp(-u))
+            if upper == np.inf:
+                return lower + np.exp(u)
+            return upper - np.exp(-u) if lower == -np.inf else lower + (upper - lower) / (1.0 + np.exp(-u))
 
     def slope(self, x: Any) -> Any:
         """dv/dx."""

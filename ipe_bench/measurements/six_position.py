@@ -53,13 +53,13 @@ class SixPosition(Measurement):
     """Which sensor each reading is of; None, as the two that follow: each axis up and down, at rest and turning either
     way about the vertical, and all six sensors in each."""
     force: tuple[Vector, ...] | None = None
-    """f at each reading, in m/s^2,"""
+    """f at each reading, in m/s^2."""
     rate: tuple[Vector, ...] | None = None
-    """and w, in deg/s."""
+    """w at each reading, in deg/s."""
     turning: Positive = 60.0
-    """The rate of the table, where there is no file, in deg/s,"""
+    """The rate of the table in deg/s, where there is no file."""
     gravity: Positive = 9.80665
-    """and the local gravity in m/s^2."""
+    """The local gravity in m/s^2, where there is no file."""
     bias: tuple[float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     """Presumed biases in counts, of ax, ay, az, gx, gy, gz; with those that follow, the nominal point."""
     scale: tuple[Positive, Positive, Positive, Positive, Positive, Positive] = (

@@ -54,7 +54,7 @@ MISTAKES = [
     (lambda: Sir(constants={"population": 763.0}).simulate(np.ones((1, 3))), "measurement: infection is not known"),
     (lambda: FallingBody(readings=0), "readings=0"),
     (lambda: Bock(tolerance="1e-13*cosh(nu*t)"), "tolerance: nu is neither a constant nor t"),
-    (lambda: Bock(answer={}, exact={"x1": "1"}), "answer: give all parameters"),
+    (lambda: Bock(answer={"q": 3.0}), "answer: q is not a parameter"),
     (lambda: StudentT(1.0, 2.0), "degrees_of_freedom=2.0"),
     (lambda: Outliers(1.0, share=1.5), "share=1.5"),
     (lambda: Colored(1.0, 1.0), "correlation=1.0"),

@@ -163,6 +163,7 @@ def test_bocks_recorded_readings_are_the_sine_and_the_answer_is_pi():
     np.testing.assert_allclose(model.recorded.z, expected, atol=1e-14)
     np.testing.assert_allclose(model.recorded.x * model.sizes, [np.pi, 0.0, np.pi], rtol=1e-15)
     np.testing.assert_array_equal(model.recorded.R.deviations, np.full(8, 0.05))
+    assert replace(model, answer={"p": np.pi}).recorded is None
 
 
 def altitude(t, h0, v0, b, gamma):

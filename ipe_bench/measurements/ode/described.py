@@ -61,9 +61,9 @@ class Ode(WrappedModel):
     step: Positive | None = None
     """A longest integration step for all, in place of the tolerance."""
     unit: str = ""
-    """Of the readings."""
+    """Unit of the readings."""
     time_unit: str = ""
-    """Of the times: s, min, day."""
+    """Unit of the times: s, min, day."""
     own: tuple[str, ...] = ()
     """Parameters of which every file of readings has its own, where there are several."""
     constants: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
@@ -71,17 +71,17 @@ class Ode(WrappedModel):
     size: Mapping[str, float] = field(default_factory=dict)
     """What one unit of error of a parameter is; where absent, the magnitude of its start."""
     units: Mapping[str, str] = field(default_factory=dict)
-    """Of the parameters."""
+    """Units of the parameters."""
     readings: Count | None = None
     """Number of times at equal intervals, where `times` are not given."""
     interval: Positive = 1.0
-    """Between these times."""
+    """Time between two of the `readings`."""
     deviation: Positive | None = None
     """The usual standard deviation of a reading."""
     answer: Mapping[str, float] = field(default_factory=dict)
-    """Parameters of which the readings are known exactly, for noise=certified,"""
+    """Parameters whose readings are known exactly: with noise=certified they stand for the truth."""
     exact: Mapping[str, str] = field(default_factory=dict)
-    """and these readings, for every output a formula of t, the parameters and the constants."""
+    """The readings at `answer`: for every output a formula of t, the parameters and the constants."""
     title: str = "ode"
     """The name of the model in tables."""
 
@@ -118,10 +118,6 @@ class Ode(WrappedModel):
             for name in read(self.tolerance, "tolerance").names:
                 if name != "t" and name not in self._constants:
                     raise UserError(f"tolerance: {name} is neither a constant nor t")
-        if (self.answer or self.exact) and not (
-            set(self.answer) == set(self.start) and set(self.exact) == set(self._outputs)
-        ):
-            raise UserError("answer: give all parameters, and in exact a formula for every output")
         require_parameters("own", self.own, self.start)
         self._check_constants()
 
@@ -250,8 +246,8 @@ class Ode(WrappedModel):
 
     @property
     def recorded(self) -> Recorded | None:
-        """The exact readings of the answer."""
-        if not self.answer or self.deviation is None:
+        """The exact readings of the answer, where it has all parameters and outputs."""
+        if set(self.answer) != set(self.start) or set(self.exact) != set(self._outputs) or self.deviation is None:
             return None
         formulas = [read(self.exact[name], f"exact.{name}") for name in self._outputs]
         z = np.concatenate([[formula({**self.answer, **known}) for formula in formulas] for known in self.known])
