@@ -17,6 +17,9 @@ from ipe_bench.trials.thresholds import FEW, GATE
 
 TOLERATED = 0.01
 """Share of trials outside their own gate above which an estimator is named diverged but confident."""
+SEEN = 60
+"""Trials from which an estimator is called pessimistic: with 95 % an error that one trial in twenty has is among so
+many, and may be in none of fewer."""
 _BETS = 0.99 * 2.0 ** -np.arange(9)
 """Shares of the stake."""
 
@@ -53,8 +56,8 @@ def verdict(nees: Array, n: int, level: float = 0.95) -> Verdict:
     `GATE` should, and the mean of NEES / n surely lies above 1, as it does not for a right covariance of errors with
     heavy tails. Optimistic, pessimistic: the mean of NEES / n surely lies above or below 1, by the interval that
     root mean squares have, whatever the law of the errors. Where few trials carry that mean there is no such interval:
-    it may still surely lie above 1, and is undecided otherwise. A trial whose NEES is NaN made no claim and is left
-    out.
+    it may still surely lie above 1, and is undecided otherwise; so is one of fewer than `SEEN` trials that seems to lie
+    below 1. A trial whose NEES is NaN made no claim and is left out.
     """
     claims = nees[~np.isnan(nees)]
     if len(claims) < FEW:
@@ -67,7 +70,9 @@ def verdict(nees: Array, n: int, level: float = 0.95) -> Verdict:
     if few_carry(Squares.of(x[None]), np.array([n]))[0]:
         return "optimistic" if above else "undecided"
     low, high = rms_interval(x[:, None], np.ones(len(x), dtype=bool), level)
-    return "optimistic" if low[0] > 1 else "pessimistic" if high[0] < 1 else "consistent"
+    if high[0] < 1:
+        return "pessimistic" if len(claims) >= SEEN else "undecided"
+    return "optimistic" if low[0] > 1 else "consistent"
 
 
 def _evidence_above_1(x: Array) -> float:

@@ -16,7 +16,7 @@ from ipe_bench.basics.errors import UserError, place_of
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics import formulas as f
 from ipe_bench.statistics.calibration import overall_p
-from ipe_bench.statistics.consistency import clopper_pearson, verdict
+from ipe_bench.statistics.consistency import SEEN, clopper_pearson, verdict
 from ipe_bench.statistics.histories import CLOSE, orders_of
 from ipe_bench.statistics.intervals import FIRST, HEAVY, LARGEST_SAMPLE, RESAMPLES, quantile, share_sequence
 from ipe_bench.statistics.sample import NIS, Sample
@@ -554,7 +554,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "Whether the reported covariance is honest. Diverged but confident: surely more than 1 % of the trials lie"
         f" where it says that a share of {GATE:g} should, and the mean NEES is surely above n; optimistic, pessimistic:"
         " the mean NEES lies surely (95 %, for errors of any law) above or below n; undecided: a few trials carry that"
-        f" mean. None for fewer than {FEW} trials.",
+        f" mean, or it seems to lie below n and there are fewer than {SEEN} trials, which rare large errors may be"
+        f" missing from. None for fewer than {FEW} trials.",
         lambda s: verdict(s.scalars["nees"][s.converged], s.n),
         kind="word",
         where=("calibration",),

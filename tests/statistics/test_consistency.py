@@ -136,6 +136,17 @@ def test_a_covariance_that_is_right_on_average_is_not_called_diverged():
     assert verdict(values, 11) == "diverged but confident"
 
 
+@pytest.mark.parametrize(("trials", "word"), [(59, "undecided"), (60, "pessimistic")])
+def test_small_errors_of_few_trials_are_no_sure_sign_of_pessimism(trials, word):
+    """Of 59 trials 4.8 % have none of the errors that one trial in twenty has."""
+    assert verdict(np.full(trials, 0.5) + 0.1 * np.arange(trials) / trials, 1) == word
+
+
+def test_an_honest_covariance_is_seldom_called_pessimistic_by_20_trials_without_their_outliers():
+    """.14 of these without the rule above."""
+    assert false_alarms(verdicts(contaminated, 1, 6, 20, 200)) <= 0.07
+
+
 def test_where_few_trials_carry_the_mean_only_too_large_a_mean_is_sure():
     """Markov: numbers of mean 1 exceed 40 with a probability of at most 1 / 40, whatever else they are."""
     few = np.full(200, 0.5)
