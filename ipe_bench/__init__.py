@@ -27,18 +27,17 @@ if TYPE_CHECKING:
     from ipe_bench.trials.scenario import Scenario
 
 _HOMES = {
-    "IPE": "estimators.ipe",
-    "Estimates": "estimators.base",
-    "Estimator": "estimators.base",
-    "Measurement": "measurements.base",
-    "Noise": "noise.base",
-    "Parameter": "measurements.base",
-    "Problem": "measurements.problem",
-    "Scenario": "trials.scenario",
-    "Status": "basics.statuses",
-    "UserError": "basics.errors",
-    **dict.fromkeys(("check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status"), "api"),
+    "api": ("check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status"),
+    "basics.errors": ("UserError",),
+    "basics.statuses": ("Status",),
+    "estimators.base": ("Estimates", "Estimator"),
+    "estimators.ipe": ("IPE",),
+    "measurements.base": ("Measurement", "Parameter"),
+    "measurements.problem": ("Problem",),
+    "noise.base": ("Noise",),
+    "trials.scenario": ("Scenario",),
 }
+"""Public names, by the module that they are in."""
 _ROOMS = ("baselines", "measurements", "noise", "priors", "solvers")
 
 __all__ = [
@@ -75,8 +74,9 @@ def __getattr__(name: str) -> Any:
 
     if name in _ROOMS:
         return importlib.import_module(f"{__name__}.{name}")
-    if name in _HOMES:
-        return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    for module, names in _HOMES.items():
+        if name in names:
+            return getattr(importlib.import_module(f"{__name__}.{module}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

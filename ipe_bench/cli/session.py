@@ -91,7 +91,8 @@ class Jobs:
 
     def here(self) -> Iterator[tuple[list[str], Spec | UserError]]:
         """The words of each job that this process runs, and its spec or why there is none. Hydra's own launcher would
-        compose each job twice again: `run -m` with ten jobs of two trials takes 1.7 times as long with it."""
+        compose each job twice again, which takes longer than a job of a few trials (`hydra/launcher=basic` shows it).
+        """
         for i, job in enumerate(self.overrides):
             try:
                 one = self.specs[i] if len(self.specs) == len(self.overrides) else _spec(job)
@@ -131,8 +132,9 @@ def jobs_of(words: Words, *, multirun: bool) -> Jobs:
                 f"{w.said(one)}: interval() is for sweepers that optimise (hydra/sweeper=optuna); give the values, "
                 "such as 1,10,100"
             )
-    launches = hydra.launcher["_target_"].endswith(".BasicLauncher") and not hydra.callbacks
-    ours = launches and not any(one.is_hydra_override() for one in words.overrides)
+    told = [one for one in words.overrides if one.is_hydra_override()]
+    ours = hydra.launcher["_target_"].endswith(".BasicLauncher")
+    ours = ours and not any((told, hydra.callbacks, hydra.job.chdir, hydra.job.env_set))
     if not multirun:
         return Jobs(words, [spec_of(config)], False, overrides=[list(words.overrides)] if ours else [])
     if optimises:

@@ -11,12 +11,14 @@ import ipe_bench as ib
 from ipe_bench.cli.main import main
 
 LAUNCHERS = {"joblib": "hydra-joblib-launcher", "submitit_local": "hydra-submitit-launcher"}
-SWEEP = ["measurement=polynomial", "noise=gaussian", "trials=12", "error_scale=1,10", "seed=1,2", "solver=[newton]"]
+EACH = ["basic", *(pytest.param(launcher, marks=pytest.mark.slow) for launcher in LAUNCHERS)]
+SWEEP = ["measurement=polynomial", "noise=gaussian", "trials=12", "error_scale=1,10", "seed=1,2"]
+SWEEP += ["solver=[newton]", "figures=none"]
 
 
-def needs(distribution: str) -> None:
-    if distribution not in {found.name for found in distributions()}:
-        pytest.skip(f"needs {distribution}")
+def needs(launcher: str) -> None:
+    if launcher != "basic" and LAUNCHERS[launcher] not in {found.name for found in distributions()}:
+        pytest.skip(f"needs {LAUNCHERS[launcher]}")
 
 
 def rows(folder: str) -> pd.DataFrame:
@@ -24,11 +26,10 @@ def rows(folder: str) -> pd.DataFrame:
     return found.sort_values(["seed", "error_scale", "estimator", "trial"], ignore_index=True)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("launcher", LAUNCHERS)
+@pytest.mark.parametrize("launcher", EACH)
 @pytest.mark.filterwarnings("default")  # what launchers use of their libraries is no error of ours
 def test_rows_are_those_of_a_serial_sweep(launcher, tmp_path, monkeypatch, capsys):
-    needs(LAUNCHERS[launcher])
+    needs(launcher)
     monkeypatch.chdir(tmp_path)
     assert main(["run", "-m", *SWEEP, "execution=serial", "output=serial"]) == 0
     assert main(["run", "-m", *SWEEP, f"hydra/launcher={launcher}", "output=launched"]) == 0
@@ -37,12 +38,13 @@ def test_rows_are_those_of_a_serial_sweep(launcher, tmp_path, monkeypatch, capsy
     pd.testing.assert_frame_equal(rows("launched"), serial, check_exact=True)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("launcher", LAUNCHERS)
+@pytest.mark.parametrize("launcher", EACH)
 @pytest.mark.filterwarnings("default")
-def test_a_job_that_is_refused_is_told_and_no_success(launcher, tmp_path, monkeypatch, capsys):
-    needs(LAUNCHERS[launcher])
+def test_a_job_that_is_refused_is_told_and_stands_in_the_books(launcher, tmp_path, monkeypatch, capsys):
+    needs(launcher)
     monkeypatch.chdir(tmp_path)
-    words = [*SWEEP, "objective=newton.no_such_column", f"hydra/launcher={launcher}", "output=out"]
-    assert main(["run", "-m", *words]) == 2
-    assert "there is no such column" in capsys.readouterr().err.splitlines()[-1]
+    sweep = [*SWEEP, "execution=serial", "noise.deviation=0.01,1e-150", f"hydra/launcher={launcher}", "output=out"]
+    assert main(["run", "-m", *sweep]) == 2
+    assert "noise.deviation=1e-150 and 3 more)" in capsys.readouterr().err.splitlines()[-1]
+    assert main(["status", "out"]) == 1
+    assert capsys.readouterr().out.count("refused: ") == 4
