@@ -13,7 +13,7 @@ from ipe_bench.cli.main import main
 LAUNCHERS = {"joblib": "hydra-joblib-launcher", "submitit_local": "hydra-submitit-launcher"}
 EACH = ["basic", *(pytest.param(launcher, marks=pytest.mark.slow) for launcher in LAUNCHERS)]
 SWEEP = ["measurement=polynomial", "noise=gaussian", "trials=12", "error_scale=1,10", "seed=1,2"]
-SWEEP += ["solver=[newton]", "figures=none"]
+SWEEP += ["solver=[newton]", "baseline=[linear_lse]", "figures=none"]
 
 
 def needs(launcher: str) -> None:
