@@ -171,12 +171,14 @@ def design(
             f"noise={scenario.noise.name}: the errors of readings are correlated, so that readings do not add up; a "
             "design wants noise=gaussian or noise=quantization"
         )
-    slopes = scenario.noise.covariance(candidates.m).whiten_jacobian(candidates.jacobian(x))
-    whole = Observability.at(candidates, scenario.noise.covariance(candidates.m), x)
+    R_all = scenario.noise.covariance(candidates.m)
+    whole = Observability.at(candidates, R_all, x)
     if not whole.observable:
         return Design(scenario, criterion, candidates, today, _largest(found), limit, (), ())
     reference = today if today.observable else whole
-    slopes = slopes * np.sqrt(np.diagonal(reference.covariance, axis1=1, axis2=2))[:, None, :]
+    bounds = np.sqrt(np.diagonal(reference.covariance, axis1=1, axis2=2))[:, None, :]
+    slopes = R_all.whiten_jacobian(candidates.jacobian(x)) * bounds
+    own = R.whiten_jacobian(model.jacobian(x)) * bounds
     most = model.m if readings is None else readings
     if most < model.n:
         raise UserError(f"readings={most}: {model.n} parameters want at least as many readings")
@@ -185,7 +187,7 @@ def design(
             f"readings={readings}: {model.name} has {candidates.m} readings to choose among; give at most as many, or"
             " make room for more with its options (`ipe-bench list measurement -v`)"
         )
-    judge = _Judge.against(_today_information(model, R, x, reference), slopes, criterion)
+    judge = _Judge.against(np.matmul(own.swapaxes(1, 2), own), slopes, criterion)
     ways = [_way(judge, _units(model, candidates, chosen, slopes), model.m, most) for chosen in columns]
     chosen_ways = tuple(way for way in ways if way is not None)
     if readings is not None and not chosen_ways:
@@ -250,11 +252,6 @@ def _compressed(slopes: Array, rows: Sequence[Rows]) -> Array:
     return units
 
 
-def _today_information(model: Measurement, R: Any, x: Array, reference: Observability) -> Array:
-    J = R.whiten_jacobian(model.jacobian(x)) * np.sqrt(np.diagonal(reference.covariance, axis1=1, axis2=2))[:, None, :]
-    return np.matmul(J.swapaxes(1, 2), J)
-
-
 @dataclass(frozen=True)
 class _Judge:
     """A criterion to be small, over information matrices M (truths, n, n) in units of today's bounds: tr M^-1 / n, or
@@ -287,35 +284,12 @@ class _Judge:
 
     def gains(self, P: Array, slopes: Array) -> Array:
         """By how much the loss falls with each further unit (units,), where P is the covariance without it."""
-        B, K = self._products(P, slopes)
-        K = np.eye(K.shape[-1]) + K
+        truths, units, r, n = slopes.shape
+        B = np.matmul(slopes.reshape(truths, units * r, n), P).reshape(slopes.shape)
+        K = np.eye(r) + np.matmul(B, slopes.swapaxes(-1, -2))
         if self.criterion == "D":
-            return _log_det(K)[1].mean(axis=0) / P.shape[-1]
-        return np.einsum("turi,turi->u", B, _solved(K, B)) / (P.shape[0] * P.shape[-1])
-
-    def _products(self, P: Array, slopes: Array) -> tuple[Array, Array]:
-        """A P (truths, units, r, n) and A P A' (truths, units, r, r)."""
-        B = _times(slopes, P)
-        if slopes.shape[2] == 1:
-            return B, np.einsum("turi,turi->tu", B, slopes)[:, :, None, None]
-        return B, B @ slopes.swapaxes(-1, -2)
-
-
-def _times(slopes: Array, P: Array) -> Array:
-    """A P for each unit, as one product per truth."""
-    truths, units, r, n = slopes.shape
-    return np.matmul(slopes.reshape(truths, units * r, n), P).reshape(slopes.shape)
-
-
-def _log_det(K: Array) -> tuple[Array, Array]:
-    if K.shape[-1] > 1:
-        return np.linalg.slogdet(K)
-    k = K[..., 0, 0]
-    return np.sign(k), np.log(np.maximum(np.abs(k), np.finfo(float).tiny))
-
-
-def _solved(K: Array, B: Array) -> Array:
-    return B / K if K.shape[-1] == 1 else np.linalg.solve(K, B)
+            return np.linalg.slogdet(K)[1].mean(axis=0) / n
+        return np.einsum("turi,turi->u", B, B / K if r == 1 else np.linalg.solve(K, B)) / (truths * n)
 
 
 def _way(judge: _Judge, units: Units, today: int, most: int) -> Way | None:
@@ -324,40 +298,34 @@ def _way(judge: _Judge, units: Units, today: int, most: int) -> Way | None:
     if len(units.rows) < _FEW:
         return None
     reach = min(max(int(_REACH * today), most), int(units.sizes.sum()))
-    grown = _Grown(judge, units)
-    curve = [choice for choice in grown.choices(reach) if np.isfinite(choice.mean_bound)]
+    curve = [choice for choice in _grown(judge, units, reach) if np.isfinite(choice.mean_bound)]
     within = [c for c in curve if c.readings <= most]
     if not within:
         return None
     if units.sizes[units.today].sum() <= most:
-        within.append(grown.choice(np.flatnonzero(units.today).tolist()))
+        within.append(_choice(judge, units, units.today))
     saving = next((c for c in curve if c.mean_bound <= 1 and c.readings < today), None)
     wanted = np.unique(np.round(np.geomspace(units.sizes.min(), reach, _POINTS)))
     shown = dict.fromkeys(next((c for c in reversed(curve) if c.readings <= w), curve[0]) for w in wanted)
     return Way(units, tuple(shown), saving, min(within, key=lambda c: c.mean_bound))
 
 
-@dataclass(frozen=True)
-class _Grown:
-    """Choices of units that grow one by one."""
+def _choice(judge: _Judge, units: Units, taken: NDArray[np.bool_]) -> Choice:
+    """The choice of these units (units,)."""
+    places = np.flatnonzero(taken)
+    rows = np.sort(np.concatenate([units.rows[u] for u in places], dtype=np.intp))
+    value = judge.value(units.information(taken.astype(float)))
+    return Choice(tuple(map(int, places)), tuple(map(int, rows)), value)
 
-    judge: _Judge
-    units: Units
 
-    def choice(self, places: Sequence[int]) -> Choice:
-        taken = sorted(places)
-        weights = np.isin(np.arange(len(self.units.rows)), taken).astype(float)
-        rows = np.sort(np.concatenate([self.units.rows[u] for u in taken], dtype=np.intp))
-        return Choice(tuple(taken), tuple(map(int, rows)), self.judge.value(self.units.information(weights)))
-
-    def choices(self, most: int) -> Iterator[Choice]:
-        """One after another, each with one unit more, of at most so many readings."""
-        sizes, taken = self.units.sizes, np.zeros(len(self.units.rows), dtype=bool)
-        while (free := ~taken & (sizes <= most - sizes[taken].sum())).any():
-            P = self.judge.covariance(self.units.information(taken.astype(float)))
-            gains = self.judge.gains(P, self.units.slopes) / sizes
-            taken[int(np.argmax(np.where(free, gains, -np.inf)))] = True
-            yield self.choice(np.flatnonzero(taken).tolist())
+def _grown(judge: _Judge, units: Units, most: int) -> Iterator[Choice]:
+    """Choices one after another, each with the unit more that gains most per reading, of at most so many readings."""
+    sizes, taken = units.sizes, np.zeros(len(units.rows), dtype=bool)
+    while (free := ~taken & (sizes <= most - sizes[taken].sum())).any():
+        P = judge.covariance(units.information(taken.astype(float)))
+        gains = judge.gains(P, units.slopes) / sizes
+        taken[int(np.argmax(np.where(free, gains, -np.inf)))] = True
+        yield _choice(judge, units, taken)
 
 
 def _effects(judge: _Judge, model: Measurement, candidates: Measurement, slopes: Array) -> Iterator[Effect]:

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, deviations, information, inverse, multiply
+from ipe_bench.basics.linalg import Array, Covariance, deviations, information, inverse, multiply
 from ipe_bench.estimators.base import Estimates, Estimator, estimate_safely
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.trials.roots import least_squares_root
@@ -216,9 +216,13 @@ def _modes(problem: Problem, z: Array, x: Array) -> tuple[Array, Array]:
 
 def _tempered(problem: Problem, x: Array, beta: float) -> Array:
     """beta J' R^-1 J + P0^-1 (points, n, n)."""
+    return beta * information(problem.measurement.jacobian(x), problem.R) + _prior(problem).inverse()
+
+
+def _prior(problem: Problem) -> Covariance:
     prior = problem.prior_covariance()
     assert prior is not None
-    return beta * information(problem.measurement.jacobian(x), problem.R) + prior.inverse()
+    return prior
 
 
 @dataclass
@@ -241,9 +245,7 @@ class _Population:
 
     @classmethod
     def run(cls, problem: Problem, z: Array, count: int, rng: np.random.Generator) -> _Population:
-        prior = problem.prior_covariance()
-        assert prior is not None
-        x = problem.x0 + prior.coloured(rng.standard_normal((count, problem.measurement.n)))
+        x = problem.x0 + _prior(problem).coloured(rng.standard_normal((count, problem.measurement.n)))
         self = cls(problem, z, rng, x, np.empty(count))
         self.log = self._log_likelihood(x)
         while self.beta < 1 and self.stages < _MOST_STAGES:
@@ -261,9 +263,7 @@ class _Population:
         return np.where(np.isfinite(squares), -0.5 * squares, -np.inf)
 
     def _log_prior(self, x: Array) -> Array:
-        prior = self.problem.prior_covariance()
-        assert prior is not None
-        return -0.5 * np.sum(prior.whiten(x - self.problem.x0) ** 2, axis=1)
+        return -0.5 * np.sum(_prior(self.problem).whiten(x - self.problem.x0) ** 2, axis=1)
 
     def _stage(self) -> None:
         """A step of temperature, resampling, and moves."""
@@ -303,11 +303,9 @@ class _Population:
         with np.errstate(all="ignore"):
             P = inverse(_tempered(self.problem, self.x[some], self.beta))[0]
         P = P[np.isfinite(P).all(axis=(1, 2))]
-        deviation = self.problem.prior_used()
-        assert deviation is not None
-        D = np.sqrt(np.diagonal(P, axis1=1, axis2=2)) if len(P) else deviation[None]
         if not len(P):
-            return np.diag(deviation)[None]
+            return np.diag(_prior(self.problem).deviations)[None]
+        D = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
         # By eigenvalues, since round-off may leave a correlation a shade beyond 1.
         values, axes = np.linalg.eigh(P / (D[:, :, None] * D[:, None, :]))
         return D[:, :, None] * axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]
@@ -372,15 +370,9 @@ def divergence(posterior: Posterior, estimates: Estimates, seed: int = 0) -> Div
 
 def _energy(a: Array, b: Array, S: Array) -> float:
     """2 E|A - B| - E|A - A'| - E|B - B'| over E|B - B'|, in the metric of S."""
+    from scipy.spatial.distance import cdist, pdist
+
     L = np.linalg.inv(np.linalg.cholesky(S)).T
     a, b = a @ L, b @ L
-    own = _mean_distance(b, b)
-    return max(0.0, (2 * _mean_distance(a, b) - _mean_distance(a, a) - own) / own)
-
-
-def _mean_distance(a: Array, b: Array) -> float:
-    squares = np.sum(a**2, axis=1)[:, None] + np.sum(b**2, axis=1) - 2 * a @ b.T
-    pairs = squares.size - (len(a) if a is b else 0)
-    if a is b:
-        np.fill_diagonal(squares, 0.0)
-    return float(np.sqrt(np.maximum(squares, 0.0)).sum() / pairs)
+    own = pdist(b).mean()
+    return max(0.0, float((2 * cdist(a, b).mean() - pdist(a).mean() - own) / own))

@@ -1,17 +1,15 @@
-"""Trials through estimators: draws a block of a scenario, lets estimators loose on it, and scores what they return.
+"""Trials through estimators: draws a block of a scenario, runs estimators on it, and scores what they return.
 
-A block is a range of trials; its result depends on nothing but the scenario, the estimator and the range. Storing,
-distributing and summarising blocks is left to others.
+A block is a range of trials; its result depends on nothing but the scenario, the estimator and the range.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import (
     Array,
     Mask,
@@ -30,12 +28,17 @@ from ipe_bench.estimators.base import Equation, Estimates, Estimator, estimate_s
 from ipe_bench.measurements.counted import CountingModel
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.trials.bounds import bound_deviations
-from ipe_bench.trials.contraction import contraction_of, curvature
 from ipe_bench.trials.fit_test import Spread, fit_probability, inflation_of, spread_of
-from ipe_bench.trials.misspecified import misspecified
 from ipe_bench.trials.roots import Known, frozen_root, least_squares_root
 from ipe_bench.trials.scenario import Scenario, Trials
-from ipe_bench.trials.second_order import box_bias, relative_curvatures, second_derivatives
+from ipe_bench.trials.theory import (
+    box_bias,
+    contraction_of,
+    curvature,
+    misspecified,
+    relative_curvatures,
+    second_derivatives,
+)
 from ipe_bench.trials.thresholds import EXPECTED, GATE, SAME_ROOT
 
 HISTORIES = 20
@@ -53,6 +56,8 @@ class Block:
 
     scenario: Scenario
     trials: Trials
+    _roots: dict[tuple[Equation, float], Array] = field(default_factory=dict, repr=False, compare=False)
+    _spreads: dict[tuple[Equation | None, bool, float], Spread] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
     def draw(cls, scenario: Scenario, start: int, stop: int) -> Block:
@@ -124,8 +129,8 @@ class Block:
             "contraction_K": contracts.K,
             "contraction_norm": contracts.infinity_norm,
             "contraction_radius": contracts.spectral_radius,
-            **self._bent(names, H_plus),
-            **self._wrong_model(names),
+            **self._curvature_columns(names, H_plus),
+            **self._misspecification_columns(names),
         }
 
     def _van_trees(self) -> tuple[Array, Array]:
@@ -154,7 +159,7 @@ class Block:
         """h(x) (trials, m) for x (trials, n); NaN where the model fails."""
         return CountingModel.uncounted(self.problem.measurement, len(x)).simulate(read_only(x), np.arange(len(x)))
 
-    def _bent(self, names: list[str], H_plus: Array) -> Columns:
+    def _curvature_columns(self, names: list[str], H_plus: Array) -> Columns:
         """What second derivatives at the truth say, for the first trials and NaN for the others: M of eq. (23), the
         relative curvatures, and the bias of least squares."""
         kept = max(0, min(CURVED, self.trials.stop) - self.trials.start)
@@ -177,7 +182,7 @@ class Block:
             **_by_parameter("box_bias", names, bias),
         }
 
-    def _wrong_model(self, names: list[str]) -> Columns:
+    def _misspecification_columns(self, names: list[str]) -> Columns:
         """Where least squares goes, and how it scatters there, when readings come from another model; nothing where
         they do not, and where estimators are told another R than that of the noise."""
         if self.scenario.truth is None or not self.scenario.noise.true_covariance:
@@ -190,10 +195,6 @@ class Block:
             **_by_parameter("misspecified", names, found.deviation),
         }
 
-    @cached_property
-    def _roots(self) -> dict[tuple[Equation, float], Array]:
-        return {}
-
     def reference_root(self, equation: Equation, inflation: float = 1.0) -> Array:
         """The root (trials, n) that an estimating equation reaches from the truth; NaN where it reaches none.
 
@@ -202,12 +203,17 @@ class Block:
         key = (equation, inflation)
         if key not in self._roots:
             with np.errstate(all="ignore"):
-                self._roots[key] = _root_from(self.problem, self.trials, self._at_truth, equation, inflation)
+                self._roots[key] = self._root(equation, inflation)
         return self._roots[key]
 
-    @cached_property
-    def _at_truth(self) -> Known:
-        return Known(self.jacobian, self.readings)
+    def _root(self, equation: Equation, inflation: float) -> Array:
+        trials, known = self.trials, Known(self.jacobian, self.readings)
+        if equation != "frozen":
+            prior = inflation if equation == "map" else None
+            return least_squares_root(self.problem, trials.z, trials.x, known, prior=prior)
+        if self.problem.rankless:  # there is no such equation; the estimators that solve it say so
+            return np.full(trials.x.shape, np.nan)
+        return frozen_root(self.problem, trials.z, trials.x, known)
 
     def estimate(self, estimator: Estimator) -> tuple[Estimates, Columns]:
         """What an estimator makes of the block, and its score."""
@@ -230,10 +236,6 @@ class Block:
         if key not in self._spreads:
             self._spreads[key] = spread_of(estimator, self.problem, self.jacobian, self.crlb_information)
         return self._spreads[key]
-
-    @cached_property
-    def _spreads(self) -> dict[tuple[Equation | None, bool, float], Spread]:
-        return {}
 
     def score(self, estimator: Estimator, estimates: Estimates) -> Columns:
         """Each trial's error, cost, status and distances, as columns."""
@@ -313,17 +315,6 @@ def _nees_of_any(e: Array, C: Array) -> Array:
     x, singular = solve(C, e)
     definite = ~singular & (np.linalg.eigvalsh(C)[:, 0] > 0)
     return np.where(definite, np.einsum("ti,ti->t", e, x), np.inf)
-
-
-def _root_from(problem: Problem, trials: Trials, known: Known, equation: Equation, inflation: float) -> Array:
-    """The root next to the truth, where this is known."""
-    if equation == "frozen":
-        try:
-            return frozen_root(problem, trials.z, trials.x, known)
-        except UserError:
-            # H lacks rank, so there is no such equation; the estimators that solve it say so.
-            return np.full(trials.x.shape, np.nan)
-    return least_squares_root(problem, trials.z, trials.x, known, prior=inflation if equation == "map" else None)
 
 
 def _by_parameter(prefix: str, names: list[str], values: Array) -> Columns:

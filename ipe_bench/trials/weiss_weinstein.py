@@ -80,12 +80,12 @@ def weiss_weinstein(problem: Problem, information: Array, offsets: Array, u: Arr
     k = len(offsets)
     G = np.zeros((n + k, n + k))
     G[:n, :n] = information + problem.prior_covariance().inverse()  # type: ignore[union-attr]
-    alike = [_Alike.of(problem, c, u) for c in offsets]
+    alike = [_alike(problem, c, u) for c in offsets]
     for i in range(k):
-        G[n + i, :n] = G[:n, n + i] = -4 * alike[i].slope / alike[i].value
+        G[n + i, :n] = G[:n, n + i] = -4 * alike[i][1] / alike[i][0]
         for j in range(i + 1):
-            pair = [_Alike.of(problem, offsets[i] + sign * offsets[j], u).value for sign in (-1.0, 1.0)]
-            G[n + i, n + j] = G[n + j, n + i] = 2 * (pair[0] - pair[1]) / (alike[i].value * alike[j].value)
+            pair = [_alike(problem, offsets[i] + sign * offsets[j], u)[0] for sign in (-1.0, 1.0)]
+            G[n + i, n + j] = G[n + j, n + i] = 2 * (pair[0] - pair[1]) / (alike[i][0] * alike[j][0])
     H = np.concatenate([np.eye(n), offsets.T], axis=1)
     scale = np.sqrt(np.diag(G))
     return np.asarray((H / scale) @ np.linalg.pinv(G / np.outer(scale, scale), hermitian=True) @ (H / scale).T)
@@ -94,7 +94,7 @@ def weiss_weinstein(problem: Problem, information: Array, offsets: Array, u: Arr
 def _telling(problem: Problem, offsets: Array, u: Array) -> Array:
     """The offsets at which readings are ever alike, each once; the most alike first, and no more than there are
     parameters."""
-    weights = np.array([_Alike.of(problem, c, u).value for c in offsets])
+    weights = np.array([_alike(problem, c, u)[0] for c in offsets])
     kept: list[Array] = []
     for i in np.argsort(-weights, kind="stable"):
         if weights[i] > _SEEN and not any(
@@ -104,33 +104,26 @@ def _telling(problem: Problem, offsets: Array, u: Array) -> Array:
     return np.array(kept[: offsets.shape[1]]).reshape(-1, offsets.shape[1])
 
 
-@dataclass(frozen=True)
-class _Alike:
-    """How alike truths are that lie an offset c apart: the mean of sqrt(p(z, x + c) p(z, x)) over all z and x.
+def _alike(problem: Problem, c: Array, u: Array) -> tuple[float, Array]:
+    """How alike truths are that lie an offset c apart, and its gradient (n,) in c: the mean of
+    sqrt(p(z, x + c) p(z, x)) over all z and x.
 
     For a normal prior that is exp(-|c|^2 / 8) in its metric, times the mean over the prior's u of
     exp(-|h(u + c/2) - h(u - c/2)|^2 / 8) in the metric of R.
     """
-
-    value: float
-    slope: Array
-    """Its gradient (n,) in c."""
-
-    @classmethod
-    def of(cls, problem: Problem, c: Array, u: Array) -> _Alike:
-        model, prior = problem.measurement, problem.prior_covariance()
-        assert prior is not None
-        above, below = u + c / 2, u - c / 2
-        with np.errstate(all="ignore"):
-            apart = problem.R.whiten(model.simulate(above) - model.simulate(below))
-            weight = np.exp(-np.sum(apart**2, axis=1) / 8 - np.sum(prior.whiten(c) ** 2) / 8)
-        weight = np.where(np.isfinite(weight), weight, 0.0)
-        slope, used = np.zeros(len(c)), weight > 0
-        if used.any():
-            both = problem.R.whiten_jacobian(model.jacobian(above[used]) + model.jacobian(below[used]))
-            fall = -np.einsum("tmi,tm->ti", both, apart[used]) / 8 - prior.inverse() @ c / 4
-            slope = np.sum(weight[used, None] * fall, axis=0) / len(u)
-        return cls(float(weight.mean()), slope)
+    model, prior = problem.measurement, problem.prior_covariance()
+    assert prior is not None
+    above, below = u + c / 2, u - c / 2
+    with np.errstate(all="ignore"):
+        apart = problem.R.whiten(model.simulate(above) - model.simulate(below))
+        weight = np.exp(-np.sum(apart**2, axis=1) / 8 - np.sum(prior.whiten(c) ** 2) / 8)
+    weight = np.where(np.isfinite(weight), weight, 0.0)
+    slope, used = np.zeros(len(c)), weight > 0
+    if used.any():
+        both = problem.R.whiten_jacobian(model.jacobian(above[used]) + model.jacobian(below[used]))
+        fall = -np.einsum("tmi,tm->ti", both, apart[used]) / 8 - prior.inverse() @ c / 4
+        slope = np.sum(weight[used, None] * fall, axis=0) / len(u)
+    return float(weight.mean()), slope
 
 
 def false_roots(problem: Problem, x: Array, starts: Array, bound: Array) -> tuple[Array, Array]:

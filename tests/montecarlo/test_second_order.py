@@ -17,10 +17,9 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.report.tables import all_tables
 from ipe_bench.runs.run import compute
 from ipe_bench.statistics import analyse
-from ipe_bench.trials.misspecified import misspecified
 from ipe_bench.trials.roots import least_squares_root
 from ipe_bench.trials.scoring import CURVED, Block
-from ipe_bench.trials.second_order import box_bias, relative_curvatures, second_derivatives
+from ipe_bench.trials.theory import box_bias, misspecified, relative_curvatures, second_derivatives
 from ipe_bench.trials.weiss_weinstein import false_roots, threshold, weiss_weinstein
 
 RADIUS = 1.959964

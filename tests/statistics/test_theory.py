@@ -19,11 +19,10 @@ from ipe_bench.runs.run import compute
 from ipe_bench.solvers import FixedPoint, Newton
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.histories import fixed_point_bound, observed_constant, orders_of
-from ipe_bench.trials.contraction import contraction_of, curvature
 from ipe_bench.trials.roots import frozen_root
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import CURVED, SAME_ROOT, Block
-from ipe_bench.trials.second_order import second_derivatives
+from ipe_bench.trials.theory import contraction_of, curvature, second_derivatives
 
 
 def contraction(problem, x):
