@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+import sys
+
 import pytest
 
 from ipe_bench.cli.main import main
+from ipe_bench.plugins import discovery
 
 
 @pytest.fixture
 def ipe_bench(monkeypatch, capsys, tmp_path):
-    """Runs a command in an empty folder: its exit code and what it wrote on stdout and stderr."""
+    """Runs a command in an empty folder, whose plugins are forgotten afterwards: its exit code, stdout and stderr."""
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "PYTHONPATH"):
+        monkeypatch.setenv(variable, "1" if variable != "PYTHONPATH" else "")
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(discovery, "_added", {})
     monkeypatch.chdir(tmp_path)
 
     def run(*words: str) -> tuple[int, str, str]:
+        discovery.sources.cache_clear()
+        capsys.readouterr()
         code = main(list(words))
         written = capsys.readouterr()
         return code, written.out, written.err
 
-    return run
+    yield run
+    discovery.sources.cache_clear()

@@ -12,7 +12,6 @@ from jsonschema import Draft202012Validator
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.options import checked, option_types
-from ipe_bench.cli.main import main
 from ipe_bench.cli.spec import keys_of_a_run
 from ipe_bench.plugins import discovery
 from ipe_bench.plugins.construct import find_class
@@ -123,25 +122,16 @@ def test_every_option_of_ours_has_a_meaning(schema):
     assert silent == []
 
 
-def test_the_command_prints_it_and_names_what_is_left_out(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    discovery.sources.cache_clear()
-    try:
-        assert main(["new", "noise", "hum"]) == 0
-        assert main(["new", "noise", "hiss"]) == 0
-        (module,) = tmp_path.rglob("hiss.py")
-        module.write_text("import a_library_that_is_not_there\n")
-        discovery.sources.cache_clear()
-        capsys.readouterr()
-        assert main(["schema"]) == 0
-    finally:
-        discovery._added.clear()
-        monkeypatch.undo()
-        discovery.sources.cache_clear()
-    written = capsys.readouterr()
-    definitions = json.loads(written.out)["$defs"]
+def test_the_command_prints_it_and_names_what_is_left_out(ipe_bench, tmp_path):
+    for name in ("hum", "hiss"):
+        assert ipe_bench("new", "noise", name)[0] == 0
+    (module,) = tmp_path.rglob("hiss.py")
+    module.write_text("import a_library_that_is_not_there\n")
+    code, out, error = ipe_bench("schema")
+    definitions = json.loads(out)["$defs"]
+    assert code == 0
     assert "noise.hum" in definitions
     assert "noise.hiss" not in definitions
-    (line,) = written.err.splitlines()
+    (line,) = error.splitlines()
     assert line.startswith("ipe-bench: noise/hiss: has no schema: ")
     assert "a_library_that_is_not_there" in line

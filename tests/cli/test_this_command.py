@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pandas as pd
 import pytest
 from rich.console import Console
 
-from ipe_bench.cli.main import main
 from ipe_bench.cli.words import default_name, read
-from ipe_bench.plugins import discovery as plugins
 from ipe_bench.report.certified_tables import attained_totals_table
 from ipe_bench.report.terminal import render
 
@@ -20,23 +17,8 @@ SMALL += ("figures=none",)
 
 
 @pytest.fixture
-def command(monkeypatch, capsys, tmp_path):
-    """Runs a command in this process: its exit code and what it wrote on stdout and stderr."""
-    for variable in ("HYDRA_FULL_ERROR", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "PYTHONPATH"):
-        monkeypatch.setenv(variable, "1" if variable != "PYTHONPATH" else "")
-    monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setattr(plugins, "_added", {})
-    monkeypatch.chdir(tmp_path)
-
-    def run(*words: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["ipe-bench"])
-        plugins.sources.cache_clear()
-        capsys.readouterr()
-        code = main(list(words))
-        written = capsys.readouterr()
-        return code, written.out, written.err
-
-    return run
+def command(ipe_bench):
+    return ipe_bench
 
 
 def rows_of(text: str, name: str) -> int:
