@@ -73,17 +73,12 @@ def test_ten_estimators_at_seven_scales_take_little_room(synthetic):
     assert sum(sizes.values()) < 40_000
 
 
-def test_with_one_scale_a_chart_is_against_cost(synthetic):
-    fill(synthetic, scales=(33.0,))
-    (chart,) = charts(views(analyse([synthetic.directory]))[0])
-    assert json.loads(chart.data)["x"][0]["column"] == "simulations_median"
-
-
-def test_what_is_not_a_number_is_null(synthetic):
-    fill(synthetic, labels=("one",))
+def test_with_one_scale_a_chart_is_against_cost_and_what_is_not_a_number_is_null(synthetic):
+    fill(synthetic, labels=("one",), scales=(1.0,))
     scenario = synthetic.scenario(error_scale=1.0)
     synthetic.add(scenario, "lost", np.full((80, 3), np.nan), status="error", solved=False)
     found = drawn(analyse([synthetic.directory]))["explore"]
+    assert found["x"][0]["column"] == "simulations_median"
     (lost,) = [series for series in found["series"] if series["name"] == "lost"]
     assert lost["values"]["error_median"] == [None]
     assert "NaN" not in json.dumps(found)

@@ -148,6 +148,7 @@ def scale_axis(ax: Axes, scales: Sequence[float], labels: Sequence[str]) -> None
     if len(scales) == 1:
         ax.set_xticks(range(len(labels)), [text(label) for label in labels], rotation=90)
         ax.set_xlim(-0.6, len(labels) - 0.4)
+        ax.set_xlabel("")
         return
     positive = sorted(s for s in scales if s > 0)
     zero = len(positive) < len(scales)
@@ -261,8 +262,11 @@ def curves(
     interval: tuple[str, str] | None = None,
     by: str = "estimator",
     trials: str = "trials",
+    heading: str = "",
+    label: str = "",
 ) -> None:
-    """A column over the error scales, a line with markers per label, on an axis whose limits are set already.
+    """A column over the error scales, a line with markers per label, on an axis whose limits are set already, with the
+    panel's heading and the label of its vertical axis.
 
     Labels stand side by side about their scale, so that points and intervals that coincide are seen. A line is broken
     where a value is missing; a point that some of the trials or fewer than `FEW` carry is hollow, and without an
@@ -272,16 +276,18 @@ def curves(
     gap = float(np.diff(np.log10([s for s in sorted(scales) if s > 0])).min(initial=1.0))
     most, emptied = rows["trials"].max(), {"linestyle": "none", "markerfacecolor": "white", "markeredgewidth": 1.1}
     hollow = False
-    for i, label in enumerate(look):
-        one, part = look[label], rows[rows[by] == label].sort_values("error_scale", kind="stable")
+    for i, (name, one) in enumerate(look.items()):
+        part: Any = rows[rows[by] == name].sort_values("error_scale", kind="stable")
         beside = 10 ** (0.3 * gap * ((i + 0.5) / len(look) - 0.5))
         x, values = (part["error_scale"] * beside if len(scales) > 1 else np.full(len(part), i)), part[y]
         few = part[trials] < FEW
         ends = None
         if interval and one.color != GREY:
             sizes = np.array([values - part[interval[0]], part[interval[1]] - values]).clip(min=0)
-            ends = np.where(np.isfinite(sizes).all(axis=0) & ~few, sizes, np.nan)
-        line = one.line | ({"linestyle": "none"} if len(scales) == 1 else {}) | {"zorder": 2 - (one.color == GREY)}
+            ends = np.where(np.isfinite(sizes).all(axis=0) & ~few.to_numpy(), sizes, np.nan)
+        line: dict[str, Any] = (
+            one.line | ({"linestyle": "none"} if len(scales) == 1 else {}) | {"zorder": 2 - (one.color == GREY)}
+        )
         ax.errorbar(x, values.where(np.isfinite(values)), ends, elinewidth=0.8, **line)
         empty = few | (part[trials] < most)
         hollow |= bool(empty.any())
@@ -289,7 +295,9 @@ def curves(
     if hollow:
         words = "hollow: trials missing, or few"
         ax.plot([], [], marker="o", markeredgecolor=BOUND_COLOR, label=words, **emptied)
-    ax.set(xlabel="error scale" if len(scales) > 1 else "", ylabel="")
+    ax.set_ylabel(label)
+    if heading:
+        title(ax, heading)
 
 
 def legend(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | None = None) -> None:

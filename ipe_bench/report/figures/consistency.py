@@ -33,19 +33,15 @@ def draw_consistency(view: View) -> Iterator[Drawing]:
     look = view.with_look(totals["estimator"])
     fig, axes = common.panels(3 if len(counted) else 2, look, height=3.0)
     shown = (
-        (totals, "nees_median", "squared error over claimed variance", 1.0),
-        (totals, "coverage95", "truth inside the 95 % ellipsoid", 0.95),
-        (counted, NIS, "filters' innovations (NIS)", 1.0),
+        (totals, "nees_median", "squared error over claimed variance", "median NEES", 1.0),
+        (totals, "coverage95", "truth inside the 95 % ellipsoid", "share of trials", 0.95),
+        (counted, NIS, "filters' innovations (NIS)", "mean NIS", 1.0),
     )
-    for ax, (rows, column, title, honest) in zip(axes, shown, strict=False):
+    for ax, (rows, column, heading, label, honest) in zip(axes, shown, strict=False):
         common.decades(ax, np.append(rows[column], 1.0)) if honest == 1 else common.shares(ax, "")
-        common.curves(
-            ax, rows, column, look, view.scales, interval=("low", "high") if column == "nees_median" else None
-        )
+        ends = ("low", "high") if column == "nees_median" else None
+        common.curves(ax, rows, column, look, view.scales, interval=ends, heading=heading, label=label)
         common.bound_line(ax, honest, "honest covariance")
-        common.title(ax, title)
-    for ax, label in zip(axes, ("median NEES", "share of trials", "mean NIS"), strict=False):
-        ax.set_ylabel(label)
     common.legend(fig, axes, look)
     inside = (totals["low"] <= 1) & (totals["high"] >= 1)
     always = [e for e in look if inside[totals["estimator"] == e].all()]

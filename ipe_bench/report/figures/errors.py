@@ -34,25 +34,22 @@ def draw_headline(view: View) -> Iterator[Drawing]:
     totals = totals.assign(**{name: totals[name].clip(upper=most) for name, most in CEILING.items()})
     claims = totals[totals["nees_median"].notna()]
     fig, axes = common.panels(3 if len(claims) else 2, view.look, height=3.3)
-    success, error = axes[:2]
-    common.shares(success, "")
-    common.curves(success, totals, "success", view.look, view.scales, interval=("success_low", "success_high"))
-    common.shares(success, "share of all trials")
-    common.title(success, "success")
-    common.decades(error, totals[["error_median", "error_q95"]].clip(lower=0.5), least=4.0)
-    common.bound_line(error, 1.0, "1: the bound, an honest covariance")
-    common.curves(error, totals, "error_median", view.look, view.scales, interval=("error_median", "error_q95"))
-    common.title(error, "error over the bound")
-    error.set_ylabel("median, bar to 95 %")
+    shown = view.look, view.scales
+    words: dict[str, Any] = {"heading": "success", "label": "share of all trials"}
+    common.shares(axes[0], "")
+    common.curves(axes[0], totals, "success", *shown, interval=("success_low", "success_high"), **words)
+    words = {"heading": "error over the bound", "label": "median, bar to 95 %"}
+    common.decades(axes[1], totals[["error_median", "error_q95"]].clip(lower=0.5), least=4.0)
+    common.bound_line(axes[1], 1.0, "1: the bound, an honest covariance")
+    common.curves(axes[1], totals, "error_median", *shown, interval=("error_median", "error_q95"), **words)
     if len(claims):
         nees = axes[2]
         common.decades(nees, np.append(claims["nees_median"].clip(lower=0.5), 1.0), least=4.0)
         common.bound_line(nees, 1.0, "1: the bound, an honest covariance")
         limits = claims["nees_median_low"].min(), claims["nees_median_high"].max()
         nees.axhspan(*limits, color=BOUND_COLOR, alpha=0.15, linewidth=0, label="limits of an honest one, 95 %")
-        common.curves(nees, claims, "nees_median", view.look, view.scales)
-        common.title(nees, "squared error over claimed variance")
-        nees.set_ylabel("NEES, median")
+        words = {"heading": "squared error over claimed variance", "label": "NEES, median"}
+        common.curves(nees, claims, "nees_median", *shown, **words)
     common.legend(fig, axes, view.look)
     over = "over error scales" if len(view.scales) > 1 else f"at error scale {plain(view.scales[0])}"
     last = common.at_scale(totals, view.scales[-1]).sort_values("success", ascending=False, kind="stable")
@@ -107,11 +104,9 @@ def draw_against_scale(view: View) -> Iterator[Drawing]:
         highs = rows["high"].where(close["error"].notna() & np.isfinite(rows["high"]))
         low, high = np.nanmin([0.9, *close["error"]]), min(np.nanmax([1.1, *close["error"], *highs]), NEAR)
         near.set_ylim(low - 0.06 * (high - low), high + 0.06 * (high - low))
-        for ax, shown in ((wide, rows), (near, close)):
-            common.curves(ax, shown, "error", look, view.scales, interval=("low", "high"))
+        for ax, shown, heading in ((wide, rows, f"{name} of all trials"), (near, close, f"{name}, near the bound")):
+            common.curves(ax, shown, "error", look, view.scales, interval=("low", "high"), heading=heading)
             common.bound_line(ax, 1.0, "Cramér-Rao bound")
-        common.title(wide, f"{name} of all trials")
-        common.title(near, f"{name}, near the bound")
     common.axis_labels(fig, "error scale" if several else "", "error / efficient estimator's")
     common.legend(fig, axes, look)
     last = common.at_scale(quantiles(view, MOST), view.scales[-1])

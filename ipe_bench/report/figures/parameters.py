@@ -46,8 +46,7 @@ def _of_one(view: View, estimator: str) -> Drawing:
                 ax.plot(bound["error_scale"], bound["linear_bound"], **style)
             else:
                 ax.hlines(bound["linear_bound"], i - 0.3, i + 0.3, **style)
-        _curves(ax, part, look, view)
-        common.title(ax, group)
+        _curves(ax, part, look, view, group)
         if len(inside) > 1 and several:
             low, high = ax.get_ylim()
             ax.set_ylim(low, high * (high / low) ** (0.05 * (len(inside) + 1)))
@@ -57,10 +56,9 @@ def _of_one(view: View, estimator: str) -> Drawing:
     common.decades(last, np.append(rows[ratio], [1.0, *totals["rmse"]]), ends=totals[["rmse_low", "rmse_high"]])
     _curves(last, rows.assign(rmse=rows[ratio]), {p["name"]: Look(GREY, ",") for p in view.parameters}, view)
     together = Look(BLACK, "o")
-    _curves(last, totals, {ALL: together}, view)
+    _curves(last, totals, {ALL: together}, view, "all parameters")
     common.bound_line(last, 1.0, "linear bound, eq. (5)")
     last.plot([], [], color=GREY, label="each parameter")
-    common.title(last, "all parameters")
     common.axis_labels(fig, "error scale" if several else "", "rms error")
     for ax, unit in zip(axes, [*(inside[0]["unit"] for inside in groups.values()), "bounds"], strict=True):
         ax.set_ylabel(common.text(f"[{unit}]" if unit else ""))
@@ -89,9 +87,9 @@ def _groups(parameters: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[s
     return groups if len(groups) <= MOST_GROUPS else {}
 
 
-def _curves(ax: Any, rows: Any, look: Any, view: View) -> None:
-    interval = ("rmse_low", "rmse_high")
-    common.curves(ax, rows, "rmse", look, view.scales, interval=interval, by="parameter", trials="solved_trials")
+def _curves(ax: Any, rows: Any, look: Any, view: View, heading: str = "") -> None:
+    given: Any = {"by": "parameter", "trials": "solved_trials", "heading": heading}
+    common.curves(ax, rows, "rmse", look, view.scales, interval=("rmse_low", "rmse_high"), **given)
 
 
 def _missing(totals: pd.DataFrame) -> str:

@@ -108,7 +108,7 @@ def views(analysis: Analysis) -> tuple[list[View], View]:
     return parts, View("", "", whole, look, equations)
 
 
-def _split(frame: pd.DataFrame, columns: Sequence[str]) -> dict[tuple[str, ...], pd.DataFrame]:
+def _split(frame: pd.DataFrame, columns: Sequence[str]) -> dict[tuple[str, ...], Any]:
     """The rows of each setting; none of a frame over all settings."""
     if not set(columns) <= set(frame.columns) or frame.empty:
         return {}
