@@ -101,7 +101,7 @@ class Pending:
         simulated, problems = without_certified(analysis), analysis.collection.further
         known = len(problems)
         tables = extensions.report_tables(analysis)
-        sections = extensions.sections(analysis, [table.name for table in tables], problems)
+        sections = extensions.written("section", analysis, [table.name for table in tables])
         added = [table for section in sections for table in section.tables]
         csv = [(output / "summary.csv", analysis.summary)]
         if len(analysis.profiles):

@@ -29,13 +29,13 @@ def check_record(option: Option, analyses: Sequence[Analysis]) -> Finding:
     """Checks the record that an option names; one that is not there is a finding as well."""
     name, check = f"{option.group}={option.name}", _CHECKS[option.group]
     try:
-        check(option.name, find_record(option), analyses)
+        check(option, find_record(option), analyses)
     except (UserError, AssertionError) as error:
         return Finding(name, (check.__doc__ or "").rstrip("."), str(error))
     return Finding(name, (check.__doc__ or "").rstrip("."))
 
 
-def has_values(_: str, record: Any, analyses: Sequence[Analysis]) -> None:
+def has_values(_: Option, record: Any, analyses: Sequence[Analysis]) -> None:
     """Has a value, or NaN, for every parameter and for all, however the trials ended; the same twice; in its limits."""
     if fault := fault_of(record):
         raise UserError(fault)
@@ -54,7 +54,7 @@ def has_values(_: str, record: Any, analyses: Sequence[Analysis]) -> None:
                     assert inside, f"{value:g} {where}"
 
 
-def can_be_drawn(_: str, record: Any, analyses: Sequence[Analysis]) -> None:
+def can_be_drawn(_: Option, record: Any, analyses: Sequence[Analysis]) -> None:
     """Is drawn and written for any run, of one trial or with estimators that fail, and shows something of a sweep."""
     extensions.checked_figure(record)
     with tempfile.TemporaryDirectory(prefix="ipe-bench-") as folder, house_style():
@@ -70,16 +70,10 @@ def can_be_drawn(_: str, record: Any, analyses: Sequence[Analysis]) -> None:
             assert len({drawing.name for drawing in drawn}) == len(drawn), "two drawings share a name"
 
 
-def makes_a_table(_: str, record: Any, analyses: Sequence[Analysis]) -> None:
-    """Makes a table of any run that can be written in every format, or None."""
+def can_be_read(option: Option, record: Any, analyses: Sequence[Analysis]) -> None:
+    """Makes texts and tables of any run, which can be written in every format, or nothing."""
     for analysis in analyses:
-        extensions.made_table(record, analysis, [table.name for table in all_tables(analysis)])
+        extensions.made(option, record, analysis, [table.name for table in all_tables(analysis)])
 
 
-def can_be_read(name: str, record: Any, analyses: Sequence[Analysis]) -> None:
-    """Is a Section that writes texts and tables of any run."""
-    for analysis in analyses:
-        extensions.made_section(name, record, analysis, [table.name for table in all_tables(analysis)])
-
-
-_CHECKS = {"statistic": has_values, "figure": can_be_drawn, "table": makes_a_table, "section": can_be_read}
+_CHECKS = {"statistic": has_values, "figure": can_be_drawn, "table": can_be_read, "section": can_be_read}

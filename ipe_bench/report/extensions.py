@@ -6,7 +6,7 @@ that says so.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 from ipe_bench.basics.errors import StorageError, UserError, place_of
@@ -33,15 +33,6 @@ def guarded(make: Callable[[], T]) -> T:
         raise UserError(blame(error) or place_of(error)) from error
 
 
-def _usable(group: str, problems: list[str], make: Callable[[Option, Any], T]) -> Iterator[tuple[Option, T]]:
-    """What is made of each record of the group; a line is added to the problems for every one that cannot be used."""
-    for option, record in records(group, problems):
-        try:
-            yield option, make(option, record)
-        except UserError as error:
-            problems.append(f"{group}={option.name}: {error}; it is left out")
-
-
 def _require(thing: Any, kind: type, says: str = "gives") -> None:
     if not isinstance(thing, kind):
         raise UserError(f"{says} a {type(thing).__name__} and not a {kind.__name__}")
@@ -49,7 +40,13 @@ def _require(thing: Any, kind: type, says: str = "gives") -> None:
 
 def figures(problems: list[str]) -> list[tuple[Option, Figure]]:
     """The figures of plugins; a line is added to the problems for every one that is none."""
-    return list(_usable("figure", problems, lambda _, record: checked_figure(record)))
+    found = []
+    for option, record in records("figure", problems):
+        try:
+            found.append((option, checked_figure(record)))
+        except UserError as error:
+            problems.append(f"figure={option.name}: {error}; it is left out")
+    return found
 
 
 def checked_figure(record: Any) -> Figure:
@@ -71,50 +68,39 @@ def drawings(figure: Figure, view: View) -> list[Drawing]:
 def report_tables(analysis: Analysis) -> list[Table]:
     """Every table of the report: those on certified readings, ours on simulated trials, and those of plugins."""
     shown = certified_tables(analysis.collection) + all_tables(without_certified(analysis), analysis)
-    if not analysis.summary.empty:
-
-        def make(_: Option, record: Any) -> Table | None:
-            return made_table(record, analysis, [table.name for table in shown])
-
-        for _, table in _usable("table", analysis.collection.further, make):
-            shown += [] if table is None else [table]
-    return shown
+    added = written("table", analysis, [table.name for table in shown])
+    return [*shown, *(table for one in added for table in one.tables)]
 
 
-def made_table(record: Any, analysis: Analysis, taken: Iterable[str] = ()) -> Table | None:
-    """The table that a plugin's function makes of the analysis, None if there is nothing to show, or UserError if it
-    raises or gives something else than a table under a name of its own."""
-    table = guarded(lambda: record(analysis))
-    if table is not None:
-        _check_table(table, taken)
-    return table
-
-
-def _check_table(table: Any, taken: Iterable[str]) -> None:
-    _require(table, Table)
-    if table.name in (*taken, "profiles"):
-        raise UserError(f"there is a table {table.name} already; choose another name")
-    guarded(lambda: (markdown(table), latex(table), comma_separated(table)))
-
-
-def sections(analysis: Analysis, taken: Iterable[str], problems: list[str]) -> list[Written]:
-    """The sections of plugins that have something to say."""
-    names, found = set(taken), []
-    if not analysis.summary.empty:
-        for _, written in _usable("section", problems, lambda o, record: made_section(o.name, record, analysis, names)):
-            names.update(table.name for table in written.tables)
-            found += [written] if written.parts else []
+def written(group: str, analysis: Analysis, taken: Iterable[str]) -> list[Written]:
+    """What the tables or the sections of plugins come to, none of them under the name of a table that is taken."""
+    names, found, problems = set(taken), [], analysis.collection.further
+    for option, record in records(group, problems) if len(analysis.summary) else ():
+        try:
+            one = made(option, record, analysis, names)
+        except UserError as error:
+            problems.append(f"{group}={option.name}: {error}; it is left out")
+            continue
+        names.update(table.name for table in one.tables)
+        found += [one] if one.parts else []
     return found
 
 
-def made_section(name: str, record: Any, analysis: Analysis, taken: Iterable[str] = ()) -> Written:
-    """The texts and tables that a plugin's section makes of the analysis, or UserError if it raises or gives something
-    else."""
-    _require(record, Section, "is")
-    written = Written(name, str(record.title), guarded(lambda: list(record.write(analysis))))
-    names = set(taken)
-    for part in written.parts:
+def made(option: Option, record: Any, analysis: Analysis, taken: Iterable[str]) -> Written:
+    """What a plugin's section, or its function that makes a table or None, comes to, or UserError if it raises or gives
+    something else than texts and tables under names of their own."""
+    if option.group == "section":
+        _require(record, Section, "is")
+        found = Written(option.name, str(record.title), guarded(lambda: list(record.write(analysis))))
+    else:
+        table = guarded(lambda: record(analysis))
+        found = Written(option.name, "", [] if table is None else [table])
+    names = {*taken, "profiles"}
+    for part in found.parts:
         if not isinstance(part, str):
-            _check_table(part, names)
+            _require(part, Table)
+            if part.name in names:
+                raise UserError(f"there is a table {part.name} already; choose another name")
             names.add(part.name)
-    return written
+            guarded(lambda part=part: (markdown(part), latex(part), comma_separated(part)))
+    return found
