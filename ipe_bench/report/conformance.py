@@ -22,7 +22,7 @@ from ipe_bench.report.style import house_style
 from ipe_bench.report.tables import all_tables
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.records import columns_of_added, fault_of
-from ipe_bench.statistics.sample import Sample, Shared
+from ipe_bench.statistics.sample import samples
 
 
 def check_record(option: Option, analyses: Sequence[Analysis]) -> Finding:
@@ -41,16 +41,14 @@ def has_values(_: Option, record: Any, analyses: Sequence[Analysis]) -> None:
         raise UserError(fault)
     for collection in [analysis.collection for analysis in analyses]:
         for groups in collection.scenarios.values():
-            shared = Shared.among(collection, groups)
-            for group in groups:
-                sample = Sample.load(collection, group, shared)
+            for sample in samples(collection, groups):
                 first, second = (columns_of_added(record, sample) for _ in range(2))
                 for name, values in first.items():
                     same = np.array_equal(values, second[name], equal_nan=record.kind != "word")
-                    assert same, f"{name} of {group.estimator} is another value each time"
+                    assert same, f"{name} of {sample.group.estimator} is another value each time"
                 for value, low, high in zip(*first.values(), strict=True) if record.limits else ():
                     inside = not np.isfinite([value, low, high]).all() or low <= value <= high
-                    where = f"of {group.estimator} is not within its interval, {low:g} to {high:g}"
+                    where = f"of {sample.group.estimator} is not within its interval, {low:g} to {high:g}"
                     assert inside, f"{value:g} {where}"
 
 

@@ -18,7 +18,7 @@ from ipe_bench.statistics.collect import Collection, Group, config_leaves, diffe
 from ipe_bench.statistics.comparisons import ALPHA, differences, holm
 from ipe_bench.statistics.formulas import gate_radius
 from ipe_bench.statistics.paired import Effect, no_drift, no_lean, ratio_effect, success_effect
-from ipe_bench.statistics.sample import Sample, Shared
+from ipe_bench.statistics.sample import Sample, samples
 
 JUDGED = ("success", "error", "cost")
 """Those that are tested. Time is not: the trials of a block share theirs evenly, and machines differ."""
@@ -82,8 +82,6 @@ def _rows(a: Sample, b: Sample, setting: _Setting, alpha: float) -> Iterator[dic
             f"{a.group.label}: has {a.n} parameters in the first and {b.n} in the second; compare results on the"
             " same measurement"
         )
-    if not len(a) or not len(b):
-        raise UserError(f"{a.group.estimator}: has no trials to compare; run more of them")
     _, one, other = np.intersect1d(a.number, b.number, assume_unique=True, return_indices=True)
     by_trial = len(one) > 0
     if not by_trial:
@@ -189,8 +187,10 @@ def _matches(
     if not found:
         raise _no_estimator(first, second, wanted)
     for one, other in found:
-        samples = [Sample.load(c, g, Shared.among(c, [g])) for c, g in ((first, one), (second, other))]
-        yield samples[0], samples[1], setting
+        mine, theirs = (next(samples(c, [g]), None) for c, g in ((first, one), (second, other)))
+        if mine is None or theirs is None:
+            raise UserError(f"{one.estimator}: has no trials to compare; run more of them")
+        yield mine, theirs, setting
 
 
 def left_out(first: Collection, second: Collection) -> list[str]:

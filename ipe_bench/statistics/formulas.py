@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import betaincinv, chdtri, gammaincinv, ndtri
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.statistics.calibration import overall_words, shared_level
+from ipe_bench.statistics.calibration import shared_level
 from ipe_bench.statistics.consistency import mean_limits
 from ipe_bench.statistics.histories import FixedPointBound, fixed_point_bound, observed_constant
 from ipe_bench.statistics.intervals import (
@@ -29,7 +29,8 @@ from ipe_bench.statistics.sample import AMBIGUOUS, FIT, NIS, Sample
 from ipe_bench.trials.thresholds import FIT_LEVEL, GATE
 
 T = TypeVar("T")
-Limits = tuple[Any, Any]
+Limits = tuple[Any, ...]
+"""Both ends of an interval."""
 CAP = 5.0
 """What a trial's error over the bound counts as at most in `efficiency_capped`: an efficient estimate lies beyond it in
 fewer than one trial in a million."""
@@ -186,19 +187,11 @@ def rmse_ends_anytime(s: Sample) -> tuple[Array, Array]:
 
 
 def overall_ends(ends: Callable[[Sample], tuple[Array, Array]]) -> Callable[[Sample], Limits]:
-    def limits(s: Sample) -> Limits:
-        low, high = ends(s)
-        return float(low[s.n]), float(high[s.n])
-
-    return limits
+    return lambda s: tuple(float(end[s.n]) for end in ends(s))
 
 
 def each_ends(ends: Callable[[Sample], tuple[Array, Array]]) -> Callable[[Sample], Limits]:
-    def limits(s: Sample) -> Limits:
-        low, high = ends(s)
-        return low[: s.n] * s.sizes, high[: s.n] * s.sizes
-
-    return limits
+    return lambda s: tuple(end[: s.n] * s.sizes for end in ends(s))
 
 
 def error_quantile(q: float) -> tuple[Callable[[Sample], float], Callable[[Sample], Array]]:
@@ -342,13 +335,11 @@ def _van_trees_ends(s: Sample) -> tuple[Array, Array]:
 
 
 def van_trees_limits(s: Sample) -> Limits:
-    low, high = _van_trees_ends(s)
-    return rms(low / s.linear_bound), rms(high / s.linear_bound)
+    return tuple(rms(end / s.linear_bound) for end in _van_trees_ends(s))
 
 
 def van_trees_limits_each(s: Sample) -> Limits:
-    low, high = _van_trees_ends(s)
-    return low * s.sizes, high * s.sizes
+    return tuple(end * s.sizes for end in _van_trees_ends(s))
 
 
 def eq_14(s: Sample) -> Array:
@@ -457,20 +448,9 @@ def claims(s: Sample) -> int:
     return int((s.converged & ~np.isnan(s.scalars["nees"])).sum())
 
 
-def calibration_p_each(s: Sample) -> Array:
-    return np.array([part.p for part in s.calibrations[:-1]] or [np.nan] * s.n)
-
-
-def excursion(s: Sample) -> float:
-    return s.calibrations[-1].excursion if s.calibrations else np.nan
-
-
-def excursion_each(s: Sample) -> Array:
-    return np.array([part.excursion for part in s.calibrations[:-1]] or [np.nan] * s.n)
-
-
-def calibration(s: Sample) -> str:
-    return overall_words(s.calibrations, s.names)
+def calibrated_each(s: Sample, name: str) -> Array:
+    """A number of each parameter's calibration."""
+    return np.array([getattr(part, name) for part in s.calibrations[:-1]] or [np.nan] * s.n)
 
 
 def calibration_each(s: Sample) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 from ipe_bench.basics.errors import UserError, place_of
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics import formulas as f
-from ipe_bench.statistics.calibration import overall_p
+from ipe_bench.statistics.calibration import overall_p, overall_words
 from ipe_bench.statistics.consistency import SEEN, clopper_pearson, verdict
 from ipe_bench.statistics.histories import CLOSE, orders_of
 from ipe_bench.statistics.intervals import FIRST, HEAVY, LARGEST_SAMPLE, RESAMPLES, quantile, share_sequence
@@ -578,7 +578,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " one leaves anywhere with a stated probability (Säilynoja, Bürkner and Vehtari, Stat. Comput. 32, 2022), and"
         " the smaller p is doubled. Of all, the smallest p of the n parameters and of NEES times n + 1 (Bonferroni).",
         lambda s: overall_p(s.calibrations),
-        f.calibration_p_each,
+        lambda s: f.calibrated_each(s, "p"),
         kind="probability",
         where=("calibration",),
     ),
@@ -587,8 +587,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "excursion",
         "the same trials",
         "The largest difference between these distribution functions and the uniform one; of all, that of NEES.",
-        f.excursion,
-        f.excursion_each,
+        lambda s: s.calibrations[-1].excursion if s.calibrations else np.nan,
+        lambda s: f.calibrated_each(s, "excursion"),
         where=("calibration",),
     ),
     Statistic(
@@ -599,7 +599,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " together: shifted is the median of error over reported deviation (estimate less truth); deviations too small"
         " or too large, the median of its size over that of an honest one; far outside, the share beyond the quantile"
         f" that {GATE:g} should lie beyond, after that factor.",
-        f.calibration,
+        lambda s: overall_words(s.calibrations, s.names),
         f.calibration_each,
         kind="word",
         where=("calibration", "parameters"),

@@ -31,45 +31,6 @@ TRUTH = (*CONTRACTION, "curvature_M", "curvature_intrinsic", "curvature_paramete
 _SEED = 1 << 40
 
 
-@dataclass(frozen=True)
-class Shared:
-    """Which trials the estimators of one scenario have in common, as ascending numbers of (seed, trial)."""
-
-    present: Array
-    """Those that every estimator has."""
-    solved: Array
-    """Those that every estimator solved."""
-
-    @classmethod
-    def among(cls, collection: Collection, groups: Sequence[Group]) -> Shared:
-        present: list[Array] = []
-        solved: list[Array] = []
-        for group in groups:
-            parts = [(cell, collection.load(cell, ["solved"])) for cell, _ in group.cells]
-            numbers = np.concatenate([_numbers(cell, rows["trial"]) for cell, rows in parts])
-            right = np.concatenate([rows["solved"] for _, rows in parts]).astype(bool)
-            present += [numbers] if len(numbers) else []
-            solved.append(numbers[right])
-        return cls(_in_all(present), _in_all(solved))
-
-
-def _in_all(several: Sequence[Array]) -> Array:
-    """The numbers that all have, ascending."""
-    common = np.unique(several[0]) if several else np.empty(0, dtype=np.int64)
-    for numbers in several[1:]:
-        if not np.array_equal(numbers, common):
-            common = np.intersect1d(common, numbers)
-    return common
-
-
-def _is_in(numbers: Array, wanted: Array) -> Array:
-    return np.ones(len(numbers), dtype=bool) if np.array_equal(numbers, wanted) else np.isin(numbers, wanted)
-
-
-def _numbers(cell: StoredCell, trial: Array) -> Array:
-    return cell.seed * _SEED + trial.astype(np.int64)
-
-
 @dataclass(frozen=True, eq=False)
 class Sample:
     """All trials of one group, seeds one after another; errors and deviations in multiples of the parameters' sizes.
@@ -79,7 +40,6 @@ class Sample:
 
     collection: Collection
     group: Group
-    shared: Shared
     number: Array
     """(trials,): one number per (seed, trial)."""
     scalars: Mapping[str, Array]
@@ -88,13 +48,19 @@ class Sample:
     """(trials, n)"""
     deviation: Array
     """(trials, n), as the estimator reports it; NaN where it reports none."""
+    present: Array
+    """Whether every estimator of the scenario has the trial (trials,)."""
+    solved_by_all: Array
+    """(trials,)"""
     unread: Array
     """The numbers of the trials that have no readings, since the model gives none at their true parameters."""
     kept: dict[Any, Any] = field(default_factory=dict, repr=False)
     """What was computed of it once; see `formulas.once`."""
 
     @classmethod
-    def load(cls, collection: Collection, group: Group, shared: Shared) -> Sample:
+    def load(cls, collection: Collection, group: Group, present: Array, solved: Array) -> Sample:
+        """The stored trials of a group; `present` and `solved` are the numbers of those that all rivals have, and all
+        solved."""
         names = [str(p["name"]) for p in group.footer["parameters"]]
         kinds = {kind: [f"{kind}_{name}" for name in names] for kind in ("error", "deviation")}
         wanted = [*SCALARS, *kinds["error"], *kinds["deviation"]]
@@ -119,8 +85,9 @@ class Sample:
             for row, name in zip(values, columns, strict=True):
                 row[:] = np.concatenate([part.pop(name) for part in parts])[used]
             matrices[kind] = _read_only(values.T)
-        number = _read_only(number)
-        return cls(collection, group, shared, number[used], scalars, unread=number[unread], **matrices)
+        number, unread = _read_only(number[used]), number[unread]
+        present, solved = np.isin(number, present), np.isin(number, solved)
+        return cls(collection, group, number, scalars, **matrices, present=present, solved_by_all=solved, unread=unread)
 
     def __len__(self) -> int:
         return len(self.number)
@@ -175,16 +142,6 @@ class Sample:
     def iterates(self) -> bool:
         """Whether the estimator approaches a limit step by step; the epochs of a filter are not such steps."""
         return not self.group.footer.get("sequential", False)
-
-    @cached_property
-    def present(self) -> Array:
-        """Whether every estimator of the scenario has the trial (trials,)."""
-        return _is_in(self.number, self.shared.present)
-
-    @cached_property
-    def solved_by_all(self) -> Array:
-        """(trials,)"""
-        return _is_in(self.number, self.shared.solved)
 
     @property
     def solved(self) -> Array:
@@ -289,10 +246,31 @@ def label_of(number: Any) -> str:
 
 def samples(collection: Collection, groups: Sequence[Group]) -> Iterator[Sample]:
     """The samples of one scenario that have trials, one after another."""
-    shared = Shared.among(collection, groups)
+    present: list[Array] = []
+    solved: list[Array] = []
     for group in groups:
-        if len(sample := Sample.load(collection, group, shared)):
+        parts = [(cell, collection.load(cell, ["solved"])) for cell, _ in group.cells]
+        numbers = np.concatenate([_numbers(cell, rows["trial"]) for cell, rows in parts])
+        right = np.concatenate([rows["solved"] for _, rows in parts]).astype(bool)
+        present += [numbers] if len(numbers) else []
+        solved.append(numbers[right])
+    common = _in_all(present), _in_all(solved)
+    for group in groups:
+        if len(sample := Sample.load(collection, group, *common)):
             yield sample
+
+
+def _in_all(several: Sequence[Array]) -> Array:
+    """The numbers that all have, ascending."""
+    common = np.unique(several[0]) if several else np.empty(0, dtype=np.int64)
+    for numbers in several[1:]:
+        if not np.array_equal(numbers, common):
+            common = np.intersect1d(common, numbers)
+    return common
+
+
+def _numbers(cell: StoredCell, trial: Array) -> Array:
+    return cell.seed * _SEED + trial.astype(np.int64)
 
 
 def _read_only(array: Array) -> Array:

@@ -16,7 +16,7 @@ from ipe_bench.runs.store import ResultKey
 from ipe_bench.statistics import analyse, formulas, summarize
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.collect import collect
-from ipe_bench.statistics.sample import Sample, Shared
+from ipe_bench.statistics.sample import samples
 
 TRIALS = 3000
 RNG = np.random.default_rng
@@ -126,7 +126,7 @@ def test_no_bit_depends_on_how_rows_are_cut_into_files(analysis, tmp_path):
 def test_matrices_are_what_is_stored_and_cannot_be_changed(store):
     collection = collect([store])
     group = collection.groups[0]
-    sample = Sample.load(collection, group, Shared.among(collection, collection.groups))
+    sample = next(samples(collection, collection.groups))
     rows = ib.load(store)
     rows = rows[rows["estimator"] == group.estimator]
     found = {"error": sample.error, "deviation": sample.deviation, "crlb": sample.crlb}
@@ -149,8 +149,7 @@ def test_a_truth_that_is_missing_is_not_a_number_beside_its_estimates(synthetic)
         if path.name.split("-")[1] in ("10", "40", "8"):
             path.unlink()
     collection = collect([synthetic.directory])
-    for group in collection.groups:
-        sample = Sample.load(collection, group, Shared.among(collection, collection.groups))
+    for sample in samples(collection, collection.groups):
         trial = sample.ids[:, 1]
         known = ~((trial >= 10) & (trial < 20) | (trial >= 40))
         np.testing.assert_array_equal(np.isfinite(sample.crlb), np.repeat(known[:, None], 3, axis=1))
@@ -186,8 +185,7 @@ def test_all_parameters_have_as_many_degrees_as_their_errors_are_apart(synthetic
     common, own = rng.standard_normal((500, 1)), rng.standard_normal((500, 3))
     synthetic.add(synthetic.scenario(), "one", 0.1 * (shared * common + (1 - shared) * own))
     collection = collect([synthetic.directory])
-    group = collection.groups[0]
-    found = formulas.degrees(Sample.load(collection, group, Shared.among(collection, [group])))
+    found = formulas.degrees(next(samples(collection, collection.groups)))
     assert found[3] in degrees
     assert (np.delete(found, 3) == 1).all()
 

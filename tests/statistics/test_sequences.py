@@ -35,17 +35,6 @@ def test_an_interval_after_every_ten_trials_holds_the_share_at_all_times(p):
     assert missed > 0 or p != 0.5
 
 
-def test_intervals_of_a_fixed_number_would_not():
-    """The reason for all this: Clopper and Pearson's after every ten of 250 trials miss one half in more than 10 %."""
-    rng = np.random.default_rng(0)
-    counts = np.cumsum(rng.binomial(10, 0.5, (400, 25)), axis=1)
-    ends = {(k, n): clopper_pearson(k, n) for n in range(10, 251, 10) for k in range(n + 1)}
-    missed = [
-        any(not ends[k, 10 * i][0] <= 0.5 <= ends[k, 10 * i][1] for i, k in enumerate(r, 1)) for r in counts.tolist()
-    ]
-    assert np.mean(missed) > 0.1
-
-
 @pytest.mark.parametrize(("count", "trials"), [(0, 1), (1, 1), (0, 250), (249, 250), (500, 1000), (7, 9000)])
 def test_an_interval_of_a_share_holds_what_was_seen_and_that_of_a_fixed_number(count, trials):
     low, high = share_sequence(count, trials)
