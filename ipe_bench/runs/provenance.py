@@ -79,11 +79,6 @@ def fingerprint(components: Iterable[Any]) -> dict[str, Any]:
     return {"versions": {p: _package_version(p) for p in packages}, "source": digest.hexdigest()[:16]}
 
 
-def class_modules(component: Any) -> set[str]:
-    """The modules of the classes of a component and of the components inside it."""
-    return {cls.__module__ for cls in component_classes(component)}
-
-
 @functools.cache
 def _package_version(package: str) -> str:
     """The version of the distribution that a top-level package comes from, where it is installed as one."""

@@ -21,9 +21,10 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from ipe_bench.basics.errors import StorageError
+from ipe_bench.basics.options import component_classes
 from ipe_bench.estimators.base import estimate_safely
 from ipe_bench.runs.execution.base import FATAL, Execution, Failure
-from ipe_bench.runs.provenance import class_modules, describe, digest, fingerprint
+from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.store import ResultKey, Store, describe_names
 from ipe_bench.trials.scenario import Scenario
@@ -54,8 +55,8 @@ class Task:
     @property
     def trusted(self) -> bool:
         """Whether it runs only code of this package, which neither ends its process nor runs without end."""
-        parts = [part for cell in self.cells for part in cell.components]
-        return all(name.startswith("ipe_bench.") for name in class_modules(parts))
+        classes = component_classes([part for cell in self.cells for part in cell.components])
+        return all(cls.__module__.startswith("ipe_bench.") for cls in classes)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import os
 import socket
 import tempfile
 import time
@@ -155,8 +154,7 @@ class Store:
 
     def parts(self, keys: Keys[str] | None = None) -> list[Part]:
         """The parts that lie here, or those of these keys, by key and in the order of reading."""
-        names = os.listdir(self.trials) if self.trials.is_dir() else ()
-        found = [part for name in names if (part := Part.parse(self.trials / name)) is not None]
+        found = [part for path in self.trials.glob("*.parquet") if (part := Part.parse(path)) is not None]
         return sorted((p for p in found if keys is None or p.key in keys), key=lambda part: (part.key, part.order))
 
     def write(
