@@ -252,7 +252,7 @@ def _look(problem: Problem, asked: Sequence[tuple[_Search, float]], released: Re
     freed, sums = _fit_others(
         released.problem, places, values, z, released.x + released.P[:, places].T * moved[:, None]
     )
-    inside = released.inside(freed).all(axis=1)
+    inside = np.asarray(released.inside(freed).all(axis=1)).tolist()
     for (one, at), total, within, point in zip(asked, sums.tolist(), inside, points, strict=True):
         if within and np.isfinite(total):
             one.note(at, total, point)

@@ -21,7 +21,6 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from ipe_bench.basics.errors import StorageError
-from ipe_bench.basics.options import component_classes
 from ipe_bench.estimators.base import estimate_safely
 from ipe_bench.runs.execution.base import FATAL, Execution, Failure
 from ipe_bench.runs.provenance import describe, digest, fingerprint
@@ -51,12 +50,6 @@ class Task:
     cells: tuple[ResultKey, ...]
     start: int
     stop: int
-
-    @property
-    def trusted(self) -> bool:
-        """Whether it runs only code of this package, which neither ends its process nor runs without end."""
-        classes = component_classes([part for cell in self.cells for part in cell.components])
-        return all(cls.__module__.startswith("ipe_bench.") for cls in classes)
 
 
 @dataclass(frozen=True)

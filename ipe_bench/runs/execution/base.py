@@ -8,7 +8,7 @@ import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 from annotated_types import Gt, Lt, doc
 
@@ -16,16 +16,8 @@ from ipe_bench.basics.errors import StorageError, UserError, describe_exception
 from ipe_bench.basics.naming import Named
 from ipe_bench.basics.options import Component, Count
 
-
-class Task(Protocol):
-    """What an execution runs: anything that can be pickled."""
-
-    @property
-    def trusted(self) -> bool:
-        """Whether it runs only code that neither ends its process nor runs without end."""
-        ...
-
-
+Task = Any
+"""What an execution runs: anything that can be pickled."""
 Work = Callable[[Any], Iterable[Any]]
 """Does a task in steps: what it yields after each step is handed on, and proves that it is alive."""
 

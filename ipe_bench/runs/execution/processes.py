@@ -48,13 +48,13 @@ class Processes(LimitedExecution):
 
 @dataclass(frozen=True)
 class Auto(Processes):
-    """Worker processes as in `Processes`, except that a single task that is trusted runs in this process.
+    """Worker processes as in `Processes`, except that a single task without limits runs in this process.
 
     A worker takes seconds to start, which a job of one block does not win back; compiled models use every core without.
     """
 
     def run(self, work: Work, tasks: Sequence[Task]) -> Iterator[Event]:
-        if len(tasks) == 1 and self.limits == Limits() and tasks[0].trusted:
+        if len(tasks) == 1 and self.limits == Limits():
             return Serial().run(work, tasks)
         return super().run(work, tasks)
 
