@@ -169,11 +169,11 @@ def _begun(index: int, message: Any) -> _Worker:
     while True:
         worker = kept.pop() if kept else _Worker()
         worker.index, worker.deadline = index, math.inf
-        try:
-            worker.connection.send(message)
-            return worker
-        except OSError:  # an idle one has ended in the meantime
-            worker.end()
+        with contextlib.suppress(OSError):
+            if worker.process.poll() is None:
+                worker.connection.send(message)
+                return worker
+        worker.end()  # an idle one has ended in the meantime
 
 
 @atexit.register
