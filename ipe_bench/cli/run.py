@@ -245,8 +245,7 @@ def _best(outcomes: Sequence[Outcome], maximises: bool) -> list[str]:
 
 
 _IN_EVERY_TITLE = {"measurement", "measurement.dataset", w.HYDRAS_TRUTH, "noise", "error_scale", "seed"}
-_NOT_TELLING = {"trials", "precision", "time_limit", "objective", "block_size", "figures", "formats", "output", "name"}
-_NOT_TELLING |= {"default_name", "experiment", "solver", "baseline"}
+_NOT_TELLING = {*w.NO_PART_OF_A_NAME, "solver", "baseline"} - {"seed"}
 """Keys that tell no job of a sweep from another."""
 
 

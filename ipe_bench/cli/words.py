@@ -367,9 +367,10 @@ def settled(overrides: Sequence[Override]) -> list[Override]:
 # The name of the folder
 
 
-_NO_PART_OF_A_NAME = ("name", "output", "trials", "block_size", "seed", "execution", "experiment", "hydra", "readings")
-_NO_PART_OF_A_NAME += ("precision", "time_limit", "write_readings", "write_readings_trial", "default_name", "objective")
-_NO_PART_OF_A_NAME += ("figures", "formats")
+NO_PART_OF_A_NAME = ("name", "output", "trials", "block_size", "seed", "execution", "experiment", "hydra", "readings")
+NO_PART_OF_A_NAME += ("precision", "time_limit", "write_readings", "write_readings_trial", "default_name", "objective")
+NO_PART_OF_A_NAME += ("figures", "formats")
+"""Keys that change no setting, or add trials to it."""
 _BARE = ("measurement", "measurement.dataset", "noise", *plugins.ESTIMATOR_GROUPS)
 """Keys whose values speak for themselves."""
 _LONGEST_NAME = 80
@@ -388,7 +389,7 @@ def default_name(overrides: Sequence[Override]) -> str:
         text = re.sub(r"[\[\]'\" ]", "", value.replace("],[", ";").replace(",", "+") if "[" in value else value)
         if override.key_or_group == "experiment":
             experiment = text
-        elif _first(override) not in _NO_PART_OF_A_NAME:
+        elif _first(override) not in NO_PART_OF_A_NAME:
             parts[key] = f"no_{key}" if override.is_delete() or text == "" else text
     if experiment and parts["measurement"] == "gins":
         parts["measurement"] = experiment
