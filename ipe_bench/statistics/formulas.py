@@ -282,7 +282,7 @@ def crlb(s: Sample) -> Array:
 
 @once
 def bayes(s: Sample) -> Array:
-    return np.sqrt(mean(s.bayes**2, s.solved))
+    return np.sqrt(mean(s.of_truth("bayes") ** 2, s.solved))
 
 
 def applying_bound(s: Sample) -> Array:

@@ -123,11 +123,6 @@ class Sample:
         return found
 
     @property
-    def ids(self) -> Array:
-        """(trials, 2): seed and trial."""
-        return np.stack(np.divmod(self.number, _SEED), axis=1)
-
-    @property
     def seeds(self) -> Array:
         """(trials,)"""
         return self.number // _SEED
@@ -169,11 +164,6 @@ class Sample:
     def crlb(self) -> Array:
         """(trials, n), deviations of the Cramér-Rao bound at the truth; NaN where the truth is missing."""
         return self.of_truth("crlb")
-
-    @property
-    def bayes(self) -> Array:
-        """(trials, n), those of the Bayesian bound."""
-        return self.of_truth("bayes")
 
     @property
     def bound_kind(self) -> str:

@@ -121,14 +121,6 @@ def test_equal_numbers_of_another_type_are_one_experiment():
     assert ResultKey(scenario).key != ResultKey(replace(scenario, error_scale=2.5)).key
 
 
-def test_seeds_are_pooled_and_nothing_else(synthetic):
-    for seed in (0, 1, 2):
-        synthetic.add(synthetic.scenario(seed=seed), "one", errors())
-    synthetic.add(synthetic.scenario(sigma=0.3), "one", errors())
-    groups = collect([synthetic.directory]).groups
-    assert sorted(len(group.cells) for group in groups) == [1, 3]
-
-
 OPTIONS = st.fixed_dictionaries(
     {
         "repeats": st.sampled_from([2, 3]),

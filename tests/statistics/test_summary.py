@@ -239,6 +239,8 @@ def test_one_runaway_does_not_decide(synthetic):
     squares = np.minimum((e**2).sum(axis=1) / 0.1**2 / 3, 25.0)
     assert total["efficiency_capped"] == pytest.approx(1 / np.sqrt(squares.mean()))
     assert 0.9 < total["efficiency_capped"] < 0.97
+    # It carries two thirds of the sum of fourth powers: no interval is made of that.
+    assert total[["efficiency_capped_low", "efficiency_capped_high"]].isna().all()
     assert total["error_median"] == pytest.approx(np.median(np.sqrt((e**2).sum(axis=1) / 0.1**2 / 3)))
     assert total["error_q95"] == pytest.approx(np.quantile(np.sqrt((e**2).sum(axis=1) / 0.1**2 / 3), 0.95))
 
@@ -257,6 +259,7 @@ def test_everybody_is_judged_by_the_same_trials(synthetic):
     assert filtered["efficiency_capped"] == pytest.approx(0.5)
     assert filtered["nees_median"] == pytest.approx(np.median((2 * e / 0.1) ** 2 @ np.ones(3)) / chi2.median(3))
     assert half["efficiency_capped"] == pytest.approx(1 / np.sqrt((25 + 1) / 2), rel=0.1)
+    assert half["efficiency_capped_low"] < half["efficiency_capped"] < half["efficiency_capped_high"]
     assert half["error_q95"] == np.inf
     assert nothing["efficiency_capped"] == pytest.approx(0.2)
     assert nothing["error_median"] == nothing["nees_median"] == np.inf
