@@ -32,7 +32,7 @@ def test_rows_are_those_of_a_serial_sweep(launcher, tmp_path, monkeypatch, capsy
     needs(launcher)
     monkeypatch.chdir(tmp_path)
     assert main(["run", "-m", *SWEEP, "execution=serial", "output=serial"]) == 0
-    assert main(["run", "-m", *SWEEP, f"hydra/launcher={launcher}", "output=launched"]) == 0
+    assert main(["run", "-m", *SWEEP, f"hydra/launcher={launcher}", f"output={tmp_path}/launched"]) == 0
     serial = rows("serial")
     assert len(serial) == 4 * 12 * 2
     pd.testing.assert_frame_equal(rows("launched"), serial, check_exact=True)
@@ -43,7 +43,9 @@ def test_rows_are_those_of_a_serial_sweep(launcher, tmp_path, monkeypatch, capsy
 def test_a_job_that_is_refused_is_told_and_stands_in_the_books(launcher, tmp_path, monkeypatch, capsys):
     needs(launcher)
     monkeypatch.chdir(tmp_path)
-    sweep = [*SWEEP, "execution=serial", "noise.deviation=0.01,1e-150", f"hydra/launcher={launcher}", "output=out"]
+    # Workers of joblib's that are there already have another working folder.
+    sweep = [*SWEEP, "execution=serial", "noise.deviation=0.01,1e-150", f"output={tmp_path}/out"]
+    sweep.append(f"hydra/launcher={launcher}")
     assert main(["run", "-m", *sweep]) == 2
     assert "noise.deviation=1e-150 and 3 more)" in capsys.readouterr().err.splitlines()[-1]
     assert main(["status", "out"]) == 1
