@@ -15,7 +15,7 @@ from ipe_bench.statistics.calibration import POINTS, shared_level
 from ipe_bench.statistics.certified import attained_table
 from ipe_bench.statistics.collect import Collection, Group, collect
 from ipe_bench.statistics.comparisons import Outcomes, Ranking, compare_pairs, corrected, profiles, rank_over_replicates
-from ipe_bench.statistics.formulas import capped_error, correlation, rmse_ends, squares
+from ipe_bench.statistics.formulas import capped_error, correlation
 from ipe_bench.statistics.intervals import quantile, quantiles
 from ipe_bench.statistics.records import SCORES, rows_of
 from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of
@@ -37,8 +37,6 @@ class Analysis:
 
     collection: Collection
     summary: pd.DataFrame
-    by_group: pd.DataFrame
-    """Root mean square of error over linear bound per group of parameters, with its bootstrap interval."""
     endings: pd.DataFrame
     """How trials ended that did not converge: status, message, number, and the first such trial."""
     pairs: pd.DataFrame
@@ -121,7 +119,6 @@ class Begun:
         def also(sample: Sample, outcome: Outcomes) -> None:
             head = dict(sample.group.columns) | {"estimator": sample.group.estimator}
             numbered = where | {"estimator": sample.group.estimator}
-            self.rows["by_group"] += [head | row for row in _group_rows(sample)]
             self.rows["endings"] += [head | row for row in _ending_rows(sample)]
             self.rows["scores"].append(numbered | rows_of(SCORES, sample)[-1])
             self.rows["replicates"] += [
@@ -152,7 +149,6 @@ class Begun:
         return Analysis(
             collection=self.collection,
             summary=to_frame(self.summary),
-            by_group=pd.DataFrame(rows["by_group"]),
             endings=pd.DataFrame(rows["endings"]),
             pairs=pd.DataFrame(corrected(pairs)),
             scores=pd.DataFrame(rows["scores"]),
@@ -203,16 +199,6 @@ def ranking(table: pd.DataFrame, everywhere: set[str]) -> Ranking | None:
     return rank_over_replicates(
         [{str(e): float(v) for e, v in part.droplevel("seed").items()} for _, part in means.groupby("seed")]
     )
-
-
-def _group_rows(sample: Sample) -> list[dict[str, Any]]:
-    """Per group of parameters, in the order of the parameters; the group's bound is one in these units."""
-    first, (low, high) = sample.n + 1, rmse_ends(sample)
-    rmse = squares(sample).rms if sample.solved.any() else np.full(len(low), np.nan)
-    return [
-        {"group": name, "rmse": float(rmse[i]), "low": low[i], "high": high[i]}
-        for i, name in enumerate(sample.members, first)
-    ]
 
 
 def _contraction_rows(collection: Collection, group: Group) -> list[dict[str, Any]]:

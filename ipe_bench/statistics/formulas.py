@@ -147,33 +147,31 @@ def together(s: Sample) -> Array:
 
 
 def _all_squares(s: Sample) -> Array:
-    """Squared errors (k, trials) of each parameter; then over the linear bound, of all together and of each group."""
-    normalised = (s.normalised**2).T
-    groups = [normalised[members].mean(axis=0) for members in s.members.values()]
-    return np.vstack([(s.error**2).T, normalised.mean(axis=0), *groups])
+    """Squared errors (n + 1, trials) of each parameter, and of all together over the linear bound."""
+    return np.vstack([(s.error**2).T, (s.normalised**2).T.mean(axis=0)])
 
 
 @once
 def squares(s: Sample) -> Squares:
-    """Of the errors of solved trials; then of all parameters together, and of each group, over the linear bound."""
+    """Of the errors of solved trials, of each parameter, and of all together over the linear bound."""
     return Squares.of(_chosen(_all_squares(s), s.solved))
 
 
 @once
 def degrees(s: Sample) -> Array:
-    """Degrees of freedom of these squares if errors are normal: 1 of each parameter and group, the least there can be;
-    of all parameters what matches the variance (Satterthwaite, Biometrics 2, 1946)."""
+    """Degrees of freedom (n + 1,) of these squares if errors are normal: 1 of each parameter; of all parameters what
+    matches the variance (Satterthwaite, Biometrics 2, 1946)."""
     factors = _unit(s) / s.linear_bound
     scaled = products(s) * np.outer(factors, factors)
     matching = np.trace(scaled) ** 2 / np.sum(scaled**2)
     whole = np.floor(matching + 1e-9) if 1 <= matching <= s.n + 1e-6 else 1.0
-    return np.array([*np.ones(s.n), whole, *np.ones(len(s.members))])
+    return np.array([*np.ones(s.n), whole])
 
 
 @once
 def rmse_ends(s: Sample) -> tuple[Array, Array]:
-    """Ends of the intervals of rmse: per parameter (n), of all over the linear bound, and so of each group of
-    parameters; NaN where few trials carry it, see `intervals.few_carry`."""
+    """Ends (n + 1,) of the intervals of rmse: per parameter, and of all over the linear bound; NaN where few trials
+    carry it, see `intervals.few_carry`."""
     sums = grouped(np.where(s.solved, _all_squares(s), 0.0))
     low, high = rms_interval_of(sums, grouped(s.solved[None].astype(float)))
     few = few_carry(squares(s), degrees(s))

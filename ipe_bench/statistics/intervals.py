@@ -128,11 +128,6 @@ class Squares:
         return cls(count, size, mean, ((scaled - mean[:, None]) ** 2).sum(axis=1))
 
     @property
-    def rms(self) -> Array:
-        """Root mean square (k,)."""
-        return np.sqrt(self.size) * np.sqrt(self.mean)
-
-    @property
     def effective(self) -> Array:
         """The effective number (k,) of those that share in the sum: its square over the sum of squares."""
         with np.errstate(all="ignore"):

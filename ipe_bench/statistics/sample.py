@@ -114,14 +114,6 @@ class Sample:
         """(n,)"""
         return np.array(self.group.footer["linear_bound"], dtype=float)
 
-    @cached_property
-    def members(self) -> dict[str, list[int]]:
-        """The groups of parameters, by name, in the order of the parameters."""
-        found: dict[str, list[int]] = {}
-        for i, parameter in enumerate(self.parameters):
-            found.setdefault(parameter.get("group") or parameter["name"], []).append(i)
-        return found
-
     @property
     def seeds(self) -> Array:
         """(trials,)"""
