@@ -38,14 +38,18 @@ def test_what_is_nearly_linear_costs_no_more_than_fixed_point_iteration_and_half
     assert cost[0] <= 1.5 * cost[1]
 
 
-def test_what_is_far_is_left_to_progressive():
-    scenario = Scenario(Gins(), Quantization(0.02286), error_scale=1000.0)
+@pytest.mark.parametrize("scale", [1000.0, 2000.0])
+def test_what_is_far_is_left_to_progressive(scale):
+    """Fixed-point iteration finds no root there: less than the cost of one Jacobian goes into seeing that."""
+    scenario = Scenario(Gins(), Quantization(0.02286), error_scale=scale)
     z = scenario.draw(0, 10).z
     with np.errstate(all="ignore"):
         chosen, thorough = (e.estimate(scenario.problem, z) for e in (Auto(), Progressive()))
     assert (chosen.extras["stage"] == PROGRESSIVE).all()
     np.testing.assert_array_equal(chosen.x, thorough.x)
-    assert (chosen.simulations > thorough.simulations).all()
+    wasted = (chosen.simulations - thorough.simulations) + 11 * (chosen.jacobians - thorough.jacobians)
+    assert (wasted > 0).all()
+    assert np.median(wasted) < 11
 
 
 def test_residuals_that_do_not_fit_are_no_answer_of_the_first_stage():
@@ -103,14 +107,8 @@ def test_minima_that_fit_alike_are_found_flagged_and_listed():
             np.testing.assert_allclose(shift, shift[0, 0] * np.eye(3), atol=tolerance)
             gained = bias_other @ A_other @ bias_other - bias @ A @ bias
             np.testing.assert_allclose(shift[0, 0], -gained, atol=tolerance)
-
-
-def test_of_several_minima_that_fit_the_most_probable_one_counts():
-    scenario = Scenario(Triad(), Gaussian(1e-5), error_scale=300.0)
-    with np.errstate(all="ignore"):
-        estimates = Auto(confirmations=6).estimate(scenario.problem, scenario.draw(0, 6).z)
-    for x, others in zip(estimates.x, estimates.alternatives, strict=True):
-        assert all(np.linalg.norm(x) <= np.linalg.norm(other) + 0.1 for other in others)
+            # The most probable one counts.
+            assert np.linalg.norm(x) <= np.linalg.norm(other) + 0.1
 
 
 def test_nobody_looks_for_others_where_the_first_stage_sufficed_or_each_look_is_dear():
@@ -123,16 +121,6 @@ def test_nobody_looks_for_others_where_the_first_stage_sufficed_or_each_look_is_
         np.testing.assert_array_equal(plain.simulations, asked.simulations)
         # Where nobody has looked, nobody can say that there is no other.
         assert np.isnan(plain.extras["ambiguous"]).all()
-
-
-def test_steps_that_lead_nowhere_are_given_up_early():
-    """At this scale fixed-point iteration finds no root: less than the cost of one Jacobian goes into seeing that."""
-    scenario = Scenario(Gins(), Quantization(0.02286), error_scale=2000.0)
-    z = scenario.draw(0, 20).z
-    with np.errstate(all="ignore"):
-        chosen, thorough = (e.estimate(scenario.problem, z) for e in (Auto(), Progressive()))
-    wasted = (chosen.simulations - thorough.simulations) + 11 * (chosen.jacobians - thorough.jacobians)
-    assert np.median(wasted) < 11
 
 
 CASES = {
