@@ -341,12 +341,6 @@ def test_long_settings_have_file_names_of_their_own(synthetic):
     suffixes = [part.suffix for part in parts]
     assert len(set(suffixes)) == 2
     assert all(len(suffix) < 100 for suffix in suffixes)
-    # The name hangs on the setting alone, not on what else there is.
-    again = Synthetic(synthetic.directory.parent / "again")
-    for last in ("b", "c", "a"):
-        fill(again, names=(long + last, "c"), scales=(1.0,))
-    parts, _ = views(analyse([again.directory]))
-    assert set(suffixes) <= {part.suffix for part in parts}
 
 
 def test_every_module_with_figures_is_in_the_list():

@@ -50,8 +50,17 @@ def _of_one(view: View, estimator: str) -> Drawing:
         if len(inside) > 1 and several:
             low, high = ax.get_ylim()
             ax.set_ylim(low, high * (high / low) ** (0.05 * (len(inside) + 1)))
-            handles = [ax.plot([], [], **one.line)[0] for one in look.values()]
-            ax.legend(handles, [common.text(name) for name in look], ncols=2, fontsize="small", borderaxespad=0.1)
+            handles = [ax.plot([], [], **one.line | {"linestyle": "none"})[0] for one in look.values()]
+            tight = {
+                "handlelength": 0.4,
+                "handletextpad": 0.4,
+                "columnspacing": 0.8,
+                "borderaxespad": 0.2,
+                "borderpad": 0.1,
+            }
+            ax.legend(
+                handles, [common.text(name) for name in look], ncols=2, fontsize="small", loc="upper left", **tight
+            )
     ratio, last = "rmse_over_linear_bound", axes[-1]
     common.decades(last, np.append(rows[ratio], [1.0, *totals["rmse"]]), ends=totals[["rmse_low", "rmse_high"]])
     _curves(last, rows.assign(rmse=rows[ratio]), {p["name"]: Look(GREY, ",") for p in view.parameters}, view)

@@ -137,7 +137,7 @@ def _ellipses(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look])
             sign = "+" if best.x[k] < 0 else "−"
             set_label(_axis_words(model, k, f" {sign} {abs(best.x[k]):.5g}"))
         ax.set_title(f"correlation {best.correlation[pair]:.3f}".replace("-", "−"))
-    common.legend(fig, axes, {f.label: look[f.label] for f in converged})
+    common.legend(fig, axes)
     count = model.n * (model.n - 1) // 2
     which = f"the {len(pairs)} most correlated of {count} pairs" if count > len(pairs) else "each pair of parameters"
     caption = common.sentence(
@@ -162,7 +162,7 @@ def _ellipse_panel(ax: Any, pair: list[int], best: Fit, fits: Sequence[Fit], loo
         centre, line = one.x[pair] - best.x[pair], look[one.label].line
         outline = centre + ellipse(one.covariance[np.ix_(pair, pair)], edge=one.region(2, LEVEL))
         ax.plot(*outline.T, **line | {"marker": "", "linewidth": linewidth})
-        ax.plot(*centre, **line)
+        ax.plot(*centre, label=common.text(one.label), **line)
     ax.xaxis.set_major_locator(MaxNLocator(4))
     ax.yaxis.set_major_locator(MaxNLocator(5))
     ax.ticklabel_format(style="sci", scilimits=(-3, 4), useMathText=True)
