@@ -6,7 +6,6 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 from ipe_bench.report.figures.views import View
 from ipe_bench.report.style import ON_DARK
@@ -87,9 +86,8 @@ def charts(views: Sequence[View]) -> Iterator[Chart]:
         yield Chart(f"explore{view.suffix}", "All trials, by any two columns", caption, text)
 
 
-def _short(value: Any) -> float | int | None:
+def _short(value: float) -> float | int | None:
     """A number as it stands on the page; None for what is not there, and for what JSON cannot say."""
-    number = float(value)
-    if not math.isfinite(number):
+    if not math.isfinite(value):
         return None
-    return int(number) if number == int(number) and abs(number) < 1e15 else float(f"{number:.{FIGURES}g}")
+    return int(value) if value == int(value) and abs(value) < 1e15 else float(f"{value:.{FIGURES}g}")
