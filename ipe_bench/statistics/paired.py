@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.special import betaln, logsumexp, ndtri
+from scipy.special import betaln, ndtri
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.comparisons import ALPHA, mcnemar
@@ -189,7 +189,7 @@ def no_lean(differences: Array, unit: float) -> float:
 
 def _mean_fortune(log_gains: Array) -> float:
     """The mean over bets of what each has made of 1, from the logarithms of its gains (bets, trials)."""
-    return _exp(float(logsumexp(log_gains.sum(axis=1))) - np.log(len(log_gains)))
+    return _exp(float(np.logaddexp.reduce(log_gains.sum(axis=1))) - np.log(len(log_gains)))
 
 
 def _exp(value: float) -> float:

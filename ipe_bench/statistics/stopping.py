@@ -34,7 +34,7 @@ STATISTICS = ("success", "rmse")
 the root mean square over parameters of error over bound, of the trials that an estimator solved."""
 
 
-def precision_of(given: float | Mapping[str, float]) -> dict[str, float]:
+def precision_of(given: float | Mapping[str, float]) -> Mapping[str, float]:
     """How near to what is found the truth has to be, at whatever number of trials one looks, by statistic; from a
     number, which is that of success, or from numbers by name.
 
