@@ -8,12 +8,13 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
-from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.errors import StorageError, UserError, place_of
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.plugins.construct import construct, find_object
-from ipe_bench.plugins.discovery import RECORD_GROUPS, Option, options
+from ipe_bench.plugins.discovery import RECORD_GROUPS, Option, blame, options
 from ipe_bench.runs.provenance import TARGET
 from ipe_bench.trials.scenario import Scenario
 
@@ -72,6 +73,23 @@ def records(group: str, problems: list[str]) -> Iterator[tuple[Option, Any]]:
             yield option, find_record(option)
         except UserError as error:
             problems.append(f"{error}; it is left out")
+
+
+@contextmanager
+def guarded() -> Iterator[None]:
+    """Runs the code of a plugin; if it raises, raises UserError in a line that says where."""
+    try:
+        yield
+    except (UserError, StorageError):
+        raise
+    except (Exception, SystemExit) as error:
+        raise UserError(blame(error) or place_of(error)) from error
+
+
+def require_type(thing: Any, kind: type, says: str = "gives") -> None:
+    """Raises UserError if what a plugin gives is of another type."""
+    if not isinstance(thing, kind):
+        raise UserError(f"{says} a {type(thing).__name__} and not a {kind.__name__}")
 
 
 def use_statistics() -> list[str]:

@@ -87,12 +87,12 @@ class Pending:
 
     def written(self) -> ReportResult:
         """Writes all files."""
-        from ipe_bench.report import extensions
         from ipe_bench.report.certified_tables import without_certified
         from ipe_bench.report.charts import charts
         from ipe_bench.report.figures import draw_all
         from ipe_bench.report.figures.views import views
         from ipe_bench.report.html import render_page
+        from ipe_bench.report.sections import report_tables, written
         from ipe_bench.report.stamp import leave
         from ipe_bench.report.table import write_table
         from ipe_bench.statistics.certified import certified_averages, certified_table
@@ -100,8 +100,8 @@ class Pending:
         analysis, output = self.begun.finish(), self.output
         simulated, problems = without_certified(analysis), analysis.collection.further
         known = len(problems)
-        tables = extensions.report_tables(analysis)
-        sections = extensions.written("section", analysis, [table.name for table in tables])
+        tables = report_tables(analysis)
+        sections = written("section", analysis, [table.name for table in tables])
         added = [table for section in sections for table in section.tables]
         csv = [(output / "summary.csv", analysis.summary)]
         if len(analysis.profiles):
@@ -109,7 +109,7 @@ class Pending:
         for path, frame in csv:
             write_text(path, frame.to_csv(index=False))
         files = [path for table in (*tables, *added) for path in write_table(table, output / "tables")]
-        drawn = draw_all(simulated, output / "figures", which=self.figures, formats=self.formats, problems=problems)
+        drawn = draw_all(simulated, output / "figures", which=self.figures, formats=self.formats)
         page = render_page(analysis, tables, drawn, sections, list(charts(views(simulated)[0])))
         write_text(output / "report.html", page)
         result = ReportResult(

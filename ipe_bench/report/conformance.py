@@ -15,9 +15,10 @@ import numpy as np
 from ipe_bench.basics.errors import UserError
 from ipe_bench.plugins.conformance import Finding
 from ipe_bench.plugins.discovery import Option
-from ipe_bench.plugins.extensions import find_record
-from ipe_bench.report import extensions
+from ipe_bench.plugins.extensions import find_record, guarded
+from ipe_bench.report.figures import checked_figure, drawn_by
 from ipe_bench.report.figures.views import views
+from ipe_bench.report.sections import made
 from ipe_bench.report.style import house_style
 from ipe_bench.report.tables import all_tables
 from ipe_bench.statistics.analysis import Analysis
@@ -54,16 +55,17 @@ def has_values(_: Option, record: Any, analyses: Sequence[Analysis]) -> None:
 
 def can_be_drawn(_: Option, record: Any, analyses: Sequence[Analysis]) -> None:
     """Is drawn and written for any run, of one trial or with estimators that fail, and shows something of a sweep."""
-    extensions.checked_figure(record)
+    checked_figure(record)
     with tempfile.TemporaryDirectory(prefix="ipe-bench-") as folder, house_style():
         for number, analysis in enumerate(analyses):
             parts, whole = views(analysis)
             seen = [view.only(record.frames) for view in ([whole] if record.together else parts)]
-            drawn = [drawing for view in seen for drawing in extensions.drawings(record, view)]
+            drawn = [drawing for view in seen for drawing in drawn_by(record, view)]
             for drawing in drawn:
                 assert drawing.title.strip(), f"{drawing.name} has no title"
                 assert drawing.caption.strip(), f"{drawing.name} has no caption"
-                extensions.guarded(lambda drawing=drawing: drawing.save(Path(folder)))
+                with guarded():
+                    drawing.save(Path(folder))
             assert drawn or number, "it draws nothing of polynomial at three error scales by four estimators"
             assert len({drawing.name for drawing in drawn}) == len(drawn), "two drawings share a name"
 
@@ -71,7 +73,7 @@ def can_be_drawn(_: Option, record: Any, analyses: Sequence[Analysis]) -> None:
 def can_be_read(option: Option, record: Any, analyses: Sequence[Analysis]) -> None:
     """Makes texts and tables of any run, which can be written in every format, or nothing."""
     for analysis in analyses:
-        extensions.made(option, record, analysis, [table.name for table in all_tables(analysis)])
+        made(option, record, analysis, [table.name for table in all_tables(analysis)])
 
 
 _CHECKS = {"statistic": has_values, "figure": can_be_drawn, "table": can_be_read, "section": can_be_read}

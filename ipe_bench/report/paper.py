@@ -8,34 +8,24 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.files import write_text
 from ipe_bench.report.certified_tables import without_certified
-from ipe_bench.report.extensions import report_tables
-from ipe_bench.report.table import COLUMN, COLUMN_GAP, PAGE, Column, Table, latex, letters
+from ipe_bench.report.sections import report_tables
+from ipe_bench.report.table import COLUMN, PAGE, Column, Table, latex
 from ipe_bench.statistics.analysis import Analysis
 
 _NARROWEST, _WIDEST = 2.0, 20.0
-_POINTS_A_LETTER = 4.0
-"""Mean width of a letter of 8 points."""
-
-
-@dataclass(frozen=True)
-class Export:
-    """What was written, and a line for every table that is too wide."""
-
-    files: tuple[Path, ...]
-    too_wide: tuple[str, ...]
 
 
 def export(
     analysis: Analysis, folder: Path, names: Sequence[str], columns: Sequence[str] = (), width: float = COLUMN
-) -> Export:
-    """Writes the tables and figures of these names into the folder: NAME.tex, or NAME.pdf and NAME.png, and the
-    figures' captions.
+) -> list[Path]:
+    """Writes the tables and figures of these names into the folder, and returns the files: NAME.tex, or NAME.pdf and
+    NAME.png, and the figures' captions.
 
     Raises:
         UserError: there is no such table, figure or column, or the width is none of paper.
@@ -50,13 +40,7 @@ def export(
     for table in chosen:
         files.append(folder / f"{table.name}.tex")
         write_text(files[-1], latex(table, width))
-    too_wide = [
-        f"{table.name}: is about {inches(table):.1f} in wide, and {width:g} in were asked for; choose with columns="
-        f" among {', '.join(_columns(table))}"
-        for table in chosen
-        if inches(table) > width
-    ]
-    return Export(tuple(files), tuple(too_wide))
+    return files
 
 
 def _columns(table: Table) -> dict[str, Column]:
@@ -78,12 +62,6 @@ def _with_columns(table: Table, names: Sequence[str]) -> Table:
     return replace(table, columns=[known[name] for name in names or known])
 
 
-def inches(table: Table) -> float:
-    """About how wide a table is."""
-    points = sum(_POINTS_A_LETTER * letters(column) for column in table.columns)
-    return (points + 2 * COLUMN_GAP * (len(table.columns) - 1)) / 72
-
-
 def _figures(analysis: Analysis, folder: Path, names: Sequence[str], width: float, tables: Sequence[str]) -> list[Path]:
     """Writes figures, and captions.md with their captions; returns the files."""
     from ipe_bench.report.figures import drawings
@@ -95,7 +73,7 @@ def _figures(analysis: Analysis, folder: Path, names: Sequence[str], width: floa
     captions: dict[str, str] = {}
     seen: list[str] = []
     with print_style(width):
-        for drawing in drawings(without_certified(analysis), analysis.collection.further):
+        for drawing, _ in drawings(without_certified(analysis)):
             seen.append(drawing.name)
             if drawing.name in names:
                 files += drawing.save(folder)

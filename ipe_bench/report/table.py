@@ -325,15 +325,11 @@ def _latex_row(cells: Iterable[str]) -> str:
 
 
 def _latex_title(column: Column) -> str:
-    """The title of a column, stacked if it is longer than its cells."""
-    lines = [escaped(line) for line in textwrap.wrap(column.title, letters(column), break_on_hyphens=False)]
+    """The title of a column, stacked if it is longer than its cells and its longest word."""
+    letters = max([1, *(len(cell.text) for cell in column.cells), *map(len, column.title.split())])
+    lines = [escaped(line) for line in textwrap.wrap(column.title, letters, break_on_hyphens=False)]
     stacked = r"\\".join(lines)
     return rf"\shortstack[{'r' if column.numeric else 'l'}]{{{stacked}}}" if len(lines) > 1 else stacked
-
-
-def letters(column: Column) -> int:
-    """The letters of the widest cell, or of the longest word of the title, which is no less."""
-    return max([1, *(len(cell.text) for cell in column.cells), *map(len, column.title.split())])
 
 
 def _latex_cell(cell: Cell, column: Column) -> str:

@@ -12,9 +12,9 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+import ipe_bench.statistics.formulas as f
 from ipe_bench.basics.errors import UserError, place_of
 from ipe_bench.basics.linalg import Array
-from ipe_bench.statistics import formulas as f
 from ipe_bench.statistics.calibration import overall_p, overall_words
 from ipe_bench.statistics.consistency import SEEN, clopper_pearson, verdict
 from ipe_bench.statistics.histories import CLOSE, orders_of

@@ -9,9 +9,8 @@ import pytest
 from test_report import HOSTILE, fill
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli.main import main
 from ipe_bench.report import figures
-from ipe_bench.report.paper import export, inches
+from ipe_bench.report.paper import export
 from ipe_bench.report.table import COLUMN, PAGE, Table, interval, latex, words
 from ipe_bench.report.words import percent, short
 from ipe_bench.statistics import analyse
@@ -96,8 +95,8 @@ def test_tables_say_what_the_report_says_whatever_the_names(synthetic, tmp_path)
     analysis = analyse([synthetic.directory])
     names = ["estimator", "converged", "error_scale", "95_of_efficiency"]
     done = export(analysis, tmp_path, ["all_trials"], names, PAGE)
-    assert [path.name for path in done.files] == ["all_trials.tex"]
-    rows = read(done.files[0].read_text(encoding="utf-8"))
+    assert [path.name for path in done] == ["all_trials.tex"]
+    rows = read(done[0].read_text(encoding="utf-8"))
     assert rows[0] == ["estimator", "converged", "error scale", "95 % of efficiency"]
     assert len(rows) == 1 + 9
     own = analysis.summary[analysis.summary["parameter"] == "all"].reset_index(drop=True)
@@ -106,33 +105,15 @@ def test_tables_say_what_the_report_says_whatever_the_names(synthetic, tmp_path)
     assert [row[3] for row in rows[1:]] == [f"{short(low)} to {short(high)}" for low, high in ends]
 
 
-def test_a_table_that_is_too_wide_is_said_to_be(synthetic, tmp_path, capsys):
-    fill(synthetic)
-    words_given = ["report", str(synthetic.directory), "paper=overview", f"output={tmp_path}"]
-    assert main([*words_given, "width=3.5"]) == 1
-    assert "overview: is about" in capsys.readouterr().err
-    assert main([*words_given, "width=3.5", "columns=error_scale,estimator,success"]) == 0
-    assert capsys.readouterr().err == ""
-
-
-def test_a_wider_table_is_longer_by_its_columns():
-    one = Table("t", "T", "C", [words("a", ["b" * 20])], pd.DataFrame())
-    two = Table("t", "T", "C", [words("a", ["b" * 20])] * 2, pd.DataFrame())
-    assert inches(one) == pytest.approx(20 * 4 / 72)
-    assert inches(two) == pytest.approx(2 * inches(one) + 6 / 72)
-
-
 @pytest.mark.parametrize("width", [COLUMN, PAGE])
 def test_a_figure_is_as_wide_as_the_column(synthetic, tmp_path, width):
     fill(synthetic)
     done = export(analyse([synthetic.directory]), tmp_path, ["cost_against_accuracy"], width=width)
-    assert [path.name for path in done.files] == [
-        *("cost_against_accuracy.png", "cost_against_accuracy.pdf", "captions.md")
-    ]
-    box = re.search(rb"/MediaBox \[ *([\d. ]+) *\]", done.files[1].read_bytes())
+    assert [path.name for path in done] == [*("cost_against_accuracy.png", "cost_against_accuracy.pdf", "captions.md")]
+    box = re.search(rb"/MediaBox \[ *([\d. ]+) *\]", done[1].read_bytes())
     left, _, right, _ = map(float, box[1].split())
     assert (right - left) / 72 == pytest.approx(width, abs=0.01)
-    assert "simulations" in done.files[2].read_text(encoding="utf-8")
+    assert "simulations" in done[2].read_text(encoding="utf-8")
 
 
 def test_drawing_for_a_paper_leaves_the_report_as_it_is(synthetic, tmp_path, monkeypatch):

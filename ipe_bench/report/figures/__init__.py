@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import partial
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import make_folder, write_text
+from ipe_bench.plugins.extensions import guarded, records, require_type
 from ipe_bench.report.choice import FORMATS, PAGE, Which
-from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.figures.views import views
+from ipe_bench.report.figures.drawing import Drawing, Figure
+from ipe_bench.report.figures.views import FRAMES, View, views
 from ipe_bench.report.style import house_style
 from ipe_bench.statistics.analysis import Analysis
 
@@ -34,28 +36,20 @@ class Drawn:
 
 
 def draw_all(
-    analysis: Analysis,
-    folder: Path,
-    *,
-    which: Which = "main",
-    formats: Sequence[str] = (PAGE,),
-    problems: list[str] | None = None,
+    analysis: Analysis, folder: Path, *, which: Which = "main", formats: Sequence[str] = (PAGE,)
 ) -> list[Drawn]:
     """The figures that the data allow, in the order of the report, as files in the folder.
 
     `index.json` in the folder names each with its title and caption; figures of an earlier report are removed. One of a
-    plugin that cannot be drawn is left out, with a line added to the `problems`.
+    plugin that cannot be drawn is left out, with a line added to the problems of the analysis.
     """
-    from ipe_bench.report.extensions import guarded
-
-    problems = [] if problems is None else problems
-    old, drawn = _names(folder), []
+    problems, old, drawn = analysis.collection.further, _names(folder), []
     with house_style():
-        for drawing, plugin in _drawings(analysis, which, problems):
+        for drawing, plugin in drawings(analysis, which):
             make_folder(folder)
-            save = partial(drawing.save, folder, formats)
             try:
-                files = guarded(save) if plugin else save()
+                with guarded() if plugin else nullcontext():
+                    files = drawing.save(folder, formats)
             except UserError as error:
                 problems.append(f"{plugin}: {error}; it is left out")
             else:
@@ -69,17 +63,11 @@ def draw_all(
     return drawn
 
 
-def drawings(analysis: Analysis, problems: list[str]) -> Iterator[Drawing]:
-    """Every figure that the data allow, drawn and not saved."""
-    return (drawing for drawing, _ in _drawings(analysis, "all", problems))
-
-
-def _drawings(analysis: Analysis, which: Which, problems: list[str]) -> Iterator[tuple[Drawing, str]]:
+def drawings(analysis: Analysis, which: Which = "all") -> Iterator[tuple[Drawing, str]]:
     """Figures of every setting, or of all of them together, ours first; with the plugin that draws one, if any."""
-    from ipe_bench.report import extensions
-
+    problems = analysis.collection.further
     # Plugins that cannot be used are told of even if nothing is drawn.
-    others = [(figure, f"figure={option.name}") for option, figure in extensions.figures(problems)]
+    others = _of_plugins(problems)
     if which == "none" or (not analysis.collection.groups and analysis.attained.empty):
         return
     ours = [(figure, "") for name in FIGURES for figure in import_module(f"{__name__}.{name}").FIGURES]
@@ -89,7 +77,7 @@ def _drawings(analysis: Analysis, which: Which, problems: list[str]) -> Iterator
         for view in ([whole] if figure.together else parts) if figure.main or which == "all" else ():
             shown = view.only(figure.frames)
             try:
-                found = extensions.drawings(figure, shown) if plugin else figure.draw(shown)
+                found = drawn_by(figure, shown) if plugin else figure.draw(shown)
             except UserError as error:
                 problems.append(f"{plugin}: {error}; it is left out")
                 continue
@@ -99,6 +87,34 @@ def _drawings(analysis: Analysis, which: Which, problems: list[str]) -> Iterator
                 else:
                     taken.add(drawing.name)
                     yield drawing, plugin
+
+
+def _of_plugins(problems: list[str]) -> list[tuple[Figure, str]]:
+    """The figures of plugins and what they are called; a line is added to the problems for every one that is none."""
+    found = []
+    for option, record in records("figure", problems):
+        try:
+            found.append((checked_figure(record), f"figure={option.name}"))
+        except UserError as error:
+            problems.append(f"figure={option.name}: {error}; it is left out")
+    return found
+
+
+def checked_figure(record: Any) -> Figure:
+    """The record, or UserError if it is no figure of frames that exist."""
+    require_type(record, Figure, "is")
+    if isinstance(record.frames, str) or not set(record.frames) <= set(FRAMES):
+        raise UserError(f"frames={record.frames}: name some of {', '.join(FRAMES)}, in a tuple")
+    return record
+
+
+def drawn_by(figure: Figure, view: View) -> list[Drawing]:
+    """The drawings that a plugin's figure makes of a view, or UserError if it raises or gives something else."""
+    with guarded():
+        found = list(figure.draw(view))
+    for drawing in found:
+        require_type(drawing, Drawing)
+    return found
 
 
 def _names(folder: Path) -> list[str]:
