@@ -103,19 +103,19 @@ class Pending:
         tables = report_tables(analysis)
         sections = written("section", analysis, [table.name for table in tables])
         added = [table for section in sections for table in section.tables]
-        csv = [(output / "summary.csv", analysis.summary)]
-        if len(analysis.profiles):
-            csv.append((output / "tables" / "profiles.csv", analysis.profiles))
-        for path, frame in csv:
-            write_text(path, frame.to_csv(index=False))
+        summary, profiles = output / "summary.csv", output / "tables" / "profiles.csv"
+        write_text(summary, analysis.summary.to_csv(index=False))
         files = [path for table in (*tables, *added) for path in write_table(table, output / "tables")]
+        if len(analysis.profiles):
+            write_text(profiles, analysis.profiles.to_csv(index=False))
+            files.append(profiles)
         drawn = draw_all(simulated, output / "figures", which=self.figures, formats=self.formats)
         page = render_page(analysis, tables, drawn, sections, list(charts(views(simulated)[0])))
         write_text(output / "report.html", page)
         result = ReportResult(
             summary=analysis.summary,
-            summary_path=csv[0][0],
-            tables=(*files, *(path for path, _ in csv[1:])),
+            summary_path=summary,
+            tables=tuple(files),
             figures=tuple(path for figure in drawn for path in figure.files),
             report=output / "report.html",
             problems=analysis.problems,

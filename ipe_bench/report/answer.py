@@ -127,7 +127,7 @@ def contents(answer: Answer) -> Iterator[Part]:
     for found in answer.examinations:
         passes = answer[found.label].passes
         if passes:
-            yield intervals(found)
+            yield _intervals(found)
         if passes or not found.least:
             for remark in remarks(found, _reading_labels(answer.model)):
                 yield Strong(remark) if remark.split(":")[0].isupper() else remark
@@ -152,16 +152,16 @@ def with_error(value: float, error: float) -> str:
     """A value with its standard error: two figures of the error, and the value to the same place."""
     if not (math.isfinite(value) and math.isfinite(error) and error > 0):
         return _number(value, 6)
-    place = math.floor(math.log10(error)) - 1
-    if float(f"{error:.1e}") >= 10 ** (place + 2):
-        place += 1  # 0.0999 rounds to 0.10
-    top = max(abs(value), error)
-    if 1e-4 <= top < 1e6 and -6 <= place <= 0:
-        return f"{value:.{-place}f} ± {error:.{-place}f}"
-    if place > 0 and top < 1e6:
-        return f"{round(value, -place):.0f} ± {round(error, -place):.0f}"
-    figures = min(max(math.floor(math.log10(top)) - place, 0), 15)
-    return f"{value:.{figures}e} ± {error:.1e}"
+    # 0.0999 rounds to 0.10.
+    return " ± ".join(_rounded((value, error), math.floor(math.log10(float(f"{error:.1e}"))) - 1))
+
+
+def _rounded(values: Sequence[float], place: int) -> list[str]:
+    """Numbers to one decimal place, with exponents if they are very large or very small."""
+    if 1e-4 <= max(map(abs, values)) < 1e6 and place >= -6:
+        return [f"{round(v, -place):.{max(-place, 0)}f}" for v in values]
+    figures = [min(max(math.floor(math.log10(abs(v) or 10.0**place)) - place, 0), 15) for v in values]
+    return [f"{v:.{most}e}" for v, most in zip(values, figures, strict=True)]
 
 
 def _number(value: float, figures: int = 4) -> str:
@@ -264,7 +264,7 @@ def _reading_labels(model: Measurement) -> list[dict[str, Any]]:
     return [{k: plain(v) for k, v in zip(columns, row, strict=True)} for row in zip(*columns.values(), strict=True)]
 
 
-def intervals(found: Examination) -> Table:
+def _intervals(found: Examination) -> Table:
     """Three intervals of each parameter; of one on a bound, that of its profile."""
     on_bounds, absent = found.on_bounds, ["-"] * len(found.on_bounds)
     parameters = [*found.model.physical_parameters, *(b.parameter for b in on_bounds)]
@@ -272,26 +272,20 @@ def intervals(found: Examination) -> Table:
     columns = [
         words("parameter", [p.name for p in parameters]),
         words("unit", [p.unit for p in parameters]),
-        texts("standard error", [*map(interval, *found.wald), *absent]),
-        texts("profile", [interval(*pair) for pair in ends]),
-        texts("bootstrap", [*map(interval, found.bootstrap.low, found.bootstrap.high), *absent]),
+        texts("standard error", [*map(_interval, *found.wald), *absent]),
+        texts("profile", [_interval(*pair) for pair in ends]),
+        texts("bootstrap", [*map(_interval, found.bootstrap.low, found.bootstrap.high), *absent]),
     ]
     prior = " with its prior" if found.with_prior else ""
     title = f"{100 * CONFIDENCE:.0f} % intervals of {found.label}{prior}, by three ways"
     return Table("intervals", title, "", columns, repeated=2)
 
 
-def interval(low: float, high: float) -> str:
+def _interval(low: float, high: float) -> str:
     """Both ends to a hundredth of the width; infinite ends as such."""
-    width = high - low
-    if not math.isfinite(width) or width <= 0:
+    if not math.isfinite(high - low) or high <= low:
         return f"{low:.6g} … {high:.6g}".replace("-inf", "−∞").replace("inf", "∞").replace("nan", "-")
-    place = max(0, 2 - math.floor(math.log10(width)))
-    largest = max(abs(low), abs(high))
-    if place > 8 or largest >= 1e7 or largest < 1e-3:
-        figures = min(15, max(1, math.floor(math.log10(largest)) - math.floor(math.log10(width)) + 2))
-        return f"{low:.{figures}e} … {high:.{figures}e}"
-    return f"{low:.{place}f} … {high:.{place}f}"
+    return " … ".join(_rounded((low, high), math.floor(math.log10(high - low)) - 2))
 
 
 def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator[str]:

@@ -91,15 +91,14 @@ def _problems(minima: pd.DataFrame) -> Table:
         words("function", rows["function"]),
         column("start", rows["start"], plain),
         words("estimator", rows["estimator"]),
-        words("solved", ["yes" if v else "no" for v in rows["solved"]]),
-        words("minimum", ["-" if v is None or pd.isna(v) else f"{int(v) + 1}" for v in rows["minimum"]]),
+        words("solved", rows["solved"].map({True: "yes", False: "no"})),
+        words("minimum", ["-" if pd.isna(v) else f"{int(v) + 1}" for v in rows["minimum"]]),
         column("sum of squares", rows["sum_of_squares"], lambda v: f"{v:.6g}"),
         words("status", rows["status"]),
         column("cost", rows["cost"], short),
     ]
     caption = (
-        "Which of a function's known minima has the estimate's sum of squares, the lowest being 1; a dash: none of"
-        " them."
+        "Which of a function's minima has the estimate's sum of squares, the lowest being 1; a dash: none of them."
     )
     return Table("attained_problems", "Known minima, problem by problem", caption, columns, rows)
 

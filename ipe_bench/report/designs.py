@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -135,13 +135,9 @@ def _ways(design: Design) -> Iterator[Part]:
     yield Table("ways", title, "", columns, notes=[note])
     for way in design.ways:
         if way.saving and len(way.units.by) == 1:
-            yield f"{way.saving.readings} readings {way.title}: {taken(design, way, way.saving)}"
-
-
-def taken(design: Design, way: Way, choice: Choice) -> str:
-    """The entries of a choice by one column, in words."""
-    (column,) = way.units.by
-    return ", ".join(levels_of(design.candidates, column, way.units.entries[u][0]) for u in choice.taken)
+            entries = [way.units.entries[u][0] for u in way.saving.taken]
+            levels = ", ".join(levels_of(design.candidates, way.units.by[0], entry) for entry in entries)
+            yield f"{way.saving.readings} readings {way.title}: {levels}"
 
 
 def _effects(design: Design) -> Table:
@@ -188,17 +184,7 @@ def described(design: Design) -> dict[str, Any]:
     sizes = np.array([p.size for p in seen.parameters])
     each = zip(seen.parameters, plain(seen.bound * sizes), plain(seen.multiple_correlation), strict=True)
     names = ("name", "deviation", "unit", "parameter", "visible", "noticed")
-    shifts = [(s, plain(s.shift * sizes), plain(s.bounds)) for s in design.suspects]
     bounds = limit and {name: plain(getattr(limit, name) * sizes) for name in ("van_trees", "weiss_weinstein")}
-    ways = [
-        {
-            "by": list(way.units.by),
-            "units": len(way.units.rows),
-            "curve": [picked(c, "readings", "mean_bound") for c in way.curve],
-            **{name: choice and _chosen(design, way, choice) for name, choice in _choices(way).items()},
-        }
-        for way in design.ways
-    ]
     return {
         "measurement": scenario.measurement.name,
         "error_scale": scenario.error_scale,
@@ -211,17 +197,23 @@ def described(design: Design) -> dict[str, Any]:
         "parameters": [{**picked(p, "name", "unit"), "bound": b, "multiple_correlation": r} for p, b, r in each],
         "correlation": plain(seen.correlation),
         "suspects": [
-            {**picked(s, *names), "shift": shift, "shift_in_bounds": by, "direction": s.words}
-            for s, shift, by in shifts
+            picked(s, *names)
+            | {"shift": plain(s.shift * sizes), "shift_in_bounds": plain(s.bounds), "direction": s.words}
+            for s in design.suspects
         ],
         "threshold": bounds and bounds | picked(limit, "false_roots", "runs", "nearest"),
-        "ways": ways,
+        "ways": [
+            {
+                "by": list(way.units.by),
+                "units": len(way.units.rows),
+                "curve": [picked(c, "readings", "mean_bound") for c in way.curve],
+                "saving": way.saving and _chosen(design, way, way.saving),
+                "sharpest": _chosen(design, way, way.sharpest),
+            }
+            for way in design.ways
+        ],
         "effects": [picked(e, "column", "entry", "action", "readings", "mean_bound") for e in design.effects],
     }
-
-
-def _choices(way: Way) -> Mapping[str, Choice | None]:
-    return {"saving": way.saving, "sharpest": way.sharpest}
 
 
 def _chosen(design: Design, way: Way, choice: Choice) -> dict[str, Any]:
@@ -241,12 +233,11 @@ def _readings(design: Design) -> pd.DataFrame:
     import pandas as pd
 
     index = pd.DataFrame(dict(design.candidates.index))
-    frames = [pd.DataFrame(columns=["by", "choice", *index])]
-    for way in design.ways:
-        for name, choice in _choices(way).items():
-            if choice:
-                own = index.iloc[list(choice.rows)]
-                own.insert(0, "by", " and ".join(way.units.by))
-                own.insert(1, "choice", name)
-                frames.append(own)
-    return pd.concat(frames[1:] or frames)
+    chosen = [
+        index.iloc[list(choice.rows)].assign(by=" and ".join(way.units.by), choice=name)
+        for way in design.ways
+        for name, choice in (("saving", way.saving), ("sharpest", way.sharpest))
+        if choice
+    ]
+    columns = ["by", "choice", *index]
+    return pd.concat(chosen)[columns] if chosen else pd.DataFrame(columns=columns)

@@ -100,25 +100,24 @@ def _runs(runs: Sequence[Run]) -> list[dict[str, Any]]:
     """What was computed, by command, the last first: everything that its jobs have in common, and the configuration of
     each. What found everything stored computed nothing."""
     commands: dict[tuple[str, str], list[Run]] = {}
-    for run in runs:
-        if run.record.get("blocks", 1):
-            command = run.record.get("command", _UNKNOWN)
-            key = (_PYTHON, run.path.name) if command is None else (str(command), "")
-            commands.setdefault(key, []).append(run)
+    for run in (run for run in runs if run.record.get("blocks", 1)):
+        command = run.record.get("command", _UNKNOWN)
+        commands.setdefault((_PYTHON, run.path.name) if command is None else (str(command), ""), []).append(run)
     found = []
     for (command, _), own in reversed(commands.items()):
-        last = own[-1].record
+        records, last = [run.record for run in own], own[-1].record
         facts = {
             "runs": ", ".join(run.path.stem for run in own),
-            "trials": ", ".join(dict.fromkeys(str(run.record.get("trials")) for run in own)),
-            "cells": sum(len(run.record.get("cells", ())) for run in own),
+            "trials": ", ".join(dict.fromkeys(str(record.get("trials")) for record in records)),
+            "cells": sum(len(record.get("cells", ())) for record in records),
             "git commit": last.get("git_commit") or "unknown",
             "source": last.get("source"),
             "machine": ", ".join(f"{k} {v}" for k, v in (last.get("machine") or {}).items()),
             "versions": ", ".join(f"{k} {v}" for k, v in (last.get("libraries") or {}).items()),
         }
-        scenarios = [scenario for run in own for scenario in run.record.get("scenarios", ())]
-        config = {"scenarios": scenarios, "estimators": last.get("estimators", {})}
-        shown = {"command": command, "started": _minute(own[0]), "facts": facts}
-        found.append(shown | {"config": json.dumps(config, indent=1, ensure_ascii=False)})
+        scenarios = [scenario for record in records for scenario in record.get("scenarios", ())]
+        config = json.dumps(
+            {"scenarios": scenarios, "estimators": last.get("estimators", {})}, indent=1, ensure_ascii=False
+        )
+        found.append({"command": command, "started": _minute(own[0]), "facts": facts, "config": config})
     return found

@@ -8,9 +8,9 @@ from typing import Any
 
 import pandas as pd
 
-from ipe_bench.report.table import Cell, Column, Table, column, interval, sort_key, words
-from ipe_bench.report.terminal import LEGEND, leading, overview_columns
-from ipe_bench.report.words import limits, p_value, percent, plain, reported, short, shower, shown
+from ipe_bench.report.table import Column, Table, column, words
+from ipe_bench.report.terminal import LEGEND, leading, overview_columns, statistics
+from ipe_bench.report.words import p_value, percent, plain, short
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.comparisons import ALPHA
 from ipe_bench.statistics.records import SCORES, Where, all_statistics, frame_columns
@@ -84,23 +84,6 @@ def head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
     ]
 
 
-def statistics(where: Where, rows: pd.DataFrame) -> list[Column]:
-    """The columns of the statistics that are shown in that table."""
-    columns: list[Column] = []
-    told: list[Any] = rows.to_dict("records")
-    for record in (*all_statistics(), *SCORES):
-        if where not in record.where or not reported(record, told):
-            continue
-        numeric = record.kind != "word"
-        cells = [Cell(shown(record, where, row), sort_key(row[record.name]) if numeric else None) for row in told]
-        columns.append(Column(record.titles.get(where, record.title), cells, numeric))
-        if where in record.limits_titles:
-            ends = [limits(record, where, row) for row in told]
-            low, high = zip(*ends, strict=True) if ends else ((), ())
-            columns.append(interval(record.limits_titles[where], low, high, shower(record.kind, where)))
-    return columns
-
-
 def _recorded(
     analysis: Analysis, where: Where, title: str, caption: str, rows: pd.DataFrame, names: Sequence[str] = ()
 ) -> Table | None:
@@ -109,17 +92,20 @@ def _recorded(
         return None
     columns = [*head(analysis, rows), *(words(name, rows[name]) for name in ("estimator", *names))]
     stored = [name for r in (*all_statistics(), *SCORES) if where in r.where for name in r.columns]
-    data = rows[[*analysis.setting_columns, "error_scale", "estimator", *names, *stored]]
-    return Table(where, title, caption, [*columns, *statistics(where, rows)], data)
+    data, told = rows[[*analysis.setting_columns, "error_scale", "estimator", *names, *stored]], _told(rows)
+    return Table(where, title, caption, [*columns, *statistics(where, told)], data)
+
+
+def _told(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    return [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]
 
 
 def overview(analysis: Analysis) -> Table:
     """How each estimator does over all trials: one population for everybody."""
     rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
-    told: list[Any] = rows.to_dict("records")
-    first = head(analysis, rows)
+    first, told = head(analysis, rows), _told(rows)
     columns = [*first, *overview_columns(told, leading(told, [*analysis.setting_columns, "error_scale"]))]
-    columns += statistics("overview", rows)
+    columns += statistics("overview", told)
     return Table("overview", "Overview", "", columns, rows, notes=LEGEND, grouped=len(first))
 
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from ipe_bench.report.table import Cell, Column, Table, column, sort_key, terminal, texts, words
-from ipe_bench.report.words import brief, compact, duration, limits, percent, plain, reported, shown
+from ipe_bench.report.table import Cell, Column, Table, column, interval, sort_key, terminal, words
+from ipe_bench.report.words import brief, duration, limits, percent, plain, reported, shower, shown
 from ipe_bench.statistics.formulas import CAP
-from ipe_bench.statistics.records import all_statistics
+from ipe_bench.statistics.records import SCORES, Where, all_statistics
 from ipe_bench.statistics.summary import ALL, BEST
 from ipe_bench.statistics.summary import columns as summary_columns
 
@@ -68,15 +67,24 @@ def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table
         columns.append(column("trials", [row["trials"] for row in rows], str))
     else:
         title = f"{title}: {counts[0]} trial{'s' * (counts[0] != 1)} per row"
-    for record in all_statistics():
-        if "terminal" in record.where and reported(record, rows):
-            values = [shown(record, "terminal", row) for row in rows]
-            columns.append(texts(record.titles.get("terminal", record.title), values))
-            if "terminal" in record.limits_titles:
-                ends = [limits(record, "terminal", row) for row in rows]
-                written = [f"{compact(low)}-{compact(high)}" if math.isfinite(low) else "-" for low, high in ends]
-                columns.append(texts(record.limits_titles["terminal"], written))
+    columns += statistics("terminal", rows)
     return Table("summary", title, "", columns, grouped=1, whole="summary.csv")
+
+
+def statistics(where: Where, rows: Sequence[Mapping[str, Any]]) -> list[Column]:
+    """The columns of the statistics that are shown in that table."""
+    columns: list[Column] = []
+    for record in (*all_statistics(), *SCORES):
+        if where not in record.where or not reported(record, rows):
+            continue
+        numeric = record.kind != "word"
+        cells = [Cell(shown(record, where, row), sort_key(row[record.name]) if numeric else None) for row in rows]
+        columns.append(Column(record.titles.get(where, record.title), cells, numeric))
+        if where in record.limits_titles:
+            ends = [limits(record, where, row) for row in rows]
+            low, high = zip(*ends, strict=True) if ends else ((), ())
+            columns.append(interval(record.limits_titles[where], low, high, shower(record.kind, where)))
+    return columns
 
 
 def leading(rows: Sequence[Mapping[str, Any]], scenario: Sequence[str]) -> list[bool]:

@@ -1,8 +1,9 @@
-"""What accuracy costs: simulations against error, performance and data profiles, and problems of known minimum."""
+"""What accuracy costs: simulations against error, and data profiles of trials and of problems of known minimum."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -11,9 +12,12 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.errors import MOST, quantiles
 from ipe_bench.report.figures.views import View
-from ipe_bench.report.style import GREY, looks
+from ipe_bench.report.style import GREY, Look, looks
 from ipe_bench.report.words import percent, plain
 from ipe_bench.statistics.certified import data_profile
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Canvas
 
 LEAST_COST = 0.5
 """What does not simulate at all stands here: a logarithmic axis has no zero."""
@@ -61,55 +65,42 @@ def draw_costs(view: View) -> Iterator[Drawing]:
 
 
 def draw_profiles(view: View) -> Iterator[Drawing]:
-    profiles = view["profiles"]
-    if profiles["estimator"].nunique() < 2:
+    rows = view["profiles"]
+    rows = rows[rows["profile"] == "data"]
+    if rows["estimator"].nunique() < 2:
         return
-    look = view.with_look(profiles["estimator"])
-    pooled = f"{len(view.scales)} error scales pooled" if len(view.scales) > 1 else "all trials"
-    fig, axes = common.panels(2, look, height=3.2)
-    headings = {"performance": "cost over the cheapest's", "data": "simulations per trial"}
-    for (profile, heading), ax in zip(headings.items(), axes, strict=True):
-        rows = profiles[profiles["profile"] == profile]
-        top = rows.groupby("estimator")["share"].transform("max")
-        # A little behind the point from which on no curve rises.
-        end = max(1.5 * float(rows[rows["share"] >= top].groupby("estimator")["at"].min().max()), 4.0)
-        common.steps(ax, rows[rows["at"] <= end], "at", "share", look, 0.93, end)
-        common.title(ax, f"{profile} profile, {pooled}")
-        ax.set_xlabel(heading)
-    fig.supylabel("share of trials with success", fontsize="medium")
-    common.legend(fig, axes, look)
-    first = profiles[profiles["profile"] == "performance"].groupby("estimator", sort=False)["share"].first()
-    final = profiles[profiles["profile"] == "data"].groupby("estimator", sort=False)["share"].last()
+    final = rows.groupby("estimator", sort=False)["share"].max()
+    # A little behind the point from which on no curve rises.
+    end = max(
+        1.5 * float(rows[rows["share"] >= rows["estimator"].map(final)].groupby("estimator")["at"].min().max()), 4.0
+    )
+    fig = _data_profile(rows[rows["at"] <= end], view.with_look(rows["estimator"]), 0.93, end)
+    fig.axes[0].set(xlabel="simulations per trial", ylabel="share of trials with success")
     yield view.drawing(
         fig,
         "profiles",
-        "Performance and data profiles",
-        "All trials of all scenarios, pooled: the curves depend on which error scales there are. Left (Dolan and Moré):"
-        " share of trials in which an estimator succeeds at a cost of at most the abscissa times that of the cheapest"
-        " success. Right (Moré and Wild): share in which it succeeds within that many simulations.",
-        f"{first.idxmax()} is the cheapest most often ({percent(first.max())}); {final.idxmax()} succeeds most often"
-        f" ({percent(final.max())}).",
+        "Data profile, all trials",
+        "All trials of all scenarios, pooled: the curves depend on which error scales there are. Data profile of Moré"
+        " and Wild: the share of trials in which an estimator succeeds within that many simulations.",
+        f"{final.idxmax()} succeeds most often ({percent(final.max())}).",
     )
 
 
 def draw_known_minima(view: View) -> Iterator[Drawing]:
     table = view["attained"]
-    profile = data_profile(table)
-    if profile.empty:
+    rows = data_profile(table)
+    if rows.empty:
         return
     problems = len(table[["function", "start"]].drop_duplicates())
-    end = 1.5 * float(profile["at"].max())
+    low, end = 0.9 * float(rows["at"].min()), 1.5 * float(rows["at"].max())
     # Each curve rises from none, and goes on to the end of the axis.
-    final = profile.groupby("estimator", sort=False, as_index=False)["share"].max().assign(at=end)
+    final = rows.groupby("estimator", sort=False, as_index=False)["share"].max().assign(at=end)
     final = final.sort_values("share", ascending=False, kind="stable")
     best = list(final.loc[final["share"] == final["share"].max(), "estimator"])
     look = looks(list(dict.fromkeys(table["estimator"])), chosen=list(final["estimator"][:10]))
-    fig, (ax,) = common.panels(1, look, height=3.4)
-    low = 0.9 * float(profile["at"].min())
-    rows = pd.concat([final.assign(share=0.0, at=low), profile, final], ignore_index=True)
-    common.steps(ax, rows, "at", "share", look, low, end)
-    ax.set(xlabel="simplex gradients, n + 1 simulations each", ylabel="share of problems solved")
-    common.legend(fig, [ax], look)
+    rows = pd.concat([final.assign(share=0.0, at=low), rows, final], ignore_index=True)
+    fig = _data_profile(rows, look, low, end)
+    fig.axes[0].set(xlabel="simplex gradients, n + 1 simulations each", ylabel="share of problems solved")
     yield view.drawing(
         fig,
         "data_profile",
@@ -119,6 +110,13 @@ def draw_known_minima(view: View) -> Iterator[Drawing]:
         " simulations.",
         f"Most, {round(final['share'].max() * problems)}, are solved by {common.enumerate_few(best)}.",
     )
+
+
+def _data_profile(rows: pd.DataFrame, look: Mapping[str, Look], low: float, high: float) -> Canvas:
+    fig, (ax,) = common.panels(1, look, height=3.4)
+    common.steps(ax, rows, "at", "share", look, low, high)
+    common.legend(fig, [ax], look)
+    return fig
 
 
 FIGURES = (

@@ -41,7 +41,7 @@ def _of_one(view: View, estimator: str) -> Drawing:
         common.decades(ax, part[["rmse", "linear_bound"]], ends=part[["rmse_low", "rmse_high"]])
         for i, (name, one) in enumerate(look.items()):
             bound = part[part["parameter"] == name].sort_values("error_scale")
-            style = {"color": one.color, "linestyle": BOUND_DASH, "linewidth": 1.0}
+            style: Any = {"color": one.color, "linestyle": BOUND_DASH, "linewidth": 1.0}
             if several:
                 ax.plot(bound["error_scale"], bound["linear_bound"], **style)
             else:
@@ -50,17 +50,10 @@ def _of_one(view: View, estimator: str) -> Drawing:
         if len(inside) > 1 and several:
             low, high = ax.get_ylim()
             ax.set_ylim(low, high * (high / low) ** (0.05 * (len(inside) + 1)))
-            handles = [ax.plot([], [], **one.line | {"linestyle": "none"})[0] for one in look.values()]
-            tight = {
-                "handlelength": 0.4,
-                "handletextpad": 0.4,
-                "columnspacing": 0.8,
-                "borderaxespad": 0.2,
-                "borderpad": 0.1,
-            }
-            ax.legend(
-                handles, [common.text(name) for name in look], ncols=2, fontsize="small", loc="upper left", **tight
-            )
+            lines: list[Any] = [one.line | {"linestyle": "none"} for one in look.values()]
+            handles = [ax.plot([], [], **line)[0] for line in lines]
+            tight: Any = {"handlelength": 0.4, "handletextpad": 0.4, "columnspacing": 0.8, "borderaxespad": 0.2}
+            ax.legend(handles, list(map(common.text, look)), ncols=2, fontsize="small", loc="upper left", **tight)
     ratio, last = "rmse_over_linear_bound", axes[-1]
     common.decades(last, np.append(rows[ratio], [1.0, *totals["rmse"]]), ends=totals[["rmse_low", "rmse_high"]])
     _curves(last, rows.assign(rmse=rows[ratio]), {p["name"]: Look(GREY, ",") for p in view.parameters}, view)

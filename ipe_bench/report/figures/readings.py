@@ -106,44 +106,51 @@ def _abscissa(model: Measurement) -> tuple[Array, str]:
     return epoch, "epoch"
 
 
-def most_correlated(correlation: Array, most: int = MOST_PAIRS) -> list[tuple[int, int]]:
-    """Pairs of parameters by falling magnitude of correlation (n, n); all of them where they are few."""
-    pairs = combinations(range(len(correlation)), 2)
-    return sorted(pairs, key=lambda pair: -np.nan_to_num(abs(correlation[pair])))[:most]
-
-
-def ellipse(P: Array, level: float = LEVEL, points: int = 181, edge: float | None = None) -> Array:
-    """The boundary (points, 2) of the region about zero in which an error of covariance P (2, 2) lies with that
-    probability; or, where P is itself estimated, at the squared distance `edge` in deviations."""
+def ellipse(P: Array, edge: float = float(chdtri(2, 1 - LEVEL))) -> Array:
+    """The boundary (181, 2) at the squared distance `edge` in deviations of covariance P (2, 2): of the region about
+    zero in which an error lies with 95 % probability, unless P is itself estimated."""
     # Scaled first: the parameters' units must not decide what is singular.
     d = np.sqrt(np.diagonal(P))
     values, vectors = np.linalg.eigh(P / np.outer(d, d))
-    turn = np.linspace(0.0, 2 * np.pi, points)
-    circle = np.sqrt(chdtri(2, 1 - level) if edge is None else edge) * np.column_stack([np.cos(turn), np.sin(turn)])
+    turn = np.linspace(0.0, 2 * np.pi, 181)
+    circle = np.sqrt(edge) * np.column_stack([np.cos(turn), np.sin(turn)])
     return (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T * d
 
 
 def _ellipses(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look]) -> Iterator[Drawing]:
+    from matplotlib.ticker import MaxNLocator
+
     # Where an estimator did not converge, its covariance says nothing of the true values.
     converged = [f for f in fits if f.status is Status.CONVERGED and (f.standard_errors > 0).all()]
     if not converged or model.n < 2:
         return
     best = min(converged, key=lambda f: f.chi_square)
-    pairs = most_correlated(best.correlation)
+    # The pairs by falling magnitude of correlation.
+    every = sorted(combinations(range(model.n), 2), key=lambda pair: -np.nan_to_num(abs(best.correlation[pair])))
+    pairs = every[:MOST_PAIRS]
     fig, axes = common.panels(len(pairs), look)
-    for pair, ax in zip(pairs, axes, strict=True):
-        _ellipse_panel(ax, list(pair), best, converged, look)
-        for set_label, k in zip((ax.set_xlabel, ax.set_ylabel), pair, strict=True):
-            sign = "+" if best.x[k] < 0 else "−"
-            set_label(_axis_words(model, k, f" {sign} {abs(best.x[k]):.5g}"))
-        ax.set_title(f"correlation {best.correlation[pair]:.3f}".replace("-", "−"))
+    for (i, j), ax in zip(pairs, axes, strict=True):
+        pair = [i, j]
+        near = [f for f in converged if (np.abs(f.x - best.x) <= _NEAR * best.standard_errors)[pair].all()]
+        for one, linewidth in zip(near, np.linspace(4.0 if len(near) > 1 else 1.6, 1.0, len(near)), strict=True):
+            centre, line = one.x[pair] - best.x[pair], look[one.label].line
+            outline = centre + ellipse(one.covariance[np.ix_(pair, pair)], edge=one.region(2, LEVEL))
+            ax.plot(*outline.T, **line | {"marker": "", "linewidth": linewidth})
+            ax.plot(*centre, label=common.text(one.label), **line)
+        ax.xaxis.set_major_locator(MaxNLocator(4))
+        ax.yaxis.set_major_locator(MaxNLocator(5))
+        ax.ticklabel_format(style="sci", scilimits=(-3, 4), useMathText=True)
+        about = [f" {'+' if best.x[k] < 0 else '−'} {abs(best.x[k]):.5g}" for k in pair]
+        ax.set(xlabel=_axis_words(model, i, about[0]), ylabel=_axis_words(model, j, about[1]))
+        ax.set_title(f"correlation {best.correlation[i, j]:.3f}".replace("-", "−"))
     common.legend(fig, axes)
-    count = model.n * (model.n - 1) // 2
-    which = f"the {len(pairs)} most correlated of {count} pairs" if count > len(pairs) else "each pair of parameters"
-    caption = common.sentence(
+    which = "each pair of parameters"
+    if len(every) > len(pairs):
+        which = f"the {len(pairs)} most correlated of {len(every)} pairs"
+    caption = (
         f"Regions that hold the true values with {LEVEL:.0%} probability if the model and the noise are right, for"
         f" {which}, about the estimates of {best.label}. Equal ones are drawn narrower upon each other; what is"
-        f" more than {_NEAR:g} deviations off is not drawn.",
+        f" more than {_NEAR:g} deviations off is not drawn."
     )
     yield Drawing("ellipses", "Covariance ellipses", caption, fig)
 
@@ -151,21 +158,6 @@ def _ellipses(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look])
 def _axis_words(model: Measurement, k: int, more: str = "") -> str:
     parameter = model.physical_parameters[k]
     return common.text(f"{parameter.name}{more}{f' [{parameter.unit}]' if parameter.unit else ''}")
-
-
-def _ellipse_panel(ax: Any, pair: list[int], best: Fit, fits: Sequence[Fit], look: Mapping[str, Look]) -> None:
-    """The ellipses of two parameters whose centres are near the best fit's."""
-    from matplotlib.ticker import MaxNLocator
-
-    near = [f for f in fits if (np.abs(f.x - best.x) <= _NEAR * best.standard_errors)[pair].all()]
-    for one, linewidth in zip(near, np.linspace(4.0 if len(near) > 1 else 1.6, 1.0, len(near)), strict=True):
-        centre, line = one.x[pair] - best.x[pair], look[one.label].line
-        outline = centre + ellipse(one.covariance[np.ix_(pair, pair)], edge=one.region(2, LEVEL))
-        ax.plot(*outline.T, **line | {"marker": "", "linewidth": linewidth})
-        ax.plot(*centre, label=common.text(one.label), **line)
-    ax.xaxis.set_major_locator(MaxNLocator(4))
-    ax.yaxis.set_major_locator(MaxNLocator(5))
-    ax.ticklabel_format(style="sci", scilimits=(-3, 4), useMathText=True)
 
 
 def draw_profiles(found: Examination) -> Iterator[Drawing]:
