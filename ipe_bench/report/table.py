@@ -168,7 +168,7 @@ def _needed(column: Column, table: Table, *, folded: bool) -> int:
     longest = max((cell_len(cell.text) for cell in column.cells), default=0)
     if not column.numeric:
         longest = min(longest, _WHOLE_NAME if column is table.columns[table.naming] else _WHOLE_WORD)
-    return max(title, longest)
+    return max(title, longest, 1)
 
 
 def _taken(columns: Iterable[Column], table: Table, *, folded: bool) -> int:
@@ -190,7 +190,7 @@ def _rich(columns: Sequence[Column], table: Table, width: int) -> Any:
     shown = RichTable(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, collapse_padding=True)
     folded = _taken(columns, table, folded=False) > width
     for each in columns:
-        letters = max(_needed(each, table, folded=folded), 1)
+        letters = _needed(each, table, folded=folded)
         title = Text(textwrap.fill(" ".join(_words_of(each.title)), letters).replace("\u00a0", " "))
         if each.numeric:
             shown.add_column(title, justify="right", no_wrap=True)

@@ -97,7 +97,7 @@ def test_charts_are_drawn_and_answer_the_keyboard(desktop, page_file):
     assert said[-1] == "80 trials"
 
 
-def test_charts_answer_the_pointer(desktop):
+def test_charts_answer_the_pointer_and_series_are_hidden(desktop):
     said = chart(
         desktop,
         "const mark = f.querySelectorAll('.plot g.series')[1].querySelector('circle, polygon').getBoundingClientRect();"
@@ -106,9 +106,6 @@ def test_charts_answer_the_pointer(desktop):
         "return [f.querySelector('.note').hidden, f.querySelectorAll('.told').length]",
     )
     assert said == [False, 1]
-
-
-def test_series_are_hidden_and_the_axes_go_with_those_that_are_left(desktop):
     ticks = "Array.from(f.querySelectorAll('.frame text[text-anchor=end]'), t => t.textContent)"
     before, after, pressed, curves = chart(
         desktop,
@@ -116,9 +113,8 @@ def test_series_are_hidden_and_the_axes_go_with_those_that_are_left(desktop):
         f"return [before, {ticks}, button.getAttribute('aria-pressed'),"
         "  f.querySelectorAll('.plot g.series').length]",
     )
-    assert pressed == "false"
-    assert curves == 4
-    # The linear estimate was the one that was a hundred times the bound.
+    assert (pressed, curves) == ("false", 4)
+    # The linear estimate was the one that was a hundred times the bound: the axes go with those that are left.
     assert "100" in before
     assert "100" not in after
 
@@ -177,16 +173,13 @@ def test_the_page_opens_with_the_answer_and_a_link_unfolds_the_rest(browser, pag
 
 
 def test_columns_sort_by_number_and_by_word(desktop):
-    at = heading(desktop, "overview", "efficiency")
-    click(desktop, "overview", at)
-    values = [float(v.replace("<", "")) for v in column(desktop, "overview", at)]
-    assert values == sorted(values)
-    click(desktop, "overview", at)
-    values = [float(v.replace("<", "")) for v in column(desktop, "overview", at)]
-    assert values == sorted(values, reverse=True)
-    sort = f"document.querySelectorAll('#table-overview th')[{at}].getAttribute('aria-sort')"
-    assert desktop.run(sort) == "descending"
-    name = heading(desktop, "overview", "estimator")
+    at, name = heading(desktop, "overview", "efficiency"), heading(desktop, "overview", "estimator")
+    for last, order in ((False, "ascending"), (True, "descending")):
+        click(desktop, "overview", at)
+        values = [float(v.replace("<", "")) for v in column(desktop, "overview", at)]
+        assert values == sorted(values, reverse=last)
+        sort = f"document.querySelectorAll('#table-overview th')[{at}].getAttribute('aria-sort')"
+        assert desktop.run(sort) == order
     click(desktop, "overview", name)
     names = column(desktop, "overview", name)
     assert names == sorted(names, key=str.lower)

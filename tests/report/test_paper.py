@@ -105,24 +105,20 @@ def test_tables_say_what_the_report_says_whatever_the_names(synthetic, tmp_path)
     assert [row[3] for row in rows[1:]] == [f"{short(low)} to {short(high)}" for low, high in ends]
 
 
-@pytest.mark.parametrize("width", [COLUMN, PAGE])
-def test_a_figure_is_as_wide_as_the_column(synthetic, tmp_path, width):
-    fill(synthetic)
-    done = export(analyse([synthetic.directory]), tmp_path, ["cost_against_accuracy"], width=width)
-    assert [path.name for path in done] == [*("cost_against_accuracy.png", "cost_against_accuracy.pdf", "captions.md")]
-    box = re.search(rb"/MediaBox \[ *([\d. ]+) *\]", done[1].read_bytes())
-    left, _, right, _ = map(float, box[1].split())
-    assert (right - left) / 72 == pytest.approx(width, abs=0.01)
-    assert "simulations" in done[2].read_text(encoding="utf-8")
-
-
-def test_drawing_for_a_paper_leaves_the_report_as_it_is(synthetic, tmp_path, monkeypatch):
+def test_a_figure_is_as_wide_as_the_column_and_the_report_stays_as_it_is(synthetic, tmp_path, monkeypatch):
     fill(synthetic)
     analysis = analyse([synthetic.directory])
     monkeypatch.setattr(figures, "FIGURES", ("costs",))
-    before, *_ = figures.draw_all(analysis, tmp_path / "a", formats=("png",))
-    export(analysis, tmp_path / "p", ["cost_against_accuracy"])
-    after, *_ = figures.draw_all(analysis, tmp_path / "b", formats=("png",))
+    before, *_ = figures.draw_all(analysis, tmp_path / "a")
+    for width in (COLUMN, PAGE):
+        done = export(analysis, tmp_path / "p", ["cost_against_accuracy"], width=width)
+        names = ["cost_against_accuracy.png", "cost_against_accuracy.pdf", "captions.md"]
+        assert [path.name for path in done] == names
+        box = re.search(rb"/MediaBox \[ *([\d. ]+) *\]", done[1].read_bytes())
+        left, _, right, _ = map(float, box[1].split())
+        assert (right - left) / 72 == pytest.approx(width, abs=0.01)
+        assert "simulations" in done[2].read_text(encoding="utf-8")
+    after, *_ = figures.draw_all(analysis, tmp_path / "b")
     assert before.files[0].read_bytes() == after.files[0].read_bytes()
 
 
