@@ -61,14 +61,15 @@ class Component:
                 object.__setattr__(self, name, suited)
 
 
-def component_classes(component: Any) -> list[type]:
-    """The class of a component with its bases, and those of the components inside it."""
+def component_classes(component: Any) -> list[Any]:
+    """The class of a component with its bases and the functions it computes with, and those of its components."""
     if isinstance(component, tuple | list):
         return [cls for item in component for cls in component_classes(item)]
     if not dataclasses.is_dataclass(component) or isinstance(component, type):
         return []
     inner = [cls for f in dataclasses.fields(component) for cls in component_classes(getattr(component, f.name))]
-    return [*(cls for cls in type(component).__mro__ if cls.__module__ not in ("builtins", "abc", "typing")), *inner]
+    own = (cls for cls in type(component).__mro__ if cls.__module__ not in ("builtins", "abc", "typing"))
+    return [*own, *getattr(component, "functions", ()), *inner]
 
 
 @functools.cache

@@ -4,6 +4,7 @@ from ipe_bench.measurements.accelerometer import Accelerometer
 from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, SubsetModel, UsualNoise
 from ipe_bench.measurements.bearings import Bearings
 from ipe_bench.measurements.formula import Formula
+from ipe_bench.measurements.function import Function, function
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.gins_richer import RicherGins
 from ipe_bench.measurements.gnss import Gnss
@@ -24,6 +25,7 @@ __all__ = [
     "Bock",
     "FallingBody",
     "Formula",
+    "Function",
     "Gins",
     "Gnss",
     "Input",
@@ -43,4 +45,5 @@ __all__ = [
     "SubsetModel",
     "Triad",
     "UsualNoise",
+    "function",
 ]

@@ -1,0 +1,324 @@
+"""A measurement model that is a plain Python function of named parameters, written in NumPy or in JAX."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import inspect
+import os
+import sys
+import typing
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.basics.errors import UserError, describe_exception, unknown
+from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Finite, Positive
+from ipe_bench.measurements.arithmetic import require_parameters
+from ipe_bench.measurements.base import Input, Measurement, Parameter, differentiate
+
+_CHUNK = 8
+"""Trials per call of a compiled JAX program; shorter batches are padded, so that bits do not depend on them."""
+_TIMES = ("t", "time")
+"""Columns that are taken for the time of the readings."""
+
+
+@dataclass(frozen=True)
+class Function(Measurement):
+    """z = h(parameters, columns), for a function h of a Python file:
+
+        def angle(t, length=1.0, damping=0.1, *, g=9.80665):        # in swing.py
+            return 0.1 * np.exp(-damping * t / 2) * np.cos(np.sqrt(g / length) * t)
+
+        ipe-bench estimate measurement=function measurement.of=swing:angle readings=swing.csv
+
+    Arguments with a number as default are parameters, which start there; arguments without are columns of the readings
+    file, arrays (m,); keyword-only arguments are constants. h returns the readings (m,). The type `Annotated[float,
+    "m"]` gives a parameter its unit. Slopes are exact: by forward differentiation where h returns JAX arrays, by a
+    complex step where h turns out to be analytic, else by central differences. Readings that have a column `t` or
+    `time` arrive in that order, so that filters take part.
+    """
+
+    of: str
+    """The function: MODULE:NAME, where MODULE is importable or MODULE.py lies in the working folder."""
+    start: Mapping[str, Finite] = field(default_factory=dict)
+    """Where estimation begins, by parameter: the nominal point. An argument without a default becomes a parameter."""
+    size: Mapping[str, Positive] = field(default_factory=dict)
+    """The physical size of one unit of a parameter; otherwise the magnitude of its start, or 1 where that is 0."""
+    units: Mapping[str, str] = field(default_factory=dict)
+    """Units of parameters, by name."""
+    constants: Mapping[str, Any] = field(default_factory=dict)
+    """Values of keyword-only arguments."""
+    columns: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    """The columns of the readings, for runs that have no file."""
+    time: str | None = None
+    """The column in whose order readings arrive; None: `t` or `time` if there is one; empty: no order."""
+    reading: str = "reading"
+    """Name of the readings' column in a file."""
+    unit: str = ""
+    """Unit of the readings."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        arguments = [name for name in self._signature if name not in self._keywords]
+        require_parameters("start", self.start, arguments)
+        for key in ("size", "units"):
+            require_parameters(key, getattr(self, key), self._starts)
+        for name in self.constants:
+            if name not in self._keywords:
+                raise UserError(f"constants.{name}: {unknown(name, self._keywords, 'keyword-only argument')}")
+        for name, default in self._keywords.items():
+            if default is inspect.Parameter.empty and name not in self.constants:
+                raise UserError(f"constants.{name}: {self.of} needs it; give constants.{name}=VALUE")
+        if not self._starts:
+            raise UserError(
+                f"start: {self.of} has no parameter; give an argument a number as default, or start.NAME=VALUE "
+                f"(its arguments are {', '.join(arguments) or 'none'})"
+            )
+        if self.time and self.time not in self._headings:
+            raise UserError(f"time={self.time}: {unknown(self.time, self._headings, 'column')}")
+        lengths = {name: len(column) for name, column in self.columns.items()}
+        if self.columns and (absent := [name for name in self._headings if name not in self.columns]):
+            raise UserError(
+                f"columns: {absent[0]} is missing; give columns.{absent[0]}=[...], or start.{absent[0]}=VALUE"
+            )
+        if len(set(lengths.values())) > 1:
+            raise UserError(f"columns: have different lengths: {lengths}")
+
+    @cached_property
+    def function(self) -> Callable[..., Any]:
+        """The function that `of` names.
+
+        Raises:
+            UserError: there is no such module or function, or the module cannot be imported.
+        """
+        module, colon, name = self.of.partition(":")
+        if not (module and colon and name.isidentifier()):
+            raise UserError(
+                f"of={self.of}: give MODULE:FUNCTION, such as swing:angle for the function angle of swing.py"
+            )
+        module = module.removesuffix(".py")
+        try:
+            with _working_folder_first():
+                found = sys.modules.get(module) or importlib.import_module(module)
+        except Exception as error:
+            if isinstance(error, ModuleNotFoundError) and error.name == module.partition(".")[0]:
+                raise UserError(f"of={self.of}: there is no module {module} here; {module}.py would be one") from None
+            raise UserError(f"of={self.of}: {module} cannot be imported ({describe_exception(error)})") from None
+        functions = [key for key, value in vars(found).items() if inspect.isfunction(value) or key == name]
+        if not callable(getattr(found, name, None)):
+            raise UserError(f"of={self.of}: {unknown(name, [f for f in functions if f != name], 'function')}")
+        return getattr(found, name)
+
+    @property
+    def functions(self) -> tuple[Callable[..., Any], ...]:
+        """What the model computes with beside its class: a change of its source makes results stale."""
+        return (self.function,)
+
+    @cached_property
+    def _signature(self) -> Mapping[str, inspect.Parameter]:
+        arguments = inspect.signature(self.function).parameters
+        if starred := [str(a) for a in arguments.values() if a.kind in (a.VAR_POSITIONAL, a.VAR_KEYWORD)]:
+            raise UserError(f"of={self.of}: takes {starred[0]}; give every argument a name")
+        return arguments
+
+    @cached_property
+    def _keywords(self) -> dict[str, Any]:
+        """The keyword-only arguments with their defaults."""
+        return {name: a.default for name, a in self._signature.items() if a.kind is a.KEYWORD_ONLY}
+
+    @cached_property
+    def _starts(self) -> dict[str, float]:
+        """The parameters with their starts, in the order of the signature."""
+        found: dict[str, float] = {}
+        for name, argument in self._signature.items():
+            value = self.start.get(name, argument.default)
+            if name in self._keywords or value is argument.empty:
+                continue
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise UserError(
+                    f"of={self.of}: the default of {name} is no number; write * before it if it is a constant"
+                )
+            found[name] = float(value)
+        return found
+
+    @cached_property
+    def _headings(self) -> tuple[str, ...]:
+        """The columns of the readings, in the order of the signature."""
+        return tuple(name for name in self._signature if name not in self._starts and name not in self._keywords)
+
+    @cached_property
+    def _annotated_units(self) -> dict[str, str]:
+        try:
+            hints = typing.get_type_hints(self.function, include_extras=True)
+        except Exception:  # of names that the function's module does not hold
+            return {}
+        extras = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
+        return {name: texts[0] for name, found in extras.items() if (texts := [e for e in found if isinstance(e, str)])}
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        units = self._annotated_units | dict(self.units)
+        sizes = {name: abs(value) or 1.0 for name, value in self._starts.items()} | dict(self.size)
+        return tuple(Parameter(name, units.get(name, ""), sizes[name]) for name in self._starts)
+
+    @cached_property
+    def nominal(self) -> Array:
+        return np.array(list(self._starts.values())) / self.sizes
+
+    @property
+    def reading_unit(self) -> str:  # type: ignore[override]
+        return self.unit
+
+    @property
+    def reading_name(self) -> str:
+        return self.reading
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        return tuple(Input(name) for name in self._headings)
+
+    @property
+    def input_columns(self) -> Mapping[str, Sequence[Any]]:
+        return {name: [float(value) for value in self.columns[name]] for name in self._headings}
+
+    @property
+    def input_columns_known(self) -> bool:
+        return bool(self.columns) or not self._headings
+
+    def absent_input(self, heading: str, columns: Sequence[str]) -> str:
+        return (
+            f"there are {', '.join(columns)}. If {heading} is a parameter, give it a start: "
+            f"measurement.start.{heading}=VALUE"
+        )
+
+    def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Function:
+        return replace(self, columns={name: tuple(map(float, columns[name])) for name in self._headings})
+
+    @cached_property
+    def m(self) -> int:
+        if not self._headings:
+            return len(self._checked(self._at(self._starts.values()), None))
+        if not self.columns:
+            wanted = self._headings[0]
+            raise UserError(
+                f"measurement.columns: {self.of} takes {', '.join(self._headings)} of each reading; give readings=FILE "
+                f"with these columns, or measurement.columns.{wanted}=[...]"
+            )
+        return len(self.columns[self._headings[0]])
+
+    @property
+    def index(self) -> Mapping[str, Sequence[Any]]:
+        return {"row": list(range(1, self.m + 1)), **self.input_columns}
+
+    @cached_property
+    def epochs(self) -> tuple[NDArray[np.intp], ...] | None:
+        chosen = next((name for name in _TIMES if name in self._headings), "") if self.time is None else self.time
+        if not chosen:
+            return None
+        times = np.asarray(self.columns[chosen], dtype=float)
+        return tuple(np.flatnonzero(times == time) for time in np.unique(times))
+
+    @cached_property
+    def _known(self) -> dict[str, Any]:
+        """The arguments that are not parameters: columns as arrays (m,), and constants."""
+        return {name: np.asarray(self.columns[name], dtype=float) for name in self._headings} | dict(self.constants)
+
+    def _at(self, values: Any) -> Any:
+        """h where the parameters have these values (n,), in their own units."""
+        return self.function(**dict(zip(self._starts, values, strict=True)), **self._known)
+
+    def _checked(self, z: Any, m: int | None) -> Any:
+        shape = np.shape(z)
+        if len(shape) != 1 or m not in (None, shape[0]):
+            wanted = "one number per reading" if m is None else f"one number per reading, ({m},)"
+            raise UserError(f"measurement.of={self.of}: returns an array of shape {shape}; let it return {wanted}")
+        return z
+
+    def _rows(self, x: Array) -> Array:
+        """h of every trial, by one call of the function each; x may be complex."""
+        h, names, known = self.function, list(self._starts), self._known
+        with np.errstate(all="ignore"):
+            rows = [h(**dict(zip(names, row, strict=True)), **known) for row in x * self.sizes]
+        if any(np.shape(row) != (self.m,) for row in rows):
+            rows = [self._checked(row, self.m) for row in rows]
+        return np.array(rows) if rows else np.empty((0, self.m))
+
+    @cached_property
+    def _jax(self) -> tuple[Callable[[Array], Array], Callable[[Array], Array]] | None:
+        """Compiled readings and slopes of a function that returns arrays of JAX; None if it does not."""
+        if "jax" not in sys.modules or not type(self._at(self._starts.values())).__module__.startswith("jax"):
+            return None
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+
+        def one(x: Any) -> Any:
+            return self._checked(self._at(x * self.sizes), self.m)
+
+        return _in_chunks(jax.jit(jax.vmap(one))), _in_chunks(jax.jit(jax.vmap(jax.jacfwd(one))))
+
+    @cached_property
+    def _is_analytic(self) -> bool:
+        """Whether the complex step gives the slopes that differences give, near the start and away from it."""
+        offsets = np.random.default_rng(1).uniform(-0.3, 0.3, (4, self.n))
+        x = self.nominal + np.vstack([np.zeros(self.n), offsets])
+        by_differences = differentiate(self._rows, x, analytic=False)
+        try:  # functions of `math` refuse complex numbers; some conversions drop the imaginary part with a warning
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                by_complex_step = differentiate(self._rows, x, analytic=True)
+        except (TypeError, ValueError, Warning):
+            return False
+        known = np.isfinite(by_differences).all(axis=(1, 2))
+        size = np.abs(by_differences[known]).max(axis=1, keepdims=True, initial=0.0)
+        return bool(known.any() and (np.abs(by_complex_step - by_differences)[known] <= 1e-5 * size).all())
+
+    def simulate(self, x: Array) -> Array:
+        return self._rows(x) if self._jax is None else self._jax[0](x)
+
+    def jacobian(self, x: Array) -> Array:
+        return differentiate(self._rows, x, analytic=self._is_analytic) if self._jax is None else self._jax[1](x)
+
+    @property
+    def jacobian_cost(self) -> float:
+        return float(self.n if self._jax is not None or self._is_analytic else 2 * self.n)
+
+
+def function(h: Callable[..., Any], start: Mapping[str, float] | None = None, **options: Any) -> Function:
+    """The measurement model of a function that a module holds by name; the options are those of `Function`.
+
+    Raises:
+        UserError: the function has no name of its own in a module, as a lambda or an inner function.
+    """
+    module, name = getattr(h, "__module__", ""), getattr(h, "__qualname__", "")
+    if not name.isidentifier() or getattr(sys.modules.get(module), name, None) is not h:
+        raise UserError(f"{name or h!r}: give a function that stands in a module by its own name, not inside another")
+    return Function(of=f"{module}:{name}", start=start or {}, **options)
+
+
+@contextlib.contextmanager
+def _working_folder_first() -> Iterator[None]:
+    """Imports look into the working folder first."""
+    folder = os.getcwd()
+    if folder not in sys.path:  # and stay so: worker processes take over the path
+        sys.path.insert(0, folder)
+    yield
+
+
+def _in_chunks(program: Callable[[Array], Any]) -> Callable[[Array], Array]:
+    """A batched program in calls of `_CHUNK` trials."""
+
+    def run(x: Array) -> Array:
+        padded = np.zeros((-(-max(len(x), 1) // _CHUNK) * _CHUNK, x.shape[1]))
+        padded[: len(x)] = x
+        parts = [np.asarray(program(padded[i : i + _CHUNK])) for i in range(0, len(padded), _CHUNK)]
+        return np.ascontiguousarray(np.concatenate(parts)[: len(x)])
+
+    return run

@@ -1,0 +1,159 @@
+"""Models that are Python functions: beside the same law as a formula, by all ways to slopes, and with mistakes."""
+
+import sys
+
+import numpy as np
+import pytest
+
+import ipe_bench as ib
+from ipe_bench.measurements import Formula, function
+from ipe_bench.measurements.base import differentiate
+from ipe_bench.runs.provenance import fingerprint
+
+T = np.linspace(0.1, 4.0, 25)
+LAW = """
+from typing import Annotated
+import math
+import numpy as np
+
+def swing(t, length: Annotated[float, "m"] = 1.2, damping=0.1, *, g=9.80665):
+    return np.exp(-damping * t / 2) * np.cos(np.sqrt(g / length) * t)
+
+def by_math(t, length=1.2, damping=0.1):
+    return np.array([math.exp(-damping * s / 2) * math.cos(math.sqrt(9.80665 / length) * s) for s in t])
+
+def absolute(t, k=0.7):
+    return np.abs(np.sin(k * t))
+
+def two_columns(t, k=1.0):
+    return np.outer(t, [k, k])
+
+def shrinking(t, k=1.0):
+    return np.exp(-k * t)[: None if k == 1.0 else 5]
+
+def no_parameter(t):
+    return t
+
+def text(t, k="a"):
+    return t
+
+def starred(t, *rest):
+    return t
+
+def needs(t, k=1.0, *, g):
+    return g * k * t
+"""
+JAX = """
+import jax.numpy as np
+
+def swing(t, length=1.2, damping=0.1, *, g=9.80665):
+    return np.exp(-damping * t / 2) * np.cos(np.sqrt(g / length) * t)
+"""
+
+
+@pytest.fixture
+def laws(tmp_path, monkeypatch):
+    """A module of laws in the working folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "some_laws.py").write_text(LAW)
+    (tmp_path / "some_jax_laws.py").write_text(JAX)
+    yield tmp_path
+    for name in ("some_laws", "some_jax_laws"):
+        sys.modules.pop(name, None)
+
+
+def model(name, **options):
+    return ib.measurements.Function(of=f"some_laws:{name}", columns={"t": T.tolist()}, **options)
+
+
+def formula():
+    text = "exp(-damping*t/2)*cos(sqrt(9.80665/length)*t)"
+    return Formula(text, {"damping": 0.1, "length": 1.2}, {"t": T.tolist()})
+
+
+def test_a_function_is_the_model_that_its_formula_is(laws):
+    ours, beside = model("swing"), formula()
+    x = ours.nominal + 0.2 * np.random.default_rng(0).standard_normal((9, 2))
+    np.testing.assert_allclose(ours.simulate(x), beside.simulate(x[:, ::-1]), rtol=1e-14, atol=1e-14)
+    np.testing.assert_allclose(ours.jacobian(x), beside.jacobian(x[:, ::-1])[:, :, ::-1], rtol=1e-12, atol=1e-12)
+    assert [(p.name, p.unit, p.size) for p in ours.parameters] == [("length", "m", 1.2), ("damping", "", 0.1)]
+    assert ours.jacobian_cost == 2.0
+    assert len(ours.epochs) == len(T)
+
+
+@pytest.mark.parametrize(("name", "cost"), [("by_math", 4.0), ("absolute", 2.0)])
+def test_slopes_are_differences_where_the_complex_step_is_wrong(laws, name, cost):
+    ours = model(name)
+    x = ours.nominal[None] * 1.05
+    expected = differentiate(ours.simulate, x, analytic=False)
+    np.testing.assert_allclose(ours.jacobian(x), expected, rtol=1e-6, atol=1e-8)
+    assert ours.jacobian_cost == cost
+
+
+def test_a_function_in_jax_has_the_slopes_of_the_one_in_numpy_in_every_batch(laws):
+    pytest.importorskip("jax")
+    ours = ib.measurements.Function(of="some_jax_laws:swing", columns={"t": T.tolist()})
+    x = ours.nominal + 0.2 * np.random.default_rng(0).standard_normal((19, 2))
+    np.testing.assert_allclose(ours.jacobian(x), model("swing").jacobian(x), rtol=1e-11, atol=1e-11)
+    assert np.array_equal(ours.jacobian(x)[11:12], ours.jacobian(x[11:12]))
+
+
+def test_options_set_starts_sizes_units_constants_and_order(laws):
+    ours = model("swing", start={"damping": 0.5}, size={"length": 0.1}, units={"damping": "1/s"}, constants={"g": 1.6})
+    np.testing.assert_allclose(ours.nominal, [12.0, 1.0])
+    assert [p.unit for p in ours.parameters] == ["m", "1/s"]
+    np.testing.assert_allclose(ours.simulate(ours.nominal[None])[0], np.exp(-T / 4) * np.cos(np.sqrt(1.6 / 1.2) * T))
+    assert model("swing", time="").epochs is None
+
+
+def test_results_of_another_function_are_stale(laws):
+    (laws / "changed_laws.py").write_text(LAW.replace("damping * t / 2", "damping * t / 3"))
+    changed = ib.measurements.Function(of="changed_laws:swing", columns={"t": T.tolist()})
+    assert fingerprint([changed])["source"] != fingerprint([model("swing")])["source"]
+
+
+def test_readings_of_a_file_give_the_parameters_back(laws):
+    z = np.exp(-0.15 * T / 2) * np.cos(np.sqrt(9.80665 / 1.1) * T) + np.random.default_rng(1).normal(0, 0.01, len(T))
+    rows = "\n".join(f"{t},{value}" for t, value in zip(T, z, strict=True))
+    (laws / "swing.csv").write_text(f"t,reading\n{rows}\n")
+    import some_laws
+
+    answer = ib.estimate(function(some_laws.swing), "swing.csv")
+    fit = {fit.label: fit for fit in answer}["auto"]
+    deviations = np.sqrt(np.diag(fit.covariance))
+    assert (np.abs(fit.x - [1.1, 0.15]) < 4 * deviations).all()
+    assert (deviations < [0.01, 0.05]).all()
+
+
+@pytest.mark.parametrize(
+    ("of", "options", "said"),
+    [
+        ("some_laws", {}, "give MODULE:FUNCTION"),
+        ("nowhere:h", {}, "there is no module nowhere here"),
+        ("some_laws:swung", {}, "did you mean swing?"),
+        ("some_laws:no_parameter", {}, "has no parameter"),
+        ("some_laws:text", {}, "the default of k is no number"),
+        ("some_laws:starred", {}, "takes *rest; give every argument a name"),
+        ("some_laws:needs", {}, "constants.g: some_laws:needs needs it"),
+        ("some_laws:swing", {"start": {"lenght": 1.0}}, "start: lenght is not a parameter"),
+        ("some_laws:swing", {"constants": {"h": 1.0}}, "constants.h: "),
+        ("some_laws:swing", {"time": "s"}, "time=s: "),
+    ],
+)
+def test_a_mistake_is_one_line(laws, of, options, said):
+    with pytest.raises(ib.UserError) as refused:
+        ib.measurements.Function(of=of, columns={"t": T.tolist()}, **options)
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["two_columns", "shrinking"])
+def test_another_shape_is_refused_by_the_function_s_name(laws, name):
+    with pytest.raises(ib.UserError, match=f"measurement.of=some_laws:{name}: returns an array of shape"):
+        model(name).simulate(np.array([[1.0], [1.1]]))
+
+
+def test_a_function_inside_another_is_refused():
+    with pytest.raises(ib.UserError, match="stands in a module by its own name"):
+        function(lambda t, k=1.0: k * t)
