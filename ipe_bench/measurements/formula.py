@@ -54,15 +54,15 @@ class Formula(Measurement):
         super().__post_init__()
         for name, value in self.start.items():
             require_finite(f"start.{name}", value)
-            if name not in self._arithmetic.names:
-                wanted = ", ".join(self._arithmetic.names)
+            if name not in self.arithmetic.names:
+                wanted = ", ".join(self.arithmetic.names)
                 raise UserError(f"start.{name}: does not appear in the expression, whose names are {wanted}")
         if not self.start:
-            name = next(iter(self._arithmetic.names), "NAME")
+            name = next(iter(self.arithmetic.names), "NAME")
             raise UserError(
                 f"start: is empty, so nothing is to be estimated; give each parameter a start: start.{name}=1"
             )
-        if self.reading in self._arithmetic.names:
+        if self.reading in self.arithmetic.names:
             raise UserError(f"reading={self.reading}: stands in the expression too; what is measured cannot explain it")
         lengths = {name: len(column) for name, column in self.columns.items()}
         if len(set(lengths.values())) > 1:
@@ -70,13 +70,13 @@ class Formula(Measurement):
         require_parameters("own", self.own, self.start)
 
     @cached_property
-    def _arithmetic(self) -> Arithmetic:
+    def arithmetic(self) -> Arithmetic:
         return read(self.expression, "expression")
 
     @cached_property
     def _names(self) -> tuple[str, ...]:
         """The parameters, in order of appearance."""
-        return tuple(name for name in self._arithmetic.names if name in self.start)
+        return tuple(name for name in self.arithmetic.names if name in self.start)
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -92,7 +92,7 @@ class Formula(Measurement):
 
     @cached_property
     def inputs(self) -> tuple[Input, ...]:
-        return tuple(Input(name) for name in self._arithmetic.names if name not in self.start)
+        return tuple(Input(name) for name in self.arithmetic.names if name not in self.start)
 
     @property
     def input_columns(self) -> Mapping[str, Sequence[Any]]:
@@ -133,10 +133,10 @@ class Formula(Measurement):
     def _recorded(self) -> tuple[Expression, tuple[Expression, ...]]:
         """The formula and its derivative by each parameter, as recorded expressions."""
         graph = Graph()
-        known = {name: graph.input(name) for name in self._arithmetic.names}
+        known = {name: graph.input(name) for name in self.arithmetic.names}
         try:
             with np.errstate(all="raise", under="ignore"):
-                value, one = graph.apply("add", self._arithmetic(known), 0.0), graph.constant(1.0)
+                value, one = graph.apply("add", self.arithmetic(known), 0.0), graph.constant(1.0)
                 return value, tuple(tangent([value], {known[name]: one})[0] for name in self._names)
         except (ArithmeticError, ValueError, TypeError) as error:
             raise UserError(

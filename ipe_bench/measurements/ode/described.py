@@ -100,11 +100,16 @@ class Ode(WrappedModel):
             require_finite(f"start.{name}", value)
             if name in self.rates or name == "t":
                 raise UserError(f"start.{name}: is a state or the time, and not a parameter; rename one of them")
-        for name, formula in self._initial.items():
+        for name, formula in self.initial_formulas.items():
             for used in formula.names:
                 if used in self.rates or used == "t":
                     raise UserError(f"initial.{name}: {used} is a state or the time, which a start cannot depend on")
-        used = {name for part in (self._rates, self._initial, self._outputs) for f in part.values() for name in f.names}
+        used = {
+            name
+            for part in (self.rate_formulas, self.initial_formulas, self.output_formulas)
+            for f in part.values()
+            for name in f.names
+        }
         for name in self.start:
             if name not in used:
                 raise UserError(f"start.{name}: appears in no formula")
@@ -116,18 +121,18 @@ class Ode(WrappedModel):
             raise UserError(f"times={list(self.times)}: give ascending numbers from 0 on")
         if isinstance(self.tolerance, str):
             for name in read(self.tolerance, "tolerance").names:
-                if name != "t" and name not in self._constants:
+                if name != "t" and name not in self.constant_names:
                     raise UserError(f"tolerance: {name} is neither a constant nor t")
         require_parameters("own", self.own, self.start)
         self._check_constants()
 
     def _check_constants(self) -> None:
-        for name in self._constants:
+        for name in self.constant_names:
             if name in _COLUMNS:
                 remedy = "the time is t" if name == "time" else "rename it"
                 raise UserError(f"{name}: is a column of every readings file, and not known in a formula; {remedy}")
         for name, values in self.constants.items():
-            if name not in self._constants:
+            if name not in self.constant_names:
                 known = "is a state, a parameter or the time" if name in self._named else "appears in no formula"
                 raise UserError(f"constants.{name}: {known}")
             for value in values if isinstance(values, tuple | list) else [values]:
@@ -142,35 +147,37 @@ class Ode(WrappedModel):
         return {*self.start, *self.rates, "t"}
 
     @cached_property
-    def _constants(self) -> tuple[str, ...]:
+    def constant_names(self) -> tuple[str, ...]:
         """The names that are constants of a case, in order of appearance."""
-        formulas = [f for part in (self._rates, self._initial, self._outputs) for f in part.values()]
+        formulas = [
+            f for part in (self.rate_formulas, self.initial_formulas, self.output_formulas) for f in part.values()
+        ]
         return tuple(dict.fromkeys(name for f in formulas for name in f.names if name not in self._named))
 
     @cached_property
     def cases(self) -> Array:
         """The constants of each case (cases, constants)."""
-        for name in self._constants:
+        for name in self.constant_names:
             if name not in self.constants:
                 raise UserError(
                     f"measurement: {name} is not known; give it a start, measurement.start.{name}=1, if it is a "
                     f"parameter, or its value in each case, as a column of readings=FILE or "
                     f"measurement.constants.{name}=[...]"
                 )
-        columns = [np.atleast_1d(self.constants[name]) for name in self._constants]
+        columns = [np.atleast_1d(self.constants[name]) for name in self.constant_names]
         count = max((len(column) for column in columns), default=1)
         return np.array([np.broadcast_to(column, count) for column in columns], dtype=float).reshape(-1, count).T
 
     @cached_property
-    def _rates(self) -> dict[str, Arithmetic]:
+    def rate_formulas(self) -> dict[str, Arithmetic]:
         return {name: read(str(text), f"rates.{name}") for name, text in self.rates.items()}
 
     @cached_property
-    def _initial(self) -> dict[str, Arithmetic]:
+    def initial_formulas(self) -> dict[str, Arithmetic]:
         return {name: read(str(self.initial.get(name, 0.0)), f"initial.{name}") for name in self.rates}
 
     @cached_property
-    def _outputs(self) -> dict[str, Arithmetic]:
+    def output_formulas(self) -> dict[str, Arithmetic]:
         shown = self.outputs or {name: name for name in self.rates}
         return {name: read(str(text), f"outputs.{name}") for name, text in shown.items()}
 
@@ -195,8 +202,8 @@ class Ode(WrappedModel):
     @property
     def inputs(self) -> tuple[Input, ...]:
         stated = {name: values for name, values in self.constants.items() if not isinstance(values, tuple | list)}
-        constants = (Input(name, default=stated.get(name)) for name in self._constants)
-        outputs = tuple(self._outputs)
+        constants = (Input(name, default=stated.get(name)) for name in self.constant_names)
+        outputs = tuple(self.output_formulas)
         return (
             Input("case", int, label=True, default=1),
             Input(time_heading(self.time_unit)),
@@ -207,14 +214,14 @@ class Ode(WrappedModel):
     @property
     def input_columns(self) -> Mapping[str, Sequence[Any]]:
         cases = np.asarray(self.index["case"]) - 1
-        return {name: self.cases[cases, k].tolist() for k, name in enumerate(self._constants)}
+        return {name: self.cases[cases, k].tolist() for k, name in enumerate(self.constant_names)}
 
     @property
     def input_columns_known(self) -> bool:
-        return bool(self.times or self.readings) and all(name in self.constants for name in self._constants)
+        return bool(self.times or self.readings) and all(name in self.constants for name in self.constant_names)
 
     def absent_input(self, heading: str, columns: Sequence[str]) -> str:
-        if heading not in self._constants:
+        if heading not in self.constant_names:
             return Measurement.absent_input(self, heading, columns)
         return (
             f"there are {', '.join(columns)}. If {heading} is a parameter, give it a start: "
@@ -223,9 +230,9 @@ class Ode(WrappedModel):
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
         del readings
-        count = _cases(columns["case"]) if self._constants else 1
-        constants = {name: _of_cases(name, columns[name], columns["case"], count) for name in self._constants}
-        outputs, heading = list(self._outputs), time_heading(self.time_unit)
+        count = _cases(columns["case"]) if self.constant_names else 1
+        constants = {name: _of_cases(name, columns[name], columns["case"], count) for name in self.constant_names}
+        outputs, heading = list(self.output_formulas), time_heading(self.time_unit)
         rows = list(zip(columns["case"], map(float, columns[heading]), columns["output"], strict=True))
         seen: set[tuple[Any, ...]] = set()
         for case, time, output in rows:
@@ -247,9 +254,9 @@ class Ode(WrappedModel):
     @property
     def recorded(self) -> Recorded | None:
         """The exact readings of the answer, where it has all parameters and outputs."""
-        if set(self.answer) != set(self.start) or set(self.exact) != set(self._outputs) or self.deviation is None:
+        if set(self.answer) != set(self.start) or set(self.exact) != set(self.output_formulas) or self.deviation is None:
             return None
-        formulas = [read(self.exact[name], f"exact.{name}") for name in self._outputs]
+        formulas = [read(self.exact[name], f"exact.{name}") for name in self.output_formulas]
         z = np.concatenate([[formula({**self.answer, **known}) for formula in formulas] for known in self.known])
         x = np.array([self.answer[name] for name in self.start]) / self.sizes
         return Recorded(z, Covariance(np.full(self.m, self.deviation)), x)
@@ -257,7 +264,7 @@ class Ode(WrappedModel):
     @cached_property
     def known(self) -> list[dict[str, float]]:
         """The constants and t at each time of each case."""
-        constants = [dict(zip(self._constants, case.tolist(), strict=True)) for case in self.cases]
+        constants = [dict(zip(self.constant_names, case.tolist(), strict=True)) for case in self.cases]
         return [{**known, "t": t} for known in constants for t in self.whole.times.tolist()]
 
 
@@ -268,7 +275,7 @@ class _Engine(OdeMeasurement):
     described: Ode
 
     states = property(lambda engine: len(engine.described.rates))  # type: ignore[assignment]
-    outputs = property(lambda engine: tuple(engine.described._outputs))  # type: ignore[assignment]
+    outputs = property(lambda engine: tuple(engine.described.output_formulas))  # type: ignore[assignment]
     time_unit = property(lambda engine: engine.described.time_unit)  # type: ignore[assignment]
     step = property(lambda engine: engine.described.step)  # type: ignore[assignment]
     cases = property(lambda engine: engine.described.cases)  # type: ignore[assignment]
@@ -301,18 +308,20 @@ class _Engine(OdeMeasurement):
         return np.repeat([float(formula(known)) for known in self.described.known], len(self.outputs))
 
     def _known(self, p: Sequence[Any], c: Sequence[Any]) -> dict[str, Any]:
-        return dict(zip(self.described.start, p, strict=True)) | dict(zip(self.described._constants, c, strict=True))
+        return dict(zip(self.described.start, p, strict=True)) | dict(
+            zip(self.described.constant_names, c, strict=True)
+        )
 
     def start(self, p, c):
-        return [formula(self._known(p, c)) for formula in self.described._initial.values()]
+        return [formula(self._known(p, c)) for formula in self.described.initial_formulas.values()]
 
     def rhs(self, t, y, p, c):
         values = {**self._known(p, c), **dict(zip(self.described.rates, y, strict=True)), "t": t}
-        return [formula(values) for formula in self.described._rates.values()]
+        return [formula(values) for formula in self.described.rate_formulas.values()]
 
     def read(self, t, y, p, c):
         values = {**self._known(p, c), **dict(zip(self.described.rates, y, strict=True)), "t": t}
-        return [formula(values) for formula in self.described._outputs.values()]
+        return [formula(values) for formula in self.described.output_formulas.values()]
 
 
 def _cases(numbers: Sequence[int]) -> int:
