@@ -7,22 +7,30 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.files import own_conf
-from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.linalg import Array, Covariance, own
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.measurements.arithmetic import Arithmetic, read, require_finite, require_parameters
 from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, SubsetModel, UsualNoise, WrappedModel
 from ipe_bench.measurements.ode.model import OdeMeasurement, time_heading
+from ipe_bench.measurements.ode.rodas import Rodas5P
+from ipe_bench.measurements.ode.steps import Indices
 
 _SHARE = 1e-8
 """Of the largest reading, what the integration may leave unless told otherwise."""
 _TRIAL_STEPS = 16
 """Steps within the shortest interval that tell how large readings are."""
+_EASY = 16
+"""Explicit steps between two readings up to which nominal equations are not asked whether they are stiff."""
+_STIFF = 10.0
+_SHAPE = 1e-4
+"""A relative tolerance that shows the shape of a solution."""
+_IN_HAND = 0.3
 _COLUMNS = ("case", "time", "output", "reading", "sigma")
 """Columns that mean something else than a constant."""
 
@@ -82,6 +90,8 @@ class Ode(WrappedModel):
     """Parameters whose readings are known exactly: with noise=certified they stand for the truth."""
     exact: Mapping[str, str] = field(default_factory=dict)
     """The readings at `answer`: for every output a formula of t, the parameters and the constants."""
+    method: Literal["auto", "explicit", "implicit"] = "auto"
+    """The integrator: explicit (DOP853), implicit (Rodas5P, for stiff equations), or as the equations ask for."""
     title: str = "ode"
     """The name of the model in tables."""
 
@@ -292,12 +302,79 @@ class _Engine(OdeMeasurement):
         return described.interval * np.arange(1.0, (described.readings or 0) + 1)
 
     @cached_property
+    def stiff(self) -> bool:
+        """Whether every trial is integrated by the implicit method.
+
+        It is if stability alone costs more than `_STIFF` times as many explicit steps along the nominal solution: the
+        integral of the Jacobian's spectral radius, over what a step may cover.
+        """
+        if self.described.method != "auto":
+            return self.described.method == "implicit"
+        if self.step is not None or self._ladder[self._nominal_place] <= _EASY:
+            return False
+        x = own(self.nominal[None])
+        work = Rodas5P(self, _SHAPE).work(x)
+        followed = bool(np.isfinite(Rodas5P(self, _SHAPE).simulate(x, len(self.times))).all())
+        return followed and bool(work.explicit[0] > _STIFF * work.steps[0])
+
+    @cached_property
+    def _implicit(self) -> Rodas5P:
+        shown = np.abs(Rodas5P(self, _SHAPE).simulate(self.nominal[None], len(self.times)))
+        largest = float(np.nanmax(shown, initial=0.0)) or 1.0
+        return Rodas5P(self, float(np.clip(_IN_HAND * np.min(self._tolerances) / largest, 1e-10, 1e-4)))
+
+    def _beyond(self, x: Array) -> Indices:
+        """The trials that the shortest explicit steps do not follow, and that are integrated by the implicit method."""
+        if self.described.method != "auto" or self.step is not None:
+            return np.empty(0, dtype=np.intp)
+        return np.flatnonzero(self._search(own(x), self._zeros).places == len(self._ladder) - 1)
+
+    def _shown(self, x: Array, stop: int, offset: Array, *, coarse: bool = False) -> Array:
+        if self.stiff:
+            return self._implicit.simulate(x, stop)
+        z = super()._shown(x, stop, offset, coarse=coarse)
+        if len(beyond := self._beyond(x)):
+            z[beyond] = self._implicit.simulate(x[beyond], stop)
+        return z
+
+    def jacobian_until(self, x: Array, stop: int) -> Array:
+        return self._slopes(super().jacobian_until, x, stop)
+
+    def coarse_jacobian_until(self, x: Array, stop: int) -> Array:
+        return self._slopes(super().coarse_jacobian_until, x, stop)
+
+    def _slopes(self, explicit: Callable[[Array, int], Array], x: Array, stop: int) -> Array:
+        if self.stiff:
+            return self._implicit.jacobian(x, stop)
+        J = explicit(x, stop)
+        if len(beyond := self._beyond(x)):
+            J[beyond] = self._implicit.jacobian(x[beyond], stop)
+        return J
+
+    @cached_property
+    def jacobian_cost(self) -> float:  # type: ignore[override]
+        return float(1 + self.n) if self.stiff else super().jacobian_cost
+
+    @cached_property
+    def coarse_jacobian_cost(self) -> float:  # type: ignore[override]
+        return self.jacobian_cost if self.stiff else super().coarse_jacobian_cost
+
+    def hindrance(self, x: Array) -> str:
+        if np.isfinite(self._implicit.simulate(own(x[None, : self.n]), len(self.times))).all() and self.stiff:
+            return ""
+        return super().hindrance(x)
+
+    @cached_property
     def tolerance(self) -> float:  # type: ignore[override]
         if isinstance(self.described.tolerance, float):
             return self.described.tolerance
         intervals = np.diff(self.times, prepend=0.0)
-        trial = replace(self.described, step=float(intervals[intervals > 0].min()) / _TRIAL_STEPS)
-        largest = float(np.abs(trial.simulate(self.nominal[None])).max())
+        step = float(intervals[intervals > 0].min(initial=np.inf)) / _TRIAL_STEPS
+        nominal = own(self.nominal[None])
+        trials = [replace(self.described, step=h, method="explicit").simulate(nominal) for h in (step, step / 2)]
+        first, largest = (float(np.abs(z).max()) for z in trials)
+        if not 0.9 * largest <= first <= 1.1 * largest:  # explicit steps are unstable
+            largest = float(np.abs(Rodas5P(self, _SHAPE).simulate(nominal, len(self.times))).max())
         return _SHARE * largest if 0 < largest < np.inf else _SHARE
 
     @cached_property

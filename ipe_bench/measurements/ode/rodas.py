@@ -1,0 +1,320 @@
+"""Rodas5P: stiff equations of a batch of trials, with the exact derivatives of its steps.
+
+A Rosenbrock method of order 5 with 8 stages, stiffly accurate and L-stable: one Jacobian and one LU decomposition a
+step, no Newton iteration. Coefficients: Steinebach, BIT Numerical Mathematics 63:27, 2023, in the transformed form of
+Hairer and Wanner, Solving Ordinary Differential Equations II, section IV.7, which needs no product with the Jacobian.
+
+Sensitivities are the derivatives of the discrete steps with their lengths held: the method applied to the equations
+joined with their variational equations, with the derivative of the Jacobian times each stage taken along. One
+decomposition serves both.
+
+A lane is one trial of one case, with its own time, step and order of pivots. Operations act on lanes one by one, and
+the error norm is a maximum, so bits do not depend on the batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ipe_bench.basics.linalg import Array
+from ipe_bench.measurements.ode.trace import Expression, Graph, Program, tangent
+
+if TYPE_CHECKING:
+    from ipe_bench.measurements.ode.model import OdeMeasurement
+
+GAMMA = 0.21193756319429014
+_SIXTH = (-7.502846399306121, 2.561846144803919, -11.627539656261098, -0.18268767659942256, 0.030198172008377946)
+A: tuple[tuple[float, ...], ...] = (
+    (),
+    (3.0,),
+    (2.849394379747939, 0.45842242204463923),
+    (-6.954028509809101, 2.489845061869568, -10.358996098473584),
+    (2.8029986275628964, 0.5072464736228206, -0.3988312541770524, -0.04721187230404641),
+    _SIXTH,
+    (*_SIXTH, 1.0),
+    (*_SIXTH, 1.0, 1.0),
+)
+C: tuple[tuple[float, ...], ...] = (
+    (),
+    (-14.155112264123755,),
+    (-17.97296035885952, -2.859693295451294),
+    (147.12150275711716, -1.41221402718213, 71.68940251302358),
+    (165.43517024871676, -0.4592823456491126, 42.90938336958603, -5.961986721573306),
+    (24.854864614690072, -3.0009227002832186, 47.4931110020768, 5.5814197821558125, -0.6610691825249471),
+    (
+        30.91273214028599,
+        -3.1208243349937974,
+        77.79954646070892,
+        34.28646028294783,
+        -19.097331116725623,
+        -28.087943162872662,
+    ),
+    (
+        37.80277123390563,
+        -3.2571969029072276,
+        112.26918849496327,
+        66.9347231244047,
+        -40.06618937091002,
+        -54.66780262877968,
+        -9.48861652309627,
+    ),
+)
+NODES = (0.0, 0.6358126895828704, 0.4095798393397535, 0.9769306725060716, 0.4288403609558664, 1.0, 1.0, 1.0)
+TIME_WEIGHTS = (
+    *(0.21193756319429014, -0.42387512638858027, -0.3384627126235924, 1.8046452872882734, 2.325825639765069),
+    *(0.0, 0.0, 0.0),
+)
+_REACH = 6.0
+"""About where the stability region of DOP853 ends on the negative real axis."""
+_MOST_STEPS = 4000
+_SMALLEST = 1e-9
+"""Of the relative tolerance: the absolute one, in units of the states."""
+_SAFETY, _SHRINK, _GROW = 0.9, 0.2, 6.0
+_UFUNCS: dict[str, Any] = {"add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide}
+_UFUNCS |= {"pow": np.power, "neg": np.negative}
+
+Function = Callable[..., list[Any]]
+
+
+@dataclass(frozen=True)
+class Work:
+    """What the integration of each trial took: its hardest case."""
+
+    steps: Array
+    """Steps, rejected ones included, each with a decomposition (trials,)."""
+    explicit: Array
+    """Steps that an explicit method would need for stability alone (trials,): the integral of the spectral radius of
+    the Jacobian along the solution, over what a step may cover; 0 unless asked for."""
+
+
+@dataclass(frozen=True)
+class Rodas5P:
+    """Integrates a model; an error of `rtol` of each state is allowed in a step."""
+
+    model: OdeMeasurement
+    rtol: float = 1e-8
+
+    @cached_property
+    def _programs(self) -> dict[str, Function]:
+        """The equations and the derivatives that the method needs, as functions of arrays over lanes."""
+        model, g = self.model, Graph()
+        n, q, constants = model.states, model.n, model.cases.shape[1]
+        t, y, p, c = g.input("t"), g.inputs("y", n), g.inputs("p", q), g.inputs("c", constants)
+        k, s, d = g.inputs("k", n), g.inputs("s", n), g.inputs("d", q)
+        one, point, ways = g.constant(1.0), [t, *y, *p, *c], [*s, *d]
+
+        def lift(values: Sequence[Any]) -> list[Expression]:
+            return [v if isinstance(v, Expression) else g.constant(float(v)) for v in values]
+
+        f, h, start = lift(model.rhs(t, y, p, c)), lift(model.read(t, y, p, c)), lift(model.start(p, c))
+        along = dict(zip([*y, *p], ways, strict=True))
+        in_time, turned = tangent(f, {t: one}), tangent(f, dict(zip(y, k, strict=True)))
+        columns = [tangent(f, {a: one}) for a in y]
+        recorded = {
+            "f": (f, point),
+            "J": ([columns[j][i] for i in range(n) for j in range(n)], point),
+            "ft": (in_time, point),
+            "df": (tangent(f, along), point + ways),
+            "dft": (tangent(in_time, along), point + ways),
+            "dJk": (tangent(turned, along), [*point, *k, *ways]),
+            "start": (start, [*p, *c]),
+            "dstart": (tangent(start, along), [*p, *c, *d]),
+            "read": (h, point),
+            "dread": (tangent(h, along), point + ways),
+        }
+        return {name: _function(Program.of(outputs, inputs)) for name, (outputs, inputs) in recorded.items()}
+
+    def simulate(self, x: Array, stop: int) -> Array:
+        """Readings (trials, cases x stop x outputs) at the first `stop` times; NaN from where a trial breaks down."""
+        return self._integrated(x, stop, sensitive=False)[0]
+
+    def jacobian(self, x: Array, stop: int) -> Array:
+        """Their derivatives by x (trials, cases x stop x outputs, n)."""
+        return self._integrated(x, stop, sensitive=True)[1]
+
+    def work(self, x: Array) -> Work:
+        """What the integration takes; any tolerance that shows the solution's shape will do."""
+        return self._integrated(x, len(self.model.times), sensitive=False, stretch=True)[2]
+
+    def _integrated(self, x: Array, stop: int, *, sensitive: bool, stretch: bool = False) -> tuple[Array, Array, Work]:
+        run = _Run(self, x, stop, sensitive=sensitive, stretch=stretch)
+        with np.errstate(all="ignore"):
+            run.all_steps()
+        cases, outputs, trials = len(self.model.cases), len(self.model.outputs), len(x)
+        z = run.z.transpose(2, 1, 0).reshape(trials, cases * stop * outputs)
+        J = run.J.transpose(3, 1, 0, 2).reshape(trials, cases * stop * outputs, -1)
+        steps, explicit = (a.reshape(trials, cases).max(axis=1, initial=0) for a in (run.steps, run.stretch))
+        return z, J * self.model.si_sizes if sensitive else J, Work(steps, explicit)
+
+
+class _Run:
+    """The lanes of one integration; arrays are (..., lanes)."""
+
+    def __init__(self, method: Rodas5P, x: Array, stop: int, *, sensitive: bool, stretch: bool) -> None:
+        model, self.do, self.rtol = method.model, method._programs, method.rtol
+        self.atol = _SMALLEST * method.rtol
+        self.times, self.end = np.asarray(model.times, dtype=float)[:stop], float(model.times[-1])
+        cases, self.q = model.cases, model.n if sensitive else 0
+        lanes, n = len(x) * len(cases), model.states
+        self.p = np.repeat(x * model.si_sizes, len(cases), axis=0).T.copy()
+        self.c = np.tile(cases, (len(x), 1)).T.copy()
+        self.directions = np.eye(model.n)[:, :, None]
+        self.y = _stacked(self.do["start"](*self.p, *self.c), (lanes,))
+        self.S = np.zeros((n, 0, lanes))
+        if sensitive:
+            self.S = _stacked(self.do["dstart"](*self.p, *self.c, *self.directions), (self.q, lanes))
+        self.z = np.full((len(model.outputs), stop, lanes), np.nan)
+        self.J = np.full((len(model.outputs), stop, self.q, lanes), np.nan)
+        self.t, self.place, self.steps = np.zeros(lanes), np.zeros(lanes, int), np.zeros(lanes, int)
+        self.stretch, self.stretched = np.zeros(lanes), stretch
+
+    def all_steps(self) -> None:
+        """Integrates every lane to the last time, reading on the way."""
+        h = self._first_step()
+        live = np.arange(len(self.t))
+        while True:
+            self._read(live)
+            going = (self.place[live] < len(self.times)) & (self.steps[live] < _MOST_STEPS) & np.isfinite(h[live])
+            live = live[going]
+            if not len(live):
+                return
+            left = self.times[self.place[live]] - self.t[live]
+            # A step that would leave a sliver before the next reading is halved, one that overshoots is cut.
+            now = np.where(h[live] >= left * (1 - 1e-9), left, np.where(2 * h[live] > left, left / 2, h[live]))
+            y, S, error = self._step(live, now)
+            self.steps[live] += 1
+            good = error <= 1
+            change = np.clip(_SAFETY * np.maximum(error, 1e-10) ** -0.2, _SHRINK, _GROW)
+            wanted = now * np.where(np.isfinite(error), change, _SHRINK)
+            # What a reading cut short says nothing against the step that was wanted.
+            h[live] = np.where(good & (now < h[live]), np.maximum(wanted, h[live]), wanted)
+            h[live] = np.where(self.t[live] + 8 * h[live] == self.t[live], np.nan, h[live])
+            done = live[good]
+            self.t[done] = np.where(now[good] == left[good], self.times[self.place[done]], self.t[done] + now[good])
+            self.y[:, done], self.S[:, :, done] = y[:, good], S[:, :, good]
+
+    def _read(self, live: Array) -> None:
+        """Takes the readings whose time has come, at t = 0 too, in all lanes `live`."""
+        here = live
+        while True:
+            here = here[self.place[here] < len(self.times)]
+            here = here[self.t[here] == self.times[self.place[here]]]
+            if not len(here):
+                return
+            at = self._at(here)
+            self.z[:, self.place[here], here] = _stacked(self.do["read"](*at), (len(here),))
+            if self.q:
+                slopes = _stacked(self.do["dread"](*at, *self.S[:, :, here], *self.directions), (self.q, len(here)))
+                self.J[:, self.place[here], :, here] = slopes.transpose(2, 0, 1)
+            self.place[here] += 1
+
+    def _at(self, lanes: Array) -> tuple[Any, ...]:
+        return (self.t[lanes], *self.y[:, lanes], *self.p[:, lanes], *self.c[:, lanes])
+
+    def _step(self, live: Array, h: Array) -> tuple[Array, Array, Array]:
+        """States, sensitivities and the error in units of the tolerance after a step h of the lanes `live`."""
+        do, q, lanes = self.do, self.q, len(live)
+        t, y, p, c, S = self.t[live], self.y[:, live], self.p[:, live], self.c[:, live], self.S[:, :, live]
+        n, at = len(y), (t, *y, *p, *c)
+        J = _stacked(do["J"](*at), (lanes,)).reshape(n, n, lanes)
+        if self.stretched:
+            finite = np.nan_to_num(np.moveaxis(J, 2, 0), posinf=0.0, neginf=0.0)
+            self.stretch[live] += np.abs(np.linalg.eigvals(finite)).max(axis=1) * h / _REACH
+        W = -J
+        W[range(n), range(n)] += 1 / (h * GAMMA)
+        exchanged = _factor(W)
+        ft = _stacked(do["ft"](*at), (lanes,))
+        ways = (*S, *self.directions)
+        dft = _stacked(do["dft"](*at, *ways), (q, lanes)) if q else 0.0
+        K: list[Array] = []
+        D: list[Array] = []
+        u, V = y, S
+        for a, b, node, weight in zip(A, C, NODES, TIME_WEIGHTS, strict=True):
+            u = y + sum(w * k for w, k in zip(a, K, strict=True))
+            inside = (t + node * h, *u, *p, *c)
+            rest = _stacked(do["f"](*inside), (lanes,)) + h * weight * ft
+            rest = rest + sum(w * k for w, k in zip(b, K, strict=True)) / h
+            K.append(_solve(W, exchanged, rest[:, None])[:, 0])
+            if q:
+                V = S + sum(w * k for w, k in zip(a, D, strict=True))
+                rest = _stacked(do["df"](*inside, *V, *self.directions), (q, lanes)) + h * weight * dft
+                rest = rest + sum(w * k for w, k in zip(b, D, strict=True)) / h
+                rest = rest + _stacked(do["dJk"](*at, *K[-1], *ways), (q, lanes))
+                D.append(_solve(W, exchanged, rest))
+        y1 = u + K[-1]  # stiffly accurate: the last stage is the error of the embedded solution
+        size = self.atol + self.rtol * np.maximum(np.abs(y), np.abs(y1))
+        return y1, V + D[-1] if q else S, (np.abs(K[-1]) / size).max(axis=0)
+
+    def _first_step(self) -> Array:
+        end = self.end or 1.0
+        scale = self.atol + self.rtol * np.abs(self.y)
+        f = _stacked(self.do["f"](np.zeros(len(self.t)), *self.y, *self.p, *self.c), self.t.shape)
+        speed, size = (np.abs(f) / scale).max(axis=0), (np.abs(self.y) / scale).max(axis=0)
+        return np.where((speed > 1e-5) & (size > 1e-5), np.minimum(1e-3 * size / speed, end), 1e-6 * end)
+
+
+def _function(program: Program) -> Function:
+    """A program as a function of arrays; its outputs may be numbers."""
+
+    def run(*inputs: Any) -> list[Any]:
+        values: list[Any] = list(inputs)
+        for operation, *operands in program.operations:
+            values.append(_apply(operation, operands, values))
+        return [values[i] for i in program.outputs]
+
+    return run
+
+
+def _apply(operation: str, operands: Sequence[Any], values: Sequence[Any]) -> Any:
+    if operation == "constant":
+        return operands[0]
+    args = [values[i] for i in operands]
+    match operation:
+        case "fma":
+            return args[0] * args[1] + args[2]
+        case "fms":
+            return args[0] * args[1] - args[2]
+        case "fnma":
+            return args[2] - args[0] * args[1]
+    return (_UFUNCS.get(operation) or getattr(np, operation))(*args)
+
+
+def _stacked(values: Sequence[Any], shape: tuple[int, ...]) -> Array:
+    out = np.empty((len(values), *shape))
+    for row, value in zip(out, values, strict=True):
+        row[...] = value
+    return out
+
+
+def _factor(W: Array) -> list[Array]:
+    """The LU decomposition with row pivots of every lane of W (n, n, lanes), in place; the rows (lanes,) exchanged."""
+    lanes, exchanged = np.arange(W.shape[2]), []
+    for k in range(len(W)):
+        row = k + np.argmax(np.abs(W[k:, k]), axis=0)
+        top = W[k].T.copy()
+        W[k] = W[row, :, lanes].T
+        W[row, :, lanes] = top
+        W[k + 1 :, k] /= W[k, k]
+        W[k + 1 :, k + 1 :] -= W[k + 1 :, k, None] * W[k, k + 1 :]
+        exchanged.append(row)
+    return exchanged
+
+
+def _solve(W: Array, exchanged: Sequence[Array], b: Array) -> Array:
+    """W^-1 b of every lane for b (n, columns, lanes), in place."""
+    lanes = np.arange(b.shape[2])
+    for k, row in enumerate(exchanged):
+        top = b[k].T.copy()
+        b[k] = b[row, :, lanes].T
+        b[row, :, lanes] = top
+    for k in range(len(W)):
+        b[k + 1 :] -= W[k + 1 :, k, None] * b[k]
+    for k in reversed(range(len(W))):
+        b[k] /= W[k, k]
+        b[:k] -= W[:k, k, None] * b[k]
+    return b

@@ -1,0 +1,114 @@
+"""Stiff equations: published digits, exact solutions, SciPy's Radau, and which method a model is given."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from ipe_bench.measurements import Ode
+from ipe_bench.measurements.base import differentiate
+from ipe_bench.measurements.ode.rodas import Rodas5P
+
+HIRES = {
+    "y1": "-1.71*y1+0.43*y2+8.32*y3+0.0007",
+    "y2": "1.71*y1-8.75*y2",
+    "y3": "-10.03*y3+0.43*y4+0.035*y5",
+    "y4": "8.32*y2+1.71*y3-1.12*y4",
+    "y5": "-1.745*y5+0.43*y6+0.43*y7",
+    "y6": "-k*y6*y8+0.69*y4+1.71*y5-0.43*y6+0.69*y7",
+    "y7": "k*y6*y8-1.81*y7",
+    "y8": "-k*y6*y8+1.81*y7",
+}
+
+
+def robertson(*times):
+    rates = {"a": "-k1*a + k3*b*c", "b": "k1*a - k3*b*c - k2*b*b", "c": "k2*b*b"}
+    return Ode(rates=rates, start={"k1": 0.04, "k2": 3e7, "k3": 1e4}, initial={"a": 1.0}, times=times)
+
+
+def van_der_pol(mu, end):
+    rates = {"u": "v", "v": "mu*(1-u*u)*v - u"}
+    return Ode(rates=rates, start={"mu": mu}, initial={"u": 2.0}, times=tuple(np.linspace(end / 20, end, 20)))
+
+
+def hires():
+    return Ode(rates=HIRES, start={"k": 280.0}, initial={"y1": 1.0, "y8": 0.0057}, times=(321.8122,))
+
+
+def follower(**options):
+    """A state that follows exp(-t / 100) with a time constant of 1 / k."""
+    rates, outputs = {"w": "-0.01*w", "y": "-k*(y-w)"}, {"y": "y"}
+    options = {"start": {"k": 100.0}, "times": tuple(np.arange(0.0, 241.0, 10.0))} | options
+    return Ode(rates=rates, outputs=outputs, initial={"w": 1.0}, **options)
+
+
+# F. Mazzia and C. Magherini, Test Set for Initial Value Problem Solvers, release 2.4, Bari, 2008.
+@pytest.mark.parametrize(
+    ("model", "expected", "left"),
+    [
+        (robertson(1e11), (0.2083340149701255e-7, 0.8333360770334713e-13, 0.9999999791665050), 5e-9),
+        (van_der_pol(1000.0, 2000.0), (1.706167732170469, -0.8928097010248125e-3), 2e-8),
+        (
+            hires(),
+            (
+                *(0.7371312573325668e-3, 0.1442485726316185e-3, 0.5888729740967575e-4, 0.1175651343283149e-2),
+                *(0.2386356198831331e-2, 0.6238968252742796e-2, 0.2849998395185769e-2, 0.2850001604814231e-2),
+            ),
+            5e-9,
+        ),
+    ],
+    ids=["robertson", "van der pol", "hires"],
+)
+def test_the_digits_of_the_test_set(model, expected, left):
+    z = Rodas5P(model.whole, 1e-8).simulate(model.nominal[None], len(model.times))[0]
+    np.testing.assert_allclose(z[-len(expected) :], expected, rtol=left)
+
+
+def test_a_stiff_model_is_found_and_is_within_its_tolerance():
+    model = follower()
+    t, k = np.array(model.times), 100.0
+    exact = k / (k - 0.01) * (np.exp(-0.01 * t) - np.exp(-k * t))
+    assert model.whole.stiff
+    np.testing.assert_allclose(model.simulate(np.array([[1.0]]))[0], exact, atol=1e-8)
+    slope = -0.01 / (k - 0.01) ** 2 * (np.exp(-0.01 * t) - np.exp(-k * t)) + k / (k - 0.01) * t * np.exp(-k * t)
+    np.testing.assert_allclose(model.jacobian(np.array([[1.0]]))[0, :, 0], k * slope, atol=1e-8)
+
+
+def test_readings_beside_radau_and_slopes_beside_differences():
+    model = robertson(*np.logspace(0, 5, 6))
+    x = model.nominal * np.array([[1.0, 1.0, 1.0], [1.1, 0.9, 1.05]])
+    z, J = model.simulate(x), model.jacobian(x)
+    for row, p in zip(z, x * model.sizes, strict=True):
+
+        def rhs(t, y, p=p):
+            return model.whole.rhs(t, y, p, ())
+
+        solved = solve_ivp(rhs, (0, 1e5), [1.0, 0.0, 0.0], "Radau", model.times, rtol=1e-10, atol=1e-16)
+        np.testing.assert_allclose(row.reshape(-1, 3), solved.y.T, rtol=1e-7)
+    by_differences = differentiate(model.simulate, x, analytic=False)
+    np.testing.assert_allclose(J, by_differences, atol=1e-7 * np.abs(by_differences).max())
+
+
+def test_a_trial_and_a_prefix_have_the_same_bits_alone_and_in_a_batch():
+    model = robertson(*np.logspace(0, 5, 6))
+    x = model.nominal + 0.1 * np.random.default_rng(0).standard_normal((7, 3))
+    assert np.array_equal(model.simulate(x)[4:5], model.simulate(x[4:5]))
+    assert np.array_equal(model.jacobian(x)[4:5], model.jacobian(x[4:5]))
+    assert np.array_equal(model.simulate_until(x, 3), model.simulate(x)[:, :9])
+
+
+@pytest.mark.parametrize(("mu", "stiff"), [(3.0, False), (30.0, False), (300.0, True)])
+def test_the_rule_tells_stiff_oscillators_from_others(mu, stiff):
+    assert van_der_pol(mu, 2 * mu).whole.stiff == stiff
+
+
+def test_a_trial_that_explicit_steps_do_not_follow_is_integrated_implicitly():
+    model = follower(start={"k": 0.5}, times=(10.0, 20.0))
+    x = np.array([[1.0], [1e5]])  # k = 0.5 and 50,000
+    assert not model.whole.stiff
+    z = model.simulate(x)[1]
+    np.testing.assert_allclose(z, np.exp(-0.01 * np.array(model.times)), rtol=1e-6)
+    assert np.array_equal(model.simulate(x)[:1], replace(model, method="explicit").simulate(x[:1]))
+    off = np.abs(replace(model, method="explicit").simulate(x)[1] - z)
+    assert not (off < 1e-6).all()
