@@ -16,7 +16,7 @@ __version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from ipe_bench import baselines, measurements, noise, priors, solvers
-    from ipe_bench.api import check, compare, design, estimate, load, posterior, report, run, status
+    from ipe_bench.api import audit, check, compare, design, estimate, load, posterior, report, run, status
     from ipe_bench.basics.errors import UserError
     from ipe_bench.basics.statuses import Status
     from ipe_bench.estimators.base import Estimates, Estimator
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ipe_bench.trials.scenario import Scenario
 
 _HOMES = {
-    "api": ("check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status"),
+    "api": ("audit", "check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status"),
     "basics.errors": ("UserError",),
     "basics.statuses": ("Status",),
     "estimators.base": ("Estimates", "Estimator"),
@@ -52,6 +52,7 @@ __all__ = [
     "Status",
     "UserError",
     "__version__",
+    "audit",
     "baselines",
     "check",
     "compare",

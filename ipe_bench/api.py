@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from ipe_bench.report import ReportResult
     from ipe_bench.report.answer import Answer
     from ipe_bench.report.choice import Which
+    from ipe_bench.statistics.audit import Audit
     from ipe_bench.trials.design import Criterion, Design
     from ipe_bench.trials.posterior import Reference
 
@@ -228,6 +229,35 @@ def compare(
 
         write_comparison(frame, Path(output), alpha)
     return frame
+
+
+def audit(table: Path | str | pd.DataFrame, *, output: Path | str | None = None) -> Audit:
+    """Whether the covariance that another program reports describes its errors.
+
+    `table` is a CSV or Parquet file, or a frame, with a row per run: NAME_true and NAME (or NAME_error), NAME_std (or
+    NAME_var), and cov_A_B as far as there are any; see `ipe_bench.statistics.audit.read_claims`. The result has
+    `sentences`, at most three, the strongest first; `scale`, by which factor true errors exceed the reported standard
+    deviations, with an interval that needs no normal law; and `table()`, the same for each parameter. With `output`,
+    audit.csv and audit.html are written there.
+
+    >>> import numpy as np, pandas as pd, ipe_bench as ib
+    >>> error = np.random.default_rng(0).normal(0, 0.3, 200)
+    >>> found = ib.audit(pd.DataFrame({"x_error": error, "x_std": 0.1}))
+    >>> found.scale.verdict, round(found.scale.value, 1)
+    ('too small', 2.9)
+
+    Raises:
+        UserError: a column is missing, a covariance is none, or there are too few runs.
+    """
+    from ipe_bench.statistics.audit import audit as examined
+    from ipe_bench.statistics.audit import read_claims
+
+    found = examined(read_claims(table))
+    if output is not None:
+        from ipe_bench.report.audited import write_audit
+
+        write_audit(found, Path(output))
+    return found
 
 
 def status(directories: Directories) -> pd.DataFrame:

@@ -170,6 +170,18 @@ output=DIR           writes comparison.csv, comparison.html, and comparison as P
 """,
         (_several("arguments", "DIR", "one or two folders of results"),),
     ),
+    "audit": (
+        "whether the covariance that another program reports describes its errors",
+        "0 it may; 1 it is surely too small or too large",
+        """
+  ipe-bench audit runs.csv
+  ipe-bench audit runs.parquet output=outputs/audit       audit.csv and audit.html, too
+
+A row per run, with columns NAME_true and NAME (or NAME_error), NAME_std (or NAME_var), and cov_A_B as far as there are
+any; or long: run, parameter, true, estimate, std. Rows of one run have its number in the column run.
+""",
+        (_several("arguments", "FILE", "a table of truths, estimates and what was claimed of them"),),
+    ),
     "bundle": (
         "results in one archive to share, or whether such an archive is whole",
         _MISSING,

@@ -34,6 +34,8 @@ _DRAWS = 1999
 _DEGREE = 180 / np.pi
 _WEIGHTS = {"scale": 5.0, "direction": 2.0, "bias": 1.0, "tails": 1.0, "trend": 1.0}
 """Shares of the level that the families of sentences have: the first question is the one that is asked most."""
+_MANY = 1000
+"""Rows above which the null distribution of the fourth moment is taken for normal."""
 _LARGEST = 10.0
 """Ends of an interval more than so many times its middle are not shown."""
 
@@ -98,10 +100,12 @@ class Factor:
             return "too large"
         return "right" if self.low > 1 / MATTERS and self.high < MATTERS else "undecided"
 
-    def __str__(self) -> str:
-        if not self.high < _LARGEST * self.value:
-            return f"{self.value:.2f} times (surely more than {self.low:.2g})"
-        return f"{self.value:.2f} times ({self.low:.2f} to {self.high:.2f})"
+    @property
+    def words(self) -> str:
+        """How large true errors are beside the reported ones."""
+        known = self.high < _LARGEST * self.value
+        span = f"{self.low:.2f} to {self.high:.2f}" if known else f"surely more than {self.low:.2g}"
+        return f"{self.value:.2f} times as large as reported ({span})"
 
 
 @dataclass(frozen=True)
@@ -166,12 +170,12 @@ def audit(claims: Claims) -> Audit:
 def _of_scale(claims: Claims, scale: Factor, nees: Array, refused: bool) -> str:
     if refused:
         only, size = ("", "small") if scale.value > 1 else ("only ", "large")
-        return f"True errors are {only}{scale} as large as reported: the covariance is too {size}."
+        return f"True errors are {only}{scale.words}: the covariance is too {size}."
     if scale.verdict == "right":
-        return f"True errors are {scale} as large as reported: the covariance can be believed."
+        return f"True errors are {scale.words}: the covariance can be believed."
     needed = _runs_needed(claims, nees)
     return (
-        f"True errors are {scale} as large as reported: {claims.runs} runs cannot tell if the covariance is right; "
+        f"True errors are {scale.words}: {claims.runs} runs cannot tell if the covariance is right; "
         f"a standard deviation that is wrong by 10 % would be seen in {needed} runs."
     )
 
@@ -208,8 +212,8 @@ class _Families:
         if claims.n > 1 and claims.correlation is not None:
             self.tests["direction"], self.words["direction"] = self._directed, self._direction_words
         if self.independent:
-            squares = [nees] if joint else list(np.square(claims.z).T)
-            found = [_tails(column, claims.n if joint else 1) for column in squares]
+            parts = [claims.w] if joint else [column[:, None] for column in claims.z.T]
+            found = [_tails(part) for part in parts]
             self._tails = min(1.0, len(found) * min(p for p, _ in found)), max(ratio for _, ratio in found)
             self.tests["tails"], self.words["tails"] = lambda level: self._tails[0] <= level, self._tail_words
         self._trend = _trend(claims, nees)
@@ -239,13 +243,14 @@ class _Families:
         return self._direction[0] <= level
 
     def _direction_words(self) -> str:
-        claims, v = self.claims, self._direction[1]
-        (factor,) = _factors(claims, np.square(claims.w @ v)[:, None], 1 - ALPHA)
+        claims = self.claims
         assert claims.correlation is not None
+        found = [(_factors(claims, np.square(claims.w @ v)[:, None], 1 - ALPHA)[0], v) for v in self._direction[1]]
+        factor, v = max(found, key=lambda pair: abs(np.log(pair[0].value)))
         values, vectors = np.linalg.eigh(claims.correlation.mean(axis=0))
         c = (vectors * values**-0.5) @ vectors.T @ v
         named = _combination(c / np.linalg.norm(c), claims.names)
-        return f"The worst direction is {named} (in reported deviations), where they are {factor} as large."
+        return f"In the worst direction, {named} in reported deviations, true errors are {factor.words}."
 
     def _tail_words(self) -> str:
         return (
@@ -282,7 +287,7 @@ def _bias(claims: Claims, alpha: float = ALPHA) -> Array:
 
 
 def _worst_direction(claims: Claims) -> tuple[float, Array]:
-    """The unit vector (n,) along which w is longest or shortest beside the others, and how often chance does as much.
+    """How often chance does as much, and the unit vectors (2, n) along which w is shortest and longest.
 
     Lengths are let go: u = w / |w| is uniform on the sphere under any spherical law, normal or not, so the extreme
     eigenvalues of its scatter have one null distribution (Tyler, Biometrika 74, 1987). Of several rows of a run the
@@ -293,10 +298,7 @@ def _worst_direction(claims: Claims) -> tuple[float, Array]:
     values, vectors = np.linalg.eigh(n * (u.T @ u) / len(u))
     smallest, largest = _null_eigenvalues(len(u), n)
     p = [(1 + np.sum(smallest <= values[0])) / (1 + _DRAWS), (1 + np.sum(largest >= values[-1])) / (1 + _DRAWS)]
-    ends = ((values[0], smallest), (values[-1], largest))
-    # Both may be as rare as can be told: then the one further outside, in logarithmic standard deviations.
-    far = [abs(np.log(value / np.median(null))) / np.log(null).std() for value, null in ends]
-    return min(1.0, 2 * float(min(p))), vectors[:, -1 if far[1] > far[0] else 0]
+    return min(1.0, 2 * float(min(p))), vectors[:, [0, -1]].T
 
 
 @lru_cache(maxsize=8)
@@ -311,17 +313,26 @@ def _null_eigenvalues(rows: int, n: int) -> tuple[Array, Array]:
     return found[:, 0], found[:, -1]
 
 
-def _tails(nees: Array, n: int) -> tuple[float, float]:
-    """How often chi-square scatters as much, and E[d^2] / E[d]^2 over that of chi-square, n (n + 2) / n^2 (Mardia,
-    Biometrika 57, 1970, for a known mean)."""
-    ratio = float(np.mean(nees**2) / np.mean(nees) ** 2 * n / (n + 2))
-    return float((1 + np.sum(_null_ratio(len(nees), n) >= ratio)) / (1 + _DRAWS)), ratio
+def _tails(w: Array) -> tuple[float, float]:
+    """How often normal errors of any covariance have as large a fourth moment, and E[d^2] over that of normal errors,
+    n (n + 2), where d = w' S^-1 w with the scatter S of w (rows, n) (Mardia, Biometrika 57, 1970, for a known mean)."""
+    rows, n = w.shape
+    usual = n * (n + 2)
+    ratio = _fourth_moment(w) / usual
+    if rows > _MANY:
+        return float(ndtr(-(ratio - 1) * usual / np.sqrt(8 * usual / rows))), ratio
+    return float((1 + np.sum(_null_fourth_moment(rows, n) >= ratio * usual)) / (1 + _DRAWS)), ratio
+
+
+def _fourth_moment(w: Array) -> float:
+    d = np.sum(w * np.linalg.solve(w.T @ w / len(w), w.T).T, axis=1)
+    return float(np.mean(d**2))
 
 
 @lru_cache(maxsize=8)
-def _null_ratio(rows: int, n: int) -> Array:
-    d = np.random.default_rng([rows, n, 1]).chisquare(n, (_DRAWS, rows))
-    return np.mean(d**2, axis=1) / np.mean(d, axis=1) ** 2 * n / (n + 2)
+def _null_fourth_moment(rows: int, n: int) -> Array:
+    rng = np.random.default_rng([rows, n, 1])
+    return np.array([_fourth_moment(rng.standard_normal((rows, n))) for _ in range(_DRAWS)])
 
 
 def _trend(claims: Claims, nees: Array) -> tuple[float, str, str] | None:

@@ -17,7 +17,7 @@ from ipe_bench import api
 from ipe_bench.runs.store import ResultKey
 
 HEAVY = ("pandas", "matplotlib", "seaborn", "hydra", "omegaconf", "filterpy", "llvmlite", "rich")
-FUNCTIONS = ("check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status")
+FUNCTIONS = ("audit", "check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status")
 
 
 @pytest.mark.parametrize("use", ["pass", "ib.Scenario, ib.Status, ib.UserError, ib.Estimator", "ib.noise.Gaussian"])

@@ -1,5 +1,7 @@
 """Foreign covariances: planted faults are named, honest reports are left in peace, and files are read or refused."""
 
+import re
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -52,9 +54,11 @@ def test_honest_reports_are_believed_or_left_open(law):
 def test_a_planted_direction_is_named():
     rng = np.random.default_rng(3)
     told = [audit(claims(rng, stretched=3.0)).sentences for _ in range(10)]
-    named = [s for sentences in told for s in sentences if s.startswith("The worst direction")]
+    named = [s for sentences in told for s in sentences if s.startswith("In the worst direction")]
     assert len(named) >= 9
-    assert all("1.7" in s or "1.6" in s or "1.8" in s or "1.5" in s or "1.9" in s for s in named)
+    factors = [float(re.search(r"errors are ([\d.]+) times", s)[1]) for s in named]
+    assert all(1.4 < factor < 2.1 for factor in factors)  # the root of 3 is planted
+    assert not any("tails" in s for sentences in told for s in sentences)
 
 
 def test_heavy_tails_bias_and_trend_are_told_apart_from_scale():

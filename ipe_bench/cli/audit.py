@@ -1,0 +1,24 @@
+"""`ipe-bench audit FILE`: whether the covariance that another program reports describes its errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.cli import given_keys, say, show
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Prints what was found; exit code 1 if the covariance is surely wrong."""
+    files = [a for a in arguments if "=" not in a]
+    given = given_keys("audit", [a for a in arguments if "=" in a], ("output",))
+    if len(files) != 1:
+        raise UserError("audit: name one table of truths, estimates and deviations, such as runs.csv")
+    from ipe_bench.api import audit
+    from ipe_bench.report.audited import contents
+
+    found = audit(files[0], output=given.get("output"))
+    show(contents(found))
+    if "output" in given:
+        say(f"\nTable   {given['output']}/audit.csv", f"Page    {given['output']}/audit.html")
+    return 1 if found.scale.verdict in ("too small", "too large") else 0
