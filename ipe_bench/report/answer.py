@@ -14,6 +14,7 @@ import numpy as np
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement
+from ipe_bench.measurements.identifiability import structure
 from ipe_bench.real.estimation import Opened
 from ipe_bench.real.examination import CONFIDENCE, Examination
 from ipe_bench.real.fits import Fit
@@ -121,15 +122,17 @@ class Answer:
 
 def contents(answer: Answer) -> Iterator[Part]:
     """The tables and sentences of an answer, in order."""
+    found = structure(answer.model)
+    yield from (Strong(f"No data can tell: {sentence}.") for sentence in (found.sentences if found else ()))
     yield _estimates(answer)
     yield _verdicts(answer)
     yield from _outliers(answer)
-    for found in answer.examinations:
-        passes = answer[found.label].passes
+    for one in answer.examinations:
+        passes = answer[one.label].passes
         if passes:
-            yield _intervals(found)
-        if passes or not found.least:
-            for remark in remarks(found, _reading_labels(answer.model)):
+            yield _intervals(one)
+        if passes or not one.least:
+            for remark in remarks(one, _reading_labels(answer.model)):
                 yield Strong(remark) if remark.split(":")[0].isupper() else remark
 
 

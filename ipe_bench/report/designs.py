@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ipe_bench.measurements.identifiability import structure
 from ipe_bench.report.table import Part, Strong, Table, texts, words
 from ipe_bench.report.words import enumerate_few, percent
 from ipe_bench.report.writer import picked, plain, write
@@ -37,12 +38,22 @@ def contents(name: str, design: Design) -> Iterator[Part]:
     seen = design.observability
     direction = "Least observable direction" if seen.observable else "The readings do not determine"
     yield Strong(f"{direction}: {seen.words}")
+    yield from _structure(design)
     if design.threshold:
         yield _threshold(design)
     yield from _suspects(design)
     yield from _ways(design)
     if design.effects:
         yield _effects(design)
+
+
+def _structure(design: Design) -> Iterator[Part]:
+    """What no readings of the model's outputs can tell, however many and exact; nothing of models not examined."""
+    found = structure(design.scenario.measurement)
+    if found is not None and not found.lost:
+        yield f"Exact readings would tell all {len(found.unknowns)} parameters from their neighbours."
+    for sentence in found.sentences if found else ():
+        yield Strong(f"No data can tell: {sentence}.")
 
 
 def _parameters(name: str, design: Design) -> Table:

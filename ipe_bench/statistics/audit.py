@@ -404,7 +404,7 @@ def read_claims(table: Path | str | pd.DataFrame) -> Claims:
         if (bad := there & ~(deviation[:, i] > 0)).any():
             row = int(np.flatnonzero(bad)[0]) + 2
             raise UserError(f"{name}: row {row}: the deviation of {parameter} is not above 0")
-    frame, error, deviation = frame[there], error[there], deviation[there]
+    frame, error, deviation = frame.iloc[np.flatnonzero(there)], error[there], deviation[there]
     used = {"run", *(c for p in names for c in frame.columns if c == p or c.startswith(f"{p}_"))}
     numbers = frame.select_dtypes("number")
     trends = {
@@ -436,7 +436,7 @@ def _widened(frame: pd.DataFrame, name: str) -> pd.DataFrame:
     if frame.duplicated([*index, "parameter"]).any():
         row = int(np.flatnonzero(frame.duplicated([*index, "parameter"]))[0]) + 2
         raise UserError(f"{name}: row {row}: a parameter stands there a second time in {', '.join(index)}")
-    wide = frame.set_index([*index, "parameter"])[values].unstack("parameter")  # noqa: PD010
+    wide = frame.pivot_table(index=index, columns="parameter", values=values, sort=False)
     wide.columns = [p if value == "estimate" else f"{p}_{value}" for value, p in wide.columns]
     return wide.reset_index()
 
