@@ -285,6 +285,7 @@ class _Engine(OdeMeasurement):
 
     described: Ode
 
+    stiff_remedy = "measurement.method=implicit follows them"
     states = property(lambda engine: len(engine.described.rates))  # type: ignore[assignment]
     outputs = property(lambda engine: tuple(engine.described.output_formulas))  # type: ignore[assignment]
     time_unit = property(lambda engine: engine.described.time_unit)  # type: ignore[assignment]
@@ -361,9 +362,11 @@ class _Engine(OdeMeasurement):
         return self.jacobian_cost if self.stiff else super().coarse_jacobian_cost
 
     def hindrance(self, x: Array) -> str:
-        if np.isfinite(self._implicit.simulate(own(x[None, : self.n]), len(self.times))).all() and self.stiff:
+        x = own(x[None, : self.n])
+        implicit = self.stiff or len(self._beyond(x))
+        if implicit and np.isfinite(self._implicit.simulate(x, len(self.times))).all():
             return ""
-        return super().hindrance(x)
+        return super().hindrance(x[0])
 
     @cached_property
     def tolerance(self) -> float:  # type: ignore[override]

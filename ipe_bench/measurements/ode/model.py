@@ -68,6 +68,8 @@ class OdeMeasurement(Measurement):
     shortest_step: float = 0.0
     """Steps do not become shorter than about this, however wild the parameters, nor than 1/1024 of the usual interval
     between readings: what an iterate that diverges may cost."""
+    stiff_remedy: ClassVar[str] = "put what decays fast in balance with the rest"
+    """What to do about equations that are stiff."""
     trusted_angle: float = 0.0
     """A step that is at most this over `fastest_rate` is known to hold the tolerance; 0: every trial is tested."""
 

@@ -34,7 +34,7 @@ def diagnose(model: OdeMeasurement, x: Array, shortest: float) -> str:
     needed = _STABLE / fastest if fastest > 0 else np.inf
     if needed >= shortest:
         return f"steps of {shortest:.2g}{unit}, the shortest, are too long for these equations"
-    looks = "; they look stiff: put what decays fast in balance with the rest" if fastest > _STIFF * slow else ""
+    looks = f"; they look stiff: {model.stiff_remedy}" if fastest > _STIFF * slow else ""
     return f"the equations need steps of {needed:.2g}{unit} at t = {t:.4g}, and the shortest is {shortest:.2g}{looks}"
 
 
