@@ -113,35 +113,6 @@ def test_a_trial_that_fails_has_a_status_and_disturbs_no_other(estimator):
     assert mixed.messages[3] == "ArithmeticError: too far"
 
 
-@pytest.mark.parametrize(
-    ("kind", "options"),
-    [
-        *((GaussNewton, {"start": "home"}), (Progressive, {"growth": 1.0}), (Relinearized, {"inner_iterations": 0})),
-        *(
-            (EKF, {"prior_inflation": 0.0}),
-            (EKF, {"process_noise": -1.0}),
-            (EnKF, {"members": 1}),
-            (EnKF, {"seed": -1}),
-        ),
-        *((IteratedEKF, {o: 0}) for o in ("max_iterations", "tolerance")),
-        *((UKF, {"alpha": 0.0}), (UKF, {"kappa": -3.0})),
-        *((RecursiveUpdate, {o: 0}) for o in ("steps", "first", "prior_inflation")),
-        *((LMIEKF, {o: 0}) for o in ("max_iterations", "tolerance", "damping")),
-        *((IPLF, {o: 0}) for o in ("max_iterations", "tolerance")),
-        *((Multistart, {o: 0}) for o in ("starts", "max_iterations", "tolerance", "damping")),
-        *((MultiscaleLM, {o: 0}) for o in ("max_iterations", "tolerance")),
-        *((EsMda, {"members": 1}), (EsMda, {"steps": 0}), (EsMda, {"polish": -1}), (EsMda, {"first": 2})),
-        *((LeastSquares, {"method": "bfgs"}), (LeastSquares, {"start": "zero"}), (LeastSquares, {"loss": "l1"})),
-        *((LeastSquares, {"ftol": 0.0}), (LeastSquares, {"f_scale": 0.0}), (LeastSquares, {"max_nfev": 0})),
-        (MultipleShooting, {"segments": 0}),
-    ],
-)
-def test_a_wrong_option_is_named(kind, options):
-    ((key, value),) = options.items()
-    with pytest.raises(UserError, match=rf"^{key}={value}(\.0)?: (give|choose)"):
-        kind(**options)
-
-
 @pytest.mark.parametrize("estimator", [*FILTERS, EsMda()], ids=str)
 def test_what_an_estimator_needs_is_asked_for(estimator):
     problem = Problem(Bent(), Covariance(np.ones(12)))

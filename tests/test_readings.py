@@ -31,13 +31,6 @@ def european(path: Path) -> Path:
     return path
 
 
-def refusal(path: Path, model) -> str:
-    with pytest.raises(UserError) as told:
-        open_together([path], model)
-    assert "\n" not in str(told.value)
-    return str(told.value).removeprefix(f"readings={path}: ")
-
-
 def with_reading(folder: Path, text: str, separator: str = ",") -> Path:
     """A file of `Bent` whose third reading is that text."""
     rows = [f"{i}{separator}{text if i == 3 else '0.25'}" for i in range(1, 6)]
@@ -80,29 +73,6 @@ def test_no_text_is_read_as_a_number_that_it_does_not_say(tmp_path, text):
     assert (np.isnan(value) and not text.strip()) or (
         set(text.strip()) <= set("0123456789.+-eE") and value == float(text)
     )
-
-
-ROWS = ["1,0.25", "2,0.25", "3,0.25", "4,0.25", "5,0.25"]
-
-
-@pytest.mark.parametrize(
-    ("heading", "rows", "complaint"),
-    [
-        ("number,reading [m]", ["1", *ROWS[1:]], "row 2: has 1 cells and the header 2; a missing reading is an empty"),
-        ("number,reading [m]", ["1,,", *ROWS[1:]], "row 2: has 3 cells and the header 2"),
-        ("number,reading [m],weight", [r + ",0.1" for r in ROWS], "column weight is not understood; remove it"),
-        ("number,reading [m],", [r + "," for r in ROWS], "column 3, which has no name, is not understood; remove it"),
-        ("number,note,reading [m],note", ROWS, "column note stands there twice; keep one"),
-        ("number,reading [m]", ["1\xa0000,0.25", *ROWS[1:]], "row 2: bent has no reading number=1"),
-        ("number,reading [m]", ["1_0,0.25", *ROWS[1:]], "row 2: bent has no reading number=1_0"),
-        ("number,reading [m]", ["１,0.25", *ROWS[1:]], "row 2: bent has no reading number=１"),
-        ("number,reading [m]", [*ROWS, '6,"0.2'], "is not a readable CSV file"),
-    ],
-)
-def test_a_table_of_another_shape_is_refused(tmp_path, heading, rows, complaint):
-    path = tmp_path / "readings.csv"
-    path.write_text("\n".join([heading, *rows]) + "\n", encoding="utf-8")
-    assert complaint in refusal(path, Bent(count=5))
 
 
 def test_labels_are_compared_as_what_they_say(tmp_path):

@@ -34,18 +34,6 @@ def test_seeds_and_trials_are_independent():
     assert np.abs(np.corrcoef(joined.T) - np.eye(16)).max() < 5 / np.sqrt(500)
 
 
-def test_no_two_trials_are_alike():
-    """Every trial twice would halve the sample and look like a sample."""
-    trials = Scenario(Polynomial(), Gaussian(0.1), GaussianPrior(), 1.0).draw(0, 40)
-    for values in (trials.x, trials.z):
-        assert len(np.unique(values, axis=0)) == 40
-
-
-def test_truths_are_those_that_are_drawn():
-    scenario = Scenario(Polynomial(), Gaussian(0.1), GaussianPrior(), 3.0, seed=2)
-    assert np.array_equal(scenario.truths(2, 6), scenario.draw(0, 8).x[2:6])
-
-
 def test_truths_are_normal_about_the_nominal_point_with_the_error_scale():
     scenario = Scenario(Ranging(position=(100.0, 0.0, 0.0)), Gaussian(0.1), GaussianPrior(), 5.0)
     u = (scenario.draw(0, 2000).x - scenario.problem.x0) / 5.0

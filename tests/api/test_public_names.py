@@ -80,15 +80,6 @@ def test_rows_of_trials_say_what_they_belong_to(tmp_path, polynomial):
     np.testing.assert_array_equal(found[[f"error_{name}" for name in names]], estimates.x - drawn)
 
 
-def test_an_estimate_needs_no_scenario_and_finds_what_was_simulated(polynomial):
-    drawn = polynomial.draw(0, 1)
-    fits = ib.estimate(
-        polynomial.measurement, drawn.z[0], {"lm": ib.baselines.LevenbergMarquardt()}, noise=polynomial.noise
-    )
-    assert fits[0].status is ib.Status.CONVERGED
-    assert (np.abs(fits[0].x - drawn.x[0]) < 5 * fits[0].standard_errors).all()
-
-
 def test_a_file_and_an_array_are_estimated_alike(tmp_path, polynomial):
     from ipe_bench.real.readings import write_readings
 
@@ -110,19 +101,6 @@ def test_without_estimators_they_are_those_of_the_command(polynomial):
     command = single("estimate", asked, STANDARD_ESTIMATORS).spec.estimators
     fits = ib.estimate(polynomial.measurement, polynomial.draw(0, 1).z[0], noise=polynomial.noise)
     assert {fit.label for fit in fits} == set(command)
-
-
-def test_noise_that_nobody_states_is_estimated_from_the_residuals(polynomial):
-    """As `scipy.optimize.curve_fit` does without `absolute_sigma`: another implementation of the same definition."""
-    from scipy.optimize import curve_fit
-
-    model, z = polynomial.measurement, polynomial.draw(0, 1).z[0]
-    (found,) = ib.estimate(model, z, {"lm": ib.baselines.LevenbergMarquardt(tolerance=1e-9)}, noise=ib.noise.Unknown())
-    x, P = curve_fit(lambda _, *x: model.simulate(np.array([x]))[0], np.zeros(model.m), z, np.zeros(model.n))
-    np.testing.assert_allclose(found.x, x * model.sizes, rtol=1e-5, atol=1e-7)
-    np.testing.assert_allclose(found.covariance, P * np.outer(model.sizes, model.sizes), rtol=1e-3, atol=1e-12)
-    assert found.fits is None
-    assert np.isnan(found.p_value)
 
 
 @pytest.mark.parametrize(

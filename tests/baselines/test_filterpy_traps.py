@@ -5,10 +5,10 @@ from __future__ import annotations
 import filterpy.stats
 import numpy as np
 import pytest
-from filterpy.kalman import CubatureKalmanFilter, ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
+from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from linear_models import Linear, LinearGins, linear_map
 
-from ipe_bench.baselines import CKF, EKF, UKF
+from ipe_bench.baselines import CKF, UKF
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.problem import Problem
@@ -22,27 +22,6 @@ from ipe_bench.trials.scoring import nees
 def linear_problem():
     scenario = Scenario(Linear(), Gaussian(1.0), GaussianPrior(), 1.0)
     return scenario.problem, scenario.draw(0, 3).z
-
-
-def test_ekf_with_the_default_column_turns_x_into_a_matrix():
-    naive = ExtendedKalmanFilter(dim_x=4, dim_z=3)
-    naive.update(np.ones(3), lambda _: np.ones((3, 4)), lambda x: np.ones((3, 4)) @ x)
-    assert naive.x.shape == (4, 3)
-    problem, z = linear_problem()
-    assert EKF().estimate(problem, z).x.shape == (3, 4)
-
-
-def test_ekf_takes_a_reading_that_is_nan_without_a_word():
-    naive = ExtendedKalmanFilter(dim_x=2, dim_z=1)
-    naive.x = np.zeros(2)
-    naive.update(np.array([np.nan]), lambda _: np.ones((1, 2)), lambda x: x[:1])
-    assert np.isnan(naive.x).all()
-    problem, z = linear_problem()
-    z[1, 0] = np.nan
-    found = EKF().estimate(problem, z)
-    assert [Status(s) for s in found.status] == [Status.CONVERGED, Status.NONFINITE, Status.CONVERGED]
-    assert found.messages == {1: "reading 1 is not a finite number"}
-    assert np.isnan(found.covariance[1]).all()
 
 
 def test_ukf_wants_the_hx_of_each_epoch():
@@ -75,15 +54,6 @@ def test_ukf_with_a_small_alpha_loses_digits():
     assert apart < 1e-8
     lost = (far.status != Status.CONVERGED).any() or np.abs((far.x - x) / deviation).max() > 100 * apart
     assert lost
-
-
-def test_ckf_with_a_flat_reading_turns_x_into_a_matrix():
-    naive = CubatureKalmanFilter(4, 3, 1.0, lambda x: x[:3], lambda x, dt: x)
-    naive.predict()
-    naive.update(np.ones(3))
-    assert naive.x.shape == (4, 3)
-    problem, z = linear_problem()
-    assert CKF().estimate(problem, z).x.shape == (3, 4)
 
 
 @pytest.mark.parametrize("estimator", [UKF(), CKF()], ids=["ukf", "ckf"])

@@ -13,17 +13,12 @@ from scipy.stats import chi2
 from small_models import Bent
 
 from ipe_bench.baselines import CKF, EKF, IPLF, LMIEKF, UKF, EnKF, IteratedEKF, RecursiveUpdate
-from ipe_bench.baselines.ekf import EKFTrack
-from ipe_bench.baselines.epochs import arrivals
-from ipe_bench.baselines.information import Belief, EpochReadings, InformationFilter
-from ipe_bench.baselines.iplf import Affine
-from ipe_bench.baselines.recursive_update import geometric_weights
+from ipe_bench.baselines.information import InformationFilter
 from ipe_bench.baselines.sequential import Sequential
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Covariance, information, inverse, multiply, quadratic_form
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import SubsetModel
-from ipe_bench.measurements.counted import EvaluationCount
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Quantization
@@ -243,31 +238,18 @@ class Fragile(Linear):
         return np.where(np.abs(x[:, :1]) > 1e6, np.inf, super().simulate_until(x, stop))
 
 
-@dataclass(frozen=True)
-class Brittle(EKF):
-    """Its matrices are singular where the first reading is above 1e6."""
-
-    def track(self, P0, Q, z):
-        return BrittleTrack(P0, Q) if abs(z[0]) > 1e6 else super().track(P0, Q, z)
-
-
-class BrittleTrack(EKFTrack):
-    def update(self, z, h, H):
-        raise np.linalg.LinAlgError("singular matrix")
-
-
 @pytest.mark.parametrize(
-    ("estimator", "status"),
-    [(e, Status.NONFINITE) for e in [*FILTERS, *BATCHED, RecursiveUpdate()]] + [(Brittle(), Status.SINGULAR)],
+    "estimator",
+    [*FILTERS, *BATCHED, RecursiveUpdate()],
     ids=str,
 )
-def test_what_overflows_or_is_singular_ends_its_own_trial(estimator, status):
+def test_what_overflows_ends_its_own_trial(estimator):
     model = Fragile()
     problem = Problem(model, Covariance(np.ones(model.m)), np.ones(4))
     z = np.random.default_rng(1).standard_normal((3, model.m))
     z[1] = model.matrix @ [1e8, 0, 0, 0]
     found = estimator.estimate(problem, z)
-    assert [Status(s) for s in found.status] == [Status.CONVERGED, status, Status.CONVERGED]
+    assert [Status(s) for s in found.status] == [Status.CONVERGED, Status.NONFINITE, Status.CONVERGED]
     assert set(found.messages) == {1}
     assert np.isnan(found.covariance[1]).all()
     z[1] = 1e308
@@ -355,13 +337,6 @@ def test_recursive_steps_are_updates_with_inflated_noise():
         np.testing.assert_allclose(P_found, P, atol=1e-9)
 
 
-def test_geometric_weights_add_up_to_one():
-    weights = geometric_weights(np.array([1.0, 1e6]), 4)
-    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
-    np.testing.assert_allclose(weights[0], 0.25)
-    np.testing.assert_allclose(weights[1, 1:] / weights[1, :-1], 100.0)
-
-
 def test_damped_iterations_end_at_the_maximum_a_posteriori_of_the_epoch():
     """One epoch: SciPy minimises the same sum of squares."""
     model = Linear(sizes=(8,), unknowns=3)
@@ -401,29 +376,6 @@ def test_damping_changes_nothing_where_gauss_newton_converges():
     ours, theirs = (e.estimate(problem, z) for e in (LMIEKF(tolerance=1e-6), IteratedEKF(tolerance=1e-6)))
     assert np.abs((ours.x - theirs.x) / deviations(theirs.covariance)).max() < 1e-3
     np.testing.assert_allclose(ours.extras["nis"], theirs.extras["nis"], rtol=1e-3)
-
-
-def test_regression_over_the_cubature_points_is_the_textbooks():
-    """A = Psi' P^-1 and Omega = Phi - A P A' with the moments of the readings, all by sums over the points."""
-    problem, trials = bent(0.5, 0.2, 4)
-    epoch = next(arrivals(problem))
-    rng = np.random.default_rng(5)
-    U, x = rng.standard_normal((4, 3, 3)) + 2 * np.eye(3), rng.standard_normal((4, 3))
-    z = epoch.whitened(trials.z)
-    readings = EpochReadings(epoch, problem, np.ones(3), EvaluationCount.zeros(4), z, np.arange(4), Belief(x, U))
-    found = Affine.over(readings, x, U)
-    for k in range(4):
-        S = np.linalg.inv(U[k])
-        points = x[k] + np.sqrt(3) * np.concatenate([S.T, -S.T])
-        h = problem.measurement.simulate(points)[:, epoch.rows] / 0.2
-        P, centre = S @ S.T, h.mean(axis=0)
-        A = ((h - centre).T @ (points - x[k]) / 6) @ np.linalg.inv(P)
-        Omega = np.cov(h, rowvar=False, ddof=0) - A @ P @ A.T
-        assert np.linalg.eigvalsh(Omega).max() > 0.1
-        np.testing.assert_allclose(found.r[k], centre - z[k], rtol=1e-9)
-        np.testing.assert_allclose(found.A[k], A, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(found.Omega[k], Omega, rtol=1e-8, atol=1e-8 * np.abs(h).max() ** 2)
-    assert readings.tally.simulations == pytest.approx(6 / 4)  # six points of the first of four epochs
 
 
 def textbook_iplf(model, z, variance, iterations):

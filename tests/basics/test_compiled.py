@@ -90,30 +90,6 @@ def test_machine_code_that_others_may_have_written_is_not_run(folder, caplog):
             assert "compiling" in caplog.text
 
 
-def test_a_folder_in_place_of_the_file_is_no_trouble(folder):
-    times(2.0)
-    (file,) = folder.glob("*.o")
-    file.unlink()
-    file.mkdir()
-    assert times(2.0) == 6.0
-
-
-def test_a_function_that_the_library_lacks_is_named(monkeypatch, caplog):
-    monkeypatch.setattr(compiled, "_CALLED", ("sin", "sine_of_nothing"))
-    monkeypatch.setattr(compiled, "_addresses", compiled._addresses.__wrapped__)
-    with caplog.at_level("WARNING"):
-        assert not compiled.available.__wrapped__()
-    assert "no machine code can be made here (the C library has no function sine_of_nothing)" in caplog.text
-
-
-@pytest.mark.parametrize(
-    "wrong", [np.zeros((4, 6))[:, ::2], np.zeros(3, np.float32), np.zeros(3, int), np.broadcast_to(0.0, 3)]
-)
-def test_arrays_that_compiled_code_cannot_take_are_refused(wrong):
-    with pytest.raises((TypeError, BufferError, ValueError)):
-        at(wrong)
-
-
 def test_what_is_compiled_already_needs_no_compiler(tmp_path):
     script = """
 import sys

@@ -106,14 +106,6 @@ def test_two_estimators_of_one_folder(tmp_path):
     assert findings(ib.compare(folder, first="bad", second="good"))["error"] == "better"
 
 
-def test_scenarios_that_differ_in_one_setting_are_compared_and_it_is_said(tmp_path):
-    a, b = store(tmp_path / "a", sigma=0.2), store(tmp_path / "b", sigma=0.4, factor=2.0)
-    frame = ib.compare(a, b)
-    assert frame["noise.deviation"].iloc[0] == "0.2 | 0.4"
-    # The errors double and so does the bound that they are measured by; only the synthetic rows know another one.
-    assert frame.set_index("quantity").loc["error", "change"] == pytest.approx(1.0, rel=1e-6)
-
-
 def test_what_differs_is_named_wherever_it_stands(tmp_path, capsys):
     """Another error scale, another kind of noise, another option under the same label: in the title of the table, and
     where it is said what is worse."""
@@ -142,13 +134,6 @@ def test_scenarios_of_one_folder_alone_are_left_out_and_it_is_said(tmp_path):
     frame = ib.compare(a, b)
     assert frame["error_scale"].tolist() == [1.0] * 4
     assert "1 scenarios that the other lacks are left out" in frame.attrs["notes"][0]
-
-
-def test_two_versions_of_the_source_are_compared(tmp_path):
-    """The same estimator with another option under the same label: what a changed solver looks like."""
-    a = store(tmp_path / "a", factor=0.5, estimator=Pretender(1))
-    b = store(tmp_path / "b", factor=0.6, estimator=Pretender(2))
-    assert findings(ib.compare(a, b))["error"] == "worse"
 
 
 def test_judging_by_evidence(tmp_path):

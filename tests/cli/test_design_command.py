@@ -7,8 +7,6 @@ import json
 
 import pytest
 
-import ipe_bench as ib
-
 SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01")
 
 
@@ -47,22 +45,6 @@ def test_every_richer_version_of_the_model_is_suspected(command):
     assert "yes" in rows["tilt y"]
     assert "tilt y + 0.97 bx" in rows["tilt y"]
     assert "No test of residuals will see tilt y, tilt x, tilt z" in out
-
-
-def test_command_and_python_suspect_the_same(command, tmp_path):
-    options = {"latitude_deg": 40.0, "readings_per_case": 8}
-    words = [f"measurement.{key}={value:g}" for key, value in options.items()]
-    assert command("measurement=gins", *words, "--by", "axis")[0] == 0
-    found = json.loads((tmp_path / "outputs/design-gins/design.json").read_text())
-    same = ib.design(ib.Scenario(ib.measurements.Gins(**options)), by=["axis"])
-    assert [one["name"] for one in found["suspects"]] == [one.name for one in same.suspects]
-    assert len(same.suspects) > 4
-
-
-def test_the_truth_that_is_asked_for_is_the_only_suspect(command):
-    _, out, _ = command("measurement=gins", "truth_measurement=gins_tilted", "--by", "axis", "output=here")
-    assert "5 arcsec" in out
-    assert "misalignment" not in out
 
 
 @pytest.mark.parametrize(

@@ -95,16 +95,6 @@ def test_a_column_of_deviations_weighs_the_readings(estimate, misra, words, abso
     assert list(of(answer, "standard_errors").values()) == pytest.approx(np.sqrt(np.diag(P)), rel=1e-5)
 
 
-def test_deviations_from_the_command_line_weigh_too(estimate, misra):
-    t, y = misra
-    sigma = 0.05 + 0.01 * np.arange(len(t))
-    listed = ",".join(map(repr, sigma.tolist()))
-    code, printed, answer = estimate(*SATURATION, *LM, "readings=my.csv", f"noise.deviation=[{listed}]")
-    assert code == 0, printed
-    x, _ = curve_fit(curve, t, y, (250, 5e-4), sigma, ftol=1e-14, xtol=1e-14, gtol=1e-14)
-    assert list(of(answer, "estimates").values()) == pytest.approx(x, rel=1e-6)
-
-
 def test_a_fixed_parameter_is_named_and_costs_no_degree_of_freedom(estimate, misra):
     code, printed, answer = estimate(*SATURATION, *LM, "readings=my.csv", "parameters.b1.fixed=240")
     assert code == 0, printed
@@ -189,35 +179,6 @@ def test_rows_and_columns_are_left_out_on_purpose(estimate, misra, tmp_path):
     assert code == 0
     assert whole["readings_present"] == 14
     assert (tmp_path / "outputs/estimate-formula-2/estimate.json").is_file()
-
-
-def test_an_epidemic_has_the_noise_of_its_counts_and_not_that_of_a_platform(estimate, tmp_path):
-    """The boarding school: beta was 1.79 ± 0.000038 with the quantisation of an inertial platform."""
-    boys = (26, 75, 228, 293, 277, 268, 190, 126, 65, 28, 12, 5)
-    rows = [f"1,{day},infected,{count}" for day, count in enumerate(boys, 3)]
-    (tmp_path / "s.csv").write_text("\n".join(["case,time [day],output,reading [people]", *rows]))
-    code, printed, answer = estimate("measurement=sir", *LM, "readings=s.csv", "figures=all")
-    assert code == 0, printed
-    assert 0.02 < of(answer, "standard_errors")["ln_beta"] < 0.2
-
-
-def test_two_files_share_what_is_not_their_own(estimate, tmp_path):
-    t = np.linspace(50, 700, 12)
-    rng = np.random.default_rng(3)
-    sets = [b1 * -np.expm1(-5.6e-4 * t) + 0.1 * rng.standard_normal(12) for b1 in (240.0, 180.0)]
-    for name, y in zip("ab", sets, strict=True):
-        rows = [f"{a!r},{b!r}" for a, b in zip(t.tolist(), y.tolist(), strict=True)]
-        (tmp_path / f"{name}.csv").write_text("\n".join(["t,y", *rows]))
-    code, printed, answer = estimate(
-        *SATURATION, *LM, "readings=[a.csv,b.csv]", "measurement.own=[b1]", "noise.deviation=0.1"
-    )
-    assert code == 0, printed
-    both = curve_fit(
-        lambda _, p, q, b2: np.concatenate([curve(t, p, b2), curve(t, q, b2)]), np.tile(t, 2), np.concatenate(sets),
-        (250, 250, 5e-4), np.full(24, 0.1), True, ftol=1e-14, xtol=1e-14, gtol=1e-14,
-    )  # fmt: skip
-    found = of(answer, "estimates")
-    assert [found[name] for name in ("b1_1", "b1_2", "b2")] == pytest.approx(both[0], rel=1e-6)
 
 
 def test_equations_in_a_file_are_a_model(estimate, tmp_path):

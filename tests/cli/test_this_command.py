@@ -6,11 +6,8 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from rich.console import Console
 
 from ipe_bench.cli.words import default_name, read
-from ipe_bench.report.certified_tables import attained_totals_table
-from ipe_bench.report.terminal import render
 
 SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "execution=serial", "baseline=[]")
 SMALL += ("figures=none",)
@@ -143,33 +140,3 @@ def test_an_experiment_of_ones_own_sweeps_as_ours_do(command):
     assert code == 0
     assert rows_of(out, "newton") == 3
     assert [path.name for path in Path("outputs").iterdir()] == ["mine"]
-
-
-@pytest.mark.parametrize("width", [60, 80, 100, 120])
-def test_a_narrow_terminal_keeps_the_names_of_those_that_attain_minima(width):
-    names = ["levenberg_marquardt", "progressive"]
-    counts = {key: [4, 3] for key in ("problems", "solved", "solved_1", "solved_100", "converged", "elsewhere")}
-    budgets = {f"within_{budget}": [2, 1] for budget in (10, 100, 1000)}
-    totals = pd.DataFrame({"estimator": names, **counts, "cost_median": [21.5, 1234.0], **budgets})
-    console = Console(width=width)
-    with console.capture() as shown:
-        console.print(render([], [attained_totals_table(totals)], width))
-    lines = shown.get().splitlines()
-    assert max(map(len, lines)) <= width
-    table = lines[: next(i for i, line in enumerate(lines) if line.startswith(("Too narrow", "Problems")))]
-    assert "…" not in "".join(table)
-    assert {"levenberg_marquardt", "progressive"} <= set(" ".join(table).split())
-    heading = " ".join(table).split()
-    for word, file in (("median", "tables/attained.csv"), ("problems", "")):
-        assert word in heading or file in shown.get().replace("\n", " ")
-
-
-def test_a_precision_that_is_not_reached_is_said_and_has_its_exit_code(command):
-    """Of the first 60 trials no share is known to a thousandth; to a half, every share is."""
-    words = ("run", *SMALL, "solver=[newton]", "trials=60", "output=few")
-    code, out, _ = command(*words, "precision=0.001")
-    assert code == 1
-    assert "60 trials; the precision is not reached: there are as many trials as there may be" in out
-    code, out, _ = command(*words, "precision=0.5")
-    assert code == 0
-    assert "60 trials; every interval is narrow enough" in out

@@ -32,24 +32,6 @@ def test_no_job_of_a_sweep_begins_where_one_would_be_refused(words, complaint, i
     assert not list(Path().rglob("*.parquet"))
 
 
-@pytest.mark.parametrize(
-    ("words", "complaint"),
-    [
-        (["estimators.fixed_point.tol=3"], "estimators.fixed_point.tol: there is no such option (there are: budget,"),
-        (["noise.deviaton=3"], "noise.deviaton: there is no such option; did you mean deviation?"),
-        (["measurement.degree=high"], "measurement.degree: there is no such option"),
-        (["+experiment=triad", "measurement.field=wide"], "measurement.field=wide: give a number above 0"),
-    ],
-)
-def test_a_config_with_it_is_not_even_printed(words, complaint, ipe_bench):
-    chosen = COMMON if "experiment" not in words[0] else ()
-    code, out, err = ipe_bench("run", *chosen, *words, "--cfg", "job")
-    assert code == 2
-    assert not out
-    (line,) = err.splitlines()
-    assert line.startswith(f"ipe-bench: {complaint}")
-
-
 @pytest.mark.parametrize("command", ["estimate", "design", "posterior"])
 def test_every_command_that_composes_refuses_it(command, ipe_bench):
     code, _, err = ipe_bench(command, "measurement=ranging", "measurement.rounds=many")

@@ -185,15 +185,6 @@ def test_what_a_process_does_first_is_not_booked_as_time_of_estimation(tmp_path,
     assert rows["time_s"].max() < 0.03
 
 
-def test_no_forecast_is_made_before_a_block_is_done(tmp_path):
-    told = []
-    compute([scenario()], GOOD, 30, tmp_path, execution=Serial(), block_size=10, watch=told.append)
-    assert [p.preparing for p in told] == [True] + [False] * (len(told) - 1)
-    assert all((p.seconds_left is None) == (p.done == 0) for p in told)
-    assert told[-1].seconds_left == 0
-    assert told[-1].rate == pytest.approx(60 / told[-1].seconds)
-
-
 def test_what_failed_is_tried_again_by_the_next_run(tmp_path):
     estimators = {"rogue": Rogue("exit", until=str(tmp_path / "repaired"))}
     assert len(compute([scenario()], estimators, 10, tmp_path, execution=Processes(1))) == 1
@@ -230,11 +221,6 @@ def test_auto_starts_workers_only_where_they_are_of_use(tasks, options, here):
     seen = [event.step for event in Auto(2, **options).run(rogues.surroundings, tasks) if not event.ended]
     assert len(seen) == len(tasks)
     assert ({pid for pid, _, _ in seen} == {os.getpid()}) == here
-
-
-def test_workers_serve_the_next_run():
-    pids = [{e.step[0] for e in Processes(1).run(rogues.surroundings, [0]) if not e.ended} for _ in range(2)]
-    assert pids[0] == pids[1]
 
 
 def test_stopping_a_run_ends_its_workers():
@@ -313,21 +299,6 @@ except StorageError as error:
     assert subprocess.run([sys.executable, "-c", code], env=environment(), check=False).returncode == 42
     assert not Results.read([tmp_path]).damaged
     assert [path for path in tmp_path.rglob("*") if path.suffix == ".tmp"] == []
-
-
-@pytest.mark.parametrize(
-    ("options", "key"),
-    [
-        ({"workers": 0}, "workers=0"),
-        ({"block_timeout_s": 0.0}, "block_timeout_s"),
-        ({"memory_limit_gb": -1.0}, "memory"),
-        ({"memory_limit_gb": float("inf")}, "memory"),
-    ],
-)
-@pytest.mark.parametrize("kind", [Processes, Dask])
-def test_limits_that_make_no_sense_are_refused(kind, options, key):
-    with pytest.raises(UserError, match=key):
-        kind(**options)
 
 
 def test_source_that_changed_since_the_run_began_is_not_mixed_in(tmp_path, monkeypatch):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -113,43 +111,12 @@ def test_sandwich_is_the_spread_of_the_roots():
     assert np.trace(P) > np.trace(system.covariance()[0]) * 0.1
 
 
-def test_a_batch_equals_its_trials_one_by_one_bit_for_bit():
-    problem = problem_of(bend=0.05)
-    z = np.random.default_rng(1).normal(size=(37, problem.measurement.m)) * 2
-    for solver in (FixedPoint(), Newton()):
-        whole = replace(solver, max_iterations=15).estimate(problem, z)
-        for i in range(len(z)):
-            alone = replace(solver, max_iterations=15).estimate(problem, z[i : i + 1])
-            np.testing.assert_array_equal(whole.x[i], alone.x[0])
-            np.testing.assert_array_equal(whole.covariance[i], alone.covariance[0])
-            assert whole.status[i] == alone.status[0]
-            assert whole.simulations[i] == alone.simulations[0]
-
-
 def test_counts_are_per_trial():
     problem = problem_of(bend=0.0)
     estimates = FixedPoint().estimate(problem, np.ones((2, problem.measurement.m)))
     # h(x0) for the start, and one evaluation that finds F to be zero there.
     assert estimates.iterations.tolist() == [0, 0]
     assert estimates.simulations.tolist() == [2.0, 2.0]
-
-
-def test_divergence_and_overflow_are_statuses_and_disturb_no_other_trial():
-    problem = problem_of(bend=0.5)
-    calm = problem.measurement.simulate(np.array([[0.01, 0.02, 0.01]]))
-    wild = np.full((1, problem.measurement.m), -1e6)
-    both = FixedPoint().estimate(problem, np.concatenate([calm, wild]))
-    assert Status(both.status[0]) is Status.CONVERGED
-    assert Status(both.status[1]) in (Status.DIVERGED, Status.NONFINITE)
-    np.testing.assert_array_equal(both.x[0], FixedPoint().estimate(problem, calm).x[0])
-
-
-def test_the_budget_of_simulations_ends_a_trial():
-    problem = problem_of(bend=0.05)
-    z = problem.measurement.simulate(np.array([[1.0, 1.0, -1.0]]))
-    estimates = FixedPoint(tolerance=1e-14, budget=4).estimate(problem, z)
-    assert Status(estimates.status[0]) is Status.BUDGET
-    assert estimates.simulations[0] == 4
 
 
 def test_parameters_that_cannot_be_told_apart_are_refused():

@@ -1,6 +1,5 @@
 """The gimballed INS: closed forms, other integrators, and the reference values of its linear bound."""
 
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -28,10 +27,6 @@ def draw(scale, trials=2, seed=0):
     return scale * np.random.default_rng(seed).normal(size=(trials, 11))
 
 
-def test_zero_parameters_give_zero_readings(gins):
-    assert (gins.simulate(np.zeros((3, 11))) == 0.0).all()
-
-
 def test_an_accelerometer_bias_swings_at_the_schuler_period():
     # Without Earth rate the platform is a pendulum: v = b / w sin(w t), w^2 = g / R.
     model = Gins(earth_rate=0.0, injected_ft_per_s=0.0, step=60.0)
@@ -44,14 +39,6 @@ def test_an_accelerometer_bias_swings_at_the_schuler_period():
     for axis in range(2):
         np.testing.assert_allclose(velocity[axis, :, :, axis], np.tile(expected, (4, 1)), atol=1e-7)
         np.testing.assert_allclose(velocity[axis, :, :, 1 - axis], 0.0, atol=1e-7)
-
-
-def test_an_injected_velocity_swings_likewise():
-    # The error-free system is what the read-out shows where h is zero.
-    model = Gins(earth_rate=0.0, injected_ft_per_s=1.0, step=60.0)
-    swing = 0.3048 * np.cos(np.sqrt(model.gravity / model.earth_radius) * model.times)
-    np.testing.assert_allclose(model.offset.reshape(4, 30, 2)[0, :, 0], swing, atol=1e-7)
-    np.testing.assert_allclose(model.offset.reshape(4, 30, 2)[3, :, 1], -swing, atol=1e-7)
 
 
 @pytest.mark.parametrize("scale", [1.0, 33.0, 100.0])
@@ -81,15 +68,15 @@ def errors_beside_scipy(scale, trials):
     return np.abs(Gins().simulate(x) - (reference - velocities(np.zeros((1, 11))))).max(axis=1)
 
 
-@pytest.mark.parametrize("scale", [300.0, 3000.0])
-def test_every_step_keeps_its_promise_whatever_the_scale(scale):
-    assert errors_beside_scipy(scale, 4).max() < 1e-6
+SLOW = [(scale, 60, 2e-6 if scale == 10000.0 else 1e-6) for scale in (300.0, 1000.0, 3000.0, 10000.0)]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("scale", "limit"), [(300.0, 1e-6), (1000.0, 1e-6), (3000.0, 1e-6), (10000.0, 2e-6)])
-def test_every_step_keeps_its_promise_in_many_trials(scale, limit):
-    assert errors_beside_scipy(scale, 60).max() < limit
+@pytest.mark.parametrize(
+    ("scale", "trials", "limit"),
+    [(300.0, 4, 1e-6), (3000.0, 4, 1e-6), *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)],
+)
+def test_every_step_keeps_its_promise_whatever_the_scale(scale, trials, limit):
+    assert errors_beside_scipy(scale, trials).max() < limit
 
 
 def lopsided(trials, seed):
@@ -147,34 +134,6 @@ def test_bits_of_a_trial_depend_on_itself_alone_where_steps_differ(monkeypatch):
     for fresh in (model, Gins()):
         assert (fresh.simulate_until(x, 11) == z[:, rows]).all()
         assert (fresh.jacobian_until(x, 11) == J[:, rows]).all()
-
-
-def test_the_jacobian_takes_the_steps_of_the_simulation():
-    x, model = draw(3000.0, 6, seed=10), Gins()
-    for row in x:
-        z = model.simulate(row[None])
-        level = model._ladder[model._search(row[None], model.offset).places[0]]
-        fixed = Gins(step=180.0 / level)
-        assert (model.jacobian(row[None]) == fixed.jacobian(row[None])).all()
-        np.testing.assert_allclose(z, fixed.simulate(row[None]), atol=1e-8)
-
-
-@pytest.mark.parametrize("scale", [1e5, 1e7, 1e12, np.inf, np.nan])
-def test_what_diverges_costs_no_more_than_the_shortest_step(scale):
-    x = np.concatenate([scale * np.ones((2, 11)), draw(33.0, 2)])
-    model = Gins()
-    z = model.simulate(x)
-    assert (model._ladder[model._search(x, model.offset).places] <= 64).all()
-    assert (z[2:] == model.simulate(x[2:])).all()
-    assert model.jacobian(x).shape == (4, 240, 11)
-
-
-def test_a_model_knows_the_same_after_a_copy():
-    model, x = Gins(), draw(3000.0, 3)
-    z = model.simulate(x)
-    copy = pickle.loads(pickle.dumps(model))
-    assert copy == model
-    assert (copy.simulate(x) == z).all()
 
 
 def test_the_jacobian_is_that_of_the_same_formula_in_complex_arithmetic(gins):
@@ -261,14 +220,6 @@ def test_the_linear_bound_is_the_reference(gins):
     deviation = np.sqrt(np.diag(np.linalg.inv(H.T @ H))) * STEP / np.sqrt(12)
     np.testing.assert_allclose(deviation, LINEAR_BOUND, rtol=5e-4)
     assert np.linalg.cond(H) == pytest.approx(19.99, abs=0.01)
-
-
-def test_epochs_are_the_times_with_all_cases_and_axes(gins):
-    index = gins.index
-    assert len(gins.epochs) == 30
-    for k, rows in enumerate(gins.epochs):
-        assert len(rows) == 8
-        assert {index["time [min]"][i] for i in rows} == {3.0 * (k + 1)}
 
 
 def test_readings_of_a_window_are_near_enough_and_the_same_bits_in_any_batch():

@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from ipe_bench.baselines import MultiscaleLM
 from ipe_bench.measurements import Mgh
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.mgh import functions, score
 from ipe_bench.measurements.mgh.problems import PROBLEMS
-from ipe_bench.measurements.problem import Problem
 from ipe_bench.plugins.conformance import check_component
 
 # m and n, as the paper states them.
@@ -190,16 +188,6 @@ def test_models_keep_the_promises_of_models(function):
     assert all(square and "too few" in complaint for complaint in complaints)
     if square:
         assert inspect.getdoc(Mgh).count("(m = n)") == 1
-
-
-@pytest.mark.parametrize("function", ["rosenbrock", "kowalik_osborne", "meyer", "watson"])
-def test_recorded_zeros_are_solved_by_a_least_squares_estimator(function):
-    model = Mgh(function)
-    known = model.recorded
-    estimates = MultiscaleLM().estimate(Problem(model, known.R), known.z[None])
-    attained = score(model, estimates.x[0])
-    assert (attained.solved, attained.minimum) == (True, 0)
-    np.testing.assert_allclose(estimates.x[0], known.x, rtol=1e-5, atol=1e-7)
 
 
 def test_what_is_no_minimum_is_none():

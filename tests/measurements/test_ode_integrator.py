@@ -10,8 +10,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import OdeMeasurement, Parameter, ode
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode import tableau
-from ipe_bench.measurements.ode.model import steps_between
-from ipe_bench.measurements.ode.steps import coarser, contraction, ladder
+from ipe_bench.measurements.ode.steps import contraction
 
 
 @dataclass(frozen=True)
@@ -119,12 +118,6 @@ def test_few_lanes_and_many_have_the_same_bits(cases):
         np.testing.assert_array_equal(whole[:1], getattr(Several(0.7), method)(x[:1]))
 
 
-def test_a_fixed_step_is_the_longest_there_is_and_divides_each_interval_evenly():
-    model = Pulse(1.3)
-    assert steps_between(np.array([0.5, 0.5, 4.2, 6.0, 8.6]), 1.3).tolist() == [1, 0, 3, 2, 2]
-    np.testing.assert_array_equal(model._common_steps(np.ones((1, 2))), [1, 3, 2])
-
-
 def test_readings_are_ordered_by_case_time_and_output():
     index = Cases().index
     assert index["case"] == [1] * 6 + [2] * 6
@@ -168,18 +161,6 @@ def test_steps_that_follow_the_parameters_hold_the_tolerance_of_each_output():
     assert len(set(model._search(x, np.zeros(12)).places.tolist())) >= 3
 
 
-@pytest.mark.parametrize("column", [0, 1])
-def test_trials_that_share_all_parameters_but_one_have_levels_of_their_own(column):
-    x = np.repeat([[0.3, 0.5]], 12, axis=0)
-    x[:, column] = np.linspace(-6.0, 6.0, 12) if column == 0 else np.geomspace(1e-7, 1e4, 12)
-    model = Chosen()
-    z = np.concatenate([model.simulate(row[None]) for row in x])
-    np.testing.assert_array_equal(z, np.concatenate([Chosen().simulate(row[None]) for row in x]))
-    places = model._search(x, np.zeros(12)).places
-    assert len(set(places.tolist())) > 1
-    np.testing.assert_array_equal(places, Chosen()._search(x, np.zeros(12)).places)
-
-
 def test_a_trial_that_is_not_a_number_does_not_move_where_the_others_begin():
     x = np.random.default_rng(6).normal(size=(5, 2))
     spoilt = np.concatenate([x, [[np.nan, 1.0]]])
@@ -193,29 +174,6 @@ def test_a_coarse_jacobian_contracts_where_it_was_measured_and_beyond():
     assert max(contraction(c, j) for c, j in zip(coarse, J, strict=True)) < 0.01
     fixed = Cases(0.5)
     assert (fixed.coarse_jacobian(x) == fixed.jacobian(x)).all()
-
-
-def test_a_loose_tolerance_leaves_less_room_for_coarse_tangents():
-    """Readings that are themselves only just accurate need tangents at nearly their own step."""
-
-    class Tight(Chosen):
-        nominal = np.ones(2)  # type: ignore[assignment]
-
-    class Loose(Tight):
-        tolerance = (0.03, 0.03)
-
-    assert Loose()._coarseness.level(16) > Tight()._coarseness.level(16) >= 3
-    x = Loose().nominal + 0.3 * np.random.default_rng(8).normal(size=(30, 2))
-    J, coarse = Loose().jacobian(x), Loose().coarse_jacobian(x)
-    assert max(contraction(c, j) for c, j in zip(coarse, J, strict=True)) < 0.01
-
-
-def test_the_contraction_of_a_scaled_jacobian_is_known():
-    """With (1 + d) J in place of J a step overshoots by d / (1 + d)."""
-    J = np.random.default_rng(9).normal(size=(9, 3)) * [1.0, 1e6, 1e-6]
-    assert contraction(1.25 * J, J) == pytest.approx(0.2)
-    assert contraction(J, J) < 1e-14
-    assert contraction(np.nan * J, J) == np.inf
 
 
 @dataclass(frozen=True)
@@ -253,13 +211,6 @@ def test_without_a_tolerance_or_a_step_the_model_says_what_is_missing():
 
     with pytest.raises(UserError, match=r"^measurement.step=null: silent states neither .*; give one"):
         Silent(step=None).simulate(np.ones((1, 2)))
-
-
-def test_the_ladder_of_levels():
-    assert ladder(64).tolist() == [1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64]
-    assert ladder(1.0).tolist() == [1, 2]
-    levels = ladder(768)
-    assert [levels[coarser(i)] for i in range(1, 8)] == [1, 2, 2, 3, 4, 6, 8]
 
 
 def test_a_wrong_number_of_derivatives_is_refused():

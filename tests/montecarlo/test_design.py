@@ -12,7 +12,6 @@ from scipy import stats
 import ipe_bench as ib
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.measurements import Gins, Measurement, Parameter, RicherGins
-from ipe_bench.measurements.base import SubsetModel
 from ipe_bench.trials.design import design
 from ipe_bench.trials.observability import Observability, in_words, suspects
 
@@ -285,26 +284,9 @@ def test_candidates_of_gins_begin_with_its_own_cases_and_say_what_they_are():
     assert more.taking(sorted(rows)) == model
 
 
-def test_whole_cases_are_options_and_single_readings_a_restriction():
-    more = Gins().candidates
-    assert isinstance(more, Gins)
-    case = np.array(more.index["case"])
-    two = more.taking(np.flatnonzero((case == 2) | (case == 5)).tolist())
-    assert isinstance(two, Gins)
-    assert two.injected == ((0.0, 1500.0), (1299.038, 750.0))
-    few = more.taking([0, 5, 700])
-    assert isinstance(few, SubsetModel)
-    assert isinstance(few.whole, Gins)
-    assert len(few.whole.cases) == 2
-    x = 10 * np.random.default_rng(2).normal(size=(2, 11))
-    np.testing.assert_allclose(few.simulate(x), more.simulate(x)[:, [0, 5, 700]], atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("options", "noise", "words"),
     [
-        ({"by": ["colour"]}, None, "by=colour: there is no such column"),
-        ({"readings": 2}, None, "readings=2: 3 parameters want"),
         ({}, ib.noise.Correlated(0.1, 0.5), "the errors of readings are correlated"),
         ({}, ib.noise.Unknown(), "without the level of the noise there are no bounds"),
     ],

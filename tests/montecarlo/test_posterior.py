@@ -146,14 +146,6 @@ def test_the_same_trial_gives_the_same_draws(linear):
     assert not np.array_equal(first.x, other.x)
 
 
-def test_mistakes_are_one_line(linear):
-    problem, z, _ = linear
-    with pytest.raises(ib.UserError, match=r"^particles=59: give at least 60"):
-        sample_posterior(problem, z, particles=59)
-    with pytest.raises(ib.UserError, match="needs a prior"):
-        sample_posterior(replace(problem, prior_deviation=None), z)
-
-
 def test_a_model_that_fails_in_places_is_sampled_where_it_does_not():
     @dataclass(frozen=True)
     class Broken(Bent):

@@ -66,18 +66,6 @@ def test_what_is_to_be_given_is_named(checked):
     assert finding.check == "Names what is to be given, expression, and is tried where it is"
 
 
-def test_defaults_are_composed_as_hydra_composes_them(checked):
-    place = "baseline/tight"
-    checked({place: GOOD[place]}, place)
-    (option,) = [o for o in discovery.options("baseline") if o.name == "tight"]
-    config = discovery.composed(option)
-    assert (config["_target_"], config["tolerance"], config["damping"]) == (
-        "ipe_bench.baselines.LevenbergMarquardt",
-        1e-9,
-        0.001,
-    )
-
-
 BAD = {
     "a fault in what is made of another": (
         {"noise/bad": "defaults: [gaussian]\ndeviation: -1\n"}, "noise/bad", "deviation=-1: give a number above 0"

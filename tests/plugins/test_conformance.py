@@ -232,25 +232,11 @@ def test_a_fault_is_found(faulty, complaint):
     assert complaint in complaints(faulty)
 
 
-@pytest.mark.parametrize(
-    "faulty", [Faulty("dicing"), Linearizing(), Tinkering(), Faulty("scribbling"), Faulty("timid"), Tilted()], ids=repr
-)
-def test_a_fault_is_said_once(faulty):
-    assert sum(bool(f.complaint) for f in check_component("mine", faulty)) == 1
-
-
 def test_mixing_trials_is_not_taken_for_randomness():
     said = complaints(Faulty("averaging"))
     assert "depend on the others of the batch" in said
     assert "random" not in said
     assert "writes" not in said
-
-
-def test_a_fault_in_one_check_leaves_the_others_ok():
-    findings = list(check_component("mine", Faulty("free")))
-    assert sum(bool(f.complaint) for f in findings) == 1
-    assert not complaints(Newton())
-    assert not complaints(Gaussian(1.0))
 
 
 @pytest.mark.parametrize(

@@ -229,11 +229,6 @@ def test_faulty_statistics_are_found():
         assert FAULTY[component.removeprefix("statistic=")][1] in complaint
 
 
-def test_a_statistic_under_the_name_of_ours_is_refused(capsys):
-    assert main(["new", "statistic", "rmse"]) == 2
-    assert "rmse: is a statistic of ours; choose another name" in capsys.readouterr().err
-
-
 DRAWS = {
     "flat": lambda x0, scale, rng: x0 + np.sqrt(3) * scale * rng.uniform(-1, 1, len(x0)),
     "wide": lambda x0, scale, rng: x0 + 1.1 * scale * rng.standard_normal(len(x0)),

@@ -230,16 +230,6 @@ def test_with_as_many_readings_as_parameters_nothing_is_tested_but_a_worse_answe
     assert np.isnan(good.whiteness.p_value)
 
 
-def test_a_worse_minimum_is_a_misfit_where_the_level_is_estimated():
-    z = np.array([2.0, 3.4, 4.8, 5.4, 6.9, 8.1])
-    model = Formula("a*(1-exp(-b*t))", {"a": 30.0, "b": 2.0}, {"t": TIMES})
-    answer = ib.estimate(model, z, {**LM, "linear": LinearLSE()})
-    assert answer["linear"].fits is False
-    assert answer["lm"].passes
-    assert "MISFIT" in str(answer)
-    assert "linear: MISFIT" in answer._repr_html_()
-
-
 def test_an_answer_is_a_frame_too():
     z = Scenario(Sir(), Gaussian(20.0)).draw(0, 1).z[0]
     table = ib.estimate(Sir(), z, LM).table()

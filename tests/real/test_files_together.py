@@ -48,17 +48,6 @@ def of(result, values) -> dict[str, float]:
     return dict(zip([p.name for p in result.model.physical_parameters], values, strict=True))
 
 
-def test_bounds_that_do_not_act_change_nothing(files):
-    paths, data = files
-    known = (ParameterInfo("b1", lower=100.0, upper=300.0), ParameterInfo("b2", positive=True))
-    result = estimate(open_together(paths, ConstrainedModel(OWN, known)))
-    x, deviations = solution(lambda p: residuals(data, *p), [250, 250, 5e-4])
-    assert of(result, result.x) == pytest.approx({"b1_1": x[0], "b1_2": x[1], "b2": x[2]}, rel=1e-8)
-    assert of(result, result.standard_errors) == pytest.approx(
-        {"b1_1": deviations[0], "b1_2": deviations[1], "b2": deviations[2]}, rel=1e-8
-    )
-
-
 def test_a_parameter_of_one_file_may_be_known_there(files):
     paths, data = files
     result = estimate(together(paths, ParameterInfo("b1", lower=0.0), ParameterInfo("b1_2", fixed=181.0)))

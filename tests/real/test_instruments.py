@@ -56,28 +56,6 @@ def estimate(found, **options) -> Fit:
     return fit(Problem(found.model, R), found.z, ESTIMATORS, **options)[0]
 
 
-def test_weights_of_the_file_are_those_of_the_fit(tmp_path):
-    path, (t, y, sigma) = (lambda p, c: (p, c.T))(*simulated(tmp_path / "a.csv", 240.0, 1))
-    result = estimate(open_together([path], Formula(SATURATION, START)))
-    x, deviations = solution(lambda p: (p[0] * (1 - np.exp(-p[1] * t)) - y) / sigma, [250, 5e-4])
-    assert result.x == pytest.approx(x, rel=1e-8)
-    assert result.standard_errors == pytest.approx(deviations, rel=1e-8)
-    unweighted, _ = solution(lambda p: p[0] * (1 - np.exp(-p[1] * t)) - y, [250, 5e-4])
-    assert abs(unweighted[0] - x[0]) > 1e-3 * x[0]
-
-
-def test_a_fixed_parameter_is_not_estimated_and_costs_no_degree_of_freedom(tmp_path):
-    path, columns = simulated(tmp_path / "a.csv", 240.0, 2)
-    t, y, sigma = columns.T
-    found = open_together([path], ConstrainedModel(Formula(SATURATION, START), (ParameterInfo("b2", fixed=5.7e-4),)))
-    result = estimate(found)
-    x, deviations = solution(lambda p: (p[0] * (1 - np.exp(-5.7e-4 * t)) - y) / sigma, [250])
-    assert result.x == pytest.approx(x, rel=1e-8)
-    assert result.standard_errors == pytest.approx(deviations, rel=1e-8)
-    assert result.degrees_of_freedom == len(t) - 1
-    assert result.model.fixed == {"b2": 5.7e-4}
-
-
 @pytest.mark.parametrize(
     "known",
     [

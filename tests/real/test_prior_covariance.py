@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from small_models import Bent
 
-import ipe_bench as ib
 from ipe_bench.baselines import CKF, EKF, IPLF, LMIEKF, UKF, EnKF, EsMda, IteratedEKF, MapLM
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Formula
 from ipe_bench.measurements.known import ParameterInfo, informed
-from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.priors import GaussianPrior, prior_of
@@ -102,18 +100,6 @@ def test_a_covariance_is_of_the_parameters_in_their_own_units_and_logarithms():
     assert inner == pytest.approx(P / np.outer([8.0, 0.2], [8.0, 0.2]), rel=1e-12)
 
 
-def test_from_python(tmp_path):
-    t = np.arange(8.0)
-    model = Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)})
-    z, P = 3 + 0.4 * t + 0.3 * np.sin(7 * t), np.array([[4.0, -0.9], [-0.9, 0.25]])
-    (fit,) = ib.estimate(model, z, {"map": MapLM(tolerance=1e-10)}, noise=Gaussian(0.5), prior=prior_of(model, P))
-    A = np.column_stack([np.ones(8), t])
-    N = A.T @ A / 0.25 + np.linalg.inv(P)
-    x = np.linalg.solve(N, A.T @ z / 0.25 + np.linalg.solve(P, [1.0, 1.0]))
-    assert fit.x == pytest.approx(x, rel=1e-8)
-    assert fit.covariance == pytest.approx(np.linalg.inv(N), rel=1e-8)
-
-
 REFUSED = {
     "not symmetric": ([[1, 0.5], [0.4, 1]], r"is not symmetric; row 1, column 2 is 0.5, and row 2, column 1 is 0.4"),
     "not definite": ([[1, 1.1], [1.1, 1]], r"is not positive definite; the least eigenvalue of its correlations"),
@@ -169,10 +155,3 @@ def test_correlations_that_cannot_be_are_refused():
         GaussianPrior(correlations=((1.0, 1.0), (1.0, 1.0)))
     with pytest.raises(UserError, match="has 2 rows; give one for each of 3"):
         _ = Scenario(Bent(), Gaussian(1.0), GaussianPrior(correlations=((1.0, 0.5), (0.5, 1.0)))).problem
-
-
-def test_a_problem_without_correlations_has_the_diagonal_one():
-    problem = Problem(Bent(), Gaussian(1.0).covariance(12), np.array([2.0, 1.0, 0.0]))
-    assert problem.prior_covariance().deviations.tolist() == [2.0, 1.0, 2e-9]  # type: ignore[union-attr]
-    assert problem.scaled_prior.tolist() == np.eye(3).tolist()
-    assert problem.without_prior().prior_covariance() is None

@@ -20,7 +20,6 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Certified, Gaussian, Quantization
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.solvers import FixedPoint, Newton, Progressive, Relinearized
-from ipe_bench.solvers.attempts import window_stops
 from ipe_bench.trials.roots import least_squares_root
 from ipe_bench.trials.scenario import Scenario
 
@@ -104,16 +103,6 @@ def test_trials_without_full_rank_do_not_disturb_others():
     np.testing.assert_array_equal(np.isfinite(slope.size), [True, False, False, False, True])
 
 
-def test_map_on_a_linear_model_is_the_bayesian_closed_form():
-    problem = Problem(Bent(), Covariance(np.full(12, 0.3)), np.array([0.5, 2.0, 1.0]))
-    A = problem.measurement.A
-    z = np.random.default_rng(3).normal(size=(4, 12))
-    estimates = MapLM(prior_inflation=3.0).estimate(problem, z)
-    P = np.linalg.inv(A.T @ A / 0.09 + np.diag((3.0 * problem.prior_deviation) ** -2.0))
-    np.testing.assert_allclose(estimates.x, z @ A @ P.T / 0.09, atol=1e-6)
-    np.testing.assert_allclose(estimates.covariance, np.broadcast_to(P, (4, 3, 3)), rtol=1e-9)
-
-
 def test_a_parameter_that_the_prior_fixes_stays_where_it_is():
     problem = Problem(Bent(0.01), Covariance(np.full(12, 0.3)), np.array([1.0, 0.0, 1.0]))
     z = np.random.default_rng(3).normal(size=(4, 12))
@@ -187,20 +176,6 @@ def test_a_start_without_full_rank_does_not_hide_that_a_flat_minimum_is_reached(
         found = Progressive().estimate(scenario.problem, scenario.draw(0, 1).z)
     assert score(scenario.measurement, found.x[0]).solved
     assert found.status[0] == Status.CONVERGED
-
-
-def test_the_test_of_the_fit_is_uniform_where_the_model_holds():
-    scenario = Scenario(Polynomial(), Gaussian(0.1), GaussianPrior(), 3.0)
-    p = Progressive().estimate(scenario.problem, scenario.draw(0, 500).z).extras["fit_p"]
-    assert abs(p.mean() - 0.5) < 0.07
-    assert 0.06 < (p < 0.1).mean() < 0.14
-
-
-def test_windows_are_geometric_and_end_short_of_all_data():
-    assert window_stops(30, 2.0) == [1, 2, 4, 8, 16]
-    assert window_stops(32, 2.0) == [1, 2, 4, 8, 16]
-    assert window_stops(1, 2.0) == []
-    assert set(window_stops(30, 2.0)) < set(window_stops(30, 2.0**0.5))
 
 
 def test_a_flat_direction_is_singular_for_gauss_newton():

@@ -6,14 +6,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from synthetic_store import Pretender
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.runs import parts
 from ipe_bench.runs.execution.base import Failure
 from ipe_bench.runs.provenance import digest
 from ipe_bench.statistics import analyse
-from ipe_bench.statistics.collect import collect, config_leaves, differing
+from ipe_bench.statistics.collect import collect, differing
 
 
 @pytest.fixture
@@ -46,14 +45,6 @@ def test_missing_trials_are_counted_per_cell(filled):
     assert "40 of 60 expected trials" in line
 
 
-def test_a_cell_that_was_never_computed_is_missing(filled):
-    for path in pieces(filled, "two"):
-        path.unlink()
-    (line,) = collect([filled.directory]).problems
-    assert "two on" in line
-    assert "0 of 60" in line
-
-
 @pytest.mark.parametrize("keep", [0, 10, 500, -9])
 def test_a_truncated_file_is_named_skipped_and_left_alone(filled, keep):
     path = pieces(filled)[0]
@@ -65,15 +56,6 @@ def test_a_truncated_file_is_named_skipped_and_left_alone(filled, keep):
     rows = analysis.summary[analysis.summary["parameter"] == "all"].set_index("estimator")
     assert rows.loc["one", "trials"] == 40
     assert rows.loc["two", "trials"] == 60
-
-
-def test_damaged_data_behind_an_intact_footer_is_named(filled):
-    path = pieces(filled)[0]
-    content = bytearray(path.read_bytes())
-    content[4:600] = bytes(596)
-    path.write_bytes(content)
-    analysis = analyse([filled.directory])
-    assert any(str(path) in line and "damaged" in line for line in analysis.problems)
 
 
 def test_foreign_files_under_our_names_are_named_and_skipped(filled):
@@ -130,11 +112,6 @@ def test_a_directory_that_is_not_there_is_the_users_mistake(tmp_path):
         collect([tmp_path / "nowhere"])
 
 
-def test_an_empty_directory_says_so(tmp_path):
-    (line,) = collect([tmp_path]).problems
-    assert "holds no results" in line
-
-
 def test_the_truth_being_absent_is_a_problem_and_not_a_crash(filled):
     for path in pieces(filled, "truth"):
         path.unlink()
@@ -160,26 +137,3 @@ def test_leaves_that_differ_are_found_at_any_depth():
     coarse = {"_target_": "a.Gins", "step": 9.0}
     assert differing([scenario(1), scenario(1, fine)]) == ["truth"]
     assert differing([scenario(1), scenario(1, fine), scenario(1, coarse)]) == ["truth", "truth.step"]
-
-
-def test_options_of_different_classes_are_not_compared():
-    one = {"noise": {"_target_": "a.Quantization", "step": 1}}
-    two = {"noise": {"_target_": "a.Gaussian", "deviation": 1}}
-    assert differing([one, two]) == ["noise"]
-    assert config_leaves(two)["noise"][1] == "a.Gaussian"
-
-
-def test_the_name_of_a_component_is_not_repeated_as_its_class(synthetic):
-    from dataclasses import replace
-
-    from ipe_bench.noise import Quantization
-
-    scenario = synthetic.scenario()
-    e = 0.1 * np.random.default_rng(0).normal(size=(30, 3))
-    synthetic.add(scenario, "one", e)
-    cell = replace(scenario, noise=Quantization(0.7))
-    synthetic.bound = lambda s: np.full(3, 0.1)
-    synthetic.add(cell, "one", e, estimator=Pretender())
-    (first, second) = collect([synthetic.directory]).groups
-    assert list(first.columns) == ["measurement", "noise", "error_scale"]
-    assert {first.columns["noise"], second.columns["noise"]} == {"gaussian", "quantization"}

@@ -53,19 +53,6 @@ def headings(directory) -> tuple[list[str], list[tuple[str, ...]]]:
     return titles, rows
 
 
-def test_beacons_of_different_numbers_are_two_experiments(tmp_path):
-    scenarios = [
-        ib.Scenario(ib.measurements.Ranging(beacons=beacons), Gaussian(0.1), error_scale=1.0)
-        for beacons in (BEACONS, BEACONS[:4], (*BEACONS[:4], (0.0, -900.0, 51.0)))
-    ]
-    table = ib.run(scenarios, {"lse": ib.baselines.LinearLSE()}, 20, output=tmp_path)
-    rows = table[table["parameter"] == "all"]
-    assert rows["trials"].tolist() == [20, 20, 20]
-    assert rows["measurement.beacons"].nunique() == 3
-    for shown in headings(tmp_path):
-        assert len(set(shown)) == 3, shown
-
-
 def test_a_matrix_and_none_are_two_experiments(tmp_path):
     model = ib.measurements.Polynomial(count=6)
     noises = [Correlated(0.01), Correlated(0.01, matrix=tuple(map(tuple, 1e-4 * np.eye(6))))]

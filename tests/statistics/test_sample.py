@@ -123,23 +123,6 @@ def test_no_bit_depends_on_how_rows_are_cut_into_files(analysis, tmp_path):
     pd.testing.assert_frame_equal(summarize([tmp_path]), analysis.summary, check_exact=True)
 
 
-def test_matrices_are_what_is_stored_and_cannot_be_changed(store):
-    collection = collect([store])
-    group = collection.groups[0]
-    sample = next(samples(collection, collection.groups))
-    rows = ib.load(store)
-    rows = rows[rows["estimator"] == group.estimator]
-    found = {"error": sample.error, "deviation": sample.deviation, "crlb": sample.crlb}
-    for kind, values in (found | {"linear_error": sample.of_truth("linear_error")}).items():
-        np.testing.assert_array_equal(values, rows[[f"{kind}_{n}" for n in "abc"]].to_numpy())
-    np.testing.assert_array_equal(sample.seeds, rows["seed"].to_numpy())
-    np.testing.assert_array_equal(sample.of_truth("curvature_intrinsic"), rows["curvature_intrinsic"].to_numpy())
-    assert np.isnan(sample.of_truth("van_trees")).all()
-    for array in (sample.error, sample.scalars["nees"], sample.number):
-        with pytest.raises(ValueError, match="read-only"):
-            array[0] = 0
-
-
 def test_a_truth_that_is_missing_is_not_a_number_beside_its_estimates(synthetic):
     """Of five blocks of the truth the second and the last are lost, and one estimator has fewer trials."""
     scenario, rng = synthetic.scenario(), RNG(3)

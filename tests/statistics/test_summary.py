@@ -88,19 +88,6 @@ def test_more_than_five_per_cent_without_a_number_make_the_95_per_cent_error_inf
     assert np.isfinite(frame["median_abs_error"]).all()
 
 
-def test_common_trials_are_those_that_every_rival_solved(synthetic):
-    scenario = synthetic.scenario()
-    e = errors(200)
-    t = np.arange(200)
-    synthetic.add(scenario, "one", e, solved=t < 150)
-    synthetic.add(scenario, "two", 2 * e, solved=t >= 50)
-    both = (t >= 50) & (t < 150)
-    frame = summarize([synthetic.directory])
-    expected = np.sqrt(np.mean((e[both] / 0.1) ** 2))
-    assert row(frame, "one")["rmse_common"] == pytest.approx(expected)
-    assert row(frame, "two")["rmse_common"] == pytest.approx(2 * expected)
-
-
 def test_coverage_and_nees_of_an_estimator_that_boasts(synthetic):
     e = np.random.default_rng(5).normal(size=(4000, 3)) * 0.1
     synthetic.add(synthetic.scenario(), "honest", e)
@@ -134,18 +121,6 @@ def test_estimators_with_a_prior_are_held_against_the_bayesian_bound(synthetic):
     assert row(frame, "bayes")["bayes_bound"] == pytest.approx(0.5)
 
 
-def test_seeds_are_pooled_and_nothing_else_is(synthetic):
-    for seed in (1, 2):
-        for sigma in (0.2, 0.4):
-            e = errors(100, seed=seed) * sigma / 0.2
-            synthetic.add(synthetic.scenario(seed=seed, sigma=sigma), "one", e)
-    frame = summarize([synthetic.directory])
-    assert "noise.deviation" in frame.columns
-    assert set(frame["noise.deviation"]) == {0.2, 0.4}
-    assert (frame["trials"] == 200).all()
-    assert len(frame) == 2 * 4
-
-
 def test_one_label_for_two_configs_becomes_two_rows_with_the_option_in_the_label(synthetic):
     scenario = synthetic.scenario()
     for option in (1, 2):
@@ -173,12 +148,6 @@ def test_halves_in_two_directories_are_one_run(tmp_path):
     pd.testing.assert_frame_equal(once, summarize([right.directory, left.directory]), check_exact=True)
     # Overlapping pieces count each trial once.
     pd.testing.assert_frame_equal(once, summarize([whole.directory, right.directory]), check_exact=True)
-
-
-def test_nothing_stored_is_an_empty_table_with_its_columns(tmp_path):
-    frame = summarize([tmp_path])
-    assert frame.empty
-    assert "rmse_over_linear_bound" in frame.columns
 
 
 def rewrite_truth(synthetic, kind: str, value: float) -> None:

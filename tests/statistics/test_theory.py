@@ -21,7 +21,7 @@ from ipe_bench.statistics import analyse
 from ipe_bench.statistics.histories import fixed_point_bound, observed_constant, orders_of
 from ipe_bench.trials.roots import frozen_root
 from ipe_bench.trials.scenario import Scenario
-from ipe_bench.trials.scoring import CURVED, SAME_ROOT, Block
+from ipe_bench.trials.scoring import CURVED, Block
 from ipe_bench.trials.theory import contraction_of, curvature, second_derivatives
 
 
@@ -187,17 +187,6 @@ def test_bounds_on_iterations_are_in_the_report(analysis):
     assert newton["eq_18_trials"] == 0
     names = [t.name for t in all_tables(analysis) if t.appendix]
     assert {"contraction", "covariances", "iterations"} <= set(names)
-
-
-def test_root_distance_is_what_solved_is_judged_by():
-    scenario = Scenario(Polynomial(strength=0.02), Gaussian(0.1), GaussianPrior(), 5.0)
-    block = Block.draw(scenario, 0, 50)
-    estimates, columns = block.estimate(Newton())
-    moved = columns["root_distance"] <= SAME_ROOT
-    assert (columns["solved"] == (moved & (estimates.status == Status.CONVERGED))).all()
-    root = frozen_root(scenario.problem, block.trials.z, block.trials.x)
-    expected = (np.abs(estimates.x - root) / block.crlb_deviation).max(axis=1)
-    np.testing.assert_array_equal(columns["root_distance"], expected)
 
 
 def test_false_roots_say_how_far_off_they_are(synthetic):

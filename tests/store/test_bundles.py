@@ -57,20 +57,6 @@ def test_the_same_results_give_the_same_bytes_anywhere(bundle, tmp_path):
     assert again.digest == bundle.digest
 
 
-def test_the_manifest_has_the_digest_of_every_file(bundle, tmp_path):
-    names = {f"theirs/{p.relative_to(tmp_path / 'theirs')}" for p in (tmp_path / "theirs").rglob("*.*") if p.is_file()}
-    assert set(bundle.files) == {name for name in names if "/." not in name}
-    for name, digest in bundle.files.items():
-        assert hashlib.sha256((tmp_path / name).read_bytes()).hexdigest() == digest
-
-
-def test_two_folders_are_compared_with_ones_own(bundle, tmp_path):
-    mine = fill(tmp_path / "mine", factor=2.0)
-    frame = ib.compare(mine, bundle.path).set_index(["first", "quantity"])
-    assert frame.loc[("one", "error"), "change"] == pytest.approx(0.5)
-    assert frame.loc[("one", "error"), "finding"] == "better"
-
-
 def test_a_report_on_ones_own_and_a_bundle(bundle, tmp_path, capsys):
     mine = Synthetic(tmp_path / "mine")
     mine.add(mine.scenario(error_scale=3.0), "one", np.full((20, 3), 0.1))
