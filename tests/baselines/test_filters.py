@@ -238,11 +238,7 @@ class Fragile(Linear):
         return np.where(np.abs(x[:, :1]) > 1e6, np.inf, super().simulate_until(x, stop))
 
 
-@pytest.mark.parametrize(
-    "estimator",
-    [*FILTERS, *BATCHED, RecursiveUpdate()],
-    ids=str,
-)
+@pytest.mark.parametrize("estimator", [*FILTERS, *BATCHED, RecursiveUpdate()], ids=str)
 def test_what_overflows_ends_its_own_trial(estimator):
     model = Fragile()
     problem = Problem(model, Covariance(np.ones(model.m)), np.ones(4))

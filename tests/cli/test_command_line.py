@@ -105,20 +105,11 @@ MISTAKES = {
         ["run", "measurement=nist", "measurement.dataset=Iris"],
         "measurement.dataset=Iris: cho",
     ),
-    "a solver among baselines": (
-        ["run", "baseline=[newton]"],
-        "newton is no baseline but a solver; write solver",
-    ),
-    "a baseline among solvers": (
-        ["run", "solver=[gauss_newton]"],
-        "is no solver but a baseline; write baseline",
-    ),
+    "a solver among baselines": (["run", "baseline=[newton]"], "newton is no baseline but a solver; write solver"),
+    "a baseline among solvers": (["run", "solver=[gauss_newton]"], "is no solver but a baseline; write baseline"),
     "capital letters": (["run", "measurement=GINS"], "measurement=GINS: there is no such option; did you mean gins?"),
     "a group for a place": (["run", "baseline.ekf.process_noise=1"], "write estimators.ekf.process_noise=1"),
-    "not chosen": (
-        ["run", "estimators.newton.max_iterations=9"],
-        "newton is not chosen; add it to solver=",
-    ),
+    "not chosen": (["run", "estimators.newton.max_iterations=9"], "newton is not chosen; add it to solver="),
     "an address": (["run", "output=s3://bucket/x"], "output=s3://bucket/x: is an address; name a folder"),
     "an underscore": (["run", "error_scale=1_0"], "error_scale=1_0: has an underscore in a number"),
     "a file for its key": (["estimate", "my.csv"], "my.csv: is not KEY=VALUE, without spaces"),

@@ -78,8 +78,7 @@ class Unseeded(Polynomial):
 
 
 @pytest.mark.parametrize(
-    ("model", "way"),
-    [(Stale, "after another x"), (Crowded, "in another batch"), (Unseeded, "on a fresh object")],
+    ("model", "way"), [(Stale, "after another x"), (Crowded, "in another batch"), (Unseeded, "on a fresh object")]
 )
 def test_readings_that_hang_on_more_than_x_are_refused_by_name(model, way):
     with pytest.raises(UserError, match=rf"^measurement={model().name}: simulate\(x\) has other bits .*{way}"):

@@ -29,13 +29,7 @@ def on_ellipsoid(latitude, longitude, height):
     e2 = f * (2 - f)
     N = a / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
     r = (N + height) * np.cos(latitude)
-    return np.array(
-        [
-            r * np.cos(longitude),
-            r * np.sin(longitude),
-            (N * (1 - e2) + height) * np.sin(latitude),
-        ]
-    )
+    return np.array([r * np.cos(longitude), r * np.sin(longitude), (N * (1 - e2) + height) * np.sin(latitude)])
 
 
 def sky(model):

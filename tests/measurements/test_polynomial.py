@@ -11,12 +11,7 @@ from ipe_bench.measurements import Polynomial
 from ipe_bench.measurements.problem import Problem
 
 
-@given(
-    n=st.integers(1, 6),
-    extra=st.integers(1, 20),
-    strength=st.floats(-0.5, 0.5),
-    seed=st.integers(0, 10_000),
-)
+@given(n=st.integers(1, 6), extra=st.integers(1, 20), strength=st.floats(-0.5, 0.5), seed=st.integers(0, 10_000))
 def test_the_nonlinear_part_is_as_documented(n, extra, strength, seed):
     model = Polynomial(n, n + extra, strength)
     x = np.random.default_rng(seed).normal(size=(3, n))
