@@ -59,14 +59,6 @@ def test_it_goes_on_from_what_is_stored_and_leaves_one_record_that_is_complete(t
     assert ib.status(tmp_path).attrs["problems"] == []
 
 
-def test_a_share_of_one_takes_a_few_blocks_and_one_in_between_many():
-    easy = stop_of(ib.run(BENCH, {"newton": ib.solvers.Newton()}, precision=0.05, block_size=50))
-    hard = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=1.2)
-    table = ib.run(hard, {"linear": ib.baselines.LinearLSE()}, precision=0.05, block_size=50)
-    assert 0.1 < table["success"].iloc[0] < 0.9
-    assert easy["trials"] <= 300 < 800 < stop_of(table)["trials"]
-
-
 def test_the_root_mean_square_is_known_as_well_as_is_asked(tmp_path):
     table = ib.run(BENCH, {"newton": ib.solvers.Newton()}, precision={"rmse": 0.06}, output=tmp_path)
     row = table[table["parameter"] == "all"].iloc[0]

@@ -86,33 +86,6 @@ def test_gins_reaches_the_minimum_that_gauss_newton_has_from_the_truth(method):
     assert low < nees(found.x - trials.x, found.covariance).mean() / 11 < high
 
 
-@dataclass(frozen=True)
-class Counting(Decay):
-    calls: tuple[list[int], list[int]] = ((), ())  # type: ignore[assignment]
-
-    def simulate(self, x):
-        self.calls[0].append(len(x))
-        return super().simulate(x)
-
-    def jacobian(self, x):
-        self.calls[1].append(len(x))
-        return T[None, :, None] ** [0.0, 1.0] * np.exp(-x[:, None, 1:] * T[:, None]) * [1.0, -x[0, 0]]
-
-    def linearization(self):
-        return Decay().linearization()
-
-
-@pytest.mark.parametrize("start", ["linear_lse", "nominal"])
-@pytest.mark.parametrize("method", METHODS)
-def test_counts_what_it_evaluates(method, start):
-    problem, trials = decay(trials=1)
-    model = Counting(calls=([], []))
-    found = LeastSquares(method=method, start=start).estimate(Problem(model, problem.R), trials.z)
-    assert found.status[0] == Status.CONVERGED
-    assert found.simulations[0] == len(model.calls[0])
-    assert found.jacobians[0] == len(model.calls[1])
-
-
 def test_a_robust_loss_shrugs_off_a_bad_reading():
     problem, trials = decay(trials=4)
     z = trials.z.copy()

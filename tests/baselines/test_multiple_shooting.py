@@ -8,8 +8,6 @@ from linear_models import Linear
 from small_models import bock
 
 from ipe_bench.baselines import LevenbergMarquardt, MultipleShooting
-from ipe_bench.baselines.multiple_shooting import Linear as Linearized
-from ipe_bench.baselines.multiple_shooting import Pieces
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.basics.statuses import Status
@@ -26,50 +24,6 @@ MODELS = {"gins": (Gins(), 100.0, 0.0066), "lotka_volterra": (LotkaVolterra(), 1
 def scenario(name: str) -> Scenario:
     model, scale, deviation = MODELS[name]
     return Scenario(model, Gaussian(deviation), GaussianPrior(), scale, seed=2)
-
-
-@pytest.mark.parametrize("name", MODELS)
-@pytest.mark.parametrize("segments", [1, 4, 7])
-def test_pieces_that_meet_are_the_trajectory(name, segments):
-    """Followed from nodes on the trajectory the readings are those of the model, and its slopes theirs."""
-    drawn = scenario(name).draw(0, 3)
-    problem = scenario(name).problem
-    model = getattr(problem.measurement, "whole", problem.measurement)
-    pieces = Pieces(problem, model, np.arange(model.m), segments, 0.05)
-    first, _ = pieces.first_states(drawn.x)
-    y = np.repeat(first[:, None], len(pieces.cuts) - 1, axis=1)
-    for g in range(1, len(pieces.cuts) - 1):
-        y[:, g] = pieces.follow(drawn.x, y)[0][:, g - 1]
-    ends, h = pieces.follow(drawn.x, y)
-    np.testing.assert_array_equal(ends[:, :-1], y[:, 1:])
-    expected = model.simulate(drawn.x)
-    scale = np.abs(expected).max()
-    np.testing.assert_allclose(h.reshape(3, -1) - model.offset, expected, atol=1e-8 * scale)
-    # And as a matrix: chaining the pieces' slopes gives the Jacobian of single shooting.
-    M, Jh = pieces.slopes(drawn.x, y)
-    _, S = pieces.first_states(drawn.x)
-    n, along = drawn.x.shape[1], S
-    J = np.empty((*h.shape, n))
-    for g in range(len(pieces.cuts) - 1):
-        times = slice(pieces.cuts[g], pieces.cuts[g + 1])
-        J[:, :, times] = Jh[:, :, times, :, :n] + np.einsum("tckos,tcsn->tckon", Jh[:, :, times][..., n:], along)
-        along = M[:, g, ..., :n] + np.matmul(M[:, g, ..., n:], along)
-    exact = model.jacobian(drawn.x)
-    np.testing.assert_allclose(J.reshape(exact.shape), exact, atol=1e-6 * np.abs(exact).max())
-
-
-def test_a_linear_step_is_that_of_constrained_least_squares():
-    """The Lagrange equations, solved as one system."""
-    rng = np.random.default_rng(0)
-    C, J = rng.standard_normal((4, 5, 8)), rng.standard_normal((4, 9, 8))
-    d, r = rng.standard_normal((4, 5)), rng.standard_normal((4, 9))
-    linear = Linearized.of(C, J)
-    found = linear.step(d, r)
-    for k in range(4):
-        A = np.block([[J[k].T @ J[k], C[k].T], [C[k], np.zeros((5, 5))]])
-        u = np.linalg.solve(A, np.concatenate([-J[k].T @ r[k], -d[k]]))[:8]
-        np.testing.assert_allclose(found[k], u, atol=1e-9)
-        np.testing.assert_allclose(linear.covariance[k], np.linalg.inv(A)[:3, :3], atol=1e-9)
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -9,7 +9,6 @@ import numpy as np
 from ipe_bench.baselines import LevenbergMarquardt, Multistart
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.base import Estimates
 from ipe_bench.measurements import Measurement, Parameter
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
@@ -99,15 +98,6 @@ def test_a_budget_ends_the_search():
     free, bounded = (Multistart(starts=20, budget=b).estimate(problem, trials.z) for b in (None, 40.0))
     assert (free.simulations + free.jacobians).max() > 100
     assert (bounded.simulations + bounded.jacobians).max() <= 42
-
-
-def test_parts_are_joined_with_their_alternatives():
-    problem, trials = draw(Mirrored(), 0.01, 0.3, 4)
-    problem = Problem(problem.measurement, problem.R)
-    parts = [Multistart(starts=30, confirmations=29, seed=4).estimate(problem, z[None]) for z in trials.z]
-    parts[1].alternatives = None
-    joined = Estimates.join(parts)
-    assert [len(others) for others in joined.alternatives] == [1, 0, 1, 1]
 
 
 def test_without_readings_that_fit_every_start_is_tried():

@@ -117,28 +117,6 @@ def test_exit_code_1_where_no_estimator_has_an_answer_that_passes(estimate, misr
     assert "±" not in printed.split("Does the model fit?")[0].split("standard error", 1)[1]
 
 
-def test_an_estimate_with_a_prior_has_intervals_that_count_it(estimate, misra):
-    words = (*SATURATION, "solver=[]", "readings=weighted.csv", "parameters.b1.deviation=1")
-    code, printed, answer = estimate(*words, "baseline=[map_lm]")
-    assert code == 0, printed
-    assert answer["examination"]["with_prior"]
-    assert answer["examination"] == answer["examination_with_prior"]
-    assert "map_lm: with a prior" in printed
-    t, y = misra
-    sigma = 0.05 + 0.01 * np.arange(len(t))
-    rows = np.append(t, [0.0, 0.0])
-
-    def with_prior(_, b1, b2):
-        return np.append(curve(t, b1, b2), [b1, b2])
-
-    z, s = np.append(y, [250.0, 5e-4]), np.append(sigma, [1.0, 5e-4])
-    x, P = curve_fit(with_prior, rows, z, (250, 5e-4), s, True, ftol=1e-14, xtol=1e-14, gtol=1e-14)
-    assert list(of(answer, "estimates", "map_lm").values()) == pytest.approx(x, rel=1e-5)
-    assert list(of(answer, "standard_errors", "map_lm").values()) == pytest.approx(np.sqrt(np.diag(P)), rel=1e-4)
-    low, high = answer["examination"]["intervals"]["profile"]["b1"]
-    assert (low, high) == pytest.approx((x[0] - 1.96 * np.sqrt(P[0, 0]), x[0] + 1.96 * np.sqrt(P[0, 0])), abs=0.1)
-
-
 def test_what_is_known_of_all_parameters_stands_in_small_files(estimate, misra, tmp_path):
     """Starts, and a prior of both together, against SciPy with both as readings of a covariance."""
     (tmp_path / "known.yaml").write_text("b1: {nominal: 240}\nb2: {nominal: 5.5e-4}\n")

@@ -24,13 +24,6 @@ def said(out: str) -> float:
     return float(line.split()[1].rstrip(","))
 
 
-def test_it_is_the_number_of_the_summary(capsys):
-    assert main(["run", *SMALL, "trials=10", "error_scale=10", "objective=newton.simulations_median"]) == 0
-    summary = pd.read_csv("out/summary.csv")
-    row = summary[(summary["estimator"] == "newton") & (summary["parameter"] == "all")].iloc[0]
-    assert said(capsys.readouterr().out) == row["simulations_median"]
-
-
 def test_of_a_sweep_the_least_is_said(capsys):
     words = ["error_scale=1,100", "trials=10", "objective=newton.simulations_median"]
     assert main(["run", "-m", *SMALL, *words]) == 0

@@ -80,24 +80,6 @@ def test_fixed_point_iterates_are_those_of_eqs_16_and_17():
         x = H_plus @ (z[0] - (model.simulate(x[None])[0] - A @ x))
 
 
-def test_error_stays_below_the_bound_of_eq_18_on_a_contraction():
-    problem = problem_of(bend=0.004)
-    model = problem.measurement
-    truth = np.array([0.6, -0.4, 0.5])
-    estimates = FixedPoint(tolerance=1e-13).estimate(problem, model.simulate(truth[None]), history=True)
-    history = estimates.history[0]
-    H_plus = np.linalg.pinv(model.A)
-    # K of eq. (15) over the box that holds the iterates, on a grid of its corners.
-    low, high = history.min(axis=0), history.max(axis=0)
-    corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
-    slopes = np.eye(3) - np.matmul(H_plus, model.jacobian(corners))
-    K = 3 * np.abs(slopes).max()
-    assert K < 1
-    first = np.abs(history[1] - history[0]).max()
-    errors = np.abs(history - estimates.x[0]).max(axis=1)
-    assert (errors[:-1] <= K ** np.arange(len(history) - 1) / (1 - K) * first + 1e-14).all()
-
-
 def test_sandwich_is_the_spread_of_the_roots():
     problem = problem_of(bend=0.03, sigma=0.01)
     model, truth = problem.measurement, np.array([[1.0, -0.5, 0.8]])

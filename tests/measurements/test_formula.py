@@ -158,14 +158,6 @@ def test_derivatives_are_exact_and_those_of_a_power_of_zero_are_zero():
     assert power.jacobian(np.ones((1, 2)))[0, 1, 1] == pytest.approx(2.0 * 8.0 * math.log(4.0) * 1.5)
 
 
-def test_a_misspelt_column_is_named(tmp_path):
-    path = tmp_path / "a.csv"
-    path.write_text("t [s],y\n0,1\n1,2\n2,4\n")
-    with pytest.raises(UserError, match=r"column b2 is missing.*If b2 is a parameter.*measurement.start.b2=VALUE"):
-        open_together([path], Formula("b1*exp(b2*t)", {"b1": 1.0}))
-    assert open_together([path], Formula("b1*t", {"b1": 1.0})).z.tolist() == [1.0, 2.0, 4.0]
-
-
 def test_a_formula_is_evaluated_or_refused_however_long():
     formula = read("+".join(["b1*t"] * 399), "expression")
     assert formula({"b1": 2.0, "t": 0.5}) == 399.0

@@ -109,15 +109,6 @@ def test_trials_that_are_trusted_without_a_test_keep_it_too(injected):
     assert np.abs(model.simulate(x) - replace(model, step=10.0).simulate(x)).max() < 1e-7
 
 
-def test_other_experiments_are_not_trusted_untested():
-    assert Gins().trusted_angle > 0
-    assert Gins(readings_per_case=60).trusted_angle == 0
-    assert Gins(interval_min=1.0).trusted_angle == 0
-    long = Gins(interval_min=30.0, readings_per_case=6)
-    x = draw(1000.0, 20, seed=8)
-    assert np.abs(long.simulate(x) - replace(long, step=5.0).simulate(x)).max() < 1e-6
-
-
 def test_bits_of_a_trial_depend_on_itself_alone_where_steps_differ(monkeypatch):
     """In one batch of several levels, alone, in another order, up to a stop, and after other calls or none."""
     x = np.concatenate([draw(scale, 8, seed=9) for scale in (33.0, 1000.0, 3000.0, 10000.0)])

@@ -8,7 +8,6 @@ import pytest
 from scipy.optimize import least_squares
 
 from ipe_bench.measurements import Mgh
-from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.mgh import functions, score
 from ipe_bench.measurements.mgh.problems import PROBLEMS
 from ipe_bench.plugins.conformance import check_component
@@ -161,17 +160,6 @@ def test_the_middle_minimum_of_biggs_is_a_saddle():
     x = np.array(model.minima[1].x)
     lower = min(sum_of_squares(model, x + e * np.array([1, 0, 0, 0, -1, 0])) for e in (-0.01, 0.01))
     assert lower < model.minima[1].sum_of_squares
-
-
-@pytest.mark.parametrize("start", [1.0, 10.0])
-@pytest.mark.parametrize("function", functions())
-def test_the_exact_jacobian_agrees_with_differences(function, start):
-    model = Mgh(function, start)
-    x = model.nominal + 0.05 * np.random.default_rng(1).standard_normal((3, model.n))
-    exact, differences = model.jacobian(x), differentiate(model.simulate, x, analytic=False)
-    round_off = 1e-15 / np.finfo(float).eps ** (1 / 3) * np.abs(model.simulate(x)).max()
-    scale = np.abs(exact).max(axis=1, keepdims=True)
-    assert (np.abs(exact - differences) <= 1e-6 * scale + 10 * round_off).all()
 
 
 def test_starts_are_multiples_of_the_standard_start_and_watsons_as_in_minpack():

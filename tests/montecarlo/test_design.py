@@ -217,19 +217,6 @@ def test_the_tilt_that_looks_like_a_bias_is_named_before_anything_is_measured():
     assert all(s.hidden and s.noticed < 2e-3 for s in tilts.values())
 
 
-def test_the_tilt_costs_what_the_mismatch_experiment_finds():
-    """The predicted root mean square over parameters beside Gauss-Newton's, as in the README's table."""
-    truth = RicherGins(platform_misalignment=5.0)
-    bench = replace(scenario(Gins(), NOISE, 33.0), truth=truth)
-    predicted = suspects(bench.measurement, bench.problem.R, truth, bench.truths(0, 8))
-    trials = bench.draw(0, 60)
-    estimates = ib.baselines.GaussNewton().estimate(bench.problem, trials.z)
-    error = estimates.x - trials.x
-    moved = np.sqrt(sum(s.shift**2 for s in predicted))
-    found = np.sqrt(np.mean(error**2, axis=0))
-    assert found[:2] == pytest.approx(moved[:2], rel=0.3)
-
-
 @pytest.fixture(scope="module")
 def gins():
     return design(scenario(Gins(), NOISE, 33.0), by=["time"], truths=10)

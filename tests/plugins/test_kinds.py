@@ -300,23 +300,3 @@ def test_the_posterior_is_not_sampled_under_a_prior_that_is_not_normal():
 
     with pytest.raises(UserError, match="prior=uniform: is not normal"):
         reference(Scenario(Bent(0.02), Gaussian(0.1), Uniform()), {}, 0)
-
-
-def test_a_plugin_without_its_library_stops_no_run_and_says_what_to_install(capsys):
-    assert main(["new", "solver", "mine"]) == 0
-    Path("plugins/mine/ipe_bench_mine/mine.py").write_text("import no_such_library\n")
-    discovery.sources.cache_clear()
-    capsys.readouterr()
-    remedy = "No module named 'no_such_library'; install what the plugin needs"
-    assert main(["list", "solver"]) == 0
-    assert "mine" in capsys.readouterr().out
-    assert main(["run", *SMALL, "figures=none", "solver=[newton]"]) == 0
-    assert "mine" not in capsys.readouterr().err
-    for words, code in (
-        (["run", *SMALL, "solver=[mine]"], 2),
-        (["list", "solver", "-v"], 0),
-        (["check", "plugins/mine"], 1),
-    ):
-        assert main(words) == code
-        written = capsys.readouterr()
-        assert remedy in written.out + written.err

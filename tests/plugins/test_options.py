@@ -148,21 +148,6 @@ def test_what_a_plugins_class_does_not_check_is_checked_where_it_is_constructed(
             construct({**options, "_target_": f"{__name__}.{options['_target_']}"}, "part")
 
 
-def test_a_class_that_cannot_be_made_is_one_line(tmp_path, monkeypatch):
-    register_package("ipe_bench_broken")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    package = tmp_path / "ipe_bench_broken"
-    package.mkdir()
-    (package / "__init__.py").touch()
-    for name, source in (("raises", "raise RuntimeError('no licence')"), ("leaves", "import sys; sys.exit(5)")):
-        (package / f"{name}.py").write_text(source)
-        with pytest.raises(UserError, match=r"part\._target_=.*: its module cannot be imported") as told:
-            construct({"_target_": f"ipe_bench_broken.{name}.X"}, "part")
-        assert "\n" not in str(told.value)
-    with pytest.raises(UserError, match=r"IPE: is abstract; choose a class that writes step$"):
-        construct({"_target_": "ipe_bench.estimators.ipe.IPE"}, "part")
-
-
 PRESETS = {
     # Ways of one class that stand in tables beside its default.
     ("baseline", "dogbox"): {"method"},

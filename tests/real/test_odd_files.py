@@ -111,11 +111,8 @@ def odd_cells() -> Iterator[Case]:
         text(*(line if i != 3 else "2.0,," for i, line in enumerate(lines()))),
         missing=(2,),
     )
-    yield Case("a reading of blanks", with_cell("y", "  "), missing=(2,))
     yield Case("weight missing", with_cell("sigma", ""), r"row 4, column sigma: '' is not a standard deviation")
     yield Case("weight zero", with_cell("sigma", "0"), r"row 4, column sigma: '0' is not a standard deviation")
-    yield Case("weight negative", with_cell("sigma", "-0.1"), r"row 4, column sigma: '-0.1' is not a standard")
-    yield Case("weight so small that it is zero", with_cell("sigma", "1e-400"), r"row 4, column sigma: '1e-400' is not")
     yield Case("time missing", with_cell("t", ""), r"row 4, column t: is empty")
     yield Case(
         "rows numbered otherwise",
@@ -129,8 +126,6 @@ def odd_tables() -> Iterator[Case]:
     as_text = "\n".join(good)
     yield Case("empty", b"", "is empty")
     yield Case("a mark and nothing else", "\ufeff".encode(), "is empty")
-    yield Case("blanks alone", b"\n  \n,,\n", "is empty")
-    yield Case("a header alone", text(good[0]), "has a header and no rows")
     yield Case("no header", text(*good[1:]), "column t is missing")
     yield Case("two readings", text(*good[:2]), "1 readings are too few for 2 parameters")
     yield Case("tabs", as_text.replace(",", "\t").encode())
@@ -139,7 +134,6 @@ def odd_tables() -> Iterator[Case]:
         as_text.replace(",", "\t").replace(".", ",").encode(),
         "row 2, column y: '-1,25' is not a number",
     )
-    yield Case("bars", as_text.replace(",", "|").encode(), "column t is missing")
     yield Case("blanks between", as_text.replace(",", "  ").encode(), "column t is missing")
     yield Case(
         "a separator declared", text("sep=,", *good), "row 2: looks like the header, which must be the first row"
@@ -158,9 +152,6 @@ def odd_tables() -> Iterator[Case]:
     yield Case(
         "thousands of Germany", text("t;y;sigma", "1,5;1.017,5;1", "2;3;1", "3;4;1"), r"row 2, column y: '1.017,5'"
     )
-    yield Case(
-        "points and commas", text("t;y;sigma", "1,5;2;1", "2;3.5;1", "3;4;1"), r"row 3, column y: '3.5' is not a"
-    )
     yield Case("a cell too few", text(*good[:2], "1.25,2.5", *good[3:]), "row 3: has 2 cells and the header 3")
     yield Case("a cell too many", text(*good[:2], good[2] + ",7", *good[3:]), "row 3: has 4 cells and the header 3")
     yield Case("a comma behind each row", text(*(line + "," for line in good)), "column 4, which has no name, is not")
@@ -168,8 +159,6 @@ def odd_tables() -> Iterator[Case]:
     yield Case(
         "two columns without a name", text("t,y,sigma,,", *(line + ",," for line in good[1:])), "without a name stand"
     )
-    yield Case("Sigma", text("t,y,Sigma", *good[1:]), "column Sigma is not understood; remove it")
-    yield Case("deviation", text("t,y,deviation", *good[1:]), "column deviation is not understood; remove it")
     yield Case("weight", text("t,y,weight", *good[1:]), "column weight is not understood; remove it")
     yield Case(
         "a note",
@@ -178,27 +167,18 @@ def odd_tables() -> Iterator[Case]:
     )
     yield Case("Y", text("t,Y,sigma", *good[1:]), "column y is missing, which holds the readings")
     yield Case("x", text("x,y,sigma", *good[1:]), "column t is missing.*If t is a parameter")
-    yield Case("readings in two columns", text("t,y,reading", *good[1:]), "column reading is not understood")
     yield Case(
         "another unit of sigma",
         text("t,y [V],sigma [mV]", *good[1:]),
         r"column sigma \[mV\]: the unit must be that of y",
     )
-    yield Case(
-        "a unit of sigma alone", text("t,y,sigma [mV]", *good[1:]), r"column sigma \[mV\]: the unit must be that of y"
-    )
     yield Case("a quote left open", text(*good[:4], '3.5,"0.001,2.0', *good[5:]), r"row \d: is not a readable CSV file")
     yield Case("a quote within", text(*good[:4], '3.5,"0."001,2.0', *good[5:]), r"row 5: is not a readable CSV file")
     yield Case("latin-1", text("t,y [µV],sigma", *good[1:]).decode().encode("latin-1"), "row 1: is not a readable CSV")
-    yield Case("latin-1 below", (as_text + "\n9,1°,1").encode("latin-1"), "row 8: is not a readable CSV file")
     yield Case("UTF-16", as_text.encode("utf-16"), "row 1: is not a readable CSV file")
-    yield Case("UTF-16 without a mark", as_text.encode("utf-16-le"), "column t is missing|is not a readable")
-    yield Case("UTF-32", as_text.encode("utf-32"), "is not a readable CSV file")
     yield Case("compressed", gzip.compress(as_text.encode(), mtime=0), "is not a readable CSV file")
-    yield Case("a workbook", b"PK\x03\x04\x14\x00\x06\x00\x08\x00\x00\x00!\x00\x9c\xff", "is not a readable CSV file")
     yield Case("a page", b"<html><body>404 not found</body></html>", "column t is missing")
     yield Case("JSON", b'{"t": [1, 2], "y": [1, 2]}', "is not a readable CSV|column t is missing")
-    yield Case("no table at all", np.random.default_rng(0).bytes(500), "is not a readable CSV file")
     yield Case("text called Parquet", as_text.encode(), "is not a readable Parquet file", ".parquet")
     yield Case("Parquet called text", parquet(COLUMNS), "is not a readable CSV file")
 
@@ -226,7 +206,6 @@ def tables_of_programs() -> Iterator[Case]:
         "row 1, column t: '1970.*' is not",
         ".parquet",
     )
-    yield Case("Parquet of truths", parquet({**COLUMNS, "t": [True] * 6}), "row 1, column t: 'True' is not", ".parquet")
     yield Case("Parquet without rows", parquet({k: [] for k in COLUMNS}), "has a header and no rows", ".parquet")
 
 
@@ -277,12 +256,6 @@ def files_of_models() -> Iterator[Case]:
     )
     yield Case("a beacon as 1.0", written(Ranging(), replaced(2, "1,1,", "1.0,1e0,")), model=Ranging())
     yield Case("a beacon with weights", written(Ranging(), with_weights), model=Ranging())
-    yield Case(
-        "weights in km",
-        written(Ranging(), lambda r: with_weights(r, "sigma [km]")),
-        r"column sigma \[km\]: the unit must be that of reading \[m\]",
-        model=Ranging(),
-    )
     yield Case("a day twice", written(Sir(), lambda r: [*r, r[1]]), "stands there twice", model=Sir())
     yield Case(
         "a day before the start",

@@ -144,14 +144,3 @@ def test_a_small_file_holds_it_by_name(tmp_path, case):
             read_covariance(str(tmp_path / "p.csv"), ["a", "b"])
     else:
         assert read_covariance(str(tmp_path / "p.csv"), ["a", "b"]).tolist() == [[4.0, -0.9], [-0.9, 0.25]]
-
-
-def test_correlations_that_cannot_be_are_refused():
-    with pytest.raises(UserError, match="correlations: row 2 has 1 numbers"):
-        GaussianPrior(correlations=((1.0, 0.0), (0.0,)))
-    with pytest.raises(UserError, match="diagonal that is not 1"):
-        GaussianPrior(correlations=((2.0, 0.0), (0.0, 1.0)))
-    with pytest.raises(UserError, match="not positive definite"):
-        GaussianPrior(correlations=((1.0, 1.0), (1.0, 1.0)))
-    with pytest.raises(UserError, match="has 2 rows; give one for each of 3"):
-        _ = Scenario(Bent(), Gaussian(1.0), GaussianPrior(correlations=((1.0, 0.5), (0.5, 1.0)))).problem

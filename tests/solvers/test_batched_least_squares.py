@@ -103,14 +103,6 @@ def test_trials_without_full_rank_do_not_disturb_others():
     np.testing.assert_array_equal(np.isfinite(slope.size), [True, False, False, False, True])
 
 
-def test_a_parameter_that_the_prior_fixes_stays_where_it_is():
-    problem = Problem(Bent(0.01), Covariance(np.full(12, 0.3)), np.array([1.0, 0.0, 1.0]))
-    z = np.random.default_rng(3).normal(size=(4, 12))
-    estimates = MapLM().estimate(problem, z)
-    assert (estimates.status == Status.CONVERGED).all()
-    np.testing.assert_allclose(estimates.x[:, 1], 0.0, atol=1e-6)
-
-
 def test_one_inner_fixed_point_step_is_gauss_newton():
     problem, trials = gins(100.0, 5, Gins(step=60.0))  # with a fixed step all Jacobians are exact
     rounds = Relinearized(FixedPoint(), inner_iterations=1).estimate(problem, trials.z, history=True)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from square_systems import BurdenFaires, Cubic, NoRoot, Rosenbrock, system_of
@@ -11,7 +9,7 @@ from square_systems import BurdenFaires, Cubic, NoRoot, Rosenbrock, system_of
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.driver import Limits, iterate
 from ipe_bench.measurements import Gins, Polynomial
-from ipe_bench.noise import Gaussian, NoNoise, Quantization
+from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.solvers import Anderson, Broyden, DampedNewton, FixedPoint, Newton, SteepestDescent
 from ipe_bench.statistics.histories import orders_of
@@ -70,15 +68,6 @@ def test_gins_at_scale_10_converges_to_the_root_near_the_truth(solver):
     assert (estimates.status == Status.CONVERGED).all()
     assert np.isfinite(root).all()
     assert (np.abs(estimates.x - root) / deviation).max() < 1e-4
-
-
-@pytest.mark.parametrize("solver", ALL, ids=repr)
-def test_without_noise_the_truth_of_a_polynomial_is_the_root(solver):
-    scenario = Scenario(Polynomial(), NoNoise(1e-3), GaussianPrior(), 5.0)
-    trials = scenario.draw(0, 10)
-    estimates = replace(solver, max_iterations=1000).estimate(scenario.problem, trials.z)
-    assert (estimates.status == Status.CONVERGED).all()
-    np.testing.assert_allclose(estimates.x, trials.x, atol=1e-8)
 
 
 def _errors(solver, model, start, root, **options):

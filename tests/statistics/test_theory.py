@@ -79,21 +79,6 @@ def test_orders_of_sequences_are_recovered():
     assert len(orders_of(linear[:2])) == 0
 
 
-def test_orders_on_gins_are_linear_and_quadratic():
-    scenario = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), 100.0)
-    trials = scenario.draw(0, 20)
-    problem = scenario.problem
-    root = frozen_root(problem, trials.z, trials.x)
-    deviation = np.sqrt(np.diagonal(FrozenSystem.at_nominal(problem, trials.z).covariance()[0]))
-    orders = {}
-    for solver in (FixedPoint(), Newton()):
-        histories = solver.estimate(problem, trials.z, history=True).history
-        errors = [np.abs((h - x) / deviation).max(axis=1) for h, x in zip(histories, root, strict=True)]
-        orders[type(solver)] = np.median([o[-1] for e in errors if len(o := orders_of(e, 1e-5))])
-    assert 0.8 < orders[FixedPoint] < 1.2
-    assert 1.7 < orders[Newton] < 2.3
-
-
 def test_the_constant_of_eq_23_is_that_of_a_quadratic():
     """h(x) = A x + b (A x)^2 with one parameter: F'' = 2 b H+ A^2 and F' = H+ (A + 2 b A^2 x)."""
     scenario = Scenario(Polynomial(unknowns=1, strength=0.1), Gaussian(0.01), GaussianPrior(), 1.0)
