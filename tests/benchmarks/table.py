@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import peers
+from scale import TRIALS, WORKERS, Usage, measured, used
 from scipy.integrate import solve_ivp
 
 import ipe_bench as ib
@@ -172,44 +173,17 @@ def filters() -> Iterator[Row]:
     s = scenario(33.0)
     for cls, trials in ((B.EKF, 100), (B.IteratedEKF, 100), (B.UKF, 100), (B.CKF, 100), (B.EnKF, 20)):
         z = s.draw(0, trials).z
-        batched, floor = _with_floor(cls(engine="batched"), s.problem, z)
         few = z[:10]
+        (batched,) = least(lambda cls=cls, z=z: cls(engine="batched").estimate(s.problem, z), rounds=2)
         (plain,) = least(lambda cls=cls, few=few: cls().estimate(s.problem, few), rounds=1)
-        name, unit = cls.__name__, "µs"
-        yield Row("filters", name, 1e6 * batched / trials, unit, "its model evaluations", 1e6 * floor / trials)
-        yield Row("filters", name, 1e6 * batched / trials, unit, "filterpy, trial by trial", 1e6 * plain / len(few))
-
-
-def _with_floor(filter: Any, problem: Problem, z: np.ndarray) -> tuple[float, float]:
-    """CPU seconds of a filter, and of the evaluations of the model among them."""
-    inside = 0.0
-    read = Epoch.read
-
-    def timed(self: Epoch, *args: Any, **more: Any) -> Any:
-        nonlocal inside
-        began = time.process_time()
-        try:
-            return read(self, *args, **more)
-        finally:
-            inside += time.process_time() - began
-
-    best = (np.inf, np.inf)
-    Epoch.read = timed  # type: ignore[method-assign]
-    try:
-        for _ in range(3):
-            inside, began = 0.0, time.process_time()
-            filter.estimate(problem, z)
-            best = min(best, (time.process_time() - began, inside))
-    finally:
-        Epoch.read = read  # type: ignore[method-assign]
-    return best
+        beside = "filterpy, trial by trial"
+        yield Row("filters", cls.__name__, 1e6 * batched / trials, "µs", beside, 1e6 * plain / len(few))
 
 
 def loop() -> Iterator[Row]:
     """Whole commands as a user sees them, with bytecode kept."""
-    environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONDONTWRITEBYTECODE", "IPE_BENCH_THREADS")}
     with tempfile.TemporaryDirectory(prefix="ipe-bench-") as folder:
-        runs: dict[str, list[tuple[float, float, float]]] = {}
+        runs: dict[str, list[Usage]] = {}
         for attempt in range(3):
             run = [sys.executable, "-m", "ipe_bench", "run", "trials=2", f"output={folder}/{attempt}"]
             for name, command in (
@@ -217,36 +191,15 @@ def loop() -> Iterator[Row]:
                 ("run trials=2, all figures", run),
                 ("the same with nothing to do", run),
             ):
-                runs.setdefault(name, []).append(_timed(command, environment))
-    wall, cpu, _ = (min(column) for column in zip(*runs.pop("libraries"), strict=True))
-    for name, measured in runs.items():
-        whole, busy, table = (min(column) for column in zip(*measured, strict=True))
-        yield Row("loop", f"{name}: table on the screen", table, "s wall", LIBRARIES, wall)
-        yield Row("loop", f"{name}: whole", whole, "s wall", LIBRARIES, wall)
-        yield Row("loop", f"{name}: whole", busy, "s CPU", LIBRARIES, cpu)
-
-
-def _timed(command: list[str], environment: dict[str, str]) -> tuple[float, float, float]:
-    """Wall and CPU seconds of a process, and the seconds until it had printed its table."""
-    import resource
-
-    before, began, table = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter(), 0.0
-    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if "linear_lse" in line:
-                table = time.perf_counter() - began
-    if process.returncode:
-        raise subprocess.CalledProcessError(process.returncode, command)
-    wall, after = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return wall, cpu, table or wall
+                runs.setdefault(name, []).append(used(command))
+    beside = runs.pop("libraries")
+    for name, found in runs.items():
+        for unit, seconds in (("s wall", lambda one: one.wall_s), ("s CPU", lambda one: one.cpu_s)):
+            yield Row("loop", name, min(map(seconds, found)), unit, LIBRARIES, min(map(seconds, beside)))
 
 
 def scale() -> Iterator[Row]:
     """Many trials with their report, beside a tenth of them; not among the parts unless it is asked for."""
-    from scale import TRIALS, WORKERS, measured
-
     few, many = measured(TRIALS // 10), measured(TRIALS)
     what, tenth = f"{TRIALS:,} trials, two estimators", f"{few.trials:,} trials"
     for name, a, b in (("run with report", many.run, few.run), ("report alone", many.report, few.report)):
@@ -264,26 +217,6 @@ LONG = {"scale": scale}
 """Takes minutes: only where it is asked for."""
 
 
-def machine() -> dict[str, Any]:
-    names = [line.split(":", 1)[1].strip() for line in _lines("/proc/cpuinfo") if line.startswith("model name")]
-    load = os.getloadavg() if hasattr(os, "getloadavg") else (float("nan"),)
-    return {
-        "processor": names[0] if names else platform.processor(),
-        "cores": os.cpu_count(),
-        "system": platform.platform(),
-        "load": round(load[0], 1),
-        "when": time.strftime("%Y-%m-%d %H:%M"),
-        **library_versions(),
-    }
-
-
-def _lines(path: str) -> list[str]:
-    try:
-        return Path(path).read_text().splitlines()
-    except OSError:
-        return []
-
-
 def markdown(facts: dict[str, Any], rows: list[Row]) -> str:
     head = ", ".join(f"{k} {v}" for k, v in facts.items())
     lines = [head, "", "| part | what | here | beside | there | ratio |", "|---|---|--:|---|--:|--:|"]
@@ -295,7 +228,8 @@ def markdown(facts: dict[str, Any], rows: list[Row]) -> str:
 
 def main(folder: Path, parts: list[str]) -> None:
     peers.one_thread()
-    facts, rows = machine(), []
+    rows = []
+    facts = {"system": platform.platform(), "cores": os.cpu_count(), **library_versions()}
     for part in parts or list(PARTS):
         for row in (PARTS | LONG)[part]():
             rows.append(row)

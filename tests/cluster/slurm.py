@@ -1,8 +1,4 @@
-"""A Slurm of two nodes on this machine, started and ended by us: `with started(folder) as environment`.
-
-Needs Debian's slurm-wlm and munge, and root. By hand: `python tests/cluster/slurm.py FOLDER` starts it, and says how to
-use it until Enter is pressed.
-"""
+"""A Slurm of two nodes on this machine, by Debian's slurm-wlm and munge: `with started(folder) as environment`."""
 
 from __future__ import annotations
 
@@ -116,8 +112,3 @@ def _free_port() -> int:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return free.getsockname()[1]
-
-
-if __name__ == "__main__":
-    with started(Path(sys.argv[1]).absolute()) as found:
-        input(f"export SLURM_CONF={found['SLURM_CONF']}\nEnter ends it. ")
