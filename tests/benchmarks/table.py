@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import os
 import platform
-import subprocess
 import sys
 import tempfile
 import time
@@ -26,10 +25,8 @@ from scale import TRIALS, WORKERS, Usage, measured, used
 from scipy.integrate import solve_ivp
 
 import ipe_bench as ib
-from ipe_bench.baselines.epochs import Epoch
 from ipe_bench.basics.linalg import deviations
 from ipe_bench.basics.machine import library_versions
-from ipe_bench.measurements.problem import Problem
 from ipe_bench.trials.scoring import Block
 
 STEP_S = 180.0

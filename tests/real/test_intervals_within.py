@@ -201,7 +201,7 @@ def decay_above_zero(c: float, seed: int, bootstraps: int = 500):
 
 @pytest.mark.parametrize(("seed", "drawn"), [(0, 500), (2, 60)], ids=["estimate inside", "estimate on the bound"])
 def test_simulated_sets_are_minimised_within_the_bounds_as_the_readings_were(seed, drawn):
-    """Each once more by SciPy; about half of them are on the bound, and without those 0 would not be in the interval."""
+    """Each once more by SciPy; about half are on the bound, and without those 0 would not be in the interval."""
     one, found = decay_above_zero(0.0, seed, bootstraps=drawn)
     assert found is not None
     assert one.held_at == ({} if seed == 0 else {2: 0.0})
