@@ -6,6 +6,7 @@ import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -353,12 +354,10 @@ def write_answer(
     All its figures are main ones: `which` is all, main or none. `command` tells one command from another (see
     `writer.claim`); `provenance` is added to the JSON file and overrides what stands there of the same name.
     """
-    from ipe_bench.report.figures.readings import draw_fits, draw_profiles
+    from ipe_bench.report.figures.readings import draw_ellipses, draw_profiles, draw_residuals
 
-    found = answer.examination
-    drawings = []
-    if which != "none":
-        drawings = [*draw_fits(answer.model, answer.fits), *(draw_profiles(found) if found is not None else ())]
+    given = answer.model, answer.fits
+    drawings = chain(draw_residuals(*given), draw_ellipses(*given), *map(draw_profiles, answer.examinations[:1]))
     verdict = "an answer that passes" if answer.passes else "NO ANSWER THAT PASSES"
     return write(
         folder,
@@ -368,7 +367,7 @@ def write_answer(
         lead=f"{np.isfinite(answer.z).sum()} readings; {verdict}. {provenance.get('written', '')}",
         content={"schema": SCHEMA, "command": command, **described(answer), **provenance},
         table=(RESIDUALS, _residuals(answer)),
-        drawings=drawings,
+        drawings=() if which == "none" else drawings,
         old=_FIGURES,
     )
 

@@ -76,12 +76,12 @@ def write_posteriors(
 ) -> list[Path]:
     """Writes posteriors with a corner picture of each trial, and returns the files; `name` is the model's and
     `scenario` says what was sampled."""
-    from ipe_bench.report.figures.readings import draw_corners
+    from ipe_bench.report.figures.readings import draw_corner
 
     trials = [_described(model, one) for one in found]
     content = {"schema": SCHEMA, "command": command, "trials": trials, "measurement": name}
     title, parts = f"{name}: posteriors", contents(scenario, found)
-    return write(folder, NAME, title, parts, content=content, drawings=draw_corners(model, found))
+    return write(folder, NAME, title, parts, content=content, drawings=(draw_corner(model, one) for one in found))
 
 
 def _described(model: Measurement, one: Reference) -> dict[str, Any]:

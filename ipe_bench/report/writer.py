@@ -6,6 +6,7 @@ import base64
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import write_text
+from ipe_bench.report.style import house_style
 from ipe_bench.report.table import Part, environment
 
 if TYPE_CHECKING:
@@ -73,9 +75,9 @@ def write(
 ) -> list[Path]:
     """Writes the files of a command, each of which appears whole or not at all, and returns them.
 
-    They are `name`.json with the `content`, the `table` under its name, the `drawings`, and the
-    page `name`.html of all the tables, sentences and figures below the sentence `lead`. Of the `old` files, which the
-    same command may have written before, those go that it does not write now.
+    They are `name`.json with the `content`, the `table` under its name, the `drawings`, which are drawn here in our
+    style, and the page `name`.html of all the tables, sentences and figures below the sentence `lead`. Of the `old`
+    files, which the same command may have written before, those go that it does not write now.
     """
     files = []
     if content is not None:  # first, since it says whose folder this is
@@ -85,10 +87,11 @@ def write(
         files.append(folder / table[0])
         write_text(files[-1], table[1].to_csv(index=False))
     figures = []
-    for drawing in drawings:
-        files += drawing.save(folder)
-        png = base64.b64encode((folder / f"{drawing.name}.png").read_bytes()).decode()
-        figures.append({"title": drawing.title, "caption": drawing.caption, "png": png})
+    with house_style() if drawings else nullcontext():
+        for drawing in drawings:
+            files += drawing.save(folder)
+            png = base64.b64encode((folder / f"{drawing.name}.png").read_bytes()).decode()
+            figures.append({"title": drawing.title, "caption": drawing.caption, "png": png})
     page = environment().get_template("answer.html.j2")
     files.append(folder / f"{name}.html")
     write_text(files[-1], page.render(title=title, lead=lead, parts=list(parts), figures=figures))

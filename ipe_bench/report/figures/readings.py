@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -17,7 +17,7 @@ from ipe_bench.real.fits import Fit
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing
-from ipe_bench.report.style import BOUND_COLOR, Look, house_style, looks
+from ipe_bench.report.style import BOUND_COLOR, Look, looks
 from ipe_bench.report.words import p_value
 from ipe_bench.trials.posterior import Reference
 
@@ -39,15 +39,8 @@ _DRAWS = 2000
 _DRAW_COLOR = "#9a9a9a"
 
 
-def draw_fits(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]:
-    """The residual plot and, with two parameters or more, the covariance ellipses."""
-    look = looks([one.label for one in fits])
-    with house_style():
-        yield from _residuals(model, fits, look)
-        yield from _ellipses(model, fits, look)
-
-
-def _residuals(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look]) -> Iterator[Drawing]:
+def draw_residuals(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]:
+    """A panel of normalised residuals for each estimator."""
     import seaborn as sns
     from matplotlib.ticker import MaxNLocator
 
@@ -55,7 +48,7 @@ def _residuals(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look]
     if not shown:
         return
     x, heading = _abscissa(model)
-    limit = shown[0].outlier_limit
+    look, limit = looks([one.label for one in fits]), shown[0].outlier_limit
     fig, axes = common.panels(len(shown), height=2.6)
     for one, ax in zip(shown, axes, strict=True):
         r, out = one.normalised, one.outliers
@@ -117,7 +110,8 @@ def ellipse(P: Array, edge: float = float(chdtri(2, 1 - LEVEL))) -> Array:
     return (circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T * d
 
 
-def _ellipses(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look]) -> Iterator[Drawing]:
+def draw_ellipses(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]:
+    """A panel with the estimators' covariance ellipses for each of the most correlated pairs of parameters."""
     from matplotlib.ticker import MaxNLocator
 
     # Where an estimator did not converge, its covariance says nothing of the true values.
@@ -127,7 +121,7 @@ def _ellipses(model: Measurement, fits: Sequence[Fit], look: Mapping[str, Look])
     best = min(converged, key=lambda f: f.chi_square)
     # The pairs by falling magnitude of correlation.
     every = sorted(combinations(range(model.n), 2), key=lambda pair: -np.nan_to_num(abs(best.correlation[pair])))
-    pairs = every[:MOST_PAIRS]
+    pairs, look = every[:MOST_PAIRS], looks([one.label for one in fits])
     fig, axes = common.panels(len(pairs), look)
     for (i, j), ax in zip(pairs, axes, strict=True):
         pair = [i, j]
@@ -165,19 +159,18 @@ def draw_profiles(found: Examination) -> Iterator[Drawing]:
     bent = [i for i, one in enumerate(found.profiles) if one.bent][:MOST_PROFILES]
     if not bent:
         return
-    with house_style():
-        fig, axes = common.panels(len(bent), height=2.6)
-        for i, ax in zip(bent, axes, strict=True):
-            one = found.profiles[i]
-            known = np.isfinite(one.zeta) & (np.abs(one.zeta) <= 2.5 * found.half_width)
-            values = one.values[known]
-            line = np.linspace(values[0], values[-1], 200)
-            parabola = ((line - found.x[i]) / found.standard_errors[i]) ** 2
-            ax.plot(values, one.zeta[known] ** 2, marker="o", markersize=3, label="profile")
-            ax.plot(line, parabola, color=BOUND_COLOR, linewidth=0.8, label="standard error")
-            common.bound_line(ax, found.half_width**2, f"limit of {CONFIDENCE:.0%}".replace("%", " %"))
-            ax.set(ylim=(0, 2.5 * found.half_width**2), xlabel=_axis_words(found.model, i), ylabel="rise of chi-square")
-        common.legend(fig, axes)
+    fig, axes = common.panels(len(bent), height=2.6)
+    for i, ax in zip(bent, axes, strict=True):
+        one = found.profiles[i]
+        known = np.isfinite(one.zeta) & (np.abs(one.zeta) <= 2.5 * found.half_width)
+        values = one.values[known]
+        line = np.linspace(values[0], values[-1], 200)
+        parabola = ((line - found.x[i]) / found.standard_errors[i]) ** 2
+        ax.plot(values, one.zeta[known] ** 2, marker="o", markersize=3, label="profile")
+        ax.plot(line, parabola, color=BOUND_COLOR, linewidth=0.8, label="standard error")
+        common.bound_line(ax, found.half_width**2, f"limit of {CONFIDENCE:.0%}".replace("%", " %"))
+        ax.set(ylim=(0, 2.5 * found.half_width**2), xlabel=_axis_words(found.model, i), ylabel="rise of chi-square")
+    common.legend(fig, axes)
     names = found.model.physical_parameters
     told = "; ".join(f"{names[i].name} {found.profiles[i].low:.4g} to {found.profiles[i].high:.4g}" for i in bent)
     caption = (
@@ -190,15 +183,8 @@ def draw_profiles(found: Examination) -> Iterator[Drawing]:
 # Posteriors ----------------------------------------------------------------------------------------------------------
 
 
-def draw_corners(model: Measurement, found: Sequence[Reference]) -> Iterator[Drawing]:
-    """A picture for each trial."""
-    with house_style():
-        for one in found:
-            yield _corner(model, one)
-
-
-def _corner(model: Measurement, one: Reference) -> Drawing:
-    """Everything in standard deviations of the posterior about its mean."""
+def draw_corner(model: Measurement, one: Reference) -> Drawing:
+    """Draws of a trial's posterior and the estimators' Gaussians, in standard deviations about its mean."""
     mean, d = one.posterior.mean, one.posterior.deviation
     off = [np.abs(e.x[0] - mean) / d for e in one.estimates.values()]
     worst = np.nan_to_num(np.max([np.zeros(len(d)), *off], axis=0), nan=np.inf)
