@@ -120,7 +120,7 @@ def _paper(folders: Sequence[Path], keys: Mapping[str, str]) -> int:
             raise UserError(f"width={keys['width']}: give inches, such as 3.5 or 7.16") from None
     faults = use_statistics()
     analysis = analyse(folders)
-    analysis.collection.further += faults
+    analysis.collection.extra_problems += faults
     say(*map(str, export(analysis, Path(keys.get("output", folders[0] / "paper")), names, columns, **width)))
     print_problems([*analysis.problems, *analysis.stale])
     return 1 if analysis.problems else 0

@@ -13,7 +13,7 @@ from ipe_bench.cli.session import composed, jobs_of, session
 from ipe_bench.cli.spec import Spec
 from ipe_bench.cli.words import Words
 from ipe_bench.measurements import Nist
-from ipe_bench.report.writer import claim
+from ipe_bench.report.writer import reserve_output_folder
 
 OF_MANY_TRIALS = ("precision", "time_limit", "block_size", "formats", "execution", "write_readings")
 OF_MANY_TRIALS += ("write_readings_trial", "objective")
@@ -47,7 +47,7 @@ class Single:
         """
         output, named = Path(self.spec.output), not {"name", "output"}.isdisjoint(self.words.keys)
         folder = output if named else output.with_name(f"{self.command}-{self.measurement.replace('/', '-')}")
-        return claim(folder, name, identity, elsewhere=not named, files=files)
+        return reserve_output_folder(folder, name, identity, elsewhere=not named, files=files)
 
 
 def single(command: str, arguments: Sequence[str], standard: Sequence[str] = (), **refused: Sequence[str]) -> Single:

@@ -98,7 +98,7 @@ class Pending:
         from ipe_bench.statistics.certified import certified_averages, certified_table
 
         analysis, output = self.begun.finish(), self.output
-        simulated, problems = without_certified(analysis), analysis.collection.further
+        simulated, problems = without_certified(analysis), analysis.collection.extra_problems
         known = len(problems)
         tables = report_tables(analysis)
         sections = written("section", analysis, [table.name for table in tables])
@@ -143,7 +143,7 @@ def begin_report(
     place = folders[0] if output is None else Path(output)
     made, faults = made_from(folders, place, which, kinds), use_statistics()
     begun = begin(folders)
-    begun.collection.further += faults
+    begun.collection.extra_problems += faults
     return Pending(begun, place, which, kinds, made)
 
 

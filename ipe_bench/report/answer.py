@@ -351,8 +351,8 @@ def write_answer(
 ) -> list[Path]:
     """Writes an answer; each file appears whole or not at all. Returns the files.
 
-    All its figures are main ones: `which` is all, main or none. `command` tells one command from another (see
-    `writer.claim`); `provenance` is added to the JSON file and overrides what stands there of the same name.
+    All its figures are main ones: `which` is all, main or none. `command` tells one command from another;
+    `provenance` is added to the JSON file and overrides what stands there of the same name.
     """
     from ipe_bench.report.figures.readings import draw_ellipses, draw_profiles, draw_residuals
 

@@ -50,7 +50,7 @@ def report_tables(analysis: Analysis) -> list[Table]:
 
 def written(group: str, analysis: Analysis, taken: Iterable[str]) -> list[Written]:
     """What the tables or the sections of plugins come to, none of them under the name of a table that is taken."""
-    names, found, problems = set(taken), [], analysis.collection.further
+    names, found, problems = set(taken), [], analysis.collection.extra_problems
     for option, record in records(group, problems) if len(analysis.summary) else ():
         try:
             one = made(option, record, analysis, names)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ipe_bench.report.figures.drawing import Drawing
 
 
-def claim(folder: Path, name: str, command: Any, *, elsewhere: bool, files: Sequence[str] = ()) -> Path:
+def reserve_output_folder(folder: Path, name: str, command: Any, *, elsewhere: bool, files: Sequence[str] = ()) -> Path:
     """Reserves the folder that a command writes to: it is new, or holds what the same command wrote before.
 
     `name`.json says which command that was, `files` are further files of its kind. If the folder holds anything else of

@@ -161,7 +161,7 @@ class Results:
     """What is wrong with each file that is left out."""
     outdated: list[Path] = field(default_factory=list)
     """Files in the format of an older version."""
-    further: list[str] = field(default_factory=list)
+    extra_problems: list[str] = field(default_factory=list)
     """Problems that are not one file's: a line for each."""
 
     @classmethod
@@ -183,7 +183,7 @@ class Results:
     def _read_directory(self, store: Store, keys: Keys[str] | None) -> None:
         for folder in (store.trials, store.runs, store.failed):
             if os.path.lexists(folder) and not (folder.is_dir() and os.access(folder, os.R_OK | os.X_OK)):
-                self.further.append(f"{folder}: cannot be listed; what is in it is left out")
+                self.extra_problems.append(f"{folder}: cannot be listed; what is in it is left out")
                 return
         listed: set[Path] = set()
         # What is gone before it is read is in a larger file, which may not have been there when these were listed.
@@ -194,9 +194,9 @@ class Results:
         self.runs += tuple(Run(path, record) for path, record in self._records(store.runs))
         self.attempts += [record for _, record in self._records(store.failed)]
         if keys is None and not listed and not self.runs:
-            self.further.append(f"{store.directory}: holds no results of ipe-bench")
+            self.extra_problems.append(f"{store.directory}: holds no results of ipe-bench")
         if self.outdated and not self.stored and keys is None:
-            self.further.append(f"{store.directory}: was written by an older version of ipe-bench; {_AGAIN}")
+            self.extra_problems.append(f"{store.directory}: was written by an older version of ipe-bench; {_AGAIN}")
 
     def _add(self, part: Part) -> None:
         """Adds a part to what is stored, if it is there and every byte of it is whole."""
@@ -232,7 +232,7 @@ class Results:
             for cell in self.current
             if cell.label != TRUTH and cell.scenario_id not in truths
         ]
-        return list(dict.fromkeys([*lines, *self.further]))
+        return list(dict.fromkeys([*lines, *self.extra_problems]))
 
     @property
     def stale(self) -> list[str]:
@@ -354,7 +354,7 @@ class Results:
         names = None if columns is None else list(dict.fromkeys(["trial", *columns, *optional]))
         tables = self._of_parts(cell, lambda parts: list(self._tables(parts, names, columns or ())))
         if sum(map(len, tables)) < cell.trials and self.damaged.keys().isdisjoint(p.path for p in cell.parts):
-            self.further.append(f"missing: {describe_names(cell.names)}: trials went away while they were read")
+            self.extra_problems.append(f"missing: {describe_names(cell.names)}: trials went away while they were read")
         if not tables:
             return {name: np.empty(0) for name in ("trial", *(columns or ()), *optional)}
         table = pa.concat_tables(tables, promote_options="default")

@@ -832,7 +832,7 @@ def summary_columns_of(sample: Sample) -> list[dict[str, Any]]:
             columns = columns_of_added(record, sample)
         except UserError as error:
             line = f"statistic={record.name}: {error}; it is missing where that is so"
-            sample.collection.further.append(line)
+            sample.collection.extra_problems.append(line)
             columns = {name: ["-" if record.kind == "word" else np.nan] * len(rows) for name in record.columns}
         for i, row in enumerate(rows):
             row |= {name: values[i] for name, values in columns.items()}

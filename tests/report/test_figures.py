@@ -338,23 +338,19 @@ def test_every_module_with_figures_is_in_the_list():
     assert modules - {"__init__"} == set(FIGURES)
 
 
-def test_stale_figures_go_and_foreign_files_stay(synthetic, monkeypatch, tmp_path):
-    monkeypatch.setattr(figures, "FIGURES", ("costs", "parameters"))
-    folder = tmp_path / "figures"
-    small = {"labels": (REFERENCE, "fixed_point"), "scales": (1.0, 10.0), "names": ("a",)}
+def test_stale_figures_go_foreign_files_stay_and_the_same_figure_is_the_same_file(synthetic, monkeypatch, tmp_path):
+    monkeypatch.setattr(figures, "FIGURES", ("costs",))
+    folder, small = tmp_path / "figures", {"labels": (REFERENCE, "two"), "scales": (1.0, 10.0), "names": ("a",)}
     fill(synthetic, **small)
     analysis = analyse([synthetic.directory])
-    assert draw_all(analysis, folder, which="none") == []
-    assert not folder.exists()
-    found = draw_all(analysis, folder, which="main", formats=("png", "pdf"))
-    assert [path.name for path in found[0].files] == ["cost_against_accuracy.png", "cost_against_accuracy.pdf"]
-    assert (folder / "cost_against_accuracy.pdf").read_bytes().startswith(b"%PDF-")
-    same = {path: path.read_bytes() for path in found[0].files}
+    (found,) = draw_all(analysis, folder, formats=("png", "pdf"))
+    same = {path: path.read_bytes() for path in found.files}
     (folder / "mine.png").write_bytes(b"of the user")
-    draw_all(analysis, folder, which="main", formats=("png", "pdf"))
+    draw_all(analysis, folder, formats=("png", "pdf"))
+    assert [path.name for path in same] == ["cost_against_accuracy.png", "cost_against_accuracy.pdf"]
     assert all(path.read_bytes() == content for path, content in same.items())
     fill(synthetic, sigma=0.4, **small)
-    names = {one.name for one in draw_all(analyse([synthetic.directory]), folder, which="all")}
+    names = {one.name for one in draw_all(analyse([synthetic.directory]), folder)}
     assert {path.name for path in folder.iterdir()} == {"index.json", "mine.png", *(f"{name}.png" for name in names)}
     assert len([name for name in names if name.startswith("cost_against_accuracy_")]) == 2
 

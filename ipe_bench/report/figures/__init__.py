@@ -43,7 +43,7 @@ def draw_all(
     `index.json` in the folder names each with its title and caption; figures of an earlier report are removed. One of a
     plugin that cannot be drawn is left out, with a line added to the problems of the analysis.
     """
-    problems, old, drawn = analysis.collection.further, _names(folder), []
+    problems, old, drawn = analysis.collection.extra_problems, _names(folder), []
     with house_style():
         for drawing, plugin in drawings(analysis, which):
             make_folder(folder)
@@ -65,7 +65,7 @@ def draw_all(
 
 def drawings(analysis: Analysis, which: Which = "all") -> Iterator[tuple[Drawing, str]]:
     """Figures of every setting, or of all of them together, ours first; with the plugin that draws one, if any."""
-    problems = analysis.collection.further
+    problems = analysis.collection.extra_problems
     # Plugins that cannot be used are told of even if nothing is drawn.
     others = _of_plugins(problems)
     if which == "none" or (not analysis.collection.groups and analysis.attained.empty):
