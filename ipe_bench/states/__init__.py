@@ -1,0 +1,47 @@
+"""States that move: models with process noise, their filters and smoothers, and bounds."""
+
+from ipe_bench.states.base import Gaussian, Paths, StateModel
+from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
+from ipe_bench.states.linearisation import Cubature, GaussHermite, SigmaPoints, Taylor, Unscented
+from ipe_bench.states.models import ConstantVelocity, CoordinatedTurn, Growth, Pendulum
+from ipe_bench.states.trackers import (
+    Bootstrap,
+    Filter,
+    IteratedSmoother,
+    Smoother,
+    Tracker,
+    Tracks,
+    ckf,
+    ekf,
+    ghkf,
+    iplf,
+    ukf,
+)
+
+__all__ = [
+    "Bootstrap",
+    "ConstantVelocity",
+    "CoordinatedTurn",
+    "Cubature",
+    "Filter",
+    "GaussHermite",
+    "Gaussian",
+    "Growth",
+    "IteratedSmoother",
+    "Paths",
+    "Pendulum",
+    "SigmaPoints",
+    "Smoother",
+    "StateModel",
+    "Taylor",
+    "Tracker",
+    "Tracks",
+    "Unscented",
+    "bound_at_truth",
+    "ckf",
+    "ekf",
+    "ghkf",
+    "iplf",
+    "posterior_bounds",
+    "ukf",
+]

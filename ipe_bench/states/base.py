@@ -1,0 +1,157 @@
+"""State models: x[k] = f(x[k-1], k) + G[k] w[k] and z[k] = h(x[k], k) + v[k] with w ~ N(0, I) and v ~ N(0, R[k])."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.basics.naming import Named
+from ipe_bench.basics.options import Component
+from ipe_bench.basics.streams import numbered
+from ipe_bench.measurements.base import Parameter
+from ipe_bench.states.algebra import factor, root
+
+_COMPLEX_STEP = 1e-100
+_SMALL = 65536
+"""Bytes of complex numbers that are handed to a function at once: a quarter of a large array of NumPy's."""
+_START, _PROCESS, _READINGS = range(3)
+"""The random streams of a trial: its start, its process noise and the noise of its readings."""
+
+
+class Gaussian(NamedTuple):
+    """Normal distributions, one per trial or one for all."""
+
+    mean: Array
+    """(..., n)"""
+    covariance: Array
+    """(..., n, n)"""
+
+
+@dataclass(frozen=True)
+class Paths:
+    """True paths and their readings, drawn from a state model."""
+
+    start: Array
+    """The states before the first transition (trials, n)."""
+    x: Array
+    """The states at the epochs (trials, K, n)."""
+    z: Array
+    """The readings (trials, K, m)."""
+
+
+class StateModel(Component, Named, ABC):
+    """States that move, and what is read of them at K epochs k = 0 ... K-1.
+
+    A model writes `states`, `times`, `prior`, `transition`, `observe`, `gain` and `R`. `transition` and `observe` take
+    stacks of states (..., n), real or complex, and are analytic in them: slopes are complex steps. Process noise enters
+    by its gain G, so a singular Q = G G' needs no special case. Known inputs and unequal steps are the model's own: it
+    is told k. A measurement model with epochs is the state model whose states stand still.
+    """
+
+    moved_first: bool = True
+    """Whether a transition lies between the prior and the first reading."""
+
+    @property
+    @abstractmethod
+    def states(self) -> tuple[Parameter, ...]:
+        """Names and units of the n states."""
+
+    @property
+    @abstractmethod
+    def times(self) -> Array:
+        """Times (K,) of the epochs in s."""
+
+    @property
+    @abstractmethod
+    def prior(self) -> Gaussian:
+        """Mean (n,) and covariance (n, n) before the first transition, or at the first reading if `moved_first` is
+        false."""
+
+    @abstractmethod
+    def transition(self, x: Array, k: int) -> Array:
+        """f: (..., n) -> (..., n), from epoch k-1 to epoch k."""
+
+    @abstractmethod
+    def observe(self, x: Array, k: int) -> Array:
+        """h: (..., n) -> (..., m)."""
+
+    @abstractmethod
+    def gain(self, k: int) -> Array:
+        """G (n, q) of the step into epoch k."""
+
+    @abstractmethod
+    def R(self, k: int) -> Array:
+        """Covariance (m, m) of the readings of epoch k."""
+
+    @property
+    def periods(self) -> tuple[float, ...]:
+        """The period of each reading, such as 2 pi of a bearing in rad; 0 for a reading without. Empty: none has."""
+        return ()
+
+    @property
+    def n(self) -> int:
+        return len(self.states)
+
+    @property
+    def epochs(self) -> int:
+        """K, the number of epochs."""
+        return len(self.times)
+
+    def moves(self, k: int) -> bool:
+        """Whether a transition leads into epoch k."""
+        return k > 0 or self.moved_first
+
+    def Q(self, k: int) -> Array:
+        """Covariance (n, n) of the process noise of the step into epoch k."""
+        return self.gain(k) @ self.gain(k).T
+
+    def nearest(self, z: Array, to: Array) -> Array:
+        """z (..., m), each periodic reading shifted by whole periods next to that of `to` (..., m)."""
+        if not self.periods:
+            return z
+        period = np.array(self.periods)
+        turns = np.round(np.real(z - to) / np.where(period > 0, period, np.inf))
+        return z - np.where(period > 0, period * turns, 0.0)
+
+    def observe_near(self, x: Array, k: int, to: Array) -> Array:
+        """h without jumps around readings `to` (trials, m), for x (trials, ..., n)."""
+        between = (1,) * (x.ndim - to.ndim)
+        return self.nearest(self.observe(x, k), to.reshape(to.shape[:1] + between + to.shape[1:]))
+
+    def draw(self, start: int, stop: int, seed: int = 0) -> Paths:
+        """Trials `start` to `stop`. Start, process noise and readings' noise have a stream each per trial: with another
+        Q or R, or in another batch, a trial keeps its standard normal numbers."""
+        K, n, trials = self.epochs, self.n, stop - start
+        q, m = self.gain(K - 1).shape[1], len(self.R(0))
+
+        def normals(stream: int, *shape: int) -> Array:
+            drawn = [g.standard_normal(shape) for g in numbered(seed, start, stop, stream)]
+            return np.array(drawn).reshape(trials, *shape)
+
+        spread = root(self.prior.covariance)
+        x = self.prior.mean + multiply(spread, normals(_START, n)[:, : spread.shape[1]])
+        w, v = normals(_PROCESS, K, q), normals(_READINGS, K, m)
+        paths = Paths(x, np.empty((trials, K, n)), np.empty((trials, K, m)))
+        for k in range(K):
+            if self.moves(k):
+                x = self.transition(x, k) + multiply(self.gain(k), w[:, k])
+            paths.x[:, k] = x
+            paths.z[:, k] = self.observe(x, k) + multiply(factor(self.R(k)), v[:, k])
+        return paths
+
+
+def slope(function: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:
+    """Value (..., m) and Jacobian (..., m, n) of an analytic function at x (..., n), by complex steps.
+
+    Few trials at a time: NumPy rounds complex products differently in large arrays, and bits would depend on the batch.
+    """
+    n = x.shape[-1]
+    points = x[..., None, :] + _COMPLEX_STEP * 1j * np.eye(n)
+    few = max(1, _SMALL // (points[:1].nbytes or 1))
+    y = np.concatenate([function(points[i : i + few]) for i in range(0, max(len(points), 1), few)])
+    return np.ascontiguousarray(y[..., 0, :].real), np.ascontiguousarray(y.imag.swapaxes(-1, -2)) / _COMPLEX_STEP

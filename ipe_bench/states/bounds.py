@@ -1,0 +1,73 @@
+"""Bounds on the errors of filters and smoothers of a state model, from true paths drawn from it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
+from ipe_bench.states.algebra import divide, symmetric, transposed
+from ipe_bench.states.base import Paths, StateModel, slope
+
+
+def posterior_bounds(model: StateModel, paths: Paths) -> tuple[Array, Array]:
+    """The posterior Cramér-Rao bounds (K, n, n) on the error covariances of filters and of smoothers.
+
+    Filtering: eq. (21) of Tichavský, Muravchik and Nehorai, IEEE TSP 46, 1998, its expectations over the drawn paths.
+    Smoothing: the diagonal blocks of the inverse of the same information. They can lie far below what any estimator
+    attains, where informations of single paths differ.
+
+    Raises:
+        UserError: the process noise of a step is singular; a path then has no density.
+    """
+    J, before = np.linalg.inv(model.prior.covariance), paths.start
+    filtered, steps = [], []
+    for k in range(model.epochs):
+        x = paths.x[:, k]
+        H = slope(lambda at, k=k: model.observe(at, k), x)[1]
+        gained = _mean(np.matmul(np.matmul(transposed(H), np.linalg.inv(model.R(k))), H))
+        if model.moves(k):
+            Q = model.Q(k)
+            if (rank := np.linalg.matrix_rank(Q)) < model.n:
+                raise UserError(
+                    f"{model.name}: the process noise into epoch {k + 1} has rank {rank} of {model.n}, so that the "
+                    "posterior bound does not exist; use the bound linearised at the truth"
+                )
+            inverse = np.linalg.inv(Q)
+            F = slope(lambda at, k=k: model.transition(at, k), before)[1]
+            D11, D12 = _mean(np.matmul(np.matmul(transposed(F), inverse), F)), -_mean(F).T @ inverse
+            steps.append((J + D11, D12))
+            J = inverse + gained - D12.T @ np.linalg.solve(J + D11, D12)
+        else:
+            J = J + gained
+        J = symmetric(J)
+        filtered.append(np.linalg.inv(J))
+        before = x
+    smoothed = [filtered[-1]]
+    for A, D12 in reversed(steps[1:] if model.moved_first else steps):
+        V = np.linalg.inv(A)
+        smoothed.append(symmetric(V + V @ D12 @ smoothed[-1] @ D12.T @ V))
+    return np.array(filtered), np.array(smoothed[::-1])
+
+
+def _mean(a: Array) -> Array:
+    return np.asarray(a.mean(axis=0))
+
+
+def bound_at_truth(model: StateModel, paths: Paths) -> Array:
+    """The error covariances (trials, K, n, n) of an extended Kalman filter that is linearised at the true path (Taylor,
+    IEEE TAC 24, 1979). They exist for every Q, zero included; their mean is what a good filter attains, but no bound of
+    errors averaged over paths."""
+    P, before = np.repeat(model.prior.covariance[None], len(paths.x), 0), paths.start
+    out = []
+    for k in range(model.epochs):
+        if model.moves(k):
+            F = slope(lambda at, k=k: model.transition(at, k), before)[1]
+            P = np.matmul(np.matmul(F, P), transposed(F)) + model.Q(k)
+        before = paths.x[:, k]
+        H = slope(lambda at, k=k: model.observe(at, k), before)[1]
+        PH = np.matmul(P, transposed(H))
+        S = np.matmul(H, PH) + model.R(k)
+        P = symmetric(P - np.matmul(divide(PH, S), transposed(PH)))
+        out.append(P)
+    return np.stack(out, axis=1)

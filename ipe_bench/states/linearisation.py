@@ -1,0 +1,125 @@
+"""Rules that replace y = g(x), x ~ N(m, P), by y = A x + b + e, e ~ N(0, W): the one thing in which Gaussian filters
+differ.
+
+Taylor's rule gives the extended Kalman filter; statistical linear regression by sigma points gives the unscented,
+cubature and Gauss-Hermite filters and, about the posterior, those of posterior linearisation.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.basics.options import Component, Count, Finite
+from ipe_bench.states.algebra import factor, symmetric, transposed, upper_solve
+from ipe_bench.states.base import slope
+
+Function = Callable[[Array], Array]
+Nearest = Callable[[Array, Array], Array]
+
+
+class Affine(NamedTuple):
+    """y = A x + b + e with e ~ N(0, W), per trial."""
+
+    A: Array
+    """(trials, m, n)"""
+    b: Array
+    """(trials, m)"""
+    W: Array
+    """(trials, m, m)"""
+
+
+class Rule(Component, ABC):
+    """A way to linearise a function about a normal distribution."""
+
+    @abstractmethod
+    def linearise(self, g: Function, m: Array, P: Array, nearest: Nearest | None = None) -> Affine:
+        """The affine law of g about N(m, P), for m (trials, n) and P (trials, n, n). `nearest` shifts values of g that
+        are periodic next to others: the mean of points on both sides of a bearing's jump would lie opposite."""
+
+    @abstractmethod
+    def calls(self, n: int) -> int:
+        """Evaluations of g per trial, a slope in one direction counted as one."""
+
+
+@dataclass(frozen=True)
+class Taylor(Rule):
+    """The tangent at the mean."""
+
+    def linearise(self, g: Function, m: Array, P: Array, nearest: Nearest | None = None) -> Affine:
+        y, J = slope(g, m)
+        return Affine(J, y - multiply(J, m), np.zeros((*y.shape, y.shape[-1])))
+
+    def calls(self, n: int) -> int:
+        return 1 + n
+
+
+@dataclass(frozen=True)
+class SigmaPoints(Rule):
+    """Statistical linear regression by points s and weights w of the standard normal distribution, with sum w s s' = I
+    (Arasaratnam, Haykin, Elliott, Proc. IEEE 95, 2007)."""
+
+    @abstractmethod
+    def points(self, n: int) -> tuple[Array, Array]:
+        """Points (p, n) and weights (p,)."""
+
+    def linearise(self, g: Function, m: Array, P: Array, nearest: Nearest | None = None) -> Affine:
+        s, w = self.points(m.shape[-1])
+        L = factor(P)
+        y = g(m[..., None, :] + np.matmul(s, transposed(L)))
+        if nearest is not None:
+            y = nearest(y, g(m)[..., None, :])
+        mean = np.sum(w[:, None] * y, axis=-2)
+        d = y - mean[..., None, :]
+        M = np.matmul(s.T, d * w[:, None])  # L' A'
+        W = np.matmul(transposed(d * w[:, None]), d) - np.matmul(transposed(M), M)
+        A = transposed(upper_solve(L, M))
+        return Affine(A, mean - multiply(A, m), symmetric(W))
+
+    def calls(self, n: int) -> int:
+        return len(self.points(n)[1])
+
+
+@dataclass(frozen=True)
+class Cubature(SigmaPoints):
+    """The spherical-radial rule of third degree, 2 n points (Arasaratnam and Haykin, IEEE TAC 54, 2009)."""
+
+    def points(self, n: int) -> tuple[Array, Array]:
+        return np.sqrt(n) * np.concatenate([np.eye(n), -np.eye(n)]), np.full(2 * n, 0.5 / n)
+
+
+@dataclass(frozen=True)
+class Unscented(SigmaPoints):
+    """The 2 n + 1 points of Julier and Uhlmann (1997), alpha = 1 and beta = 0."""
+
+    kappa: Finite | None = None
+    """Weight of the central point, in units of the others' doubled; None: 3 - n, and 0 where that is negative, since a
+    negative weight costs the covariance its definiteness."""
+
+    def points(self, n: int) -> tuple[Array, Array]:
+        c = n + (max(3.0 - n, 0.0) if self.kappa is None else self.kappa)
+        s = np.sqrt(c) * np.concatenate([np.zeros((1, n)), np.eye(n), -np.eye(n)])
+        return s, np.concatenate([[1 - n / c], np.full(2 * n, 0.5 / c)])
+
+
+@dataclass(frozen=True)
+class GaussHermite(SigmaPoints):
+    """The product of Gauss-Hermite rules: order^n points (Ito and Xiong, IEEE TAC 45, 2000)."""
+
+    order: Count = 3
+
+    def points(self, n: int) -> tuple[Array, Array]:
+        s, w = self._line
+        return np.array(list(product(s, repeat=n))), np.array([np.prod(c) for c in product(w, repeat=n)])
+
+    @cached_property
+    def _line(self) -> tuple[Array, Array]:
+        s, w = np.polynomial.hermite_e.hermegauss(self.order)
+        return s, w / w.sum()

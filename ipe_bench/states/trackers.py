@@ -1,0 +1,371 @@
+"""Filters and smoothers of state models: readings (trials, K, m) in, means and covariances of the states out.
+
+All trials advance together. A reading that is NaN is missing; a trial whose covariance is no longer positive definite
+is NaN from then on and disturbs no other.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.basics.naming import Named
+from ipe_bench.basics.options import Component, Count, NonNegative
+from ipe_bench.basics.streams import own_generators
+from ipe_bench.states.algebra import divide, factor, lower_solve, mahalanobis, root, symmetric, transposed
+from ipe_bench.states.base import Gaussian, StateModel
+from ipe_bench.states.linearisation import Affine, Cubature, GaussHermite, Rule, Taylor, Unscented
+
+_HALVINGS = 12
+"""Halvings of a damped step."""
+
+
+@dataclass
+class Tracks:
+    """What a tracker says of the states at K epochs, and what its smoother needs."""
+
+    mean: Array
+    """(trials, K, n)"""
+    covariance: Array
+    """(trials, K, n, n)"""
+    nis: Array
+    """Squared normalised innovations (trials, K), chi-square with `degrees` if the model holds; 0 in smoothers."""
+    degrees: Array
+    """Readings that were there (trials, K)."""
+    log_likelihood: Array
+    """Of the readings by the innovations (trials,)."""
+    calls: float
+    """Evaluations of f and of h per trial."""
+    start: Gaussian
+    """The states before the first transition."""
+    moves: list[Affine] = field(default_factory=list)
+    """The transitions as they were linearised."""
+    predicted: list[Gaussian] = field(default_factory=list)
+    """The states after each transition, before the reading."""
+
+    @classmethod
+    def empty(cls, model: StateModel, trials: int) -> Tracks:
+        K, n = model.epochs, model.n
+        nis, degrees = np.zeros((trials, K)), np.zeros((trials, K))
+        means, covariances = np.empty((trials, K, n)), np.empty((trials, K, n, n))
+        return cls(means, covariances, nis, degrees, np.zeros(trials), 0.0, spread_prior(model, trials))
+
+
+class Tracker(Component, Named, ABC):
+    """Estimates the states of every trial from its readings."""
+
+    @property
+    def smooths(self) -> bool:
+        """Whether the states of an epoch are estimated from later readings too."""
+        return False
+
+    @abstractmethod
+    def track(self, model: StateModel, z: Array) -> Tracks:
+        """The states that readings z (trials, K, m) tell of."""
+
+
+def spread_prior(model: StateModel, trials: int) -> Gaussian:
+    m, P = model.prior
+    return Gaussian(np.repeat(m[None], trials, 0), np.repeat(P[None], trials, 0))
+
+
+def predict(x: Gaussian, move: Affine, Q: Array) -> Gaussian:
+    """The states after a linearised transition with process noise of covariance Q (n, n)."""
+    P = np.matmul(np.matmul(move.A, x.covariance), transposed(move.A)) + move.W + Q
+    return Gaussian(multiply(move.A, x.mean) + move.b, symmetric(P))
+
+
+def linearised_reading(model: StateModel, rule: Rule, k: int, z: Array, x: Gaussian) -> Affine:
+    """h linearised about the states x, periodic readings next to the readings z (trials, m)."""
+    A, b, W = rule.linearise(lambda at: model.observe(at, k), *x, model.nearest if model.periods else None)
+    value = multiply(A, x.mean) + b
+    return Affine(A, b + model.nearest(value, np.where(np.isfinite(z), z, value)) - value, W)
+
+
+class Update(NamedTuple):
+    """The states after a reading, and what the innovation says of the filter."""
+
+    x: Gaussian
+    nis: Array
+    degrees: Array
+    log_likelihood: Array
+
+
+def update(x: Gaussian, read: Affine, R: Array, z: Array) -> Update:
+    """Takes in the readings z (trials, m) of covariance R (m, m). A missing reading has no slope and unit variance."""
+    m, P = x
+    seen = np.isfinite(z)
+    both = seen[..., :, None] & seen[..., None, :]
+    H = np.where(seen[..., None], read.A, 0.0)
+    y = np.where(seen, z - multiply(read.A, m) - read.b, 0.0)
+    PH = np.matmul(P, transposed(H))
+    L = factor(np.matmul(H, PH) + np.where(both, read.W + R, np.eye(R.shape[-1])))
+    U = lower_solve(L, transposed(PH))  # the gain is U' L^-1
+    e = lower_solve(L, y[..., None])
+    nis, degrees = np.sum(e[..., 0] ** 2, axis=-1), seen.sum(axis=-1)
+    log_determinant = 2 * np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(axis=-1)
+    posterior = Gaussian(m + np.matmul(transposed(U), e)[..., 0], symmetric(P - np.matmul(transposed(U), U)))
+    return Update(posterior, nis, degrees, -0.5 * (nis + log_determinant + degrees * np.log(2 * np.pi)))
+
+
+@dataclass(frozen=True)
+class Filter(Tracker):
+    """A Gaussian filter: predict by the linearised transition, update by the linearised reading.
+
+    With `iterations` above 1 the reading is linearised again about its posterior: by Taylor's rule the iterated
+    extended Kalman filter (Bell and Cathey, IEEE TAC 38, 1993), by sigma points the iterated posterior linearisation
+    filter (García-Fernández, Svensson, Morelande, Särkkä, IEEE TSP 63, 2015).
+    """
+
+    rule: Rule = field(default_factory=Taylor)
+    iterations: Count = 1
+    damped: bool = False
+    """Whether steps that raise the cost of the update are halved; for Taylor's rule."""
+
+    def track(self, model: StateModel, z: Array) -> Tracks:
+        out = Tracks.empty(model, len(z))
+        x = out.start
+        for k in range(model.epochs):
+            if model.moves(k):
+                move = self.rule.linearise(lambda at, k=k: model.transition(at, k), *x)
+                x = predict(x, move, model.Q(k))
+                out.moves.append(move)
+                out.predicted.append(x)
+            x = self._updated(model, x, k, z[:, k], out)
+            out.mean[:, k], out.covariance[:, k] = x
+        steps = len(out.moves) + self.iterations * model.epochs
+        out.calls = float(self.rule.calls(model.n) * steps)
+        return out
+
+    def _updated(self, model: StateModel, x: Gaussian, k: int, z: Array, out: Tracks) -> Gaussian:
+        at, R = x, model.R(k)
+        for _ in range(self.iterations):
+            read = linearised_reading(model, self.rule, k, z, at)
+            found = update(x, read, R, z)
+            new = found.x
+            if self.damped:
+
+                def cost(mean: Array) -> Array:
+                    return mahalanobis(mean - x.mean, x.covariance) + misfit(model, z, mean, k)
+
+                new = Gaussian(_halved(at.mean, new.mean, cost), new.covariance)
+            at = new
+        out.nis[:, k], out.degrees[:, k] = found.nis, found.degrees  # pyright: ignore[reportPossiblyUnboundVariable]
+        out.log_likelihood += found.log_likelihood  # pyright: ignore[reportPossiblyUnboundVariable]
+        return at
+
+
+@dataclass(frozen=True)
+class Smoother(Tracker):
+    """The smoother of Rauch, Tung and Striebel (AIAA J. 3, 1965) behind a filter."""
+
+    filter: Filter = field(default_factory=Filter)
+
+    @property
+    def smooths(self) -> bool:
+        return True
+
+    def track(self, model: StateModel, z: Array) -> Tracks:
+        return smoothed(model, self.filter.track(model, z))
+
+
+@dataclass(frozen=True)
+class IteratedSmoother(Tracker):
+    """Linearises everything about the last smoothed path and solves that affine problem exactly, again and again.
+
+    By Taylor's rule these are Gauss-Newton steps to the path of largest posterior density (Bell, SIAM J. Optim. 4,
+    1994), with `damped` halved while they raise its cost; by sigma points it is the iterated posterior linearisation
+    smoother (García-Fernández, Svensson, Särkkä, IEEE TSP 65, 2017). The first path is that of `first`, smoothed.
+    """
+
+    first: Filter = field(default_factory=Filter)
+    rule: Rule = field(default_factory=Taylor)
+    iterations: Count = 10
+    damped: bool = False
+    tolerance: NonNegative = 0.0
+    """Ends where no trial's path moves by more than so many of its own standard deviations."""
+
+    @property
+    def smooths(self) -> bool:
+        return True
+
+    def track(self, model: StateModel, z: Array) -> Tracks:
+        path = self.first.track(model, z)
+        calls = path.calls
+        for _ in range(self.iterations):
+            new = smoothed(model, _along(model, z, path, self.rule))
+            calls += self.rule.calls(model.n) * (model.epochs + len(new.moves))
+            if self.damped:
+                new = _shortened(model, z, path, new)
+            moved = np.abs(new.mean - path.mean) / np.sqrt(np.diagonal(new.covariance, axis1=-2, axis2=-1))
+            path = new
+            if not (moved > self.tolerance).any():
+                break
+        path.calls = calls
+        return path
+
+
+def smoothed(model: StateModel, tracks: Tracks) -> Tracks:
+    """The backward pass of Rauch, Tung and Striebel through a filter's tracks, to before the first transition."""
+    out = Tracks.empty(model, len(tracks.mean))
+    x = Gaussian(tracks.mean[:, -1], tracks.covariance[:, -1])
+    out.mean[:, -1], out.covariance[:, -1] = x
+    first = 0 if model.moved_first else 1
+    start = spread_prior(model, len(tracks.mean)) if model.moved_first else None
+    for k in range(model.epochs - 1, first - 1, -1):
+        before = Gaussian(tracks.mean[:, k - 1], tracks.covariance[:, k - 1]) if k else start
+        assert before is not None
+        move, predicted = tracks.moves[k - first], tracks.predicted[k - first]
+        G = divide(np.matmul(before.covariance, transposed(move.A)), predicted.covariance)
+        P = np.matmul(np.matmul(G, x.covariance - predicted.covariance), transposed(G))
+        x = Gaussian(before.mean + multiply(G, x.mean - predicted.mean), symmetric(before.covariance + P))
+        if k:
+            out.mean[:, k - 1], out.covariance[:, k - 1] = x
+    out.start = x
+    out.moves, out.predicted, out.calls = tracks.moves, tracks.predicted, tracks.calls
+    return out
+
+
+def _along(model: StateModel, z: Array, path: Tracks, rule: Rule) -> Tracks:
+    """The exact filter of the model linearised about a path."""
+    out = Tracks.empty(model, len(z))
+    x, before = out.start, path.start
+    for k in range(model.epochs):
+        here = Gaussian(path.mean[:, k], path.covariance[:, k])
+        if model.moves(k):
+            move = rule.linearise(lambda at, k=k: model.transition(at, k), *before)
+            x = predict(x, move, model.Q(k))
+            out.moves.append(move)
+            out.predicted.append(x)
+        read = linearised_reading(model, rule, k, z[:, k], here)
+        x = update(x, read, model.R(k), z[:, k]).x
+        out.mean[:, k], out.covariance[:, k] = x
+        before = here
+    return out
+
+
+def path_cost(model: StateModel, z: Array, start: Array, mean: Array) -> Array:
+    """-2 log p(path | readings) (trials,) up to a constant; disturbances count by the pseudo-inverse of the gain."""
+    total, before = mahalanobis(start - model.prior.mean, model.prior.covariance), start
+    for k in range(model.epochs):
+        if model.moves(k):
+            w = multiply(np.linalg.pinv(model.gain(k)), mean[:, k] - model.transition(before, k))
+            total = total + np.sum(w**2, axis=-1)
+        total, before = total + misfit(model, z[:, k], mean[:, k], k), mean[:, k]
+    return total
+
+
+def misfit(model: StateModel, z: Array, x: Array, k: int) -> Array:
+    """(z - h)' R^-1 (z - h) (trials,) over the readings z (trials, m) of epoch k that are there."""
+    r = z - model.observe_near(x, k, np.where(np.isfinite(z), z, 0.0))
+    seen = np.isfinite(r)
+    R = np.where(seen[:, :, None] & seen[:, None, :], model.R(k), np.eye(r.shape[1]))
+    return mahalanobis(np.where(seen, r, 0.0), R)
+
+
+def _halved(old: Array, new: Array, cost: Callable[[Array], Array]) -> Array:
+    """The step from `old` to `new` (trials, ...), halved in each trial until the cost (trials,) is not above that of
+    `old`."""
+    best, share = cost(old), np.ones((len(old),) + (1,) * (old.ndim - 1))
+    for _ in range(_HALVINGS):
+        worse = ~(cost(old + share * (new - old)) <= best * (1 + 1e-12))
+        if not worse.any():
+            break
+        share[worse] /= 2
+    return old + share * (new - old)
+
+
+def _shortened(model: StateModel, z: Array, old: Tracks, new: Tracks) -> Tracks:
+    """The step from one path to the next, halved where it raises the path's cost."""
+    ends = [np.concatenate([path.start.mean[:, None], path.mean], axis=1) for path in (old, new)]
+    path = _halved(*ends, lambda x: path_cost(model, z, x[:, 0], x[:, 1:]))
+    new.mean, new.start = path[:, 1:], Gaussian(path[:, 0], new.start.covariance)
+    return new
+
+
+@dataclass(frozen=True)
+class Bootstrap(Tracker):
+    """The bootstrap particle filter (Gordon, Salmond, Smith, IEE Proc. F 140, 1993), with systematic resampling at
+    every epoch. Each trial's random numbers are those of its readings, in whatever batch."""
+
+    particles: Count = 1000
+    seed: int = 0
+
+    def track(self, model: StateModel, z: Array) -> Tracks:
+        trials, N = len(z), self.particles
+        generators = own_generators(self.seed, z.reshape(trials, -1))
+
+        def normals(columns: int) -> Array:
+            return np.stack([g.standard_normal((N, columns)) for g in generators])
+
+        out = Tracks.empty(model, trials)
+        spread = root(model.prior.covariance)
+        x = model.prior.mean + np.matmul(normals(spread.shape[1]), spread.T)
+        for k in range(model.epochs):
+            if model.moves(k):
+                G = model.gain(k)
+                x = model.transition(x, k) + np.matmul(normals(G.shape[1]), G.T)
+            w = self._weights(model, x, k, z[:, k], out)
+            mean = np.sum(w[..., None] * x, axis=1)
+            d = x - mean[:, None]
+            out.mean[:, k], out.covariance[:, k] = mean, np.matmul(transposed(d * w[..., None]), d)
+            x = _resampled(x, w, np.array([g.random() for g in generators]))
+        out.calls = float(N * 2 * model.epochs)
+        return out
+
+    def _weights(self, model: StateModel, x: Array, k: int, z: Array, out: Tracks) -> Array:
+        """The normalised likelihood (trials, N) of the particles; adds to the log likelihood of the readings."""
+        near = np.where(np.isfinite(z), z, 0.0)
+        r = z[:, None] - model.observe_near(x, k, near)
+        seen = np.isfinite(z)
+        both = seen[:, :, None] & seen[:, None, :]
+        L = factor(np.where(both, model.R(k), np.eye(z.shape[1])))
+        white = lower_solve(L, transposed(np.where(seen[:, None], r, 0.0)))
+        log = -0.5 * np.sum(white**2, axis=1)
+        top = log.max(axis=1, keepdims=True)
+        w = np.exp(log - top)
+        total = w.sum(axis=1, keepdims=True)
+        constant = np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1) + 0.5 * np.log(2 * np.pi) * seen.sum(axis=1)
+        out.log_likelihood += top[:, 0] + np.log(total[:, 0] / self.particles) - constant
+        out.degrees[:, k] = seen.sum(axis=1)
+        return w / total
+
+
+def _resampled(x: Array, w: Array, offset: Array) -> Array:
+    """Particles x (trials, N, n) copied in proportion to their weights w (trials, N), systematically from an offset
+    (trials,) in [0, 1)."""
+    trials, N, n = x.shape
+    upto = np.ceil(N * np.cumsum(w, axis=1) - offset[:, None]).clip(0, N)
+    upto[:, -1] = N
+    counts = np.diff(upto, axis=1, prepend=0.0).astype(int)
+    return x.reshape(trials * N, n)[np.repeat(np.arange(trials * N), counts.ravel())].reshape(trials, N, n)
+
+
+def ekf(iterations: int = 1) -> Filter:
+    """The extended Kalman filter; iterated (IEKF) with more than one iteration."""
+    return Filter(Taylor(), iterations)
+
+
+def ukf(kappa: float | None = None) -> Filter:
+    """The unscented Kalman filter."""
+    return Filter(Unscented(kappa))
+
+
+def ckf() -> Filter:
+    """The cubature Kalman filter, which draws its points again after the prediction."""
+    return Filter(Cubature())
+
+
+def ghkf(order: int = 5) -> Filter:
+    """The Gauss-Hermite Kalman filter."""
+    return Filter(GaussHermite(order))
+
+
+def iplf(order: int = 3, iterations: int = 10) -> Filter:
+    """The iterated posterior linearisation filter."""
+    return Filter(GaussHermite(order), iterations)

@@ -1,0 +1,82 @@
+"""The gimballed inertial navigation system of the paper with gyro drifts that walk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Count, NonNegative, Positive
+from ipe_bench.measurements.base import Parameter
+from ipe_bench.measurements.gins import Gins
+from ipe_bench.states.base import Gaussian, StateModel
+
+_KINEMATIC = 11
+"""States of the motion; the parameters follow."""
+_DRIFTS = slice(_KINEMATIC + 4, _KINEMATIC + 7)
+
+
+@dataclass(frozen=True)
+class WalkingGins(StateModel):
+    """The paper's four runs of 90 minutes one after another on one platform, whose three gyro drifts walk meanwhile.
+
+    The states are the eleven of the motion, which begin anew with each run, and the eleven parameters of `Gins` in
+    multiples of their sizes; eight of them stand still. An epoch is a pair of velocities, every three minutes.
+    """
+
+    walk: NonNegative = 1.0
+    """By how much a drift walks in an hour: standard deviation, in multiples of the drift's size (0.01 deg/h about x
+    and y, 0.1 deg/h about z)."""
+    error_scale: Positive = 10.0
+    """Standard deviation of each parameter at the beginning, in multiples of its size."""
+    deviation: Positive = 0.0066
+    """Standard deviation of a reading, m/s: that of rounding to 0.02286 m/s."""
+    steps: Count = 4
+    """Runge-Kutta steps between two readings."""
+    gins: Gins = field(default_factory=Gins)
+
+    @property
+    def states(self) -> tuple[Parameter, ...]:
+        names = ("vx", "vy", "ux", "uy", "uz", "ex", "ey", "ez", "cx", "cy", "cz")
+        return (*(Parameter(name) for name in names), *self.gins.parameters)
+
+    @property
+    def times(self) -> Array:
+        runs, interval = len(self.gins.cases), 60.0 * self.gins.interval_min
+        return interval * np.arange(1, runs * self.gins.readings_per_case + 1)
+
+    @property
+    def prior(self) -> Gaussian:
+        variances = np.r_[np.zeros(_KINEMATIC), np.full(self.gins.n, self.error_scale**2)]
+        return Gaussian(np.zeros(len(variances)), np.diag(variances))
+
+    def transition(self, x: Array, k: int) -> Array:
+        g = self.gins
+        p = list(np.moveaxis(x[..., _KINEMATIC:] * g.si_sizes, -1, 0))
+        y = x[..., :_KINEMATIC]
+        run, within = divmod(k, g.readings_per_case)
+        if within == 0:
+            y = y * 0.0 + np.array(g.start(p, g.cases[run]))
+        h = 60.0 * g.interval_min / self.steps
+
+        def rate(y: Array) -> Array:
+            return np.stack(g.rhs(0.0, list(np.moveaxis(y, -1, 0)), p, ()), axis=-1)
+
+        for _ in range(self.steps):
+            k1 = rate(y)
+            k2 = rate(y + h / 2 * k1)
+            k3 = rate(y + h / 2 * k2)
+            y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(y + h * k3))
+        return np.concatenate([y, x[..., _KINEMATIC:]], axis=-1)
+
+    def observe(self, x: Array, k: int) -> Array:
+        return x[..., :2] - self.gins.offset.reshape(-1, 2)[k]
+
+    def gain(self, k: int) -> Array:
+        G = np.zeros((self.n, 3))
+        G[_DRIFTS] = self.walk * np.sqrt(self.gins.interval_min / 60.0) * np.eye(3)
+        return G
+
+    def R(self, k: int) -> Array:
+        return self.deviation**2 * np.eye(2)

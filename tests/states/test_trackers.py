@@ -1,0 +1,290 @@
+"""Filters and smoothers of states that move: published figures, filterpy, dense solvers and closed forms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
+from scipy.optimize import least_squares
+
+import ipe_bench as ib
+from ipe_bench.measurements import Parameter
+from ipe_bench.states import (
+    Bootstrap,
+    ConstantVelocity,
+    CoordinatedTurn,
+    Cubature,
+    Filter,
+    GaussHermite,
+    Gaussian,
+    Growth,
+    IteratedSmoother,
+    Pendulum,
+    Smoother,
+    StateModel,
+    Taylor,
+    Tracker,
+    Tracks,
+    Unscented,
+    bound_at_truth,
+    ckf,
+    ekf,
+    posterior_bounds,
+    ukf,
+)
+from ipe_bench.states.trackers import path_cost
+
+BOOK = {
+    "EKF": (Taylor(), 1, 0.16830859061153763, 0.057446202494837),
+    "IEKF": (Taylor(), 10, 0.16547516472119136, 0.03463604419042699),
+    "UKF": (Unscented(), 1, 0.09524392125923083, 0.036617555415464256),
+    "CKF": (Cubature(), 1, 0.1141966031380275, 0.04064624229594188),
+    "GHKF": (GaussHermite(5), 1, 0.0998062421916222, 0.03710181978632009),
+    "IPLF": (GaussHermite(3), 10, 0.14055766458714145, 0.034733224044175594),
+}
+"""RMSE of the angle over 500 epochs, filter and smoother, as stored in the notebooks of the book (see NOTICE.md)."""
+NEAR = Pendulum(count=60, start=(1.0, 0.0), spread=0.1)
+
+
+@pytest.fixture(scope="module")
+def stored():
+    """The book's path (1, 500, 2) and readings (1, 500, 1)."""
+    rows = np.loadtxt(Path(__file__).with_name("pendulum.csv"), delimiter=",", skiprows=1)
+    return rows[None, :, 1:3], rows[None, :, 3:]
+
+
+@pytest.mark.parametrize("name", BOOK)
+def test_the_twelve_figures_of_the_book(name, stored):
+    (rule, iterations, filtered, smoothed), (x, z) = BOOK[name], stored
+    first = Filter(rule, iterations)
+    smoother = IteratedSmoother(first, rule) if iterations > 1 else Smoother(first)
+    for tracker, figure in ((first, filtered), (smoother, smoothed)):
+        error = tracker.track(Pendulum(), z).mean - x
+        assert np.sqrt(np.mean(error[..., 0] ** 2)) == pytest.approx(figure, abs=1e-12)
+
+
+def test_filterpy_s_extended_and_unscented_filters_and_its_smoother(stored):
+    model, (_, z) = Pendulum(), stored
+    points = MerweScaledSigmaPoints(2, alpha=1.0, beta=0.0, kappa=1.0)
+    theirs = ExtendedKalmanFilter(2, 1)
+    unscented = UnscentedKalmanFilter(2, 1, model.step, lambda x: model.observe(x, 0), _moved(model), points)
+    for other in (theirs, unscented):
+        other.x, other.P, other.Q, other.R = np.zeros(2), np.eye(2), model.Q(0), model.R(0)
+    extended, means, covariances = [], [], []
+    for reading in z[0]:
+        theirs.F = np.array([[1.0, model.step], [-model.step * model.gravity * np.cos(theirs.x[0]), 1.0]])
+        moved = model.transition(theirs.x, 0)
+        theirs.predict()
+        theirs.x = moved
+        theirs.update(reading, lambda x: np.array([[np.cos(x[0]), 0.0]]), lambda x: model.observe(x, 0))
+        extended.append(theirs.x.copy())
+        unscented.predict()
+        unscented.sigmas_f = points.sigma_points(unscented.x, unscented.P)  # else they do not carry Q
+        unscented.update(reading)
+        means.append(unscented.x.copy())
+        covariances.append(unscented.P.copy())
+    smoothed, _, _ = unscented.rts_smoother(np.array(means), np.array(covariances))
+    np.testing.assert_allclose(ekf().track(model, z).mean[0], extended, atol=1e-11)
+    np.testing.assert_allclose(ukf().track(model, z).mean[0], means, atol=1e-11)
+    np.testing.assert_allclose(Smoother(ukf()).track(model, z).mean[0], smoothed, atol=1e-11)
+
+
+def _moved(model):
+    return lambda x, dt: model.transition(x, 0)
+
+
+def dense(model, z):
+    """Means (K, n) and covariances (K, n, n) of a linear model's states given all readings, by one dense solve over the
+    start and the disturbances."""
+    n, q, K = model.n, model.gain(0).shape[1], model.epochs
+    prior = np.zeros((n + q * K, n + q * K))
+    prior[:n, :n], prior[n:, n:] = model.prior.covariance, np.eye(q * K)
+    X, S = [], np.hstack([np.eye(n), np.zeros((n, q * K))])
+    F = model.transition(np.eye(n), 0).T - model.transition(np.zeros((1, n)), 0).T
+    for k in range(K):
+        S = F @ S
+        S[:, n + q * k : n + q * (k + 1)] += model.gain(k)
+        X.append(S.copy())
+    H = model.observe(np.eye(n), 0).T
+    A = np.concatenate([H @ part for part in X])
+    R = np.kron(np.eye(K), model.R(0))
+    gain = prior @ A.T @ np.linalg.inv(A @ prior @ A.T + R)
+    u, C = gain @ z.ravel(), prior - gain @ A @ prior
+    return np.array([part @ u for part in X]), np.array([part @ C @ part.T for part in X])
+
+
+@dataclass(frozen=True)
+class Walk(StateModel):
+    """A position whose velocity alone is disturbed: Q has rank 1 of 2."""
+
+    @property
+    def states(self):
+        return Parameter("position"), Parameter("velocity")
+
+    @property
+    def times(self):
+        return np.arange(1.0, 21.0)
+
+    @property
+    def prior(self):
+        return Gaussian(np.zeros(2), np.eye(2))
+
+    def transition(self, x, k):
+        return np.stack([x[..., 0] + x[..., 1], x[..., 1]], axis=-1)
+
+    def observe(self, x, k):
+        return x[..., :1]
+
+    def gain(self, k):
+        return np.array([[0.0], [0.3]])
+
+    def R(self, k):
+        return np.eye(1)
+
+
+@pytest.mark.parametrize("model", [ConstantVelocity(count=20, spread=2.0), Walk()], ids=lambda m: m.name)
+@pytest.mark.parametrize("rule", [Taylor(), Cubature(), Unscented(), GaussHermite(2)], ids=lambda r: type(r).__name__)
+def test_linear_models_have_their_closed_form_by_every_rule(model, rule):
+    z = model.draw(0, 3).z
+    filtered, smoothed = Filter(rule).track(model, z), Smoother(Filter(rule)).track(model, z)
+    for trial in range(3):
+        mean, covariance = dense(model, z[trial])
+        np.testing.assert_allclose(smoothed.mean[trial], mean, atol=2e-10)
+        np.testing.assert_allclose(smoothed.covariance[trial], covariance, atol=2e-10)
+        np.testing.assert_allclose(filtered.mean[trial, -1], mean[-1], atol=2e-10)
+        np.testing.assert_allclose(filtered.covariance[trial, -1], covariance[-1], atol=2e-10)
+
+
+def test_the_damped_gauss_newton_smoother_finds_the_path_of_a_dense_solver():
+    z = NEAR.draw(0, 1).z
+    smoother = IteratedSmoother(ukf(), Taylor(), 50, damped=True, tolerance=1e-10)
+    track = smoother.track(NEAR, z)
+    P, G = np.linalg.cholesky(NEAR.prior.covariance), np.linalg.inv(NEAR.gain(0))
+
+    def residual(u):
+        x = u.reshape(-1, 2)
+        steps = [G @ (x[k + 1] - NEAR.transition(x[k], k)) for k in range(NEAR.epochs)]
+        read = (z[0] - np.sin(x[1:, :1])).ravel() / np.sqrt(NEAR.variance)
+        return np.concatenate([np.linalg.solve(P, x[0] - NEAR.prior.mean), *steps, read])
+
+    start = np.concatenate([NEAR.prior.mean, Smoother(ukf()).track(NEAR, z).mean.ravel()])
+    found = least_squares(residual, start, method="lm", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    np.testing.assert_allclose(track.mean[0], found.x.reshape(-1, 2)[1:], atol=1e-7)
+    assert path_cost(NEAR, z, track.start.mean, track.mean)[0] == pytest.approx(2 * found.cost, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    "tracker",
+    [
+        ekf(),
+        ukf(),
+        Filter(Taylor(), 5, damped=True),
+        Smoother(ckf()),
+        IteratedSmoother(ukf(), Taylor(), 5, damped=True),
+        Bootstrap(200),
+    ],
+    ids=["ekf", "ukf", "iekf", "smoother", "iterated", "bootstrap"],
+)
+@pytest.mark.parametrize("model", [NEAR, CoordinatedTurn(count=20)], ids=["pendulum", "turn"])
+def test_a_trial_has_the_same_bits_in_every_batch(tracker, model):
+    z = model.draw(0, 9).z
+    whole = tracker.track(model, z)
+    alone = tracker.track(model, z[5:6])
+    assert np.array_equal(whole.mean[5:6], alone.mean)
+    assert np.array_equal(whole.covariance[5:6], alone.covariance)
+    assert np.array_equal(model.draw(5, 6).z, z[5:6])
+
+
+@pytest.mark.parametrize("rule", [Taylor(), Unscented()])
+def test_missing_readings_are_as_if_they_had_never_been_taken(rule):
+    z = NEAR.draw(0, 2).z
+    z[0, 10:30] = np.nan
+    tracks = Filter(rule).track(NEAR, z)
+    blind = replace(NEAR, count=30, variance=1e12)
+    before = Filter(rule).track(replace(NEAR, count=10), z[:1, :10])
+    ahead = replace(blind, count=20, start=tuple(before.mean[0, -1].tolist()))
+    assert tracks.degrees[0].sum() == 40
+    assert tracks.nis[0, 10:30].max() == 0.0
+    x = Gaussian(before.mean[0, -1], before.covariance[0, -1])
+    for k in range(10, 30):  # the prediction alone
+        move = rule.linearise(lambda at, k=k: ahead.transition(at, k), x.mean[None], x.covariance[None])
+        x = Gaussian(
+            (move.A @ x.mean + move.b)[0], (move.A @ x.covariance @ move.A.swapaxes(1, 2) + move.W)[0] + NEAR.Q(k)
+        )
+    np.testing.assert_allclose(tracks.mean[0, 29], x.mean, atol=1e-12)
+    np.testing.assert_allclose(tracks.covariance[0, 29], x.covariance, atol=1e-12)
+
+
+def test_bearings_come_round():
+    """A turn whose track crosses the negative x axis: without wrapping the filters lose it at once."""
+    model = CoordinatedTurn(count=60)
+    paths = model.draw(0, 40)
+    angle = np.arctan2(paths.x[..., 2], paths.x[..., 0])
+    assert (np.abs(np.diff(angle, axis=1)) > np.pi).any()
+    bound = np.sqrt(np.median(np.einsum("tkii->tki", bound_at_truth(model, paths))[..., [0, 2]].sum(axis=-1)))
+    for tracker in (ukf(), ckf()):
+        error = tracker.track(model, paths.z).mean - paths.x
+        assert np.median(np.hypot(error[..., 0], error[..., 2])) < 2 * bound
+
+
+@dataclass(frozen=True)
+class Grid(Tracker):
+    """The exact filter of a scalar state on a grid (Kitagawa, JASA 82, 1987)."""
+
+    def track(self, model, z):
+        g = np.linspace(-45.0, 45.0, 901)
+        mean, P = model.prior
+        p = np.repeat(np.exp(-0.5 * (g - mean) ** 2 / P[0, 0])[None], len(z), 0)
+        out = Tracks.empty(model, len(z))
+        for k in range(model.epochs):
+            gap = (g[:, None] - model.transition(g[:, None], k)[:, 0]) / model.gain(k)[0, 0]
+            kernel = np.exp(-0.5 * gap**2)
+            p = (p / p.sum(axis=1, keepdims=True)) @ (kernel / kernel.sum(axis=0)).T
+            p = p * np.exp(-0.5 * (z[:, k] - model.observe(g[:, None], k)[:, 0]) ** 2)
+            p /= p.sum(axis=1, keepdims=True)
+            out.mean[:, k, 0] = p @ g
+        return out
+
+
+def test_the_growth_model_separates_the_filters_from_the_exact_answer():
+    model = Growth()
+    paths = model.draw(0, 60)
+
+    def rmse(tracker):
+        return np.sqrt(np.mean((tracker.track(model, paths.z).mean - paths.x) ** 2))
+
+    exact, particles, extended = rmse(Grid()), rmse(Bootstrap(1000)), rmse(ekf())
+    assert exact == pytest.approx(4.66, abs=0.25)
+    assert exact < particles < 1.05 * exact
+    assert extended == pytest.approx(22.0, abs=2.5)
+    bound = np.sqrt(posterior_bounds(model, paths)[0][:, 0, 0].mean())
+    assert bound < 0.4 * exact  # far from attainable
+
+
+def test_the_bounds_of_a_linear_model_are_its_covariances():
+    model = ConstantVelocity(count=20)
+    paths = model.draw(0, 5)
+    filtered, smoothed = posterior_bounds(model, paths)
+    np.testing.assert_allclose(filtered, ekf().track(model, paths.z).covariance[0], rtol=1e-9)
+    np.testing.assert_allclose(smoothed, Smoother(ekf()).track(model, paths.z).covariance[0], rtol=1e-9)
+    np.testing.assert_allclose(bound_at_truth(model, paths)[2], filtered, rtol=1e-9)
+
+
+def test_a_path_without_a_density_has_no_posterior_bound():
+    with pytest.raises(ib.UserError, match="process noise into epoch 1 has rank 1 of 2"):
+        posterior_bounds(Walk(), Walk().draw(0, 2))
+
+
+def test_nees_and_nis_of_the_kalman_filter_are_chi_square():
+    model = ConstantVelocity(count=50)
+    paths = model.draw(0, 400)
+    tracks = ekf().track(model, paths.z)
+    e = tracks.mean - paths.x
+    nees = np.einsum("tki,tkij,tkj->tk", e, np.linalg.inv(tracks.covariance), e)
+    assert nees[:, -1].mean() == pytest.approx(2.0, abs=4 * 2 / np.sqrt(400))
+    assert tracks.nis.mean() == pytest.approx(1.0, abs=4 * np.sqrt(2 / (400 * 50)))
+    white = tracks.nis - tracks.nis.mean()
+    assert abs((white[:, 1:] * white[:, :-1]).mean() / white.var()) < 4 / np.sqrt(400 * 49)
