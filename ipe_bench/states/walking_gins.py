@@ -12,9 +12,9 @@ from ipe_bench.measurements.base import Parameter
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.states.base import Gaussian, StateModel
 
-_KINEMATIC = 11
+KINEMATIC = 11
 """States of the motion; the parameters follow."""
-_DRIFTS = slice(_KINEMATIC + 4, _KINEMATIC + 7)
+_DRIFTS = slice(KINEMATIC + 4, KINEMATIC + 7)
 
 
 @dataclass(frozen=True)
@@ -48,13 +48,13 @@ class WalkingGins(StateModel):
 
     @property
     def prior(self) -> Gaussian:
-        variances = np.r_[np.zeros(_KINEMATIC), np.full(self.gins.n, self.error_scale**2)]
+        variances = np.r_[np.zeros(KINEMATIC), np.full(self.gins.n, self.error_scale**2)]
         return Gaussian(np.zeros(len(variances)), np.diag(variances))
 
     def transition(self, x: Array, k: int) -> Array:
         g = self.gins
-        p = list(np.moveaxis(x[..., _KINEMATIC:] * g.si_sizes, -1, 0))
-        y = x[..., :_KINEMATIC]
+        p = list(np.moveaxis(x[..., KINEMATIC:] * g.si_sizes, -1, 0))
+        y = x[..., :KINEMATIC]
         run, within = divmod(k, g.readings_per_case)
         if within == 0:
             y = y * 0.0 + np.array(g.start(p, g.cases[run]))
@@ -68,7 +68,7 @@ class WalkingGins(StateModel):
             k2 = rate(y + h / 2 * k1)
             k3 = rate(y + h / 2 * k2)
             y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(y + h * k3))
-        return np.concatenate([y, x[..., _KINEMATIC:]], axis=-1)
+        return np.concatenate([y, x[..., KINEMATIC:]], axis=-1)
 
     def observe(self, x: Array, k: int) -> Array:
         return x[..., :2] - self.gins.offset.reshape(-1, 2)[k]
