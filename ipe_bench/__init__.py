@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.2.0"
 
 if TYPE_CHECKING:
-    from ipe_bench import baselines, measurements, noise, priors, solvers
+    from ipe_bench import baselines, measurements, noise, priors, solvers, states
     from ipe_bench.api import audit, check, compare, design, estimate, load, posterior, report, run, status
     from ipe_bench.basics.errors import UserError
     from ipe_bench.basics.statuses import Status
@@ -38,7 +38,7 @@ _HOMES = {
     "trials.scenario": ("Scenario",),
 }
 """Public names, by the module that they are in."""
-_ROOMS = ("baselines", "measurements", "noise", "priors", "solvers")
+_ROOMS = ("baselines", "measurements", "noise", "priors", "solvers", "states")
 
 __all__ = [
     "IPE",
@@ -66,6 +66,7 @@ __all__ = [
     "report",
     "run",
     "solvers",
+    "states",
     "status",
 ]
 

@@ -13,7 +13,7 @@ HOUSE = Path(ipe_bench.__file__).parent
 LINE = (
     ("basics",),
     ("measurements",),
-    ("noise", "priors"),
+    ("noise", "priors", "states"),
     ("estimators",),
     ("solvers", "baselines"),
     ("trials",),
@@ -29,6 +29,7 @@ BUDGETS = {
     "measurements": 7050,
     "noise": 430,
     "priors": 175,
+    "states": 950,
     "estimators": 1270,
     "solvers": 1250,
     "baselines": 2540,

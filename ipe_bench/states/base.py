@@ -154,4 +154,5 @@ def slope(function: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:
     points = x[..., None, :] + _COMPLEX_STEP * 1j * np.eye(n)
     few = max(1, _SMALL // (points[:1].nbytes or 1))
     y = np.concatenate([function(points[i : i + few]) for i in range(0, max(len(points), 1), few)])
-    return np.ascontiguousarray(y[..., 0, :].real), np.ascontiguousarray(y.imag.swapaxes(-1, -2)) / _COMPLEX_STEP
+    value, slopes = np.real(y[..., 0, :]), np.imag(y).swapaxes(-1, -2)
+    return np.ascontiguousarray(value), np.ascontiguousarray(slopes) / _COMPLEX_STEP

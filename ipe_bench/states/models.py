@@ -156,8 +156,8 @@ def bearing(x: Array, y: Array) -> Array:
     """The angle of (x, y) from the x axis in rad, for real or complex-step arguments."""
     if not np.iscomplexobj(x):
         return np.arctan2(y, x)
-    turned = (x.real * y.imag - y.real * x.imag) / (x.real**2 + y.real**2)
-    return np.arctan2(y.real, x.real) + 1j * turned
+    a, b = np.real(x), np.real(y)
+    return np.arctan2(b, a) + 1j * (a * np.imag(y) - b * np.imag(x)) / (a**2 + b**2)
 
 
 @dataclass(frozen=True)

@@ -282,8 +282,8 @@ def _halved(old: Array, new: Array, cost: Callable[[Array], Array]) -> Array:
 
 def _shortened(model: StateModel, z: Array, old: Tracks, new: Tracks) -> Tracks:
     """The step from one path to the next, halved where it raises the path's cost."""
-    ends = [np.concatenate([path.start.mean[:, None], path.mean], axis=1) for path in (old, new)]
-    path = _halved(*ends, lambda x: path_cost(model, z, x[:, 0], x[:, 1:]))
+    first, last = (np.concatenate([path.start.mean[:, None], path.mean], axis=1) for path in (old, new))
+    path = _halved(first, last, lambda x: path_cost(model, z, x[:, 0], x[:, 1:]))
     new.mean, new.start = path[:, 1:], Gaussian(path[:, 0], new.start.covariance)
     return new
 
