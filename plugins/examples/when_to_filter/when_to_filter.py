@@ -89,7 +89,7 @@ def main(trials: int, figure: Path) -> None:
             ax.loglog(WALKS, values, color=color, linestyle=line, marker=marker, markersize=4, label=name)
         ax.axhline(1.0, color="black", linewidth=0.8, zorder=0)
         ax.set(title=f"error scale {scale:g}", xlabel="walk of a drift in an hour [its size]", ylim=(0.8, 200))
-    axes[0].set_ylabel("error of what stands still, over the bound")
+    axes[0].set_ylabel("error over the bound")
     fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False, fontsize=8)
     figure.parent.mkdir(parents=True, exist_ok=True)
     fig.savefig(figure, dpi=150)
