@@ -183,7 +183,7 @@ def compare(
     `low` and `high` are the ends of the row's own interval, `p` is corrected over all rows (Holm), and `e` is evidence
     that may be looked at after any number of trials; `finding` says what the second is, by p below `alpha`, or by e
     where `anytime`. `attrs` has lines on what of `fail_on` is `worse`, and on `problems`, `stale` results and `notes`.
-    With `output`, comparison.csv, a page and figures are written there.
+    With `output`, comparison.csv and a page are written there.
 
     >>> import tempfile, ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)

@@ -166,7 +166,7 @@ Nothing is computed: run both first. The same trials are compared one by one; fo
 alpha=0.05           the chance that anything is found where there is no difference
 anytime=true         judge by e-values: then it may be looked at as often as one likes, while trials are added
 fail_on=success,error  what the second may not be worse in: success, error, cost
-output=DIR           writes comparison.csv, comparison.html, and comparison as PNG and PDF there
+output=DIR           writes comparison.csv and comparison.html there
 """,
         (_several("arguments", "DIR", "one or two folders of results"),),
     ),
