@@ -342,4 +342,5 @@ def _effects(judge: _Judge, model: Measurement, candidates: Measurement, slopes:
 def levels_of(model: Measurement, column: str, entry: Any) -> str:
     """An entry of the index with what it stands for, where the model has words for it."""
     words: Mapping[Any, str] = model.levels.get(column, {})
-    return f"{entry} ({words[entry]})" if entry in words else str(entry)
+    shown = f"{entry:g}" if isinstance(entry, float) else str(entry)
+    return f"{shown} ({words[entry]})" if entry in words else shown

@@ -311,16 +311,13 @@ def legend(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | None = 
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
-    if handles:
-        columns = _legend_columns([len(label) for label in handles], fig.get_figwidth())
-        fig.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=columns)
-
-
-def _legend_columns(lengths: Sequence[int], width: float) -> int:
-    """The most columns that fit side by side, each as wide as its longest label."""
-    letter = _letter("legend.fontsize")
-
-    def needed(columns: int) -> float:
-        return sum(letter * (7 + int(part.max())) for part in np.array_split(np.array(lengths), columns))
-
-    return next((n for n in range(len(lengths), 1, -1) if needed(n) <= width), 1)
+    if not handles:
+        return
+    # The most columns that fit side by side, each as wide as its longest label.
+    letter, lengths = _letter("legend.fontsize"), np.array([len(label) for label in handles])
+    fitting = (
+        count
+        for count in range(len(handles), 1, -1)
+        if sum(letter * (7 + part.max()) for part in np.array_split(lengths, count)) <= fig.get_figwidth()
+    )
+    fig.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=next(fitting, 1))

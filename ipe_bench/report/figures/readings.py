@@ -240,15 +240,17 @@ def _estimate(ax: Any, one: Reference, label: str, look: Look, which: list[int])
     """An estimator's Gaussian: its density of one parameter, its 95 % ellipse of two, or its estimate alone."""
     d, estimates = one.posterior.deviation[which], one.estimates[label]
     centre = (estimates.x[0][which] - one.posterior.mean[which]) / d
+    if not np.isfinite(centre).all():
+        return
     P = np.full((len(d), len(d)), np.nan)
     if estimates.covariance is not None:
         P = estimates.covariance[0][np.ix_(which, which)] / np.outer(d, d)
     style = {"color": look.color, "linestyle": look.line["linestyle"], "linewidth": 1.0}
-    if np.isfinite(P).all() and np.isfinite(centre).all() and np.linalg.eigvalsh(P)[0] > 0:
+    if np.isfinite(P).all() and np.linalg.eigvalsh(P)[0] > 0:
         if len(which) == 1:
             x = np.linspace(-_VIEW, _VIEW, 201)
             ax.plot(x, np.exp(-0.5 * (x - centre[0]) ** 2 / P[0, 0]) / np.sqrt(2 * np.pi * P[0, 0]), **style)
         else:
             ax.plot(*(centre + ellipse(P)).T, **style)
-    elif len(which) == 2 and np.isfinite(centre).all():
+    elif len(which) == 2:
         ax.plot(*centre, color=look.color, marker=look.marker, markersize=3)
