@@ -130,11 +130,3 @@ def test_status_and_report_agree_and_the_report_is_still_a_function_afterwards(t
     assert result.report == tmp_path / "elsewhere" / "report.html"
     with pytest.warns(UserWarning, match="missing"):
         ib.load([tmp_path])
-
-
-def test_check_takes_a_component_or_the_folder_of_a_plugin():
-    assert not any(finding.complaint for finding in ib.check(ib.noise.Gaussian(0.1)))
-    folder = Path(__file__).parents[2] / "plugins" / "relaxed_fixed_point"
-    findings = ib.check(folder)
-    assert {finding.component for finding in findings} == {"solver=relaxed"}
-    assert any(finding.complaint for finding in ib.check(3))

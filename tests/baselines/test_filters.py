@@ -18,7 +18,6 @@ from ipe_bench.baselines.sequential import Sequential
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Covariance, information, inverse, multiply, quadratic_form
 from ipe_bench.basics.statuses import Status
-from ipe_bench.measurements.base import SubsetModel
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Quantization
@@ -86,16 +85,6 @@ def test_on_a_linear_model_a_filter_is_the_batch_map(model, estimator, apart, sc
     assert (found.status == Status.CONVERGED).all()
     assert np.abs((found.x - x) / deviations(P)).max() < apart
     assert np.abs((found.covariance - P) / np.outer(deviations(P), deviations(P))).max() < apart
-
-
-@pytest.mark.parametrize("estimator", [*KALMAN, *INFORMATION], ids=label)
-def test_inflation_widens_the_prior(estimator):
-    scenario = Scenario(Linear(), Gaussian(1.0), GaussianPrior(), 0.5)
-    problem, trials = scenario.problem, scenario.draw(0, 3)
-    x, P = linear_map(problem, Linear().matrix, trials.z, inflation=3.0)
-    found = replace(estimator, prior_inflation=3.0).estimate(problem, trials.z)
-    assert found.x == pytest.approx(x, abs=1e-8)
-    assert found.covariance[0] == pytest.approx(P, abs=1e-8)
 
 
 def test_ensemble_tends_to_the_kalman_filter():
@@ -263,19 +252,6 @@ def test_a_prefix_costs_its_share(estimator, simulations, jacobians):
     found = estimator.estimate(scenario.problem, scenario.draw(0, 3).z)
     assert found.simulations == pytest.approx(2.5 * simulations)
     assert found.jacobians == pytest.approx(2.5 * jacobians)
-
-
-@pytest.mark.parametrize("kept", [tuple(range(11)), (0, 2, 3, 5, 6, 7, 9)], ids=["all readings", "some missing"])
-@pytest.mark.parametrize("estimator", [UKF(), *INFORMATION], ids=label)
-def test_nothing_is_computed_beyond_the_epoch_at_hand(estimator, kept):
-    whole = Linear()
-    model = whole if len(kept) == whole.m else SubsetModel(whole, kept)
-    problem = Problem(model, Covariance(np.ones(model.m)), np.ones(4))
-    z = np.random.default_rng(1).standard_normal((2, model.m))
-    found = estimator.estimate(problem, z)
-    assert sorted(set(whole.stops)) == [k for k, rows in enumerate(whole.epochs, start=1) if set(rows) & set(kept)]
-    x, _ = linear_map(problem, whole.matrix[list(kept)], z)
-    assert found.x == pytest.approx(x, abs=1e-9)
 
 
 def test_the_ensemble_leaves_the_global_random_state_alone():

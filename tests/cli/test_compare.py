@@ -165,16 +165,6 @@ def test_costs_are_judged_by_their_means_alone(tmp_path):
     assert row["finding"] == ""
 
 
-@pytest.mark.parametrize("trials", [1, 2, 3, 5])
-def test_a_handful_of_trials_is_compared_with_open_intervals(tmp_path, trials):
-    bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
-    estimators = {"linear": ib.baselines.LinearLSE(), "newton": ib.solvers.Newton()}
-    ib.run(bench, estimators, trials, output=tmp_path)
-    assert main(["compare", str(tmp_path), "first=linear", "second=newton"]) == 0
-    rows = ib.compare(tmp_path, first="linear", second="newton").set_index("quantity")
-    assert (rows.loc["error", "low"], rows.loc["error", "high"]) == (0.0, np.inf)
-
-
 @pytest.mark.parametrize(
     ("words", "remedy"),
     [

@@ -23,7 +23,6 @@ from ipe_bench.priors import GaussianPrior
 from ipe_bench.runs.execution import Auto, Dask, Event, Failure, Processes, Serial
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import compute
-from ipe_bench.runs.store import Store
 from ipe_bench.solvers import Newton
 
 GOOD = {"linear_lse": LinearLSE(), "newton": Newton()}
@@ -166,13 +165,6 @@ except KeyboardInterrupt:
     sys.exit(130)
 """
     assert subprocess.run([sys.executable, "-c", code], env=environment(), check=False).returncode == 130
-
-
-def test_what_is_said_to_be_stored_and_is_not_is_a_failure(tmp_path, monkeypatch):
-    monkeypatch.setattr(Store, "write", lambda *arguments: None)
-    failures = compute([scenario()], GOOD, 10, tmp_path, execution=Serial())
-    assert len(failures) == 3
-    assert all("is not" in failure for failure in failures)
 
 
 @pytest.mark.parametrize("execution", [Serial(), Processes(1)], ids=repr)

@@ -118,14 +118,6 @@ def test_few_lanes_and_many_have_the_same_bits(cases):
         np.testing.assert_array_equal(whole[:1], getattr(Several(0.7), method)(x[:1]))
 
 
-def test_readings_are_ordered_by_case_time_and_output():
-    index = Cases().index
-    assert index["case"] == [1] * 6 + [2] * 6
-    assert index["time [s]"][:4] == [0.5, 0.5, 4.0, 4.0]
-    assert index["output"][:3] == ["y", "rate", "y"]
-    assert [rows.tolist() for rows in Cases().epochs][1] == [2, 3, 8, 9]
-
-
 def test_bits_do_not_depend_on_the_batch_or_on_the_number_of_threads(monkeypatch):
     model, x = Cases(0.5), np.random.default_rng(3).normal(size=(70, 2))
     z, J = model.simulate(x), model.jacobian(x)
@@ -159,12 +151,6 @@ def test_steps_that_follow_the_parameters_hold_the_tolerance_of_each_output():
     assert off[..., 0].max() < 1e-9
     assert off[..., 1].max() < 1e-6
     assert len(set(model._search(x, np.zeros(12)).places.tolist())) >= 3
-
-
-def test_a_trial_that_is_not_a_number_does_not_move_where_the_others_begin():
-    x = np.random.default_rng(6).normal(size=(5, 2))
-    spoilt = np.concatenate([x, [[np.nan, 1.0]]])
-    assert (Chosen().simulate(spoilt)[:5] == Chosen().simulate(x)).all()
 
 
 def test_a_coarse_jacobian_contracts_where_it_was_measured_and_beyond():

@@ -256,21 +256,6 @@ def test_four_cases_of_the_paper_are_as_good_as_what_is_chosen():
     assert 0.98 < way.sharpest.mean_bound <= 1
 
 
-def test_candidates_of_gins_begin_with_its_own_cases_and_say_what_they_are():
-    model = Gins()
-    more = model.candidates
-    assert isinstance(more, Gins)
-    np.testing.assert_allclose(more.cases[:4], model.cases)
-    assert np.hypot(*more.cases.T).max() == pytest.approx(np.hypot(*model.cases.T).max())
-    assert more.levels["case"][1] == "1500, 0 ft/s"
-    here, there = (list(zip(*m.index.values(), strict=True)) for m in (model, more))
-    assert set(here) < set(there)
-    x = np.random.default_rng(2).normal(size=(2, 11))
-    rows = [there.index(entry) for entry in here]
-    np.testing.assert_allclose(more.simulate(x)[:, rows], model.simulate(x), atol=1e-9)
-    assert more.taking(sorted(rows)) == model
-
-
 @pytest.mark.parametrize(
     ("options", "noise", "words"),
     [

@@ -58,13 +58,6 @@ def test_a_parameter_of_one_file_may_be_known_there(files):
     assert result.degrees_of_freedom == sum(map(len, data)) - 2
 
 
-def test_a_common_parameter_may_be_fixed_for_all(files):
-    paths, data = files
-    result = estimate(open_together(paths, ConstrainedModel(OWN, (ParameterInfo("b2", fixed=5.5e-4),))))
-    x, _ = solution(lambda p: residuals(data, p[0], p[1], 5.5e-4), [250, 250])
-    assert of(result, result.x) == pytest.approx({"b1_1": x[0], "b1_2": x[1]}, rel=1e-8)
-
-
 def test_a_bound_acts_in_the_file_that_it_is_of(files):
     """On the bound in one file and free in the other, where SciPy's bounded minimum is."""
     paths, data = files

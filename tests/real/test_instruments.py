@@ -174,20 +174,6 @@ def test_a_satellite_file_brings_its_own_sky(tmp_path):
     assert result.standard_errors == pytest.approx(deviations, rel=1e-6)
 
 
-def test_an_epidemic_is_read_when_its_file_says(tmp_path):
-    times = (0.7, 2.25, 3.0, 5.5, 9.0, 12.125)
-    truth = Sir(times=times)
-    x = np.array([[0.5, -0.3, 0.2]])
-    write_readings(tmp_path / "s.csv", truth, truth.simulate(x)[0])
-    lines = (tmp_path / "s.csv").read_text().splitlines()
-    (tmp_path / "s.csv").write_text("\n".join([lines[0], *reversed(lines[1:])]))
-    found = open_together([tmp_path / "s.csv"], Sir())
-    assert found.model.simulate(x)[0] == pytest.approx(found.z, abs=1e-9)
-    assert found.model.index["time [day]"] == list(reversed(times))
-    result = fit(Problem(found.model, Gaussian(20.0).covariance(6)), found.z, {"gn": GaussNewton(max_iterations=50)})[0]
-    assert result.inner == pytest.approx(x[0], abs=1e-6)
-
-
 def test_every_model_with_a_noise_of_its_own_is_simulated_with_it():
     assert Scenario(Gins()).noise == Quantization(step=0.02286)
     assert Scenario(Sir()).noise == Gaussian(20.0)

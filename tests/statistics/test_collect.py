@@ -12,7 +12,7 @@ from ipe_bench.runs import parts
 from ipe_bench.runs.execution.base import Failure
 from ipe_bench.runs.provenance import digest
 from ipe_bench.statistics import analyse
-from ipe_bench.statistics.collect import collect, differing
+from ipe_bench.statistics.collect import collect
 
 
 @pytest.fixture
@@ -119,21 +119,3 @@ def test_the_truth_being_absent_is_a_problem_and_not_a_crash(filled):
     assert any("the truth" in line for line in analysis.problems)
     assert analysis.summary["crlb"].isna().all()
     assert analysis.summary["rmse"].notna().all()
-
-
-def test_leaves_that_differ_are_found_at_any_depth():
-    def scenario(step, truth=None, latitude=36.0):
-        return {
-            "_target_": "a.Scenario",
-            "noise": {"_target_": "a.Quantization", "step": step},
-            "measurement": {"_target_": "a.Gins", "latitude_deg": latitude, "list": [1, 2]},
-            "truth": truth,
-        }
-
-    assert differing([scenario(1), scenario(1)]) == []
-    assert differing([scenario(1), scenario(2)]) == ["noise.step"]
-    assert differing([scenario(1), scenario(1, latitude=40.0)]) == ["measurement.latitude_deg"]
-    fine = {"_target_": "a.Gins", "step": 1.0}
-    coarse = {"_target_": "a.Gins", "step": 9.0}
-    assert differing([scenario(1), scenario(1, fine)]) == ["truth"]
-    assert differing([scenario(1), scenario(1, fine), scenario(1, coarse)]) == ["truth", "truth.step"]

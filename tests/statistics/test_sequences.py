@@ -77,25 +77,10 @@ def test_a_root_mean_square_scales_with_its_errors_and_narrows_with_trials():
     assert ends(np.zeros((1, 100)))[1] == 0
 
 
-def test_the_next_number_of_trials():
-    """Half as wide takes four times as many, but at most twice as many are taken at once."""
-    assert next_trials(1000, 1.3, 250, 10**6) == 1750
-    assert next_trials(1000, 2.0, 250, 10**6) == 2000
-    assert next_trials(1000, 1.0001, 250, 10**6) == 1250
-    assert next_trials(1100, 1.0001, 250, 10**6) == 1250
-    assert next_trials(250, np.inf, 250, 10**6) == 500
-    assert next_trials(1000, 1.3, 250, 1600) == 1600
-
-
 @pytest.mark.parametrize("given", [0, 1, -0.1, 2, True, "x", float("nan"), {}, {"nees": 0.1}, {"rmse": 0}, None])
 def test_what_is_no_precision_is_refused(given):
     with pytest.raises(UserError, match="precision"):
         precision_of(given)
-
-
-def test_a_precision_is_a_number_or_numbers_by_name():
-    assert precision_of(0.02) == {"success": 0.02}
-    assert precision_of({"rmse": 0.05, "success": 0.01}) == {"success": 0.01, "rmse": 0.05}
 
 
 def trials_taken(p: float, wanted: float, rng: np.random.Generator, block: int = 50) -> tuple[int, bool]:

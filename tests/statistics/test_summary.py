@@ -78,16 +78,6 @@ def test_shares_are_of_all_trials_and_moments_of_solved_ones(synthetic):
     assert a["median_abs_error"] == pytest.approx(np.median(worst))
 
 
-def test_more_than_five_per_cent_without_a_number_make_the_95_per_cent_error_infinite(synthetic):
-    e = errors(100)
-    e[:6] = np.nan
-    ended = np.where(np.arange(100) < 6, "nonfinite", "converged")
-    synthetic.add(synthetic.scenario(), "one", e, solved=np.arange(100) >= 6, status=ended)
-    frame = summarize([synthetic.directory])
-    assert (frame["q95_abs_error"] == np.inf).all()
-    assert np.isfinite(frame["median_abs_error"]).all()
-
-
 def test_coverage_and_nees_of_an_estimator_that_boasts(synthetic):
     e = np.random.default_rng(5).normal(size=(4000, 3)) * 0.1
     synthetic.add(synthetic.scenario(), "honest", e)

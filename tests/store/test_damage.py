@@ -200,15 +200,6 @@ def test_a_folder_that_goes_away_in_mid_run_is_not_filled_anew(tmp_path):
     assert not (folder / "trials").exists()
 
 
-def test_the_record_of_a_run_that_goes_away_is_missed(tmp_path):
-    def remove(progress) -> None:
-        for path in (tmp_path / "runs").iterdir():
-            path.unlink()
-
-    with pytest.raises(StorageError, match="lost the record"):
-        compute(SCENARIOS, {"newton": Newton()}, 4, tmp_path, block_size=2, watch=remove)
-
-
 def test_abandoned_temporary_files_go_wherever_they_lie(folder):
     old, young = [], []
     for place in (".", "trials", "runs", "failed", "figures", "tables", "log"):

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from small_models import Bent
-from synthetic_store import Synthetic, forge
+from synthetic_store import Synthetic
 
 from ipe_bench import Scenario, report
 from ipe_bench.baselines import LinearLSE
@@ -86,18 +86,6 @@ def test_a_file_that_the_disk_does_not_give_back_stands_for_none(tmp_path, monke
         with pytest.raises(parts.Unusable, match="damaged"):
             Store(tmp_path).merge(key)
     assert set(before) < set(names(tmp_path))
-
-
-def test_a_gap_and_a_part_by_other_libraries_stay_as_they_are(tmp_path):
-    synthetic = filled(tmp_path)
-    (cell,) = (c for c in synthetic.cells.values() if c.label == "mine")
-    (tmp_path / "trials" / f"{cell.key}-9-12.parquet").unlink()
-    forge(
-        tmp_path / "trials" / f"{cell.key}-27-30.parquet",
-        lambda rows, footer: footer.update(libraries={"numpy": "0.1"}),
-    )
-    Store(tmp_path).merge(cell.key)
-    assert names(tmp_path, cell.key) == sorted(f"{r}.parquet" for r in ("0-9", "12-27", "27-30", "30-100"))
 
 
 def test_what_a_larger_file_holds_is_read_once_and_goes(tmp_path):
