@@ -1,7 +1,5 @@
 """The gimballed INS once more, written from its equations in vectors and integrated by SciPy to round-off."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.integrate import solve_ivp
 

@@ -1,7 +1,5 @@
 """Small models with known answers, shared by the tests."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Square systems with known roots, as models for the solvers' tests."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Stores filled with trials whose statistics are known beforehand."""
 
-from __future__ import annotations
-
 import datetime
 import json
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Fits of one file of readings: what they find, and what they say of the model."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2, kstest

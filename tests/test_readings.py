@@ -1,7 +1,5 @@
 """A file of readings is read as it was meant, or refused with the row and the column: never something in between."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of residuals against what they promise: false alarms as often as they say, and power where there is a fault."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2, kstest

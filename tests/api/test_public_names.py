@@ -1,7 +1,5 @@
 """`import ipe_bench as ib` is enough for all that the command line does, and costs nothing until it is used."""
 
-from __future__ import annotations
-
 import doctest
 import inspect
 import re

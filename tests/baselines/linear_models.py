@@ -1,7 +1,5 @@
 """Linear measurement models with epochs, whose maximum a posteriori has a closed form."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """The ensemble smoother against the closed form of linear models, and against the formula of its paper."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from linear_models import Linear, linear_map

@@ -1,7 +1,5 @@
 """What filterpy does when it is used as it stands, and that ours are not caught by it."""
 
-from __future__ import annotations
-
 import filterpy.stats
 import numpy as np
 import pytest

@@ -1,8 +1,6 @@
 """The filters against closed forms, textbook loops and the batch answer on GINS, and against themselves one trial at a
 time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """SciPy's least squares: the root, the counts, the statuses, and robust losses."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

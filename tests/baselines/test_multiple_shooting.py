@@ -1,7 +1,5 @@
 """Multiple shooting against single shooting, against the closed form of Bock's problem, and against its own pieces."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from linear_models import Linear

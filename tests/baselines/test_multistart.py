@@ -1,7 +1,5 @@
 """Multistart against minima that are known: several of one depth, and one behind others."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where least squares and IPE begin: at the linear estimate, at the nominal point, or at the better of the two."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Machine code is kept between processes, and only what was made here of the same source is run."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Batched algebra beside NumPy's own, one matrix at a time."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A trial has one random stream, wherever a batch begins."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ipe_bench.basics.streams import numbered, own_generators

@@ -4,8 +4,6 @@ They come with the extra `peers`; a library that is not installed has no row. Ea
 readings are within the tolerance that ours hold, which the caller checks before it takes the time.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +16,6 @@ from ipe_bench.measurements.ode.model import OdeMeasurement
 from ipe_bench.measurements.ode.plan import _Tape
 from ipe_bench.measurements.ode.tableau import DOP853
 from ipe_bench.measurements.ode.trace import Program
-from ipe_bench.measurements.problem import Problem
 
 Simulate = Callable[[Array], Array]
 _FUSED = {
@@ -155,30 +152,6 @@ def jax_readings(model: OdeMeasurement, steps: int) -> Callable[[Any], Any]:
 def _moved(y: list[Any], h: Any, weights: Sequence[float], k: list[list[Any]]) -> list[Any]:
     terms = [(w, slope) for w, slope in zip(weights, k, strict=False) if w]
     return [v + h * sum(w * slope[i] for w, slope in terms) if terms else v for i, v in enumerate(y)]
-
-
-def optimistix_estimator(problem: Problem, steps: int, tolerance: float) -> Simulate | None:
-    """Levenberg-Marquardt of optimistix from the nominal point, for readings (trials, m); None: not installed."""
-    if not importlib.util.find_spec("optimistix"):
-        return None
-    jax = _jax()
-    optimistix: Any = __import__("optimistix")
-    assert isinstance(problem.measurement, OdeMeasurement)
-    readings, deviation = jax_readings(problem.measurement, steps), problem.R.factor
-    solver = optimistix.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
-
-    def one(z: Any) -> Any:
-        found = optimistix.least_squares(
-            lambda x, _: (readings(x) - z) / deviation,
-            solver,
-            jax.numpy.asarray(problem.x0),
-            max_steps=200,
-            throw=False,
-        )
-        return found.value
-
-    batched = jax.jit(jax.vmap(one))
-    return lambda z: np.asarray(batched(z))
 
 
 def _jax() -> Any:

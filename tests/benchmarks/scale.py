@@ -3,8 +3,6 @@
 `SCALE` in the environment is another number of trials. A tenth of it is run first: what is flat is the same for both.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -5,8 +5,6 @@ ratios hold on a busy machine, too. The Makefile sets one thread for each librar
 processes, beside the import of the libraries that they use.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import platform
@@ -25,7 +23,6 @@ from scale import TRIALS, WORKERS, Usage, measured, used
 from scipy.integrate import solve_ivp
 
 import ipe_bench as ib
-from ipe_bench.basics.linalg import deviations
 from ipe_bench.basics.machine import library_versions
 from ipe_bench.trials.scoring import Block
 
@@ -142,16 +139,6 @@ def estimation() -> Iterator[Row]:
     yield Row(
         "estimation", "LevenbergMarquardt", 1e6 * seconds / BATCH, "µs", "SciPy least_squares", 1e6 * theirs / len(few)
     )
-
-    theirs = peers.optimistix_estimator(problem, 1, 1e-8)
-    if theirs is not None:
-        some = z[:50]
-        best = B.LevenbergMarquardt().estimate(problem, some)
-        if not (np.abs(theirs(some) - best.x) < 0.01 * deviations(best.covariance)).all():
-            raise AssertionError("optimistix ends somewhere else")
-        seconds, beside = least(lambda: B.LevenbergMarquardt().estimate(problem, some), lambda: theirs(some), rounds=2)
-        name = "optimistix LevenbergMarquardt, batch 50"
-        yield Row("estimation", "LevenbergMarquardt, batch 50", 2e4 * seconds, "µs", name, 2e4 * beside)
 
     def scored() -> None:
         # Not the first block, which also holds what is taken of a few trials only.

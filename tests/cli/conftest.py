@@ -1,7 +1,5 @@
 """Commands in this process."""
 
-from __future__ import annotations
-
 import sys
 
 import pytest

@@ -1,7 +1,5 @@
 """The command line end to end: what it computes, and one clear line for every mistake."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -141,15 +139,6 @@ def test_a_data_set_may_be_written_as_an_option_of_its_own(words, expected, tmp_
     assert [re.split("[,:]", line.partition("nist ")[2])[0] for line in lines] == expected
 
 
-def test_data_sets_are_swept_by_either_spelling(tmp_path, here):
-    certified = ("noise=certified", "trials=1", "figures=none", "output=both")
-    first = here("run", "-m", "measurement=nist/misra1a,nist/boxbod", *certified, folder=tmp_path)
-    assert first.returncode == 0, first.stderr
-    assert "nist BoxBOD" in first.stderr
-    again = here("run", "-m", "measurement=nist", "measurement.dataset=Misra1a,BoxBOD", *certified, folder=tmp_path)
-    assert again.stderr.count("nothing left to compute") == 2
-
-
 def test_hydras_own_flags_work_after_run(tmp_path, here, monkeypatch):
     assert "error_scale: 5\n" in here("run", "error_scale=5", "--cfg", "job", folder=tmp_path).stdout
     # Which sets up logging for the whole of its process.
@@ -238,15 +227,6 @@ def test_the_bare_program_and_every_command_have_help(capsys):
     for command in COMMANDS:
         assert main([command, "--help"]) == 0
         assert f"ipe-bench {command}" in capsys.readouterr().out
-
-
-def test_flags_stand_anywhere_among_the_words_of_a_command(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    texts = []
-    for words in (["solver", "noise", "-v"], ["solver", "-v", "noise"], ["--verbose", "solver", "noise"]):
-        assert main(["list", *words]) == 0
-        texts.append(capsys.readouterr().out)
-    assert texts[0] == texts[1] == texts[2] != ""
 
 
 def test_a_reader_that_closes_the_pipe_is_no_mistake(tmp_path):

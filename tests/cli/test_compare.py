@@ -1,7 +1,5 @@
 """`compare` finds what is there, nothing where there is nothing, and says which trials it compared."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`ipe-bench design`: tables, files, and mistakes in one line."""
 
-from __future__ import annotations
-
 import csv
 import json
 

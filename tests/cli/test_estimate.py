@@ -1,7 +1,5 @@
 """`estimate` as people with readings of their own type it: the command, its exit code, and the numbers it leaves."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sys

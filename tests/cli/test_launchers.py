@@ -1,7 +1,5 @@
 """Where Hydra's launchers run the jobs of a sweep changes no number."""
 
-from __future__ import annotations
-
 from importlib.metadata import distributions
 
 import pandas as pd

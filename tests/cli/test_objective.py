@@ -1,7 +1,5 @@
 """What a job returns to sweepers that optimise is the number that its report shows."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 

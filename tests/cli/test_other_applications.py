@@ -1,7 +1,5 @@
 """Another application of Hydra composes our configs, and makes of them what we do."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """`ipe-bench posterior`: a table, files, and mistakes in one line."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """The JSON schema accepts every config that we ship, and refuses what a run would refuse."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

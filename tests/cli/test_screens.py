@@ -1,7 +1,5 @@
 """What a terminal of 80, 100 or 120 columns shows: names are whole, and nothing is cut."""
 
-from __future__ import annotations
-
 import io
 import re
 

@@ -1,7 +1,5 @@
 """What a command answers is about what it asked for: its scenarios, a folder of its own, what it would do."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pandas as pd

@@ -1,7 +1,5 @@
 """An option of a wrong type, or one that nothing chosen has, is refused before the first job begins."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

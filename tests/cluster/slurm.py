@@ -1,7 +1,5 @@
 """A Slurm of two nodes on this machine, by Debian's slurm-wlm and munge: `with started(folder) as environment`."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

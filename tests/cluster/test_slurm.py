@@ -1,7 +1,5 @@
 """The recipe for Slurm, on a Slurm: rows are those of one process, also where a job is killed."""
 
-from __future__ import annotations
-
 import importlib.util
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Estimators and tasks that misbehave in every way that a plugin can; a module, so that workers can import it."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

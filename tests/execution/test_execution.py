@@ -1,7 +1,5 @@
 """Whatever happens to the parts of a run, the other parts are complete, and have the same bits everywhere."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Eqs. (2), (5), (11) = (19), (15), (17), (18) and (24) as identities, on random systems."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Differential equations of several cases that a file describes, against their solution in closed form."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import curve_fit

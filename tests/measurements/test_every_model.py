@@ -1,7 +1,5 @@
 """Every model under every estimator that it admits: at small error scale the efficient ones reach the bound."""
 
-from __future__ import annotations
-
 import pytest
 from omegaconf import OmegaConf
 from scipy.stats import norm

@@ -1,7 +1,5 @@
 """Models that cannot be computed with, told of in one line before anything is computed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np

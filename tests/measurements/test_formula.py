@@ -1,7 +1,5 @@
 """A formula without a plugin: its language, its derivatives, and NIST's problems as a user types them."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import math

@@ -1,7 +1,5 @@
 """The gimballed INS: closed forms, other integrators, and the reference values of its linear bound."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from gins_reference import velocities
@@ -93,20 +91,6 @@ def lopsided(trials, seed):
 def test_every_step_keeps_its_promise_where_few_parameters_dominate(scale):
     x = scale * lopsided(40, seed=4)
     assert np.abs(Gins().simulate(x) - Gins(step=3.75).simulate(x)).max() < 1e-6
-
-
-@pytest.mark.parametrize("injected", [None, ((1299.0, 750.0), (-400.0, 1400.0), (0.0, 0.0), (600.0, -1000.0))])
-def test_trials_that_are_trusted_without_a_test_keep_it_too(injected):
-    """Scaled to the rate up to which nothing is tested, and there the coarsest steps are taken."""
-    x, model = lopsided(150, seed=6), Gins(injected=injected)
-    low, high = np.zeros(len(x)), np.full(len(x), 1e6)
-    for _ in range(60):
-        middle = (low + high) / 2
-        fits = model._rates(middle[:, None] * x)[0] * model._longest <= model.trusted_angle
-        low, high = np.where(fits, middle, low), np.where(fits, high, middle)
-    x = low[:, None] * x
-    assert (model.simulate(x) == replace(model, step=180.0).simulate(x)).all()
-    assert np.abs(model.simulate(x) - replace(model, step=10.0).simulate(x)).max() < 1e-7
 
 
 def test_bits_of_a_trial_depend_on_itself_alone_where_steps_differ(monkeypatch):

@@ -1,7 +1,5 @@
 """Readings of GINS in a file, estimated by a command that is not told how far the parameters lie."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

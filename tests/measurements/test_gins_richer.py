@@ -1,7 +1,5 @@
 """Truths richer than the GINS model: exact, of their own draws, and seen or not seen by the test of the fit."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from gins_reference import velocities

@@ -1,7 +1,5 @@
 """Options of models and noises that cannot be, each refused by its name."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

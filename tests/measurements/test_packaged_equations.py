@@ -1,7 +1,5 @@
 """The models that are described in the configs, against closed forms, invariants and other integrators."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A model inside of another: what is restricted, constrained or joined is the whole model in other coordinates."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from small_models import Bent

@@ -1,7 +1,5 @@
 """What to measure next: brute force, closed forms, and the Monte Carlo that a designed model is put to."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import combinations
 

@@ -1,7 +1,5 @@
 """The p of the test of fit is uniform where model and noise are right, whatever the noise and the estimator."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import chi2, kstest

@@ -1,7 +1,5 @@
 """The reference posterior: closed forms, integration on a grid, and estimators held against it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

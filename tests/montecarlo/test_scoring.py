@@ -1,7 +1,5 @@
 """What counts as solved, and as a covariance, in the score of a block."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Theory beside experiment: closed forms of curvature, bias and error under a wrong model, and Monte Carlo."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`check` on options that are made of others, that suit one number of readings, or that want something given."""
 
-from __future__ import annotations
-
 import itertools
 import subprocess
 import sys

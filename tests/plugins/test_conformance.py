@@ -1,7 +1,5 @@
 """Our own components pass the checks that plugins are given, and the checks catch what they are for."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

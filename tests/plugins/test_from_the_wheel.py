@@ -1,7 +1,5 @@
 """Outside of the checkout, from the wheel: every kind of plugin is made, checked, run and seen in the report."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

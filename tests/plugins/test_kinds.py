@@ -1,7 +1,5 @@
 """Every kind of plugin that `new` makes works, and one that does not is named and leaves the rest as it was."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """What plugins/README.md says of where things are is so."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What is said of answers that cannot all be right, and of parameters that the readings do not determine."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What is signed of an answer: intervals that hold what they promise, and readings, directions and minima by name."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,8 +1,6 @@
 """Several files of a model whose parameters are fixed, bounded or one file's own, against SciPy; and what is left out
 of a file on purpose, against a file without it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Estimates from files as instruments give them, against SciPy's solution of the same problem."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Intervals of estimates that use a prior, and of estimates on a bound, against closed forms and by their coverage."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import brentq, least_squares

@@ -1,8 +1,6 @@
 """More than 200 files as instruments, spreadsheets and people write them: each is read as it was meant, or refused with
 the row and the column, and none is read as something else."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import itertools

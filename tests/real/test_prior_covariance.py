@@ -1,7 +1,5 @@
 """Priors whose parameters depend on each other, against conditional normal distributions in closed form."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from small_models import Bent

@@ -1,7 +1,5 @@
 """The estimator that chooses for itself: the least-squares answer everywhere, as cheaply as the problem allows."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

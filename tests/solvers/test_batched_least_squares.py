@@ -1,7 +1,5 @@
 """Batch least squares, re-linearised and progressive IPE against SciPy, closed forms and the truth."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Jacobians that are near enough for steps: what they cost, and that answers do not depend on them."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """When `progressive` and `auto` look for a better fit, what they find, and what they may spend on it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

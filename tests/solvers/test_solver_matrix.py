@@ -1,7 +1,5 @@
 """Every solver on every system: roots where theory promises them, the right status where there are none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from square_systems import BurdenFaires, Cubic, NoRoot, Rosenbrock, system_of

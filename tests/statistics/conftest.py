@@ -1,7 +1,5 @@
 """Stores to fill with made-up trials."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """NEES, limits and the verdict, against simulated truth and published values."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -37,15 +37,6 @@ def test_squares_of_any_size_have_an_interval():
         assert 0 < low[0] < np.sqrt(size) < high[0] < np.inf
 
 
-def test_bootstrap_uses_only_the_trials_it_is_told_to():
-    squares = np.ones((100, 1))
-    used = np.arange(100) % 2 == 0
-    squares[~used] = np.nan
-    low, high = rms_interval(np.where(used[:, None], squares, 0.0), used)
-    assert low[0] == high[0] == 1.0
-    assert np.isnan(rms_interval(squares, np.zeros(100, dtype=bool))).all()
-
-
 def coverage(draw, trials: int, repeats: int) -> float:
     """How often the interval holds the rms 1 of errors that `draw` makes, a fifth of the trials being left out."""
     rng = np.random.default_rng(trials)

@@ -1,7 +1,5 @@
 """Paired effects against exhaustive enumeration and maximised likelihoods; evidence that keeps its promise."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Only seeds are pooled; whatever else two experiments differ in is named wherever they are shown."""
 
-from __future__ import annotations
-
 import io
 import re
 from dataclasses import dataclass, replace

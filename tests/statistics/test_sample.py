@@ -1,7 +1,5 @@
 """What is summed up of stored trials is what pandas makes of them, however they are cut into files."""
 
-from __future__ import annotations
-
 import tracemalloc
 from pathlib import Path
 

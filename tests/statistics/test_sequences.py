@@ -1,7 +1,5 @@
 """Intervals that stay valid however often one looks: exact probabilities, simulated studies, and trials saved."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar

@@ -1,7 +1,5 @@
 """The paper's theory against systems whose answers are known in closed form, and as it stands in a report."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from small_models import Bent

@@ -1,7 +1,5 @@
 """A bundle is what it was made of, the same bytes wherever it is made, and nothing at all once anything is changed."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

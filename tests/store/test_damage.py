@@ -1,7 +1,5 @@
 """Whatever is done to stored files, no number changes: what is damaged is named, left out, and computed again."""
 
-from __future__ import annotations
-
 import os
 import random
 import shutil

@@ -1,7 +1,5 @@
 """At the end of a run every result is one file with the same rows; nothing is lost on the way, whatever happens."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys
@@ -155,16 +153,6 @@ def test_killed_at_any_moment_every_trial_is_there_and_the_next_time_it_ends(tmp
     merge(tmp_path)
     assert names(tmp_path) == ["0-100.parquet"] * 2
     assert_same(everything(tmp_path), expected)
-
-
-def test_readers_that_listed_the_small_files_find_the_rows_in_the_large_ones(tmp_path):
-    filled(tmp_path)
-    expected = everything(tmp_path)
-    results = Results.read([tmp_path])
-    merge(tmp_path)
-    found = {key: results.load(cell, None) for key, cell in results.stored.items()}
-    assert results.problems == []
-    assert_same(found, expected)
 
 
 def test_rows_that_go_away_for_good_are_missed(tmp_path):

@@ -1,7 +1,5 @@
 """What is stored is found again, what is missing is computed, and no half file is ever read."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
