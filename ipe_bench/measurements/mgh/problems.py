@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from ipe_bench.measurements.mgh import formulas as f
+import ipe_bench.measurements.mgh.formulas as f
 from ipe_bench.measurements.mgh.formulas import Residuals
 
 _INF = math.inf
