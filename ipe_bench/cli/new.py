@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import keyword
 import re
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -15,13 +16,29 @@ from ipe_bench.plugins import discovery as plugins
 LONGEST = 60
 RECORDS = {"statistic": "STATISTIC", "figure": "FIGURE", "table": "table", "section": "SECTION"}
 """What reports are made of, and what each is called in its module."""
+ALONE = {
+    "function": (
+        "{name}.py",
+        'measurement=function measurement.of={name}:{name} "measurement.columns.t=[0,1,2,3,4,5,6,7]"'
+        " noise=gaussian noise.deviation=0.01",
+    ),
+    "ode": ("{name}.yaml", "measurement=ode measurement.file={name}.yaml"),
+}
+"""Models that are one file and no plugin, and how to choose them."""
 
 
 def main(kind: str, name: str) -> int:
-    """Writes plugins/NAME in the working folder."""
+    """Writes plugins/NAME in the working folder, or the one file of a function or of differential equations."""
     if kind not in KINDS:
         raise UserError(f"{kind}: {unknown(kind, KINDS, 'kind')}")
     _check_name(kind, name)
+    if kind in ALONE:
+        file, choice = (text.format(name=name) for text in ALONE[kind])
+        if Path(file).exists():
+            raise UserError(f"{file}: is there already and is not overwritten; choose another name")
+        _fill(Path(file), f"{kind}{Path(file).suffix}", {"name": name})
+        print(f"{file} is ready. Try:\n  ipe-bench run {choice} error_scale=0.1 trials=100")
+        return 0
     folder, package = Path("plugins") / name, f"ipe_bench_{name}"
     if folder.exists():
         raise UserError(f"{folder}: is there already and is not overwritten; choose another name")
@@ -39,14 +56,18 @@ def main(kind: str, name: str) -> int:
     if kind == "experiment":  # it has no class
         del texts[f"{package}/{name}.py"]
     for target, source in texts.items():
-        path = folder / target
-        path.parent.mkdir(parents=True, exist_ok=True)
-        template = files("ipe_bench.plugins") / "templates" / f"{source}.template"
-        path.write_text(Template(template.read_text(encoding="utf-8")).substitute(words), encoding="utf-8")
+        _fill(folder / target, source, words)
     choices = {"solver": f'"solver=[{name}]"', "baseline": f'"baseline=[{name}]"', "experiment": f"+experiment={name}"}
     choose = "" if kind in RECORDS else choices.get(kind, f"{kind}={name}") + " "
     print(f"{folder} is ready. Try:\n  ipe-bench check {folder}\n  ipe-bench run {choose}trials=100")
     return 0
+
+
+def _fill(path: Path, source: str, words: Mapping[str, str]) -> None:
+    """Writes a file from its template."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    template = files("ipe_bench.plugins") / "templates" / f"{source}.template"
+    path.write_text(Template(template.read_text(encoding="utf-8")).substitute(words), encoding="utf-8")
 
 
 def _check_name(kind: str, name: str) -> None:

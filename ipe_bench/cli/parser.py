@@ -22,7 +22,7 @@ _CODES = """\
 `ipe-bench COMMAND --help` says more of one command.
 Exit codes: 0 done; 1 done, but some pieces failed or are missing; 2 a mistake in what was asked for; 130 Ctrl-C.
 """
-KINDS = ("solver", "baseline", "measurement", "noise", "prior", "execution")
+KINDS = ("function", "ode", "solver", "baseline", "measurement", "noise", "prior", "execution")
 KINDS += ("statistic", "figure", "table", "section", "experiment")
 """Of plugins that `new` makes."""
 INFO_TOPICS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")

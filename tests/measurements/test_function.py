@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import ipe_bench as ib
+from ipe_bench.cli.main import main
 from ipe_bench.measurements import Formula, function
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.runs.provenance import fingerprint
@@ -157,3 +158,24 @@ def test_another_shape_is_refused_by_the_function_s_name(laws, name):
 def test_a_function_inside_another_is_refused():
     with pytest.raises(ib.UserError, match="stands in a module by its own name"):
         function(lambda t, k=1.0: k * t)
+
+
+@pytest.mark.parametrize(
+    ("kind", "file", "choice"),
+    [
+        (
+            "function",
+            "decay.py",
+            ["measurement=function", "measurement.of=decay:decay", "measurement.columns.t=[0,1,2]"],
+        ),
+        ("ode", "decay.yaml", ["measurement=ode", "measurement.file=decay.yaml"]),
+    ],
+)
+def test_a_new_model_of_one_file_runs_as_it_stands(laws, capsys, kind, file, choice):
+    assert main(["new", kind, "decay"]) == 0
+    assert all(word in capsys.readouterr().out for word in choice[:2])
+    assert main(["new", kind, "decay"]) == 2
+    assert f"{file}: is there already" in capsys.readouterr().err
+    noise = ["noise=gaussian", "noise.deviation=0.01"]
+    assert main(["run", *choice, *noise, "error_scale=0.1", "trials=5", "figures=none", "execution=serial"]) == 0
+    sys.modules.pop("decay", None)
