@@ -10,7 +10,7 @@ from pathlib import Path
 from string import Template
 
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.cli.parser import KINDS
+from ipe_bench.cli.parser import KINDS, MODELS
 from ipe_bench.plugins import discovery as plugins
 
 LONGEST = 60
@@ -29,8 +29,8 @@ ALONE = {
 
 def main(kind: str, name: str) -> int:
     """Writes plugins/NAME in the working folder, or the one file of a function or of differential equations."""
-    if kind not in KINDS:
-        raise UserError(f"{kind}: {unknown(kind, KINDS, 'kind')}")
+    if kind not in (*MODELS, *KINDS):
+        raise UserError(f"{kind}: {unknown(kind, (*MODELS, *KINDS), 'kind')}")
     _check_name(kind, name)
     if kind in ALONE:
         file, choice = (text.format(name=name) for text in ALONE[kind])

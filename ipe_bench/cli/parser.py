@@ -22,7 +22,9 @@ _CODES = """\
 `ipe-bench COMMAND --help` says more of one command.
 Exit codes: 0 done; 1 done, but some pieces failed or are missing; 2 a mistake in what was asked for; 130 Ctrl-C.
 """
-KINDS = ("function", "ode", "solver", "baseline", "measurement", "noise", "prior", "execution")
+MODELS = ("function", "ode")
+"""Models of one file."""
+KINDS = ("solver", "baseline", "measurement", "noise", "prior", "execution")
 KINDS += ("statistic", "figure", "table", "section", "experiment")
 """Of plugins that `new` makes."""
 INFO_TOPICS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
@@ -222,11 +224,11 @@ The same results give the same file, so that the digest may stand in a paper. Ot
         (_several("folders", "DIR", "folders of plugins, such as plugins/my_plugin"),),
     ),
     "new": (
-        "a working plugin to start from, in plugins/NAME",
+        "a working model of one file, or a plugin in plugins/NAME, to start from",
         "",
         "",
         (
-            _argument("kind", metavar="KIND", help=f"{', '.join(KINDS[:-1])} or {KINDS[-1]}"),
+            _argument("kind", metavar="KIND", help=f"{', '.join((*MODELS, *KINDS[:-1]))} or {KINDS[-1]}"),
             _argument("name", metavar="NAME", help="small letters, digits and underscores"),
         ),
     ),

@@ -173,7 +173,8 @@ def test_a_function_inside_another_is_refused():
 )
 def test_a_new_model_of_one_file_runs_as_it_stands(laws, capsys, kind, file, choice):
     assert main(["new", kind, "decay"]) == 0
-    assert all(word in capsys.readouterr().out for word in choice[:2])
+    said = capsys.readouterr().out
+    assert all(word in said for word in choice[:2])
     assert main(["new", kind, "decay"]) == 2
     assert f"{file}: is there already" in capsys.readouterr().err
     noise = ["noise=gaussian", "noise.deviation=0.01"]
