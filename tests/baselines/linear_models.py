@@ -1,6 +1,6 @@
 """Linear measurement models with epochs, whose maximum a posteriori has a closed form."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -17,8 +17,6 @@ class Linear(Measurement):
 
     sizes: tuple[int, ...] = (1, 3, 2, 5)
     unknowns: int = 4
-    stops: list[int] = field(default_factory=list, compare=False)
-    """Where each evaluation stopped, in order."""
 
     @property
     def parameters(self):
@@ -43,11 +41,9 @@ class Linear(Measurement):
         return np.random.default_rng(5).standard_normal((self.m, self.unknowns))
 
     def simulate(self, x):
-        self.stops.append(len(self.sizes))
         return np.matmul(self.matrix, x[..., None])[..., 0]
 
     def simulate_until(self, x, stop):
-        self.stops.append(stop)
         return np.matmul(self.matrix[self.rows(stop)], x[..., None])[..., 0]
 
     def jacobian(self, x):

@@ -117,9 +117,6 @@ REFUSED = {
         "time,begin,reading\n1,2,3\n2,2,3\n",
         "column feed is missing; there are time, begin, reading",
     ),
-    "an empty cell": ("time,feed,begin,reading\n1,,1,3\n2,3,1,3\n", "row 2, column feed: is empty"),
-    "a reading twice": ("case,time,feed,begin,reading\n1,1,2,1,3\n1,1,2,1,4\n", "stands there twice"),
-    "half a case": ("case,time,feed,begin,reading\n1.5,1,2,1,3\n1,1,2,1,4\n", "'1.5' is not a whole number"),
 }
 
 

@@ -109,18 +109,6 @@ def test_minima_that_fit_alike_are_found_flagged_and_listed():
             assert np.linalg.norm(x) <= np.linalg.norm(other) + 0.1
 
 
-def test_nobody_looks_for_others_where_the_first_stage_sufficed_or_each_look_is_dear():
-    near = Scenario(Triad(), Gaussian(1e-5), error_scale=10.0)
-    far = Scenario(Gins(), Quantization(0.02286), error_scale=1000.0)
-    for scenario in (near, far):
-        z = scenario.draw(0, 4).z
-        with np.errstate(all="ignore"):
-            plain, asked = (Auto(confirmations=c).estimate(scenario.problem, z) for c in (None, 0))
-        np.testing.assert_array_equal(plain.simulations, asked.simulations)
-        # Where nobody has looked, nobody can say that there is no other.
-        assert np.isnan(plain.extras["ambiguous"]).all()
-
-
 CASES = {
     "polynomial": (Polynomial(), Gaussian(0.01), (0.1, 1.0, 10.0)),
     "ranging": (Ranging(), Gaussian(0.1), (0.1, 1.0, 10.0)),

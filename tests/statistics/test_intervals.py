@@ -72,10 +72,6 @@ def test_the_table_of_coverage():
     """At least 94 %, within what 4000 repeats can tell, from 20 to 2000 trials."""
     trials = (20, 48, 200, 1000, 2000)
     found = {law: [coverage(draw, t, 4000) for t in trials] for law, draw in LAWS.items()}
-    print("\ncoverage of 95 % intervals of rmse")
-    print(f"{'trials':>24}", *(f"{t:>7}" for t in trials))
-    for law, shares in found.items():
-        print(f"{law:>24}", *(f"{s:7.3f}" for s in shares))
     assert min(map(min, found.values())) >= 0.94 - 3 * np.sqrt(0.94 * 0.06 / 4000)
 
 

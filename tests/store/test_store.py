@@ -18,7 +18,7 @@ from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import compute
 from ipe_bench.runs.schedule import block_size_for
 from ipe_bench.runs.store import ResultKey, Store, gaps
-from ipe_bench.solvers import FixedPoint, Newton
+from ipe_bench.solvers import Newton
 
 
 def scenario(**changes) -> Scenario:
@@ -52,15 +52,6 @@ def test_a_second_run_computes_nothing_and_more_trials_only_the_difference(tmp_p
     assert blocks_of([scenario()], estimators, 20, tmp_path, block_size=10) == 2
     assert blocks_of([scenario()], estimators, 20, tmp_path, block_size=10) == 0
     assert blocks_of([scenario()], estimators, 30, tmp_path, block_size=10) == 1
-
-
-def test_one_more_estimator_computes_only_itself(tmp_path):
-    compute([scenario()], {"linear_lse": LinearLSE()}, 20, tmp_path)
-    before = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "trials").iterdir()}
-    compute([scenario()], {"linear_lse": LinearLSE(), "fixed_point": FixedPoint()}, 20, tmp_path)
-    after = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "trials").iterdir()}
-    assert len(after) == len(before) + 1
-    assert before.items() <= after.items()
 
 
 @pytest.mark.parametrize("block_size", [1, 7, 100])
