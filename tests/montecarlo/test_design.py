@@ -11,7 +11,7 @@ import ipe_bench as ib
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.measurements import Gins, Measurement, Parameter, RicherGins
 from ipe_bench.trials.design import design
-from ipe_bench.trials.observability import Observability, in_words, suspects
+from ipe_bench.trials.observability import Observability, suspects
 
 NOISE = ib.noise.Quantization()
 
@@ -159,11 +159,6 @@ def test_a_direction_that_no_reading_has_is_named_and_its_bounds_are_infinite():
     assert np.isinf(seen.bound[:2]).all()
     assert np.isfinite(seen.bound[2])
     assert design(scenario(Alike())).ways == ()
-
-
-def test_directions_are_words():
-    assert in_words(["bx", "tilt"], np.array([1.0, -0.98])) == "bx - 0.98 tilt"
-    assert in_words(["a", "b", "c"], np.array([0.02, -2.0, 2.0])) == "b - c"
 
 
 @dataclass(frozen=True)

@@ -230,13 +230,6 @@ def test_a_fault_is_found(faulty, complaint):
     assert complaint in complaints(faulty)
 
 
-def test_mixing_trials_is_not_taken_for_randomness():
-    said = complaints(Faulty("averaging"))
-    assert "depend on the others of the batch" in said
-    assert "random" not in said
-    assert "writes" not in said
-
-
 @pytest.mark.parametrize(
     "model",
     [

@@ -126,10 +126,6 @@ RAISING = {
     "section": "from ipe_bench.report.sections import Section\n"
     "def f(analysis):\n    yield 'so far'\n    raise ValueError('broken')\nSECTION = Section('Bad', f)\n",
 }
-MEDDLING = (
-    "from ipe_bench.statistics.records import Statistic\n"
-    "def f(s):\n    s.error *= 0\n    return 1.0\nSTATISTIC = Statistic('bad_statistic', 'bad', 'all trials', '', f)\n"
-)
 
 
 @pytest.fixture(scope="module")
@@ -170,17 +166,6 @@ def test_those_that_raise_are_named_and_the_rest_is_whole(ours, capsys):
     assert set(after) == set(ours)
     complaints = {finding.component for finding in check("plugins/bad") if "broken" in finding.complaint}
     assert complaints == {f"{kind}=bad_{kind}" for kind in RECORDS}
-
-
-def test_a_statistic_that_writes_into_what_it_is_given_is_left_out(ours, capsys):
-    before = pd.read_csv("out/summary.csv")
-    write("statistic", "bad_statistic", MEDDLING)
-    capsys.readouterr()
-    assert main(["report", "out", MAIN]) == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("ipe-bench: statistic=bad_statistic: ")
-    after = pd.read_csv("out/summary.csv")
-    pd.testing.assert_frame_equal(after[before.columns], before)
 
 
 def test_a_figure_under_the_name_of_ours_is_left_out_and_ours_stays(ours, capsys):
