@@ -83,8 +83,10 @@ def main(arguments: Sequence[str]) -> int:
             jobs = replace(jobs, specs=[one.suited() for one in jobs.specs])
         if flags.dry_run:
             dry = DryRun()
-            for one in jobs.specs:
-                print(dry.add(one, title(one, words.text)))
+            own = [[w.forced(one) for one in job] for job in jobs.overrides]
+            for i, one in enumerate(jobs.specs):
+                # Not known: what a sweeper of Hydra's chooses, and what only some jobs of a very large sweep have.
+                print(dry.add(one, title(one, own[i] if len(own) == len(jobs.specs) else words.text)))
             print(dry.summary())
             return 0
         if words.standard_baselines:

@@ -92,6 +92,12 @@ def test_a_dry_run_says_what_is_missing_and_computes_nothing(command):
     assert set(Path("dry").rglob("*")) == stored
 
 
+def test_each_job_of_a_dry_run_is_told_from_the_others(command):
+    _, out, _ = command("run", *SMALL, "solver=[newton]", "-m", "noise.deviation=0.01,0.02", "trials=8", "--dry-run")
+    lines = out.splitlines()[:-1]
+    assert [line.split("noise.deviation=")[1].split(":")[0] for line in lines] == ["0.01", "0.02"]
+
+
 def test_status_says_complete_in_a_line(command):
     assert command("run", *SMALL, "solver=[newton]", "trials=8", "output=whole")[0] == 0
     code, out, _ = command("status", "whole")
