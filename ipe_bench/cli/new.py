@@ -59,6 +59,7 @@ def main(kind: str, name: str) -> int:
         _fill(folder / target, source, words)
     choices = {"solver": f'"solver=[{name}]"', "baseline": f'"baseline=[{name}]"', "experiment": f"+experiment={name}"}
     choose = "" if kind in RECORDS else choices.get(kind, f"{kind}={name}") + " "
+    choose = "figures=all " if kind == "figure" else choose  # the figures of main are chosen among our own
     print(f"{folder} is ready. Try:\n  ipe-bench check {folder}\n  ipe-bench run {choose}trials=100")
     return 0
 

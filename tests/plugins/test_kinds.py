@@ -81,6 +81,7 @@ def files(folder: str) -> dict[str, str]:
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_new_makes_passes_its_checks(kind, capsys):
     assert main(["new", kind, "mine"]) == 0
+    assert ("figures=all" in capsys.readouterr().out) == (kind == "figure")  # the main ones do not hold a new figure
     assert main(["check", "plugins/mine"]) == 0
     out = capsys.readouterr().out
     assert f"ok     {kind}=mine: " in out
