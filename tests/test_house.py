@@ -38,7 +38,7 @@ BUDGETS = {
     "statistics": 4400,
     "real": 2080,
     "plugins": 1510,
-    "report": 5050,
+    "report": 5015,
     "cli": 2770,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""

@@ -557,7 +557,6 @@ class _Errand:
     number: int
     steps: int = 2
     end: Literal["well", "error", "mistake"] = "well"
-    trusted: bool = True
 
 
 def _run_errand(errand: _Errand) -> Iterator[tuple[int, int]]:

@@ -19,7 +19,7 @@ from ipe_bench.statistics.summary import ALL
 _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     "costs": (
         "Costs",
-        "Medians per trial over all trials. A Jacobian counts as many simulations as there are parameters. To 0.05 σ of"
+        "Medians per trial over all trials. A Jacobian counts as many simulations as its model says. To 0.05 σ of"
         " limit: cost until all further iterates are within 0.05 standard deviations of the last one, over the"
         " converged trials with a stored history. Order: the last observed order of convergence of these trials.",
         lambda rows: rows["trials"] > 0,

@@ -807,7 +807,7 @@ def fault_of(record: Any) -> str:
     if not isinstance(record, Statistic):
         return f"is a {type(record).__name__} and not a Statistic"
     others = [other for other in _added.values() if other is not record]
-    taken = {"leads", *_RESERVED, *frame_columns([*STATISTICS, *SCORES, *others])}
+    taken = {"may_be_best", *_RESERVED, *frame_columns([*STATISTICS, *SCORES, *others])}
     for column in record.columns:
         if not (column.isidentifier() and column.isascii()):
             return f"{column!r} is not a name for a column; use letters, digits and underscores"

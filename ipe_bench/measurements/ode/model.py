@@ -76,7 +76,7 @@ class OdeMeasurement(Measurement):
     @property
     @abstractmethod
     def times(self) -> Array:
-        """The times of the readings (times,) in seconds after the start at 0, ascending."""
+        """The times of the readings (times,) after the start at 0, in `time_unit`, ascending."""
 
     @property
     def cases(self) -> Array:
