@@ -42,7 +42,9 @@ def render(
     `totals` instead.
     """
     listed: list[Any] = list(summary) if isinstance(summary, Sequence) else [*summary.to_dict("records")]
-    rows = [row for row in listed if row["parameter"] == ALL and row["noise"] != "certified"]
+    totals = list(totals)
+    # Models whose own readings are certified, without being of a collection, have no totals.
+    rows = [row for row in listed if row["parameter"] == ALL and not (totals and row["noise"] == "certified")]
     known = {*summary_columns(), "parameter", "unit", "estimator", "error_scale"}
     columns = dict.fromkeys(c for row in rows for c in row if c not in known and not c.startswith("estimator."))
     settings: dict[str, list[Any]] = {}

@@ -278,3 +278,11 @@ def test_a_model_of_one_case_or_one_reading_warns_of_nothing(tmp_path, here, cas
     result = here("run", *CASES[case], "trials=3", "execution=serial", folder=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "Warning" not in result.stdout + result.stderr
+
+
+def test_a_model_that_brings_its_own_certified_readings_has_a_table(capsys):
+    words = ["measurement=bock", "noise=certified", "trials=1", "figures=none", "output=out", "solver=[]"]
+    assert main(["run", *words, "baseline=[gauss_newton]"]) == 0
+    said = capsys.readouterr().out
+    assert "gauss_newton" in said
+    assert "nothing is stored" not in said
