@@ -255,7 +255,7 @@ class Function(Measurement):
         """Compiled readings and slopes of a function that returns arrays of JAX; None if it does not."""
         if "jax" not in sys.modules or not type(self._at(self._starts.values())).__module__.startswith("jax"):
             return None
-        import jax
+        import jax  # pyright: ignore[reportMissingImports]
 
         jax.config.update("jax_enable_x64", True)
 
