@@ -280,7 +280,8 @@ def test_a_model_of_one_case_or_one_reading_warns_of_nothing(tmp_path, here, cas
     assert "Warning" not in result.stdout + result.stderr
 
 
-def test_a_model_that_brings_its_own_certified_readings_has_a_table(capsys):
+def test_a_model_that_brings_its_own_certified_readings_has_a_table(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
     words = ["measurement=bock", "noise=certified", "trials=1", "figures=none", "output=out", "solver=[]"]
     assert main(["run", *words, "baseline=[gauss_newton]"]) == 0
     said = capsys.readouterr().out
