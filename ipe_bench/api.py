@@ -109,7 +109,8 @@ def load(directories: Directories) -> pd.DataFrame:
     differs (`estimator.KEY` for options under one label). It has `error_NAME` and `deviation_NAME` (as the estimator
     reports it) per parameter, status, message, iterations, simulations, jacobians, time_s, crlb_distance, nees, fit_p,
     solved, success, and the truth `x_NAME` with its bounds `crlb_NAME` and `bayes_NAME`, all in multiples of the
-    parameters' sizes. What is missing or damaged is a warning, and stale results are left out.
+    parameters' sizes; `crlb_distance` is the squared Mahalanobis distance by the bound at the truth, n on average where
+    it is attained. What is missing or damaged is a warning, and stale results are left out.
 
     >>> import tempfile, ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
