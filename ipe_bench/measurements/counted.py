@@ -68,17 +68,18 @@ class CountingModel:
     def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: Mask | bool = False) -> Array:
         """dh/dx (trials, m, n) for the trials `rows` of the tally. Where it is only for steps `coarse` will do, which
         counts as what it costs beside an exact one."""
+        # What calls itself here is this method, whatever parameters a subclass leaves out of x.
         if self.coarse_share == 1.0 or not np.any(coarse):
             return self._jacobian(self.measurement.jacobian, 1.0, x, rows)
         if not np.all(coarse):
             J = np.empty((len(x), self.measurement.m, self.measurement.n))
-            J[coarse] = self.jacobian(x[coarse], rows[coarse], coarse=True)
-            J[~coarse] = self.jacobian(x[~coarse], rows[~coarse])
+            J[coarse] = CountingModel.jacobian(self, x[coarse], rows[coarse], coarse=True)
+            J[~coarse] = CountingModel.jacobian(self, x[~coarse], rows[~coarse])
             return J
         J = self._jacobian(self.measurement.coarse_jacobian, self.coarse_share, x, rows)
         # Far away the longer steps of a coarse one may overflow where those of the readings do not.
         lost = ~finite(J)
-        return put(J, lost, self.jacobian(x[lost], rows[lost])) if lost.any() else J
+        return put(J, lost, CountingModel.jacobian(self, x[lost], rows[lost])) if lost.any() else J
 
     def _jacobian(self, method: Callable[[Array], Array], cost: float, x: Array, rows: NDArray[np.intp]) -> Array:
         self.tally.jacobians[rows] += self.share * cost

@@ -1,7 +1,5 @@
 """Stiff equations: published digits, exact solutions, SciPy's Radau, and which method a model is given."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -101,14 +99,3 @@ def test_a_trial_and_a_prefix_have_the_same_bits_alone_and_in_a_batch():
 @pytest.mark.parametrize(("mu", "stiff"), [(3.0, False), (30.0, False), (300.0, True)])
 def test_the_rule_tells_stiff_oscillators_from_others(mu, stiff):
     assert van_der_pol(mu, 2 * mu).whole.stiff == stiff
-
-
-def test_a_trial_that_explicit_steps_do_not_follow_is_integrated_implicitly():
-    model = follower(start={"k": 0.5}, times=(10.0, 20.0))
-    x = np.array([[1.0], [1e5]])  # k = 0.5 and 50,000
-    assert not model.whole.stiff
-    z = model.simulate(x)[1]
-    np.testing.assert_allclose(z, np.exp(-0.01 * np.array(model.times)), rtol=1e-6)
-    assert np.array_equal(model.simulate(x)[:1], replace(model, method="explicit").simulate(x[:1]))
-    off = np.abs(replace(model, method="explicit").simulate(x)[1] - z)
-    assert not (off < 1e-6).all()

@@ -19,7 +19,6 @@ from ipe_bench.measurements.arithmetic import Arithmetic, read, require_finite, 
 from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, SubsetModel, UsualNoise, WrappedModel
 from ipe_bench.measurements.ode.model import OdeMeasurement, time_heading
 from ipe_bench.measurements.ode.rodas import Rodas5P
-from ipe_bench.measurements.ode.steps import Indices
 
 _SHARE = 1e-8
 """Of the largest reading, what the integration may leave unless told otherwise."""
@@ -325,33 +324,14 @@ class _Engine(OdeMeasurement):
         largest = float(np.nanmax(shown, initial=0.0)) or 1.0
         return Rodas5P(self, float(np.clip(_IN_HAND * np.min(self._tolerances) / largest, 1e-10, 1e-4)))
 
-    def _beyond(self, x: Array) -> Indices:
-        """The trials that the shortest explicit steps do not follow, and that are integrated by the implicit method."""
-        if self.described.method != "auto" or self.step is not None:
-            return np.empty(0, dtype=np.intp)
-        return np.flatnonzero(self._search(own(x), self._zeros).places == len(self._ladder) - 1)
-
     def _shown(self, x: Array, stop: int, offset: Array, *, coarse: bool = False) -> Array:
-        if self.stiff:
-            return self._implicit.simulate(x, stop)
-        z = super()._shown(x, stop, offset, coarse=coarse)
-        if len(beyond := self._beyond(x)):
-            z[beyond] = self._implicit.simulate(x[beyond], stop)
-        return z
+        return self._implicit.simulate(x, stop) if self.stiff else super()._shown(x, stop, offset, coarse=coarse)
 
     def jacobian_until(self, x: Array, stop: int) -> Array:
-        return self._slopes(super().jacobian_until, x, stop)
+        return self._implicit.jacobian(x, stop) if self.stiff else super().jacobian_until(x, stop)
 
     def coarse_jacobian_until(self, x: Array, stop: int) -> Array:
-        return self._slopes(super().coarse_jacobian_until, x, stop)
-
-    def _slopes(self, explicit: Callable[[Array, int], Array], x: Array, stop: int) -> Array:
-        if self.stiff:
-            return self._implicit.jacobian(x, stop)
-        J = explicit(x, stop)
-        if len(beyond := self._beyond(x)):
-            J[beyond] = self._implicit.jacobian(x[beyond], stop)
-        return J
+        return self._implicit.jacobian(x, stop) if self.stiff else super().coarse_jacobian_until(x, stop)
 
     @cached_property
     def jacobian_cost(self) -> float:  # type: ignore[override]
@@ -363,8 +343,7 @@ class _Engine(OdeMeasurement):
 
     def hindrance(self, x: Array) -> str:
         x = own(x[None, : self.n])
-        implicit = self.stiff or len(self._beyond(x))
-        if implicit and np.isfinite(self._implicit.simulate(x, len(self.times))).all():
+        if self.stiff and np.isfinite(self._implicit.simulate(x, len(self.times))).all():
             return ""
         return super().hindrance(x[0])
 
