@@ -29,7 +29,7 @@ BUDGETS = {
     "measurements": 7050,
     "noise": 430,
     "priors": 175,
-    "states": 1115,
+    "states": 1090,
     "estimators": 1270,
     "solvers": 1250,
     "baselines": 2540,

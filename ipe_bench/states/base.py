@@ -13,12 +13,9 @@ from ipe_bench.basics.linalg import Array, multiply
 from ipe_bench.basics.naming import Named
 from ipe_bench.basics.options import Component
 from ipe_bench.basics.streams import numbered
-from ipe_bench.measurements.base import Parameter
+from ipe_bench.measurements.base import Parameter, differentiate
 from ipe_bench.states.algebra import factor, root
 
-_COMPLEX_STEP = 1e-100
-_SMALL = 65536
-"""Bytes of complex numbers that are handed to a function at once: a quarter of a large array of NumPy's."""
 _START, _PROCESS, _READINGS = range(3)
 """The random streams of a trial: its start, its process noise and the noise of its readings."""
 
@@ -146,13 +143,5 @@ class StateModel(Component, Named, ABC):
 
 
 def slope(function: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:
-    """Value (..., m) and Jacobian (..., m, n) of an analytic function at x (..., n), by complex steps.
-
-    Few trials at a time: NumPy rounds complex products differently in large arrays, and bits would depend on the batch.
-    """
-    n = x.shape[-1]
-    points = x[..., None, :] + _COMPLEX_STEP * 1j * np.eye(n)
-    few = max(1, _SMALL // (points[:1].nbytes or 1))
-    y = np.concatenate([function(points[i : i + few]) for i in range(0, max(len(points), 1), few)])
-    value, slopes = np.real(y[..., 0, :]), np.imag(y).swapaxes(-1, -2)
-    return np.ascontiguousarray(value), np.ascontiguousarray(slopes) / _COMPLEX_STEP
+    """Value (trials, m) and Jacobian (trials, m, n) of an analytic function at x (trials, n)."""
+    return function(x), differentiate(function, x, analytic=True)

@@ -59,11 +59,6 @@ class Tracks:
 class Tracker(Component, Named, ABC):
     """Estimates the states of every trial from its readings."""
 
-    @property
-    def smooths(self) -> bool:
-        """Whether the states of an epoch are estimated from later readings too."""
-        return False
-
     @abstractmethod
     def track(self, model: StateModel, z: Array) -> Tracks:
         """The states that readings z (trials, K, m) tell of."""
@@ -166,10 +161,6 @@ class Smoother(Tracker):
 
     filter: Filter = field(default_factory=Filter)
 
-    @property
-    def smooths(self) -> bool:
-        return True
-
     def track(self, model: StateModel, z: Array) -> Tracks:
         return smoothed(model, self.filter.track(model, z))
 
@@ -189,10 +180,6 @@ class IteratedSmoother(Tracker):
     damped: bool = False
     tolerance: NonNegative = 0.0
     """Ends where no trial's path moves by more than so many of its own standard deviations."""
-
-    @property
-    def smooths(self) -> bool:
-        return True
 
     def track(self, model: StateModel, z: Array) -> Tracks:
         path = self.first.track(model, z)
