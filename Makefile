@@ -16,7 +16,7 @@ slow: .venv/ready
 
 # Slurm: two nodes on this machine. On Debian, `apt-get install slurm-wlm munge` first; as root.
 cluster: .venv/ready
-	$(BIN)/uv pip install --quiet --python $(BIN)/python "hydra-submitit-launcher>=1.2"
+	$(BIN)/uv pip install --quiet --python $(BIN)/python "hydra-submitit-launcher>=1.2" --editable plugins/dask
 	$(BIN)/pytest -m cluster
 
 # What takes the better part of an hour: hundreds of damaged files, wrong command lines, tables of error rates.
@@ -27,7 +27,8 @@ campaigns: .venv/ready
 plugins: .venv/ready
 	$(BIN)/uv venv --quiet --allow-existing --python $(BIN)/python outputs/plugins/.venv
 	$(BIN)/uv pip install --quiet --python outputs/plugins/.venv/bin/python --editable ".[test]" \
-		--editable plugins/optimistix --editable plugins/stonesoup --editable plugins/gins_jax
+		--editable plugins/optimistix --editable plugins/stonesoup --editable plugins/gins_jax \
+		--editable plugins/dask
 	outputs/plugins/.venv/bin/python -m pytest -m plugin plugins
 
 # Whether the tests notice changes on purpose, room by room, as a table in outputs/mutants. SAMPLE=40 draws that many.
@@ -57,7 +58,7 @@ docs: .venv/ready
 		{ echo "ipe-bench needs Python 3.11 to 3.13: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 2; }
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[test,lint,dask]"
+	$(BIN)/uv pip install --quiet --python $(BIN)/python --editable ".[test,lint]"
 	@touch $@
 
 clean:

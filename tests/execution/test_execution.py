@@ -15,10 +15,10 @@ from small_models import Bent
 
 from ipe_bench import Scenario
 from ipe_bench.baselines import LinearLSE
-from ipe_bench.basics.errors import StorageError, UserError  # noqa: F401
+from ipe_bench.basics.errors import UserError
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
-from ipe_bench.runs.execution import Auto, Dask, Event, Failure, Processes, Serial
+from ipe_bench.runs.execution import Auto, Event, Failure, Processes, Serial
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import compute
 from ipe_bench.solvers import Newton
@@ -77,17 +77,9 @@ def test_processes_compute_the_same_bits_as_one_process(tmp_path, reference):
     assert_same(stored(tmp_path), reference)
 
 
-@pytest.mark.slow
-def test_dask_computes_the_same_bits_as_one_process(tmp_path, reference):
-    pytest.importorskip("distributed")
-    assert compute([scenario()], GOOD, 40, tmp_path, execution=Dask(2), block_size=10) == ()
-    assert_same(stored(tmp_path), reference)
-
-
-@pytest.mark.parametrize("execution", [Processes(2), pytest.param(Dask(2), marks=pytest.mark.slow)], ids=repr)
-def test_a_run_completes_when_a_worker_is_killed(tmp_path, reference, execution):
+def test_a_run_completes_when_a_worker_is_killed(tmp_path, reference):
     rogue = {"killer": Rogue("kill", until=str(tmp_path / "killed"))}
-    assert compute([scenario()], {**rogue, **GOOD}, 40, tmp_path, execution=execution, block_size=10) == ()
+    assert compute([scenario()], {**rogue, **GOOD}, 40, tmp_path, execution=Processes(2), block_size=10) == ()
     assert (tmp_path / "killed").exists()
     there = stored(tmp_path)
     assert_same({name: there[name] for name in reference}, reference)
@@ -157,6 +149,7 @@ def test_ctrl_c_stops_a_serial_run(tmp_path):
 import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # which what runs in the background ignores
 from test_execution import *
+from ipe_bench.basics.errors import StorageError
 try:
     compute([scenario()], {{"rogue": Rogue("stop")}}, 20, {str(tmp_path)!r})
 except KeyboardInterrupt:
@@ -279,6 +272,7 @@ def test_a_full_disk_ends_the_run_with_one_line_and_no_half_files(tmp_path, exec
 import resource, sys
 sys.path[:0] = {sys.path!r}
 from test_execution import *
+from ipe_bench.basics.errors import StorageError
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 try:
     compute([scenario()], GOOD, 500, {str(tmp_path)!r}, execution={execution})
@@ -299,12 +293,6 @@ def test_source_that_changed_since_the_run_began_is_not_mixed_in(tmp_path, monke
     assert len(failures) == 2
     assert "numerical source" in failures[0]
     assert not Results.read([tmp_path]).stored
-
-
-def test_a_missing_dask_is_said_in_a_line(monkeypatch):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(UserError, match=r"pip install"):
-        list(Dask(workers=3).run(rogues.square, [1]))
 
 
 def test_a_failure_keeps_one_line_and_the_traceback():

@@ -126,7 +126,7 @@ def _connect(workers: int | None, address: str | None, jobqueue: str | None, opt
     try:
         import distributed
     except ImportError:
-        raise UserError('execution=dask: Dask is not installed; pip install "ipe-bench[dask]"') from None
+        raise UserError("execution=dask: Dask is not installed; pip install distributed") from None
     # What Dask logs of a cluster that goes away is a traceback; a line of ours says it.
     for name in ("client", "core", "comm", "batched"):
         logging.getLogger(f"distributed.{name}").setLevel(logging.CRITICAL)
@@ -155,7 +155,7 @@ def _jobqueue_cluster(name: str, options: Mapping[str, Any]) -> Any:
     try:
         import dask_jobqueue
     except ImportError:
-        raise UserError('execution=dask: dask-jobqueue is not installed; pip install "ipe-bench[dask]"') from None
+        raise UserError("execution=dask: dask-jobqueue is not installed; pip install dask-jobqueue") from None
     known = [n for n in dir(dask_jobqueue) if n.endswith("Cluster")]
     if name not in known:
         raise UserError(f"execution.jobqueue={name}: there is no such cluster (there are: {', '.join(known)})")
