@@ -25,7 +25,7 @@ LINE = (
     ("cli",),
 )
 BUDGETS = {
-    "basics": 1260,
+    "basics": 1105,
     "measurements": 7050,
     "noise": 430,
     "priors": 175,

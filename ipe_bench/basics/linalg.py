@@ -7,29 +7,20 @@ the batch. A singular matrix spoils its own trial only.
 from __future__ import annotations
 
 import contextlib
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics import compiled
 from ipe_bench.basics.machine import keep_freed_memory
-
-if TYPE_CHECKING:
-    # Imported where something is compiled, and here so that results are known to depend on it.
-    from ipe_bench.basics import small_matrices as small_matrices
 
 Array: TypeAlias = NDArray[Any]
 Mask: TypeAlias = NDArray[Any]
 
 keep_freed_memory()
 
-_MOST_IN_REGISTERS = 16
-"""Parameters up to which the normal equations are computed by machine code that keeps them in registers."""
 _WELL_CONDITIONED = 1e3
 """The condition of J, its columns scaled, up to which J' J has enough of its digits: nine or more."""
 
@@ -184,16 +175,9 @@ def information(J: Array, R: Covariance) -> Array:
 def normal_equations(J: Array, r: Array, deviation: Array | None = None) -> tuple[Array, Array]:
     """A' A (trials, n, n) and A' r (trials, n) for J (trials, m, n) and r (trials, m), where A is J with its rows
     divided by `deviation` (m,), or J."""
-    trials, m, n = J.shape
     with np.errstate(all="ignore"):
-        weights = np.ones(m) if deviation is None else 1.0 / deviation
-        if not _small(n):
-            A = J * weights[:, None]
-            return np.matmul(A.swapaxes(1, 2), A), multiply(A.swapaxes(1, 2), r)
-        G, gradient = np.empty((trials, n, n)), np.empty((trials, n))
-        at, J, r = compiled.at, own(J), own(r)
-        _compiled("normal", n, 5, 2)(at(J), at(weights), at(r), at(G), at(gradient), trials, m)
-        return G, gradient
+        A = np.ascontiguousarray(J if deviation is None else J / deviation[:, None])
+        return np.matmul(A.swapaxes(1, 2), A), np.matmul(np.ascontiguousarray(r)[:, None], A)[:, 0]
 
 
 def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
@@ -203,40 +187,25 @@ def definite_factor(G: Array) -> tuple[Array, Array, Mask]:
     The columns of J are scaled first; what is lost of U is n eps times the condition squared (Higham, Accuracy and
     Stability of Numerical Algorithms, 2002, section 20.4).
     """
-    trials, n = G.shape[:2]
+    n = G.shape[1]
     with np.errstate(all="ignore"):
-        if _small(n):
-            at, G = compiled.at, own(G)
-            U, inverse_U, norm = np.zeros(G.shape), np.zeros(G.shape), np.empty(trials)
-            _compiled("factor", n, 4, 1)(at(G), at(U), at(inverse_U), at(norm), trials)
-            return U, inverse_U, norm * np.sqrt(n) <= _WELL_CONDITIONED
         size = np.sqrt(np.diagonal(G, axis1=1, axis2=2))
         scaled = G / (size[:, :, None] * size[:, None, :])
         usable = finite(scaled)
         U = cholesky(np.where(usable[:, None, None], scaled, np.eye(n)))
-        usable &= finite(U)
-        inverse_U = np.triu(np.linalg.inv(np.where(usable[:, None, None], U, np.eye(n))))
+        inverse_U = _inverse_of_upper(U)
         well = usable & (np.linalg.norm(inverse_U, axis=(1, 2)) * np.sqrt(n) <= _WELL_CONDITIONED)
         return U * size[:, None, :], inverse_U / size[:, :, None], well
 
 
-def _small(n: int) -> bool:
-    """Whether problems of n parameters are computed by machine code."""
-    return n <= _MOST_IN_REGISTERS and compiled.available()
-
-
-@functools.cache
-def _compiled(name: str, n: int, pointers: int, numbers: int) -> Any:
-    """A function of `small_matrices` for n parameters."""
-
-    def write() -> str:
-        from ipe_bench.basics import small_matrices
-
-        return getattr(small_matrices, name)(n)
-
-    arguments = (*[compiled.POINTER] * pointers, *[compiled.INTEGER] * numbers)
-    key = f"{n} {compiled.digest_of(Path(__file__).with_name('small_matrices.py'))}"
-    return compiled.load(key, write, name, arguments, "linear algebra")
+def _inverse_of_upper(U: Array) -> Array:
+    """The inverses of upper triangular matrices (trials, n, n), by back substitution in all trials at once."""
+    V = np.zeros(U.shape)
+    for i in reversed(range(U.shape[1])):
+        V[:, i] = -np.matmul(U[:, i, None, i + 1 :], V[:, i + 1 :])[:, 0]
+        V[:, i, i] += 1.0
+        V[:, i] /= U[:, i, i, None]
+    return V
 
 
 def pseudo_inverse(H: Array, R: Covariance) -> tuple[Array, Mask]:

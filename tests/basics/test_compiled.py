@@ -11,7 +11,6 @@ from ipe_bench.basics import compiled
 from ipe_bench.basics.compiled import POINTER, at
 from ipe_bench.measurements import LotkaVolterra
 from ipe_bench.runs import provenance
-from ipe_bench.solvers import FixedPoint
 
 
 def times(factor, name="scale"):
@@ -111,7 +110,6 @@ print("ipe_bench.basics.vectors" in sys.modules)
         ("basics.compiled", LotkaVolterra()),
         ("basics.vectors", LotkaVolterra()),
         ("measurements.ode.emit", LotkaVolterra()),
-        ("basics.small_matrices", FixedPoint()),
     ],
 )
 def test_what_machine_code_comes_from_is_part_of_the_source_that_results_depend_on(monkeypatch, module, part):

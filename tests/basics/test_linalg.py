@@ -61,8 +61,7 @@ def test_a_factor_is_refused_where_too_few_digits_are_left():
 
 
 @pytest.mark.parametrize("n", [1, 5, 8, 11, 40])
-def test_a_factor_is_that_of_lapack_whether_compiled_or_not(n):
-    """From 8 columns on it is compiled code; the columns' sizes are nothing to either."""
+def test_a_factor_is_that_of_a_qr_decomposition_whatever_the_sizes_of_columns(n):
     rng = np.random.default_rng(n)
     J = rng.normal(size=(7, 3 * n, n)) * np.geomspace(1e-9, 1e9, n)
     U, inverse_U, well = definite_factor(np.matmul(J.swapaxes(1, 2), J))
