@@ -1,12 +1,11 @@
 """Baselines: estimators that are not IPE. Config group `baseline`."""
 
 from ipe_bench.baselines.ckf import CKF
-from ipe_bench.baselines.ekf import EKF
+from ipe_bench.baselines.ekf import EKF, IteratedEKF
 from ipe_bench.baselines.enkf import EnKF
 from ipe_bench.baselines.es_mda import EsMda
 from ipe_bench.baselines.gauss_newton import GaussNewton
 from ipe_bench.baselines.iplf import IPLF
-from ipe_bench.baselines.iterated_ekf import IteratedEKF
 from ipe_bench.baselines.levenberg_marquardt import LevenbergMarquardt
 from ipe_bench.baselines.linear_lse import LinearLSE
 from ipe_bench.baselines.lm_iekf import LMIEKF

@@ -2,105 +2,102 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
-
 import numpy as np
 
-from ipe_bench.baselines.epochs import Epoch, Rows, Walk, symmetric
+from ipe_bench.baselines.epochs import Epoch, Rows, Walk
 from ipe_bench.baselines.sequential import LARGEST
-from ipe_bench.basics.linalg import Array, Mask, finite, multiply, solve
+from ipe_bench.basics.linalg import Array, deviations, finite, multiply
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.problem import Problem
+from ipe_bench.states.base import Gaussian
+from ipe_bench.states.linearisation import Rule
+from ipe_bench.states.trackers import update
 
 
 class Stack(Walk):
-    """The filters of a batch, at x = 0 with covariance P0 (n, n) and process noise Q (n, n) per epoch.
+    """The filters of a batch, at x = 0 with covariance P0 (n, n) and process noise Q (n, n) per epoch: those of states
+    that stand still.
 
     `at` are the trials that something is done for; a trial's bits do not depend on which others there are.
     """
 
-    slopes = False
-    """True where `update` wants dh/dx; then there is one point per trial."""
-
-    def __init__(self, P0: Array, Q: Array, problem: Problem, z: Array) -> None:
+    def __init__(
+        self, rule: Rule, P0: Array, Q: Array, problem: Problem, z: Array, iterations: int = 1, tolerance: float = 0.0
+    ) -> None:
         super().__init__(problem, z)
+        self.rule, self.iterations, self.tolerance = rule, iterations, tolerance
         self.x = np.zeros((len(z), len(P0)))
         """The estimates (trials, n)."""
         self.P = np.repeat(P0[None], len(z), axis=0)
         """Their covariances (trials, n, n)."""
         self.Q = Q
 
-    def predict(self, at: Rows) -> None:
-        """Brings the states from one epoch to the next: the parameters stay, the process noise comes on top."""
-        self.P[at] += self.Q
-
-    @abstractmethod
-    def points(self, at: Rows) -> Array:
-        """The states (trials, points, n) at which the epoch's readings are wanted; NaN where there are none."""
-
-    @abstractmethod
-    def update(self, at: Rows, z: Array, h: Array, H: Array | None) -> Mask | bool:
-        """Takes in z (trials, m), given h (trials, points, m) and, for filters with slopes, dh/dx (trials, m, n).
-
-        Returns which trials are done with the epoch; the others are read again. What cannot be computed is NaN.
-        """
-
     def state(self, at: Rows) -> tuple[Array, Array]:
         return self.x[at], self.P[at]
 
     def take_in(self, epoch: Epoch, at: Rows) -> None:
-        self.predict(at)
-        while len(at):
-            points = self.points(at)
-            lost = ~finite(points)
-            self.end(at[lost], Status.SINGULAR, f"the filter's P is not positive definite at epoch {epoch.number}")
-            if lost.all():
-                return
-            at, h, H = self.read(epoch, points[~lost], at[~lost], slopes=self.slopes)
-            beyond = ~(np.abs(h if H is None else H).max(axis=(1, 2)) < LARGEST)
-            self.end(at[beyond], Status.NONFINITE, "what the filter is to take in is beyond the range of numbers")
-            at = at[~beyond]
+        self.P[at] += self.Q
+        x, P = self.x.copy(), self.P.copy()
+        for iteration in range(self.iterations):
+            before = self.x[at]
+            readings = TurnedReadings(self, epoch, at, P[at])
+            read = self.rule.linearise(readings, before, self.P[at])
+            found = update(Gaussian(x[at], P[at]), read, np.eye(read.b.shape[-1]), readings.z)
+            self.x[at], self.P[at] = found.x
+            if iteration == 0:
+                self.nis[at] += found.nis  # the innovation of the prediction; later ones have seen z
+            lost = ~finite(found.x.mean)
+            singular = lost & (self.status[at] == Status.RUNNING)
+            self.end(at[singular], Status.SINGULAR, f"S is singular at epoch {epoch.number}")
+            change = (np.abs(self.x[at] - before) / deviations(self.P[at])).max(axis=1)
+            at = at[~(lost | (change <= self.tolerance))]
             if not len(at):
                 return
-            done = self.update(at, epoch.whitened(self.z[at]), h[~beyond], None if H is None else H[~beyond])
-            lost = ~finite(self.x[at])
-            self.end(at[lost], Status.SINGULAR, f"S is singular at epoch {epoch.number}")
-            at = at[~(done | lost)]
 
-    def correct(self, at: Rows, away: Array, z: Array, h: Array, weights: Array, mean: Array) -> None:
-        """The update of a filter whose points are `away` (trials, points, n) from its estimate.
 
-        `weights` (points,) are those of covariances, `mean` (points,) those of means.
-        """
+class TurnedReadings:
+    """An epoch's whitened readings as functions of the states of the trials `at`, along axes that make S nearly
+    diagonal: white readings stay white, and S keeps its digits where a wide prior makes it as ill-conditioned as 1e10.
+
+    Trials that the model ends are NaN.
+    """
+
+    def __init__(self, walk: Walk, epoch: Epoch, at: Rows, P: Array) -> None:
+        self.walk, self.epoch, self.at, self.P = walk, epoch, at, P
+        self.z = epoch.whitened(walk.z[at])
+
+    def __call__(self, x: Array) -> Array:
+        """h (trials, points, m) less its mean over the points, and z alike."""
+        h, _ = self.read(x, slopes=False)
         centre = h.mean(axis=1, keepdims=True)
         spread = h - centre
         axes = principal_axes(np.matmul(spread.swapaxes(1, 2), spread))
-        spread, z = np.matmul(spread, axes), multiply(axes.swapaxes(1, 2), z - centre[:, 0])
-        predicted = np.matmul(mean, spread)
-        off = spread - predicted[:, None]
-        weighted = off * weights[:, None]
-        S = np.matmul(off.swapaxes(1, 2), weighted) + np.eye(z.shape[1])
-        cross = np.matmul(away.swapaxes(1, 2), weighted)
-        K, y = gain_of(cross, S), z - predicted
-        self.x[at] += multiply(K, y)
-        self.P[at] = symmetric(self.P[at] - np.matmul(K, cross.swapaxes(1, 2)))
-        self.nis[at] += squared_innovations(y, S)
+        self.z = multiply(axes.swapaxes(1, 2), self.z - centre[:, 0])
+        return np.matmul(spread, axes)
+
+    def slope(self, x: Array) -> tuple[Array, Array]:
+        """h (trials, m) and dh/dx (trials, m, n)."""
+        h, H = self.read(x[:, None], slopes=True)
+        axes = principal_axes(np.matmul(np.matmul(H, self.P), H.swapaxes(1, 2))).swapaxes(1, 2)
+        self.z = multiply(axes, self.z)
+        return multiply(axes, h[:, 0]), np.matmul(axes, H)
+
+    def read(self, x: Array, *, slopes: bool) -> tuple[Array, Array]:
+        """h (trials, points, m) as it is and, for one point, dh/dx (trials, m, n)."""
+        known, m = finite(x), self.z.shape[1]
+        lost = f"the filter's P is not positive definite at epoch {self.epoch.number}"
+        self.walk.end(self.at[~known], Status.SINGULAR, lost)
+        kept, h, H = self.walk.read(self.epoch, x[known], self.at[known], slopes=slopes)
+        beyond = ~(np.abs(h if H is None else H).max(axis=(1, 2), initial=0) < LARGEST)
+        self.walk.end(kept[beyond], Status.NONFINITE, "what the filter is to take in is beyond the range of numbers")
+        rows = np.isin(self.at, kept[~beyond])
+        values, tangents = np.full((*x.shape[:2], m), np.nan), np.full((len(x), m, x.shape[2]), np.nan)
+        values[rows] = h[~beyond]
+        if H is not None:
+            tangents[rows] = H[~beyond]
+        return values, tangents
 
 
 def principal_axes(G: Array) -> Array:
-    """Orthonormal axes (trials, m, m), one per column, along which each G (trials, m, m), symmetric, is diagonal.
-
-    White readings stay white when turned to them, and S becomes nearly diagonal: so it keeps its digits where a wide
-    prior makes it as ill-conditioned as 1e10.
-    """
-    return np.linalg.eigh(G)[1]
-
-
-def gain_of(cross: Array, S: Array) -> Array:
-    """K = Pxz S^-1 (trials, n, m); NaN where S is singular."""
-    return solve(S, cross.swapaxes(1, 2))[0].swapaxes(1, 2)
-
-
-def squared_innovations(y: Array, S: Array) -> Array:
-    """y' S^-1 y of each trial."""
-    return np.einsum("ti,ti->t", y, solve(S, y)[0])
+    """Orthonormal axes (trials, m, m), one per column, along which each G (trials, m, m), symmetric, is diagonal."""
+    return np.linalg.eigh(np.nan_to_num(G))[1]

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from ipe_bench.baselines.batched import Stack
-from ipe_bench.baselines.epochs import Rows, symmetric
+from ipe_bench.baselines.epochs import symmetric
 from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, turned
-from ipe_bench.basics.linalg import Array, cholesky
+from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.problem import Problem
+from ipe_bench.states.linearisation import Cubature
 
 
 @dataclass(frozen=True)
@@ -21,8 +22,8 @@ class CKF(Sequential):
     def track(self, P0: Array, Q: Array, z: Array) -> CKFTrack:
         return CKFTrack(P0, Q)
 
-    def stack(self, P0: Array, Q: Array, problem: Problem, z: Array) -> CKFStack:
-        return CKFStack(P0, Q, problem, z)
+    def stack(self, P0: Array, Q: Array, problem: Problem, z: Array) -> Stack:
+        return Stack(Cubature(), P0, Q, problem, z)
 
 
 class CKFTrack(Track):
@@ -71,22 +72,4 @@ class CKFTrack(Track):
         self.nis += squared_innovation(f.y, f.SI)
         self.reference = self.reference + f.x[:, 0]
         f.x = np.zeros_like(f.x)
-        return True
-
-
-class CKFStack(Stack):
-    """The same filter for all trials at once."""
-
-    def __init__(self, P0: Array, Q: Array, problem: Problem, z: Array) -> None:
-        super().__init__(P0, Q, problem, z)
-        self.away = np.zeros((len(z), 2 * len(P0), len(P0)))
-
-    def points(self, at: Rows) -> Array:
-        U = cholesky(self.P[at]) * np.sqrt(self.P.shape[1])
-        self.away[at] = np.concatenate([U, -U], axis=1)
-        return self.x[at][:, None] + self.away[at]
-
-    def update(self, at: Rows, z: Array, h: Array, H: Array | None) -> bool:
-        weights = np.full(h.shape[1], 1 / h.shape[1])
-        self.correct(at, self.away[at], z, h, weights, weights)
         return True

@@ -11,11 +11,12 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Gt
 
-from ipe_bench.baselines.batched import Stack, gain_of, squared_innovations
-from ipe_bench.baselines.epochs import Rows, symmetric
+from ipe_bench.baselines.batched import TurnedReadings
+from ipe_bench.baselines.epochs import Epoch, Rows, Walk, symmetric
 from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, turned
-from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.basics.linalg import Array, finite, multiply, solve
 from ipe_bench.basics.options import Whole
+from ipe_bench.basics.statuses import Status
 from ipe_bench.basics.streams import own_bits
 from ipe_bench.measurements.problem import Problem
 
@@ -80,11 +81,12 @@ class EnKFTrack(Track):
         return True
 
 
-class EnKFStack(Stack):
+class EnKFStack(Walk):
     """The same filter for all trials at once, with the same draws."""
 
     def __init__(self, P0: Array, Q: Array, problem: Problem, z: Array, given: EnKF) -> None:
-        super().__init__(P0, Q, problem, z)
+        super().__init__(problem, z)
+        self.x, self.P = np.zeros((len(z), len(P0))), np.repeat(P0[None], len(z), axis=0)
         self.members, self.draws = given.members, [np.random.RandomState(own_bits(given.seed, row)) for row in z]
         self.root_Q = _root(Q)
         self.ensemble = self._drawn(np.arange(len(z)), _root(P0))
@@ -94,16 +96,17 @@ class EnKFStack(Stack):
         white = [self.draws[trial].standard_normal((self.members, len(root))) for trial in at]
         return np.matmul(np.stack(white), root) if white else np.empty((0, self.members, len(root)))
 
-    def predict(self, at: Rows) -> None:
+    def state(self, at: Rows) -> tuple[Array, Array]:
+        return self.x[at], self.P[at]
+
+    def take_in(self, epoch: Epoch, at: Rows) -> None:
         self.ensemble[at] += self._drawn(at, self.root_Q)
+        h = TurnedReadings(self, epoch, at, self.P[at]).read(self.ensemble[at], slopes=False)[0]
+        at, h = at[finite(h)], h[finite(h)]
+        z = epoch.whitened(self.z[at])
         self.x[at] = self.ensemble[at].mean(axis=1)
         away = self.ensemble[at] - self.x[at][:, None]
         self.P[at] = np.matmul(away.swapaxes(1, 2), away) / (self.members - 1)
-
-    def points(self, at: Rows) -> Array:
-        return self.ensemble[at]
-
-    def update(self, at: Rows, z: Array, h: Array, H: Array | None) -> bool:
         centre = h.mean(axis=1, keepdims=True)
         spread = h - centre
         # The perturbations are drawn along these axes, so they are those of `turned` to the sign.
@@ -112,14 +115,13 @@ class EnKFStack(Stack):
         off = spread - spread.mean(axis=1, keepdims=True)
         I = np.eye(z.shape[1])  # noqa: E741  the field's letter for the unit matrix
         S = np.matmul(off.swapaxes(1, 2), off) / (self.members - 1) + I
-        away = self.ensemble[at] - self.x[at][:, None]
-        K = gain_of(np.matmul(away.swapaxes(1, 2), off) / (self.members - 1), S)
+        K = solve(S, np.matmul(off.swapaxes(1, 2), away) / (self.members - 1))[0].swapaxes(1, 2)
         innovations = z[:, None] + self._drawn(at, _root(I)) - spread
         self.ensemble[at] += np.matmul(innovations, K.swapaxes(1, 2))
         self.x[at] = self.ensemble[at].mean(axis=1)
         self.P[at] = symmetric(self.P[at] - np.matmul(np.matmul(K, S), K.swapaxes(1, 2)))
-        self.nis[at] += squared_innovations(z, S)
-        return True
+        self.nis[at] += np.einsum("ti,ti->t", z, solve(S, z)[0])
+        self.end(at[~finite(self.x[at])], Status.SINGULAR, f"S is singular at epoch {epoch.number}")
 
 
 def _root(P: Array) -> Array:

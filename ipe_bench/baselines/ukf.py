@@ -9,11 +9,12 @@ import numpy as np
 from annotated_types import Gt, Le
 
 from ipe_bench.baselines.batched import Stack
-from ipe_bench.baselines.epochs import Rows, symmetric
+from ipe_bench.baselines.epochs import symmetric
 from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, turned
-from ipe_bench.basics.linalg import Array, cholesky
+from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Finite, NonNegative
 from ipe_bench.measurements.problem import Problem
+from ipe_bench.states.linearisation import Unscented
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,8 @@ class UKF(Sequential):
 
         return UKFTrack(P0, Q, MerweScaledSigmaPoints(len(P0), self.alpha, self.beta, self.kappa))
 
-    def stack(self, P0: Array, Q: Array, problem: Problem, z: Array) -> UKFStack:
-        return UKFStack(P0, Q, problem, z, self)
+    def stack(self, P0: Array, Q: Array, problem: Problem, z: Array) -> Stack:
+        return Stack(Unscented(self.kappa, self.alpha, self.beta), P0, Q, problem, z)
 
 
 class UKFTrack(Track):
@@ -73,27 +74,4 @@ class UKFTrack(Track):
         f.update(z, R=np.eye(len(z)), hx=in_turn(h))
         f.P = symmetric(f.P)
         self.nis += squared_innovation(f.y, f.SI)
-        return True
-
-
-class UKFStack(Stack):
-    """The same filter for all trials at once, with van der Merwe's points and weights."""
-
-    def __init__(self, P0: Array, Q: Array, problem: Problem, z: Array, given: UKF) -> None:
-        super().__init__(P0, Q, problem, z)
-        n = len(P0)
-        self.reach = given.alpha**2 * (n + given.kappa)
-        self.mean = np.full(2 * n + 1, 0.5 / self.reach)
-        self.mean[0] = (self.reach - n) / self.reach
-        self.weights = self.mean.copy()
-        self.weights[0] += 1 - given.alpha**2 + given.beta
-        self.away = np.zeros((len(z), 2 * n + 1, n))
-
-    def points(self, at: Rows) -> Array:
-        U = cholesky(self.reach * self.P[at])
-        self.away[at, 1:] = np.concatenate([U, -U], axis=1)
-        return self.x[at][:, None] + self.away[at]
-
-    def update(self, at: Rows, z: Array, h: Array, H: Array | None) -> bool:
-        self.correct(at, self.away[at], z, h, self.weights, self.mean)
         return True

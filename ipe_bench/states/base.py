@@ -143,5 +143,8 @@ class StateModel(Component, Named, ABC):
 
 
 def slope(function: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:
-    """Value (trials, m) and Jacobian (trials, m, n) of an analytic function at x (trials, n)."""
+    """Value (trials, m) and Jacobian (trials, m, n) of a function at x (trials, n), by its own `slope` if it has one,
+    else by complex steps."""
+    if (own := getattr(function, "slope", None)) is not None:
+        return own(x)
     return function(x), differentiate(function, x, analytic=True)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ipe_bench.basics.linalg import Array, multiply
-from ipe_bench.basics.options import Component, Count, Finite
+from ipe_bench.basics.options import Component, Count, Finite, Positive
 from ipe_bench.states.algebra import factor, symmetric, transposed, upper_solve
 from ipe_bench.states.base import slope
 
@@ -68,7 +68,11 @@ class SigmaPoints(Rule):
 
     @abstractmethod
     def points(self, n: int) -> tuple[Array, Array]:
-        """Points (p, n) and weights (p,)."""
+        """Points (p, n) and their weights (p,) in means."""
+
+    def covariance_weights(self, w: Array) -> Array:
+        """The points' weights (p,) in covariances."""
+        return w
 
     def linearise(self, g: Function, m: Array, P: Array, nearest: Nearest | None = None) -> Affine:
         s, w = self.points(m.shape[-1])
@@ -78,6 +82,7 @@ class SigmaPoints(Rule):
             y = nearest(y, g(m)[..., None, :])
         mean = np.sum(w[:, None] * y, axis=-2)
         d = y - mean[..., None, :]
+        w = self.covariance_weights(w)
         M = np.matmul(s.T, d * w[:, None])  # L' A'
         W = np.matmul(transposed(d * w[:, None]), d) - np.matmul(transposed(M), M)
         A = transposed(upper_solve(L, M))
@@ -97,16 +102,23 @@ class Cubature(SigmaPoints):
 
 @dataclass(frozen=True)
 class Unscented(SigmaPoints):
-    """The 2 n + 1 points of Julier and Uhlmann (1997), alpha = 1 and beta = 0."""
+    """The 2 n + 1 points of Julier and Uhlmann (1997), scaled as by van der Merwe (dissertation, 2004)."""
 
     kappa: Finite | None = None
     """Weight of the central point, in units of the others' doubled; None: 3 - n, and 0 where that is negative, since a
     negative weight costs the covariance its definiteness."""
+    alpha: Positive = 1.0
+    """Times the distance of the points."""
+    beta: Finite = 0.0
+    """Further weight of the central point in covariances: 2 is best for a square of normal numbers."""
 
     def points(self, n: int) -> tuple[Array, Array]:
-        c = n + (max(3.0 - n, 0.0) if self.kappa is None else self.kappa)
+        c = self.alpha**2 * (n + (max(3.0 - n, 0.0) if self.kappa is None else self.kappa))
         s = np.sqrt(c) * np.concatenate([np.zeros((1, n)), np.eye(n), -np.eye(n)])
         return s, np.concatenate([[1 - n / c], np.full(2 * n, 0.5 / c)])
+
+    def covariance_weights(self, w: Array) -> Array:
+        return np.concatenate([[w[0] + 1 - self.alpha**2 + self.beta], w[1:]])
 
 
 @dataclass(frozen=True)

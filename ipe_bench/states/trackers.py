@@ -17,7 +17,7 @@ from ipe_bench.basics.linalg import Array, multiply
 from ipe_bench.basics.naming import Named
 from ipe_bench.basics.options import Component, Count, NonNegative
 from ipe_bench.basics.streams import own_generators
-from ipe_bench.states.algebra import divide, factor, lower_solve, mahalanobis, root, symmetric, transposed
+from ipe_bench.states.algebra import divide, factor, lower_solve, mahalanobis, root, symmetric, transposed, upper_solve
 from ipe_bench.states.base import Gaussian, StateModel
 from ipe_bench.states.linearisation import Affine, Cubature, GaussHermite, Rule, Taylor, Unscented
 
@@ -92,19 +92,26 @@ class Update(NamedTuple):
 
 
 def update(x: Gaussian, read: Affine, R: Array, z: Array) -> Update:
-    """Takes in the readings z (trials, m) of covariance R (m, m). A missing reading has no slope and unit variance."""
+    """Takes in the readings z (trials, m) of covariance R (m, m). A missing reading has no slope and unit variance.
+
+    P is updated in Joseph's form, (I - K H) P (I - K H)' + K R K', which stays positive definite where the prior is
+    much wider than R.
+    """
     m, P = x
     seen = np.isfinite(z)
     both = seen[..., :, None] & seen[..., None, :]
     H = np.where(seen[..., None], read.A, 0.0)
     y = np.where(seen, z - multiply(read.A, m) - read.b, 0.0)
     PH = np.matmul(P, transposed(H))
-    L = factor(np.matmul(H, PH) + np.where(both, read.W + R, np.eye(R.shape[-1])))
-    U = lower_solve(L, transposed(PH))  # the gain is U' L^-1
+    noise = np.where(both, read.W + R, np.eye(R.shape[-1]))
+    L = factor(np.matmul(H, PH) + noise)
+    K = transposed(upper_solve(L, lower_solve(L, transposed(PH))))
+    rest = np.eye(m.shape[-1]) - np.matmul(K, H)
+    covariance = np.matmul(np.matmul(rest, P), transposed(rest)) + np.matmul(np.matmul(K, noise), transposed(K))
     e = lower_solve(L, y[..., None])
     nis, degrees = np.sum(e[..., 0] ** 2, axis=-1), seen.sum(axis=-1)
     log_determinant = 2 * np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(axis=-1)
-    posterior = Gaussian(m + np.matmul(transposed(U), e)[..., 0], symmetric(P - np.matmul(transposed(U), U)))
+    posterior = Gaussian(m + multiply(K, y), symmetric(covariance))
     return Update(posterior, nis, degrees, -0.5 * (nis + log_determinant + degrees * np.log(2 * np.pi)))
 
 

@@ -7,7 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
+from filterpy.kalman import (
+    CubatureKalmanFilter,
+    ExtendedKalmanFilter,
+    MerweScaledSigmaPoints,
+    UnscentedKalmanFilter,
+    spherical_radial_sigmas,
+)
 from scipy.optimize import least_squares
 
 import ipe_bench as ib
@@ -91,6 +97,25 @@ def test_filterpy_s_extended_and_unscented_filters_and_its_smoother(stored):
     np.testing.assert_allclose(ekf().track(model, z).mean[0], extended, atol=1e-11)
     np.testing.assert_allclose(ukf().track(model, z).mean[0], means, atol=1e-11)
     np.testing.assert_allclose(Smoother(ukf()).track(model, z).mean[0], smoothed, atol=1e-11)
+
+
+def test_filterpy_s_cubature_filter_passes_points_on_that_do_not_carry_the_process_noise(stored):
+    model, (_, z) = Pendulum(), stored
+    means = {}
+    for redrawn in (False, True):
+        theirs = CubatureKalmanFilter(2, 1, model.step, lambda x: model.observe(x, 0), _moved(model))
+        theirs.x, theirs.P, theirs.Q, theirs.R = np.zeros((2, 1)), np.eye(2), model.Q(0), model.R(0)
+        path = []
+        for reading in z[0]:
+            theirs.predict()
+            if redrawn:
+                theirs.sigmas_f = spherical_radial_sigmas(theirs.x, theirs.P)
+            theirs.update(reading[:, None])
+            path.append(theirs.x[:, 0].copy())
+        means[redrawn] = np.array(path)
+    ours = ckf().track(model, z).mean[0]
+    np.testing.assert_allclose(ours, means[True], atol=1e-10)
+    assert np.abs(ours - means[False]).max() > 1e-3
 
 
 def _moved(model):
