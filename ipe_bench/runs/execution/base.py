@@ -16,10 +16,8 @@ from ipe_bench.basics.errors import StorageError, UserError, describe_exception
 from ipe_bench.basics.naming import Named
 from ipe_bench.basics.options import Component, Count
 
-Task = Any
-"""What an execution runs: anything that can be pickled."""
 Work = Callable[[Any], Iterable[Any]]
-"""Does a task in steps: what it yields after each step is handed on, and proves that it is alive."""
+"""Does a task, which is anything that can be pickled, in steps: what it yields after each step is handed on."""
 
 _LONGEST = 1e9
 """Seconds, and 1e9 bytes, beyond which no limit is meant: thirty years, and more memory than there is."""
@@ -28,7 +26,7 @@ Limit = Annotated[float, Gt(0), Lt(_LONGEST), doc(f"a number above 0 and below {
 
 
 @dataclass(frozen=True)
-class Limits:
+class ResourceLimits:
     """What a task may use."""
 
     seconds: float | None = None
@@ -81,7 +79,7 @@ class Execution(Component, Named, ABC):
     """Where tasks run. A new execution is a frozen dataclass that writes `run`."""
 
     @abstractmethod
-    def run(self, work: Work, tasks: Sequence[Task]) -> Iterator[Event]:
+    def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
         """Yields an event per step, and one with `ended` per task; an exception in `work` fails its task alone.
 
         Closing the iterator, or an exception of `FATAL`, stops what is under way.
@@ -95,7 +93,7 @@ class Serial(Execution):
     Nothing stands between an estimator and this process: one that never returns, or ends the process, ends the run.
     """
 
-    def run(self, work: Work, tasks: Sequence[Task]) -> Iterator[Event]:
+    def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
         for index, task in enumerate(tasks):
             failure = None
             try:
@@ -125,6 +123,6 @@ class LimitedExecution(Execution):
             raise UserError(f"memory_limit_gb={self.memory_limit_gb}: can be enforced on Linux only; give null")
 
     @property
-    def limits(self) -> Limits:
+    def limits(self) -> ResourceLimits:
         """What one task may use."""
-        return Limits(self.block_timeout_s, self.memory_limit_gb)
+        return ResourceLimits(self.block_timeout_s, self.memory_limit_gb)

@@ -26,7 +26,7 @@ from typing import Any
 import cloudpickle
 
 from ipe_bench.basics.machine import cores
-from ipe_bench.runs.execution.base import Event, Failure, LimitedExecution, Limits, Serial, Task, Work
+from ipe_bench.runs.execution.base import Event, Failure, LimitedExecution, ResourceLimits, Serial, Work
 
 _THREADED = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB", "NUMEXPR")
 _PREPARATION_S = 60.0
@@ -40,7 +40,7 @@ class Processes(LimitedExecution):
     compiled models get several threads.
     """
 
-    def run(self, work: Work, tasks: Sequence[Task]) -> Iterator[Event]:
+    def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
         workers = min(self.workers or cores(), len(tasks))
         threads = 1 if self.workers else max(1, cores() // max(workers, 1))
         return supervise(work, tasks, workers, threads, self.limits)
@@ -53,13 +53,13 @@ class Auto(Processes):
     A worker takes seconds to start, which a job of one block does not win back; compiled models use every core without.
     """
 
-    def run(self, work: Work, tasks: Sequence[Task]) -> Iterator[Event]:
-        if len(tasks) == 1 and self.limits == Limits():
+    def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
+        if len(tasks) == 1 and self.limits == ResourceLimits():
             return Serial().run(work, tasks)
         return super().run(work, tasks)
 
 
-def supervise(work: Work, tasks: Sequence[Task], workers: int, threads: int, limits: Limits) -> Iterator[Event]:
+def supervise(work: Work, tasks: Sequence[Any], workers: int, threads: int, limits: ResourceLimits) -> Iterator[Event]:
     """Runs tasks in at most so many worker processes with so many threads each; see `Execution.run`.
 
     A worker whose task exceeds its time is ended. The first step has a minute in any case: a new worker has to load

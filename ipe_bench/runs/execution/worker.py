@@ -17,7 +17,7 @@ from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ipe_bench.runs.execution.base import Limits
+    from ipe_bench.runs.execution.base import ResourceLimits
 
 
 def main(handle: int) -> None:
@@ -47,7 +47,7 @@ def _listen(connection: Connection, messages: queue.SimpleQueue[Any]) -> None:
             os._exit(0)
 
 
-def _perform(connection: Connection, limits: Limits, payload: bytes) -> tuple[str, Any]:
+def _perform(connection: Connection, limits: ResourceLimits, payload: bytes) -> tuple[str, Any]:
     """Does one task; the last message about it."""
     from ipe_bench.runs.execution.base import FATAL, Failure
 

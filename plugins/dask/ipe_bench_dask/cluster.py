@@ -22,7 +22,7 @@ import cloudpickle
 from ipe_bench.basics.errors import StorageError, UserError, describe_exception
 from ipe_bench.basics.machine import cores
 from ipe_bench.basics.options import Count
-from ipe_bench.runs.execution.base import FATAL, Event, Failure, LimitedExecution, Limits, Task, Work
+from ipe_bench.runs.execution.base import FATAL, Event, Failure, LimitedExecution, ResourceLimits, Work
 from ipe_bench.runs.execution.processes import supervise
 
 log = logging.getLogger(__name__)
@@ -57,7 +57,7 @@ class Dask(LimitedExecution):
         if self.address is not None and (self.jobqueue is not None or self.workers is not None or self.options):
             raise UserError(f"address={self.address}: goes with no workers, jobqueue or options; leave out either")
 
-    def run(self, work: Work, tasks: Sequence[Task]) -> Iterator[Event]:
+    def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
         if not tasks:
             return
         options = json.dumps(dict(self.options), sort_keys=True, default=str)
@@ -110,7 +110,7 @@ def _say_when_nobody_works(client: Any, heard: threading.Event) -> None:
                 log.warning(f"execution=dask: the scheduler at {address} has no workers yet; waiting for one")
 
 
-def _run_one(payload: bytes, limits: Limits) -> Any:
+def _run_one(payload: bytes, limits: ResourceLimits) -> Any:
     """On a Dask worker: the steps and the failure of one task, done in a process beside it."""
     try:
         work, task = pickle.loads(payload)
