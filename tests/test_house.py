@@ -25,8 +25,8 @@ LINE = (
     ("cli",),
 )
 BUDGETS = {
-    "basics": 1105,
-    "measurements": 7050,
+    "basics": 1110,
+    "measurements": 7030,
     "noise": 430,
     "priors": 175,
     "states": 1110,

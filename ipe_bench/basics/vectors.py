@@ -66,6 +66,11 @@ class Vectors:
                 return self.call("fma", builder.fneg(a), b, c)
             case (("fma" | "sqrt"), _):
                 return self.call(name, *args)
+            case (("less" | "less_equal"), [a, b]):
+                holds = builder.fcmp_ordered("<" if name == "less" else "<=", a, b)
+                return builder.select(holds, self.constant(1.0), self.constant(0.0))
+            case "where", [condition, a, b]:
+                return builder.select(builder.fcmp_unordered("!=", condition, self.constant(0.0)), a, b)
         return self._each("atan" if name == "arctan" else name, *args)
 
     def call(self, name: str, *args: Value) -> Value:

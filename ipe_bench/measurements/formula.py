@@ -6,7 +6,6 @@ carried out on arrays.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -17,23 +16,21 @@ import numpy as np
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.arithmetic import Arithmetic, read, require_finite, require_parameters
-from ipe_bench.measurements.base import Input, Measurement, Parameter
-from ipe_bench.measurements.ode.trace import Expression, Graph, in_order, operands, tangent
-
-_UFUNCS: dict[str, Any] = {"add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide}
-_UFUNCS |= {"pow": np.power, "neg": np.negative}
+from ipe_bench.measurements.base import Input
+from ipe_bench.measurements.ode.trace import Graph, Program, tangent
+from ipe_bench.measurements.written import WrittenModel
 
 
 @dataclass(frozen=True)
-class Formula(Measurement):
+class Formula(WrittenModel):
     """z = expression, in which every name with a start is a parameter and every other one a column of the readings.
 
         ipe-bench estimate measurement=formula "measurement.expression=b1*(1-exp(-b2*t))" \\
             measurement.start.b1=500 measurement.start.b2=1e-4 readings=my.csv
 
     The language is that of `ipe_bench.measurements.arithmetic`: + - * / ** and elementary functions, angles in rad.
-    Parameters stand in the order of their appearance, each in multiples of the magnitude of its start; they have no
-    units but those that the formula gives them. Readings have the order of the file, and no epochs.
+    Parameters stand in the order of their starts, each in multiples of its magnitude; they have no units but those that
+    the formula gives them. Readings have the order of the file, and no epochs.
     """
 
     expression: str
@@ -64,29 +61,13 @@ class Formula(Measurement):
             )
         if self.reading in self.arithmetic.names:
             raise UserError(f"reading={self.reading}: stands in the expression too; what is measured cannot explain it")
-        lengths = {name: len(column) for name, column in self.columns.items()}
-        if len(set(lengths.values())) > 1:
-            raise UserError(f"columns: have different lengths: {lengths}")
+        self.require_equal_lengths()
         require_parameters("own", self.own, self.start)
 
     @cached_property
     def arithmetic(self) -> Arithmetic:
         return read(self.expression, "expression")
 
-    @cached_property
-    def _names(self) -> tuple[str, ...]:
-        """The parameters, in order of appearance."""
-        return tuple(name for name in self.arithmetic.names if name in self.start)
-
-    @cached_property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return tuple(Parameter(name, size=abs(float(self.start[name])) or 1.0) for name in self._names)
-
-    @cached_property
-    def nominal(self) -> Array:
-        return np.sign([float(self.start[name]) for name in self._names])
-
-    reading_unit = property(lambda model: model.unit)  # type: ignore[assignment]
     reading_name = property(lambda model: model.reading)  # type: ignore[assignment]
     own_parameters = property(lambda model: model.own)  # type: ignore[assignment]
 
@@ -101,12 +82,6 @@ class Formula(Measurement):
     @property
     def input_columns_known(self) -> bool:
         return bool(self.columns) or self.readings is not None
-
-    def absent_input(self, heading: str, columns: Sequence[str]) -> str:
-        return (
-            f"there are {', '.join(columns)}. If {heading} is a parameter, give it a start: "
-            f"measurement.start.{heading}=VALUE"
-        )
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Formula:
         return replace(self, columns=dict(columns), readings=readings)
@@ -125,72 +100,36 @@ class Formula(Measurement):
             return self.readings
         return len(self._column(self.inputs[0].heading)) if self.inputs else 0
 
-    @property
-    def index(self) -> Mapping[str, Sequence[Any]]:
-        return {"row": list(range(1, self.m + 1)), **self.input_columns}
-
     @cached_property
-    def _recorded(self) -> tuple[Expression, tuple[Expression, ...]]:
-        """The formula and its derivative by each parameter, as recorded expressions."""
+    def _recorded(self) -> tuple[Program, Program]:
+        """The formula, and its derivative by each parameter, from the values of its names."""
         graph = Graph()
         known = {name: graph.input(name) for name in self.arithmetic.names}
         try:
             with np.errstate(all="raise", under="ignore"):
                 value, one = graph.apply("add", self.arithmetic(known), 0.0), graph.constant(1.0)
-                return value, tuple(tangent([value], {known[name]: one})[0] for name in self._names)
+                slopes = [tangent([value], {known[name]: one})[0] for name in self.start]
         except (ArithmeticError, ValueError, TypeError) as error:
             raise UserError(
                 f"measurement.expression: a part that is made of numbers alone has no real value ({error})"
             ) from None
+        return Program.of([value], list(known.values())), Program.of(slopes, list(known.values()))
 
-    def _values(self, x: Array) -> dict[str, Array]:
-        p = (x * self.sizes)[:, :, None]
-        return {name: p[:, i] for i, name in enumerate(self._names)} | {
-            i.heading: self._column(i.heading)[None] for i in self.inputs
-        }
+    def _values(self, x: Array) -> list[Array]:
+        p = dict(zip(self.start, (x * self.sizes).T[:, :, None], strict=True))
+        return [p[name] if name in p else self._column(name)[None] for name in self.arithmetic.names]
 
     def simulate(self, x: Array) -> Array:
         value, _ = self._recorded
         with np.errstate(all="ignore"):
-            z = carry_out([value], self._values(x))[0]
+            z = value(self._values(x))[0]
         return np.array(np.broadcast_to(z, (len(x), self.m)))
 
     def jacobian(self, x: Array) -> Array:
         _, slopes = self._recorded
         with np.errstate(all="ignore"):
-            columns = carry_out(slopes, self._values(x))
+            columns = slopes(self._values(x))
         J = np.empty((len(x), self.m, self.n))
         for i, column in enumerate(columns):
             J[:, :, i] = column * self.sizes[i]
         return J
-
-
-def carry_out(outputs: Sequence[Expression], values: Mapping[str, Array]) -> list[Array]:
-    """The values of recorded expressions, entry by entry, where `values` gives the arrays of their inputs.
-
-    What no later operation needs is let go of: a formula on a million rows keeps few arrays.
-    """
-    order = in_order(outputs)
-    users = Counter(a.order for e in order for a in operands(e))
-    users.update(e.order for e in outputs)
-    found: dict[int, Any] = {}
-    for e in order:
-        found[e.order] = _operation(e, [found[a.order] for a in operands(e)], values)
-        for a in operands(e):
-            users[a.order] -= 1
-            if not users[a.order]:
-                del found[a.order]
-    return [found[e.order] for e in outputs]
-
-
-def _operation(e: Expression, arrays: Sequence[Any], values: Mapping[str, Array]) -> Any:
-    if e.operation == "input":
-        return values[e.operands[0]]
-    if e.operation == "constant":
-        return e.value
-    if e.operation == "mul":
-        power, logarithm = operands(e)
-        if logarithm.operation == "log" and power.operation == "pow" and power.operands[0] is logarithm.operands[0]:
-            # d(a^b)/db = a^b log(a), which is 0 where a = 0 and b > 0, and not 0 times infinity.
-            return np.where(arrays[0] == 0.0, 0.0, arrays[0] * arrays[1])
-    return (_UFUNCS.get(e.operation) or getattr(np, e.operation))(*arrays)

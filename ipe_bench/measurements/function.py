@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import inspect
 import os
 import sys
 import typing
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -21,7 +20,8 @@ from ipe_bench.basics.errors import UserError, describe_exception, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Finite, Positive
 from ipe_bench.measurements.arithmetic import require_parameters
-from ipe_bench.measurements.base import Input, Measurement, Parameter, differentiate
+from ipe_bench.measurements.base import Input, differentiate
+from ipe_bench.measurements.written import WrittenModel
 
 _CHUNK = 8
 """Trials per call of a compiled JAX program; shorter batches are padded, so that bits do not depend on them."""
@@ -30,7 +30,7 @@ _TIMES = ("t", "time")
 
 
 @dataclass(frozen=True)
-class Function(Measurement):
+class Function(WrittenModel):
     """z = h(parameters, columns), for a function h of a Python file:
 
         def angle(t, length=1.0, damping=0.1, *, g=9.80665):        # in swing.py
@@ -69,27 +69,25 @@ class Function(Measurement):
         arguments = [name for name in self._signature if name not in self._keywords]
         require_parameters("start", self.start, arguments)
         for key in ("size", "units"):
-            require_parameters(key, getattr(self, key), self._starts)
+            require_parameters(key, getattr(self, key), self.starts)
         for name in self.constants:
             if name not in self._keywords:
                 raise UserError(f"constants.{name}: {unknown(name, self._keywords, 'keyword-only argument')}")
         for name, default in self._keywords.items():
             if default is inspect.Parameter.empty and name not in self.constants:
                 raise UserError(f"constants.{name}: {self.of} needs it; give constants.{name}=VALUE")
-        if not self._starts:
+        if not self.starts:
             raise UserError(
                 f"start: {self.of} has no parameter; give an argument a number as default, or start.NAME=VALUE "
                 f"(its arguments are {', '.join(arguments) or 'none'})"
             )
         if self.time and self.time not in self._headings:
             raise UserError(f"time={self.time}: {unknown(self.time, self._headings, 'column')}")
-        lengths = {name: len(column) for name, column in self.columns.items()}
         if self.columns and (absent := [name for name in self._headings if name not in self.columns]):
             raise UserError(
                 f"columns: {absent[0]} is missing; give columns.{absent[0]}=[...], or start.{absent[0]}=VALUE"
             )
-        if len(set(lengths.values())) > 1:
-            raise UserError(f"columns: have different lengths: {lengths}")
+        self.require_equal_lengths()
 
     @cached_property
     def function(self) -> Callable[..., Any]:
@@ -105,8 +103,8 @@ class Function(Measurement):
             )
         module = module.removesuffix(".py")
         try:
-            with _working_folder_first():
-                found = sys.modules.get(module) or importlib.import_module(module)
+            _working_folder_first()
+            found = sys.modules.get(module) or importlib.import_module(module)
         except Exception as error:
             if isinstance(error, ModuleNotFoundError) and error.name == module.partition(".")[0]:
                 raise UserError(f"of={self.of}: there is no module {module} here; {module}.py would be one") from None
@@ -134,7 +132,7 @@ class Function(Measurement):
         return {name: a.default for name, a in self._signature.items() if a.kind is a.KEYWORD_ONLY}
 
     @cached_property
-    def _starts(self) -> dict[str, float]:
+    def starts(self) -> dict[str, float]:
         """The parameters with their starts, in the order of the signature."""
         found: dict[str, float] = {}
         for name, argument in self._signature.items():
@@ -151,30 +149,17 @@ class Function(Measurement):
     @cached_property
     def _headings(self) -> tuple[str, ...]:
         """The columns of the readings, in the order of the signature."""
-        return tuple(name for name in self._signature if name not in self._starts and name not in self._keywords)
+        return tuple(name for name in self._signature if name not in self.starts and name not in self._keywords)
 
     @cached_property
-    def _annotated_units(self) -> dict[str, str]:
+    def parameter_units(self) -> dict[str, str]:
         try:
             hints = typing.get_type_hints(self.function, include_extras=True)
         except Exception:  # of names that the function's module does not hold
-            return {}
+            hints = {}
         extras = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
-        return {name: texts[0] for name, found in extras.items() if (texts := [e for e in found if isinstance(e, str)])}
-
-    @cached_property
-    def parameters(self) -> tuple[Parameter, ...]:
-        units = self._annotated_units | dict(self.units)
-        sizes = {name: abs(value) or 1.0 for name, value in self._starts.items()} | dict(self.size)
-        return tuple(Parameter(name, units.get(name, ""), sizes[name]) for name in self._starts)
-
-    @cached_property
-    def nominal(self) -> Array:
-        return np.array(list(self._starts.values())) / self.sizes
-
-    @property
-    def reading_unit(self) -> str:  # type: ignore[override]
-        return self.unit
+        texts = {name: [text for text in found if isinstance(text, str)] for name, found in extras.items()}
+        return {name: found[0] for name, found in texts.items() if found} | dict(self.units)
 
     @property
     def reading_name(self) -> str:
@@ -192,19 +177,13 @@ class Function(Measurement):
     def input_columns_known(self) -> bool:
         return bool(self.columns) or not self._headings
 
-    def absent_input(self, heading: str, columns: Sequence[str]) -> str:
-        return (
-            f"there are {', '.join(columns)}. If {heading} is a parameter, give it a start: "
-            f"measurement.start.{heading}=VALUE"
-        )
-
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Function:
         return replace(self, columns={name: tuple(map(float, columns[name])) for name in self._headings})
 
     @cached_property
     def m(self) -> int:
         if not self._headings:
-            return len(self._checked(self._at(self._starts.values()), None))
+            return len(self._checked(self._at(self.starts.values()), None))
         if not self.columns:
             wanted = self._headings[0]
             raise UserError(
@@ -212,10 +191,6 @@ class Function(Measurement):
                 f"with these columns, or measurement.columns.{wanted}=[...]"
             )
         return len(self.columns[self._headings[0]])
-
-    @property
-    def index(self) -> Mapping[str, Sequence[Any]]:
-        return {"row": list(range(1, self.m + 1)), **self.input_columns}
 
     @cached_property
     def epochs(self) -> tuple[NDArray[np.intp], ...] | None:
@@ -232,7 +207,7 @@ class Function(Measurement):
 
     def _at(self, values: Any) -> Any:
         """h where the parameters have these values (n,), in their own units."""
-        return self.function(**dict(zip(self._starts, values, strict=True)), **self._known)
+        return self.function(**dict(zip(self.starts, values, strict=True)), **self._known)
 
     def _checked(self, z: Any, m: int | None) -> Any:
         shape = np.shape(z)
@@ -243,7 +218,7 @@ class Function(Measurement):
 
     def _rows(self, x: Array) -> Array:
         """h of every trial, by one call of the function each; x may be complex."""
-        h, names, known = self.function, list(self._starts), self._known
+        h, names, known = self.function, list(self.starts), self._known
         with np.errstate(all="ignore"):
             rows = [h(**dict(zip(names, row, strict=True)), **known) for row in x * self.sizes]
         if any(np.shape(row) != (self.m,) for row in rows):
@@ -253,7 +228,7 @@ class Function(Measurement):
     @cached_property
     def _jax(self) -> tuple[Callable[[Array], Array], Callable[[Array], Array]] | None:
         """Compiled readings and slopes of a function that returns arrays of JAX; None if it does not."""
-        if "jax" not in sys.modules or not type(self._at(self._starts.values())).__module__.startswith("jax"):
+        if "jax" not in sys.modules or not type(self._at(self.starts.values())).__module__.startswith("jax"):
             return None
         import jax  # pyright: ignore[reportMissingImports]
 
@@ -303,13 +278,10 @@ def function(h: Callable[..., Any], start: Mapping[str, float] | None = None, **
     return Function(of=f"{module}:{name}", start=start or {}, **options)
 
 
-@contextlib.contextmanager
-def _working_folder_first() -> Iterator[None]:
-    """Imports look into the working folder first."""
-    folder = os.getcwd()
-    if folder not in sys.path:  # and stay so: worker processes take over the path
-        sys.path.insert(0, folder)
-    yield
+def _working_folder_first() -> None:
+    """Lets imports look into the working folder first; worker processes take over the path."""
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
 
 
 def _in_chunks(program: Callable[[Array], Any]) -> Callable[[Array], Array]:

@@ -1,12 +1,18 @@
 """Stiff equations: published digits, exact solutions, SciPy's Radau, and which method a model is given."""
 
+import pickle
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+import ipe_bench as ib
+from ipe_bench.baselines import LinearLSE
 from ipe_bench.measurements import Ode
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.ode.rodas import Rodas5P
+from ipe_bench.noise import Gaussian
+from ipe_bench.runs.execution import Processes, Serial
 
 HIRES = {
     "y1": "-1.71*y1+0.43*y2+8.32*y3+0.0007",
@@ -99,3 +105,19 @@ def test_a_trial_and_a_prefix_have_the_same_bits_alone_and_in_a_batch():
 @pytest.mark.parametrize(("mu", "stiff"), [(3.0, False), (30.0, False), (300.0, True)])
 def test_the_rule_tells_stiff_oscillators_from_others(mu, stiff):
     assert van_der_pol(mu, 2 * mu).whole.stiff == stiff
+
+
+def test_a_stiff_model_that_was_used_goes_to_worker_processes(tmp_path):
+    model = follower(times=(10.0, 20.0))
+    x = model.nominal[None] * 1.1
+    z, J = model.simulate(x), model.jacobian(x)
+    again = pickle.loads(pickle.dumps(model))
+    assert np.array_equal(again.simulate(x), z)
+    assert np.array_equal(again.jacobian(x), J)
+    bench, tables = ib.Scenario(model, Gaussian(1e-5), error_scale=0.01), []
+    for execution in (Serial(), Processes(2)):
+        folder = tmp_path / type(execution).__name__
+        ib.run(bench, {"linear": LinearLSE()}, 4, output=folder, execution=execution, block_size=2)
+        tables.append(ib.load(folder)["error_k"].to_numpy())
+    assert len(tables[0]) == 4
+    np.testing.assert_array_equal(*tables)

@@ -16,9 +16,10 @@ from ipe_bench.basics.files import own_conf
 from ipe_bench.basics.linalg import Array, Covariance, own
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.measurements.arithmetic import Arithmetic, read, require_finite, require_parameters
-from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, SubsetModel, UsualNoise, WrappedModel
+from ipe_bench.measurements.base import Input, Measurement, Recorded, SubsetModel, UsualNoise, WrappedModel
 from ipe_bench.measurements.ode.model import OdeMeasurement, time_heading
-from ipe_bench.measurements.ode.rodas import Rodas5P
+from ipe_bench.measurements.ode.rodas import Rodas5P, Work
+from ipe_bench.measurements.written import WrittenModel
 
 _SHARE = 1e-8
 """Of the largest reading, what the integration may leave unless told otherwise."""
@@ -35,7 +36,7 @@ _COLUMNS = ("case", "time", "output", "reading", "sigma")
 
 
 @dataclass(frozen=True)
-class Ode(WrappedModel):
+class Ode(WrittenModel, WrappedModel):
     """Readings of the solution of differential equations, each a formula of the states, the parameters and t.
 
         states prey and predators with
@@ -95,7 +96,7 @@ class Ode(WrappedModel):
     """The name of the model in tables."""
 
     name = property(lambda model: model.title)  # type: ignore[assignment]
-    reading_unit = property(lambda model: model.unit)  # type: ignore[assignment]
+    index = WrappedModel.index
     own_parameters = property(lambda model: model.own)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
@@ -195,15 +196,6 @@ class Ode(WrappedModel):
         """The equations as the integrator takes them."""
         return _Engine(self)
 
-    @cached_property
-    def parameters(self) -> tuple[Parameter, ...]:
-        sizes = {name: abs(float(value)) or 1.0 for name, value in self.start.items()} | dict(self.size)
-        return tuple(Parameter(name, self.units.get(name, ""), float(sizes[name])) for name in self.start)
-
-    @cached_property
-    def nominal(self) -> Array:
-        return np.array([float(value) for value in self.start.values()]) / self.sizes
-
     @property
     def usual_noise(self) -> UsualNoise | None:  # type: ignore[override]
         return None if self.deviation is None else UsualNoise(self.deviation)
@@ -232,10 +224,8 @@ class Ode(WrappedModel):
     def absent_input(self, heading: str, columns: Sequence[str]) -> str:
         if heading not in self.constant_names:
             return Measurement.absent_input(self, heading, columns)
-        return (
-            f"there are {', '.join(columns)}. If {heading} is a parameter, give it a start: "
-            f"measurement.start.{heading}=VALUE; if it is the same in all cases, measurement.constants.{heading}=VALUE"
-        )
+        alike = f"if it is the same in all cases, measurement.constants.{heading}=VALUE"
+        return f"{super().absent_input(heading, columns)}; {alike}"
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
         del readings
@@ -303,6 +293,11 @@ class _Engine(OdeMeasurement):
         return described.interval * np.arange(1.0, (described.readings or 0) + 1)
 
     @cached_property
+    def _shape(self) -> tuple[Array, Work]:
+        """The nominal readings (1, m) by the implicit method, near enough to show their size, and what they took."""
+        return Rodas5P(self, _SHAPE).measured(own(self.nominal[None]))
+
+    @cached_property
     def stiff(self) -> bool:
         """Whether every trial is integrated by the implicit method.
 
@@ -313,15 +308,12 @@ class _Engine(OdeMeasurement):
             return self.described.method == "implicit"
         if self.step is not None or self._ladder[self._nominal_place] <= _EASY:
             return False
-        x = own(self.nominal[None])
-        work = Rodas5P(self, _SHAPE).work(x)
-        followed = bool(np.isfinite(Rodas5P(self, _SHAPE).simulate(x, len(self.times))).all())
-        return followed and bool(work.explicit[0] > _STIFF * work.steps[0])
+        z, work = self._shape
+        return bool(np.isfinite(z).all() and work.explicit[0] > _STIFF * work.steps[0])
 
     @cached_property
     def _implicit(self) -> Rodas5P:
-        shown = np.abs(Rodas5P(self, _SHAPE).simulate(self.nominal[None], len(self.times)))
-        largest = float(np.nanmax(shown, initial=0.0)) or 1.0
+        largest = float(np.nanmax(np.abs(self._shape[0]), initial=0.0)) or 1.0
         return Rodas5P(self, float(np.clip(_IN_HAND * np.min(self._tolerances) / largest, 1e-10, 1e-4)))
 
     def _shown(self, x: Array, stop: int, offset: Array, *, coarse: bool = False) -> Array:
@@ -357,7 +349,7 @@ class _Engine(OdeMeasurement):
         trials = [replace(self.described, step=h, method="explicit").simulate(nominal) for h in (step, step / 2)]
         first, largest = (float(np.abs(z).max()) for z in trials)
         if not 0.9 * largest <= first <= 1.1 * largest:  # explicit steps are unstable
-            largest = float(np.abs(Rodas5P(self, _SHAPE).simulate(nominal, len(self.times))).max())
+            largest = float(np.abs(self._shape[0]).max())
         return _SHARE * largest if 0 < largest < np.inf else _SHARE
 
     @cached_property

@@ -172,7 +172,7 @@ def interpret(
     with np.errstate(all="ignore"):
         store([x[trial, j] * si[j] for j in range(len(plan.x))], plan.x)
         store([cases[case, j] for j in range(len(plan.constants))], plan.constants)
-        store(evaluate(plan.begin, load([*plan.x, *plan.constants])), plan.begun)
+        store(plan.begin(load([*plan.x, *plan.constants])), plan.begun)
         t = 0.0
         for k, to in enumerate(times.tolist()):
             for s in range(int(steps[k]) if to != t else 0):
@@ -181,7 +181,7 @@ def interpret(
 
                 def slope(stage: int, y: list[Any], since: float = since, h: float = h, ny: int = ny) -> list[Any]:
                     time = [since + plan.tableau.C[stage] * h] if plan.step_timed else []
-                    result = evaluate(plan.step, [*time, *y, *load(plan.fixed)])
+                    result = plan.step([*time, *y, *load(plan.fixed)])
                     store(result[ny:], plan.kept[stage])
                     return result[:ny]
 
@@ -191,43 +191,19 @@ def interpret(
                     def moving(stage: int, d: list[Any], sources: Any = sources, move: Any = move) -> list[Any]:
                         beyond = stage * move.stage_size
                         given = [*d, *load(sources, beyond), *load(move.saved, beyond), *load(plan.fixed)]
-                        return evaluate(move.slope, given)
+                        return move.slope(given)
 
                     store(advance(load(lie), h, moving), lie)
             t = to
-            store(evaluate(plan.read, [*([t] if plan.read_timed else []), *load([*plan.y, *plan.fixed])]), plan.noted)
+            store(plan.read([*([t] if plan.read_timed else []), *load([*plan.y, *plan.fixed])]), plan.noted)
             if move is None:
                 less = more[0].reshape(len(cases), -1, no)[case, k]
                 for i, value in enumerate(load(plan.shown)):
                     out[trial, case, k, i, 0] = value - less[:, i]
             for j, (lie, sources) in enumerate(zip(move.lie, move.show_sources, strict=True) if move else ()):
                 given = [*load(lie), *load(sources), *load(move.show_saved), *load(plan.fixed)] if move else []
-                for i, value in enumerate(evaluate(move.show, given) if move else ()):
+                for i, value in enumerate(move.show(given) if move else ()):
                     out[trial, case, k, i, j] = value * si[j]
-
-
-_OPERATIONS: dict[str, Callable[..., Any]] = {
-    "add": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "div": np.divide,
-    "neg": np.negative,
-    "pow": np.power,
-    "fma": lambda a, b, c: a * b + c,
-    "fms": lambda a, b, c: a * b - c,
-    "fnma": lambda a, b, c: c - a * b,
-}
-
-
-def evaluate(program: Program, inputs: Sequence[Any]) -> list[Any]:
-    """What a program computes, in NumPy."""
-    values = list(inputs)
-    for name, *numbers in program.operations:
-        if name == "constant":
-            values.append(np.float64(numbers[0]))
-        else:
-            values.append((_OPERATIONS.get(name) or getattr(np, name))(*[values[i] for i in numbers]))
-    return [values[i] for i in program.outputs]
 
 
 @dataclass(frozen=True)
@@ -246,4 +222,4 @@ class Rates:
             self._machine_code(at(x), at(si), at(out), len(x))
         else:
             with np.errstate(all="ignore"):
-                out[:] = evaluate(self.program, list((x * si).T))[0]
+                out[:] = self.program(list((x * si).T))[0]

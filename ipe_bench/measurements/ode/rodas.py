@@ -14,7 +14,7 @@ the error norm is a maximum, so bits do not depend on the batch.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -75,10 +75,6 @@ _MOST_STEPS = 4000
 _SMALLEST = 1e-9
 """Of the relative tolerance: the absolute one, in units of the states."""
 _SAFETY, _SHRINK, _GROW = 0.9, 0.2, 6.0
-_UFUNCS: dict[str, Any] = {"add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide}
-_UFUNCS |= {"pow": np.power, "neg": np.negative}
-
-Function = Callable[..., list[Any]]
 
 
 @dataclass(frozen=True)
@@ -100,8 +96,8 @@ class Rodas5P:
     rtol: float = 1e-8
 
     @cached_property
-    def _programs(self) -> dict[str, Function]:
-        """The equations and the derivatives that the method needs, as functions of arrays over lanes."""
+    def _programs(self) -> dict[str, Program]:
+        """The equations and the derivatives that the method needs, on arrays over lanes."""
         model, g = self.model, Graph()
         n, q, constants = model.states, model.n, model.cases.shape[1]
         t, y, p, c = g.input("t"), g.inputs("y", n), g.inputs("p", q), g.inputs("c", constants)
@@ -127,7 +123,7 @@ class Rodas5P:
             "read": (h, point),
             "dread": (tangent(h, along), point + ways),
         }
-        return {name: _function(Program.of(outputs, inputs)) for name, (outputs, inputs) in recorded.items()}
+        return {name: Program.of(outputs, inputs) for name, (outputs, inputs) in recorded.items()}
 
     def simulate(self, x: Array, stop: int) -> Array:
         """Readings (trials, cases x stop x outputs) at the first `stop` times; NaN from where a trial breaks down."""
@@ -137,9 +133,10 @@ class Rodas5P:
         """Their derivatives by x (trials, cases x stop x outputs, n)."""
         return self._integrated(x, stop, sensitive=True)[1]
 
-    def work(self, x: Array) -> Work:
-        """What the integration takes; any tolerance that shows the solution's shape will do."""
-        return self._integrated(x, len(self.model.times), sensitive=False, stretch=True)[2]
+    def measured(self, x: Array) -> tuple[Array, Work]:
+        """All readings, and what their integration takes; any tolerance that shows the solution's shape will do."""
+        z, _, work = self._integrated(x, len(self.model.times), sensitive=False, stretch=True)
+        return z, work
 
     def _integrated(self, x: Array, stop: int, *, sensitive: bool, stretch: bool = False) -> tuple[Array, Array, Work]:
         run = _Run(self, x, stop, sensitive=sensitive, stretch=stretch)
@@ -164,10 +161,10 @@ class _Run:
         self.p = np.repeat(x * model.si_sizes, len(cases), axis=0).T.copy()
         self.c = np.tile(cases, (len(x), 1)).T.copy()
         self.directions = np.eye(model.n)[:, :, None]
-        self.y = _stacked(self.do["start"](*self.p, *self.c), (lanes,))
+        self.y = _stacked(self.do["start"], [*self.p, *self.c], (lanes,))
         self.S = np.zeros((n, 0, lanes))
         if sensitive:
-            self.S = _stacked(self.do["dstart"](*self.p, *self.c, *self.directions), (self.q, lanes))
+            self.S = _stacked(self.do["dstart"], [*self.p, *self.c, *self.directions], (self.q, lanes))
         self.z = np.full((len(model.outputs), stop, lanes), np.nan)
         self.J = np.full((len(model.outputs), stop, self.q, lanes), np.nan)
         self.t, self.place, self.steps = np.zeros(lanes), np.zeros(lanes, int), np.zeros(lanes, int)
@@ -207,9 +204,9 @@ class _Run:
             if not len(here):
                 return
             at = self._at(here)
-            self.z[:, self.place[here], here] = _stacked(self.do["read"](*at), (len(here),))
+            self.z[:, self.place[here], here] = _stacked(self.do["read"], at, (len(here),))
             if self.q:
-                slopes = _stacked(self.do["dread"](*at, *self.S[:, :, here], *self.directions), (self.q, len(here)))
+                slopes = _stacked(self.do["dread"], [*at, *self.S[:, :, here], *self.directions], (self.q, len(here)))
                 self.J[:, self.place[here], :, here] = slopes.transpose(2, 0, 1)
             self.place[here] += 1
 
@@ -221,30 +218,30 @@ class _Run:
         do, q, lanes = self.do, self.q, len(live)
         t, y, p, c, S = self.t[live], self.y[:, live], self.p[:, live], self.c[:, live], self.S[:, :, live]
         n, at = len(y), (t, *y, *p, *c)
-        J = _stacked(do["J"](*at), (lanes,)).reshape(n, n, lanes)
+        J = _stacked(do["J"], at, (lanes,)).reshape(n, n, lanes)
         if self.stretched:
             finite = np.nan_to_num(np.moveaxis(J, 2, 0), posinf=0.0, neginf=0.0)
             self.stretch[live] += np.abs(np.linalg.eigvals(finite)).max(axis=1) * h / _REACH
         W = -J
         W[range(n), range(n)] += 1 / (h * GAMMA)
         exchanged = _factor(W)
-        ft = _stacked(do["ft"](*at), (lanes,))
+        ft = _stacked(do["ft"], at, (lanes,))
         ways = (*S, *self.directions)
-        dft = _stacked(do["dft"](*at, *ways), (q, lanes)) if q else 0.0
+        dft = _stacked(do["dft"], [*at, *ways], (q, lanes)) if q else 0.0
         K: list[Array] = []
         D: list[Array] = []
         u, V = y, S
         for a, b, node, weight in zip(A, C, NODES, TIME_WEIGHTS, strict=True):
             u = y + sum(w * k for w, k in zip(a, K, strict=True))
             inside = (t + node * h, *u, *p, *c)
-            rest = _stacked(do["f"](*inside), (lanes,)) + h * weight * ft
+            rest = _stacked(do["f"], inside, (lanes,)) + h * weight * ft
             rest = rest + sum(w * k for w, k in zip(b, K, strict=True)) / h
             K.append(_solve(W, exchanged, rest[:, None])[:, 0])
             if q:
                 V = S + sum(w * k for w, k in zip(a, D, strict=True))
-                rest = _stacked(do["df"](*inside, *V, *self.directions), (q, lanes)) + h * weight * dft
+                rest = _stacked(do["df"], [*inside, *V, *self.directions], (q, lanes)) + h * weight * dft
                 rest = rest + sum(w * k for w, k in zip(b, D, strict=True)) / h
-                rest = rest + _stacked(do["dJk"](*at, *K[-1], *ways), (q, lanes))
+                rest = rest + _stacked(do["dJk"], [*at, *K[-1], *ways], (q, lanes))
                 D.append(_solve(W, exchanged, rest))
         y1 = u + K[-1]  # stiffly accurate: the last stage is the error of the embedded solution
         size = self.atol + self.rtol * np.maximum(np.abs(y), np.abs(y1))
@@ -253,40 +250,15 @@ class _Run:
     def _first_step(self) -> Array:
         end = self.end or 1.0
         scale = self.atol + self.rtol * np.abs(self.y)
-        f = _stacked(self.do["f"](np.zeros(len(self.t)), *self.y, *self.p, *self.c), self.t.shape)
+        f = _stacked(self.do["f"], [np.zeros(len(self.t)), *self.y, *self.p, *self.c], self.t.shape)
         speed, size = (np.abs(f) / scale).max(axis=0), (np.abs(self.y) / scale).max(axis=0)
         return np.where((speed > 1e-5) & (size > 1e-5), np.minimum(1e-3 * size / speed, end), 1e-6 * end)
 
 
-def _function(program: Program) -> Function:
-    """A program as a function of arrays; its outputs may be numbers."""
-
-    def run(*inputs: Any) -> list[Any]:
-        values: list[Any] = list(inputs)
-        for operation, *operands in program.operations:
-            values.append(_apply(operation, operands, values))
-        return [values[i] for i in program.outputs]
-
-    return run
-
-
-def _apply(operation: str, operands: Sequence[Any], values: Sequence[Any]) -> Any:
-    if operation == "constant":
-        return operands[0]
-    args = [values[i] for i in operands]
-    match operation:
-        case "fma":
-            return args[0] * args[1] + args[2]
-        case "fms":
-            return args[0] * args[1] - args[2]
-        case "fnma":
-            return args[2] - args[0] * args[1]
-    return (_UFUNCS.get(operation) or getattr(np, operation))(*args)
-
-
-def _stacked(values: Sequence[Any], shape: tuple[int, ...]) -> Array:
-    out = np.empty((len(values), *shape))
-    for row, value in zip(out, values, strict=True):
+def _stacked(program: Program, inputs: Sequence[Any], shape: tuple[int, ...]) -> Array:
+    """The outputs of a program, of which some may be numbers, as one array."""
+    out = np.empty((len(program.outputs), *shape))
+    for row, value in zip(out, program(inputs), strict=True):
         row[...] = value
     return out
 

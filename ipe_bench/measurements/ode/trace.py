@@ -1,25 +1,29 @@
 """Records plain arithmetic as an expression graph, and differentiates it.
 
 A right-hand side written once in ordinary Python arithmetic is called with `Expression` objects instead of numbers.
-What comes back knows every operation, so it can be listed as a straight-line program (`Program`) or differentiated
-exactly in forward mode (`tangent`). Turning programs into machine code is left to `integrator`.
+What comes back knows every operation, so it can be listed as a straight-line program (`Program`), which runs on NumPy
+arrays, or differentiated exactly in forward mode (`tangent`). Machine code is left to `integrator`.
 """
 
 from __future__ import annotations
 
+import importlib
 import math
 import operator
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
 
 Operand: TypeAlias = "Expression | float"
 
-_FUNCTIONS = ("sin", "cos", "tan", "arctan", "exp", "log", "sqrt", "sinh", "cosh", "tanh")
-_BINARY = ("add", "sub", "mul", "div")
+_FUNCTIONS = ("sin", "cos", "tan", "arctan", "exp", "log", "sqrt", "sinh", "cosh", "tanh", "erf", "erfc")
 _UFUNCS = {"add": "add", "subtract": "sub", "multiply": "mul", "divide": "div", "true_divide": "div", "power": "pow"}
+_UFUNCS |= {"negative": "neg", "less": "less", "less_equal": "less_equal"} | {name: name for name in _FUNCTIONS}
+COMPARISONS = ("less", "less_equal")
+"""Operations that are 1 where they hold and 0 elsewhere."""
 
 
 class Graph:
@@ -78,6 +82,12 @@ class Graph:
                 return self.apply("sub", args[1], args[0].operands[0])
             case ("sub", _) if args[1].operation == "neg":
                 return self.apply("add", args[0], args[1].operands[0])
+            case ("where", [float(condition), _, _]):
+                return args[1] if condition else args[2]
+            case ("where", [None, 1.0, 0.0]) if args[0].operation in COMPARISONS:
+                return args[0]
+            case ("where", _) if args[1] is args[2]:
+                return args[1]
         return None
 
 
@@ -90,7 +100,7 @@ def _reflected(name: str) -> Any:
 
 
 class Expression:
-    """A quantity that is not known yet: supports + - * / **, and NumPy's elementary functions."""
+    """A quantity that is not known yet: supports + - * / **, NumPy's elementary functions, comparisons and np.where."""
 
     __slots__ = ("graph", "operands", "operation", "order")
 
@@ -118,25 +128,54 @@ class Expression:
         return self
 
     def __bool__(self) -> bool:
-        raise TypeError("a recorded expression has no truth value: write the model without if, min, max or comparisons")
+        remedy = "np.where, np.minimum and np.maximum are recorded"
+        raise TypeError(f"a recorded expression has no truth value: write the model without if, min and max; {remedy}")
 
-    __lt__ = __le__ = __gt__ = __ge__ = lambda self, other: bool(self)
+    __lt__, __gt__ = _operator("less"), _reflected("less")
+    __le__, __ge__ = _operator("less_equal"), _reflected("less_equal")
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
         if method != "__call__" or kwargs:
             return NotImplemented
-        if ufunc.__name__ == "negative":
-            return -self
-        name = _UFUNCS.get(ufunc.__name__, ufunc.__name__)
-        if name not in _BINARY and name not in _FUNCTIONS and name != "pow":
-            raise TypeError(f"np.{ufunc.__name__} cannot be recorded; use + - * / ** and {', '.join(_FUNCTIONS)}")
-        return self.graph.apply(name, *inputs)
+        if ufunc.__name__ in _COMPOSED:
+            return _COMPOSED[ufunc.__name__](self.graph.apply, *inputs)
+        if ufunc.__name__ not in _UFUNCS:
+            known = ", ".join((*_FUNCTIONS, *_COMPOSED))
+            raise TypeError(f"np.{ufunc.__name__} cannot be recorded; use + - * / **, np.where and {known}")
+        return self.graph.apply(_UFUNCS[ufunc.__name__], *inputs)
+
+    def __array_function__(self, function: Any, types: Any, args: tuple[Any, ...], kwargs: Any) -> Any:
+        if function is not np.where or len(args) != 3:
+            raise TypeError(f"np.{function.__name__} cannot be recorded; apply it to numbers, or write it out")
+        return self.graph.apply("where", *args)
 
     def __getattr__(self, name: str) -> Any:
         # NumPy calls the method `sin` of each element when np.sin meets an array of objects.
         if name in _FUNCTIONS:
             return lambda: self.graph.apply(name, self)
         raise AttributeError(name)
+
+
+_COMPOSED: dict[str, Callable[..., Any]] = {
+    "greater": lambda apply, a, b: apply("less", b, a),
+    "greater_equal": lambda apply, a, b: apply("less_equal", b, a),
+    "equal": lambda apply, a, b: apply("mul", apply("less_equal", a, b), apply("less_equal", b, a)),
+    "not_equal": lambda apply, a, b: apply("add", apply("less", a, b), apply("less", b, a)),
+    "absolute": lambda apply, a: apply("where", apply("less", a, 0.0), apply("neg", a), a),
+    "minimum": lambda apply, a, b: _first_if(apply, "less", a, b, a, b),
+    "maximum": lambda apply, a, b: _first_if(apply, "less", b, a, a, b),
+}
+"""NumPy's functions that are made of several operations."""
+
+
+def _first_if(apply: Callable[..., Any], comparison: str, low: Any, high: Any, a: Any, b: Any) -> Any:
+    """a where `low` is less than `high`, b where it is not, and not a number where one of them is not."""
+    return apply("where", apply(comparison, low, high), a, apply("where", apply("less_equal", high, low), b, a + b))
+
+
+def _special(name: str) -> Callable[[Any], Any]:
+    """A function of scipy.special, which is imported where one is needed."""
+    return lambda a: getattr(importlib.import_module("scipy.special"), name)(a)
 
 
 _NUMBERS: dict[str, Callable[..., Any]] = {
@@ -147,7 +186,25 @@ _NUMBERS: dict[str, Callable[..., Any]] = {
     "pow": operator.pow,
     "neg": operator.neg,
     "arctan": math.atan,
+    "less": operator.lt,
+    "less_equal": operator.le,
+    "where": lambda condition, a, b: a if condition else b,
 } | {name: getattr(math, name) for name in _FUNCTIONS if name != "arctan"}
+_ARRAYS: dict[str, Callable[..., Any]] = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": np.divide,
+    "pow": np.power,
+    "neg": np.negative,
+    "less": lambda a, b: np.less(a, b) * 1.0,
+    "less_equal": lambda a, b: np.less_equal(a, b) * 1.0,
+    "where": lambda condition, a, b: np.where(condition, a, b)[()],
+    "fma": lambda a, b, c: a * b + c,
+    "fms": lambda a, b, c: a * b - c,
+    "fnma": lambda a, b, c: c - a * b,
+} | {name: getattr(np, name, None) or _special(name) for name in _FUNCTIONS}
+"""The operations of a program, on arrays; products are rounded before they are added."""
 _DERIVATIVES: dict[str, Callable[[Any, Any, Any], Any]] = {
     "tan": lambda e, a, one: one + e * e,
     "sin": lambda e, a, one: np.cos(a),
@@ -159,6 +216,8 @@ _DERIVATIVES: dict[str, Callable[[Any, Any, Any], Any]] = {
     "sinh": lambda e, a, one: np.cosh(a),
     "cosh": lambda e, a, one: np.sinh(a),
     "tanh": lambda e, a, one: one - e * e,
+    "erf": lambda e, a, one: 2.0 / math.sqrt(math.pi) * np.exp(-(a * a)),
+    "erfc": lambda e, a, one: -2.0 / math.sqrt(math.pi) * np.exp(-(a * a)),
 }
 """Of e, a function of a."""
 
@@ -178,7 +237,8 @@ def _partials(e: Expression) -> list[Any]:
         case "div":
             return [one / b, -(e / b)]
         case "pow":
-            to_exponent = e * np.log(a) if b.value is None else e.graph.constant(0.0)
+            # d(a^b)/db = a^b log(a), which is 0 where a = 0 and b > 0, and not 0 times infinity.
+            to_exponent = e.graph.apply("where", e, e * np.log(a), 0.0) if b.value is None else e.graph.constant(0.0)
             return [b * a ** (b - 1.0), to_exponent]
         case "neg":
             return [-one]
@@ -243,8 +303,12 @@ def tangent(outputs: Sequence[Expression], direction: Mapping[Expression, Expres
             along[e.order] = direction.get(e, zero)
             continue
         moving = [(along[a.order], i) for i, a in enumerate(e.operands) if along[a.order] is not zero]
-        if not moving:
+        if not moving or e.operation in COMPARISONS:
             along[e.order] = zero
+            continue
+        if e.operation == "where":  # a branch that is not taken may have no slope
+            condition, *branches = operands(e)
+            along[e.order] = e.graph.apply("where", condition, *(along[a.order] for a in branches))
             continue
         partials = _partials(e)
         total = zero
@@ -300,6 +364,10 @@ def _linear(e: Expression, own: list[_Parts | None], joined: Any) -> _Parts:
         first, second = (part or _Parts(None, None) for part in own)
         pairs = ((first.homogeneous, second.homogeneous), (first.source, second.source))
         return _Parts(*(_sum(e.operation, a, b) for a, b in pairs))
+    if e.operation == "where":
+        first, second = (part or _Parts(None, None) for part in own[1:])
+        pairs = ((first.homogeneous, second.homogeneous), (first.source, second.source))
+        return _Parts(*(_chosen(operands(e)[0], a, b) for a, b in pairs))
     place = next(i for i, part in enumerate(own) if part is not None)
     part = own[place]
     assert part is not None
@@ -319,6 +387,12 @@ def _sum(operation: str, a: Expression | None, b: Expression | None) -> Expressi
     if a is None or b is None:
         return (-b if operation == "sub" else b) if b is not None else a
     return a.graph.apply(operation, a, b)
+
+
+def _chosen(condition: Expression, a: Expression | None, b: Expression | None) -> Expression | None:
+    if a is None and b is None:
+        return None
+    return condition.graph.apply("where", condition, 0.0 if a is None else a, 0.0 if b is None else b)
 
 
 @dataclass(frozen=True)
@@ -351,6 +425,25 @@ class Program:
                 operations.append(_operation(e, fused.get(e.order), number))
                 number[e.order] = len(inputs) + len(operations) - 1
         return cls(len(inputs), tuple(operations), tuple(number[e.order] for e in outputs))
+
+    @cached_property
+    def _released(self) -> tuple[tuple[int, ...], ...]:
+        """The values that nothing needs after each operation."""
+        needed, released = set(self.outputs), []
+        for name, *numbers in reversed(self.operations):
+            released.append(() if name == "constant" else tuple(set(numbers) - needed))
+            needed.update(released[-1])
+        return tuple(reversed(released))
+
+    def __call__(self, inputs: Sequence[Any]) -> list[Any]:
+        """The outputs by NumPy, entry by entry; a formula on a million rows keeps few arrays."""
+        values = list(inputs)
+        for (name, *numbers), released in zip(self.operations, self._released, strict=True):
+            result = np.float64(numbers[0]) if name == "constant" else _ARRAYS[name](*[values[i] for i in numbers])
+            values.append(result)
+            for i in released:
+                values[i] = None
+        return [values[i] for i in self.outputs]
 
 
 _Fusion: TypeAlias = "tuple[str, Expression, Expression]"
