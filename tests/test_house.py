@@ -34,7 +34,7 @@ BUDGETS = {
     "solvers": 1250,
     "baselines": 2410,
     "trials": 2050,
-    "runs": 2215,
+    "runs": 2220,
     "statistics": 4400,
     "real": 2080,
     "plugins": 1510,

@@ -10,10 +10,10 @@ import numpy as np
 
 from ipe_bench.basics.machine import cores
 from ipe_bench.cli.spec import Spec
+from ipe_bench.runs.key import ResultKey
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import result_keys, validate
 from ipe_bench.runs.schedule import plan
-from ipe_bench.runs.store import ResultKey
 from ipe_bench.trials.scoring import Block
 
 _TRIED = 4

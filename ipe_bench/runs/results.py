@@ -16,7 +16,7 @@ from collections.abc import Collection as Keys
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -25,7 +25,10 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.parts import TRUTH, Outdated, Part, Unusable, as_array, read_record
 from ipe_bench.runs.provenance import canonical_json
-from ipe_bench.runs.store import ResultKey, Store, describe_names, gaps, title
+from ipe_bench.runs.store import Store, describe_names, gaps, title
+
+if TYPE_CHECKING:
+    from ipe_bench.runs.key import ResultKey
 
 T = TypeVar("T")
 _AGAIN = "run the same command again, which computes it anew"

@@ -23,9 +23,10 @@ from threadpoolctl import ThreadpoolController
 from ipe_bench.basics.errors import StorageError
 from ipe_bench.estimators.base import estimate_safely
 from ipe_bench.runs.execution.base import FATAL, Execution, Failure
+from ipe_bench.runs.key import ResultKey
 from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.runs.results import Results
-from ipe_bench.runs.store import ResultKey, Store, describe_names
+from ipe_bench.runs.store import Store, describe_names
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import HISTORIES, Block
 

@@ -17,7 +17,7 @@ from ipe_bench.cli.main import main
 from ipe_bench.noise import Correlated, Gaussian
 from ipe_bench.report.tables import overview
 from ipe_bench.report.terminal import render
-from ipe_bench.runs.store import ResultKey
+from ipe_bench.runs.key import ResultKey
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.collect import collect
 
