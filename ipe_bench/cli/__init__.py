@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Collection, Iterable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.errors import UserError, unknown
 
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
 
     from ipe_bench.report.table import Part
 
+NAMES = tuple[str, ...]
+"""The type of a key that takes names, as in fail_on=success,error."""
 _WIDTH_WITHOUT_TERMINAL = 120
 
 
@@ -56,20 +59,31 @@ def show(parts: Iterable[Part]) -> None:
     out.print(terminal(parts, out.width))
 
 
-def given_keys(command: str, words: Sequence[str], keys: Collection[str]) -> dict[str, str]:
-    """The words KEY=VALUE after a command that Hydra does not read.
+def places_and_keys(command: str, words: Sequence[str], kinds: Mapping[str, Any]) -> tuple[list[str], dict[str, Any]]:
+    """The files and folders after a command that Hydra does not read, and the values of its keys by their types."""
+    from ipe_bench.basics.options import checked
 
-    Raises:
-        UserError: a key is none of `keys`, stands there twice, or has no value.
-    """
-    found: dict[str, str] = {}
-    for word in words:
-        key, _, value = word.partition("=")
-        if key not in keys:
-            raise UserError(f"{command}: {word}: {unknown(key, keys, 'key')}")
+    places = [word for word in words if "=" not in word or Path(word).is_dir()]
+    found: dict[str, Any] = {}
+    for word in (word for word in words if word not in places):
+        key, _, text = word.partition("=")
+        if key not in kinds:
+            raise UserError(f"{command}: {word}: {unknown(key, kinds, 'key')}")
         if key in found:
             raise UserError(f"{command}: {word}: {key} stands there twice; give it once")
-        if not value:
+        if not text:
             raise UserError(f"{command}: {word}: give it a value")
-        found[key] = value
-    return found
+        value: Any = text
+        if kinds[key] is NAMES:
+            value = [name.strip() for name in text.strip("[]").split(",") if name.strip()]
+        elif kinds[key] is not str:
+            value = {"true": True, "false": False}.get(text) if kinds[key] is bool else _number(text)
+        found[key] = checked(text if value is None else value, kinds[key], key)
+    return places, found
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import given_keys, say, show
+from ipe_bench.cli import places_and_keys, say, show
 
 
 def main(arguments: Sequence[str]) -> int:
     """Prints what was found; exit code 1 if the covariance is surely wrong."""
-    files = [a for a in arguments if "=" not in a]
-    given = given_keys("audit", [a for a in arguments if "=" in a], ("output",))
+    files, given = places_and_keys("audit", arguments, {"output": str})
     if len(files) != 1:
         raise UserError("audit: name one table of truths, estimates and deviations, such as runs.csv")
     from ipe_bench.api import audit

@@ -6,15 +6,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import given_keys, print_problems, say
+from ipe_bench.cli import places_and_keys, print_problems, say
 from ipe_bench.runs.bundles import SUFFIX, Bundle, is_bundle, read_bundle, write_bundle
 from ipe_bench.runs.results import Results
 
 
 def main(arguments: Sequence[str]) -> int:
     """Writes the archive, or checks one; exit code 1 where the folders lack something that was asked for."""
-    paths = [Path(word) for word in arguments if not word.startswith("output=")]
-    output = given_keys("bundle", [w for w in arguments if w.startswith("output=")], ("output",)).get("output")
+    places, keys = places_and_keys("bundle", arguments, {"output": str})
+    paths, output = [Path(place) for place in places], keys.get("output")
     if not paths:
         raise UserError("bundle: name at least one folder of results, such as outputs/paper, or a bundle to check")
     if any(map(is_bundle, paths)):

@@ -9,15 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from ipe_bench.basics.machine import cores
+from ipe_bench.cli.progress import duration
 from ipe_bench.cli.spec import Spec
 from ipe_bench.runs.key import ResultKey
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import result_keys, validate
-from ipe_bench.runs.schedule import plan
 from ipe_bench.trials.scoring import Block
 
-_TRIED = 4
+_TRIED = 2
 """Trials that an estimator is timed on where the folder holds none of it."""
+_PATIENCE_S = 4.0
+"""Seconds of such trials; after that an estimator that was timed at another error scale is not timed again."""
 
 
 @dataclass
@@ -29,30 +31,30 @@ class DryRun:
     seconds: float = 0.0
     """Of one core."""
     workers: int = 1
-    most: str = ""
+    at_most: str = ""
     """Says so where a precision may stop a job earlier."""
-    tried: dict[tuple[str, str, float], float] = field(default_factory=dict)
-    """Seconds per trial, by what they depend on most."""
+    at_least: str = ""
+    """Says so where an estimator was timed at an easier error scale alone."""
+    tried: dict[tuple[str, str], dict[float, float]] = field(default_factory=dict)
+    """Seconds per trial, of an estimator on a model, by the error scale."""
+    spent: float = 0.0
 
     def add(self, job: Spec, title: str) -> str:
         """Notes what a job lacks; a line for people."""
         validate([job.scenario], job.estimators, job.count, job.block_size)
-        cells, output = result_keys(job.scenario, job.estimators), Path(job.output)
+        cells, output = result_keys(job.scenario, job.estimators)[1:], Path(job.output)
         results = Results.read([output] if output.is_dir() else [], keys={cell.key for cell in cells})
-        lacking = dict.fromkeys((cell.key for cell in cells if cell.estimator is not None), 0)
-        for task in plan(output, cells, results, job.count, job.block_size):
-            for cell in task.cells:
-                if cell.key in lacking:
-                    lacking[cell.key] += task.stop - task.start
-        asked, missing = job.count * len(lacking), sum(lacking.values())
-        seconds = sum(lacking[c.key] * self._per_trial(c, results) for c in cells if lacking.get(c.key))
+        lacking = [sum(stop - start for start, stop in results.missing(cell.key, job.count)) for cell in cells]
+        asked, missing = job.count * len(cells), sum(lacking)
+        pairs = zip(cells, lacking, strict=True)
+        seconds = sum(count * self._per_trial(cell, results) for cell, count in pairs if count)
         self.stored += asked - missing
         self.missing += missing
         self.seconds += seconds
         most = "" if job.precision is None else "at most "
-        self.most = self.most or most
+        self.at_most = self.at_most or most
         self.workers = getattr(job.execution, "workers", None) or cores()
-        more = f", {most}{missing} are missing (on one core {duration(seconds)})" if missing else ""
+        more = f", {most}{missing} are missing (on one core {self.at_least}{duration(seconds)})" if missing else ""
         return f"{title}: {asked - missing} of {asked} estimates are stored{more}"
 
     def _per_trial(self, cell: ResultKey, results: Results) -> float:
@@ -60,28 +62,26 @@ class DryRun:
         known, scenario = results.stored.get(cell.key), cell.scenario
         if known is not None:
             return float(np.nanmean(results.load(known, ("time_s",))["time_s"]))
-        place = (cell.label, scenario.measurement.name, scenario.error_scale)
-        if place not in self.tried and cell.estimator is not None:
+        assert cell.estimator is not None
+        times = self.tried.setdefault((cell.label, scenario.measurement.name), {})
+        if scenario.error_scale not in times:
+            if times and self.spent > _PATIENCE_S:
+                self.at_least = "at least "
+                return max(times.values())
             block = Block.draw(scenario, 0, 1 if scenario.noise.real else _TRIED)
-            block.estimate(cell.estimator)  # compiled code is loaded
+            if not times:
+                block.estimate(cell.estimator)  # compiled code is loaded
             began = time.perf_counter()
             block.estimate(cell.estimator)
-            self.tried[place] = (time.perf_counter() - began) / len(block.trials.x)
-        return self.tried[place]
+            took = time.perf_counter() - began
+            self.spent += took
+            times[scenario.error_scale] = took / len(block.trials.x)
+        return times[scenario.error_scale]
 
     def summary(self) -> str:
         """What it comes to, in a line."""
         if not self.missing:
             return f"all {self.stored} estimates are stored; nothing would be computed"
-        return (
-            f"{self.stored} estimates are stored, {self.most}{self.missing} would be computed, in about "
-            f"{duration(self.seconds / self.workers)} on {self.workers} cores; nothing was computed now"
-        )
-
-
-def duration(seconds: float) -> str:
-    """About how long, for people."""
-    for size, unit in ((86_400.0, "days"), (3600.0, "h"), (60.0, "min")):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.2g} {unit}"
-    return "a moment" if seconds < 0.1 else f"{seconds:.2g} s"
+        about = f"{self.at_least}about {duration(self.seconds / self.workers)} on {self.workers} cores"
+        missing = f"{self.at_most}{self.missing} would be computed, in {about}"
+        return f"{self.stored} estimates are stored, {missing}; nothing was computed now"

@@ -16,9 +16,9 @@ from ipe_bench.cli import discard_output, interrupts
 from ipe_bench.cli.parser import COMMANDS, parsers
 
 GONE = {
-    "completion": 'eval "$(ipe-bench -sc install=bash)"'
-    " lets bash complete (install=zsh, install=fish likewise); "
-    "names inside of lists are no longer completed"
+    "completion": 'eval "$(ipe-bench -sc install=bash)" lets bash complete (install=zsh, install=fish likewise); names '
+    "inside of lists are no longer completed",
+    "schema": "`ipe-bench list GROUP/NAME` shows every option with its type and default",
 }
 """Commands of earlier versions, and what to use instead."""
 

@@ -41,10 +41,6 @@ def _several(name: str, metavar: str, what: str) -> Argument:
     return _argument(name, metavar=metavar, nargs="*", help=what)
 
 
-def _verbose(what: str) -> Argument:
-    return _argument("-v", "--verbose", action="store_true", help=what)
-
-
 COMMANDS: dict[str, tuple[str, str, str, tuple[Argument, ...]]] = {
     "run": (
         "simulate, estimate, store and report",
@@ -205,7 +201,7 @@ The same results give the same file, so that the digest may stand in a paper. Ot
         "",
         (
             _several("arguments", "DIR", "folders of results, such as outputs/paper"),
-            _verbose("with what is complete, too"),
+            _argument("-v", "--verbose", action="store_true", help="with what is complete, too"),
         ),
     ),
     "list": (
@@ -214,7 +210,7 @@ The same results give the same file, so that the digest may stand in a paper. Ot
         "",
         (
             _several("names", "GROUP", "solver, measurement, ... or keys; solver/newton: its options"),
-            _verbose("with each one's options, and the parameters and readings file of measurements"),
+            _argument("-v", "--verbose", action="store_true", help="with the options of each, and the files of models"),
         ),
     ),
     "check": (
@@ -231,19 +227,6 @@ The same results give the same file, so that the digest may stand in a paper. Ot
             _argument("kind", metavar="KIND", help=f"{', '.join((*MODELS, *KINDS[:-1]))} or {KINDS[-1]}"),
             _argument("name", metavar="NAME", help="small letters, digits and underscores"),
         ),
-    ),
-    "schema": (
-        "a JSON schema of config files, for editors that complete and check them",
-        "",
-        """
-  ipe-bench schema > ipe-bench.schema.json
-
-Visual Studio Code with its YAML extension, in settings.json:
-                    "yaml.schemas": {"ipe-bench.schema.json": "**/conf/**/*.yaml"}
-Any editor with yaml-language-server, in a file: # yaml-language-server: $schema=ipe-bench.schema.json
-Options of plugins are in it as far as they are found from here; write it again after a new one.
-""",
-        (),
     ),
 }
 """Each command's line, its exit codes besides 2, what its help says more, and its arguments."""
@@ -272,11 +255,7 @@ class Parser(argparse.ArgumentParser):
         return self.prog.partition(" ")[2]
 
     def parse(self, words: Sequence[str]) -> argparse.Namespace:
-        """The values of these words.
-
-        Raises:
-            UserError: a flag or a word that the command does not take, or one that it wants is not there.
-        """
+        """The values of these words."""
         values, surplus = self.parse_known_intermixed_args(words)
         if not surplus:
             return values

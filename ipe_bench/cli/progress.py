@@ -80,7 +80,7 @@ def _state(progress: Progress) -> str:
     """How far a job is, with the rate and the forecast once there are any."""
     failed = f", {len(progress.failures)} failed" if progress.failures else ""
     rate = f", {_rounded(progress.rate)} estimates/s" if progress.rate else ""
-    left = "" if progress.seconds_left is None else f", {_duration(progress.seconds_left)} left"
+    left = "" if progress.seconds_left is None else f", {duration(progress.seconds_left)} left"
     return f"block {progress.done}/{progress.tasks}{failed}" + (
         ", compiling, once" if progress.preparing else rate + left
     )
@@ -100,7 +100,7 @@ def _line_watcher(console: Console, title: str) -> Watcher:
         elif progress.done == progress.tasks:
             failed = f", {len(progress.failures)} failed" if progress.failures else ""
             blocks = "1 block" if progress.tasks == 1 else f"{progress.tasks} blocks"
-            say(f"{blocks}{failed} in {_duration(now - began)}, {_rounded(progress.rate)} estimates/s")
+            say(f"{blocks}{failed} in {duration(now - began)}, {_rounded(progress.rate)} estimates/s")
         elif now - spoken >= LINE_EVERY_S:
             spoken = now
             say(_state(progress))
@@ -112,7 +112,8 @@ def _rounded(rate: float) -> str:
     return f"{rate:.0f}" if rate >= 10 else f"{rate:.2g}"
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """A time for people: 2.5 s, 3 min 20 s, 5 h 07 min."""
     if seconds < 60:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)

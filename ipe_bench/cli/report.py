@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import console, given_keys, print_problems, say
+from ipe_bench.cli import NAMES, console, places_and_keys, print_problems, say
 from ipe_bench.report import begin_report
 from ipe_bench.report.choice import PAGE, Which
 from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
@@ -18,17 +18,15 @@ from ipe_bench.runs.results import require_results
 if TYPE_CHECKING:
     from ipe_bench.statistics.collect import Collection
 
-_KEYS = ("output", "figures", "formats")
-_PAPER = ("output", "paper", "columns", "width")
+_KEYS = {"output": str, "figures": str, "formats": str}
+_PAPER = {"output": str, "paper": NAMES, "columns": NAMES, "width": float}
 """Keys of tables and figures for a paper."""
 
 
 def main(arguments: Sequence[str]) -> int:
     """Writes the report on these folders, or bundles; exit code 1 where something that was asked for is missing."""
-    named = [word for word in arguments if "=" not in word or Path(word).is_dir()]
-    words = [word for word in arguments if word not in named]
-    for_paper = any(word.partition("=")[0] in _PAPER[1:] for word in words)
-    keys = given_keys("report", words, _PAPER if for_paper else _KEYS)
+    for_paper = any(word.startswith(("paper=", "columns=", "width=")) for word in arguments)
+    named, keys = places_and_keys("report", arguments, _PAPER if for_paper else _KEYS)
     output = Path(keys["output"]) if "output" in keys else None
     if not named:
         raise UserError("report: name at least one directory of results, such as outputs/paper")
@@ -103,28 +101,18 @@ def _counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def _paper(folders: Sequence[Path], keys: Mapping[str, str]) -> int:
+def _paper(folders: Sequence[Path], keys: Mapping[str, Any]) -> int:
     """Writes tables and figures as a paper wants them; exit code 1 where data are missing."""
     from ipe_bench.plugins.extensions import use_statistics
     from ipe_bench.report.paper import export
     from ipe_bench.statistics import analyse
 
-    names, columns = _listed(keys.get("paper", "")), _listed(keys.get("columns", ""))
-    if not names:
+    if not keys.get("paper"):
         raise UserError("paper=: name tables and figures, such as paper=overview,error_against_scale")
-    width = {}
-    if "width" in keys:
-        try:
-            width["width"] = float(keys["width"].removesuffix("in"))
-        except ValueError:
-            raise UserError(f"width={keys['width']}: give inches, such as 3.5 or 7.16") from None
+    chosen = {key: keys[key] for key in ("columns", "width") if key in keys}
     faults = use_statistics()
     analysis = analyse(folders)
     analysis.collection.extra_problems += faults
-    say(*map(str, export(analysis, Path(keys.get("output", folders[0] / "paper")), names, columns, **width)))
+    say(*map(str, export(analysis, Path(keys.get("output", folders[0] / "paper")), keys["paper"], **chosen)))
     print_problems([*analysis.problems, *analysis.stale])
     return 1 if analysis.problems else 0
-
-
-def _listed(value: str) -> list[str]:
-    return [name for name in (part.strip() for part in value.strip("[]").split(",")) if name]

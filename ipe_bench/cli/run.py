@@ -13,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from ipe_bench.basics.errors import StorageError, UserError
+from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import interrupts, say
 from ipe_bench.cli import words as w
 from ipe_bench.cli.dry_run import DryRun
@@ -47,8 +47,6 @@ class Outcome:
     """Whether it did not come to its precision."""
     objective: float | None = None
     mistake: str = ""
-    full: str = ""
-    """Why nothing can be stored any more."""
 
     @property
     def job(self) -> str:
@@ -57,8 +55,8 @@ class Outcome:
 
     def __float__(self) -> float:
         """What sweepers that optimise make small; they cannot go on from a job that was refused."""
-        if self.mistake or self.full or self.objective is None:
-            raise UserError(self.mistake or self.full or "objective: is not given; a sweeper that optimises needs it")
+        if self.mistake or self.objective is None:
+            raise UserError(self.mistake or "objective: is not given; a sweeper that optimises needs it")
         return self.objective
 
 
@@ -71,31 +69,35 @@ def main(arguments: Sequence[str]) -> int:
             complete(flags.overrides)
             return 0
         words = w.read("run", flags.overrides, folder)
-        named = w.read("run", [f"default_name='{w.default_name(words.overrides)}'"])
-        jobs = jobs_of(w.Words(words.overrides + named.overrides), multirun=flags.multirun)
+        named = w.read("run", [f"default_name='{w.default_name(words)}'"])
+        words = replace(words, overrides=words.overrides + named.overrides)
+        jobs = jobs_of(words, multirun=flags.multirun)
         if flags.cfg or flags.info:
-            show(jobs.words, flags)
+            show(words, flags)
             return 0
-        jobs.words.refuse(OF_FILES, "is for `ipe-bench estimate`: run simulates its readings")
-        for one in jobs.specs:
-            _ = one.scenario  # whose parts may not suit one another
+        words.refuse(OF_FILES, "is for `ipe-bench estimate`: run simulates its readings")
         if words.standard_baselines:
             jobs = replace(jobs, specs=[one.suited() for one in jobs.specs])
+        for one in jobs.specs:
+            _ = one.scenario  # whose parts may not suit one another
         if flags.dry_run:
-            dry = DryRun()
-            own = [[w.forced(one) for one in job] for job in jobs.overrides]
-            for i, one in enumerate(jobs.specs):
-                # Not known: what a sweeper of Hydra's chooses, and what only some jobs of a very large sweep have.
-                print(dry.add(one, title(one, own[i] if len(own) == len(jobs.specs) else words.text)))
-            print(dry.summary())
-            return 0
+            return _say_what_is_missing(jobs)
         if words.standard_baselines:
             say(*_left_out(jobs.specs))
-        task = Task(shlex.join(["ipe-bench", "run", *arguments]), words.standard_baselines)
-        for told, spec in jobs.here():
-            task.compute(told, spec, jobs.specs[0].output)
-        outcomes = task.outcomes if jobs.overrides else jobs.launch(task) or task.outcomes
+        task = Task(shlex.join(["ipe-bench", "run", *arguments]), words)
+        for told, spec in zip(jobs.told, jobs.specs, strict=False):
+            task.compute(told, spec)
+        outcomes = task.outcomes if jobs.told else jobs.launch(task) or task.outcomes
     return _conclude(jobs, outcomes)
+
+
+def _say_what_is_missing(jobs: Jobs) -> int:
+    dry = DryRun()
+    # The words of a job are not known where a sweeper of Hydra's chooses them.
+    for told, one in zip(jobs.told or [jobs.words.text] * len(jobs.specs), jobs.specs, strict=True):
+        print(dry.add(one, title(one, w.as_typed(told, jobs.words.files))))
+    print(dry.summary())
+    return 0
 
 
 def _left_out(jobs: Sequence[Spec]) -> list[str]:
@@ -106,7 +108,7 @@ def _left_out(jobs: Sequence[Spec]) -> list[str]:
 
 
 def _flags(arguments: Sequence[str]) -> Namespace:
-    """What the flags say, and the other words as `overrides`."""
+    """The flags, and the other words as `overrides`."""
     waiting = list(arguments)
     for i, word in enumerate(waiting):
         # The topic may be left out: what follows may be an override as well.
@@ -124,14 +126,14 @@ def _flags(arguments: Sequence[str]) -> Namespace:
 
 
 class Task:
-    """Computes jobs. A mistake in one stops no other; once nothing can be stored, no other is begun in this process."""
+    """Computes jobs; a mistake in one stops no other."""
 
-    def __init__(self, command: str, standard: bool) -> None:
+    def __init__(self, command: str, words: w.Words) -> None:
         self.command = command
         """As it was typed."""
-        self.standard = standard
+        self.files = words.files
+        self.standard = words.standard_baselines
         """Whether the baselines are those of a plain run."""
-        self.full = ""
         self.outcomes: list[Outcome] = []
         """Of the jobs in this process: a sweeper that optimises keeps to itself what they return."""
 
@@ -142,24 +144,18 @@ class Task:
         elsewhere = hydra.mode == RunMode.MULTIRUN and not hydra.launcher["_target_"].endswith(".BasicLauncher")
         try:
             spec = spec_of(config)
-            if elsewhere:
-                spec = replace(spec, execution=Serial())
         except UserError as error:
-            spec = error
-        return self.compute(hydra.overrides.task, spec, str(config.output))
+            self.outcomes.append(Outcome(str(config.output), tuple(hydra.overrides.task), mistake=str(error)))
+            return self.outcomes[-1]
+        spec = spec.suited() if self.standard else spec
+        return self.compute(hydra.overrides.task, replace(spec, execution=Serial()) if elsewhere else spec)
 
-    def compute(self, words: Sequence[str], spec: Spec | UserError, output: str) -> Outcome:
-        """Computes a job, or notes why there is none; `output` is where it would go then."""
-        done = Outcome(output if isinstance(spec, UserError) else spec.output, tuple(words), full=self.full)
+    def compute(self, words: Sequence[str], spec: Spec) -> Outcome:
+        """Computes a job."""
+        done = Outcome(spec.output, w.as_typed(words, self.files))
         try:
-            if isinstance(spec, UserError):
-                raise spec
-            if not self.full:
-                done = _computed(spec.suited() if self.standard else spec, done, self.command)
-                accept(done.output, done.job)
-        except StorageError as error:
-            self.full = str(error)
-            done = replace(done, full=self.full)
+            done = _computed(spec, done, self.command)
+            accept(done.output, done.job)
         except UserError as error:
             done = replace(done, mistake=str(error))
         self.outcomes.append(done)
@@ -197,21 +193,20 @@ def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
 
 def _conclude(jobs: Jobs, outcomes: list[Outcome]) -> int:
     """Shows what the jobs came to; the exit code."""
-    if full := [one.full for one in outcomes if one.full]:
-        raise StorageError(full[0])
     end_idle()  # a report on many trials has use for their memory
-    _note_refusals(jobs, outcomes)
+    first, refused = jobs.specs[0], [one for one in outcomes if one.mistake]
+    if jobs.multirun and first.write_readings is None:
+        _note_refusals(jobs.specs, outcomes)
     code = 1 if any(one.failures or one.precision_missed for one in outcomes) else 0
     folders: dict[str, dict[str, str]] = {}
     # Of jobs that a sweeper ran in other processes nothing is known but the folder.
     for one in outcomes or [Outcome(job.output) for job in jobs.specs]:
         folders.setdefault(one.output, {}).update(one.cells)
-    first = jobs.specs[0]
     for output, cells in folders.items():
         if (Path(output) / "trials").is_dir() and first.write_readings is None:
             code = max(code, show_command(Path(output), cells, first.figures, first.formats))
     say(*_best(outcomes, jobs.maximises), *(one.stop for one in outcomes if one.stop))
-    if refused := [one for one in outcomes if one.mistake]:
+    if refused:
         raise UserError(_refused(refused, told=jobs.multirun and len(outcomes) > 1))
     return code
 
@@ -225,11 +220,11 @@ def _refused(outcomes: Sequence[Outcome], *, told: bool) -> str:
     return "; ".join(f"{r} (refused: {jobs[0]}{more[r]})" if told else r for r, jobs in which.items())
 
 
-def _note_refusals(jobs: Jobs, outcomes: Sequence[Outcome]) -> None:
+def _note_refusals(specs: Sequence[Spec], outcomes: Sequence[Outcome]) -> None:
     """Notes the refused jobs of a sweep in its folder, which holds what was asked for."""
-    known = jobs.specs if len(jobs.specs) == len(outcomes) else [None] * len(outcomes)
+    known = specs if len(specs) == len(outcomes) else [None] * len(outcomes)
     for one, spec in zip(outcomes, known, strict=True):
-        if one.mistake and jobs.multirun and jobs.specs[0].write_readings is None:
+        if one.mistake:
             parts: Any = () if spec is None else (spec.scenario, spec.estimators, spec.count)
             record_refusal(one.output, one.job, one.mistake, *parts)
 

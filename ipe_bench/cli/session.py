@@ -40,9 +40,6 @@ from ipe_bench.cli.words import Words
 from ipe_bench.measurements.nist import datasets
 from ipe_bench.plugins import discovery as plugins
 
-_EACH_JOB = 1000
-"""Largest sweep whose jobs are all constructed to be checked; of a larger one, each value of each key is."""
-
 
 class PluginConfigs(SearchPathPlugin):
     """Lets our own commands find the options of plugins, and a user's own folder first."""
@@ -79,27 +76,19 @@ def _hydra() -> Any:
 
 @dataclass(frozen=True)
 class Jobs:
-    """What a command is to do: its jobs, each checked."""
+    """The jobs of a command, each checked."""
 
     words: Words
     specs: list[Spec]
-    """Of a sweep whose jobs only its sweeper can choose, the first; of a very large one, each value of each key."""
+    """Of a sweep whose jobs only its sweeper can choose, the first."""
     multirun: bool
     maximises: bool = False
-    overrides: list[list[Override]] = field(default_factory=list)
-    """The overrides of each job; empty where Hydra's sweepers and launchers are to run them."""
+    told: list[list[str]] = field(default_factory=list)
+    """The words of each job that this process runs; empty where Hydra's sweepers and launchers are to run them.
 
-    def here(self) -> Iterator[tuple[list[str], Spec | UserError]]:
-        """The words of each job that this process runs, and its spec or why there is none. Hydra's own launcher would
-        compose each job twice again, which takes longer than a job of a few trials (`hydra/launcher=basic` shows it).
-        """
-        for i, job in enumerate(self.overrides):
-            try:
-                one = self.specs[i] if len(self.specs) == len(self.overrides) else _spec(job)
-            except UserError as error:
-                yield list(map(w.forced, job)), error
-            else:
-                yield list(map(w.forced, job)), one
+    Hydra's own launcher would compose each job twice again, which takes longer than a job of a few trials
+    (`hydra/launcher=basic` shows it).
+    """
 
     def launch(self, task: Callable[[DictConfig], Any]) -> list[Any]:
         """What each job returned, run by the launcher and the sweeper that the words choose; nothing from a sweeper
@@ -114,11 +103,7 @@ class Jobs:
 
 
 def jobs_of(words: Words, *, multirun: bool) -> Jobs:
-    """The jobs of a command; with an experiment that sweeps nobody has to say that as well.
-
-    Raises:
-        UserError: the first mistake in any job, before one has begun.
-    """
+    """The jobs of a command; an experiment that sweeps needs no flag for it."""
     config = _composed(tuple(map(w.forced, w.settled(words.overrides))), whole=True)
     hydra = config.hydra
     params = [f"{key}={value}" for key, value in (hydra.sweeper.get("params") or {}).items()]
@@ -132,30 +117,20 @@ def jobs_of(words: Words, *, multirun: bool) -> Jobs:
                 f"{w.said(one)}: interval() is for sweepers that optimise (hydra/sweeper=optuna); give the values, "
                 "such as 1,10,100"
             )
-    told = [one for one in words.overrides if one.is_hydra_override()]
-    ours = hydra.launcher["_target_"].endswith(".BasicLauncher")
-    ours = ours and not any((told, hydra.callbacks, hydra.job.chdir, hydra.job.env_set))
-    if not multirun:
-        return Jobs(words, [spec_of(config)], False, overrides=[list(words.overrides)] if ours else [])
-    if optimises:
+    if multirun and optimises:
         return Jobs(words, [spec_of(config)], True, "maximize" in str(hydra.sweeper.get("direction", "")))
-    own = [OverridesParser.create().parse_override(word) for word in params]
-    jobs = list(itertools.islice(w.jobs([*own, *words.overrides]), w.MOST_JOBS + 1))
-    if not 0 < len(jobs) <= w.MOST_JOBS:
-        number = f"more than {w.MOST_JOBS}" if jobs else "no"
-        raise UserError(f"the sweep has {number} jobs: give 1 to {w.MOST_JOBS}, and check its patterns")
-    specs = [_spec(job) for job in _checked(jobs)]
-    return Jobs(words, specs, True, overrides=jobs if ours else [])
-
-
-def _checked(jobs: list[list[Override]]) -> Iterator[list[Override]]:
-    """All jobs of a sweep; of a large one, those in which a value stands for the first time."""
-    seen: set[str | None] = set()
-    for job in jobs:
-        lines = {one.input_line for one in job}
-        if len(jobs) <= _EACH_JOB or not lines <= seen:
-            yield job
-        seen |= lines
+    jobs, specs = [list(words.overrides)], [spec_of(config)] if not multirun else []
+    if multirun:
+        own = [OverridesParser.create().parse_override(word) for word in params]
+        jobs = list(itertools.islice(w.jobs([*own, *words.overrides]), w.MOST_JOBS + 1))
+        if not 0 < len(jobs) <= w.MOST_JOBS:
+            number = f"more than {w.MOST_JOBS}" if jobs else "no"
+            raise UserError(f"the sweep has {number} jobs: give 1 to {w.MOST_JOBS}, and check its patterns")
+        specs = [_spec(job) for job in jobs]
+    told = any(one.is_hydra_override() for one in words.overrides)
+    elsewhere = told or hydra.callbacks or hydra.job.chdir or hydra.job.env_set
+    ours = hydra.launcher["_target_"].endswith(".BasicLauncher") and not elsewhere
+    return Jobs(words, specs, multirun, told=[list(map(w.forced, job)) for job in jobs] if ours else [])
 
 
 def _spec(job: Sequence[Override]) -> Spec:
@@ -178,11 +153,7 @@ def _composed(words: tuple[str, ...], *, whole: bool = False) -> DictConfig:
 
 
 def spec_of(config: DictConfig) -> Spec:
-    """The checked job of a composed config.
-
-    Raises:
-        UserError: the first mistake, by its key.
-    """
+    """The checked job of a composed config."""
     return spec(_plain(config))
 
 
@@ -209,11 +180,7 @@ def show(words: Words, flags: Any) -> None:
 
 
 def complete(words: Sequence[str]) -> None:
-    """Installs Hydra's completion, or answers a shell.
-
-    Raises:
-        UserError: the words ask for neither.
-    """
+    """Installs Hydra's completion, or answers a shell."""
     if not re.fullmatch("(install|uninstall|query)=(bash|fish|zsh)", " ".join(words)):
         shown = " ".join(words) or "nothing"
         raise UserError(f"-sc {shown}: write -sc install=SHELL or -sc uninstall=SHELL, SHELL being bash, fish, zsh")

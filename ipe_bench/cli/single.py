@@ -52,11 +52,7 @@ class Single:
 
 def single(command: str, arguments: Sequence[str], standard: Sequence[str] = (), **refused: Sequence[str]) -> Single:
     """The one job that the arguments of a command ask for; `standard` are words that stand unless others are given, and
-    `refused` are keys that mean nothing to it, by whom they are for.
-
-    Raises:
-        UserError: a mistake in the arguments, in one line.
-    """
+    `refused` are keys that mean nothing to it, by whom they are for."""
     with session():
         words = w.read(command, arguments)
         for whose, keys in refused.items():

@@ -7,12 +7,11 @@ remedy. What the values of options may be is checked where a job is constructed.
 from __future__ import annotations
 
 import copy
-import hashlib
 import itertools
 import json
 import re
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.cli.spec import KEYS
 from ipe_bench.measurements.nist import datasets
 from ipe_bench.plugins import discovery as plugins
-from ipe_bench.runs.provenance import TARGET
+from ipe_bench.runs.provenance import TARGET, digest
 
 MOST_JOBS = 10_000
 """The largest sweep."""
@@ -35,7 +34,6 @@ _FORMULA = re.compile(
 )
 """Texts that the shell has taken the quotes from; a list of units is none."""
 _FILE = re.compile(rf"\+*(?:(measurement|{TRUTH})\.file|(parameters))=(?![{{$]|null$)(.*)", re.DOTALL)
-_UNDERSCORED = re.compile(r"(?:^|[\[,:(\s])[-+]?[\d.]+_[\d_.eE+-]*(?=$|[\],})\s])")
 
 Groups = dict[str, list[str]]
 """The names of the options of each group."""
@@ -46,6 +44,8 @@ class Words:
     """What a command was told, word by word."""
 
     overrides: tuple[Override, ...]
+    files: Mapping[str, str] = field(default_factory=dict)
+    """By an override that a file holds, the word that names the file."""
 
     @property
     def text(self) -> list[str]:
@@ -68,11 +68,7 @@ class Words:
         return None if not found else str(plain(found[-1].value()))
 
     def refuse(self, keys: Collection[str], why: str) -> None:
-        """Refuses a word whose key is one of these, or below one.
-
-        Raises:
-            UserError: `KEY: why; leave it out`.
-        """
+        """Refuses a word whose key is one of these, or below one."""
         for one in self.overrides:
             if (first := _first(one)) in keys:
                 raise UserError(f"{one.key_or_group if '.' in one.key_or_group else first}: {why}; leave it out")
@@ -96,21 +92,28 @@ def chooses(override: Override) -> bool:
     return chosen or override.is_delete() or override.is_hydra_override()
 
 
-def read(command: str, words: Sequence[str], folder: Path | None = None) -> Words:
-    """The words of a command; `folder` holds configs besides ours.
+def as_typed(words: Sequence[str], files: Mapping[str, str]) -> tuple[str, ...]:
+    """The words of a job, with the file in place of what it holds."""
+    return tuple(dict.fromkeys(files.get(word, word) for word in words))
 
-    Raises:
-        UserError: a word is none, or Hydra would not do what it says.
-    """
+
+def read(command: str, words: Sequence[str], folder: Path | None = None) -> Words:
+    """The words of a command; `folder` holds configs besides ours."""
     groups = _groups(folder)
-    found = [_parse(command, part, groups) for word in words for part in _expanded(word)]
+    found: list[Override] = []
+    files: dict[str, str] = {}
+    for word in words:
+        parts = [_parse(command, part, groups) for part in _expanded(word)]
+        found += parts
+        if _FILE.fullmatch(word):
+            files |= dict.fromkeys(map(forced, parts), word)
     for override in found:
         _check(override, groups)
     _check_labels(found)
     experiments = [said(one) for one in found if one.key_or_group == "experiment"]
     if len(experiments) > 1:
         raise UserError(f"{' '.join(experiments)}: one command runs one experiment; run them one by one")
-    return Words(tuple(found))
+    return Words(tuple(found), files)
 
 
 def _groups(folder: Path | None) -> Groups:
@@ -199,8 +202,6 @@ def _parse(command: str, word: str, groups: Groups) -> Override:
         if command == "estimate" and Path(word).suffix in (".csv", ".parquet"):
             remedy = f"write readings={word}"
         raise UserError(f"{word}: is not KEY=VALUE, without spaces about the equals sign; {remedy}")
-    if _UNDERSCORED.search(value) and not value.startswith(("'", '"')):
-        raise UserError(f"{word}: has an underscore in a number; leave it out, or put a text in quotes")
     try:
         found = OverridesParser.create().parse_override(word)
     except (HydraException, ValueError, RecursionError):
@@ -235,8 +236,6 @@ def _check(override: Override, groups: Groups) -> None:
         _check_choice(override, groups)
     else:
         _check_key(override, groups)
-    if override.is_range_sweep():
-        _check_range(override)
 
 
 def _check_deletion(override: Override) -> None:
@@ -259,8 +258,6 @@ def _check_key(override: Override, groups: Groups) -> None:
     if key == "estimators":
         raise UserError(f"{word}: choose with solver= and baseline=, and set options by estimators.LABEL.KEY=VALUE")
     for value in values(override):
-        if key in ("name", "output") and str(value).strip() in ("", ".", ".."):
-            raise UserError(f"{word}: name a folder")
         if key in ("trials", "block_size") and value is None:
             raise UserError(f"{word}: cannot be null; give a whole number, or leave it out")
 
@@ -321,15 +318,6 @@ def no_option(group: str, name: str, groups: Groups) -> str:
     return unknown(meant.lower() if nist else meant, known, "data set" if nist else "option")
 
 
-def _check_range(override: Override) -> None:
-    try:
-        count = sum(1 for _ in itertools.islice(override.sweep_iterator(), MOST_JOBS + 1))
-    except (HydraException, ValueError, ArithmeticError, TypeError):
-        count = 0
-    if not 0 < count <= MOST_JOBS:
-        raise UserError(f"{said(override)}: give a range of 1 to {MOST_JOBS} jobs, with three finite numbers")
-
-
 def _check_labels(overrides: Sequence[Override]) -> None:
     """Two parts under one label would be mixed, without a word."""
     taken: dict[str, Override] = {}
@@ -350,13 +338,19 @@ def _check_labels(overrides: Sequence[Override]) -> None:
 
 def jobs(overrides: Sequence[Override]) -> Iterator[list[Override]]:
     """The overrides of each job of a sweep, as Hydra's basic sweeper makes them."""
-    axes: dict[str, list[Override]] = {}
-    parse = OverridesParser.create().parse_override
-    for one in overrides:
-        key = one.get_key_element()
-        swept = one.is_discrete_sweep()
-        axes[key] = [parse(f"{key}={value}") for value in one.sweep_string_iterator()] if swept else [one]
+    axes = {one.get_key_element(): _swept(one) if one.is_discrete_sweep() else [one] for one in overrides}
     return map(list, itertools.product(*axes.values()))
+
+
+def _swept(override: Override) -> list[Override]:
+    """A word for each value of a sweep."""
+    try:
+        values = list(itertools.islice(override.sweep_string_iterator(), MOST_JOBS + 1))
+    except (HydraException, ValueError, ArithmeticError, TypeError):
+        values = []
+    if not 0 < len(values) <= MOST_JOBS:
+        raise UserError(f"{said(override)}: is a sweep of 1 to {MOST_JOBS} finite values; give fewer, or any")
+    return [OverridesParser.create().parse_override(f"{override.get_key_element()}={value}") for value in values]
 
 
 def settled(overrides: Sequence[Override]) -> list[Override]:
@@ -376,15 +370,18 @@ _BARE = ("measurement", "measurement.dataset", "noise", *plugins.ESTIMATOR_GROUP
 _LONGEST_NAME = 80
 
 
-def default_name(overrides: Sequence[Override]) -> str:
+def default_name(words: Words) -> str:
     """What a command asks for, in a name for its folder: ranging-gaussian-deviation=0.1.
 
     The same for the same settings in any order. What changes no setting, or adds trials to it, is no part of it.
     """
     parts: dict[str, str] = {"measurement": "gins"}
-    experiment = ""
-    for override in overrides:
-        key, _, value = (override.input_line or "").partition("=")
+    experiment = held = ""
+    for override in words.overrides:
+        line = override.input_line or ""
+        if file := words.files.get(forced(override)):
+            line, held = f"file={Path(file.partition('=')[2]).name}", held + line
+        key, _, value = line.partition("=")
         key = key.lstrip("+~").replace(HYDRAS_TRUTH, "truth").rpartition("@estimators.")[2]
         text = re.sub(r"[\[\]'\" ]", "", value.replace("],[", ";").replace(",", "+") if "[" in value else value)
         if override.key_or_group == "experiment":
@@ -398,6 +395,6 @@ def default_name(overrides: Sequence[Override]) -> str:
     full = "-".join(parts[k] if k in _BARE else f"{k.removeprefix('estimators.')}={parts[k]}" for k in keys)
     full = full.replace("/", "-")
     short = re.sub(r"[^\w.,=+-]", "_", full, flags=re.ASCII)
-    if short == full and len(full) <= _LONGEST_NAME:
+    if short == full and len(full) <= _LONGEST_NAME and not held:
         return full
-    return f"{short[: _LONGEST_NAME - 10]}-{hashlib.sha256(full.encode()).hexdigest()[:8]}"
+    return f"{short[: _LONGEST_NAME - 10]}-{digest(full + held)[:8]}"

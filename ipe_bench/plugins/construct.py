@@ -24,11 +24,7 @@ def register_package(name: str) -> None:
 
 
 def construct(config: Any, where: str) -> Any:
-    """The component that a config describes; `where` is the config key, for messages.
-
-    Raises:
-        UserError: an unknown class or option, or a value of the wrong type, by its key.
-    """
+    """The component that a config describes; `where` is the config key, for messages."""
     if isinstance(config, list | tuple):
         return tuple(construct(v, f"{where}[{i}]") for i, v in enumerate(config))
     if not isinstance(config, Mapping):
@@ -38,11 +34,7 @@ def construct(config: Any, where: str) -> Any:
 
 
 def find_class(target: Any, where: str) -> type:
-    """The component class of that dotted name.
-
-    Raises:
-        UserError: it is not there, not a component, abstract, or of a package that is not registered.
-    """
+    """The component class of that dotted name."""
     cls = find_object(target, where)
     where = f"{where}.{TARGET}={target}"
     if not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
@@ -53,11 +45,7 @@ def find_class(target: Any, where: str) -> type:
 
 
 def find_object(target: Any, where: str) -> Any:
-    """What has that dotted name in a registered package.
-
-    Raises:
-        UserError: it is not there, cannot be imported, or is of a package that is not registered.
-    """
+    """What has that dotted name in a registered package."""
     where = f"{where}.{TARGET}={target}"
     module_name, _, name = str(target).rpartition(".")
     if module_name.split(".")[0] not in _registered_packages:

@@ -40,11 +40,7 @@ class Described:
 
 
 def described(option: Option) -> list[Described]:
-    """The options of what a config file names, in the order of its class.
-
-    Raises:
-        UserError: the class is not there, or cannot be imported.
-    """
+    """The options of what a config file names, in the order of its class."""
     config: Mapping[str, Any] = option.config or {}
     if option.group in RECORD_GROUPS:
         return []

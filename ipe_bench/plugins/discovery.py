@@ -58,11 +58,7 @@ _Loader.add_implicit_resolver(
 
 
 def read_yaml(text: str) -> Any:
-    """YAML as plain data, with numbers as Hydra reads them.
-
-    Raises:
-        YAMLError: it is not YAML, a key stands there twice, or there is an alias.
-    """
+    """YAML as plain data, with numbers as Hydra reads them."""
     try:
         return yaml.load(text, _Loader)
     except RecursionError:
@@ -72,11 +68,7 @@ def read_yaml(text: str) -> Any:
 
 
 def read_yaml_file(path: Path, key: str) -> Any:
-    """What a file of YAML says; `key` is the word of the command that names it.
-
-    Raises:
-        UserError: it cannot be read.
-    """
+    """What a file of YAML says; `key` is the word of the command that names it."""
     try:
         return read_yaml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
@@ -290,11 +282,7 @@ def options(group: str | None = None) -> list[Option]:
 
 def composed(option: Option, seen: Sequence[str] = ()) -> dict[str, Any]:
     """What an option says together with the options of its group that its `defaults` name, as Hydra composes them:
-    later ones replace what earlier ones say, and the file itself comes last unless `_self_` stands elsewhere.
-
-    Raises:
-        UserError: the defaults name what is not there, or what is of another group.
-    """
+    later ones replace what earlier ones say, and the file itself comes last unless `_self_` stands elsewhere."""
     config = dict(option.config or {})
     defaults = config.pop("defaults", [])
     if not isinstance(defaults, list):
@@ -323,11 +311,7 @@ def _merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, An
 
 
 def options_in(folder: Path) -> list[Option]:
-    """The options of a plugin's folder that can be checked, with those that they clash with.
-
-    Raises:
-        UserError: there is no plugin in the folder, or nothing to check.
-    """
+    """The options of a plugin's folder that can be checked, with those that they clash with."""
     if not folder.is_dir():
         beside = Path("plugins") / folder.name.rpartition("=")[2]
         meant = beside if beside.is_dir() else "a plugin's folder, such as plugins/my_plugin"

@@ -21,11 +21,7 @@ from ipe_bench.trials.scenario import Scenario
 
 def richer_models(scenario: Scenario) -> list[Measurement]:
     """What else may act on the readings of a scenario: the truth that simulates them, or every option of `measurement`
-    that is the same model with more errors, with the model's own options.
-
-    Raises:
-        UserError: the truth has no errors besides the parameters.
-    """
+    that is the same model with more errors, with the model's own options."""
     model, truth = scenario.measurement, scenario.truth
     if truth is not None:
         if not truth.nuisance_deviation.any():
@@ -47,11 +43,7 @@ def richer_models(scenario: Scenario) -> list[Measurement]:
 
 
 def find_record(option: Option) -> Any:
-    """The record that an option names.
-
-    Raises:
-        UserError: the file cannot be read or says something else, or the record is not there.
-    """
+    """The record that an option names."""
     where = f"{option.group}={option.name}"
     if option.fault is not None:
         raise UserError(f"{where}: {option.fault}")

@@ -93,6 +93,7 @@ MISTAKES = {
     "a file for its key": (["estimate", "my.csv"], "my.csv: is not KEY=VALUE, without spaces"),
     "a flag for a key": (["run", "--trials", "10"], "write trials=VALUE"),
     "a command that is gone": (["completion", "bash"], "completion: is no command any more"),
+    "the schema that is gone": (["schema"], "schema: is no command any more; `ipe-bench list GROUP/NAME` shows every"),
     "a flag that is gone": (["run", "--config-path", "x"], "name it with --config-dir"),
     "no readings": (["estimate"], "readings: is not given"),
 }

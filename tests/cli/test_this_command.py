@@ -59,11 +59,25 @@ NAMES = {
 
 @pytest.mark.parametrize("words", NAMES)
 def test_a_folder_is_named_after_what_was_asked(words):
-    assert default_name(read("run", words.split()).overrides) == NAMES[words]
+    assert default_name(read("run", words.split())) == NAMES[words]
+
+
+def test_a_model_of_a_file_is_told_by_the_name_of_the_file(command):
+    assert command("new", "ode", "decay")[0] == 0
+    words = ("run", "measurement=ode", "measurement.file=decay.yaml", "baseline=[]", "trials=4", "figures=none")
+    code, _, error = command(*words)
+    assert code == 0
+    assert "measurement.file=decay.yaml" in error
+    assert "rates" not in error
+    (folder,) = Path("outputs").iterdir()
+    assert folder.name.startswith("ode-no_baseline-file=decay.yaml-")
+    Path("decay.yaml").write_text(Path("decay.yaml").read_text().replace("0.4", "0.5"))
+    assert command(*words)[0] == 0
+    assert len(list(Path("outputs").iterdir())) == 2
 
 
 def test_a_long_name_is_cut_and_stays_one_of_a_kind():
-    names = [default_name(read("run", [f"prior.deviations=[{'1,' * 60}{last}]"]).overrides) for last in (1, 2)]
+    names = [default_name(read("run", [f"prior.deviations=[{'1,' * 60}{last}]"])) for last in (1, 2)]
     assert names[0] != names[1]
     assert all(len(name) <= 80 for name in names)
 

@@ -206,7 +206,7 @@ class Forgetful(Noise):
         (Faulty("timid"), "variances are 1"),
         (Faulty("bold"), "times too small"),
         (Faulty("diagonal"), "covariance has shape (60, 4), and not (trials, n, n), which is (60, 4, 4) here"),
-        (Bare(), "step returns an array, and not a State: return State(x, system.F(x))"),
+        (Bare(), "step returns ndarray, and not a State: return State(x, system.F(x))"),
         (Misshapen(), "step returns a State whose F has shape (8, 1), and not (8, 4)"),
         (Tilted(), "most for parameter c2 in reading time=-0.6"),
         (Broken(), "write np.where(u.real < 0, -u, u) for np.abs(u)"),
