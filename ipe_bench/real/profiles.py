@@ -87,15 +87,15 @@ def natural_limits(model: Measurement) -> tuple[Array, Array]:
 def wald_interval(model: Measurement, x: Array, deviation: Array, q: float) -> tuple[Array, Array]:
     """The interval (n,), (n,) of q standard deviations (n,) about the estimate x (n,), in the parameters' own units.
 
-    It is symmetric in x, the logarithm of a distance to a bound, say; where q standard errors reach a bound the
-    logarithm says nothing any more, and the interval is symmetric in the parameter itself and ends at the bound.
+    It is symmetric in x, the logarithm of a distance to a bound, say. If three times q standard errors reach a bound,
+    the logarithm bends too much over the interval, which is then symmetric in the parameter and ends at the bound.
     """
     with np.errstate(all="ignore"):
         ends = model.physical(np.stack([x - q * deviation, x + q * deviation]))
         value, error = model.physical(x[None])[0], deviation * np.abs(model.physical_slope(x[None])[0])
     lower, upper = natural_limits(model)
     with np.errstate(invalid="ignore"):
-        reached = (value - q * error <= lower) | (value + q * error >= upper)
+        reached = (value - 3 * q * error <= lower) | (value + 3 * q * error >= upper)
         reached &= np.isfinite(lower) | np.isfinite(upper)
     low = np.where(reached, np.maximum(lower, value - q * error), ends.min(axis=0))
     return low, np.where(reached, np.minimum(upper, value + q * error), ends.max(axis=0))
