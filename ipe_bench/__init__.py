@@ -10,6 +10,7 @@
 Importing it costs nothing: each name is loaded when it is first used.
 """
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.2.0"
@@ -71,8 +72,12 @@ __all__ = [
 ]
 
 
+# The room of the report is imported first, so that its name stands for the function `report` from then on.
+importlib.import_module(f"{__name__}.report")
+del globals()["report"]
+
+
 def __getattr__(name: str) -> Any:
-    import importlib
 
     if name in _ROOMS:
         return importlib.import_module(f"{__name__}.{name}")

@@ -18,7 +18,7 @@ from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.noise.base import Noise
 from ipe_bench.priors import Prior
-from ipe_bench.runs.bundles import opened
+from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.results import Results, require_results
 from ipe_bench.runs.run import TRIALS, compute, validate
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
     from ipe_bench.plugins.conformance import Finding
     from ipe_bench.plugins.discovery import Option
-    from ipe_bench.report import ReportResult
     from ipe_bench.report.answer import Answer
     from ipe_bench.report.choice import Which
+    from ipe_bench.report.run import ReportResult
     from ipe_bench.statistics.audit import Audit
     from ipe_bench.trials.design import Criterion, Design
     from ipe_bench.trials.posterior import Reference
@@ -157,9 +157,14 @@ def report(
         UserError: no run ever wrote to a directory, or there is no such choice of figures or formats.
         StorageError: the files cannot be written.
     """
-    from ipe_bench.report import write_report
+    from ipe_bench.report.run import begin_report
 
-    return write_report(directories, output, figures=figures, formats=formats)
+    paths = _paths(directories)
+    if output is None and any(map(is_bundle, paths)):
+        raise UserError(f"{paths[0]}: a bundle is read and not written to; give output=, where the report goes")
+    with opened(paths, None if output is None else Path(output) / BUNDLES) as folders:
+        require_results(folders)
+        return begin_report(folders, output, figures=figures, formats=formats).written()
 
 
 def compare(

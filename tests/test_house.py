@@ -38,7 +38,7 @@ BUDGETS = {
     "statistics": 4400,
     "real": 2080,
     "plugins": 1240,
-    "report": 5015,
+    "report": 4515,
     "cli": 2670,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""

@@ -140,7 +140,7 @@ Nothing is computed again.
 
   ipe-bench report DIR                            into DIR itself
   ipe-bench report DIR1 DIR2 output=DIR           several folders together, into another
-  ipe-bench report DIR paper=overview,error_against_scale columns=error_scale,estimator,success width=3.5
+  ipe-bench report DIR paper=overview,headline columns=error_scale,estimator,success width=3.5
 
 paper=NAMES          tables and figures for a paper instead, into DIR/paper: LaTeX (booktabs, siunitx), PDF and PNG
 columns=NAMES        those of the tables, in this order; a name that is not there is answered with those that are

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import NAMES, console, places_and_keys, print_problems, say
-from ipe_bench.report import begin_report
 from ipe_bench.report.choice import PAGE, Which
+from ipe_bench.report.run import begin_report
 from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
 from ipe_bench.runs.parts import TRUTH
 from ipe_bench.runs.results import require_results
@@ -108,7 +108,7 @@ def _paper(folders: Sequence[Path], keys: Mapping[str, Any]) -> int:
     from ipe_bench.statistics import analyse
 
     if not keys.get("paper"):
-        raise UserError("paper=: name tables and figures, such as paper=overview,error_against_scale")
+        raise UserError("paper=: name tables and figures, such as paper=overview,headline")
     chosen = {key: keys[key] for key in ("columns", "width") if key in keys}
     faults = use_statistics()
     analysis = analyse(folders)

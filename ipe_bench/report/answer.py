@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 NAME, RESIDUALS, SCHEMA = "estimate", "residuals.csv", 2
-_FIGURES = tuple(f"{name}{suffix}" for name in ("residuals", "ellipses", "likelihood") for suffix in (".png", ".pdf"))
+_FIGURES = tuple(f"{name}{suffix}" for name in ("residuals", "ellipses") for suffix in (".png", ".pdf"))
 FILES = (RESIDUALS, *_FIGURES)
 LEAST_FIT_P = 1 / (DRAWS + 1)
 """Least p of the test of fit if the law of the noise is simulated."""
@@ -81,8 +81,7 @@ class Answer:
     @property
     def passes(self) -> bool:
         """Whether any estimator has an answer that nothing speaks against."""
-        least = self.examination is None or self.examination.least
-        return least and any(one.passes for one in self.fits)
+        return (self.examination is None or self.examination.least) and any(one.passes for one in self.fits)
 
     def __iter__(self) -> Iterator[Fit]:
         return iter(self.fits)
@@ -100,11 +99,11 @@ class Answer:
 
         frames = []
         for one in self.fits:
-            parameters, (low, high) = one.model.physical_parameters, one.interval()
-            frame = pd.DataFrame({"parameter": [p.name for p in parameters], "unit": [p.unit for p in parameters]})
-            frame = frame.assign(estimate=one.x, standard_error=one.standard_errors, low95=low, high95=high)
-            frame.insert(0, "estimator", one.label)
-            frames.append(frame.assign(passes=one.passes))
+            names, units = zip(*((p.name, p.unit) for p in one.model.physical_parameters), strict=True)
+            low, high = one.interval()
+            own = {"estimator": one.label, "parameter": names, "unit": units, "estimate": one.x}
+            own |= {"standard_error": one.standard_errors, "low95": low, "high95": high, "passes": one.passes}
+            frames.append(pd.DataFrame(own))
         return pd.concat(frames, ignore_index=True)
 
     def __str__(self) -> str:
@@ -116,9 +115,6 @@ class Answer:
 
     def _repr_html_(self) -> str:
         return html(contents(self))
-
-
-# Tables and sentences ------------------------------------------------------------------------------------------------
 
 
 def contents(answer: Answer) -> Iterator[Part]:
@@ -173,8 +169,7 @@ def _number(value: float, figures: int = 4) -> str:
 
 
 def _verdicts(answer: Answer) -> Table:
-    """Whether each fit passes; if the residuals make the level of the noise, chi-square is the degrees of freedom and
-    is left out."""
+    """Whether each fit passes; chi-square is left out if the level of the noise is estimated from the residuals."""
     fits = answer.fits
     columns = [
         words("estimator", [one.label for one in fits]),
@@ -242,19 +237,18 @@ def _values(values: Mapping[str, float], figures: int = 6) -> str:
 def _outliers(answer: Answer) -> Iterator[Table]:
     """The readings that lie farthest off, each with its largest residual and the estimators that say so."""
     told = [f for f in answer.fits if 0 < f.outliers.sum() <= max(3, _FEW * len(f.outliers))]
-    rows = {
-        int(i): max((float(f.normalised[i]) for f in told), key=abs) for f in told for i in np.flatnonzero(f.outliers)
-    }
-    if not rows:
+    if not told:
         return
-    listed = sorted(sorted(rows), key=lambda i: -abs(rows[i]))[:_MOST_OUTLIERS]
-    labels = _reading_labels(answer.model)
+    worst = {
+        i: max((float(f.normalised[i]) for f in told), key=abs) for i in np.flatnonzero(sum(f.outliers for f in told))
+    }
+    listed, labels = sorted(worst, key=lambda i: -abs(worst[i]))[:_MOST_OUTLIERS], _reading_labels(answer.model)
     columns = [
         words("reading", [_where(labels[i]) for i in listed]),
-        texts("residual", [f"{rows[i]:.1f}" for i in listed]),
+        texts("residual", [f"{worst[i]:.1f}" for i in listed]),
         words("of", [", ".join(f.label for f in told if f.outliers[i]) for i in listed]),
     ]
-    more = [f"And {len(rows) - _MOST_OUTLIERS} others: see {RESIDUALS}."] if len(rows) > _MOST_OUTLIERS else []
+    more = [f"And {len(worst) - _MOST_OUTLIERS} others: see {RESIDUALS}."] if len(worst) > _MOST_OUTLIERS else []
     title = f"Outliers: normalised residual beyond ±{told[0].outlier_limit:.2f}"
     yield Table("outliers", title, "", columns, notes=more)
 
@@ -309,7 +303,7 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
         yield f"AMBIGUOUS: the readings fit as well at {at(one.x)} (chi-square {one.chi_square:.5g})."
     profiles = list(zip(names, found.profiles, strict=True))
     if bent := [n for n, p in profiles if p.bent]:
-        yield f"Profiles that are no parabola: {', '.join(bent)}; trust their profile intervals, see likelihood.png."
+        yield f"Profiles that are no parabola: {', '.join(bent)}; trust their profile intervals."
     if unlimited := [n for n, p in profiles if not math.isfinite(p.high - p.low)]:
         yield f"The readings set no limit to one side of {', '.join(unlimited)}."
     for one in found.on_bounds:
@@ -343,9 +337,6 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
         yield f"Bootstrap: {drawn - converged} of {drawn} simulated sets of readings have no answer."
 
 
-# Files ---------------------------------------------------------------------------------------------------------------
-
-
 def write_answer(
     folder: Path, answer: Answer, command: Any, provenance: Mapping[str, Any], *, which: Which = "all"
 ) -> list[Path]:
@@ -354,10 +345,10 @@ def write_answer(
     All its figures are main ones: `which` is all, main or none. `command` tells one command from another;
     `provenance` is added to the JSON file and overrides what stands there of the same name.
     """
-    from ipe_bench.report.figures.readings import draw_ellipses, draw_profiles, draw_residuals
+    from ipe_bench.report.figures.readings import draw_ellipses, draw_residuals
 
     given = answer.model, answer.fits
-    drawings = chain(draw_residuals(*given), draw_ellipses(*given), *map(draw_profiles, answer.examinations[:1]))
+    drawings = chain(draw_residuals(*given), draw_ellipses(*given))
     verdict = "an answer that passes" if answer.passes else "NO ANSWER THAT PASSES"
     return write(
         folder,
@@ -393,9 +384,8 @@ def described(answer: Answer) -> dict[str, Any]:
 
 
 def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
-    names, white = [p.name for p in one.model.physical_parameters], one.whiteness
-    outliers = np.flatnonzero(one.outliers)
-    test = {"test": "Ljung-Box, p from simulated fits", "p": plain(white.p_value)}
+    names = [p.name for p in one.model.physical_parameters]
+    whiteness = {"test": "Ljung-Box, p from simulated fits", "p": plain(one.whiteness.p_value)}
     return {
         "status": one.status.label,
         "estimates": named(names, one.x),
@@ -405,8 +395,10 @@ def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
         "on_bounds": {names[k]: value for k, value in one.held_at.items()},
         "undetermined": list(one.undetermined),
         "noise_level_estimated": plain(one.level),
-        "whiteness": test | picked(white, "statistic", "lags"),
-        "outliers": [{**labels[i], "normalised_residual": plain(one.normalised[i])} for i in outliers],
+        "whiteness": whiteness | picked(one.whiteness, "statistic", "lags"),
+        "outliers": [
+            {**labels[i], "normalised_residual": plain(one.normalised[i])} for i in np.flatnonzero(one.outliers)
+        ],
         **picked(one, "message", "correlation", "chi_square", "degrees_of_freedom", "fits", "passes", "with_prior"),
         **picked(one, "beaten_by", "residual_deviation", "outlier_limit", "iterations", "simulations"),
     }
@@ -414,26 +406,24 @@ def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _examined(found: Examination, labels: list[dict[str, Any]]) -> dict[str, Any]:
     names, bootstrap = [p.name for p in found.model.physical_parameters], found.bootstrap
-    minima = [named(names, one.x) for one in found.minima]
+    intervals = {
+        "standard_error": np.transpose(found.wald),
+        "profile": [(p.low, p.high) for p in found.profiles],
+        "bootstrap": np.column_stack([bootstrap.low, bootstrap.high]),
+    }
+    direction = {"direction": named(names, found.direction.weights)}
     return {
         "estimator": found.label,
         "confidence": CONFIDENCE,
         "estimates": named(names, found.x),
         "standard_errors": named(names, found.standard_errors),
-        "intervals": {
-            "standard_error": named(names, np.transpose(found.wald)),
-            "profile": named(names, [(p.low, p.high) for p in found.profiles]),
-            "bootstrap": named(names, np.column_stack([bootstrap.low, bootstrap.high])),
-        },
+        "intervals": {name: named(names, ends) for name, ends in intervals.items()},
         "profiles": dict(zip(names, [picked(p, "values", "zeta", "bent") for p in found.profiles], strict=True)),
         "bootstrap": {**picked(bootstrap, "drawn", "converged"), "bias": named(names, bootstrap.bias)},
-        "least_observable": {
-            "direction": named(names, found.direction.weights),
-            "collinearity_index": plain(found.direction.collinearity),
-        },
+        "least_observable": {**direction, "collinearity_index": plain(found.direction.collinearity)},
         "minima": [
-            {"estimates": x, "starts": one.found, **picked(one, "chi_square", "as_good")}
-            for x, one in zip(minima, found.minima, strict=True)
+            {"estimates": named(names, one.x), "starts": one.found, **picked(one, "chi_square", "as_good")}
+            for one in found.minima
         ],
         "is_least_minimum": found.least,
         "with_prior": found.with_prior,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,15 +20,11 @@ if TYPE_CHECKING:
     import pandas as pd
 
 NAME, READINGS, SCHEMA = "design", "readings.csv", 1
-FILES = (READINGS, "design.png", "design.pdf")
 _MOST_SUSPECTS = 12
 _MUST_BREAK = 1.02
 """Multiple of Van Trees's bound above which false roots are felt by any estimator."""
 _UNSEEN = 0.05
 """Share of trials below which an error goes unnoticed by any test of residuals."""
-
-
-# Tables and sentences ------------------------------------------------------------------------------------------------
 
 
 def contents(name: str, design: Design) -> Iterator[Part]:
@@ -38,22 +33,16 @@ def contents(name: str, design: Design) -> Iterator[Part]:
     seen = design.observability
     direction = "Least observable direction" if seen.observable else "The readings do not determine"
     yield Strong(f"{direction}: {seen.words}")
-    yield from _structure(design)
+    told = structure(design.scenario.measurement)
+    if told is not None and not told.lost:
+        yield f"Exact readings would tell all {len(told.unknowns)} parameters from their neighbours."
+    yield from (Strong(f"No data can tell: {sentence}.") for sentence in (told.sentences if told else ()))
     if design.threshold:
         yield _threshold(design)
     yield from _suspects(design)
     yield from _ways(design)
     if design.effects:
         yield _effects(design)
-
-
-def _structure(design: Design) -> Iterator[Part]:
-    """What no readings of the model's outputs can tell, however many and exact; nothing of models not examined."""
-    found = structure(design.scenario.measurement)
-    if found is not None and not found.lost:
-        yield f"Exact readings would tell all {len(found.unknowns)} parameters from their neighbours."
-    for sentence in found.sentences if found else ():
-        yield Strong(f"No data can tell: {sentence}.")
 
 
 def _parameters(name: str, design: Design) -> Table:
@@ -156,8 +145,7 @@ def _effects(design: Design) -> Table:
     for e in sorted(design.effects, key=lambda e: e.mean_bound):
         if np.isfinite(e.mean_bound):
             best.setdefault((e.column, e.action), e)
-    columns = list(dict.fromkeys(e.column for e in design.effects))
-    found = [best[key] for key in itertools.product(columns, ("add", "drop")) if key in best]
+    found = sorted(best.values(), key=lambda e: (list(design.candidates.index).index(e.column), e.action))
     cells = [
         words("what", [f"{e.action} {e.column} {levels_of(design.candidates, e.column, e.entry)}" for e in found]),
         texts("readings", [str(e.readings) for e in found]),
@@ -167,26 +155,14 @@ def _effects(design: Design) -> Table:
     return Table("effects", "One more, one less", "", cells, notes=[note])
 
 
-# Files ---------------------------------------------------------------------------------------------------------------
-
-
 def write_design(folder: Path, name: str, design: Design, command: Any) -> list[Path]:
     """Writes a design, of which readings.csv has what each choice takes, and returns the files.
 
     `command` tells one command from another.
     """
-    from ipe_bench.report.figures.designs import draw_design
-
-    return write(
-        folder,
-        NAME,
-        f"{name}: design",
-        contents(name, design),
-        content={"schema": SCHEMA, "command": command, **described(design), "measurement": name},
-        table=(READINGS, _readings(design)),
-        drawings=draw_design(design),
-        old=FILES[1:],
-    )
+    content = {"schema": SCHEMA, "command": command, **described(design), "measurement": name}
+    table = READINGS, _readings(design)
+    return write(folder, NAME, f"{name}: design", contents(name, design), content=content, table=table)
 
 
 def described(design: Design) -> dict[str, Any]:

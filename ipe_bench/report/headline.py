@@ -138,10 +138,9 @@ def _costs(rows: pd.DataFrame, scales: Sequence[float]) -> str:
     """What a trial costs at the largest scale at which most hold, and at the largest for those that still do."""
     holding = rows[rows["success_high"] >= BROKEN]
     number = holding.groupby("error_scale")["estimator"].nunique()
-    most = number[number > rows["estimator"].nunique() / 2]
-    at = [*([most.index.max()] if len(most) else []), number.index.max() if len(number) else scales[-1]]
+    most = number.index[number > rows["estimator"].nunique() / 2]
     parts = []
-    for scale in dict.fromkeys(at):
+    for scale in dict.fromkeys([*most[-1:], number.index.max() if len(number) else scales[-1]]):
         part = (holding if len(number) else rows).query("error_scale == @scale")
         listed = [
             f"{row['estimator']} {brief(row['simulations_median'])} ({duration(row['time_median_s'], 2)})"
@@ -158,13 +157,13 @@ def _ranked(analysis: Analysis, rows: pd.DataFrame, scales: Sequence[float]) -> 
     sums = sums.assign(share=sums["success"] / sums["trials"], silent=sums["failed_silent"] / sums["trials"])
     sums = sums.sort_values("share", ascending=False, kind="stable")
     listed = [f"{label} in {percent(row['share'])}" for label, row in sums.iterrows()]
-    reach = (
-        f"error scale{'s' * (len(scales) > 1)} {' to '.join(plain(s) for s in dict.fromkeys([scales[0], scales[-1]]))}"
-    )
+    reach = f"scale{'s' * (len(scales) > 1)} {' to '.join(dict.fromkeys(plain(s) for s in (scales[0], scales[-1])))}"
     scenarios = len(set(analysis.scores["scenario"]))
     number = f"{int(sums['trials'].max()):,} trials" + (f" in {scenarios} scenarios" if scenarios > 1 else "")
-    sentence = f"At {reach}, of {number} succeed: {enumerate_few(listed)}."
-    worst = sums.sort_values("silent").iloc[-1]
+    sentence, worst = (
+        f"At error {reach}, of {number} succeed: {enumerate_few(listed)}.",
+        sums.sort_values("silent").iloc[-1],
+    )
     if worst["silent"] > 0:
         sentence += f" Failures that look right: {percent(worst['silent'])} at most ({worst.name})."
     return sentence

@@ -52,29 +52,32 @@ def render_page(
     commands = dict.fromkeys(run["command"] for run in runs if run["command"] not in (_PYTHON, _UNKNOWN))
     templates = resources.files("ipe_bench.report") / "templates"
     script, style = ((templates / name).read_text(encoding="utf-8") for name in ("report.js", "report.css"))
-    page = environment().get_template("report.html.j2")
-    return page.render(
-        version=__version__,
-        script=Markup(script),
-        style=Markup(style),
-        policy=_policy(script, style),
-        about=about(analysis),
-        headline=headline(analysis),
-        collection=collection,
-        title=", ".join(d.resolve().name or str(d) for d in collection.directories),
-        computed=_minute(collection.runs[-1]) if collection.runs else "",
-        commands=list(commands)[:MOST_COMMANDS],
-        sections=[(name, title) for name, (title, there) in sections.items() if there],
-        tables=main,
-        written=written,
-        appendix=appendix,
-        figures=[_picture(figure) for figure in figures],
-        charts=charts,
-        nothing_failed=nothing_failed,
-        runs=runs[:MOST_RUNS],
-        older_runs=max(0, len(runs) - MOST_RUNS),
-        citation=CITATION,
-        definitions=definitions(),
+    return (
+        environment()
+        .get_template("report.html.j2")
+        .render(
+            version=__version__,
+            script=Markup(script),
+            style=Markup(style),
+            policy=_policy(script, style),
+            about=about(analysis),
+            headline=headline(analysis),
+            collection=collection,
+            title=", ".join(d.resolve().name or str(d) for d in collection.directories),
+            computed=_minute(collection.runs[-1].started) if collection.runs else "",
+            commands=list(commands)[:MOST_COMMANDS],
+            sections=[(name, title) for name, (title, there) in sections.items() if there],
+            tables=main,
+            written=written,
+            appendix=appendix,
+            figures=[_picture(figure) for figure in figures],
+            charts=charts,
+            nothing_failed=nothing_failed,
+            runs=runs[:MOST_RUNS],
+            older_runs=max(0, len(runs) - MOST_RUNS),
+            citation=CITATION,
+            definitions=definitions(),
+        )
     )
 
 
@@ -92,13 +95,9 @@ def _picture(figure: Drawn) -> dict[str, Any]:
     return {"name": figure.name, "title": figure.title, "caption": figure.caption, "data": png, "files": names}
 
 
-def _minute(run: Run) -> str:
-    return run.started[:16].replace("T", " ")
-
-
 def _runs(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """What was computed, by command, the last first: everything that its jobs have in common, and the configuration of
-    each. What found everything stored computed nothing."""
+    """What was computed, by command, the last first: all that its jobs have in common, and the configuration of each;
+    a run that found everything stored computed nothing."""
     commands: dict[tuple[str, str], list[Run]] = {}
     for run in (run for run in runs if run.record.get("blocks", 1)):
         command = run.record.get("command", _UNKNOWN)
@@ -116,8 +115,11 @@ def _runs(runs: Sequence[Run]) -> list[dict[str, Any]]:
             "versions": ", ".join(f"{k} {v}" for k, v in (last.get("libraries") or {}).items()),
         }
         scenarios = [scenario for record in records for scenario in record.get("scenarios", ())]
-        config = json.dumps(
-            {"scenarios": scenarios, "estimators": last.get("estimators", {})}, indent=1, ensure_ascii=False
-        )
-        found.append({"command": command, "started": _minute(own[0]), "facts": facts, "config": config})
+        config = {"scenarios": scenarios, "estimators": last.get("estimators", {})}
+        text = json.dumps(config, indent=1, ensure_ascii=False)
+        found.append({"command": command, "started": _minute(own[0].started), "facts": facts, "config": text})
     return found
+
+
+def _minute(started: str) -> str:
+    return started[:16].replace("T", " ")

@@ -7,7 +7,7 @@ nothing is scaled. What they say is what the report says.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,8 +17,6 @@ from ipe_bench.report.certified_tables import without_certified
 from ipe_bench.report.sections import report_tables
 from ipe_bench.report.table import COLUMN, PAGE, Column, Table, latex
 from ipe_bench.statistics.analysis import Analysis
-
-_NARROWEST, _WIDEST = 2.0, 20.0
 
 
 def export(
@@ -30,58 +28,50 @@ def export(
     Raises:
         UserError: there is no such table, figure or column, or the width is none of paper.
     """
-    if not _NARROWEST <= width <= _WIDEST:
+    if not 2 <= width <= 20:
         raise UserError(f"width={width:g}: give inches, such as {COLUMN:g} for one column and {PAGE:g} for two")
     tables = {table.name: table for table in report_tables(analysis)}
     chosen = [_with_columns(tables[name], columns) for name in names if name in tables]
     if columns and not chosen:
         raise UserError(f"columns={','.join(columns)}: goes with a table; paper={','.join(names)} names none")
-    files = _figures(analysis, folder, [name for name in names if name not in tables], width, list(tables))
+    files = _figures(analysis, folder, [name for name in names if name not in tables], width, tables)
     for table in chosen:
         files.append(folder / f"{table.name}.tex")
         write_text(files[-1], latex(table, width))
     return files
 
 
-def _columns(table: Table) -> dict[str, Column]:
-    """The columns by the names by which they are chosen: their titles in letters, digits and underscores."""
-    named: dict[str, Column] = {}
+def _with_columns(table: Table, names: Sequence[str]) -> Table:
+    """The table with these columns, in this order, or all of them; a column is called by its title in letters, digits
+    and underscores."""
+    known: dict[str, Column] = {}
     for column in table.columns:
         name = re.sub(r"[^a-z0-9]+", "_", column.title.lower()).strip("_") or "column"
-        alike = sum(re.fullmatch(rf"{name}(_\d+)?", other) is not None for other in named)
-        named[f"{name}_{alike + 1}" if alike else name] = column
-    return named
-
-
-def _with_columns(table: Table, names: Sequence[str]) -> Table:
-    """The table with these columns, in this order; all columns if none is named."""
-    known = _columns(table)
+        alike = sum(re.fullmatch(rf"{name}(_\d+)?", other) is not None for other in known)
+        known[f"{name}_{alike + 1}" if alike else name] = column
     for name in names:
         if name not in known:
             raise UserError(f"columns={name}: {unknown(name, known, f'column of {table.name}')}")
     return replace(table, columns=[known[name] for name in names or known])
 
 
-def _figures(analysis: Analysis, folder: Path, names: Sequence[str], width: float, tables: Sequence[str]) -> list[Path]:
+def _figures(analysis: Analysis, folder: Path, names: Sequence[str], width: float, tables: Iterable[str]) -> list[Path]:
     """Writes figures, and captions.md with their captions; returns the files."""
     from ipe_bench.report.figures import drawings
     from ipe_bench.report.style import print_style
 
-    if not names:
-        return []
     files: list[Path] = []
     captions: dict[str, str] = {}
-    seen: list[str] = []
     with print_style(width):
-        for drawing, _ in drawings(without_certified(analysis)):
-            seen.append(drawing.name)
-            if drawing.name in names:
-                files += drawing.save(folder)
-                captions[drawing.name] = f"**{drawing.name}.** {drawing.title}. {drawing.caption}"
-            if set(names) <= set(seen):
+        for drawing, _ in drawings(without_certified(analysis)) if names else ():
+            captions[drawing.name] = f"**{drawing.name}.** {drawing.title}. {drawing.caption}"
+            files += drawing.save(folder) if drawing.name in names else ()
+            if set(names) <= captions.keys():
                 break
     for name in names:
-        if name not in seen:
-            raise UserError(f"paper={name}: {unknown(name, [*tables, *seen], 'table or figure')}")
-    write_text(folder / "captions.md", "\n\n".join(captions.values()) + "\n")
-    return [*files, folder / "captions.md"]
+        if name not in captions:
+            raise UserError(f"paper={name}: {unknown(name, [*tables, *captions], 'table or figure')}")
+    if names:
+        files.append(folder / "captions.md")
+        write_text(files[-1], "\n\n".join(captions[name] for name in names) + "\n")
+    return files

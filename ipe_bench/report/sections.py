@@ -76,9 +76,7 @@ def made(option: Option, record: Any, analysis: Analysis, taken: Iterable[str]) 
         else:
             table = record(analysis)
             found = Written(option.name, "", [] if table is None else [table])
-        for part in found.parts:
-            if isinstance(part, str):
-                continue
+        for part in (part for part in found.parts if not isinstance(part, str)):
             require_type(part, Table)
             if part.name in names:
                 raise UserError(f"there is a table {part.name} already; choose another name")

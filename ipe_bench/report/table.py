@@ -141,12 +141,11 @@ def terminal(parts: Iterable[Part], width: int) -> Group:
         if part.title:
             shown += [Text()] if shown and isinstance(shown[-1], Text) else []
             shown.append(Text(part.title, style="bold"))
-        kept = max(part.repeated, part.naming + 1)
+        kept, notes = max(part.repeated, part.naming + 1), [text for text in (part.caption, *part.notes) if text]
         head, rest = list(part.columns[:kept]), list(part.columns[kept:])
-        notes = [text for text in (part.caption, *part.notes) if text]
         while True:
             count = min(1, len(rest))
-            while count < len(rest) and _taken([*head, *rest[: count + 1]], part, folded=True) <= width:
+            while count < len(rest) and _taken([*head, *rest[: count + 1]], part)[1] <= width:
                 count += 1
             shown.append(_rich([*head, *rest[:count]], part, width))
             rest = rest[count:]
@@ -158,27 +157,28 @@ def terminal(parts: Iterable[Part], width: int) -> Group:
     return Group(*shown)
 
 
-def _needed(column: Column, table: Table, *, folded: bool) -> int:
-    """Minimal width of a column in letters: numbers are never folded, words are, and titles if `folded`."""
+def _needed(column: Column, table: Table) -> tuple[int, int]:
+    """Letters that a column takes with its title in one line, and with its title folded; numbers are never folded."""
     from rich.cells import cell_len
 
-    title = cell_len(column.title)
-    if folded:
-        title = min(max(map(cell_len, _words_of(column.title))), _WHOLE_NAME)
-    longest = max((cell_len(cell.text) for cell in column.cells), default=0)
+    longest = max([1, *(cell_len(cell.text) for cell in column.cells)])
     if not column.numeric:
         longest = min(longest, _WHOLE_NAME if column is table.columns[table.naming] else _WHOLE_WORD)
-    return max(title, longest, 1)
+    title = _unbroken(column.title)
+    word = max(map(cell_len, title.split(" ")))
+    return max(longest, cell_len(title)), max(longest, min(word, _WHOLE_NAME))
 
 
-def _taken(columns: Iterable[Column], table: Table, *, folded: bool) -> int:
-    """The width of a table of such columns, with the space between them."""
-    return 2 + sum(_needed(column, table, folded=folded) + _PADDING for column in columns)
+def _unbroken(title: str) -> str:
+    """A title in which a number and its per cent are one word."""
+    return title.replace(" %", "\u00a0%")
 
 
-def _words_of(title: str) -> list[str]:
-    """The words of a title; a number and its per cent are one."""
-    return title.replace(" %", "\u00a0%").split(" ")
+def _taken(columns: Iterable[Column], table: Table) -> tuple[int, int]:
+    """The width of a table of such columns with their titles in one line, and with them folded."""
+    whole, folded = zip(*(_needed(column, table) for column in columns), strict=True)
+    space = 2 + _PADDING * len(whole)
+    return sum(whole) + space, sum(folded) + space
 
 
 def _rich(columns: Sequence[Column], table: Table, width: int) -> Any:
@@ -188,24 +188,23 @@ def _rich(columns: Sequence[Column], table: Table, width: int) -> Any:
     from rich.text import Text
 
     shown = RichTable(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, collapse_padding=True)
-    folded = _taken(columns, table, folded=False) > width
+    folded = _taken(columns, table)[0] > width
     for each in columns:
-        letters = _needed(each, table, folded=folded)
-        title = Text(textwrap.fill(" ".join(_words_of(each.title)), letters).replace("\u00a0", " "))
+        letters = _needed(each, table)[folded]
+        title = Text(textwrap.fill(_unbroken(each.title), letters).replace("\u00a0", " "))
         if each.numeric:
             shown.add_column(title, justify="right", no_wrap=True)
         else:
             shown.add_column(title, overflow="fold", min_width=letters)
-    group: list[str] | None = None
+    group: list[Cell] = []
     for row in zip(*(c.cells for c in columns), strict=True):
-        cells = [cell.text for cell in row]
-        if table.grouped and group == cells[: table.grouped]:
-            cells[: table.grouped] = [""] * table.grouped
-        elif table.grouped:
-            if group is not None:
-                shown.add_section()
-            group = cells[: table.grouped]
-        shown.add_row(*(Text(text, style="bold" if cell.best else "") for text, cell in zip(cells, row, strict=True)))
+        first = list(row[: table.grouped])
+        repeated = bool(group) and first == group
+        if group and not repeated:
+            shown.add_section()
+        group = first
+        cells = [Cell("")] * len(first) if repeated else first
+        shown.add_row(*(Text(c.text, style="bold" if c.best else "") for c in (*cells, *row[table.grouped :])))
     return shown
 
 
@@ -239,36 +238,31 @@ def html(parts: Iterable[Part]) -> str:
 
 def write_table(table: Table, folder: Path) -> list[Path]:
     """Writes one table as CSV, Markdown and LaTeX."""
-    formats = {".csv": comma_separated(table), ".md": markdown(table), ".tex": latex(table)}
-    for suffix, text in formats.items():
-        write_text(folder / f"{table.name}{suffix}", text)
-    return [folder / f"{table.name}{suffix}" for suffix in formats]
+    files = []
+    for suffix, write in ((".csv", comma_separated), (".md", markdown), (".tex", latex)):
+        files.append(folder / f"{table.name}{suffix}")
+        write_text(files[-1], write(table))
+    return files
 
 
 def comma_separated(table: Table) -> str:
     """The numbers behind the table in full precision, or else its cells."""
     import pandas as pd
 
-    data = table.data
-    if data is None:
-        rows = [[cell.text for cell in row] for row in table.rows]
-        data = pd.DataFrame(rows, columns=[c.title for c in table.columns])
-    return data.to_csv(index=False)
+    cells = pd.DataFrame([[cell.text for cell in row] for row in table.rows], columns=[c.title for c in table.columns])
+    return (cells if table.data is None else table.data).to_csv(index=False)
 
 
 def markdown(table: Table) -> str:
     """A GitHub table; names cannot break it."""
 
     def cell(value: str) -> str:
-        for sign, escaped in (("\\", "\\\\"), ("|", "\\|"), ("<", "&lt;"), ("*", "\\*")):
-            value = value.replace(sign, escaped)
-        return " ".join(value.split())
+        return re.sub(r"([\\|*])", r"\\\1", " ".join(value.split())).replace("<", "&lt;")
 
-    lines = [f"**{table.title}.** {cell(table.caption)}", ""]
-    lines.append("| " + " | ".join(cell(c.title) for c in table.columns) + " |")
-    lines.append("|" + "|".join("---:" if c.numeric else ":---" for c in table.columns) + "|")
     rows = [[f"**{cell(c.text)}**" if c.best else cell(c.text) for c in row] for row in table.rows]
-    lines += [f"| {' | '.join(row)} |" for row in rows]
+    head, *lines = [f"| {' | '.join(row)} |" for row in ([cell(c.title) for c in table.columns], *rows)]
+    rule = "|" + "|".join("---:" if c.numeric else ":---" for c in table.columns) + "|"
+    lines = [f"**{table.title}.** {cell(table.caption)}", "", head, rule, *lines]
     return "\n".join([*lines, *(f"\n{cell(note)}" for note in table.notes)]) + "\n"
 
 
@@ -297,27 +291,19 @@ def latex(table: Table, width: float | None = None) -> str:
     shape = "@{}" + "".join("r" if c.numeric else "l" for c in table.columns) + "@{}"
     head = [r"\toprule", _latex_row(map(_latex_title, table.columns)), r"\midrule"]
     rows = [_latex_row(map(_latex_cell, row, table.columns)) for row in table.rows]
-    label = f"tab:{table.name.replace('_', '-')}"
-    caption = rf"\caption{{{escaped(table.title)}. {escaped(table.caption)}}}\label{{{label}}}"
-    size = rf"\footnotesize\setlength{{\tabcolsep}}{{{COLUMN_GAP:g}pt}}"
-    comment = (
-        rf"% {' '.join(table.title.split())}. Needs \usepackage{{booktabs, longtable, siunitx, amsmath}} and"
-        r" \usepackage[T1]{fontenc}."
-    )
-    if len(table) > LONG:
-        comment += " A longtable stands where the text has one column."
-        more = rf"\multicolumn{{{len(table.columns)}}}{{r}}{{continued on the next page}} \\"
-        foot = [r"\midrule", more, r"\endfoot", r"\bottomrule", r"\endlastfoot"]
-        named = [] if width is None else [rf"{caption} \\"]
-        lines = [*named, *head, r"\endfirsthead", *head, r"\endhead", *foot, *rows]
-        lines = [rf"\begin{{longtable}}{{{shape}}}", *lines, r"\end{longtable}"]
-        lines = lines if width is None else [f"{{{size}", *lines, "}"]
-    else:
-        lines = [rf"\begin{{tabular}}{{{shape}}}", *head, *rows, r"\bottomrule", r"\end{tabular}"]
-        if width is not None:
+    kind, repeated = ("longtable", [r"\endhead"]) if len(table) > LONG else ("tabular", [])
+    lines = [rf"\begin{{{kind}}}{{{shape}}}", *head, *repeated, *rows, r"\bottomrule", rf"\end{{{kind}}}"]
+    if width is not None:
+        label = f"tab:{table.name.replace('_', '-')}"
+        caption = rf"\caption{{{escaped(table.title)}. {escaped(table.caption)}}}\label{{{label}}}"
+        size = rf"\footnotesize\setlength{{\tabcolsep}}{{{COLUMN_GAP:g}pt}}"
+        if repeated:
+            lines = [f"{{{size}", lines[0], rf"{caption} \\", *lines[1:], "}"]
+        else:
             kind = "table" if width <= COLUMN else "table*"
             lines = [rf"\begin{{{kind}}}[tb]", r"\centering", caption, size, *lines, rf"\end{{{kind}}}"]
-    return "\n".join([comment, *lines, ""])
+    needed = r"\usepackage{booktabs, longtable, siunitx, amsmath} and \usepackage[T1]{fontenc}."
+    return "\n".join([f"% {' '.join(table.title.split())}. Needs {needed}", *lines, ""])
 
 
 def _latex_row(cells: Iterable[str]) -> str:

@@ -19,31 +19,26 @@ from ipe_bench.statistics.summary import ALL
 _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     "costs": (
         "Costs",
-        "Medians per trial over all trials. A Jacobian counts as many simulations as its model says. To 0.05 σ of"
-        " limit: cost until all further iterates are within 0.05 standard deviations of the last one, over the"
-        " converged trials with a stored history. Order: the last observed order of convergence of these trials.",
+        "Medians per trial over all trials; a Jacobian counts as many simulations as its model says. To 0.05 σ of limit"
+        " and order: over the converged trials with a stored history.",
         lambda rows: rows["trials"] > 0,
     ),
     "all_trials": (
         "All trials",
-        "Over all trials. misfit: residuals fail the test of fit at 0.1 %. ambiguous: several minima fit, as far as the"
-        " estimator has looked. Root mean squares and efficiency here are not capped: one trial may decide them.",
+        "Over all trials. Root mean squares and efficiency here are not capped: one trial may decide them.",
         lambda rows: rows["trials"] > 0,
     ),
     "solved_trials": (
         "Solved trials",
         "A diagnostic of estimators that solve an equation, and no comparison with others: each over the trials in"
-        " which it found the root that belongs to the truth, which nobody knows who has readings alone. Their number"
-        " stands in brackets where it is not all. rmse, common: on the trials that every estimator solved. False root:"
-        " it converged to another one.",
+        " which it found the root that belongs to the truth. Their number stands in brackets where it is not all.",
         lambda rows: rows["equation"] != "-",
     ),
     "covariances": (
         "Covariance of the frozen root",
         "Standard deviations over the linear bound of eq. (5), root mean square over parameters, of the estimators that"
-        " solve eq. (11), over solved trials. rmse is what happened (Monte Carlo); reported is the sandwich at the"
-        " estimate, which holds to first order; eq. (14) takes the compensation error for independent of the noise,"
-        " which it is not. A false root is a converged trial at another root than the truth leads to.",
+        " solve eq. (11), over solved trials. rmse is by Monte Carlo; reported is the sandwich at the estimate, which"
+        " holds to first order; eq. (14) takes the compensation error for independent of the noise, which it is not.",
         lambda rows: rows["eq_14"].notna(),
     ),
     "iterations": (
@@ -64,13 +59,10 @@ def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]
     if not analysis.summary.empty:
         rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
         totals = pd.concat([rows, analysis.scores[list(frame_columns(SCORES))]], axis=1)
-        recorded = {
-            where: _recorded(analysis, where, title, caption, totals[chosen(totals)])
-            for where, (title, caption, chosen) in _RECORDED.items()
-        }
-        main = (recorded["costs"], comparisons(analysis), ranks(analysis), parameters(analysis), calibration(analysis))
-        late = (recorded["all_trials"], recorded["solved_trials"], contraction(analysis), recorded["covariances"])
-        late = [*late, theory(analysis), recorded["iterations"]]
+        made = {w: _recorded(analysis, w, t, c, totals[chosen(totals)]) for w, (t, c, chosen) in _RECORDED.items()}
+        main = (made["costs"], comparisons(analysis), ranks(analysis), parameters(analysis), calibration(analysis))
+        late = (made["all_trials"], made["solved_trials"], contraction(analysis), made["covariances"])
+        late = [*late, theory(analysis), made["iterations"]]
         found = [overview(analysis), *main, *found, *(table and replace(table, appendix=True) for table in late)]
     return [table for table in found if table is not None]
 
@@ -136,10 +128,8 @@ def calibration(analysis: Analysis) -> Table | None:
     """How each reported covariance lies, in words; the file says so of each parameter, too."""
     caption = (
         "Whether the truth lies under the Gaussian that an estimator reports as that Gaussian says: over converged"
-        " trials with a covariance, for NEES and every parameter together, at 5 % for each row. p: that chance alone"
-        " takes any of these distributions so far. Excursion: how far the one of NEES is from its own at most. What"
-        " each parameter came to is in the table of parameters. The verdict is over converged trials, the median NEES"
-        " with its limits over all."
+        " trials with a covariance, for NEES and every parameter together, at 5 % for each row. The median NEES with"
+        " its limits is over all trials."
     )
     rows = analysis.summary[analysis.summary["claims"] > 0]
     title = "Calibration of the reported covariance"
@@ -161,9 +151,9 @@ def contraction(analysis: Analysis) -> Table | None:
             column(f"{title} below 1", rows[f"contraction_{name}_below_1"], percent),
         ]
     caption = (
-        "Of g' = I - H⁺J at the truth, over all trials. K of eq. (15) below 1, or the infinity norm below 1, in a whole"
-        " neighbourhood is sufficient for fixed-point iteration to converge there; the spectral radius below 1 is"
-        " necessary and sufficient close to the root, and is the rate at which the error shrinks."
+        "Of g' = I - H⁺J at the truth, over all trials. K of eq. (15), or the infinity norm, below 1 in a whole"
+        " neighbourhood is sufficient for fixed-point iteration to converge there; the spectral radius, the rate at"
+        " which the error shrinks, below 1 is necessary and sufficient close to the root."
     )
     return Table("contraction", "Contraction", caption, columns, rows)
 
@@ -185,10 +175,9 @@ def comparisons(analysis: Analysis) -> Table | None:
         words("finding", [f"{label} is closer" if label else "no difference" for label in rows["closer"]]),
     ]
     caption = (
-        "On the trials that both have. A win is a Mahalanobis error of the first smaller by more than 0.001 standard"
-        " deviations; first, second alone: trials in which only that one succeeds, by the gate of the Cramér-Rao bound,"
-        " prior or not. p: Wilcoxon's signed-rank and McNemar's exact test, Holm-corrected over all pairs of all"
-        " scenarios."
+        "On the trials that both have. First, second alone: trials in which only that one succeeds, by the gate of the"
+        " Cramér-Rao bound, prior or not. p: Wilcoxon's signed-rank and McNemar's exact test, Holm-corrected over all"
+        " pairs of all scenarios."
     )
     return Table("comparisons", "Paired comparisons", caption, columns, rows)
 

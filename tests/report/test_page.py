@@ -10,7 +10,7 @@ import pytest
 from synthetic_store import Synthetic
 from test_report import HOSTILE, fill
 
-from ipe_bench.report import write_report
+from ipe_bench.api import report as write_report
 
 pytestmark = pytest.mark.browser
 

@@ -17,8 +17,9 @@ from markupsafe import escape
 from rich.console import Console
 from synthetic_store import Filter, Seeker, Synthetic
 
+from ipe_bench.api import report as write_report
 from ipe_bench.noise import Quantization
-from ipe_bench.report import figures, write_report
+from ipe_bench.report import figures
 from ipe_bench.report.definitions import DEFINITIONS
 from ipe_bench.report.headline import about, headline
 from ipe_bench.report.table import Strong, Table, column, comma_separated, html, latex, markdown, terminal, texts, words
@@ -153,7 +154,7 @@ def test_hostile_names_are_shown_and_not_run(synthetic, figures):
     fill(synthetic, labels=labels, names=(HOSTILE, "_b%", "c#~^\u03b1"), scales=(1.0, 10.0))
     result = write_report([synthetic.directory], synthetic.directory / "out", figures=figures)
     drawn = {path.stem for path in result.figures}
-    assert figures == "main" or {"error_against_scale", "consistency", "profiles", "correlation"} <= drawn
+    assert figures == "main" or {"headline", "calibration"} <= drawn
     page = result.report.read_text(encoding="utf-8")
     assert HOSTILE not in page
     assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
@@ -214,10 +215,10 @@ def test_settings_that_differ_have_figures_of_their_own(synthetic, tmp_path, mon
     synthetic.bound = lambda scenario: np.full(3, 0.1)
     for scenario in (*gaussian, *(replace(s, noise=Quantization(0.7)) for s in gaussian[:2])):
         synthetic.add(scenario, "one", 0.1 * rng.normal(size=(40, 3)))
-    monkeypatch.setattr(figures, "FIGURES", ("errors", "parameters"))
+    monkeypatch.setattr(figures, "FIGURES", ("errors", "costs"))
     result = write_report([synthetic.directory], tmp_path / "out", figures="all")
     names = {path.stem for path in result.figures}
-    for kind in ("error_against_scale", "correlation"):
+    for kind in ("headline", "cost_against_accuracy"):
         settings = {name.removeprefix(f"{kind}_") for name in names if name.startswith(f"{kind}_")}
         assert settings == {"gaussian-0.2", "gaussian-0.4", "quantization"}
     page = re.sub(r'base64,[^"]*', "", result.report.read_text(encoding="utf-8"))

@@ -62,7 +62,7 @@ def test_the_report_has_the_figures_and_formats_that_were_asked_for_last(
     assert drawn() == {f"cost_against_accuracy.{kind}" for kind in ("png", "pdf", "svg")}
     report = ["report", str(tmp_path)]
     assert main([*report, "figures=all", "formats=[pdf]"]) == 0
-    assert {"cost_against_accuracy.pdf", "correlation.png"} <= drawn()
+    assert {"cost_against_accuracy.pdf", "parameter_errors_linear_lse.png"} <= drawn()
     assert {name.rpartition(".")[2] for name in drawn()} == {"png", "pdf"}
     assert main([*report, "figures=none"]) == 0
     assert drawn() == set()

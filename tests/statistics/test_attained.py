@@ -3,11 +3,11 @@
 import pytest
 from rich.console import Console
 
+from ipe_bench.api import report as write_report
 from ipe_bench.baselines import LeastSquares, LevenbergMarquardt
 from ipe_bench.measurements import Mgh
 from ipe_bench.measurements.mgh import functions
 from ipe_bench.noise import Certified
-from ipe_bench.report import write_report
 from ipe_bench.report.certified_tables import certified_tables
 from ipe_bench.report.terminal import render
 from ipe_bench.runs.run import compute

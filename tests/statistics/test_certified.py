@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from ipe_bench.api import report as write_report
 from ipe_bench.baselines import LinearLSE, MultiscaleLM
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Nist, Polynomial
 from ipe_bench.noise import Certified
 from ipe_bench.priors import GaussianPrior
-from ipe_bench.report import write_report
 from ipe_bench.runs.run import compute, validate
 from ipe_bench.solvers import FixedPoint
 from ipe_bench.statistics.certified import certified_averages, certified_table

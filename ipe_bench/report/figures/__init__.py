@@ -19,7 +19,7 @@ from ipe_bench.report.figures.views import FRAMES, View, views
 from ipe_bench.report.style import house_style
 from ipe_bench.statistics.analysis import Analysis
 
-FIGURES = ("errors", "costs", "parameters", "consistency", "convergence")
+FIGURES = ("errors", "costs", "parameters", "calibration", "convergence")
 """The modules in the order of the report; each holds its kinds of figures in FIGURES."""
 INDEX = "index.json"
 
@@ -43,7 +43,8 @@ def draw_all(
     `index.json` in the folder names each with its title and caption; figures of an earlier report are removed. One of a
     plugin that cannot be drawn is left out, with a line added to the problems of the analysis.
     """
-    problems, old, drawn = analysis.collection.extra_problems, _names(folder), []
+    problems, drawn = analysis.collection.extra_problems, []
+    old = json.loads((folder / INDEX).read_text(encoding="utf-8")) if (folder / INDEX).exists() else []
     with house_style():
         for drawing, plugin in drawings(analysis, which):
             make_folder(folder)
@@ -55,7 +56,7 @@ def draw_all(
             else:
                 drawn.append(Drawn(drawing.name, str(drawing.title), str(drawing.caption), files))
     written = {path.name for one in drawn for path in one.files}
-    for name in {f"{name}.{kind}" for name in old for kind in FORMATS} - written:
+    for name in {f"{entry['name']}.{kind}" for entry in old for kind in FORMATS} - written:
         (folder / name).unlink(missing_ok=True)
     index = [{"name": one.name, "title": one.title, "caption": one.caption} for one in drawn]
     if index or old:
@@ -66,8 +67,7 @@ def draw_all(
 def drawings(analysis: Analysis, which: Which = "all") -> Iterator[tuple[Drawing, str]]:
     """Figures of every setting, or of all of them together, ours first; with the plugin that draws one, if any."""
     problems = analysis.collection.extra_problems
-    # Plugins that cannot be used are told of even if nothing is drawn.
-    others = _of_plugins(problems)
+    others = _of_plugins(problems)  # those that cannot be used are told of even if nothing is drawn
     if which == "none" or (not analysis.collection.groups and analysis.attained.empty):
         return
     ours = [(figure, "") for name in FIGURES for figure in import_module(f"{__name__}.{name}").FIGURES]
@@ -115,12 +115,3 @@ def drawn_by(figure: Figure, view: View) -> list[Drawing]:
     for drawing in found:
         require_type(drawing, Drawing)
     return found
-
-
-def _names(folder: Path) -> list[str]:
-    """Names of the figures of an earlier report; none if its index is missing, damaged or of another version."""
-    try:
-        names = [entry["name"] for entry in json.loads((folder / INDEX).read_text(encoding="utf-8"))]
-        return [name for name in names if Path(name).name == name]
-    except (OSError, ValueError, KeyError, TypeError):
-        return []

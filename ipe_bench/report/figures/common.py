@@ -23,16 +23,6 @@ REACH = 0.3
 """Part of the span of the points that intervals may add to an axis at either end."""
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
-# Panels --------------------------------------------------------------------------------------------------------------
-
-
-def figure(width: float, height: float) -> Figure:
-    """An empty figure; in print as wide as the column, in the same shape."""
-    from matplotlib.figure import Figure
-
-    size = (column(), max(1.9, height * column() / width)) if column() else (width, height)
-    return Figure(figsize=size, layout="constrained")
-
 
 def most_panels() -> int:
     """Panels of a figure: six on the page, two rows in a column of print."""
@@ -43,26 +33,18 @@ def panels(count: int, look: Mapping[str, Look] | None = None, *, height: float 
     """A figure with that many panels, in print in at most two rows, and room for the legend of the estimators."""
     from matplotlib.figure import Figure
 
-    entries = len(look or ())
     if column():
         across = min(count, max(2, -(-count // 2)) if column() < 5 or count == 4 else 3)
-        down = -(-count // across)
-        size = column(), max(1.5, 0.85 * column() / across) * down + 0.055 * entries + 0.2
+        size, height = column(), max(1.2, 0.85 * column() / across)
     else:
         across = min(count, {4: 2, 7: 4, 8: 4}.get(count, 3))
-        down = -(-count // across)
-        size = {1: 5.2, 2: 8.0, 3: 9.2}.get(across, 11.0), height * down + 0.4 + 0.04 * entries
-    fig = Figure(figsize=size, layout="constrained")
+        size = {1: 5.2, 2: 8.0, 3: 9.2}.get(across, 11.0)
+    down = -(-count // across)
+    fig = Figure(figsize=(size, height * down + 0.4 + 0.05 * len(look or ())), layout="constrained")
     axes: list[Axes] = list(fig.subplots(down, across, squeeze=False).flat)
     for ax in axes[count:]:
         ax.set_axis_off()
     return fig, axes[:count]
-
-
-def spread(values: Sequence[Any], most: int | None = None) -> list[Any]:
-    """At most that many of the values, evenly spread and with both ends."""
-    count = min(most or most_panels(), len(values))
-    return [values[round(i)] for i in np.linspace(0, len(values) - 1, count)]
 
 
 def at_scale(frame: pd.DataFrame, scale: float) -> pd.DataFrame:
@@ -70,15 +52,13 @@ def at_scale(frame: pd.DataFrame, scale: float) -> pd.DataFrame:
 
 
 def panels_of_scales(rows: pd.DataFrame, look: Mapping[str, Look]) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
-    """A figure with a panel for each error scale, and the panels, each with its rows."""
-    scales = spread(sorted(set(rows["error_scale"])))
+    """A figure with a panel for each error scale, or for some with both ends, and the panels, each with its rows."""
+    every = sorted(set(rows["error_scale"]))
+    scales = [every[round(i)] for i in np.linspace(0, len(every) - 1, min(most_panels(), len(every)))]
     fig, axes = panels(len(scales), look)
     for scale, ax in zip(scales, axes, strict=True):
         title(ax, f"error scale {plain(scale)}")
     return fig, [(ax, at_scale(rows, scale)) for scale, ax in zip(scales, axes, strict=True)]
-
-
-# Words ---------------------------------------------------------------------------------------------------------------
 
 
 def text(value: Any) -> str:
@@ -89,24 +69,21 @@ def text(value: Any) -> str:
     return "\u200b" + words if words.startswith("_") else words
 
 
-def _letter(size: Any) -> float:
-    """Inches of a letter in this one of matplotlib's settings of size, with the space around it."""
+def _letters(inches: float, size: Any) -> float:
+    """About the number of letters of one of matplotlib's sizes in that length."""
     from matplotlib import rcParams
 
-    return 0.0085 * float(rcParams[size])
+    return inches / (0.0085 * float(rcParams[size]))
 
 
-def _inches(ax: Axes) -> float:
-    """About the width of a panel: in print its labels take a fourth of what the layout has not given them yet."""
-    width = ax.get_position().width * ax.figure.get_figwidth()  # type: ignore[union-attr]
-    return min(0.75 * width, width - 0.45) if column() else width
+def _width(ax: Axes) -> float:
+    """About the inches across a panel, whose layout is still to come."""
+    return 0.8 * ax.get_position().width * ax.figure.get_figwidth()  # type: ignore[union-attr]
 
 
 def title(ax: Axes, words: str) -> None:
     """Sets the title of a panel, in as many lines as its width needs."""
-    broken = max(map(len, words.split()), default=0) > 20
-    letters = max(12, int(_inches(ax) / _letter("axes.titlesize")))
-    ax.set_title(fill(words.replace("$", r"\$"), letters, break_long_words=broken))
+    ax.set_title(fill(words.replace("$", r"\$"), max(12, int(_letters(_width(ax), "axes.titlesize")))))
 
 
 def axis_labels(fig: Figure, x: str, y: str) -> None:
@@ -115,11 +92,6 @@ def axis_labels(fig: Figure, x: str, y: str) -> None:
     fig.supylabel(y, fontsize="medium")
     for ax in fig.axes:
         ax.set(xlabel="", ylabel="")
-
-
-def power_of_ten(value: float) -> str:
-    """10⁻³ in plain letters, which take a fraction of the time that mathematics does."""
-    return "10" + f"{round(np.log10(value))}".translate(_RAISED)
 
 
 def number(value: float) -> str:
@@ -140,9 +112,6 @@ def sentence(*parts: str) -> str:
     return " ".join(part for part in parts if part)
 
 
-# Axes ----------------------------------------------------------------------------------------------------------------
-
-
 def scale_axis(ax: Axes, scales: Sequence[float], labels: Sequence[str]) -> None:
     """A logarithmic axis that shows the error scales themselves; if there is one alone, the labels side by side."""
     if len(scales) == 1:
@@ -156,7 +125,7 @@ def scale_axis(ax: Axes, scales: Sequence[float], labels: Sequence[str]) -> None
     least = positive[0] / 10 if zero else positive[0]
     ax.set_xscale("symlog", linthresh=positive[0], linscale=0.5) if zero else ax.set_xscale("log")
     span = np.log10(positive[-1] / least)
-    kept = [0.0] * zero + labelled(positive, span * _letter("xtick.labelsize") / max(_inches(ax), 0.3))
+    kept = [0.0] * zero + labelled(positive, span / _letters(_width(ax), "xtick.labelsize"))
     ax.set_xticks(kept, [plain(s) for s in kept])
     ax.set_xticks([], minor=True)
     margin = 10 ** max(0.06 * span, 0.15)
@@ -188,25 +157,21 @@ def decades(ax: Axes, values: Any, least: float = 10.0, *, ends: Any = ()) -> No
     if len(values) == 0:
         # A logarithmic axis without anything to show makes matplotlib warn.
         return
-    ax.set_yscale("log")
-    low, high = float(values.min()), float(values.max())
+    low, high = values.min(), values.max()
     room = max(least, (high / low) ** REACH)
-    low = max(low / room, ends.min(initial=low)) / 1.6
-    high = min(high * room, ends.max(initial=high)) * 1.6
-    if high / low < least:
-        middle = np.sqrt(low * high)
-        low, high = middle / np.sqrt(least), middle * np.sqrt(least)
-    ax.set_ylim(low, high)
-    log_ticks(ax.yaxis, low, high)
+    low, high = max(low / room, ends.min(initial=low)) / 1.6, min(high * room, ends.max(initial=high)) * 1.6
+    wider = max(np.sqrt(least * low / high), 1.0)
+    ax.set_yscale("log")
+    ax.set_ylim(low / wider, high * wider)
+    log_ticks(ax.yaxis, low / wider, high * wider)
 
 
 def log_ticks(axis: Axis, low: float, high: float) -> None:
     """Labels that do not crowd: powers of ten, and 2 and 5 between if those are few."""
     from matplotlib.ticker import LogLocator, NullLocator
 
-    few = high / low < 200
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5)) if few else LogLocator(numticks=7))
-    axis.set_major_formatter(lambda value, _: number(value) if few else power_of_ten(value))
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5)) if high / low < 200 else LogLocator(numticks=7))
+    axis.set_major_formatter(lambda value, _: number(value))
     axis.set_minor_locator(NullLocator())
 
 
@@ -219,9 +184,6 @@ def shares(ax: Axes, label: str) -> None:
 
 def bound_line(ax: Axes, at: float, label: str) -> None:
     ax.axhline(at, color=BOUND_COLOR, linestyle=BOUND_DASH, linewidth=1.0, label=label, zorder=1)
-
-
-# Curves --------------------------------------------------------------------------------------------------------------
 
 
 def seaborn_style(look: Mapping[str, Look], by: str = "estimator") -> dict[str, Any]:
@@ -241,15 +203,6 @@ def lines(ax: Axes, rows: pd.DataFrame, x: str, y: str, look: Mapping[str, Look]
     style = {**seaborn_style(look), "markers": False, "dashes": dashes, "estimator": None, "sort": False, **style}
     sns.lineplot(rows, x=x, y=y, ax=ax, **style)
     ax.set(xlabel="", ylabel="")
-
-
-def steps(ax: Axes, rows: pd.DataFrame, x: str, y: str, look: Mapping[str, Look], low: float, high: float) -> None:
-    """Shares that rise in steps from `low` to `high` on a logarithmic axis."""
-    lines(ax, rows, x, y, look, drawstyle="steps-post")
-    ax.set_xscale("log")
-    ax.set_xlim(low, high)
-    log_ticks(ax.xaxis, low, high)
-    shares(ax, "")
 
 
 def curves(
@@ -314,10 +267,7 @@ def legend(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | None = 
     if not handles:
         return
     # The most columns that fit side by side, each as wide as its longest label.
-    letter, lengths = _letter("legend.fontsize"), np.array([len(label) for label in handles])
-    fitting = (
-        count
-        for count in range(len(handles), 1, -1)
-        if sum(letter * (7 + part.max()) for part in np.array_split(lengths, count)) <= fig.get_figwidth()
-    )
+    lengths, room = np.array([7 + len(label) for label in handles]), _letters(fig.get_figwidth(), "legend.fontsize")
+    counts = range(len(handles), 1, -1)
+    fitting = (n for n in counts if sum(part.max() for part in np.array_split(lengths, n)) <= room)
     fig.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=next(fitting, 1))

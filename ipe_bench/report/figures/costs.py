@@ -1,28 +1,52 @@
-"""What accuracy costs: simulations against error, and data profiles of trials and of problems of known minimum."""
+"""What accuracy costs: simulations against error, and the data profile of problems of known minimum."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.special import gammaincinv
 
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing, Figure
-from ipe_bench.report.figures.errors import MOST, quantiles
 from ipe_bench.report.figures.views import View
-from ipe_bench.report.style import GREY, Look, looks
-from ipe_bench.report.words import percent, plain
+from ipe_bench.report.style import GREY, looks
+from ipe_bench.report.words import plain
 from ipe_bench.statistics.certified import data_profile
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as Canvas
 
 LEAST_COST = 0.5
 """What does not simulate at all stands here: a logarithmic axis has no zero."""
+MOST = 0.95
+"""Share of the trials whose errors lie below what is drawn."""
 _HIGHEST = 1e6
 """Errors beyond this many bounds stand at the upper edge."""
+
+
+def efficient(share: float, n: int) -> float:
+    """The quantile of an efficient estimator's Mahalanobis error: that of chi with n degrees of freedom."""
+    return float(np.sqrt(2 * gammaincinv(n / 2, share)))
+
+
+def quantiles(view: View, share: float) -> pd.DataFrame:
+    """What that share of all trials err less than, over the same of an efficient estimator: 1 at the Cramér-Rao bound.
+
+    A row per error scale and estimator with `trials`, `error` and its 95 % interval from `low` to `high`, which are
+    order statistics: between them lies the true quantile whatever the errors' distribution (binomial counts). An end
+    beyond the last trial is infinite, and so is an error if too many estimates are not finite.
+    """
+    from scipy.stats import binom
+
+    trials: Any = view.totals.set_index(["error_scale", "estimator"])["trials"]
+    found = []
+    for key, part in view["distributions"].groupby(["error_scale", "estimator"], sort=False):
+        count = int(trials[key])
+        at, errors = part["probability"].to_numpy(), part["distance"].to_numpy() / efficient(share, view.n)
+        low, high = np.add(binom.interval(0.95, count, share), (0, 1)) / count
+        ends = errors[at <= low][-1] if low > 0 else 0.0, errors[at >= high][0] if high < 1 else np.inf
+        found.append((*key, count, errors[np.searchsorted(at, share - 1e-9)], *ends))
+    return pd.DataFrame(found, columns=["error_scale", "estimator", "trials", "error", "low", "high"])
 
 
 def draw_costs(view: View) -> Iterator[Drawing]:
@@ -58,31 +82,9 @@ def draw_costs(view: View) -> Iterator[Drawing]:
         "Cost against accuracy, all trials",
         "Median cost of a trial in simulations, a Jacobian counting what it costs, against what 95 % of all trials err"
         " by at most, over the same of an efficient estimator; down and left is better.",
-        f"Errors beyond {common.power_of_ten(_HIGHEST)} stand at the edge." * bool((rows["error"] == _HIGHEST).any()),
+        f"Errors beyond {common.number(_HIGHEST)} stand at the edge." * bool((rows["error"] == _HIGHEST).any()),
         f"The cheapest within 5 % of the least error at scale {plain(view.scales[-1])}: {good['estimator']}"
         f" ({good['cost_median']:g} simulations).",
-    )
-
-
-def draw_profiles(view: View) -> Iterator[Drawing]:
-    rows = view["profiles"]
-    rows = rows[rows["profile"] == "data"]
-    if rows["estimator"].nunique() < 2:
-        return
-    final = rows.groupby("estimator", sort=False)["share"].max()
-    # A little behind the point from which on no curve rises.
-    end = max(
-        1.5 * float(rows[rows["share"] >= rows["estimator"].map(final)].groupby("estimator")["at"].min().max()), 4.0
-    )
-    fig = _data_profile(rows[rows["at"] <= end], view.with_look(rows["estimator"]), 0.93, end)
-    fig.axes[0].set(xlabel="simulations per trial", ylabel="share of trials with success")
-    yield view.drawing(
-        fig,
-        "profiles",
-        "Data profile, all trials",
-        "All trials of all scenarios, pooled: the curves depend on which error scales there are. Data profile of Moré"
-        " and Wild: the share of trials in which an estimator succeeds within that many simulations.",
-        f"{final.idxmax()} succeeds most often ({percent(final.max())}).",
     )
 
 
@@ -99,8 +101,14 @@ def draw_known_minima(view: View) -> Iterator[Drawing]:
     best = list(final.loc[final["share"] == final["share"].max(), "estimator"])
     look = looks(list(dict.fromkeys(table["estimator"])), chosen=list(final["estimator"][:10]))
     rows = pd.concat([final.assign(share=0.0, at=low), rows, final], ignore_index=True)
-    fig = _data_profile(rows, look, low, end)
-    fig.axes[0].set(xlabel="simplex gradients, n + 1 simulations each", ylabel="share of problems solved")
+    fig, (ax,) = common.panels(1, look, height=3.4)
+    common.lines(ax, rows, "at", "share", look, drawstyle="steps-post")
+    ax.set_xscale("log")
+    ax.set_xlim(low, end)
+    common.log_ticks(ax.xaxis, low, end)
+    common.shares(ax, "")
+    common.legend(fig, [ax], look)
+    ax.set(xlabel="simplex gradients, n + 1 simulations each", ylabel="share of problems solved")
     yield view.drawing(
         fig,
         "data_profile",
@@ -112,15 +120,7 @@ def draw_known_minima(view: View) -> Iterator[Drawing]:
     )
 
 
-def _data_profile(rows: pd.DataFrame, look: Mapping[str, Look], low: float, high: float) -> Canvas:
-    fig, (ax,) = common.panels(1, look, height=3.4)
-    common.steps(ax, rows, "at", "share", look, low, high)
-    common.legend(fig, [ax], look)
-    return fig
-
-
 FIGURES = (
     Figure(draw_costs, ("summary", "distributions", "scores"), main=True),
     Figure(draw_known_minima, ("attained",), together=True, main=True),
-    Figure(draw_profiles, ("profiles", "scores"), together=True),
 )

@@ -1,4 +1,4 @@
-"""Errors parameter by parameter, figures 2 and 3 of the paper, and their correlations."""
+"""Errors parameter by parameter: figures 2 and 3 of the paper."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from ipe_bench.report.style import BLACK, BOUND_DASH, COLORS, GREY, MARKERS, REF
 from ipe_bench.report.words import plain
 from ipe_bench.statistics.summary import ALL
 
-MOST_GROUPS, MOST_PARAMETERS, MOST_NUMBERED = 8, 30, 15
-"""Groups that have panels, parameters of a map of correlations, and those up to which numbers stand in its cells."""
+MOST_GROUPS = 8
+"""Groups of parameters that have panels."""
 
 
 def draw(view: View) -> Iterator[Drawing]:
@@ -102,57 +102,4 @@ def _missing(totals: pd.DataFrame) -> str:
     return common.enumerate_few(seen, 12) or f"all of {totals['trials'].min():.0f}"
 
 
-def draw_correlations(view: View) -> Iterator[Drawing]:
-    """Correlation of the parameters' errors, beside that of the bound."""
-    import seaborn as sns
-
-    if not 2 <= view.n <= MOST_PARAMETERS or view["correlations"].empty:
-        return
-    scale, names = view.scales[-1], [p["name"] for p in view.parameters]
-    # Who succeeds most, and of those who errs least.
-    ranked = common.at_scale(view.totals, scale).sort_values(["success", "error_median"], ascending=[False, True])
-    best = ranked.iloc[0]
-    rows = common.at_scale(view["correlations"], scale)
-    table = rows[rows["estimator"] == best["estimator"]].pivot_table(index="row", columns="column", values="value")
-    table = table.reindex(index=names, columns=names)
-    if table.isna().all(axis=None):
-        return
-    tables = {f"{best['estimator']}, error scale {plain(scale)}, {best['solved_trials']:.0f} solved trials": table}
-    if view.bound_correlation is not None:
-        tables["linear bound, eq. (5)"] = pd.DataFrame(view.bound_correlation, names, names)
-    side = 1.2 + 0.36 * view.n
-    # Side by side on the page, one below the other in a column of print.
-    across, down = (1, len(tables)) if common.most_panels() <= 4 else (len(tables), 1)
-    fig = common.figure(min(11.0, (side + 0.4) * across + 0.6), min(5.4, side + 0.3) * down)
-    axes = list(fig.subplots(down, across, squeeze=False).flat)
-    hidden, numbered = ~np.tri(view.n, k=-1, dtype=bool), view.n <= MOST_NUMBERED and common.most_panels() > 4
-    style: dict[str, Any] = {"cmap": "RdBu_r", "vmin": -1, "vmax": 1, "square": True, "linewidths": 0.5, "cbar": False}
-    style |= {"fmt": "", "annot_kws": {"fontsize": 6.5}, "xticklabels": False, "yticklabels": False}
-    for (title, one), ax in zip(tables.items(), axes, strict=True):
-        sns.heatmap(one, ax=ax, mask=hidden, annot=one.map(two_decimals) if numbered else False, **style)
-        ax.set_xticks(np.arange(view.n) + 0.5, [common.text(name) for name in names], rotation=90)
-        ax.set_yticks(np.arange(view.n) + 0.5, [common.text(name) for name in names], rotation=0)
-        # The first row and the last column are empty without the diagonal.
-        ax.set(xlim=(0, view.n - 1), ylim=(view.n, 1), xlabel="", ylabel="")
-        ax.grid(visible=False)
-        common.title(ax, title)
-    fig.colorbar(axes[0].collections[0], ax=axes, label="correlation", shrink=0.8).outline.set_linewidth(0)
-    values = np.abs(np.tril(table.to_numpy(), -1))
-    i, j = map(int, np.unravel_index(np.nanargmax(values), values.shape))
-    yield view.drawing(
-        fig,
-        "correlation",
-        "Correlation of parameter errors, solved trials",
-        f"Correlation of the parameters' errors of {best['estimator']} at error scale {plain(scale)} over its solved"
-        " trials" + (", beside that of the linear bound." if len(tables) > 1 else "."),
-        f"Strongest: {names[i]} with {names[j]}, {table.iloc[i, j]:.2f}.",
-    )
-
-
-def two_decimals(value: float) -> str:
-    """0.97 as .97; never a minus before zero, and the sign that typography has."""
-    words = f"{value:.2f}".replace("-0.00", "0.00").replace("0.", ".")
-    return words.replace("-", "\N{MINUS SIGN}") if np.isfinite(value) else ""
-
-
-FIGURES = (Figure(draw, ("summary",)), Figure(draw_correlations, ("summary", "correlations")))
+FIGURES = (Figure(draw, ("summary",)),)

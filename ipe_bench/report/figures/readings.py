@@ -1,9 +1,9 @@
-"""Figures of estimates from readings: residuals, covariance ellipses, profiles of the likelihood, and posteriors."""
+"""Figures of estimates from readings: residuals, covariance ellipses, and posteriors."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,6 @@ from scipy.special import chdtri
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.real.examination import CONFIDENCE, Examination
 from ipe_bench.real.fits import Fit
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.figures import common
@@ -23,7 +22,7 @@ from ipe_bench.trials.posterior import Reference
 
 MOST_ESTIMATORS = 12
 """Estimators with a panel of residuals; `residuals.csv` has all."""
-MOST_PAIRS = MOST_PROFILES = 9
+MOST_PAIRS = 9
 LEVEL = 0.95
 _MANY = 5000
 """Points from which on they are pixels in the PDF, too."""
@@ -59,15 +58,13 @@ def draw_residuals(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]
         sns.scatterplot(x=x[good], y=r[good], s=9, alpha=0.75, linewidth=0, rasterized=len(x) > _MANY, **style)
         if out.any():
             sns.scatterplot(x=x[out], y=r[out], s=25, marker="x", linewidth=1.2, label="outlier", **style)
-        largest = float(np.nanmax(np.abs(r)))
-        if largest > _BENT:
+        edge = 1.15 * max(float(np.nanmax(np.abs(r))), limit)
+        ax.set_ylim(-edge, edge)
+        if edge > _BENT:
             ax.set_yscale("symlog", linthresh=10.0, linscale=1.0)
-            ax.set_ylim(-1.6 * largest, 1.6 * largest)
         else:
-            edge = 1.15 * max(largest, limit)
-            ax.set_ylim(-edge, edge)
             ax.yaxis.set_major_locator(MaxNLocator(7, integer=True))
-        ax.xaxis.set_major_locator(MaxNLocator(6, integer=heading in ("reading", "epoch")))
+        ax.xaxis.set_major_locator(MaxNLocator(6, integer=heading == "reading"))
         tests = f"fit p {p_value(one.p_value)}, white p {p_value(one.whiteness.p_value, LEAST_P)}"
         ax.set_title(f"{common.text(one.label)}\n{tests}")
     common.axis_labels(fig, common.text(heading), "residual / its deviation")
@@ -83,20 +80,12 @@ def draw_residuals(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]
 
 
 def _abscissa(model: Measurement) -> tuple[Array, str]:
-    """Where each reading (m,) stands along the axis: its time where it has one, else its epoch, else its row."""
-    if model.epochs is None:
-        return np.arange(1.0, model.m + 1), "reading"
-    epoch = np.zeros(model.m)
-    for number, rows in enumerate(model.epochs, 1):
-        epoch[rows] = number
+    """Where each reading (m,) stands along the axis: at its time if there is such a column, else in its row."""
     for name, column in model.index.items():
-        if not all(isinstance(v, int | float | np.number) for v in column):
-            continue
-        values = np.array(column, dtype=float)
-        alike = all(np.ptp(values[rows]) == 0 for rows in model.epochs)
-        if alike and np.ptp(values) > 0 and np.ptp(epoch) > 0 and np.corrcoef(values, epoch)[0, 1] > 0.99:
-            return values, name
-    return epoch, "epoch"
+        values = np.asarray(column)
+        if np.issubdtype(values.dtype, np.number) and np.ptp(values) > 0 and (np.diff(values) >= 0).all():
+            return values.astype(float), name
+    return np.arange(1.0, model.m + 1), "reading"
 
 
 def ellipse(P: Array, edge: float = float(chdtri(2, 1 - LEVEL))) -> Array:
@@ -154,70 +143,40 @@ def _axis_words(model: Measurement, k: int, more: str = "") -> str:
     return common.text(f"{parameter.name}{more}{f' [{parameter.unit}]' if parameter.unit else ''}")
 
 
-def draw_profiles(found: Examination) -> Iterator[Drawing]:
-    """A panel for each parameter whose interval from the standard error is off by more than a tenth."""
-    bent = [i for i, one in enumerate(found.profiles) if one.bent][:MOST_PROFILES]
-    if not bent:
-        return
-    fig, axes = common.panels(len(bent), height=2.6)
-    for i, ax in zip(bent, axes, strict=True):
-        one = found.profiles[i]
-        known = np.isfinite(one.zeta) & (np.abs(one.zeta) <= 2.5 * found.half_width)
-        values = one.values[known]
-        line = np.linspace(values[0], values[-1], 200)
-        parabola = ((line - found.x[i]) / found.standard_errors[i]) ** 2
-        ax.plot(values, one.zeta[known] ** 2, marker="o", markersize=3, label="profile")
-        ax.plot(line, parabola, color=BOUND_COLOR, linewidth=0.8, label="standard error")
-        common.bound_line(ax, found.half_width**2, f"limit of {CONFIDENCE:.0%}".replace("%", " %"))
-        ax.set(ylim=(0, 2.5 * found.half_width**2), xlabel=_axis_words(found.model, i), ylabel="rise of chi-square")
-    common.legend(fig, axes)
-    names = found.model.physical_parameters
-    told = "; ".join(f"{names[i].name} {found.profiles[i].low:.4g} to {found.profiles[i].high:.4g}" for i in bent)
-    caption = (
-        "How chi-square rises when one parameter is held and the others adapt to it, beside the parabola that a"
-        f" standard error stands for. The interval is where the profile stays below the line: {told}."
-    )
-    yield Drawing("likelihood", "Profiles of the likelihood", caption, fig)
-
-
-# Posteriors ----------------------------------------------------------------------------------------------------------
-
-
 def draw_corner(model: Measurement, one: Reference) -> Drawing:
     """Draws of a trial's posterior and the estimators' Gaussians, in standard deviations about its mean."""
+    from matplotlib.figure import Figure
+
     mean, d = one.posterior.mean, one.posterior.deviation
     off = [np.abs(e.x[0] - mean) / d for e in one.estimates.values()]
     worst = np.nan_to_num(np.max([np.zeros(len(d)), *off], axis=0), nan=np.inf)
     shown = sorted(np.argsort(-worst, kind="stable")[:MOST_CORNERS].tolist())
     look, k = looks(list(one.estimates)), len(shown)
     names = [common.text(p.name) for p in model.parameters]
-    draws = (one.posterior.x - mean) / d
-    draws = draws[np.linspace(0, len(draws) - 1, min(_DRAWS, len(draws))).round().astype(int)]
+    draws = (one.posterior.x[:: -(-len(one.posterior.x) // _DRAWS)] - mean) / d
     truth, modes = (one.truth - mean) / d, (one.posterior.modes - mean) / d
-    fig = common.figure(1.6 + 0.85 * k, 1.8 + 0.85 * k)
+    fig = Figure(figsize=(1.6 + 0.85 * k, 1.8 + 0.85 * k), layout="constrained")
     axes = fig.subplots(k, k, squeeze=False, sharex=True)
-    for row, i in enumerate(shown):
-        for column, j in enumerate(shown):
-            ax = axes[row, column]
-            ax.grid(False)
-            ax.tick_params(labelsize=6)
-            if column > row:
-                ax.set_axis_off()
-                continue
-            if column == row:
-                ax.hist(draws[:, i], bins=np.linspace(-_VIEW, _VIEW, 41), density=True, color=_DRAW_COLOR, linewidth=0)
-                ax.axvline(truth[i], color="black", linewidth=0.7)
-                ax.set(xlim=(-_VIEW, _VIEW), ylim=(0, 0.75), yticks=[])
-                ax.set_title(names[i], fontsize=8, pad=4)
-            else:
-                ax.scatter(*draws[:, [j, i]].T, s=1.2, color=_DRAW_COLOR, linewidth=0, alpha=0.6, rasterized=True)
-                if len(modes) > 1:
-                    ax.plot(*modes[:, [j, i]].T, linestyle="none", marker="x", color="#C00000", markersize=4)
-                ax.plot(truth[j], truth[i], linestyle="none", marker="+", color="black", markersize=6)
-                ax.set(ylim=(-_VIEW, _VIEW), yticks=[-4, 0, 4] if column == 0 else [])
-            for label in one.estimates:
-                _estimate(ax, one, label, look[label], [i] if row == column else [j, i])
-        axes[-1, row].set_xlabel(names[i], fontsize=8)
+    for (row, i), (column, j) in product(enumerate(shown), repeat=2):
+        ax = axes[row, column]
+        ax.grid(False)
+        ax.tick_params(labelsize=6)
+        if column > row:
+            ax.set_axis_off()
+        elif column == row:
+            ax.hist(draws[:, i], bins=np.linspace(-_VIEW, _VIEW, 41), density=True, color=_DRAW_COLOR, linewidth=0)
+            ax.axvline(truth[i], color="black", linewidth=0.7)
+            ax.set(xlim=(-_VIEW, _VIEW), ylim=(0, 0.75), yticks=[])
+            ax.set_title(names[i], fontsize=8, pad=4)
+        else:
+            ax.scatter(*draws[:, [j, i]].T, s=1.2, color=_DRAW_COLOR, linewidth=0, alpha=0.6, rasterized=True)
+            if len(modes) > 1:
+                ax.plot(*modes[:, [j, i]].T, linestyle="none", marker="x", color="#C00000", markersize=4)
+            ax.plot(truth[j], truth[i], linestyle="none", marker="+", color="black", markersize=6)
+            ax.set(ylim=(-_VIEW, _VIEW), yticks=[-4, 0, 4] if column == 0 else [])
+        for label in one.estimates if column <= row else ():
+            _estimate(ax, one, label, look[label], [i] if row == column else [j, i])
+        axes[-1, column].set_xlabel(names[j], fontsize=8)
         if row > 0:
             axes[row, 0].set_ylabel(names[i], fontsize=8)
     fig.supxlabel("deviations of the posterior about its mean", fontsize=8)
@@ -231,26 +190,21 @@ def draw_corner(model: Measurement, one: Reference) -> Drawing:
         f"Divergence in nats: {common.enumerate_few(told, 12)}." if told else "",
         f"{len(modes)} modes, crossed." if len(modes) > 1 else "",
         f"The {k} parameters in which estimators are farthest off." if k < model.n else "",
-        "" if one.posterior.settled else "The populations of particles do not agree: give more.",
     )
     return Drawing(f"corner_{one.trial}", f"Posterior of trial {one.trial}", caption, fig)
 
 
 def _estimate(ax: Any, one: Reference, label: str, look: Look, which: list[int]) -> None:
-    """An estimator's Gaussian: its density of one parameter, its 95 % ellipse of two, or its estimate alone."""
+    """An estimator's Gaussian: its density of one parameter or its 95 % ellipse of two, if it reports a covariance."""
     d, estimates = one.posterior.deviation[which], one.estimates[label]
     centre = (estimates.x[0][which] - one.posterior.mean[which]) / d
-    if not np.isfinite(centre).all():
-        return
-    P = np.full((len(d), len(d)), np.nan)
-    if estimates.covariance is not None:
-        P = estimates.covariance[0][np.ix_(which, which)] / np.outer(d, d)
     style = {"color": look.color, "linestyle": look.line["linestyle"], "linewidth": 1.0}
-    if np.isfinite(P).all() and np.linalg.eigvalsh(P)[0] > 0:
-        if len(which) == 1:
-            x = np.linspace(-_VIEW, _VIEW, 201)
-            ax.plot(x, np.exp(-0.5 * (x - centre[0]) ** 2 / P[0, 0]) / np.sqrt(2 * np.pi * P[0, 0]), **style)
-        else:
-            ax.plot(*(centre + ellipse(P)).T, **style)
+    P = None if estimates.covariance is None else estimates.covariance[0][np.ix_(which, which)] / np.outer(d, d)
+    if P is None or not np.isfinite(P).all() or not np.isfinite(centre).all():
+        if len(which) == 2:
+            ax.plot(*centre, color=look.color, marker=look.marker, markersize=3)
     elif len(which) == 2:
-        ax.plot(*centre, color=look.color, marker=look.marker, markersize=3)
+        ax.plot(*(centre + ellipse(P)).T, **style)
+    else:
+        x = np.linspace(-_VIEW, _VIEW, 201)
+        ax.plot(x, np.exp(-0.5 * (x - centre[0]) ** 2 / P[0, 0]) / np.sqrt(2 * np.pi * P[0, 0]), **style)

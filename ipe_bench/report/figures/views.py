@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
 MOST_SETTINGS = 6
 """Settings that have figures of their own; the tables have all."""
-MOST_LETTERS = 80
-"""Of a setting in a file name; longer ones end in a digest instead of being cut to the same beginning."""
+MOST_LETTERS = 70
+"""Of a setting in a file name; longer ones are cut and end in a digest."""
 FRAMES = tuple(field.name for field in fields(Analysis) if field.type == "pd.DataFrame")
 """The tables of an analysis that a figure may ask for."""
 
@@ -42,8 +42,6 @@ class View:
     """What each estimator solves; None for filters and direct estimates, which have no iterations and no root."""
     parameters: Sequence[Mapping[str, Any]] = ()
     """Name, unit, size and group of each; empty for all settings."""
-    bound_correlation: Any = None
-    """Correlation (n, n) of the linear bound's covariance, if it is known."""
     paper: bool = False
     """Whether this is the setting of the paper: the gimballed INS with quantised readings."""
 
@@ -98,13 +96,18 @@ def views(analysis: Analysis) -> tuple[list[View], View]:
         key = tuple(setting.values())
         frames = {name: split[name].get(key, frame.iloc[:0]) for name, frame in whole.items()}
         seen = {label: one for label, one in look.items() if label in set(frames["scores"]["estimator"])}
-        label = _label(setting, varying)
+        # An option that this setting does not have is not spoken of.
+        own = {c: setting[c] for c in varying if setting[c] != "-"}
+        head = [setting[c] for c in ("measurement", "noise") if setting.get(c, "-") != "-"]
+        label = ", ".join([*head, *(f"{c}={v}" for c, v in own.items() if c not in ("measurement", "noise"))])
         if len(parts) + 1 == MOST_SETTINGS < len(settings):
             label += f" ({len(settings) - MOST_SETTINGS} further settings are in the tables)"
-        suffix = _suffix(setting, varying, [part.suffix for part in parts])
+        suffix = re.sub(r"[^A-Za-z0-9.]+", "-", "_".join(own.values())).strip("-.")
+        if varying and (len(suffix) > MOST_LETTERS or f"_{suffix}" in ("_", *(part.suffix for part in parts))):
+            suffix = f"{suffix[:MOST_LETTERS]}-{hashlib.sha256(repr(setting).encode()).hexdigest()[:8]}"
         paper = (setting.get("measurement"), setting.get("noise")) == ("gins", "quantization")
-        known = footers[key]["parameters"], footers[key].get("linear_correlation"), paper
-        parts.append(View(suffix, label, frames, seen, {e: equations[e] for e in seen}, *known))
+        known = footers[key]["parameters"], paper
+        parts.append(View(f"_{suffix}" * bool(varying), label, frames, seen, {e: equations[e] for e in seen}, *known))
     return parts, View("", "", whole, look, equations)
 
 
@@ -122,23 +125,6 @@ def _word(value: Any) -> str:
         return "-"
     # Six figures where they say it all: values that differ later are different settings.
     return plain(value) if isinstance(value, float) and float(plain(value)) == value else str(value)
-
-
-def _label(setting: Mapping[str, str], varying: Sequence[str]) -> str:
-    # An option that this setting does not have is not spoken of.
-    shown = [setting[c] for c in ("measurement", "noise") if setting.get(c, "-") != "-"]
-    others = [c for c in varying if c not in ("measurement", "noise") and setting[c] != "-"]
-    return ", ".join([*shown, *(f"{c}={setting[c]}" for c in others)])
-
-
-def _suffix(setting: Mapping[str, str], varying: Sequence[str], taken: Sequence[str]) -> str:
-    if not varying:
-        return ""
-    words = "_".join(setting[c] for c in varying if setting[c] != "-")
-    safe = re.sub(r"[^A-Za-z0-9.]+", "-", words).strip("-.")
-    if len(safe) > MOST_LETTERS or not safe or f"_{safe}" in taken:
-        safe = f"{safe[: MOST_LETTERS - 9]}-{hashlib.sha256(repr(setting).encode()).hexdigest()[:8]}".strip("-")
-    return f"_{safe}"
 
 
 def _looks(analysis: Analysis) -> dict[str, Look]:

@@ -1,11 +1,10 @@
-"""Whether estimators know how wrong they are: NEES, coverage and the filters' NIS, and the calibration of NEES."""
+"""Whether estimators know how wrong they are: the calibration of NEES."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from ipe_bench.report.figures import common
@@ -13,7 +12,6 @@ from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
 from ipe_bench.report.style import BOUND_COLOR
 from ipe_bench.report.words import plain
-from ipe_bench.statistics.sample import NIS
 from ipe_bench.statistics.summary import ALL
 
 LINEAR = 0.1
@@ -21,43 +19,7 @@ LINEAR = 0.1
 hundredths, dishonest ones by up to 1."""
 
 
-def draw_consistency(view: View) -> Iterator[Drawing]:
-    totals = view.totals[view.totals["nees_median"].notna()]
-    if totals.empty:
-        return
-    # The median lies within its limits where this interval holds 1.
-    middle = totals["nees_median"]
-    totals = totals.assign(low=middle / totals["nees_median_high"], high=middle / totals["nees_median_low"])
-    scores = view["scores"].reindex(columns=["error_scale", "estimator", NIS]).dropna()
-    counted = scores.merge(totals[["error_scale", "estimator", "trials"]])
-    look = view.with_look(totals["estimator"])
-    fig, axes = common.panels(3 if len(counted) else 2, look, height=3.0)
-    shown = (
-        (totals, "nees_median", "squared error over claimed variance", "median NEES", 1.0),
-        (totals, "coverage95", "truth inside the 95 % ellipsoid", "share of trials", 0.95),
-        (counted, NIS, "filters' innovations (NIS)", "mean NIS", 1.0),
-    )
-    for ax, (rows, column, heading, label, honest) in zip(axes, shown, strict=False):
-        common.decades(ax, np.append(rows[column], 1.0)) if honest == 1 else common.shares(ax, "")
-        ends = ("low", "high") if column == "nees_median" else None
-        common.curves(ax, rows, column, look, view.scales, interval=ends, heading=heading, label=label)
-        common.bound_line(ax, honest, "honest covariance")
-    common.legend(fig, axes, look)
-    inside = (totals["low"] <= 1) & (totals["high"] >= 1)
-    always = [e for e in look if inside[totals["estimator"] == e].all()]
-    yield view.drawing(
-        fig,
-        "consistency",
-        "Consistency of the reported covariance, all trials",
-        "All trials. First panel: median normalised estimation error squared over that of chi-square, 1 where the"
-        " reported covariance is right; a bar that does not reach 1 is outside its 95 % limits. Second panel: how often"
-        " the truth lies inside the estimator's own 95 % ellipsoid.",
-        "Third panel: the filters' innovations against the covariance that they expect of them." * bool(len(counted)),
-        f"Inside the limits at every scale: {common.enumerate_few(always, 20) or 'no estimator'}.",
-    )
-
-
-def draw_calibration(view: View) -> Iterator[Drawing]:
+def draw(view: View) -> Iterator[Drawing]:
     """NEES of all estimators, a panel per error scale."""
     rows = view["calibration"]
     if rows.empty:
@@ -99,7 +61,4 @@ def _bands(ax: Any, rows: pd.DataFrame) -> None:
     ax.axhline(0, color=BOUND_COLOR, linewidth=0.6, zorder=1)
 
 
-FIGURES = (
-    Figure(draw_consistency, ("summary", "scores")),
-    Figure(draw_calibration, ("summary", "calibration")),
-)
+FIGURES = (Figure(draw, ("summary", "calibration")),)

@@ -1,0 +1,117 @@
+"""Writes a report: collects what is stored, summarises it, and makes the files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ipe_bench.basics.files import write_text
+from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from ipe_bench.statistics.analysis import Begun
+
+
+@dataclass(frozen=True)
+class ReportResult:
+    """The files of a report, its summary, and what is missing from it."""
+
+    summary: pd.DataFrame
+    summary_path: Path
+    tables: tuple[Path, ...]
+    figures: tuple[Path, ...]
+    report: Path
+    problems: tuple[str, ...]
+    """One line per piece that is missing, failed, foreign or damaged; the exit code is 1 if there is any."""
+    stale: tuple[str, ...]
+    """One line per piece that older code computed, which is left out."""
+    certified: pd.DataFrame
+    """Mean correct digits per estimator and start on certified readings; empty without such runs."""
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Everything that was written."""
+        return (self.summary_path, *self.tables, *self.figures, self.report)
+
+
+@dataclass(frozen=True)
+class Pending:
+    """A report whose summary is known, and whose files are still to be written."""
+
+    begun: Begun
+    output: Path
+    figures: Which
+    formats: tuple[str, ...]
+    made: str
+    """A digest of what it is made from."""
+
+    def write_unless_current(self) -> None:
+        """Writes all files, unless they are there already."""
+        from ipe_bench.report.stamp import is_current
+
+        if not is_current(self.output, self.made):
+            self.written()
+
+    def written(self) -> ReportResult:
+        """Writes all files."""
+        from ipe_bench.report.certified_tables import without_certified
+        from ipe_bench.report.charts import charts
+        from ipe_bench.report.figures import draw_all
+        from ipe_bench.report.figures.views import views
+        from ipe_bench.report.html import render_page
+        from ipe_bench.report.sections import report_tables, written
+        from ipe_bench.report.stamp import leave
+        from ipe_bench.report.table import write_table
+        from ipe_bench.statistics.certified import certified_averages, certified_table
+
+        analysis, output = self.begun.finish(), self.output
+        simulated, problems = without_certified(analysis), analysis.collection.extra_problems
+        known = len(problems)
+        tables = report_tables(analysis)
+        sections = written("section", analysis, [table.name for table in tables])
+        added = [table for section in sections for table in section.tables]
+        write_text(output / "summary.csv", analysis.summary.to_csv(index=False))
+        files = [path for table in (*tables, *added) for path in write_table(table, output / "tables")]
+        if len(simulated.profiles):
+            files.append(output / "tables" / "profiles.csv")
+            write_text(files[-1], simulated.profiles.to_csv(index=False))
+        drawn = draw_all(simulated, output / "figures", which=self.figures, formats=self.formats)
+        page = render_page(analysis, tables, drawn, sections, list(charts(views(simulated)[0])))
+        write_text(output / "report.html", page)
+        result = ReportResult(
+            summary=analysis.summary,
+            summary_path=output / "summary.csv",
+            tables=tuple(files),
+            figures=tuple(path for figure in drawn for path in figure.files),
+            report=output / "report.html",
+            problems=analysis.problems,
+            stale=analysis.stale,
+            certified=certified_averages(certified_table(analysis.collection)),
+        )
+        if len(problems) == known:  # what plugins cannot make is said each time
+            leave(output, self.made, result.files)
+        return result
+
+
+def begin_report(
+    folders: Sequence[Path], output: Path | str | None = None, *, figures: Any = "main", formats: Any = PAGE
+) -> Pending:
+    """Collects and summarises what folders hold, with the statistics of plugins.
+
+    Raises:
+        UserError: there is no such choice of `figures` (all, main or none) or of `formats` (png, pdf and svg).
+    """
+    from ipe_bench.plugins.extensions import use_statistics
+    from ipe_bench.report.stamp import made_from
+    from ipe_bench.statistics.analysis import begin
+
+    kinds, which = file_formats(formats), which_figures(figures)
+    place = folders[0] if output is None else Path(output)
+    made, faults = made_from(folders, place, which, kinds), use_statistics()
+    begun = begin(folders)
+    begun.collection.extra_problems += faults
+    return Pending(begun, place, which, kinds, made)
