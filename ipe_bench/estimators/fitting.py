@@ -12,8 +12,8 @@ from ipe_bench.estimators.base import Estimates
 from ipe_bench.estimators.least_squares import Minima
 from ipe_bench.measurements.problem import Problem
 
-FIT_LEVEL = 1e-6
-"""Residuals less probable than this are taken for those of a wrong minimum."""
+WRONG_MINIMUM = 1e-6
+"""Residuals less probable than this are taken for those of a wrong minimum: far less than those of a misfit."""
 _APART = 0.1
 """Two minima further apart than this, in standard deviations of the local bound, are two."""
 
@@ -32,7 +32,7 @@ class Fitting:
 
     def note(self, found: Minima, rows: NDArray[np.intp]) -> Mask:
         """Adds the minima of the trials `rows` that fit and are not known yet, and says which of them fit."""
-        fits: Mask = found.converged & passes(found, self.readings, FIT_LEVEL)
+        fits: Mask = found.converged & passes(found, self.readings, WRONG_MINIMUM)
         deviation = deviations(found.covariance)
         for i in np.flatnonzero(fits):
             known = self.known[rows[i]]

@@ -109,7 +109,7 @@ class OnBound:
     not found."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Examination:
     """An answer with all that is known of it."""
 
@@ -278,21 +278,21 @@ class _Least:
             deviations[:] = known[0]
         minima = self.minima()
         return Examination(
-            label,
-            model,
-            model.physical(x)[0],
-            deviation * np.abs(model.physical_slope(x)[0]),
-            wald_interval(model, self.x, deviation, q),
-            profiles(self.problem, self.z[None], x, self.P[None], freedom=self.freedom, released=released)[0],
-            self.bootstrap(bootstraps, released),
-            self.direction(),
-            self.influence(rows, m),
-            h,
-            errors,
-            np.hypot(errors, deviations),
-            q,
-            minima,
-            self.chi_square <= minima[0].chi_square + 1e-6 * max(1.0, self.chi_square),
+            label=label,
+            model=model,
+            x=model.physical(x)[0],
+            standard_errors=deviation * np.abs(model.physical_slope(x)[0]),
+            wald=wald_interval(model, self.x, deviation, q),
+            profiles=profiles(self.problem, self.z[None], x, self.P[None], freedom=self.freedom, released=released)[0],
+            bootstrap=self.bootstrap(bootstraps, released),
+            direction=self.direction(),
+            influence=self.influence(rows, m),
+            fitted=h,
+            fitted_errors=errors,
+            new_errors=np.hypot(errors, deviations),
+            half_width=q,
+            minima=minima,
+            least=self.chi_square <= minima[0].chi_square + 1e-6 * max(1.0, self.chi_square),
             with_prior=self.readings < len(self.z),
         )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,11 +36,13 @@ _FARTHEST = 40.0
 """A normal deviate beyond every limit."""
 _OPEN = 1e-4
 """A combination of parameters that changes the readings by less than this share of what others do may be open."""
+Where = tuple[NDArray[np.intp], int, NDArray[np.intp]]
+"""The present readings' rows, how many readings there are with the missing ones, and the succession of the present."""
 _DOUBTED = 0.05
 """Where the test of the fit gives less, estimators that can look for a better fit: there is but one set of readings."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Fit:
     """What one estimator makes of the readings."""
 
@@ -117,16 +118,12 @@ class Fit:
         return float(np.sqrt(np.nansum(self.residuals**2) / self.degrees_of_freedom)) if known else np.nan
 
     @property
-    def testable(self) -> bool:
-        """Whether the size of the residuals says anything of the model: not where it made R, nor without any left."""
-        return self.level is None and self.degrees_of_freedom > 0
-
-    @property
     def fits(self) -> bool | None:
         """Whether the residuals are as small as R says, or as small as they can be; None where neither can be told."""
         if self.beaten_by:
             return False
-        return self.p_value >= FIT_LEVEL if self.testable else None
+        # The size of the residuals says nothing of the model where it made R, nor without any degrees of freedom.
+        return self.p_value >= FIT_LEVEL if self.level is None and self.degrees_of_freedom > 0 else None
 
     @property
     def passes(self) -> bool:
@@ -174,9 +171,9 @@ def fit(
     given = replace(present_part(problem, present), doubted=1.0 if noise.estimated else _DOUBTED)
     where = present, len(z), _succession(problem.measurement, present)
     if noise.estimated:
-        found = [_fit_with_level(label, one, given, z[present], *where) for label, one in estimators.items()]
+        found = [_fit_with_level(label, one, given, z[present], where) for label, one in estimators.items()]
     else:
-        found = [_fit_one(label, one, given, z[present], *where, noise=noise) for label, one in estimators.items()]
+        found = [_fit_one(label, one, given, z[present], where, noise) for label, one in estimators.items()]
     return _compared(found)
 
 
@@ -202,13 +199,13 @@ def _compared(fits: list[Fit]) -> list[Fit]:
     return [one if value <= limit else replace(one, beaten_by=label) for one, value in zip(fits, sums, strict=True)]
 
 
-def _fit_with_level(label: str, estimator: Estimator, problem: Problem, z: Array, *where: Any) -> Fit:
+def _fit_with_level(label: str, estimator: Estimator, problem: Problem, z: Array, where: Where) -> Fit:
     """Fits until the level that R assumes is that of the residuals, since estimators measure their steps by it."""
     spread = float(np.sqrt(np.mean(problem.R.whiten(z) ** 2)))
     level, found = spread or 1.0, None
     for _ in range(_MOST_LEVELS):
         assumed = level
-        again = _fit_one(label, estimator, scaled(problem, assumed), z, *where, noise=None)
+        again = _fit_one(label, estimator, scaled(problem, assumed), z, where, None)
         if found is not None and again.status is not Status.CONVERGED and found.status is Status.CONVERGED:
             break
         found = again
@@ -280,13 +277,13 @@ def _succession(model: Measurement, present: NDArray[np.intp]) -> NDArray[np.int
     return place[np.stack([np.sort(rows) for rows in epochs]).T]
 
 
-def _fit_one(label: str, estimator: Estimator, problem: Problem, z: Array, *where: Any, noise: Noise | None) -> Fit:
+def _fit_one(label: str, estimator: Estimator, problem: Problem, z: Array, where: Where, noise: Noise | None) -> Fit:
     """The fit within the bounds of the parameters, on some of them where its minimum lies there; see `_fit_inside`."""
-    found = _fit_inside(label, estimator, problem, z, *where, noise=noise)
+    found = _fit_inside(label, estimator, problem, z, where, noise)
     near = {} if found.with_prior else problem.measurement.near_bounds(found.inner)
     if not 0 < len(near) < len(found.x):
         return found
-    held = _fit_inside(label, estimator, holding(problem, near), z, *where, noise=noise)
+    held = _fit_inside(label, estimator, holding(problem, near), z, where, noise)
     if held.status is not Status.CONVERGED or not falls_beyond(problem, held.inner[None], near, z[None])[0]:
         return found
     return _on_bounds(found, held, near)
@@ -334,20 +331,10 @@ def _on_bounds(found: Fit, held: Fit, near: Mapping[int, float]) -> Fit:
     return replace(held, x=x, inner=inner, covariance=P, inner_covariance=inner_P, model=found.model, held=held)
 
 
-def _fit_inside(
-    label: str,
-    estimator: Estimator,
-    problem: Problem,
-    z: Array,
-    rows: NDArray[np.intp],
-    m: int,
-    order: NDArray[np.intp],
-    *,
-    noise: Noise | None,
-) -> Fit:
-    """The fit to readings z that are the `rows` of m. `noise` None: its level is not known, and the size of the
+def _fit_inside(label: str, estimator: Estimator, problem: Problem, z: Array, where: Where, noise: Noise | None) -> Fit:
+    """The fit to readings z, which stand `where` among all. `noise` None: its level is not known, and the size of the
     residuals cannot be tested."""
-    model, n = problem.measurement, problem.measurement.n
+    (rows, m, order), model, n = where, problem.measurement, problem.measurement.n
     estimates = estimate_safely(estimator, problem, z[None])
     message = estimates.messages.get(0, "")
     r, J = np.full(len(z), np.nan), np.full((len(z), n), np.nan)
@@ -373,22 +360,22 @@ def _fit_inside(
     P = np.full((n, n), np.nan) if estimates.covariance is None else estimates.covariance[0]
     slope = model.physical_slope(estimates.x)[0]
     return Fit(
-        label,
-        Status(int(estimates.status[0])),
-        message,
-        model.physical(estimates.x)[0],
-        P * np.outer(slope, slope),
-        at_rows(rows, r, m),
-        at_rows(rows, deviates, m),
-        chi_square,
-        len(z) - n,
-        white,
-        int(estimates.iterations[0]),
-        float(p),
-        float(cost(estimates.simulations, estimates.jacobians, n)[0]),
-        model,
-        estimates.x[0],
-        P,
+        label=label,
+        status=Status(int(estimates.status[0])),
+        message=message,
+        x=model.physical(estimates.x)[0],
+        covariance=P * np.outer(slope, slope),
+        residuals=at_rows(rows, r, m),
+        normalised=at_rows(rows, deviates, m),
+        chi_square=chi_square,
+        degrees_of_freedom=len(z) - n,
+        whiteness=white,
+        iterations=int(estimates.iterations[0]),
+        p_value=float(p),
+        simulations=float(cost(estimates.simulations, estimates.jacobians, n)[0]),
+        model=model,
+        inner=estimates.x[0],
+        inner_covariance=P,
         with_prior="prior" in estimator.needs,
         prior_inflation=inflation_of(estimator),
         undetermined=open_ones,

@@ -290,7 +290,7 @@ def open_together(
         rows = [left_out.rows_of(path, paths) for path in paths]
         tables = [read_table(path, without=gone) for path, gone in zip(paths, rows, strict=True)]
         for name in left_out.columns:
-            if all(_meant(name, table) is None for table in tables):
+            if all(table.find(name.strip()) is None for table in tables):
                 known = dict.fromkeys(heading for table in tables for heading in table.heading)
                 raise UserError(f"ignore_columns={name}: {unknown(name, list(known), 'column')}")
         reduced = [_reduced(table, model, left_out.columns, gone) for table, gone in zip(tables, rows, strict=True)]
@@ -309,11 +309,6 @@ def require_enough(paths: Sequence[Path], found: Readings) -> None:
         raise UserError(f"readings={shown}: {there} readings are too few for {found.model.n} parameters")
 
 
-def _meant(name: str, table: Table) -> str | None:
-    """The column that is meant by a name with its unit or without."""
-    return next((heading for heading in table.heading if name.strip() in (heading, _quantity(heading))), None)
-
-
 def _reduced(table: Table, model: Measurement, columns: Sequence[str], rows: Collection[int]) -> Table:
     """The table without these columns, and with the readings missing in these rows."""
     numbers = [number for number, _ in table.rows]
@@ -321,7 +316,7 @@ def _reduced(table: Table, model: Measurement, columns: Sequence[str], rows: Col
         if number not in numbers:
             there = f"{table.path} has no such row; its rows are {numbers[0]} to {numbers[-1]}" if numbers else ""
             raise UserError(f"ignore_rows={number}: {there or f'{table.path} has no rows'}")
-    gone = {_meant(name, table) for name in columns}
+    gone = {table.find(name.strip()) for name in columns}
     kept = [k for k, name in enumerate(table.heading) if name not in gone]
     heading = [table.heading[k] for k in kept]
     # Of other lengths are only rows that are left out.

@@ -12,7 +12,7 @@ from ipe_bench.basics.options import Positive, Whole
 from ipe_bench.basics.streams import normals, own_generators
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import Limits
-from ipe_bench.estimators.fitting import FIT_LEVEL, Fitting, spread_of_starts
+from ipe_bench.estimators.fitting import WRONG_MINIMUM, Fitting, spread_of_starts
 from ipe_bench.estimators.least_squares import Minima, Objective, minimize
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
@@ -68,7 +68,7 @@ class Auto(Estimator):
         best, contracts = by_chords(objective, problem.H, self.tolerance, self.budget, history=history)
         fitting = Fitting.none(len(z), m)
         fits = fitting.note(best, everyone)
-        answered = accepted(best, m, max(FIT_LEVEL, problem.doubted))
+        answered = accepted(best, m, max(WRONG_MINIMUM, problem.doubted))
         spent = objective.model.tally
         tally = EvaluationCount(spent.simulations, spent.jacobians - answered, np.zeros(len(z), dtype=bool))
         left = np.flatnonzero(~answered)

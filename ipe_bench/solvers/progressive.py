@@ -17,7 +17,7 @@ from ipe_bench.basics.options import Count, Positive, Whole
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import Limits
-from ipe_bench.estimators.fitting import FIT_LEVEL, passes
+from ipe_bench.estimators.fitting import WRONG_MINIMUM, passes
 from ipe_bench.estimators.least_squares import Minima
 from ipe_bench.measurements.counted import EvaluationCount
 from ipe_bench.measurements.problem import Problem
@@ -99,7 +99,7 @@ class Progressive(Estimator):
             self.window_tolerance,
             self.restarts,
         )
-        tally, level = attempts.tally, max(FIT_LEVEL, problem.doubted)
+        tally, level = attempts.tally, max(WRONG_MINIMUM, problem.doubted)
         best = attempts.attempt(0, everyone, None)
         if before is not None:
             worse = before.converged & ~best.better_than(before)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,11 +79,7 @@ class Analysis:
 
 
 def analyse(directories: Sequence[Path | str]) -> Analysis:
-    """Reads what is stored under the directories and computes all statistics.
-
-    Raises:
-        UserError: a directory does not exist.
-    """
+    """Reads what is stored under the directories and computes all statistics; raises what `begin` does."""
     return begin(directories).finish()
 
 
@@ -142,7 +138,9 @@ class Begun:
     def finish(self) -> Analysis:
         import pandas as pd
 
-        everywhere = _everywhere(self.collection)
+        labels = [{group.estimator for group in groups} for groups in self.collection.scenarios.values()]
+        # Profiles and ranks compare on the same scenarios only.
+        everywhere = set.intersection(*labels) if labels else set()
         # Corrected over all scenarios: a sweep asks all its questions at once.
         pairs = [where | pair for where, outcomes in self.compared for pair in compare_pairs(outcomes)]
         rows = self.rows
@@ -169,22 +167,8 @@ def _joined(parts: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> pd.Da
 
     if not parts:
         return pd.DataFrame(columns=["scenario", "estimator", *columns])
-    lengths = [next(len(value) for value in part.values() if isinstance(value, np.ndarray)) for part in parts]
-    joined: dict[str, Any] = {}
-    for name in dict.fromkeys(name for part in parts for name in part):
-        values: list[Any] = [part.get(name) for part in parts]
-        if any(isinstance(value, np.ndarray) for value in values):
-            pieces = [np.broadcast_to(value, (n,)) for value, n in zip(values, lengths, strict=True)]
-            joined[name] = np.concatenate(pieces)
-        else:
-            joined[name] = pd.Series(values).repeat(lengths).array
-    return pd.DataFrame(joined)
-
-
-def _everywhere(collection: Collection) -> set[str]:
-    """The estimators that every scenario has: profiles and ranks compare on the same scenarios only."""
-    labels = [{group.estimator for group in groups} for groups in collection.scenarios.values()]
-    return set.intersection(*labels) if labels else set()
+    arrays = [name for name, value in parts[0].items() if isinstance(value, np.ndarray)]
+    return pd.DataFrame(list(parts)).explode(arrays, ignore_index=True).infer_objects()
 
 
 def ranking(table: pd.DataFrame, everywhere: set[str]) -> Ranking | None:
@@ -217,24 +201,21 @@ def _contraction_rows(collection: Collection, group: Group) -> list[dict[str, An
 def _ending_rows(sample: Sample) -> list[dict[str, Any]]:
     """How trials ended that did not converge, the commonest ending first; trials without readings are last."""
     messages = sample.scalars.get("message", np.full(len(sample), ""))
-    counts: Counter[tuple[str, str]] = Counter()
-    first: dict[tuple[str, str], str] = {}
+    found: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
     for i in np.flatnonzero(~sample.converged):
-        ending = str(sample.scalars["status"][i]), str(messages[i] or "")
-        counts[ending] += 1
-        first.setdefault(ending, label_of(sample.number[i]))
+        found[str(sample.scalars["status"][i]), str(messages[i] or "")].append(sample.number[i])
+    endings = sorted(found.items(), key=lambda ending: -len(ending[1]))
     reasons = {s.label: s.reason for s in Status}
     rows = [
-        {"status": status, "message": message or reasons.get(status, ""), "trials": n, "first": first[status, message]}
-        for (status, message), n in counts.most_common(MESSAGES)
+        (status, message or reasons.get(status, ""), len(numbers), label_of(numbers[0]))
+        for (status, message), numbers in endings[:MESSAGES]
     ]
-    if rest := sum(counts.values()) - sum(row["trials"] for row in rows):
-        rows.append({"status": "others", "message": "further messages, each rarer", "trials": rest, "first": ""})
+    if rest := sum(len(numbers) for _, numbers in endings[MESSAGES:]):
+        rows.append(("others", "further messages, each rarer", rest, ""))
     if count := len(sample.unread):
-        ending = Status.NO_READINGS
-        first_one = label_of(sample.unread[0])
-        rows.append({"status": ending.label, "message": ending.reason, "trials": count, "first": first_one})
-    return [row | {"share": row["trials"] / (len(sample) + len(sample.unread))} for row in rows]
+        rows.append((Status.NO_READINGS.label, Status.NO_READINGS.reason, count, label_of(sample.unread[0])))
+    columns, trials = ("status", "message", "trials", "first", "share"), len(sample) + len(sample.unread)
+    return [dict(zip(columns, (*row, row[2] / trials), strict=True)) for row in rows]
 
 
 def _calibration_rows(sample: Sample) -> Iterator[dict[str, Any]]:

@@ -16,9 +16,9 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.provenance import canonical_json
 from ipe_bench.statistics.collect import Collection, Group, config_leaves, differing, shown_leaf
 from ipe_bench.statistics.comparisons import ALPHA, differences, holm
-from ipe_bench.statistics.formulas import gate_radius
 from ipe_bench.statistics.paired import Effect, no_drift, no_lean, ratio_effect, success_effect
 from ipe_bench.statistics.sample import Sample, samples
+from ipe_bench.trials.thresholds import gate
 
 JUDGED = ("success", "error", "cost")
 """Those that are tested. Time is not: the trials of a block share theirs evenly, and machines differ."""
@@ -117,8 +117,7 @@ def _head(first: Group, second: Group, setting: _Setting) -> dict[str, Any]:
 
 def _effects(a: Sample, one: Array, b: Sample, other: Array, alpha: float) -> dict[str, Effect]:
     """Of the rows `one` of the first sample and `other` of the second, in the same order."""
-    radius = gate_radius(a.n)
-    success = a.distance[one] <= radius, b.distance[other] <= radius
+    radius = float(np.sqrt(gate(a.n)))
     error = np.minimum(a.distance[one], radius), np.minimum(b.distance[other], radius)
     cost = a.cost[one], b.cost[other]
     d = differences(error[1], error[0])
@@ -127,7 +126,7 @@ def _effects(a: Sample, one: Array, b: Sample, other: Array, alpha: float) -> di
     seconds = float(np.median(a.scalars["time_s"][one])), float(np.median(b.scalars["time_s"][other]))
     time = seconds[1] / seconds[0] if seconds[0] > 0 else np.nan
     return {
-        "success": success_effect(*success, alpha),
+        "success": success_effect(a.inside_gate[one], b.inside_gate[other], alpha),
         "error": ratio_effect(error[0], error[0] + d, alpha, no_drift(d, radius), radius),
         "cost": ratio_effect(*cost, alpha, no_lean(cost[1] - cost[0], unit)),
         "time": Effect(*seconds, time, np.nan, np.nan, np.nan, np.nan),
@@ -173,17 +172,13 @@ def _matches(
             " the same measurement, noise and error scales"
         )
     wanted = labels[0] or labels[1], labels[1] or labels[0]
-    found = [
-        (one, other)
-        for key in shared
-        for one in a[key]
-        for other in b[key]
-        if (
-            one.estimator == other.estimator
-            if wanted[0] is None
-            else wanted[0] in (one.estimator, one.label) and wanted[1] in (other.estimator, other.label)
-        )
-    ]
+
+    def asked(one: Group, other: Group) -> bool:
+        if wanted[0] is None:
+            return one.estimator == other.estimator
+        return wanted[0] in (one.estimator, one.label) and wanted[1] in (other.estimator, other.label)
+
+    found = [(one, other) for key in shared for one in a[key] for other in b[key] if asked(one, other)]
     if not found:
         raise _no_estimator(first, second, wanted)
     for one, other in found:
@@ -195,13 +190,9 @@ def _matches(
 
 def left_out(first: Collection, second: Collection) -> list[str]:
     """A line where one has scenarios that the other lacks, while both share some."""
-    a, b = _by_scenario(first), _by_scenario(second)
-    lines = []
-    if a.keys() & b.keys():
-        for collection, alone in ((first, a.keys() - b.keys()), (second, b.keys() - a.keys())):
-            if alone:
-                lines.append(f"{_where(collection)}: {len(alone)} scenarios that the other lacks are left out")
-    return lines
+    a, b = _by_scenario(first).keys(), _by_scenario(second).keys()
+    alone = ((first, len(a - b)), (second, len(b - a))) if a & b else ()
+    return [f"{_where(c)}: {count} scenarios that the other lacks are left out" for c, count in alone if count]
 
 
 def _by_scenario(collection: Collection) -> dict[_Leaves, list[Group]]:

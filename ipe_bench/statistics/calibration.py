@@ -15,13 +15,12 @@ import numpy as np
 from scipy.special import bdtr, bdtrc, chdtri, gammaincinv, gammaln, ndtri
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.trials.thresholds import FEW, GATE
+from ipe_bench.trials.thresholds import FEW, GATE, gate
 
 LEVEL = 0.95
 POINTS = np.arange(1, 100) / 100
 """Where the distribution functions are compared."""
 INSIDE = "inside its bands"
-_OTHER = "of another shape"
 _RESOLVED = 1e-9
 """Below it, one less a coverage is round-off: then the sum over the points bounds the probability."""
 _LEAST_TAIL = 1e-13
@@ -162,42 +161,32 @@ class Calibration:
         return band(len(self.z), level if self.place is None else (1 + level) / 2)
 
     def words(self, level: float) -> str:
-        """What is wrong, if anything surely is. An estimate that is shifted by +1 deviations lies above the truth."""
-        return INSIDE if self.p >= 1 - level else "; ".join(self._faults(level)) or self._leaning()
-
-    def _faults(self, level: float) -> list[str]:
-        """Shift, scale and tails, as far as each is sure by itself; by order statistics, which no outlier moves."""
-        z, faults = self.z, []
-        if self.place is not None:
-            low, high = median_limits(z, level)
-            if low > 0 or high < 0:
-                middle = float(np.median(z))
-                faults.append(f"shifted by {_signed(middle)} deviations")
-                z = z - middle
+        """What is wrong, if anything surely is: shift, scale and tails, each by order statistics, which no outlier
+        moves. An estimate that is shifted by +1 deviations lies above the truth."""
+        if self.p >= 1 - level:
+            return INSIDE
+        z, faults, middle = self.z, [], float(np.median(self.z))
+        if self.place is not None and not _holds(median_limits(z, level), 0.0):
+            faults.append(f"shifted by {_signed(middle)} deviations")
+            z = z - middle
         usual = float(np.sqrt(2 * gammaincinv(self.degrees / 2, 0.5)))
         scale = float(np.median(np.abs(z))) / usual
         if not np.isfinite(scale):
-            return [*faults, "most reported covariances are void"]
-        low, high = median_limits(np.abs(z) / usual, level)
-        if low > 1 or high < 1:
+            return "; ".join([*faults, "most reported covariances are void"])
+        if not _holds(median_limits(np.abs(z) / usual, level), 1.0):
             faults.append(_scaled(scale))
-        share = self._far(z / max(scale, 1.0), level)
-        return [*faults, f"{100 * share:.2g} % far outside"] if share else faults
-
-    def _leaning(self) -> str:
-        """What a curve as a whole shows where no order statistic shows it surely: that it lies to one side."""
-        if self.place is not None and self.place.p < self.size.p:
-            return f"shifted by {_signed(float(np.median(self.z)))} deviations" if self.place.leans else _OTHER
-        if not self.size.leans:
-            return _OTHER
+        outside = int((np.abs(z) / max(scale, 1.0) > np.sqrt(gate(self.degrees))).sum())
+        if outside and bdtrc(outside - 1, len(z), GATE) < 1 - level:
+            faults.append(f"{100 * outside / len(z):.2g} % far outside")
+        if faults:
+            return "; ".join(faults)
+        # No order statistic is sure by itself: the curve as a whole may still lie to one side.
+        by_place = self.place is not None and self.place.p < self.size.p
+        if not (self.shown if by_place else self.size).leans:
+            return "of another shape"
         at = POINTS[np.argmax(np.abs(self.size.difference))]
         scale = float(np.quantile(np.abs(self.z), at) / np.sqrt(2 * gammaincinv(self.degrees / 2, at)))
-        return _scaled(scale)
-
-    def _far(self, z: Array, level: float) -> float:
-        """The share outside the gate, where that is surely larger than it should be; else 0."""
-        outside = int((np.abs(z) > np.sqrt(chdtri(self.degrees, GATE))).sum())
-        return outside / len(z) if outside and bdtrc(outside - 1, len(z), GATE) < 1 - level else 0.0
+        return f"shifted by {_signed(middle)} deviations" if by_place else _scaled(scale)
 
 
 def calibrations(error: Array, deviation: Array, nees: Array, claimed: Array) -> list[Calibration]:
@@ -244,14 +233,21 @@ def overall_words(parts: Sequence[Calibration], names: Sequence[str], level: flo
     if not parts:
         return "-"
     each = shared_level(parts, level)
-    together = parts[-1].words(each)
-    outside = [(part.p, -part.excursion, name, part.words(each)) for name, part in zip(names, parts, strict=False)]
-    outside = sorted(entry for entry in outside if entry[0] < 1 - each)
+    *outside, together = [part.words(each) for part in parts]
+    outside = sorted(
+        (part.p, -part.excursion, name, words)
+        for part, name, words in zip(parts, names, outside, strict=False)
+        if words != INSIDE
+    )
     if not outside:
         return together
     *_, worst, words = outside[0]
     who = worst if len(outside) == 1 else f"{len(outside)} of {len(names)} parameters outside, most {worst}"
     return f"{'' if together == INSIDE else together + '; '}{who}: {words}"
+
+
+def _holds(interval: tuple[float, float], value: float) -> bool:
+    return interval[0] <= value <= interval[1]
 
 
 def median_limits(values: Array, level: float = LEVEL) -> tuple[float, float]:
@@ -265,20 +261,12 @@ def median_limits(values: Array, level: float = LEVEL) -> tuple[float, float]:
 
 
 def _scaled(scale: float) -> str:
-    """Errors that are `scale` times what is reported."""
+    """Errors that are `scale` times what is reported, with two figures, three just above 1."""
     if scale == 0:
         return "errors of 0"
     times, fault = (scale, "small") if scale > 1 else (1 / scale, "large")
-    return f"deviations {_times(times)} times too {fault}"
-
-
-def _times(factor: float) -> str:
-    """Two figures, three just above 1; of very many the order."""
-    if factor < 1.095:
-        return f"{factor:.2f}"
-    if factor >= 1e6:
-        return f"{factor:.1e}".replace("e+0", "e").replace("e+", "e")
-    return f"{float(f'{factor:.2g}'):,.{1 if factor < 9.95 else 0}f}"
+    shown = f"{times:.2f}" if times < 1.095 else f"{times:.1f}" if times < 9.95 else f"{float(f'{times:.2g}'):,.7g}"
+    return f"deviations {shown.replace('e+', 'e')} times too {fault}"
 
 
 def _signed(value: float) -> str:

@@ -42,20 +42,13 @@ def certified_averages(table: pd.DataFrame) -> pd.DataFrame:
     """Per estimator and start: the mean digits, and how many data sets have four digits or more."""
     import pandas as pd
 
-    rows = [
-        {
-            "estimator": estimator,
-            "start": start,
-            "datasets": len(part),
-            "solved": int((part["lre_parameters"] >= 4).sum()),
-            "deviations_to_6_digits": int((part["lre_deviations"] >= 6).sum()),
-            "mean_lre_parameters": part["lre_parameters"].mean(),
-            "mean_lre_deviations": part["lre_deviations"].mean(),
-            "mean_lre_rss": part["lre_rss"].mean(),
-        }
-        for (estimator, start), part in table.groupby(["estimator", "start"], sort=False)
-    ]
-    return pd.DataFrame(rows)
+    if table.empty:
+        return pd.DataFrame()
+    enough = table.assign(solved=table["lre_parameters"] >= 4, deviations_to_6_digits=table["lre_deviations"] >= 6)
+    groups = enough.groupby(["estimator", "start"], sort=False)
+    counts = groups[["solved", "deviations_to_6_digits"]].sum()
+    means = groups[["lre_parameters", "lre_deviations", "lre_rss"]].mean().add_prefix("mean_")
+    return pd.concat([groups.size().rename("datasets"), counts, means], axis=1).reset_index()
 
 
 def attained_table(collection: Collection) -> pd.DataFrame:
@@ -100,14 +93,10 @@ def attained_totals(table: pd.DataFrame) -> pd.DataFrame:
 
 def data_profile(table: pd.DataFrame) -> pd.DataFrame:
     """The share of problems that each estimator solves within `at` simplex gradients, a step at each solution."""
-    import pandas as pd
-
-    parts = []
-    for estimator, part in table.groupby("estimator", sort=False):
-        spent = np.sort(part.loc[part["solved"].astype(bool), "gradients"].to_numpy(dtype=float))
-        share = np.arange(1, len(spent) + 1) / len(part)
-        parts.append(pd.DataFrame({"estimator": estimator, "at": spent, "share": share}))
-    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=["estimator", "at", "share"])
+    problems = table.groupby("estimator")["solved"].transform("size")
+    solved = table.assign(problems=problems)[table["solved"].astype(bool)].sort_values(["estimator", "gradients"])
+    share = (solved.groupby("estimator").cumcount() + 1) / solved["problems"]
+    return solved.assign(at=solved["gradients"], share=share)[["estimator", "at", "share"]].reset_index(drop=True)
 
 
 def _certified(collection: Collection, measurement: str) -> Iterator[tuple[Group, StoredCell, dict[str, Any]]]:

@@ -38,10 +38,6 @@ class Group:
     """Each seed's estimates with the truth that belongs to them."""
 
     @property
-    def scenario(self) -> tuple[Any, ...]:
-        return tuple(self.columns.values())
-
-    @property
     def footer(self) -> Mapping[str, Any]:
         return self.cells[0][0].footer
 
@@ -61,7 +57,7 @@ class Collection(Results):
         """The groups of each scenario, in order."""
         result: dict[tuple[Any, ...], list[Group]] = {}
         for group in self.groups:
-            result.setdefault(group.scenario, []).append(group)
+            result.setdefault(tuple(group.columns.values()), []).append(group)
         return result
 
     @property
@@ -197,11 +193,9 @@ def _stands_in_a_name(key: str, cells: Sequence[StoredCell]) -> bool:
     component = key.split(".")[0]
     if component not in ("measurement", "noise"):
         return False
-    values: dict[Any, set[str]] = {}
-    for cell in cells:
-        leaf = config_leaves(_scenario(cell)).get(key)
-        values.setdefault(cell.footer["names"].get(component), set()).add(canonical_json(leaf))
-    return all(len(v) == 1 for v in values.values())
+    leaves = [canonical_json(config_leaves(_scenario(cell)).get(key)) for cell in cells]
+    said = {(cell.footer["names"].get(component), leaf) for cell, leaf in zip(cells, leaves, strict=True)}
+    return len(said) == len({name for name, _ in said})
 
 
 def _options(cells: Sequence[StoredCell]) -> dict[str, list[str]]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -53,11 +54,10 @@ class Outcomes:
 
 def common(outcomes: Mapping[str, Outcomes]) -> dict[str, Outcomes]:
     """The outcomes on the trials that every estimator has, in the same order."""
-    shared: Array | None = None
-    for outcome in outcomes.values():
-        if shared is None or not np.array_equal(shared, outcome.ids):
-            shared = outcome.ids if shared is None else np.intersect1d(shared, outcome.ids, assume_unique=True)
-    return {} if shared is None else {label: outcome.at(shared) for label, outcome in outcomes.items()}
+    if not outcomes:
+        return {}
+    shared = reduce(np.intersect1d, [outcome.ids for outcome in outcomes.values()])
+    return {label: outcome.at(shared) for label, outcome in outcomes.items()}
 
 
 def compare_pairs(outcomes: Mapping[str, Outcomes]) -> list[dict[str, Any]]:
@@ -160,13 +160,11 @@ def rank_over_replicates(scores: Sequence[Mapping[str, float]]) -> Ranking | Non
     from scipy.stats import friedmanchisquare, studentized_range  # late: takes longer to load than all else here
 
     ranks = np.array([tied_ranks(np.array([s[label] for label in everywhere])) for s in scores])
-    if np.ptp(ranks, axis=1).max() == 0:
-        friedman = 1.0
-    elif k == 2:
+    if k == 2:
         # Friedman's test of two is the sign test; the exact one is taken.
         friedman = mcnemar(int((ranks[:, 0] < ranks[:, 1]).sum()), int((ranks[:, 0] > ranks[:, 1]).sum()))
     else:
-        friedman = float(friedmanchisquare(*ranks.T).pvalue)
+        friedman = float(friedmanchisquare(*ranks.T).pvalue) if np.ptp(ranks, axis=1).any() else 1.0
     q = float(studentized_range.ppf(1 - ALPHA, k, np.inf)) / np.sqrt(2)
     difference = q * float(np.sqrt(k * (k + 1) / (6 * count)))
     return Ranking(dict(zip(everywhere, ranks.mean(axis=0).tolist(), strict=True)), count, friedman, difference)
@@ -192,21 +190,22 @@ def profiles(scenarios: Sequence[Mapping[str, Outcomes]]) -> pd.DataFrame:
     """
     import pandas as pd
 
-    spent: dict[str, list[tuple[Array, Array]]] = {}
+    ratios: dict[str, list[Array]] = {}
+    costs: dict[str, list[Array]] = {}
     for outcomes in scenarios:
-        costs = {label: np.where(o.success, o.cost, np.inf) for label, o in common(outcomes).items()}
-        best = np.min(list(costs.values()), axis=0) if costs else np.empty(0)
-        for label, cost in costs.items():
+        spent = {label: np.where(o.success, o.cost, np.inf) for label, o in common(outcomes).items()}
+        best = np.min(list(spent.values()), axis=0) if spent else np.empty(0)
+        for label, cost in spent.items():
             solved = np.isfinite(cost)
             # A cost of nothing, without any simulation, is the best there is.
             ratio = np.divide(cost, best, out=np.where(solved, 1.0, np.inf), where=solved & (best > 0))
-            spent.setdefault(label, []).append((ratio, cost))
-    kinds = ("performance", RATIOS, RATIOS * (1 + 1e-9)), ("data", BUDGETS, BUDGETS)
+            ratios.setdefault(label, []).append(ratio)
+            costs.setdefault(label, []).append(cost)
     parts = []
-    for label, several in spent.items():
-        for (profile, at, limits), values in zip(kinds, zip(*several, strict=True), strict=True):
-            ordered = np.sort(np.concatenate(values))
-            share = np.searchsorted(ordered, limits, side="right") / max(1, len(ordered))
+    for label in costs:
+        for profile, at, values, slack in (("performance", RATIOS, ratios, 1e-9), ("data", BUDGETS, costs, 0.0)):
+            ordered = np.sort(np.concatenate(values[label]))
+            share = np.searchsorted(ordered, at * (1 + slack), side="right") / max(1, len(ordered))
             parts.append(pd.DataFrame({"estimator": label, "profile": profile, "at": at, "share": share}))
     columns = ["estimator", "profile", "at", "share"]
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)

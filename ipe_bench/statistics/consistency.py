@@ -13,7 +13,7 @@ from scipy.special import betaincinv, chdtri
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.intervals import Squares, few_carry, rms_interval
-from ipe_bench.trials.thresholds import FEW, GATE
+from ipe_bench.trials.thresholds import FEW, gate
 
 TOLERATED = 0.01
 """Share of trials outside their own gate above which an estimator is named diverged but confident."""
@@ -43,9 +43,8 @@ def clopper_pearson(count: int, trials: int, level: float = 0.95) -> tuple[float
     if trials < 1:
         return np.nan, np.nan
     tail = (1 - level) / 2
-    low = 0.0 if count == 0 else float(betaincinv(count, trials - count + 1, tail))
-    high = 1.0 if count == trials else float(betaincinv(count + 1, trials - count, 1 - tail))
-    return low, high
+    low = float(betaincinv(count, trials - count + 1, tail)) if count else 0.0
+    return low, float(betaincinv(count + 1, trials - count, 1 - tail)) if count < trials else 1.0
 
 
 def verdict(nees: Array, n: int, level: float = 0.95) -> Verdict:
@@ -53,7 +52,7 @@ def verdict(nees: Array, n: int, level: float = 0.95) -> Verdict:
     converged, as `scoring.nees` returns them, for n parameters; none of fewer than `FEW`.
 
     Diverged but confident: surely more than `TOLERATED` of the trials lie where the estimator says that a share of
-    `GATE` should, and the mean of NEES / n surely lies above 1, as it does not for a right covariance of errors with
+    `thresholds.GATE` should, and the mean of NEES / n surely lies above 1, as it does not for a right covariance of errors with
     heavy tails. Optimistic, pessimistic: the mean of NEES / n surely lies above or below 1, by the interval that
     root mean squares have, whatever the law of the errors. Where few trials carry that mean there is no such interval:
     it may still surely lie above 1, and is undecided otherwise; so is one of fewer than `SEEN` trials that seems to lie
@@ -64,7 +63,7 @@ def verdict(nees: Array, n: int, level: float = 0.95) -> Verdict:
         return "-"
     x = np.minimum(claims / n, 1e150)
     above = _evidence_above_1(x) >= 2 / (1 - level)
-    outside = int(np.sum(claims > chdtri(n, GATE)))
+    outside = int(np.sum(claims > gate(n)))
     if above and clopper_pearson(outside, len(claims), level)[0] > TOLERATED:
         return "diverged but confident"
     if few_carry(Squares.of(x[None]), np.array([n]))[0]:

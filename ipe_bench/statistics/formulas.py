@@ -10,7 +10,7 @@ from functools import wraps
 from typing import Any, TypeVar
 
 import numpy as np
-from scipy.special import betaincinv, chdtri, gammaincinv, ndtri
+from scipy.special import betaincinv, gammaincinv, ndtri
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.calibration import shared_level
@@ -26,7 +26,7 @@ from ipe_bench.statistics.intervals import (
     rms_sequence,
 )
 from ipe_bench.statistics.sample import AMBIGUOUS, FIT, NIS, Sample
-from ipe_bench.trials.thresholds import FIT_LEVEL, GATE
+from ipe_bench.trials.thresholds import FIT_LEVEL, gate
 
 T = TypeVar("T")
 Limits = tuple[Any, ...]
@@ -226,12 +226,7 @@ def efficiency_capped_limits(s: Sample) -> Limits:
 def capped_error(s: Sample, among: Array | None = None) -> float:
     """Mean Mahalanobis error of the trials that all have (and of `among` alone), each at most the gate's radius."""
     used = s.present if among is None else s.present & among
-    return float(np.minimum(s.distance[used], gate_radius(s.n)).mean()) if used.any() else np.nan
-
-
-def gate_radius(n: int) -> float:
-    """The Mahalanobis distance at which success ends."""
-    return float(np.sqrt(chdtri(n, GATE)))
+    return float(np.minimum(s.distance[used], np.sqrt(gate(s.n))).mean()) if used.any() else np.nan
 
 
 def failed(s: Sample, *, known: bool) -> float:

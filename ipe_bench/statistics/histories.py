@@ -53,7 +53,7 @@ def iterations_to_limit(distances: Array) -> int:
 def orders_of(errors: Array, floor: float = FLOOR) -> Array:
     """log(e_(k+1) / e_k) / log(e_k / e_(k-1)) of successive errors (iterates,), where they decrease above the floor:
     1 where convergence is linear, 2 where it is quadratic."""
-    e = errors[: int(np.argmax(errors <= floor)) if (errors <= floor).any() else len(errors)]
+    e = errors[: np.argmax(np.append(errors <= floor, True))]
     with np.errstate(divide="ignore", invalid="ignore"):
         orders = np.log(e[2:] / e[1:-1]) / np.log(e[1:-1] / e[:-2])
     decreasing = (e[2:] < e[1:-1]) & (e[1:-1] < e[:-2])

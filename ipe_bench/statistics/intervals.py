@@ -7,11 +7,9 @@ with the stated probability, so that one may look as often as one likes.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
-from math import prod
 
 import numpy as np
 from scipy.special import betaln, ndtri
@@ -54,12 +52,12 @@ def rms_interval(squares: Array, used: Array, level: float = LEVEL) -> tuple[Arr
     return rms_interval_of(sums, grouped(used.astype(float)[None]), level)
 
 
-def grouped(values: Array) -> Array:
-    """Sums (groups, k) of values (k, trials) over groups of trials in succession, as many as `LARGEST_SAMPLE` and as
-    alike as can be; the values themselves where there are no more trials than that."""
+def grouped(values: Array, groups: int = LARGEST_SAMPLE) -> Array:
+    """Sums (groups, k) of values (k, trials) over groups of trials in succession, as alike as can be; the values
+    themselves where there are no more trials than groups."""
     trials = values.shape[1]
-    if trials > LARGEST_SAMPLE:
-        values = np.add.reduceat(values, np.linspace(0, trials, LARGEST_SAMPLE, endpoint=False).astype(int), axis=1)
+    if trials > groups:
+        values = np.add.reduceat(values, np.linspace(0, trials, groups, endpoint=False).astype(int), axis=1)
     return np.ascontiguousarray(values.T)
 
 
@@ -121,7 +119,7 @@ class Squares:
         """Of squares (k, trials)."""
         size, count = squares.max(axis=1, initial=0.0), squares.shape[1]
         if not count:
-            return cls(0, size, np.zeros(len(size)), np.zeros(len(size)))
+            return cls(0, size, 0 * size, 0 * size)
         with np.errstate(all="ignore"):
             scaled = np.where(size[:, None] > 0, squares / size[:, None], 0.0)
         mean = scaled.mean(axis=1)
@@ -158,8 +156,11 @@ def _heaviest(trials: int, degrees: int) -> float:
         return np.inf
     a = Fraction(degrees, 2)
 
+    def rising(x: Fraction, k: int) -> Fraction:
+        return math.prod((x + i for i in range(k)), start=Fraction(1))
+
     def moment(*powers: int) -> Fraction:
-        return prod((_rising(a, k) for k in powers), start=Fraction(1)) / _rising(trials * a, sum(powers))
+        return math.prod((rising(a, k) for k in powers), start=Fraction(1)) / rising(trials * a, sum(powers))
 
     pairs = trials * (trials - 1)
     mean = trials * moment(2)
@@ -171,10 +172,6 @@ def _heaviest(trials: int, degrees: int) -> float:
     w = root + 1 / root - 1
     beyond = np.exp(-ndtri(HEAVY) * np.log(w) ** 0.5) - w**0.5
     return float(mean) + deviation * float(beyond) / (w * (w - 1)) ** 0.5
-
-
-def _rising(x: Fraction, k: int) -> Fraction:
-    return prod((x + i for i in range(k)), start=Fraction(1))
 
 
 # However often one looks ---------------------------------------------------------------------------------------------
@@ -196,19 +193,16 @@ def share_sequence(count: int, trials: int, level: float = LEVEL) -> tuple[float
         own = (count * math.log(p) if count else 0.0) + (failures * math.log1p(-p) if failures else 0.0)
         return mixture - own > -math.log(1 - level)
 
-    return _crossing(beaten, count / trials, 0.0), _crossing(beaten, count / trials, 1.0)
-
-
-def _crossing(beaten: Callable[[float], bool], inside: float, outside: float) -> float:
-    """Where, from the share that was seen to that end, shares begin to be beaten."""
-    if inside == outside:
+    def crossing(inside: float, outside: float) -> float:
+        """Where, from the share that was seen to that end, shares begin to be beaten."""
+        for _ in range(_STEPS):
+            middle = (inside + outside) / 2
+            if middle in (0.0, 1.0):
+                break
+            inside, outside = (inside, middle) if beaten(middle) else (middle, outside)
         return outside
-    for _ in range(_STEPS):
-        middle = (inside + outside) / 2
-        if middle in (0.0, 1.0):
-            return outside
-        inside, outside = (inside, middle) if beaten(middle) else (middle, outside)
-    return outside
+
+    return crossing(count / trials, 0.0), crossing(count / trials, 1.0)
 
 
 def mean_sequence(deviation: Array, count: int, level: float = LEVEL) -> Array:
@@ -249,15 +243,9 @@ def quantiles(values: Array, q: Array) -> Array:
     """Several quantiles at once; see `quantile`."""
     if len(values) == 0:
         return np.full(len(q), np.nan)
-    ordered = np.where(np.isfinite(values), values, np.inf)
     position = (len(values) - 1) * q
-    low, high = np.floor(position).astype(int), np.ceil(position).astype(int)
-    if len(q) > 4:
-        ordered.sort()
-    else:
-        ordered.partition(np.unique(np.concatenate([low, high])))
-    a, b, part = ordered[low], ordered[high], position - low
-    # Between two infinite values, and at a value itself, nothing is interpolated: inf - inf is not a number.
-    step = np.zeros(len(q))
-    np.subtract(b, a, out=step, where=(a < b) & (part > 0))
-    return a + step * np.where(part > 0, part, 0.0)
+    places = np.array([np.floor(position), np.ceil(position)]).astype(int)
+    a, b = np.partition(np.where(np.isfinite(values), values, np.inf), np.unique(places))[places]
+    with np.errstate(invalid="ignore"):
+        # Between two infinite values nothing is interpolated: inf - inf is not a number.
+        return np.where(a < b, a + (b - a) * (position - places[0]), a)

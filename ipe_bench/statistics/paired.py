@@ -12,6 +12,7 @@ from scipy.special import betaln, ndtri
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.comparisons import ALPHA, mcnemar
 from ipe_bench.statistics.consistency import clopper_pearson
+from ipe_bench.statistics.intervals import grouped
 
 FLIPS = 4999
 """Random assignments of signs."""
@@ -98,7 +99,7 @@ def ratio_effect(
     Pearson), each by `largest`, the largest difference there can be; None: the largest number seen. It is never widened
     over a ratio of 1 that the test rejects.
     """
-    a, b = _grouped(first), _grouped(second)
+    a, b = grouped(np.array([first, second], dtype=float), LARGEST_SAMPLE).T.copy()
     means, p_equal = (float(first.mean()), float(second.mean())), _p_of_ratio(a, b)(1.0)
     total_a, total_b = float(a.sum()), float(b.sum())
     if not total_a > 0 or not total_b > 0:
@@ -146,13 +147,6 @@ def _unseen(first: Array, second: Array, alpha: float) -> float:
     if others >= min(RARE, trials / 2):
         return 0.0
     return clopper_pearson(others, trials, 1 - alpha)[1] - others / trials
-
-
-def _grouped(values: Array) -> Array:
-    values, trials = values.astype(float), len(values)
-    if trials <= LARGEST_SAMPLE:
-        return values
-    return np.add.reduceat(values, np.linspace(0, trials, LARGEST_SAMPLE, endpoint=False).astype(int))
 
 
 @lru_cache(maxsize=2)

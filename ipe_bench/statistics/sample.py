@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.counted import cost
 from ipe_bench.runs.results import StoredCell
 from ipe_bench.statistics.calibration import Calibration, calibrations
 from ipe_bench.statistics.collect import Collection, Group
 from ipe_bench.statistics.histories import History, distances_to_limit
+from ipe_bench.trials.thresholds import gate
 
 FIT = "fit_p"
 NIS = "extra_nis"
@@ -71,19 +72,20 @@ class Sample:
         status = np.concatenate([part["status"] for part in parts])
         unread: Array = np.asarray(status == Status.NO_READINGS.label)
         used = ~unread if unread.any() else slice(None)
-        # Each column is forgotten when it has been joined.
-        scalars = {
-            name: _read_only(np.concatenate([part.pop(name) for part in parts])[used])
-            for name in (*SCALARS, *OPTIONAL)
-            if all(name in part for part in parts)
-        }
+
+        def joined(name: str) -> Array:
+            """The column, which is forgotten in its parts."""
+            return np.concatenate([part.pop(name) for part in parts])[used]
+
+        there = [name for name in (*SCALARS, *OPTIONAL) if all(name in part for part in parts)]
+        scalars = {name: _read_only(joined(name)) for name in there}
         for name in ("solved", "success"):
             scalars[name] = _read_only(scalars[name].astype(bool))
         matrices = {}
         for kind, columns in kinds.items():
             values = np.empty((len(columns), len(scalars["status"])))
             for row, name in zip(values, columns, strict=True):
-                row[:] = np.concatenate([part.pop(name) for part in parts])[used]
+                row[:] = joined(name)
             matrices[kind] = _read_only(values.T)
         number, unread = _read_only(number[used]), number[unread]
         present, solved = np.isin(number, present), np.isin(number, solved)
@@ -148,6 +150,11 @@ class Sample:
         return distance
 
     @property
+    def inside_gate(self) -> Mask:
+        """Success (trials,) by the Cramér-Rao bound, one gate for all; the column `success` is by `bound_kind`."""
+        return self.scalars["crlb_distance"] <= gate(self.n)
+
+    @property
     def normalised(self) -> Array:
         """Errors over the linear bound (trials, n)."""
         return self.error / self.linear_bound
@@ -165,12 +172,7 @@ class Sample:
     def of_truth(self, kind: str) -> Array:
         """What is stored of the truth for each parameter (trials, n), or (trials,) by a name in `TRUTH`, read anew; NaN
         where it is not stored."""
-        if kind in TRUTH:
-            return self._beside([kind])[0]
-        return self._beside([f"{kind}_{name}" for name in self.names]).T
-
-    def _beside(self, names: Sequence[str]) -> Array:
-        """Columns (columns, trials) of the truths of these trials."""
+        names = [kind] if kind in TRUTH else [f"{kind}_{name}" for name in self.names]
         values = np.full((len(names), len(self)), np.nan)
         for _, truth in self.group.cells:
             stored = {} if truth is None else self.collection.load(truth, (), names)
@@ -182,7 +184,7 @@ class Sample:
             for row, name in zip(values, names, strict=True):
                 if name in stored:
                     row[there] = stored[name][at[there]]
-        return values
+        return values[0] if kind in TRUTH else values.T
 
     @cached_property
     def calibrations(self) -> list[Calibration]:
@@ -201,9 +203,9 @@ class Sample:
             for cell, history in stored
             if history is not None
             for trial in np.unique(history["trial"])
-            for row in np.flatnonzero(self.number == cell.seed * _SEED + trial).tolist()
+            for row in np.flatnonzero(self.converged & (self.number == cell.seed * _SEED + trial)).tolist()
         ]
-        found = [(row, iterates) for row, iterates in found if self.converged[row] and len(iterates) > 1]
+        found = [(row, iterates) for row, iterates in found if len(iterates) > 1]
         if not found:
             return []
         crlb = self.crlb
@@ -244,11 +246,7 @@ def samples(collection: Collection, groups: Sequence[Group]) -> Iterator[Sample]
 
 def _in_all(several: Sequence[Array]) -> Array:
     """The numbers that all have, ascending."""
-    common = np.unique(several[0]) if several else np.empty(0, dtype=np.int64)
-    for numbers in several[1:]:
-        if not np.array_equal(numbers, common):
-            common = np.intersect1d(common, numbers)
-    return common
+    return reduce(np.intersect1d, several[1:], np.unique(several[0])) if several else np.empty(0, dtype=np.int64)
 
 
 def _numbers(cell: StoredCell, trial: Array) -> Array:

@@ -11,7 +11,6 @@ import numpy as np
 
 from ipe_bench.statistics.collect import ALWAYS_COLUMNS, Collection, Group, collect
 from ipe_bench.statistics.comparisons import Outcomes, common, may_be_best
-from ipe_bench.statistics.formulas import gate_radius
 from ipe_bench.statistics.records import STATISTICS, all_statistics, frame_columns, summary_columns_of
 from ipe_bench.statistics.sample import Sample, samples
 
@@ -69,8 +68,8 @@ def scenario_rows(
 def outcomes_of(sample: Sample) -> Outcomes:
     """What comparisons and profiles need of a sample, by ascending seed and trial."""
     order = np.argsort(sample.number, kind="stable")
-    success = sample.distance <= gate_radius(sample.n)
-    return Outcomes(*(values[order] for values in (sample.number, sample.distance, success, sample.cost)))
+    columns = sample.number, sample.distance, sample.inside_gate, sample.cost
+    return Outcomes(*(values[order] for values in columns))
 
 
 def to_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:

@@ -39,7 +39,7 @@ from ipe_bench.trials.theory import (
     relative_curvatures,
     second_derivatives,
 )
-from ipe_bench.trials.thresholds import EXPECTED, GATE, SAME_ROOT
+from ipe_bench.trials.thresholds import EXPECTED, SAME_ROOT, gate
 
 HISTORIES = 20
 """Trials whose iterates are kept: the first ones of a scenario."""
@@ -260,8 +260,6 @@ class Block:
         P = estimates.covariance
         squared = np.full(trials, np.nan) if P is None else nees(error, P)
         deviation = np.full(error.shape, np.nan) if P is None else deviations(P)
-        from scipy.special import chdtri
-
         return {
             "trial": np.arange(self.trials.start, self.trials.stop),
             **_by_parameter("error", names, error),
@@ -277,7 +275,7 @@ class Block:
             "fit_p": self._fit_probability(estimator, estimates.x),
             "root_distance": apart,
             "solved": solved,
-            "success": np.isfinite(distance) & (distance <= chdtri(model.n, GATE)),
+            "success": distance <= gate(model.n),
             **{f"extra_{name}": values for name, values in estimates.extras.items()},
         }
 

@@ -11,3 +11,10 @@ FEW = 20
 """Below this many trials a figure that is conditional on them has no interval, and no place on a curve unmarked."""
 EXPECTED = 50
 """Truths over which Van Trees's bound takes the mean of the information."""
+
+
+def gate(n: int) -> float:
+    """The squared Mahalanobis error of n parameters up to which a trial is a success."""
+    from scipy.special import chdtri
+
+    return float(chdtri(n, GATE))
