@@ -242,14 +242,15 @@ def audit(table: Path | str | pd.DataFrame, *, output: Path | str | None = None)
 
     `table` is a CSV or Parquet file, or a frame, with a row per run: NAME_true and NAME (or NAME_error), NAME_std (or
     NAME_var), and cov_A_B as far as there are any; see `ipe_bench.statistics.audit.read_claims`. The result has
-    `sentences`, at most three, the strongest first; `scale`, by which factor true errors exceed the reported standard
-    deviations, with an interval that needs no normal law; and `table()`, the same for each parameter. With `output`,
+    `sentences`, at most three, the strongest first; `verdict`, what the covariance is: "too small", "too large",
+    "right" or "undecided"; `scale`, by which factor true errors exceed the reported standard deviations, with an
+    interval that needs no normal law; and `table()`, the same for each parameter. With `output`,
     audit.csv and audit.html are written there.
 
     >>> import numpy as np, pandas as pd, ipe_bench as ib
     >>> error = np.random.default_rng(0).normal(0, 0.3, 200)
     >>> found = ib.audit(pd.DataFrame({"x_error": error, "x_std": 0.1}))
-    >>> found.scale.verdict, round(found.scale.value, 1)
+    >>> found.verdict, round(found.scale.value, 1)
     ('too small', 2.9)
 
     Raises:

@@ -35,7 +35,7 @@ BUDGETS = {
     "baselines": 2410,
     "trials": 2050,
     "runs": 2220,
-    "statistics": 4282,
+    "statistics": 4289,
     "real": 2057,
     "plugins": 1240,
     "report": 4515,

@@ -20,4 +20,4 @@ def main(arguments: Sequence[str]) -> int:
     show(contents(found))
     if "output" in given:
         say(f"\nTable   {given['output']}/audit.csv", f"Page    {given['output']}/audit.html")
-    return 1 if found.scale.verdict in ("too small", "too large") else 0
+    return 1 if found.scale.wrong else 0

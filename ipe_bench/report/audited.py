@@ -16,7 +16,7 @@ def contents(found: Audit) -> list[Part]:
     columns = [
         words("parameter", names),
         texts("true over reported", [f"{f.value:.2f}" for f in found.each]),
-        texts("95 %", [f"{f.low:.2f} to {f.high:.2f}" for f in found.each]),
+        texts("97.5 %", [f"{f.low:.2f} to {f.high:.2f}" for f in found.each]),
         words("deviation", [f.verdict for f in found.each]),
         texts("bias", [f"{value:+.2f}" for value in found.bias[:, 0]]),
         texts("95 % of bias", [f"{low:+.2f} to {high:+.2f}" for low, high in found.bias[:, 1:]]),
@@ -29,7 +29,7 @@ def contents(found: Audit) -> list[Part]:
     low, high = found.nees_limits
     if math.isfinite(low):
         notes.append(f"NEES over n is {found.nees:.3f}; normal errors would leave it within {low:.3f} to {high:.3f}.")
-    if found.claims.correlation is None and found.claims.n > 1:
+    if not found.claims.joint:
         notes.append("No covariances are reported, so directions and the NEES are not judged.")
     title = f"Audit of {runs} runs" + (f", {left_out} rows without an estimate left out" if left_out else "")
     return [*found.sentences, Table("audit", title, "", columns, notes=notes)]

@@ -64,6 +64,11 @@ class Claims:
     def n(self) -> int:
         return len(self.names)
 
+    @property
+    def joint(self) -> bool:
+        """Whether the report says of all parameters together how wrong they are."""
+        return self.n == 1 or self.correlation is not None
+
     @cached_property
     def runs(self) -> int:
         return len(np.unique(self.run))
@@ -101,6 +106,10 @@ class Factor:
         return "right" if self.low > 1 / MATTERS and self.high < MATTERS else "undecided"
 
     @property
+    def wrong(self) -> bool:
+        return self.verdict in ("too small", "too large")
+
+    @property
     def words(self) -> str:
         """How large true errors are beside the reported ones."""
         known = self.high < _LARGEST * self.value
@@ -114,8 +123,9 @@ class Audit:
 
     claims: Claims
     scale: Factor
+    """Of all parameters, with an interval of 97.5 %: half of the level, the other questions having the rest."""
     each: tuple[Factor, ...]
-    """Of each parameter, all intervals together at 95 %."""
+    """Of each parameter, all intervals together at 97.5 %."""
     bias: Array
     """Mean error in reported standard deviations with its interval (n, 3), all together at 95 %."""
     nees: float
@@ -123,6 +133,11 @@ class Audit:
     nees_limits: tuple[float, float]
     """Where it lies in 95 % of cases if errors are normal; NaN without correlations, or with several rows a run."""
     sentences: tuple[str, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        """What the covariance is as a whole."""
+        return self.scale.verdict
 
     def table(self) -> pd.DataFrame:
         """A row per parameter: factor and bias with their intervals."""
@@ -139,8 +154,8 @@ class Audit:
 def audit(claims: Claims) -> Audit:
     """Examines what a program said.
 
-    Sentences beside the first are said where their family (scale, direction, tails, bias, trend) is refused at 5 % over
-    all of them together (Holm), so an honest report meets any false one in at most 5 % of cases.
+    A fault is said where its family (scale, direction, tails, bias, trend) is refused at 5 % over all of them together
+    (Holm), so an honest report meets any false sentence in at most 5 % of cases.
 
     Raises:
         UserError: there are too few runs, or errors and deviations differ by the factor of degrees and radians.
@@ -149,7 +164,7 @@ def audit(claims: Claims) -> Audit:
         one = "one log of dependent rows says too little; " if claims.runs == 1 and len(claims.run) > 1 else ""
         raise UserError(f"audit: there are {claims.runs} independent runs; {one}give at least {FEWEST_RUNS}")
     nees = np.sum(claims.w**2, axis=1)
-    each = _factors(claims, claims.z**2, 1 - ALPHA / claims.n)
+    each = _factors(claims, claims.z**2, 1 - ALPHA / 2 / claims.n)
     for name, factor in zip(claims.names, each, strict=True):
         for ratio in (_DEGREE, 1 / _DEGREE):
             if factor.low < ratio < factor.high and factor.high < 1.5 * factor.low:
@@ -158,19 +173,19 @@ def audit(claims: Claims) -> Audit:
                     "degrees and radians; give both in one unit"
                 )
     families = _Families(claims, nees)
-    refused = _holm(families.tests)
-    (scale,) = _factors(claims, nees[:, None] / claims.n, 1 - ALPHA)
-    joint = claims.n == 1 or claims.correlation is not None
-    limits = mean_limits(claims.n, claims.runs) if joint and claims.runs == len(nees) else (np.nan, np.nan)
-    told = [_of_scale(claims, scale, nees, "scale" in refused)]
+    (scale,) = _factors(claims, nees[:, None] / claims.n, 1 - ALPHA / 2)
+    refused = _holm(families.tests, {"scale"} if scale.wrong else set())
+    whole = claims.joint and claims.runs == len(nees)
+    limits = mean_limits(claims.n, claims.runs) if whole else (np.nan, np.nan)
+    told = [_of_scale(claims, scale, nees)]
     told += [families.words[name]() for name in ("direction", "bias", "tails", "trend") if name in refused]
     return Audit(claims, scale, each, _bias(claims), float(nees.mean() / claims.n), limits, tuple(told[:3]))
 
 
-def _of_scale(claims: Claims, scale: Factor, nees: Array, refused: bool) -> str:
-    if refused:
-        only, size = ("", "small") if scale.value > 1 else ("only ", "large")
-        return f"True errors are {only}{scale.words}: the covariance is too {size}."
+def _of_scale(claims: Claims, scale: Factor, nees: Array) -> str:
+    if scale.wrong:
+        only = "" if scale.value > 1 else "only "
+        return f"True errors are {only}{scale.words}: the covariance is {scale.verdict}."
     if scale.verdict == "right":
         return f"True errors are {scale.words}: the covariance can be believed."
     needed = _runs_needed(claims, nees)
@@ -184,35 +199,33 @@ def _runs_needed(claims: Claims, nees: Array) -> int:
     """Independent runs in which a standard deviation wrong by 10 % is seen in four of five cases."""
     mean = _per_run(claims, nees[:, None])[:, 0]
     spread = float(mean.var(ddof=1) / mean.mean() ** 2)
-    return int(np.ceil(spread * ((ndtri(1 - ALPHA / 2) + ndtri(0.8)) / (2 * np.log(MATTERS))) ** 2))
+    return int(np.ceil(spread * ((ndtri(1 - ALPHA / 4) + ndtri(0.8)) / (2 * np.log(MATTERS))) ** 2))
 
 
-def _holm(tests: Mapping[str, Callable[[float], bool]]) -> set[str]:
+def _holm(tests: Mapping[str, Callable[[float], bool]], refused: set[str]) -> set[str]:
     """The families that are refused at `ALPHA` over all of them, each given as whether it is refused at a level, with
-    the weights of `_WEIGHTS` (Holm, Scand. J. Statist. 6, 1979, section 4)."""
-    refused: set[str] = set()
-    while remaining := {name: _WEIGHTS[name] for name in tests if name not in refused}:
-        share = ALPHA / sum(remaining.values())
-        new = {name for name, weight in remaining.items() if tests[name](share * weight)}
+    the weights of `_WEIGHTS` (Holm, Scand. J. Statist. 6, 1979, section 4); `refused` says if the scale is."""
+    while True:
+        remaining = {name: _WEIGHTS[name] for name in ("scale", *tests) if name not in refused}
+        share = ALPHA / max(sum(remaining.values()), 1.0)
+        new = {name for name, weight in remaining.items() if name in tests and tests[name](share * weight)}
         if not new:
-            break
-        refused |= new
-    return refused
+            return refused
+        refused = refused | new
 
 
 class _Families:
     """The questions that are asked of a report beside how large errors are: tests by level, and words."""
 
     def __init__(self, claims: Claims, nees: Array) -> None:
-        self.claims, self.nees = claims, nees
+        self.claims = claims
         self.independent = claims.runs == len(nees)
-        joint = claims.n == 1 or claims.correlation is not None
-        self.tests: dict[str, Callable[[float], bool]] = {"scale": self._scale, "bias": self._biased}
+        self.tests: dict[str, Callable[[float], bool]] = {"bias": self._biased}
         self.words: dict[str, Callable[[], str]] = {"bias": self._bias_words}
-        if claims.n > 1 and claims.correlation is not None:
+        if claims.n > 1 and claims.joint:
             self.tests["direction"], self.words["direction"] = self._directed, self._direction_words
         if self.independent:
-            parts = [claims.w] if joint else [column[:, None] for column in claims.z.T]
+            parts = [claims.w] if claims.joint else [column[:, None] for column in claims.z.T]
             found = [_tails(part) for part in parts]
             self._tails = min(1.0, len(found) * min(p for p, _ in found)), max(ratio for _, ratio in found)
             self.tests["tails"], self.words["tails"] = lambda level: self._tails[0] <= level, self._tail_words
@@ -220,10 +233,6 @@ class _Families:
         if self._trend is not None:
             p = self._trend[0]
             self.tests["trend"], self.words["trend"] = lambda level: p <= level, self._trend_words
-
-    def _scale(self, level: float) -> bool:
-        (factor,) = _factors(self.claims, self.nees[:, None] / self.claims.n, 1 - level)
-        return factor.low > 1 or factor.high < 1
 
     def _biased(self, level: float) -> bool:
         bias = _bias(self.claims, level)
@@ -360,11 +369,9 @@ def _trend(claims: Claims, nees: Array) -> tuple[float, str, str] | None:
 
 
 def _spearman(x: Array, y: Array) -> float:
-    from scipy.stats import rankdata
+    from scipy.stats import spearmanr
 
-    a, b = rankdata(x) - (len(x) + 1) / 2, rankdata(y) - (len(y) + 1) / 2
-    size = float(np.sqrt((a @ a) * (b @ b)))
-    return float(a @ b) / size if size > 0 else 0.0
+    return float(spearmanr(x, y).statistic) if np.ptp(x) > 0 and np.ptp(y) > 0 else 0.0
 
 
 def _combination(c: Array, names: Sequence[str]) -> str:

@@ -52,7 +52,7 @@ def verdict(nees: Array, n: int, level: float = 0.95) -> Verdict:
     converged, as `scoring.nees` returns them, for n parameters; none of fewer than `FEW`.
 
     Diverged but confident: surely more than `TOLERATED` of the trials lie where the estimator says that a share of
-    `thresholds.GATE` should, and the mean of NEES / n surely lies above 1, as it does not for a right covariance of errors with
+    `GATE` should, and the mean of NEES / n surely lies above 1, as it does not for a right covariance of errors with
     heavy tails. Optimistic, pessimistic: the mean of NEES / n surely lies above or below 1, by the interval that
     root mean squares have, whatever the law of the errors. Where few trials carry that mean there is no such interval:
     it may still surely lie above 1, and is undecided otherwise; so is one of fewer than `SEEN` trials that seems to lie

@@ -5,8 +5,11 @@ import re
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from ipe_bench.basics.errors import UserError
+from ipe_bench.cli.audit import main
 from ipe_bench.statistics.audit import Claims, audit, read_claims
 
 
@@ -131,3 +134,72 @@ def test_wrong_tables_are_refused_in_one_line(table, said):
         audit(read_claims(table))
     assert said in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+# One verdict ---------------------------------------------------------------------------------------------------------
+
+
+def test_sentence_verdict_and_exit_code_say_the_same(tmp_path, capsys):
+    """Near the edge of the interval, where a test of the scale alone refuses more reports than the sentences do."""
+    rng, seen = np.random.default_rng(0), set()
+    for _ in range(20):
+        table = pd.DataFrame({"x_error": rng.normal(0, 1, 60), "x_std": 0.78, "t": np.arange(60.0)})
+        table.to_csv(tmp_path / "runs.csv", index=False)
+        found = audit(read_claims(table))
+        wrong = found.verdict in ("too small", "too large")
+        assert (f"the covariance is {found.verdict}" in found.sentences[0]) == wrong
+        assert wrong == (not found.scale.low <= 1 <= found.scale.high)
+        assert [f.verdict for f in found.each] == [found.verdict] == found.table()["covariance"].tolist()
+        assert main([str(tmp_path / "runs.csv")]) == wrong
+        assert found.sentences[0] in " ".join(capsys.readouterr().out.split())
+        seen.add(found.verdict)
+    assert {"too small", "undecided"} <= seen
+
+
+# A bundle adjustment -------------------------------------------------------------------------------------------------
+
+SIGMA = 0.5
+"""Standard deviation of the image points in pixels."""
+POINTS = np.array([[-1, -1, 5], [1, -1, 6], [1, 1, 5], [-1, 1, 7], [0.3, -0.4, 4], [-0.5, 0.2, 6.5], [0.8, 0.1, 5.5]])
+CENTRES = np.array([[-1.0, 0.0, 0.0], [1.0, 0.2, 0.0]])
+KNOWN = 3
+"""Control points, which fix where the scene stands, how it is turned, and its size."""
+
+
+def bundle_adjustments(runs: int, assumed: float, seed: int) -> pd.DataFrame:
+    """Errors of the first camera's rotation over simulated images of two cameras, and the covariance (J' J)^-1 of
+    residuals that are divided by `assumed`: what a solver reports that takes them for independent of variance 1.
+
+    A rotation's error is the rotation vector from the true to the estimated one, in which the solver steps, too.
+    """
+
+    def images(x: np.ndarray) -> np.ndarray:
+        turned = Rotation.from_rotvec(x[:6].reshape(2, 3))
+        points = np.vstack([POINTS[:KNOWN], x[12:].reshape(-1, 3)])
+        seen = [one.apply(points - centre) for one, centre in zip(turned, x[6:12].reshape(2, 3), strict=True)]
+        return np.concatenate([(500 * p[:, :2] / p[:, 2:]).ravel() for p in seen])
+
+    truth = np.concatenate([np.zeros(6), CENTRES.ravel(), POINTS[KNOWN:].ravel()])
+    rng, exact, rows = np.random.default_rng(seed), images(truth), []
+    for _ in range(runs):
+        z = exact + rng.normal(0, SIGMA, len(exact))
+        found = least_squares(lambda x, z=z: (images(x) - z) / assumed, truth, method="lm")
+        P = np.linalg.inv(found.jac.T @ found.jac)
+        row = {f"r{a}_error": found.x[i] for i, a in enumerate("xyz")}
+        rows.append(row | {f"cov_r{a}_r{b}": P[i, j] for i, a in enumerate("xyz") for j, b in enumerate("xyz")})
+    return pd.DataFrame(rows)
+
+
+def test_a_bundle_adjustment_in_pixels_reports_the_covariance_of_errors_of_one_pixel():
+    """The question of users of such solvers: 'the covariance is larger than that of a Monte Carlo simulation'. The
+    residuals were in pixels, and the image points half a pixel wrong; divided by that, it is right."""
+    found = audit(read_claims(bundle_adjustments(200, assumed=1.0, seed=1)))
+    assert found.verdict == "too large"
+    assert found.scale.low < SIGMA < found.scale.high
+    assert found.sentences[0].startswith("True errors are only 0.")
+    assert found.sentences[0].endswith("the covariance is too large.")
+    assert len(found.sentences) == 1  # neither direction, bias nor tails: a factor mends it
+    whitened = audit(read_claims(bundle_adjustments(200, assumed=SIGMA, seed=2)))
+    assert whitened.verdict not in ("too small", "too large")
+    assert whitened.scale.low < 1 < whitened.scale.high
+    assert len(whitened.sentences) == 1
