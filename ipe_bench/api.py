@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import tempfile
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -390,14 +390,20 @@ def design(
 
 
 def posterior(
-    scenario: Scenario, estimators: Mapping[str, Estimator], trials: int = 3, *, particles: int = 1000
+    scenario: Scenario,
+    estimators: Mapping[str, Estimator],
+    trials: int = 3,
+    *,
+    particles: int = 1000,
+    watch: Callable[[int], None] | None = None,
 ) -> list[Reference]:
     """What the readings of a scenario's first trials really say, and how far each estimator's Gaussian is from it.
 
     The posterior is sampled by sequential Monte Carlo for normal errors of the covariance R that estimators assume. A
     result has the `truth` (n,), the `posterior` (draws `x` (draws, n) in multiples of the parameters' sizes, `mean`,
     `covariance`, `modes` with their `shares`, and whether it has `settled`: two populations agree), and for
-    each estimator its `estimates` and a `divergences` entry: `kl` in nats, `shift`, `width` and `energy`.
+    each estimator its `estimates` and a `divergences` entry: `kl` in nats, `shift`, `width` and `energy`. `watch` is
+    called with the number of each trial before that is sampled.
 
     >>> import ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -410,10 +416,16 @@ def posterior(
     Raises:
         UserError: the scenario has no prior, an estimator needs what is not there, or there are too few particles.
     """
-    from ipe_bench.trials.posterior import reference
+    from ipe_bench.trials.posterior import reference, require_particles
 
     validate([scenario], estimators, trials)
-    return [reference(scenario, estimators, trial, particles) for trial in range(trials)]
+    require_particles(scenario.problem, particles)
+    found = []
+    for trial in range(trials):
+        if watch is not None:
+            watch(trial)
+        found.append(reference(scenario, estimators, trial, particles))
+    return found
 
 
 def check(component: Any) -> list[Finding]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -63,6 +64,7 @@ def places_and_keys(command: str, words: Sequence[str], kinds: Mapping[str, Any]
     """The files and folders after a command that Hydra does not read, and the values of its keys by their types."""
     from ipe_bench.basics.options import checked
 
+    refuse_blanks(words)
     places = [word for word in words if "=" not in word or Path(word).is_dir()]
     found: dict[str, Any] = {}
     for word in (word for word in words if word not in places):
@@ -80,6 +82,14 @@ def places_and_keys(command: str, words: Sequence[str], kinds: Mapping[str, Any]
             value = {"true": True, "false": False}.get(text) if kinds[key] is bool else _number(text)
         found[key] = checked(text if value is None else value, kinds[key], key)
     return places, found
+
+
+def refuse_blanks(words: Sequence[str]) -> None:
+    """Refuses KEY = VALUE, of which a shell makes several words."""
+    for i, (first, second) in enumerate(itertools.pairwise(words)):
+        if (second.startswith("=") and "=" not in first) or (first.endswith("=") and "=" not in second):
+            parts = words[i : i + 3] if second == "=" else (first, second)
+            raise UserError(f"{' '.join(parts)}: has a blank beside the equals sign; write {''.join(parts)}")
 
 
 def _number(text: str) -> float | None:

@@ -78,6 +78,8 @@ def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 
 def _dispatch(words: list[str]) -> int:
     command, *rest = words or ["--help"]
+    if command == "help" and rest:
+        command, rest = rest[0], ["--help"]
     if command in ("-h", "--help", "help"):
         parsers()[0].print_help()
         return 0

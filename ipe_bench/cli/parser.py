@@ -51,10 +51,34 @@ COMMANDS: dict[str, tuple[str, str, str, tuple[Argument, ...]]] = {
   ipe-bench run -m error_scale=1,10,100 seed=1,2                a job for each combination
   ipe-bench run +solver@estimators.second=newton estimators.second.tolerance=1e-3
 
-`ipe-bench list keys` has all keys, `ipe-bench list` the options of measurement=, noise=, solver= and the other groups.
+measurement=NAME       the measurement model; `ipe-bench list measurement` shows which there are
+noise=NAME             the errors of the readings
+prior=NAME             the distribution of the true parameters about the nominal point
+solver=[A,B]           iterative solvers of the estimating equation
+baseline=[A,B]         other estimators, on the same trials
+execution=NAME         where blocks of trials are computed: in this process, on all cores, on a cluster
+GROUP.KEY=VALUE        an option of one of these; `ipe-bench list GROUP/NAME` shows its type and default
+estimators.NAME.KEY=X  an option of a solver or a baseline that is chosen
+truth_measurement=NAME the model that simulates the readings, if estimators assume another one
+error_scale=X          standard deviation of the true parameters, in multiples of their sizes (1)
+seed=N                 number that all random draws follow from (0)
+trials=N               number of trials (1000); with precision= the largest number
+precision=X            adds trials until the success shares are known to within X, as in 0.01
+time_limit=SECONDS     ends this earlier
+objective=NAME.COLUMN  the statistic that a sweeper minimises, as in newton.capped_error
+parameters.NAME.KEY=X  knowledge of a parameter: fixed, nominal, deviation, lower, upper, positive
+prior_covariance=FILE  prior covariance of the parameters in their own units
+output=DIR             folder of the results; the same command in the same folder resumes
+name=NAME              name of the folder under outputs/, in place of the one made of the other keys (default_name)
+figures=main           figures to draw: main, all or none
+formats=pdf,svg        file formats of the figures besides PNG
+block_size=N           trials that are computed at once; it changes no number
+write_readings=FILE    writes the simulated readings of trial write_readings_trial=N, and computes nothing
+readings=FILE          is for `ipe-bench estimate`, as are ignore_rows= and ignore_columns=
++experiment=NAME       an experiment of `ipe-bench list experiment`, which sets some of these keys
 """,
         (
-            _several("overrides", "KEY=VALUE", "see `ipe-bench list keys` and `ipe-bench list`"),
+            _several("overrides", "KEY=VALUE", "see above"),
             _argument(
                 "--dry-run", action="store_true", help="say what is stored, what is missing and how long it takes"
             ),
@@ -264,8 +288,10 @@ class Parser(argparse.ArgumentParser):
             raise UserError(f"run: {word}: is no flag any more; {_GONE[flag]}")
         takes_keys = equals or any(action.metavar == "KEY=VALUE" for action in self._actions)
         if word.startswith("-" if equals else "--") and takes_keys and flag.lstrip("-").isidentifier():
-            said = word.lstrip("-") if equals else f"write {word[2:]}=VALUE"
-            raise UserError(f"{self.command}: {word}: there is no such flag; keys have no dashes: {said}")
+            after = list(words)[list(words).index(word) + 1 :]
+            value = after[0] if after and "=" not in after[0] and not after[0].startswith("-") else "VALUE"
+            said = word.lstrip("-") if equals else f"{word[2:]}={value}"
+            raise UserError(f"{self.command}: {word}: there is no such flag; keys have no dashes: write {said}")
         if word.startswith("-"):
             flags = [flag for action in self._actions for flag in action.option_strings]
             raise UserError(f"{self.command}: {word}: {unknown(word, flags, 'flag')}")

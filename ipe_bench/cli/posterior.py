@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 
 from ipe_bench.api import posterior
@@ -34,7 +35,11 @@ def main(arguments: Sequence[str], particles: int) -> int:
         "particles": particles,
     }
     folder = asked.folder(NAME, command)
-    found = posterior(scenario, job.estimators, trials, particles=particles)
+
+    def tell(trial: int) -> None:
+        print(f"{name}: trial {trial + 1} of {trials}", file=sys.stderr, flush=True)
+
+    found = posterior(scenario, job.estimators, trials, particles=particles, watch=tell)
     title = f"{name}, {scenario.noise.name}, error scale {scenario.error_scale:g}"
     files = write_posteriors(folder, name, title, scenario.measurement, found, command)
     show(contents(title, found))

@@ -218,7 +218,9 @@ def _estimator(label: str, options: Any) -> Estimator:
         raise UserError(f"{where}={options}: set its options, such as {where}.KEY=VALUE")
     if TARGET not in options:
         keys = ", ".join(f"{where}.{key}" for key in options) or where
-        raise UserError(f"{keys}: is set, but {label} is not chosen; add it to solver= or baseline=, or leave it out")
+        groups = {o.label: o.group for group in plugins.ESTIMATOR_GROUPS for o in plugins.options(group)}
+        remedy = f"add it to {groups[label]}=" if label in groups else unknown(label, groups, "estimator")
+        raise UserError(f"{keys}: is set, but {label} is not chosen; {remedy}")
     for group in plugins.ESTIMATOR_GROUPS:
         for option in plugins.options(group):
             if option.label == label and option.target != str(options[TARGET]):

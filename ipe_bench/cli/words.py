@@ -20,6 +20,7 @@ from hydra.core.override_parser.types import ChoiceSweep, Glob, Override, Overri
 from hydra.errors import HydraException
 
 from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.cli import refuse_blanks
 from ipe_bench.cli.spec import KEYS
 from ipe_bench.measurements.nist import datasets
 from ipe_bench.plugins import discovery as plugins
@@ -34,6 +35,9 @@ _FORMULA = re.compile(
 )
 """Texts that the shell has taken the quotes from; a list of units is none."""
 _FILE = re.compile(rf"\+*(?:(measurement|{TRUTH})\.file|(parameters))=(?![{{$]|null$)(.*)", re.DOTALL)
+
+_WHOLE = ("trials", "block_size", "seed", "write_readings_trial")
+"""Keys that take a whole number."""
 
 Groups = dict[str, list[str]]
 """The names of the options of each group."""
@@ -99,6 +103,7 @@ def as_typed(words: Sequence[str], files: Mapping[str, str]) -> tuple[str, ...]:
 
 def read(command: str, words: Sequence[str], folder: Path | None = None) -> Words:
     """The words of a command; `folder` holds configs besides ours."""
+    refuse_blanks(words)
     groups = _groups(folder)
     found: list[Override] = []
     files: dict[str, str] = {}
@@ -198,10 +203,11 @@ def _quoted(text: str) -> str:
 def _parse(command: str, word: str, groups: Groups) -> Override:
     key, equals, value = word.partition("=")
     if not equals and not word.startswith("~"):
-        remedy = f"see `ipe-bench {command} --help`"
-        if command == "estimate" and Path(word).suffix in (".csv", ".parquet"):
-            remedy = f"write readings={word}"
-        raise UserError(f"{word}: is not KEY=VALUE, without spaces about the equals sign; {remedy}")
+        remedies = [f"write {group}={word}" for group, names in groups.items() if word in names]
+        remedy = " or ".join(remedies) or f"see `ipe-bench {command} --help`"
+        if Path(word).suffix in (".csv", ".parquet"):
+            remedy = f"write {'' if command == 'estimate' else 'ipe-bench estimate '}readings={word}"
+        raise UserError(f"{word}: is not KEY=VALUE; {remedy}")
     try:
         found = OverridesParser.create().parse_override(word)
     except (HydraException, ValueError, RecursionError):
@@ -258,6 +264,8 @@ def _check_key(override: Override, groups: Groups) -> None:
     if key == "estimators":
         raise UserError(f"{word}: choose with solver= and baseline=, and set options by estimators.LABEL.KEY=VALUE")
     for value in values(override):
+        if key in _WHOLE and isinstance(value, float) and value.is_integer():
+            raise UserError(f"{word}: is not written as a whole number; write {key}={value:.0f}")
         if key in ("trials", "block_size") and value is None:
             raise UserError(f"{word}: cannot be null; give a whole number, or leave it out")
 

@@ -129,6 +129,15 @@ def reference(
     )
 
 
+def require_particles(problem: Problem, particles: int, populations: int = POPULATIONS) -> None:
+    """Refuses a problem without a prior, and fewer than ten particles per parameter and population."""
+    if problem.prior_deviation is None:
+        raise UserError("posterior: needs a prior; choose a noise and an error_scale that parameters are drawn with")
+    least = 10 * problem.measurement.n * populations
+    if particles < least:
+        raise UserError(f"particles={particles}: give at least {least}, 10 per parameter and population")
+
+
 def sample_posterior(
     problem: Problem, z: Array, *, particles: int = PARTICLES, populations: int = POPULATIONS, seed: int = 0
 ) -> Posterior:
@@ -139,11 +148,8 @@ def sample_posterior(
     Raises:
         UserError: no prior is known, or there are too few particles.
     """
-    if problem.prior_deviation is None:
-        raise UserError("posterior: needs a prior; choose a noise and an error_scale that parameters are drawn with")
-    n, each = problem.measurement.n, particles // populations
-    if each < 10 * n:
-        raise UserError(f"particles={particles}: give at least {10 * n * populations}, 10 per parameter and population")
+    require_particles(problem, particles, populations)
+    each = particles // populations
     sequences = np.random.SeedSequence(seed).spawn(populations)
     runs = [_Population.run(problem, z, each, np.random.Generator(np.random.Philox(s))) for s in sequences]
     evidence = np.array([run.evidence for run in runs])

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import yaml
 
 import ipe_bench as ib
 from ipe_bench.cli.main import COMMANDS, main
+from ipe_bench.cli.spec import KEYS
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.report import figures
 
@@ -90,8 +92,22 @@ MISTAKES = {
     "a group for a place": (["run", "baseline.ekf.process_noise=1"], "write estimators.ekf.process_noise=1"),
     "not chosen": (["run", "estimators.newton.max_iterations=9"], "newton is not chosen; add it to solver="),
     "an address": (["run", "output=s3://bucket/x"], "output=s3://bucket/x: is an address; name a folder"),
-    "a file for its key": (["estimate", "my.csv"], "my.csv: is not KEY=VALUE, without spaces"),
-    "a flag for a key": (["run", "--trials", "10"], "write trials=VALUE"),
+    "a label that is misspelt": (
+        ["run", "estimators.newtn.max_iterations=9"],
+        "did you mean newton?",
+    ),
+    "a file for its key": (["estimate", "my.csv"], "my.csv: is not KEY=VALUE; write readings=my.csv"),
+    "a file for another command": (["run", "my.csv"], "write ipe-bench estimate readings=my.csv"),
+    "an option without its group": (["run", "newton"], "newton: is not KEY=VALUE; write solver=newton"),
+    "a flag for a key": (["run", "--trials", "10"], "keys have no dashes: write trials=10"),
+    "a flag with a value for a key": (["run", "--trials=10"], "keys have no dashes: write trials=10"),
+    "a blank behind": (["run", "error_scale=", "33"], "has a blank beside the equals sign; write error_scale=33"),
+    "a blank before": (["run", "error_scale", "=33"], "has a blank beside the equals sign; write error_scale=33"),
+    "blanks about": (
+        ["report", ".", "figures", "=", "none"],
+        "figures = none: has a blank beside the equals sign; write",
+    ),
+    "an exponent": (["run", "trials=1e3"], "trials=1e3: is not written as a whole number; write trials=1000"),
     "a command that is gone": (["completion", "bash"], "completion: is no command any more"),
     "the schema that is gone": (["schema"], "schema: is no command any more; `ipe-bench list GROUP/NAME` shows every"),
     "a flag that is gone": (["run", "--config-path", "x"], "name it with --config-dir"),
@@ -226,8 +242,20 @@ def test_the_bare_program_and_every_command_have_help(capsys):
         text = capsys.readouterr().out
         assert all(re.search(rf"\n    {command}\s", text) for command in COMMANDS)
     for command in COMMANDS:
-        assert main([command, "--help"]) == 0
-        assert f"ipe-bench {command}" in capsys.readouterr().out
+        texts = []
+        for words in ([command, "--help"], ["help", command]):
+            assert main(words) == 0
+            texts.append(capsys.readouterr().out)
+        assert texts[0] == texts[1]
+        assert f"ipe-bench {command}" in texts[0]
+
+
+def test_the_help_of_run_explains_every_key_of_the_config_in_a_line(capsys):
+    assert main(["run", "--help"]) == 0
+    text = capsys.readouterr().out
+    config = yaml.safe_load((ROOT / "conf/config.yaml").read_text(encoding="utf-8"))
+    keys = {*KEYS, "solver", "baseline", "experiment", *config} - {"defaults", "hydra"}
+    assert {key for key in keys if not re.search(rf"\b{key}\b", text)} == set()
 
 
 def test_a_reader_that_closes_the_pipe_is_no_mistake(tmp_path):

@@ -13,8 +13,9 @@ def command(ipe_bench):
 
 
 def test_a_table_and_files_for_each_trial(command, tmp_path):
-    code, out, _ = command(*SMALL, "baseline=[linear_lse]", "trials=2", "--particles", "400")
+    code, out, error = command(*SMALL, "baseline=[linear_lse]", "trials=2", "--particles", "400")
     assert code == 0
+    assert error.splitlines() == ["polynomial: trial 1 of 2", "polynomial: trial 2 of 2"]
     folder = tmp_path / "outputs" / "posterior-polynomial"
     found = json.loads((folder / "posterior.json").read_text())
     assert [trial["trial"] for trial in found["trials"]] == [0, 1]
