@@ -176,6 +176,8 @@ def compare(
     alpha: float = 0.05,
     anytime: bool = False,
     fail_on: Sequence[str] = ("success", "error"),
+    power: float | None = None,
+    difference: float | None = None,
     output: Path | str | None = None,
 ) -> pd.DataFrame:
     """Whether a second version, setting or estimator is better or worse than a first, trial by trial.
@@ -190,6 +192,10 @@ def compare(
     that may be looked at after any number of trials; `finding` says what the second is, by p below `alpha`, or by e
     where `anytime`. `attrs` has lines on what of `fail_on` is `worse`, and on `problems`, `stale` results and `notes`.
     With `output`, comparison.csv and a page are written there.
+
+    With `power` and `difference`, rows on success have the column `trials_needed`: how many trials find such a
+    difference of success with that probability, by the upper limit (80 %) of the share of trials in which one alone
+    succeeds.
 
     >>> import tempfile, ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -206,7 +212,9 @@ def compare(
 
     from ipe_bench.statistics.between import JUDGED, compared, described, left_out
     from ipe_bench.statistics.collect import collect
+    from ipe_bench.statistics.power import plan_of
 
+    plan = plan_of(power, difference, anytime=anytime)
     if not 0 < alpha < 1:
         raise UserError(f"alpha={alpha}: give a number between 0 and 1")
     if wrong := [name for name in fail_on if name not in JUDGED]:
@@ -222,8 +230,11 @@ def compare(
     with opened(paths[0]) as one, opened(paths[1]) as other:
         for part in (one, other):
             require_results(part)
-        collections = [collect(part) for part in (one, other)]
-        frame = pd.DataFrame(compared(collections[0], collections[1], (first, second), alpha=alpha, anytime=anytime))
+        collections = collect(one), collect(other)
+        frame = pd.DataFrame(compared(*collections, (first, second), alpha=alpha, anytime=anytime, plan=plan))
+    if plan is not None:
+        whole = ["discordant", "trials_needed"]
+        frame[whole] = frame[whole].astype("Int64")
     worse = frame[(frame["finding"] == "worse") & frame["quantity"].isin(list(fail_on))]
     rows = [{str(name): value for name, value in row.items()} for row in worse.to_dict("records")]
     frame.attrs["worse"] = [f"{row['second']} in {row['quantity']}, {described(row)}" for row in rows]

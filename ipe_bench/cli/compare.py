@@ -17,6 +17,8 @@ KEYS = {
     "alpha": Annotated[float, Gt(0), Lt(1)],
     "anytime": bool,
     "fail_on": NAMES,
+    "power": float,
+    "difference": float,
     "output": str,
 }
 

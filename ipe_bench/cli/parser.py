@@ -188,6 +188,7 @@ Nothing is computed: run both first. The same trials are compared one by one; fo
 alpha=0.05           the chance that anything is found where there is no difference
 anytime=true         judge by e-values: then it may be looked at as often as one likes, while trials are added
 fail_on=success,error  what the second may not be worse in: success, error, cost
+power=0.9            how many trials find a difference of success, such as difference=0.05, with this probability
 output=DIR           writes comparison.csv and comparison.html there
 """,
         (_several("arguments", "DIR", "one or two folders of results"),),

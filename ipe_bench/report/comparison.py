@@ -26,7 +26,8 @@ def contents(frame: pd.DataFrame, alpha: float) -> list[Table]:
         cells = list(zip(*map(_cells, rows), strict=True))
         last = len(titles) - 1
         columns = [(words if i in (0, last) else texts)(t, cells[i]) for i, t in enumerate(titles)]
-        tables.append(Table("comparison", title, "", columns))
+        needed = [_needed(row) for row in rows if row.get("power", math.nan) > 0]
+        tables.append(Table("comparison", title, "", columns, notes=needed))
     note = (
         "error: mean Mahalanobis error, each trial's at most the radius of the gate of success. cost: simulations."
         " p: McNemar's exact test, random signs for ratios; Holm over all rows. e: evidence that may be looked at as"
@@ -34,7 +35,15 @@ def contents(frame: pd.DataFrame, alpha: float) -> list[Table]:
     )
     if (frame["matched_by"] == "order").any():
         note += " Without common trials nothing is gained from pairing: the intervals are wider."
-    return [*tables[:-1], *(replace(last, notes=[note]) for last in tables[-1:])]
+    return [*tables[:-1], *(replace(last, notes=[*last.notes, note]) for last in tables[-1:])]
+
+
+def _needed(row: dict[str, Any]) -> str:
+    return (
+        f"{row['trials_needed']:,} trials find a difference of {100 * row['difference']:g} % in success with a"
+        f" probability of {100 * row['power']:g} %: one alone succeeds in {row['discordant']} of {row['trials']}"
+        f" trials, so in at most {percent(row['discordant_high'])} of all (80 % limit)."
+    )
 
 
 def _comparisons(frame: pd.DataFrame) -> Iterator[tuple[str, list[dict[str, Any]]]]:

@@ -371,7 +371,7 @@ def _trend(claims: Claims, nees: Array) -> tuple[float, str, str] | None:
 def _spearman(x: Array, y: Array) -> float:
     from scipy.stats import spearmanr
 
-    return float(spearmanr(x, y).statistic) if np.ptp(x) > 0 and np.ptp(y) > 0 else 0.0
+    return float(np.asarray(spearmanr(x, y))[0]) if np.ptp(x) > 0 and np.ptp(y) > 0 else 0.0
 
 
 def _combination(c: Array, names: Sequence[str]) -> str:

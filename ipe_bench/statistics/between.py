@@ -17,6 +17,7 @@ from ipe_bench.runs.provenance import canonical_json
 from ipe_bench.statistics.collect import Collection, Group, config_leaves, differing, shown_leaf
 from ipe_bench.statistics.comparisons import ALPHA, differences, holm
 from ipe_bench.statistics.paired import Effect, no_drift, no_lean, ratio_effect, success_effect
+from ipe_bench.statistics.power import PLANNED, Plan
 from ipe_bench.statistics.sample import Sample, samples
 from ipe_bench.trials.thresholds import gate
 
@@ -27,7 +28,7 @@ BOTH = " | "
 _SAYS_NOTHING = {"null": "-", "None": "-", "false": "-"}
 NOT_SETTINGS = (
     *("first", "second", "trials", "matched_by", "quantity", "first_value", "second_value"),
-    *("change", "low", "high", "p", "e", "finding"),
+    *("change", "low", "high", "p", "e", "finding", *PLANNED),
 )
 """The columns of a row that do not say what is compared."""
 _HEADINGS = {"error_scale": "error scale"}
@@ -53,16 +54,22 @@ def compared(
     *,
     alpha: float = ALPHA,
     anytime: bool = False,
+    plan: Plan | None = None,
 ) -> list[dict[str, Any]]:
     """Rows of every comparison that can be made: one per scenario, pair of estimators and quantity.
 
-    Each p is corrected over all of them by Holm; with `anytime`, findings go by e-values, divided by their number.
+    Each p is corrected over all of them by Holm; with `anytime`, findings go by e-values, divided by their number. With
+    a `plan`, rows on success say how many trials it takes, at the strictest level that Holm asks for.
 
     Raises:
         UserError: there is nothing to compare.
     """
     rows = [row for match in _matches(first, second, labels) for row in _rows(*match, alpha)]
     judged = [row for row in rows if row["quantity"] in JUDGED]
+    for row in judged:
+        discordant = row.pop("discordant", None)
+        if plan is not None and discordant is not None:
+            row |= plan.row(discordant, row["trials"], alpha / len(judged))
     for row, p in zip(judged, holm([row["p"] for row in judged]), strict=True):
         row["p"] = float(p)
         sure = row["e"] >= len(judged) / alpha if anytime else p < alpha
@@ -94,8 +101,10 @@ def _rows(a: Sample, b: Sample, setting: _Setting, alpha: float) -> Iterator[dic
         "trials": len(one),
         "matched_by": "trial" if by_trial else "order",
     }
+    discordant = int(np.sum(a.inside_gate[one] != b.inside_gate[other]))
     for quantity, effect in _effects(a, one, b, other, alpha).items():
-        yield head | {"quantity": quantity} | asdict(effect) | {"finding": ""}
+        further = {"discordant": discordant} if quantity == "success" else {}
+        yield head | {"quantity": quantity} | asdict(effect) | {"finding": ""} | further
 
 
 def _head(first: Group, second: Group, setting: _Setting) -> dict[str, Any]:

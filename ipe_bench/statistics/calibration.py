@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.special import bdtr, bdtrc, chdtri, gammaincinv, gammaln, ndtri
@@ -59,12 +60,12 @@ def _poisson(count: Array, mean: float) -> Array:
 
 def _allowed(trials: int, tails: Array) -> tuple[Array, Array]:
     """The least and the largest count (bands, points) both of whose binomial tails exceed the band's."""
-    return _least(trials, POINTS, tails[:, None]), trials - _least(trials, 1 - POINTS, tails[:, None])
+    return least_count(trials, POINTS, tails[:, None]), trials - least_count(trials, 1 - POINTS, tails[:, None])
 
 
-def _least(trials: int, p: Array, tail: Array) -> Array:
+def least_count(trials: Any, p: Array, tail: Array) -> Array:
     """The least k with P(binomial <= k) > tail, by bisection: the inverses of libraries are off by one at ties."""
-    shape = np.broadcast_shapes(p.shape, tail.shape)
+    shape = np.broadcast_shapes(np.shape(trials), p.shape, tail.shape)
     low, high = np.full(shape, -1), np.full(shape, trials)
     while (high - low > 1).any():
         middle = (low + high) // 2
@@ -253,7 +254,7 @@ def _holds(interval: tuple[float, float], value: float) -> bool:
 def median_limits(values: Array, level: float = LEVEL) -> tuple[float, float]:
     """Interval of the median by order statistics, whatever the distribution; without ends below `FEW` values."""
     count = len(values)
-    k = int(_least(count, np.array([0.5]), np.array([(1 - level) / 2]))[0]) if count >= FEW else 0
+    k = int(least_count(count, np.array([0.5]), np.array([(1 - level) / 2]))[0]) if count >= FEW else 0
     if k == 0:
         return -np.inf, np.inf
     ordered = np.partition(values, (k - 1, count - k))

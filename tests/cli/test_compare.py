@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.stats import chi2
+from scipy.stats import binom, binomtest, chi2
 from synthetic_store import Pretender, Synthetic
 
 import ipe_bench as ib
@@ -244,3 +244,41 @@ def test_equal_folders_of_other_seeds_are_found_different_as_rarely_as_stated(tm
     assert alarms[False] / 500 < 0.05 + 3 * np.sqrt(0.05 * 0.95 / 500)
     assert alarms[False] / 500 > 0.01
     assert alarms[True] <= alarms[False]
+
+
+def test_a_pilot_says_how_many_trials_a_difference_takes(tmp_path, capsys):
+    """In 15 of 200 trials one alone succeeds, and three questions are asked: McNemar's p is multiplied by 3."""
+    a, b = store(tmp_path / "a"), store(tmp_path / "b", fails=15)
+    rows = ib.compare(a, b, power=0.9, difference=0.05).set_index("quantity")
+    high = binomtest(15, 200).proportion_ci(0.6).high
+    needed = rows.loc["success", "trials_needed"]
+    assert rows.loc["success", "discordant"] == 15
+    assert rows.loc["success", "discordant_high"] == pytest.approx(high)
+    assert rows["trials_needed"].isna().tolist() == [False, True, True, True]
+    drawn = np.random.default_rng(0).multinomial(needed, [(high - 0.05) / 2, (high + 0.05) / 2, 1 - high], 5000)
+    p = 2 * binom.cdf(drawn[:, :2].min(axis=1), drawn[:, :2].sum(axis=1), 0.5)
+    assert np.mean(3 * p < 0.05) == pytest.approx(0.9, abs=0.02)
+    assert main(["compare", str(a), str(b), "power=0.9", "difference=0.05", f"output={tmp_path / 'c'}"]) == 1
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"{needed} trials find a difference of 5 % in success with a probability of 90 %" in said
+    assert pd.read_csv(tmp_path / "c" / "comparison.csv")["trials_needed"][0] == needed
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (["power=1.2", "difference=0.05"], "power=1.2: give a number between 0 and 1"),
+        (["power=0.9", "difference=0"], "difference=0.0: give a number between 0 and 1"),
+        (["power=0.9"], "difference: is not given; both go together"),
+        (["power=0.9", "difference=0.05", "anytime=true"], "leave out anytime"),
+        (["power=0.9", "difference=0.00001"], "needs more than 10,000,000 trials"),
+        (["power=0.9", "difference=0.05"], "19 common trials are too few to plan from; run at least 20"),
+    ],
+)
+def test_what_cannot_be_planned_is_refused_in_a_line(tmp_path, capsys, wrong, said):
+    trials = 19 if "19" in said else 40
+    a, b = store(tmp_path / "a", trials=trials), store(tmp_path / "b", trials=trials, fails=3)
+    assert main(["compare", str(a), str(b), *wrong]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
