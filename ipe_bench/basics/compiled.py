@@ -90,8 +90,8 @@ def load(
 ) -> Callable[..., None]:
     """The function `name` of the module that `write` writes and `key` stands for, compiled once per machine.
 
-    What is kept is used only if it was made of this key for this processor, is whole, and nobody else may have put it
-    there.
+    A kept file is used only if it was made of this key for this processor, is whole, and belongs to this user or the
+    system.
     """
     import llvmlite.binding as llvm
 
@@ -116,7 +116,7 @@ def load(
 
 
 def _own_bytes(path: Path) -> bytes:
-    """What a file holds that this user or the system has written and nobody else can write to; else nothing."""
+    """The content of a file that belongs to this user or the system and that no other user can write to; else b""."""
     if not path.is_file():
         return b""
     with path.open("rb") as file:
@@ -172,6 +172,6 @@ def at(a: Any, kind: Any = DOUBLE) -> int:
 
 
 def aligned(numbers: int) -> tuple[np.ndarray[Any, Any], int]:
-    """Room for so many numbers, and where it begins: at the border of a cache line."""
+    """Memory for this many numbers, and the address at which it begins, the border of a cache line."""
     memory = np.empty(numbers + 8)
     return memory, -(-at(memory) // 64) * 64

@@ -37,7 +37,7 @@ def finite(a: Array) -> Mask:
 
 
 def read_only(a: Array) -> Array:
-    """The same numbers, which nobody can write to by this name."""
+    """A read-only view of the same numbers."""
     view = np.asarray(a).view()
     view.flags.writeable = False
     return view

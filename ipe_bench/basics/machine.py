@@ -31,7 +31,7 @@ def keep_freed_memory() -> None:
     with the Jacobians of a batch that took a fifth of an estimation.
 
     glibc takes the largest block that it has mapped and freed, up to 32 MB, for its measure of what to keep, mallopt(3)
-    at M_MMAP_THRESHOLD. The pages of a block that nobody touches are never fetched.
+    at M_MMAP_THRESHOLD. Pages that are never touched are never fetched.
     """
     import numpy as np
 

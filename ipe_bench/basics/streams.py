@@ -1,4 +1,4 @@
-"""Random streams that belong to a trial: the same numbers in whatever batch the trial stands."""
+"""Random streams that belong to a trial: its numbers do not depend on the batch."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ class Estimates:
     """The result of a batch; every field has a leading trials axis."""
 
     x: Array
-    """(trials, n), in multiples of the parameters' units; whatever was reached where the status is not converged."""
+    """(trials, n), in multiples of the parameters' units; the last iterate if the status is not converged."""
     status: NDArray[np.int8]
     covariance: Array | None = None
     """(trials, n, n): the covariance that the estimator itself reports."""
@@ -99,7 +99,7 @@ class Estimates:
 class Estimator(Component, ABC):
     """Turns readings into parameters. A new estimator is a frozen dataclass that writes `estimate`.
 
-    The trials of a batch are independent: a trial's result is the same, bit for bit, in whatever batch it stands, and
+    The trials of a batch are independent: the result of a trial is bit-identical in every batch, and
     a trial that fails ends as a status without disturbing the others.
     """
 

@@ -184,7 +184,7 @@ class NormalEquations:
 
     def damped(self, weights: Array) -> tuple[Array, Array]:
         """The step that minimises |r + J s|^2 + |weights s|^2, and the decrease of |r + J s|^2 + that it predicts."""
-        with np.errstate(over="ignore"):  # a damping beyond all bounds is left to the other way
+        with np.errstate(over="ignore"):  # an overflowing damping is treated by the other way
             squares = weights[:, :, None] ** 2 * np.eye(self.U.shape[1])
         _, root, well = definite_factor(np.matmul(self.U.swapaxes(1, 2), self.U) + squares)
         step = -multiply(root, multiply(root.swapaxes(1, 2), multiply(self.U.swapaxes(1, 2), self.gradient)))
@@ -272,7 +272,7 @@ class LeastSquaresSystem:
     exact: Mask
     """Where the slope is that of an exact Jacobian."""
     near: Mask
-    """Where Jacobians are exact from now on, since little is left to go."""
+    """Where Jacobians are exact from now on, since the minimum is near."""
 
     @classmethod
     def at(cls, objective: Residuals, x: Array, lam: float = 0.0, *, keep_Q: bool = False) -> LeastSquaresSystem:

@@ -33,7 +33,7 @@ class ResultKey:
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """What was computed, whatever the version of the program that did."""
+        """What was computed, without the version of the program."""
         return {"scenario": describe(self.scenario), "label": self.label, "estimator": describe(self.estimator)}
 
     @cached_property

@@ -2,7 +2,7 @@
 
 Parquet's own CRC-32 covers the pages and nothing else; a SHA-256 digest covers the footer, which says where the pages
 are, what they belong to and by what they were made. It stands between the pages and the footer, where every reader of
-Parquet passes over it. Which files there are is left to `runs.results`.
+Parquet passes over it. `runs.results` finds out which files there are.
 """
 
 from __future__ import annotations

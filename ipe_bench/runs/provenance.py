@@ -30,7 +30,7 @@ WITHOUT_NUMBERS = tuple(
 )
 """Modules and rooms that no number of a trial comes from: they word messages, name, store, summarise and show."""
 _SESSION = uuid.uuid4().hex
-"""Stands for source that no file holds, as of a notebook: what it computed is nobody's but this session's."""
+"""Stands for source that no file holds, such as a notebook's: its results are valid in this session alone."""
 
 
 def describe(value: Any) -> Any:

@@ -1,8 +1,8 @@
 """What is stored under output folders: what is there, done, missing, failed, refused, stale and damaged.
 
 `run` asks it what to compute, `status` and `report` what to show, `load` for the rows, so they cannot disagree. A file
-is used, or named with what is wrong with it; nothing is guessed, mixed or deleted. What the numbers mean is left to
-`statistics`.
+is used, or named with what is wrong with it; nothing is guessed, mixed or deleted. `statistics` says what the numbers
+mean.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The run of a bench: what is asked for is checked, what is missing is computed and stored, and all of it recorded.
 
-When a run has enough trials for a precision is left to `statistics.stopping`.
+`statistics.stopping` decides when a run has enough trials for a precision.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def compute(
 ) -> tuple[str, ...]:
     """Computes and stores what is missing under `output`; returns the messages of what failed.
 
-    Trials are computed `block_size` at once, which changes no number: where it is None, so many as are quickest.
+    Trials are computed in blocks of `block_size`, which changes no number; None: the quickest size.
 
     The run is recorded, unless nothing is missing and the same was asked for before: under a new name, or under
     `record_as`, in place of what is there; with `further` facts, and the `command` as it was typed.

@@ -1,4 +1,4 @@
-"""What is to be computed, cut into tasks, and how a run gets through them whatever happens to its parts.
+"""The work of a run, cut into tasks, and how the run completes them although parts of it may fail.
 
 A task is the cells of one scenario that are missing in one block. Each cell is stored as soon as it is there, so a task
 that dies has lost no more than the cell it died of: that one is tried again alone, the rest goes on.
@@ -33,7 +33,7 @@ from ipe_bench.trials.scoring import HISTORIES, Block
 log = logging.getLogger(__name__)
 
 BLOCK_SIZE = 250
-"""Trials: at the least, where nobody says how many."""
+"""Trials of a block, at least, by default."""
 LARGEST_BLOCK = 1000
 """Of more trials at once, the arrays leave a processor's cache: each trial takes longer again."""
 _WORTH_BLOCKS = 100
@@ -93,7 +93,7 @@ Watcher = Callable[[Progress], None]
 
 
 def block_size_for(trials: int) -> int:
-    """What is computed at once where nobody says: 250 trials, and more where there still are a hundred blocks."""
+    """The default size of a block: 250 trials, and more if there still are a hundred blocks."""
     return min(max(trials // _WORTH_BLOCKS // BLOCK_SIZE, 1) * BLOCK_SIZE, LARGEST_BLOCK)
 
 
@@ -174,7 +174,7 @@ def _prepare(block: Block, cell: ResultKey) -> None:
 
 @contextlib.contextmanager
 def _alone() -> Iterator[None]:
-    """One thread in BLAS and no warnings of NumPy, whatever the part before has asked for."""
+    """One thread in BLAS and no warnings of NumPy."""
     with _blas().limit(limits=1, user_api="blas"), np.errstate(all="ignore"):
         yield
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from ipe_bench.runs.key import ResultKey
 
 _ABANDONED_S = 3600.0
-"""Age of a temporary file that nobody will finish."""
+"""Age in s from which a temporary file counts as abandoned."""
 
 
 class Store:

@@ -217,7 +217,7 @@ _RANDOMISED = 2
 """Windows, those which leave much open, in which the prior of a candidate is centred at its own start; one more with
 each attempt after the first from draws."""
 _THINNING = (1, 1, 4, 8, 16, 32, 64)
-"""Each window keeps the best one in so many of the candidates at the start; one at least."""
+"""One candidate in this many, the best ones, is kept by each window; at least one."""
 _GIVEN_UP = (np.inf, 1e6, 1e3)
 """The mean squared residual above which the fit of the first window, the second, and a later one is a wrong one, unless
 the best fit of all data so far is as bad: then R may be wrong."""

@@ -44,7 +44,7 @@ class Auto(Estimator):
     `confirmations` minimisations from draws of the prior look for other minima that fit. Of several the one counts that
     is the most probable with the prior, since no residual can tell. Extras: `minima`, how many distinct minima that fit
     were found, and `ambiguous`, 1 where there are several, 0 where the look found none, which is no proof that there is
-    none, and NaN where nobody looked; `alternatives` lists the others.
+    none, and NaN if no look was taken; `alternatives` lists the others.
 
     One Jacobian of the first stage is the covariance's, and as with every solver not counted where it ends there.
     """

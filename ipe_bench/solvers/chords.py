@@ -17,8 +17,8 @@ from ipe_bench.solvers.anderson import accelerated, push
 _ITERATIONS = 25
 """Steps with the Jacobian H of the nominal point; where more are needed, another way is cheaper."""
 _TRIED, _PER_DECADE = 6, 3
-"""After so many steps from the linear estimate, each ten that the steps still to go have shrunk by must have taken no
-more than so many, but for the first three: far from the root they wander."""
+"""After `_TRIED` steps from the linear estimate, each decade by which the remaining step has shrunk may have taken at
+most `_PER_DECADE` steps, the first three aside: far from the root the steps wander."""
 _NEAR = 1e-2
 """How near to the root of eq. (11), in deviations, they bring a trial before the Jacobian there takes over."""
 _CHORDS = 8
@@ -28,7 +28,7 @@ _JACOBIANS = 16
 _BENT = 200
 """Times the tolerance: how far from the minimum, in deviations, a Jacobian that has changed may leave the answer."""
 _CONTRACTING = 0.75
-"""The rate up to which fixed-point iteration is said to contract, so that nobody need look for another minimum."""
+"""The rate up to which fixed-point iteration counts as contracting, so that no other minimum is looked for."""
 _DEPTH = 5
 """Differences that accelerate a step."""
 

@@ -133,7 +133,7 @@ class _Account:
         self.attempts, self.draws, self.repeats = nothing
 
     def note(self, rows: Rows, again: Minima, known: Minima, better: Mask, draws: int) -> None:
-        """Books an attempt from so many draws at the trials `rows`, of which `known` were the best minima."""
+        """Books an attempt from `draws` draws at the trials `rows`, whose best minima were `known`."""
         with np.errstate(invalid="ignore"):  # two infinite fits are not one minimum
             near = _SAME_FIT * np.maximum(again.chi_square, known.chi_square)
             same = again.converged & known.converged & (np.abs(again.chi_square - known.chi_square) <= near)

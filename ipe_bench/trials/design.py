@@ -319,7 +319,7 @@ def _choice(judge: _Judge, units: Units, taken: NDArray[np.bool_]) -> Choice:
 
 
 def _grown(judge: _Judge, units: Units, most: int) -> Iterator[Choice]:
-    """Choices one after another, each with the unit more that gains most per reading, of at most so many readings."""
+    """Choices one after another, each with the further unit that gains most per reading, up to a number of readings."""
     sizes, taken = units.sizes, np.zeros(len(units.rows), dtype=bool)
     while (free := ~taken & (sizes <= most - sizes[taken].sum())).any():
         P = judge.covariance(units.information(taken.astype(float)))

@@ -8,7 +8,7 @@ its law follows from the noise, which states that of its whitened readings, and 
 - an estimate with a prior leaves residuals of covariance (I - J S J')(J P0 J' + I)(I - J S J'), S the covariance that
   it reports, over truths from the prior (whitened J).
 
-It needs no truth, so whoever estimates can ask for it too.
+It needs no truth, so it applies to real readings too.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What readings say about each parameter before any are taken: singular values, the least observable direction, bounds
 and correlations, and which errors that the model leaves out look like its parameters.
 
-All of it follows from Jacobians at truths drawn from the prior. Which readings to take is left to `design`.
+All of it follows from Jacobians at truths drawn from the prior. `design` chooses which readings to take.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@ estimators against.
 
 Slow and general, with nothing linearised: particles go from the prior to the posterior by tempering the likelihood (Del
 Moral, Doucet and Jasra, J. R. Stat. Soc. B 68, 2006), moved by Metropolis steps with covariances of Gauss and Newton.
-The likelihood is what estimators are told: normal errors of covariance R, whatever the noise.
+The likelihood is the one that estimators assume: normal errors of covariance R, for every noise.
 """
 
 from __future__ import annotations

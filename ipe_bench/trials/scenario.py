@@ -93,7 +93,7 @@ class Scenario:
         return self._drawn(start, stop)[:, : self.simulator.n]
 
     def draw(self, start: int, stop: int) -> Trials:
-        """Trials start to stop. Trial t has random streams of its own, so it is the same in whatever block it is drawn.
+        """Trials start to stop. Trial t has random streams of its own, so it is the same in every block.
 
         One seed gives the same draws, in units of the error scale, at every error scale.
         """

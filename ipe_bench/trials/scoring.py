@@ -242,7 +242,7 @@ class Block:
         model = self.problem.measurement
         names = [p.name for p in model.parameters]
         error = estimates.x - self.trials.x
-        # Whatever the estimator says: what is not finite has not converged.
+        # An estimate that is not finite has not converged, even if the estimator says so.
         usable = np.isfinite(error).all(axis=1)
         status = np.where((estimates.status == Status.CONVERGED) & ~usable, Status.NONFINITE, estimates.status)
         unread = ~np.isfinite(self.trials.z).all(axis=1)

@@ -24,7 +24,7 @@ _SEEN = 1e-6
 _APART = 1.0
 """Roots nearer than this, in deviations of the bound, are one."""
 _TRUTHS, _STARTS = 4, 4
-"""False roots are looked for from so many starts for each of so many truths."""
+"""Starts for each truth, and truths, from which false roots are looked for."""
 
 
 @dataclass(frozen=True)

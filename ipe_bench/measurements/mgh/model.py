@@ -1,6 +1,6 @@
 """Nonlinear least-squares problems with known minima as measurement models: Moré, Garbow and Hillstrom's functions.
 
-What an estimate is worth is left to `score`, formulas to `formulas`, starts and minima to `problems`.
+`score` judges estimates, `formulas` holds the functions, `problems` their starts and minima.
 """
 
 from __future__ import annotations

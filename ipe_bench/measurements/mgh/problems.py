@@ -1,7 +1,7 @@
 """Standard starts and known minima of the test functions of Moré, Garbow and Hillstrom, under the names they go by.
 
 Values and places agree with what the paper prints, to its six digits; the further digits, and the minima that it does
-not list, come from Newton's method on the gradient in double precision. Formulas are left to `formulas`.
+not list, come from Newton's method on the gradient in double precision. The functions are in `formulas`.
 """
 
 from __future__ import annotations

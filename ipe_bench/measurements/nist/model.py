@@ -2,7 +2,7 @@
 
 The readings are real or generated data with certified answers (National Institute of Standards and Technology,
 https://www.itl.nist.gov/div898/strd/nls/nls_main.shtml, public domain), kept in `data.json`. How an estimate is
-compared with the certified one is left to `score`.
+compared with the certified one is said by `score`.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ class Auto(Processes):
 
 
 def supervise(work: Work, tasks: Sequence[Any], workers: int, threads: int, limits: ResourceLimits) -> Iterator[Event]:
-    """Runs tasks in at most so many worker processes with so many threads each; see `Execution.run`.
+    """Runs tasks in at most `workers` processes with `threads` threads each; see `Execution.run`.
 
     A worker whose task exceeds its time is ended. The first step has a minute in any case: a new worker has to load
     compiled code.
