@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import tempfile
 import warnings
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
     from ipe_bench.report.answer import Answer
     from ipe_bench.report.choice import Which
     from ipe_bench.report.run import ReportResult
+    from ipe_bench.report.summary import Summary
     from ipe_bench.statistics.audit import Audit
     from ipe_bench.trials.design import Criterion, Design
     from ipe_bench.trials.posterior import Reference
@@ -41,22 +41,28 @@ Directories = Path | str | Sequence[Path | str]
 
 
 def run(
-    scenarios: Scenario | Sequence[Scenario],
+    scenarios: Scenario | Measurement | Sequence[Scenario],
     estimators: Mapping[str, Estimator],
     trials: int | None = None,
     *,
+    noise: Noise | None = None,
+    prior: Prior | None = None,
+    error_scale: float | None = None,
     precision: float | Mapping[str, float] | None = None,
     time_limit: float | None = None,
     output: Path | str | None = None,
     execution: Execution | None = None,
     block_size: int | None = None,
     watch: Watcher | None = None,
-) -> pd.DataFrame:
+) -> Summary:
     """Runs every estimator on the same trials of every scenario and summarises what is known of them.
 
-    What `output` holds already is not computed again; without `output` nothing is kept. Returns a row per scenario,
-    estimator and parameter, plus the parameter `all`, the root mean square over parameters of error over bound; `rmse`
-    and its kin are in the parameter's own unit. What could not be computed is left out, with a warning that says why.
+    What `output` holds already is not computed again; without `output` nothing is kept. A model with its `noise`,
+    `prior` and `error_scale` stands for a scenario of its own. Returns a frame with a row per scenario, estimator and
+    parameter, plus the parameter `all`, the root mean square over parameters of error over bound; `rmse` and its kin
+    are in the parameter's own unit. It shows the table of the terminal, `.trials` has a row per trial, `.figures` has
+    Matplotlib's figures by name, and `.report(output)` writes the report. What could not be computed is left out, with
+    a warning that says why.
 
     There are 1000 `trials` unless another number is given. With `precision` there are just enough, and `trials` is the
     most there may be (100,000 unless given): blocks are added until every success share is known to within that number,
@@ -78,28 +84,31 @@ def run(
         StorageError: nothing can be stored any more.
     """
     from ipe_bench.plugins.extensions import use_statistics
+    from ipe_bench.report.summary import Stored, Summary
     from ipe_bench.statistics import summarize
     from ipe_bench.statistics.stopping import Stop, check_time_limit, compute_until
 
-    scenarios = [scenarios] if isinstance(scenarios, Scenario) else list(scenarios)
-    with contextlib.ExitStack() as stack:
-        folder = output or stack.enter_context(tempfile.TemporaryDirectory(prefix="ipe-bench-"))
-        options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
-        stops: tuple[Stop, ...] = ()
-        if precision is None:
-            check_time_limit(time_limit)
-            failures = compute(scenarios, estimators, TRIALS if trials is None else trials, folder, **options)
-        else:
-            options |= {"precision": precision, "time_limit": time_limit}
-            failures, stops = compute_until(scenarios, estimators, trials, folder, **options)
-        for failure in failures:
-            warnings.warn(f"failed: {failure}", stacklevel=2)
-        for problem in use_statistics():
-            warnings.warn(problem, stacklevel=2)
-        table = summarize([folder])
-        if precision is not None:
-            table.attrs["stops"] = [stop.row for stop in stops]
-        return table
+    if isinstance(scenarios, Sequence):
+        scenarios = [_scenario(one) for one in scenarios]
+    else:
+        scenarios = [_scenario(scenarios, noise=noise, prior=prior, error_scale=error_scale)]
+    estimators, stored = _labelled(estimators), Stored(output)
+    options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
+    stops: tuple[Stop, ...] = ()
+    if precision is None:
+        check_time_limit(time_limit)
+        failures = compute(scenarios, estimators, TRIALS if trials is None else trials, stored.folder, **options)
+    else:
+        options |= {"precision": precision, "time_limit": time_limit}
+        failures, stops = compute_until(scenarios, estimators, trials, stored.folder, **options)
+    for failure in failures:
+        warnings.warn(f"failed: {failure}", stacklevel=2)
+    for problem in use_statistics():
+        warnings.warn(problem, stacklevel=2)
+    table = Summary.of(summarize([stored.folder]), stored)
+    if precision is not None:
+        table.attrs["stops"] = [stop.row for stop in stops]
+    return table
 
 
 def load(directories: Directories) -> pd.DataFrame:
@@ -311,7 +320,7 @@ def status(directories: Directories) -> pd.DataFrame:
 
 
 def estimate(
-    model: Measurement,
+    model: Measurement | Scenario,
     readings: Path | str | Sequence[Path | str] | Array | None = None,
     estimators: Mapping[str, Estimator] | None = None,
     *,
@@ -323,14 +332,15 @@ def estimate(
 ) -> Answer:
     """Parameters from real readings, by every estimator: estimates, standard errors, residuals and a test of the fit.
 
-    `readings` is a CSV file (see `ipe_bench.real.readings`), several that share parameters, or an array z (m,) in the
-    model's order and unit, NaN where missing; None: those that come with the model. `noise` states R; without it R is
-    what the file says in its column sigma, or the model of its own noise, or else one level for all is estimated from
-    the residuals (`Unknown`), whose size then cannot test the fit. Filters and `map_lm` need a prior:
-    `error_scale` is the standard deviation of each parameter in multiples of its size, and `prior` widens or narrows
-    some, or makes them depend on each other (`ipe_bench.priors.prior_of` makes one of a covariance). `ignore_rows` and
-    `ignore_columns` of the files are left out. `x` and `covariance` of a fit are in the parameters' own units. The
-    answer is the sequence of the fits; it shows itself in a notebook, and `table()` is a frame.
+    A scenario stands for its model with its noise, prior and error scale. `readings` is a CSV file (see
+    `ipe_bench.real.readings`), several that share parameters, or an array z (m,) in the model's order and unit, NaN
+    where missing; None: those that come with the model. `noise` states R; without it R is what the file says in its
+    column sigma, or the model of its own noise, or else one level for all is estimated from the residuals (`Unknown`),
+    whose size then cannot test the fit. Filters and `map_lm` need a prior: `error_scale` is the standard deviation of
+    each parameter in multiples of its size, and `prior` widens or narrows some, or makes them depend on each other
+    (`ipe_bench.priors.prior_of` makes one of a covariance). `ignore_rows` and `ignore_columns` of the files are left
+    out. `x` and `covariance` of a fit are in the parameters' own units. The answer is the sequence of the fits; it
+    shows itself in a notebook, and `table()` is a frame.
 
     >>> import ipe_bench as ib
     >>> model = ib.measurements.Polynomial()
@@ -351,8 +361,13 @@ def estimate(
     from ipe_bench.report.answer import Answer
     from ipe_bench.solvers import Auto
 
+    if not isinstance(model, Measurement):
+        scenario = _scenario(model, noise=noise, prior=prior, error_scale=error_scale)
+        model, noise = scenario.measurement, None if scenario.noise.real else scenario.noise
+        prior, error_scale = scenario.prior, scenario.error_scale
     if estimators is None:
         estimators = {"linear_lse": LinearLSE(), "levenberg_marquardt": LevenbergMarquardt(), "auto": Auto()}
+    estimators = _labelled(estimators)
     if isinstance(readings, str | Path):
         readings = [readings]
     given = readings if readings is None or isinstance(readings, np.ndarray) else tuple(map(Path, readings))
@@ -362,8 +377,11 @@ def estimate(
 
 
 def design(
-    scenario: Scenario,
+    scenario: Scenario | Measurement,
     *,
+    noise: Noise | None = None,
+    prior: Prior | None = None,
+    error_scale: float | None = None,
     by: Sequence[str] | None = None,
     readings: int | None = None,
     criterion: Criterion = "A",
@@ -395,16 +413,20 @@ def design(
     from ipe_bench.plugins.extensions import richer_models
     from ipe_bench.trials.design import design as designed
 
+    scenario = _scenario(scenario, noise=noise, prior=prior, error_scale=error_scale)
     errors = richer_models(scenario) if errors is None else errors
     scenario = dataclasses.replace(scenario, truth=None)
     return designed(scenario, by=by, readings=readings, criterion=criterion, errors=errors)
 
 
 def posterior(
-    scenario: Scenario,
+    scenario: Scenario | Measurement,
     estimators: Mapping[str, Estimator],
     trials: int = 3,
     *,
+    noise: Noise | None = None,
+    prior: Prior | None = None,
+    error_scale: float | None = None,
     particles: int = 1000,
     watch: Callable[[int], None] | None = None,
 ) -> list[Reference]:
@@ -429,6 +451,8 @@ def posterior(
     """
     from ipe_bench.trials.posterior import reference, require_particles
 
+    scenario = _scenario(scenario, noise=noise, prior=prior, error_scale=error_scale)
+    estimators = _labelled(estimators)
     validate([scenario], estimators, trials)
     require_particles(scenario.problem, particles)
     found = []
@@ -485,6 +509,43 @@ def _check_records(options: Sequence[Option]) -> list[Finding]:
         compute(scenarios[-1:], estimators, 1, f"{folder}/single")
         analyses = [analyse([f"{folder}/{name}"]) for name in ("sweep", "single")]
         return [check_record(option, analyses) for option in options]
+
+
+def _scenario(given: Any, **stated: Any) -> Scenario:
+    """The scenario that is given, or that of a model under what is stated of it.
+
+    Raises:
+        UserError: it is neither, or something is stated of a scenario.
+    """
+    stated = {name: value for name, value in stated.items() if value is not None}
+    if isinstance(given, Scenario):
+        if stated:
+            raise UserError(f"{next(iter(stated))}=: is part of the scenario; leave it out, or give the model alone")
+        return given
+    if not isinstance(given, Measurement):
+        raise UserError(f"{_described(given)}; give a scenario, ib.Scenario(model, noise), or a measurement model")
+    return Scenario(given, **stated)
+
+
+def _labelled(estimators: Any) -> Mapping[str, Estimator]:
+    """The estimators by their labels.
+
+    Raises:
+        UserError: they have no labels, or one is no estimator.
+    """
+    if not isinstance(estimators, Mapping):
+        raise UserError('estimators: give each a label, as in {"newton": ib.solvers.Newton()}')
+    for label, one in estimators.items():
+        if not isinstance(one, Estimator):
+            raise UserError(f"estimators: {label}: {_described(one)}; give an estimator such as ib.solvers.Newton()")
+    return estimators
+
+
+def _described(given: Any) -> str:
+    """What was given in place of an object of the bench."""
+    if isinstance(given, type):
+        return f"{given.__name__} is a class, whose objects are written {given.__name__}()"
+    return f"{given!r:.60} is a {type(given).__name__}"
 
 
 def _paths(directories: Directories) -> list[Path]:

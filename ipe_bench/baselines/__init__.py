@@ -16,6 +16,7 @@ from ipe_bench.baselines.multistart import Multistart
 from ipe_bench.baselines.recursive_update import RecursiveUpdate
 from ipe_bench.baselines.scipy_least_squares import LeastSquares
 from ipe_bench.baselines.ukf import UKF
+from ipe_bench.basics.naming import without_modules
 
 __all__ = [
     "CKF",
@@ -36,3 +37,5 @@ __all__ = [
     "Multistart",
     "RecursiveUpdate",
 ]
+
+without_modules(__name__, __all__)

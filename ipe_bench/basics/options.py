@@ -14,12 +14,12 @@ import numbers
 import types
 import typing
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from annotated_types import BaseMetadata, DocInfo, Ge, GroupedMetadata, Gt, Le, Lt, MaxLen, MinLen, Predicate
 
-from ipe_bench.basics.errors import UserError, describe_exception
+from ipe_bench.basics.errors import UserError, describe_exception, unknown
 
 FINITE = Predicate(math.isfinite)
 
@@ -47,6 +47,14 @@ class Component:
 
     A class whose options must suit one another writes `__post_init__` and calls this one first.
     """
+
+    def __new__(cls, *_: Any, **options: Any) -> Self:
+        """Refuses an option that the class does not have, with those that it has."""
+        known = {f.name for f in dataclasses.fields(cls) if f.init} if dataclasses.is_dataclass(cls) else options
+        if not options.keys() <= known:
+            name = next(name for name in options if name not in known)
+            raise UserError(f"{cls.__name__}: {name}=: {unknown(name, known, 'option')}")
+        return super().__new__(cls)
 
     def __post_init__(self) -> None:
         """Checks each option by its type, and keeps it as that type has it: 1 as 1.0, a list as a tuple.

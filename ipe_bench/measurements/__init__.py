@@ -1,5 +1,6 @@
 """Measurement models: what a parameter vector makes the instruments read. Config group `measurement`."""
 
+from ipe_bench.basics.naming import without_modules
 from ipe_bench.measurements.accelerometer import Accelerometer
 from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, SubsetModel, UsualNoise
 from ipe_bench.measurements.bearings import Bearings
@@ -47,3 +48,5 @@ __all__ = [
     "UsualNoise",
     "function",
 ]
+
+without_modules(__name__, __all__)

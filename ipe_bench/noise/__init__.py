@@ -1,5 +1,6 @@
 """Noise: adds errors to readings, and knows the covariance that estimators assume. Config group `noise`."""
 
+from ipe_bench.basics.naming import without_modules
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.colored import Colored, Correlated
 from ipe_bench.noise.own import Certified, ModelNoise, Unknown
@@ -18,3 +19,5 @@ __all__ = [
     "StudentT",
     "Unknown",
 ]
+
+without_modules(__name__, __all__)

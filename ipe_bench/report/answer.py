@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from ipe_bench.real.examination import CONFIDENCE, Examination
 from ipe_bench.real.fits import Fit
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.choice import Which
-from ipe_bench.report.table import Part, Strong, Table, html, terminal, texts, words
+from ipe_bench.report.table import Part, Strong, Table, html, plain_text, texts, words
 from ipe_bench.report.words import p_value
 from ipe_bench.report.writer import named, picked, plain, write
 from ipe_bench.trials.fit_test import DRAWS
@@ -107,11 +106,7 @@ class Answer:
         return pd.concat(frames, ignore_index=True)
 
     def __str__(self) -> str:
-        from rich.console import Console
-
-        shown = io.StringIO()
-        Console(width=120, file=shown).print(terminal(contents(self), 120))
-        return shown.getvalue()
+        return plain_text(contents(self))
 
     def _repr_html_(self) -> str:
         return html(contents(self))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from ipe_bench.statistics.analysis import Begun
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ReportResult:
     """The files of a report, its summary, and what is missing from it."""
 
@@ -31,6 +32,19 @@ class ReportResult:
     """One line per piece that older code computed, which is left out."""
     certified: pd.DataFrame
     """Mean correct digits per estimator and start on certified readings; empty without such runs."""
+
+    headline: tuple[str, ...]
+    """What the page opens with: a few sentences on what the data say."""
+
+    def __repr__(self) -> str:
+        return "\n".join([f"Report  {self.report}", *self.headline, *self.problems, *self.stale])
+
+    def _repr_html_(self) -> str:
+        from markupsafe import Markup
+
+        link = Markup('<a href="{}" target="_blank">{}</a>').format(os.path.relpath(self.report), self.report)
+        lines = [Markup("<li>{}</li>").format(line) for line in (*self.headline, *self.problems, *self.stale)]
+        return f"<p>{link}</p><ul>{''.join(lines)}</ul>"
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -62,6 +76,7 @@ class Pending:
         from ipe_bench.report.charts import charts
         from ipe_bench.report.figures import draw_all
         from ipe_bench.report.figures.views import views
+        from ipe_bench.report.headline import headline
         from ipe_bench.report.html import render_page
         from ipe_bench.report.sections import report_tables, written
         from ipe_bench.report.stamp import leave
@@ -91,6 +106,7 @@ class Pending:
             problems=analysis.problems,
             stale=analysis.stale,
             certified=certified_averages(certified_table(analysis.collection)),
+            headline=tuple(headline(analysis)),
         )
         if len(problems) == known:  # what plugins cannot make is said each time
             leave(output, self.made, result.files)

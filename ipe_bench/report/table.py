@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import textwrap
@@ -155,6 +156,15 @@ def terminal(parts: Iterable[Part], width: int) -> Group:
                 break
         shown += [Text(note, style="dim") for note in notes]
     return Group(*shown)
+
+
+def plain_text(parts: Iterable[Part], width: int = 120) -> str:
+    """What a terminal of that width shows, without colours."""
+    from rich.console import Console
+
+    shown = io.StringIO()
+    Console(width=width, file=shown).print(terminal(parts, width))
+    return shown.getvalue()
 
 
 def _needed(column: Column, table: Table) -> tuple[int, int]:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from ipe_bench.report.table import Cell, Column, Table, column, interval, sort_key, terminal, words
+from ipe_bench.report.table import Cell, Column, Part, Table, column, interval, sort_key, terminal, words
 from ipe_bench.report.words import brief, duration, limits, percent, plain, reported, shower, shown
 from ipe_bench.statistics.formulas import CAP
 from ipe_bench.statistics.records import SCORES, Where, all_statistics
@@ -36,13 +36,17 @@ _VERDICTS |= {"diverged but confident": ("diverged", "!"), "-": ("", "")}
 def render(
     summary: pd.DataFrame | Sequence[Mapping[str, Any]], totals: Iterable[Table] = (), width: int = 120
 ) -> Group:
-    """A table per setting (measurement, noise, and every option that differs), a section per error scale.
+    """The summary on a terminal: a table per setting, a section per error scale.
 
     `summary` is the frame or its rows. Runs on certified readings and on problems of known minimum are shown by their
     `totals` instead.
     """
-    listed: list[Any] = list(summary) if isinstance(summary, Sequence) else [*summary.to_dict("records")]
-    totals = list(totals)
+    rows: list[Any] = list(summary) if isinstance(summary, Sequence) else [*summary.to_dict("records")]
+    return terminal(summary_tables(rows, list(totals), width), width)
+
+
+def summary_tables(listed: Sequence[Mapping[str, Any]], totals: Sequence[Table], width: int) -> list[Part]:
+    """A table per setting (measurement, noise, and every option that differs) behind the totals."""
     # Models whose own readings are certified, without being of a collection, have no totals.
     rows = [row for row in listed if row["parameter"] == ALL and not (totals and row["noise"] == "certified")]
     known = {*summary_columns(), "parameter", "unit", "estimator", "error_scale"}
@@ -56,7 +60,7 @@ def render(
     tables = [_setting(title, part, width) for title, part in settings.items()]
     if tables:
         tables[-1] = replace(tables[-1], notes=LEGEND)
-    return terminal([*totals, *tables] or ["nothing is stored yet"], width)
+    return [*totals, *tables] or ["nothing is stored yet"]
 
 
 def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table:

@@ -43,15 +43,23 @@ class Drawing:
     caption: str
     figure: Canvas
 
+    def shown(self) -> Canvas:
+        """The figure, which shows itself in a notebook."""
+        self.figure._repr_png_ = lambda: self._content("png")  # type: ignore[attr-defined]
+        return self.figure
+
     def save(self, folder: Path, formats: Sequence[str] = ("png", "pdf")) -> tuple[Path, ...]:
         """Writes the figure in these formats, named for it; no file is ever seen half written."""
         paths = []
         for kind in formats:
-            content = BytesIO()
-            with warnings.catch_warnings():
-                # Labels of great length leave a panel no room: it is drawn as it is.
-                warnings.filterwarnings("ignore", "constrained_layout not applied")
-                self.figure.savefig(content, format=kind, metadata=_METADATA.get(kind))
             paths.append(folder / f"{self.name}.{kind}")
-            write_bytes(paths[-1], content.getvalue())
+            write_bytes(paths[-1], self._content(kind))
         return tuple(paths)
+
+    def _content(self, kind: str) -> bytes:
+        content = BytesIO()
+        with warnings.catch_warnings():
+            # Labels of great length leave a panel no room: it is drawn as it is.
+            warnings.filterwarnings("ignore", "constrained_layout not applied")
+            self.figure.savefig(content, format=kind, metadata=_METADATA.get(kind))
+        return content.getvalue()

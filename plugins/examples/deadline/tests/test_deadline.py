@@ -13,6 +13,7 @@ from ipe_bench_deadline.deadline import limits
 
 import ipe_bench as ib
 from ipe_bench.plugins import discovery
+from ipe_bench.report import figures
 
 PLUGIN = Path(__file__).resolve().parents[1]
 
@@ -43,7 +44,7 @@ def test_a_report_has_the_column_and_the_figure(tmp_path, monkeypatch):
     (tmp_path / "plugins" / "deadline").symlink_to(PLUGIN)
     monkeypatch.chdir(tmp_path)
     # Of the bench's own figures one will do.
-    monkeypatch.setattr("ipe_bench.report.figures.FIGURES", ("costs",))
+    monkeypatch.setattr(figures, "FIGURES", ("costs",))
     discovery.sources.cache_clear()
     try:
         bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=30.0)

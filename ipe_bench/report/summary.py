@@ -1,0 +1,125 @@
+"""The summary that `ib.run` returns: a frame that shows itself, with its trials, figures and report."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import weakref
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import pandas as pd
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.report.certified_tables import certified_tables, without_certified
+from ipe_bench.report.choice import PAGE
+from ipe_bench.report.figures import drawings
+from ipe_bench.report.run import ReportResult, begin_report
+from ipe_bench.report.style import house_style
+from ipe_bench.report.table import html, plain_text
+from ipe_bench.report.terminal import summary_tables
+from ipe_bench.statistics.analysis import Analysis, analyse
+from ipe_bench.statistics.collect import collect, trials_frame
+from ipe_bench.statistics.summary import ALL
+from ipe_bench.statistics.summary import columns as summary_columns
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class Stored:
+    """The folder of a run; one that was not named is removed with the last frame on it."""
+
+    def __init__(self, folder: Path | str | None = None) -> None:
+        self.named = folder is not None
+        self.folder = Path(tempfile.mkdtemp(prefix="ipe-bench-") if folder is None else folder)
+        if not self.named:
+            weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
+
+
+class Figures(Mapping[str, "Figure"]):
+    """Figures by their names, each drawn when it is first asked for."""
+
+    def __init__(self, analysis: Analysis) -> None:
+        self._left = drawings(analysis)
+        self._drawn: dict[str, Figure] = {}
+
+    def _next(self) -> bool:
+        """Draws one more; False if there is none."""
+        with house_style():
+            drawing, _ = next(self._left, (None, ""))
+        if drawing is not None:
+            self._drawn[drawing.name] = drawing.shown()
+        return drawing is not None
+
+    def __getitem__(self, name: str) -> Figure:
+        while name not in self._drawn:
+            if not self._next():
+                raise KeyError(f"{name}: there are the figures {', '.join(self._drawn) or 'none'}")
+        return self._drawn[name]
+
+    def __iter__(self) -> Iterator[str]:
+        while self._next():
+            pass
+        return iter(self._drawn)
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+
+class Summary(pd.DataFrame):
+    """A row per scenario, estimator and parameter, shown as the terminal shows it while it has the columns for that."""
+
+    _metadata: ClassVar = ["_stored"]
+    _stored: Stored | None = None
+
+    @property
+    def _constructor(self) -> Any:
+        return Summary
+
+    @classmethod
+    def of(cls, frame: pd.DataFrame, stored: Stored) -> Summary:
+        """The summary of what is stored in a folder."""
+        made = cls(frame)
+        made.attrs, made._stored = frame.attrs, stored
+        return made
+
+    @property
+    def trials(self) -> pd.DataFrame:
+        """A row per trial and estimator; see `ib.load`."""
+        return trials_frame(collect([self._folder]))
+
+    @property
+    def figures(self) -> Figures:
+        """The figures of `ib.report` by their names, as Matplotlib's figures."""
+        return Figures(without_certified(analyse([self._folder])))
+
+    def report(self, output: Path | str | None = None, *, figures: Any = "main", formats: Any = PAGE) -> ReportResult:
+        """Writes the report into `output`, or else into the folder of the run; see `ib.report`."""
+        if output is None and not (self._stored and self._stored.named):
+            raise UserError("report: the run has no folder; give output=, or run with output=")
+        return begin_report([self._folder], output, figures=figures, formats=formats).written()
+
+    @property
+    def _folder(self) -> Path:
+        if self._stored is None or not self._stored.folder.is_dir():
+            raise UserError("this frame does not know its trials; take them from the one that `ib.run` returned")
+        return self._stored.folder
+
+    @property
+    def _is_whole(self) -> bool:
+        """Whether it has all that the terminal's table is made of."""
+        return {"parameter", "noise", *summary_columns()} <= set(self.columns) and ALL in set(self["parameter"])
+
+    def _tables(self, width: int) -> list[Any]:
+        rows: Any = self.to_dict("records")
+        certified = self._stored is not None and (self["noise"] == "certified").any()
+        totals = certified_tables(collect([self._folder])) if certified else ()
+        return summary_tables(rows, [table for table in totals if table.whole], width)
+
+    def __repr__(self) -> str:
+        return plain_text(self._tables(120), 120).rstrip() if self._is_whole else super().__repr__()
+
+    def _repr_html_(self) -> str | None:
+        return html(self._tables(1000)) if self._is_whole else super()._repr_html_()  # type: ignore[operator]

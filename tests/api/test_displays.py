@@ -1,0 +1,103 @@
+"""What functions return shows itself, stays a frame under pandas, and answers wrong arguments in one sentence."""
+
+# pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
+# (what is wrong here is wrong on purpose)
+import copy
+import gc
+import pickle
+import re
+
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+
+import ipe_bench as ib
+from ipe_bench.report import figures
+from ipe_bench.report.summary import Summary
+
+ESTIMATORS = {"newton": ib.solvers.Newton(), "linear": ib.baselines.LinearLSE()}
+MODEL, NOISE = ib.measurements.Polynomial(), ib.noise.Gaussian(0.01)
+BENCH = ib.Scenario(MODEL, NOISE, error_scale=3.0)
+
+
+@pytest.fixture(scope="module")
+def table() -> Summary:
+    return ib.run(BENCH, ESTIMATORS, trials=20)
+
+
+def test_a_summary_shows_the_table_of_the_terminal_and_is_a_frame(table):
+    total = table[table["parameter"] == "all"].set_index("estimator", drop=False)
+    for shown in (repr(table), re.sub("<[^>]*>", " ", table._repr_html_())):
+        assert "polynomial, gaussian: 20 trials per row" in shown
+        assert re.search(r"newton\s+100 \(83-100\)", shown)
+        assert f"{total['nees_median']['newton']:.2f}" in shown
+    # What has not all its columns is shown by pandas.
+    part = table[["estimator", "rmse"]]
+    assert repr(part) == repr(pd.DataFrame(part))
+    assert part._repr_html_() == pd.DataFrame(part)._repr_html_()
+    assert "linear" not in repr(table.query("estimator == 'newton'").sort_values("rmse").assign(mine=1.0))
+    for again in (table.copy(), copy.deepcopy(table), pickle.loads(pickle.dumps(table)), table.head(3)):
+        assert len(again.trials) == 40
+    pd.testing.assert_frame_equal(pd.DataFrame(table), pd.DataFrame(pickle.loads(pickle.dumps(table))))
+
+
+def test_trials_and_figures_are_those_of_the_folder_which_goes_with_the_last_frame(table, tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "FIGURES", ("errors", "costs"))
+    kept = ib.run(BENCH, ESTIMATORS, trials=20, output=tmp_path / "kept")
+    pd.testing.assert_frame_equal(kept.trials, ib.load(tmp_path / "kept"))
+    result = kept.report()
+    assert list(kept.figures) == [path.stem for path in result.figures]
+    headline = table.figures["headline"]
+    assert isinstance(headline, Figure)
+    assert headline._repr_png_().startswith(b"\x89PNG")
+    with pytest.raises(KeyError, match="there are the figures headline"):
+        table.figures["haedline"]
+    with pytest.raises(ib.UserError, match="give output="):
+        table.report()
+    other = ib.run(BENCH, ESTIMATORS, trials=5)
+    folder = other._folder
+    part = other.head(2)
+    del other
+    gc.collect()
+    assert len(part.trials) == 10
+    del part
+    gc.collect()
+    assert not folder.exists()
+    assert (tmp_path / "kept" / "report.html").exists()
+
+
+def test_a_report_shows_its_link_and_headline(table, tmp_path):
+    result = table.report(tmp_path, figures="none")
+    assert str(tmp_path / "report.html") in repr(result)
+    assert "of 20 trials succeed: newton in 100" in repr(result)
+    assert len(repr(result).splitlines()) < 10
+    assert re.search(r'<a href="[^"]*report.html"', result._repr_html_())
+
+
+def test_a_model_with_its_noise_is_a_scenario(table):
+    own = ib.run(MODEL, ESTIMATORS, 20, noise=NOISE, error_scale=3.0)
+    numbers = [c for c in table if "time" not in str(c)]
+    pd.testing.assert_frame_equal(pd.DataFrame(own[numbers]), pd.DataFrame(table[numbers]))
+    z = BENCH.draw(0, 1).z[0]
+    stated = ib.estimate(MODEL, z, ESTIMATORS, noise=NOISE, error_scale=3.0).table()
+    pd.testing.assert_frame_equal(ib.estimate(BENCH, z, ESTIMATORS).table(), stated)
+    assert ib.design(MODEL, noise=NOISE, error_scale=3.0).ways[0].curve == ib.design(BENCH).ways[0].curve
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: ib.run(BENCH, [ib.solvers.Newton()]), 'give each a label, as in {"newton": ib.solvers.Newton()}'),
+        (lambda: ib.run(BENCH, {"n": ib.solvers.Newton}), "Newton is a class, whose objects are written Newton()"),
+        (lambda: ib.run(ib.measurements.Gins, ESTIMATORS), "Gins is a class, whose objects are written Gins()"),
+        (lambda: ib.run(BENCH, ESTIMATORS, error_scale=2.0), "error_scale=: is part of the scenario"),
+        (lambda: ib.solvers.Newton(max_iter=3), "Newton: max_iter=: there is no such option; did you mean max_iter"),
+        (lambda: ib.measurements.gins(), "ipe_bench.measurements.gins: there is no such name; did you mean Gins?"),
+        (lambda: ib.estimate(3, "my.csv"), "3 is a int; give a scenario"),
+    ],
+)
+def test_a_wrong_argument_is_answered_in_one_sentence(call, said):
+    with pytest.raises((ib.UserError, AttributeError)) as caught:
+        call()
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
