@@ -67,6 +67,9 @@ class Standardized:
         """The whitened residuals, followed by y: the maximum a posteriori has the least squares of these."""
         return np.concatenate([self.readings.misfit(self._x(y)), y], axis=1)
 
+    def cost(self, y: Array, r: Array) -> Array:
+        return squared(r)
+
     def slopes(self, y: Array, *, coarse: bool) -> tuple[Array, None]:
         J = np.matmul(self.readings.slope(self._x(y)), self.root)
         return np.concatenate([J, np.broadcast_to(np.eye(self.n), self.root.shape)], axis=1), None

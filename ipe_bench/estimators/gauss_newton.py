@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array, finite, multiply, squared
+from ipe_bench.basics.linalg import Array, finite, multiply
 from ipe_bench.estimators.driver import ConvergenceCheck, Solver
 from ipe_bench.estimators.least_squares import LeastSquaresSystem, Residuals, slope_at
 
@@ -29,9 +29,8 @@ class GaussNewtonMethod(Solver[LeastSquaresSystem]):
         slope, exact = slope_at(objective, x, r, near)
         moved = state.reach(step)
         regular = state.regular | np.isfinite(slope.size)
-        return replace(
-            state, x=x, r=r, cost=squared(r), slope=slope, moved=moved, regular=regular, exact=exact, near=near
-        )
+        cost = objective.cost(x, r)
+        return replace(state, x=x, r=r, cost=cost, slope=slope, moved=moved, regular=regular, exact=exact, near=near)
 
     def check(
         self, objective: Residuals, before: LeastSquaresSystem | None, state: LeastSquaresSystem

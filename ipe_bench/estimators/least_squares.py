@@ -55,6 +55,10 @@ class Residuals(Protocol):
         None where nothing is."""
         ...
 
+    def cost(self, x: Array, r: Array, /) -> Array:
+        """What is minimised (trials,) at x, where the residuals are r: half its gradient is J' r."""
+        ...
+
     @property
     def exact_within(self) -> float:
         """Where the Gauss-Newton step still to go is shorter than so many deviations, Jacobians are exact, elsewhere
@@ -97,6 +101,9 @@ class Objective:
         if self.prior is None:
             return r
         return np.concatenate([r, self.prior.whiten(x - self.x0)], axis=1)
+
+    def cost(self, x: Array, r: Array) -> Array:
+        return squared(r)
 
     def jacobian(self, x: Array) -> Array:
         """The derivative of the whitened residuals (trials, m, n) or (trials, m + n, n)."""
@@ -255,7 +262,7 @@ class LeastSquaresSystem:
     r: Array
     """Whitened residuals, those of the prior included."""
     cost: Array
-    """|r|^2."""
+    """What is minimised: |r|^2, unless the objective says otherwise."""
     slope: NormalEquations
     moved: Array
     """The last step, tried or taken, in standard deviations of the readings that it moves."""
@@ -283,7 +290,7 @@ class LeastSquaresSystem:
         slope, exact = slope_at(objective, x, r, near, keep_Q=keep_Q)
         scale = np.where(slope.columns > 0, slope.columns, 1.0)
         far, regular = np.full(trials, np.inf), np.isfinite(slope.size)
-        cost, idle = squared(r), np.zeros(trials, np.int64)
+        cost, idle = objective.cost(x, r), np.zeros(trials, np.int64)
         damping, growth = np.full(trials, lam), np.full(trials, 2.0)
         return cls(x, r, cost, slope, far, damping, growth, scale, regular, cost, idle, exact, near)
 

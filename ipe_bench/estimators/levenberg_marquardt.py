@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ipe_bench.basics.batches import put
-from ipe_bench.basics.linalg import Array, finite, multiply, squared
+from ipe_bench.basics.linalg import Array, finite, multiply
 from ipe_bench.estimators.driver import ConvergenceCheck, Solver
 from ipe_bench.estimators.least_squares import LeastSquaresSystem, Residuals, slope_at
 
@@ -58,14 +58,15 @@ class LevenbergMarquardtMethod(Solver[LeastSquaresSystem]):
         weights = np.sqrt(state.lam)[:, None] * state.scale
         step, predicted = state.slope.damped(weights)
         bent, believed = self._bend(objective, state, weights, step)
-        r = objective.residual(state.x + bent)
-        cost = squared(r)
+        tried = state.x + bent
+        r = objective.residual(tried)
+        cost = objective.cost(tried, r)
         gain = (state.cost - cost) / predicted
         invisible = (predicted <= _ROUND_OFF * state.cost) & (np.abs(cost - state.cost) <= 2 * _ROUND_OFF * state.cost)
         taken = (gain > 0) | invisible
         factor = np.maximum(1 / 3, 1 - (2 * np.clip(np.where(invisible, 1.0, gain), 0, 1) - 1) ** 3)
         factor = np.where(believed, factor, np.maximum(factor, 1.0))
-        x = np.where(taken[:, None], state.x + bent, state.x)
+        x = np.where(taken[:, None], tried, state.x)
         r = np.where(taken[:, None], r, state.r)
         near = state.nearly(objective)
         # Where steps of a coarse Jacobian go on failing, it may be the Jacobian.

@@ -10,6 +10,8 @@ import numpy as np
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.naming import Named
 from ipe_bench.basics.options import Component
+from ipe_bench.measurements.base import Measurement
+from ipe_bench.noise.levels import Levels
 
 GINS_STEP = 0.02286
 """The velocity read-outs' step of 0.075 ft/s in m/s: what noises are set to, since GINS is the standard model."""
@@ -37,6 +39,10 @@ class Noise(Component, Named, ABC):
     @abstractmethod
     def covariance(self, m: int) -> Covariance:
         """R of m readings, as the estimators assume it."""
+
+    def levels_of(self, model: Measurement) -> Levels | None:
+        """Levels of which standard deviations are formulas, if these are to be estimated with the parameters."""
+        del model
 
     def whitened(self, shape: tuple[int, ...], rng: np.random.Generator) -> Array | None:
         """Draws of the errors of whitened readings, R^-1/2 v, if R is right: independent, of mean 0 and variance 1.

@@ -11,6 +11,7 @@ from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.options import Positive
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.noise.base import Noise
+from ipe_bench.noise.levels import Levels, read_sigma
 from ipe_bench.noise.white import Gaussian, Quantization
 
 
@@ -32,15 +33,31 @@ class Certified(Noise):
 
 @dataclass(frozen=True)
 class Unknown(Noise):
-    """Independent errors whose level is estimated from the residuals, so for `estimate` alone.
+    """Independent normal errors whose level is estimated from the residuals.
 
-    Estimates do not depend on the level; standard errors are scaled by it, and tests of the level itself are not
-    possible. `weights` are standard deviations of the readings up to a common factor; None: they are equal.
+    Estimates do not depend on a single level; standard errors are scaled by it, and tests of the level itself are not
+    possible. Several levels, or a standard deviation that depends on the reading, are estimated with the parameters by
+    restricted maximum likelihood.
     """
 
     weights: tuple[Positive, ...] | None = None
+    """Standard deviations of the readings up to a common factor; None: they are equal."""
+    by: str | None = None
+    """Column of the readings whose entries have levels of their own: `output`, say, or `file`."""
+    sigma: str = "sigma"
+    """Formula of the standard deviation: h is the magnitude of the error-free reading, all other names are levels."""
 
     estimated = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        read_sigma(self.sigma)
+
+    def levels_of(self, model: Measurement) -> Levels | None:
+        """The levels of a model's readings; None if a single one multiplies all standard deviations."""
+        if self.by is None and self.sigma == "sigma":
+            return None
+        return Levels.of(read_sigma(self.sigma), self.covariance(model.m).factor, self.by, model)
 
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
         raise UserError("noise=unknown: has no level to simulate with; choose another noise, or use `estimate`")

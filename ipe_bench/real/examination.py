@@ -15,12 +15,11 @@ import numpy as np
 
 from ipe_bench.basics.linalg import Array, Mask, deviations
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.driver import Limits
-from ipe_bench.estimators.least_squares import Minima, Objective, inverse_factor, minimize
-from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
+from ipe_bench.estimators.least_squares import Minima, inverse_factor
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.real.fits import Fit, at_rows, falls_beyond, holding, present_part, scaled, sum_of_squares
+from ipe_bench.real.fits import Fit, at_rows, falls_beyond, holding, scaled
+from ipe_bench.real.levels import SLACK, Levelled, maximum, minimise, objective_of
 from ipe_bench.real.penalised import penalised
 from ipe_bench.real.profiles import (
     CONFIDENCE,
@@ -42,8 +41,6 @@ _WORK = 20_000_000
 """Entries of Jacobians that one iteration of all draws or starts may come to: of very many readings there are fewer."""
 _FEWEST = 4
 """The least number of draws or starts."""
-_TOLERANCE = 1e-8
-_MOST_STEPS = 200
 _SAME = 1e-2
 """Minima closer than this, in standard errors of either, are one."""
 
@@ -167,59 +164,58 @@ def examine(
         return None
     if with_prior:
         best = min(told, key=lambda one: _sum_with_prior(problem, one))
-        part = present_part(problem, rows, best.level)
-        least = _Least.near(*penalised(part, z[rows], best.prior_inflation), best, readings=len(rows))
+        least = _Least.near(*penalised(best.assumed, z[rows], best.prior_inflation), best, readings=len(rows))
         return None if least is None else least.examined(best.label, problem, rows, bootstraps)
-    whole, best = problem, min(told, key=sum_of_squares)
-    on_bounds = best.held_at
+    best = min(told, key=lambda one: one.deviance)
+    whole, on_bounds = best.assumed, best.held_at
     if best.held is not None:
         # What is on its bound has no error; the others are examined with it held there.
         problem, best = holding(problem, on_bounds), best.held
-    least = _Least.near(present_part(problem, rows, best.level), z[rows], best)
+    least = _Least.near(best.assumed, z[rows], best)
     if least is None:
         return None
-    released = _released(whole, rows, least, best.level, on_bounds) if on_bounds else None
+    released = _released(whole, least, on_bounds) if on_bounds else None
     found = least.examined(best.label, problem, rows, bootstraps, released)
-    return replace(found, on_bounds=tuple(_on_bounds(whole, z, rows, least, best.level, on_bounds)))
+    return replace(found, on_bounds=tuple(_on_bounds(whole, least, on_bounds)))
 
 
 def _sum_with_prior(problem: Problem, one: Fit) -> float:
     prior = problem.prior_covariance(one.prior_inflation)
     assert prior is not None
-    return sum_of_squares(one) / (one.level or 1.0) ** 2 + float(np.sum(prior.whiten(one.inner - problem.x0) ** 2))
+    x = one.inner[: len(problem.x0)]
+    return one.deviance / (one.level or 1.0) ** 2 + float(np.sum(prior.whiten(x - problem.x0) ** 2))
 
 
-def _released(
-    problem: Problem, rows: Array, least: _Least, level: float | None, values: Mapping[int, float]
-) -> Released | None:
+def _released(problem: Problem, least: _Least, values: Mapping[int, float]) -> Released | None:
     """The problem in which what is on bounds may leave them; None where nothing is known of it there."""
     places = np.array(list(values))
     start = problem.measurement.physical(problem.measurement.nominal[None])[0]
-    given = present_part(replace(problem, measurement=problem.measurement.unbounded(values)), rows, level)
+    given = replace(problem, measurement=problem.measurement.unbounded(values))
     x = np.array(given.measurement.nominal, dtype=float)
     x[np.setdiff1d(np.arange(len(x)), places)] = least.x
     with np.errstate(all="ignore"):
-        inverse_U = inverse_factor(given.R.whiten_jacobian(given.measurement.jacobian(x[None])))[0]
+        inverse_U = inverse_factor(objective_of(given, least.z[None]).jacobian(x[None]))[0]
     if not np.isfinite(inverse_U).all():
         return None
     inwards = np.sign(start[places] - np.array(list(values.values())))
     return Released(given, x, inverse_U @ inverse_U.T, places, inwards)
 
 
-def _on_bounds(
-    problem: Problem, z: Array, rows: Array, least: _Least, level: float | None, values: Mapping[int, float]
-) -> Iterator[OnBound]:
+def _on_bounds(problem: Problem, least: _Least, values: Mapping[int, float]) -> Iterator[OnBound]:
     """What the readings say of each parameter on its bound, the others being held on theirs."""
     model = problem.measurement
     lower, upper = natural_limits(model)
     for place, bound in values.items():
         others = {k: value for k, value in values.items() if k != place}
         k = place - sum(other < place for other in others)
-        part = _released(holding(problem, others) if others else problem, rows, least, level, {k: bound})
+        part = _released(holding(problem, others) if others else problem, least, {k: bound})
         other = np.nan
         if part is not None:
-            sign, asked = int(part.inwards[0]), (part.problem, z[rows][None], part.x[None], part.P[None])
-            ((found,),) = profiles(*asked, freedom=least.freedom, places=(k,), signs=(sign,))
+            sign, asked = int(part.inwards[0]), (part.problem, least.z[None], part.x[None], part.P[None])
+            freedom = least.freedom
+            if isinstance(freedom, np.ndarray):
+                freedom = np.insert(freedom, k, freedom.min())
+            ((found,),) = profiles(*asked, freedom=freedom, places=(k,), signs=(sign,))
             other = np.nan if found.lower_minimum else (found.low, found.high)[sign > 0]
         yield OnBound(model.physical_parameters[place], bound, float(np.clip(other, lower[place], upper[place])))
 
@@ -233,14 +229,21 @@ class _Least:
     x: Array
     P: Array
     chi_square: float
-    freedom: int | None
-    """Degrees of freedom that the level of the noise is estimated from; None where it is known."""
+    freedom: int | Array | None
+    """Degrees of freedom that the level of the noise is estimated from, or (n,) those behind the variances where x has
+    several levels; None where it is known."""
     readings: int
     """How many of z are readings: the others are the prior's means."""
 
     @classmethod
     def near(cls, problem: Problem, z: Array, best: Fit, *, readings: int | None = None) -> _Least | None:
-        minima = _minimise(problem, z[None], best.inner[None])
+        if best.estimated is not None and readings is None:
+            found = maximum(best.estimated, z)
+            if not found.converged or not (np.diag(found.P) > 0).all():
+                return None
+            chi_square = float(np.sum(found.problem.R.whiten(z - found.fitted) ** 2))
+            return cls(found.problem, z, found.x, found.P, chi_square, found.freedom, len(z))
+        minima = minimise(problem, z[None], best.inner[None, : problem.measurement.n])
         if not minima.converged[0] or not (np.diag(minima.covariance[0]) > 0).all():
             return None
         free, readings = best.degrees_of_freedom, len(z) if readings is None else readings
@@ -256,10 +259,25 @@ class _Least:
     def model(self) -> Measurement:
         return self.problem.measurement
 
+    @property
+    def _mean(self) -> Measurement:
+        """The model without levels of the noise."""
+        return self.model.whole if isinstance(self.model, Levelled) else self.model
+
+    @property
+    def _place(self) -> Array:
+        """The parameters (1, n) of that model."""
+        return self.x[None, : self._mean.n]
+
+    @cached_property
+    def fitted(self) -> Array:
+        """h (m,) of the readings that are there."""
+        return self._mean.simulate(self._place)[0]
+
     @cached_property
     def J(self) -> Array:
-        """The whitened Jacobian (m, n)."""
-        return self.problem.R.whiten_jacobian(self.model.jacobian(self.x[None]))[0]
+        """The whitened Jacobian (m, n) of that model."""
+        return self.problem.R.whiten_jacobian(self._mean.jacobian(self._place))[0]
 
     def examined(
         self, label: str, whole: Problem, rows: Array, bootstraps: int, released: Released | None = None
@@ -269,51 +287,64 @@ class _Least:
         model, x, m = self.model, self.x[None], whole.R.m
         q = half_width(CONFIDENCE, self.freedom)
         deviation = np.sqrt(np.diag(self.P))
-        h, raw = whole.measurement.simulate(x)[0], whole.measurement.jacobian(x)[0]
-        errors = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", raw, self.P, raw), 0.0))
+        h, raw = whole.measurement.simulate(self._place)[0], whole.measurement.jacobian(self._place)[0]
+        inner = self.P[: raw.shape[1], : raw.shape[1]]
+        errors = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", raw, inner, raw), 0.0))
         known = self.problem.R.deviations[: self.readings]
         deviations = at_rows(rows, known, m)
         if np.ptp(known) == 0:
             # Where all readings are as good, so is one that is missing; else nobody knows.
             deviations[:] = known[0]
         minima = self.minima()
+        slack = SLACK if isinstance(self.model, Levelled) else 1e-6 * max(1.0, self.chi_square)
         return Examination(
             label=label,
             model=model,
             x=model.physical(x)[0],
             standard_errors=deviation * np.abs(model.physical_slope(x)[0]),
             wald=wald_interval(model, self.x, deviation, q),
-            profiles=profiles(self.problem, self.z[None], x, self.P[None], freedom=self.freedom, released=released)[0],
+            profiles=profiles(
+                self.problem, self.z[None], x, self._P_apart[None], freedom=self.freedom, released=released
+            )[0],
             bootstrap=self.bootstrap(bootstraps, released),
             direction=self.direction(),
             influence=self.influence(rows, m),
             fitted=h,
             fitted_errors=errors,
             new_errors=np.hypot(errors, deviations),
-            half_width=q,
+            half_width=float(np.max(q)),
             minima=minima,
-            least=self.chi_square <= minima[0].chi_square + 1e-6 * max(1.0, self.chi_square),
+            least=self.chi_square <= minima[0].chi_square + slack,
             with_prior=self.readings < len(self.z),
         )
+
+    @property
+    def _P_apart(self) -> Array:
+        """P (n, n) for the starts of profiles: the logarithm of a level does not follow a straight line."""
+        n, P = self.J.shape[1], np.diag(np.diag(self.P))
+        P[:n, :n] = self.P[:n, :n]
+        return P
 
     def direction(self) -> Direction:
         size = np.linalg.norm(self.J, axis=0)
         _, s, V = np.linalg.svd(self.J / size, full_matrices=False)
-        weights = V[-1] / size * self.model.physical_slope(self.x[None])[0]
+        weights = np.zeros(len(self.x))
+        weights[: len(size)] = V[-1] / size * self._mean.physical_slope(self._place)[0]
         leading = np.argmax(np.abs(V[-1]))
         return Direction(weights * np.sign(weights[leading]), float(1.0 / s[-1]))
 
     def influence(self, rows: Array, m: int) -> Influence:
         """By the linear model about the estimate (Cook and Weisberg, Residuals and Influence in Regression, 1982)."""
-        n = len(self.x)
+        n = self.J.shape[1]
+        P = self.P[:n, :n]
         Q, _ = np.linalg.qr(self.J)
-        w = self.problem.R.whiten(self.z - self.model.simulate(self.x[None])[0])
+        w = self.problem.R.whiten(self.z - self.fitted)
         leverage = np.sum(Q**2, axis=1)
         with np.errstate(all="ignore"):
             left = np.where(leverage < 1 - 1e-9, 1 - leverage, np.nan)
             cook = w**2 * leverage / (n * left**2)
-            moved = self.P @ self.J.T * (w / left)
-        shift = np.abs(moved / np.sqrt(np.diag(self.P))[:, None]).max(axis=0)
+            moved = P @ self.J.T * (w / left)
+        shift = np.abs(moved / np.sqrt(np.diag(P))[:, None]).max(axis=0)
         return Influence(*(at_rows(rows, values[: self.readings], m) for values in (leverage, cook, shift)))
 
     def bootstrap(self, draws: int, released: Released | None = None) -> Bootstrap:
@@ -329,11 +360,10 @@ class _Least:
         factor = self.problem.R.factor
         e = rng.standard_normal((draws, len(self.z)))
         level = np.ones(draws)
-        if self.freedom is not None:
+        if isinstance(self.freedom, int):
             level = np.sqrt(self.freedom / rng.chisquare(self.freedom, draws))
         e[:, : self.readings] *= level[:, None]
-        h = self.model.simulate(self.x[None])[0]
-        z = h + (e * factor if factor.ndim == 1 else e @ factor.T)
+        z = self.fitted + (e * factor if factor.ndim == 1 else e @ factor.T)
         if released is None:
             values, answered = answers(self.problem, z, np.repeat(self.x[None], draws, axis=0))
         else:
@@ -357,11 +387,12 @@ class _Least:
         spread = np.ones(n) if problem.prior_deviation is None else problem.prior_deviation
         reach = np.repeat(_SPREADS, _affordable(STARTS, self.J.size) // len(_SPREADS))[:, None]
         starts = np.concatenate([self.x[None], problem.x0 + reach * spread * rng.standard_normal((len(reach), n))])
-        minima = _minimise(problem, np.repeat(self.z[None], len(starts), axis=0), starts)
+        minima = minimise(problem, np.repeat(self.z[None], len(starts), axis=0), starts)
         return self._told_apart(minima)
 
     def _told_apart(self, minima: Minima) -> list[Minimum]:
-        limit = joint_region(len(self.x), CONFIDENCE, self.freedom)
+        freedom = self.freedom if isinstance(self.freedom, int) else None
+        limit = joint_region(len(self.x), CONFIDENCE, freedom)
         usable = minima.converged & np.isfinite(minima.chi_square) & np.isfinite(minima.covariance).all(axis=(1, 2))
         order = np.flatnonzero(usable)[np.argsort(minima.chi_square[usable], kind="stable")]
         found: list[Minimum] = []
@@ -382,7 +413,7 @@ class _Least:
 def answers(problem: Problem, z: Array, x: Array, released: Released | None = None) -> tuple[Array, Mask]:
     """The least-squares estimates (sets, n) within the bounds, in the parameters' own units, for readings z (sets, m)
     from x (sets, n), and which sets have one; parameters that are `released` have the bounds where they stood."""
-    minima, model = _minimise(problem, z, x), problem.measurement
+    minima, model = minimise(problem, z, x), problem.measurement
     values, found = model.physical(minima.x), minima.converged.copy()
     on_bounds: dict[tuple[tuple[int, float], ...], list[int]] = {}
     outside, bounds = np.zeros((len(x), 0), dtype=bool), np.zeros(0)
@@ -400,7 +431,7 @@ def answers(problem: Problem, z: Array, x: Array, released: Released | None = No
         near = dict(key)
         free = [k for k in range(model.n) if k not in near]
         held = holding(problem, near)
-        there = _minimise(held, z[sets], np.ascontiguousarray(minima.x[sets][:, free]))
+        there = minimise(held, z[sets], np.ascontiguousarray(minima.x[sets][:, free]))
         least = there.converged & falls_beyond(problem, there.x, near, z[sets], released)
         values[sets] = np.array([near.get(k, np.nan) for k in range(model.n)])
         values[np.ix_(sets, free)] = held.measurement.physical(there.x)
@@ -411,9 +442,3 @@ def answers(problem: Problem, z: Array, x: Array, released: Released | None = No
 def _affordable(wanted: int, entries: int) -> int:
     """How many minimisations to make of a Jacobian with so many entries."""
     return min(wanted, max(_FEWEST, _WORK // entries))
-
-
-def _minimise(problem: Problem, z: Array, x: Array) -> Minima:
-    with np.errstate(all="ignore"):
-        objective = Objective.of(problem, z, prior=False)
-        return minimize(objective, LevenbergMarquardtMethod(1e-3), x, Limits(_TOLERANCE, _MOST_STEPS))

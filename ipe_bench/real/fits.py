@@ -12,12 +12,14 @@ from scipy.special import chdtri, fdtri, ndtri, stdtr
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance, Mask
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.base import Estimator, estimate_safely
+from ipe_bench.estimators.base import Estimates, Estimator, estimate_safely
 from ipe_bench.measurements.base import Measurement, SubsetModel
 from ipe_bench.measurements.counted import cost
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
+from ipe_bench.noise.levels import Levels
 from ipe_bench.noise.white import Gaussian
+from ipe_bench.real.levels import Estimated, first_levels, levels_at, maximum, objective_of, unknown_levels
 from ipe_bench.real.profiles import Released, half_width, joint_region, wald_interval
 from ipe_bench.real.residuals import Whiteness, explained, normalised, outlier_limit, whiteness
 from ipe_bench.trials.fit_test import fit_probability, inflation_of, spread_of
@@ -74,9 +76,13 @@ class Fit:
     """The estimates (n,) as the estimator knows them: in multiples of sizes, or logarithms of distances to bounds."""
     inner_covariance: Array
     """Of those (n, n)."""
+    assumed: Problem
+    """What was fitted: the readings that are there, with R as it is known or estimated."""
     level: float | None = None
     """The estimated factor by which the readings are noisier than R says, which is in all other fields; None: R is
     known."""
+    estimated: Estimated | None = None
+    """The parameters with several levels of the noise, which x has behind them; then `level` is 1."""
     held: Fit | None = None
     """The fit of the model in which parameters are held on their bounds; those have no errors."""
     with_prior: bool = False
@@ -131,9 +137,31 @@ class Fit:
         return self.status is Status.CONVERGED and self.fits is not False
 
     @property
-    def _freedom(self) -> int | None:
-        """The degrees of freedom that the level of the noise is estimated from; None where it is known."""
+    def _freedom(self) -> float | Array | None:
+        """The degrees of freedom that the level of the noise is estimated from, or (n,) those behind the variance of
+        each parameter; None where it is known."""
+        if self.estimated is not None:
+            return self.estimated.freedom
         return None if self.level is None else self.degrees_of_freedom
+
+    @property
+    def deviance(self) -> float:
+        """What tells fits to the same readings apart: the sum of squares, whitened by R as it was stated; with several
+        levels, twice the negative logarithm of the likelihood."""
+        if self.estimated is not None:
+            return self.estimated.deviance
+        return self.chi_square * (1.0 if self.level is None else self.level**2)
+
+    @property
+    def of_likelihood(self) -> bool:
+        """Whether the parameters, too, are those of maximum likelihood where there are several levels of the noise."""
+        return self.estimated is not None and self.estimated.maximal
+
+    @property
+    def levels(self) -> dict[str, float]:
+        """Several levels of the noise by name."""
+        names = [] if self.estimated is None else [p.name for p in self.estimated.model.noise.parameters]
+        return dict(zip(names, self.x[len(self.x) - len(names) :].tolist(), strict=True))
 
     def interval(self, confidence: float = 0.95) -> tuple[Array, Array]:
         """Confidence intervals (n,), (n,) from the standard errors; inside of its bounds where a parameter has some."""
@@ -143,7 +171,8 @@ class Fit:
 
     def region(self, parameters: int, confidence: float = 0.95) -> float:
         """The squared distance, in standard errors, to the edge of a joint region of so many parameters."""
-        return joint_region(parameters, confidence, self._freedom)
+        freedom = self._freedom
+        return joint_region(parameters, confidence, None if freedom is None else float(np.min(freedom)))
 
     @property
     def outlier_limit(self) -> float:
@@ -170,28 +199,26 @@ def fit(
     present = np.flatnonzero(~np.isnan(z))
     given = replace(present_part(problem, present), doubted=1.0 if noise.estimated else _DOUBTED)
     where = present, len(z), _succession(problem.measurement, present)
-    if noise.estimated:
+    if (levels := noise.levels_of(problem.measurement)) is not None:
+        levels, each = levels.restricted(present), estimators.items()
+        found = [_fit_with_levels(label, one, given, z[present], where, levels) for label, one in each]
+    elif noise.estimated:
         found = [_fit_with_level(label, one, given, z[present], where) for label, one in estimators.items()]
     else:
         found = [_fit_one(label, one, given, z[present], where, noise) for label, one in estimators.items()]
     return _compared(found)
 
 
-def sum_of_squares(one: Fit) -> float:
-    """Of the residuals, whitened by R as it was stated."""
-    return one.chi_square * (1.0 if one.level is None else one.level**2)
-
-
 def _compared(fits: list[Fit]) -> list[Fit]:
     """The fits, marked where they lie outside of the joint confidence region of the best (Bates and Watts, Nonlinear
     Regression Analysis and Its Applications, 1988, section 6.1)."""
-    sums = [sum_of_squares(one) for one in fits]
+    sums = [one.deviance for one in fits]
     known = [value if np.isfinite(value) else np.inf for value in sums]
     if not np.isfinite(known).any():
         return fits
     n, free, best = len(fits[0].x), fits[0].degrees_of_freedom, int(np.argmin(known))
     least = known[best]
-    if fits[0].level is None:
+    if fits[0].level is None or fits[0].estimated is not None:
         limit = least + float(chdtri(n, FIT_LEVEL))
     else:
         limit = least * (1 + n / free * float(fdtri(n, free, 1 - FIT_LEVEL))) if free > 0 else np.inf
@@ -231,36 +258,99 @@ def scaled(problem: Problem, level: float) -> Problem:
 
 
 def _with_level(found: Fit, factor: float, level: float) -> Fit:
-    """The fit as it is with R multiplied by factor^2; residuals in their own deviations, which are then estimated.
-
-    An internally studentised residual r becomes t = r sqrt((f - 1) / (f - r^2)), Student's t with f - 1 degrees of
-    freedom (Cook and Weisberg, Residuals and Influence in Regression, 1982, eq. 2.2.8), and that the normal deviate
-    that is as probable.
-    """
-    free = found.degrees_of_freedom
+    """The fit as it is with R multiplied by factor^2; residuals in their own deviations, which are then estimated."""
     with np.errstate(all="ignore"):
-        r = found.normalised / factor
-        t = r * np.sqrt((free - 1) / np.maximum(free - r**2, 0.0))
-        deviates = -np.sign(r) * ndtri(stdtr(free - 1, -np.abs(t))) if free > 1 else np.full(len(r), np.nan)
-        # So improbable that it underflows: a deviate beyond every limit.
-        deviates = np.where(np.isinf(deviates), np.sign(r) * _FARTHEST, deviates)
         return replace(
             found,
             covariance=found.covariance * factor**2,
             inner_covariance=found.inner_covariance * factor**2,
             chi_square=found.chi_square / factor**2,
-            normalised=deviates,
+            normalised=_deviates(found.normalised / factor, found.degrees_of_freedom),
+            assumed=scaled(found.assumed, factor),
             level=level,
             held=None if found.held is None else _with_level(found.held, factor, level),
         )
 
 
-def present_part(problem: Problem, rows: NDArray[np.intp], level: float | None = None) -> Problem:
-    """The problem of the readings that are there, R multiplied by an estimated level."""
-    if len(rows) < problem.R.m:
-        model = SubsetModel(problem.measurement, tuple(rows.tolist()))
-        problem = replace(problem, measurement=model, R=problem.R.restricted(rows))
-    return problem if level is None else scaled(problem, level)
+def _deviates(r: Array, free: Array | int) -> Array:
+    """The normal deviates (m,) that are as probable as residuals r (m,) in deviations that are estimated from `free`
+    degrees of freedom.
+
+    An internally studentised residual r becomes t = r sqrt((f - 1) / (f - r^2)), Student's t with f - 1 degrees of
+    freedom (Cook and Weisberg, Residuals and Influence in Regression, 1982, eq. 2.2.8), and that the deviate.
+    """
+    with np.errstate(all="ignore"):
+        t = r * np.sqrt((free - 1) / np.maximum(free - r**2, 0.0))
+        deviates = np.where(np.asarray(free) > 1, -np.sign(r) * ndtri(stdtr(free - 1, -np.abs(t))), np.nan)
+        # So improbable that it underflows: a deviate beyond every limit.
+        return np.where(np.isinf(deviates), np.sign(r) * _FARTHEST, deviates)
+
+
+def _fit_with_levels(label: str, estimator: Estimator, problem: Problem, z: Array, where: Where, levels: Levels) -> Fit:
+    """Fits until the levels that R assumes are those of the residuals; where an estimator minimises the sum of squares,
+    the maximum of the restricted likelihood near there."""
+    theta, h = first_levels(levels, z), z
+    found: tuple[Fit, Fit, Estimated] | None = None
+    for _ in range(_MOST_LEVELS):
+        R = Covariance(np.exp(levels.at(h[None], theta[None])[0][0]))
+        again = _fit_one(label, estimator, replace(problem, R=R), z, where, None)
+        if found is not None and again.status is not Status.CONVERGED:
+            break
+        h, inside = z - again.residuals[where[0]], again.held or again
+        x, last = inside.inner, theta
+        if not np.isfinite(h).all():
+            return _at_levels(inside, estimator, unknown_levels(inside.assumed, levels, x), z, where)
+        known = levels_at(inside.assumed, levels, theta, z, x)
+        theta = known.x[len(x) :]
+        found = again, inside, known
+        if np.abs(theta - last).max() < _SAME_LEVEL:
+            break
+    assert found is not None
+    again, inside, known = found
+    if estimator.equation == "least_squares" and again.status is Status.CONVERGED:
+        known = maximum(known, z)
+    leveled = _at_levels(inside, estimator, known, z, where)
+    if again.held is None:
+        return leveled
+    whole = replace(known.problem, measurement=replace(known.model, whole=again.assumed.measurement))
+    x = np.concatenate([again.x, leveled.x[len(inside.x) :]])
+    return _on_bounds(replace(leveled, x=x, model=whole.measurement, assumed=whole), leveled, again.held_at)
+
+
+def _at_levels(found: Fit, estimator: Estimator, known: Estimated, z: Array, where: Where) -> Fit:
+    """The fit with levels of the noise behind its parameters."""
+    n, problem = len(found.x), replace(found.assumed, R=known.problem.R)
+    x, P = known.x, known.P.copy()
+    if not known.maximal:
+        # Such an estimator takes the levels for known.
+        P[:n, :n], P[:n, n:], P[n:, :n] = found.inner_covariance, 0.0, 0.0
+    status = Status.STALLED if found.status is Status.CONVERGED and not known.converged else found.status
+    estimates = Estimates(x[None, :n], np.array([status]), P[None, :n, :n])
+    again = _described(found.label, estimator, problem, estimates, z, where, None)
+    slope = known.model.physical_slope(x[None])[0]
+    return replace(
+        again,
+        message=found.message,
+        x=known.model.physical(x[None])[0],
+        covariance=P * np.outer(slope, slope),
+        normalised=at_rows(where[0], _deviates(again.normalised[where[0]], known.reading_freedom), where[1]),
+        iterations=found.iterations,
+        simulations=found.simulations,
+        model=known.model,
+        inner=x,
+        inner_covariance=P,
+        assumed=problem if found.with_prior else known.problem,
+        level=1.0,
+        estimated=known,
+    )
+
+
+def present_part(problem: Problem, rows: NDArray[np.intp]) -> Problem:
+    """The problem of the readings that are there."""
+    if len(rows) == problem.R.m:
+        return problem
+    model = SubsetModel(problem.measurement, tuple(rows.tolist()))
+    return replace(problem, measurement=model, R=problem.R.restricted(rows))
 
 
 def _succession(model: Measurement, present: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -309,9 +399,8 @@ def falls_beyond(
     x = np.repeat(np.array(model.nominal, dtype=float)[None], len(z), axis=0)
     x[:, [k for k in range(model.n) if k not in near]] = held
     with np.errstate(all="ignore"):
-        r = problem.R.whiten(z - model.simulate(x))
-        J = problem.R.whiten_jacobian(model.jacobian(x))[:, :, places]
-        downhill = np.einsum("tmi,tm->ti", J, r)
+        objective = objective_of(replace(problem, measurement=model), z)
+        downhill = -np.einsum("tmi,tm->ti", objective.jacobian(x)[:, :, places], objective.residual(x))
     start = problem.measurement.physical(problem.measurement.nominal[None])[0]
     outward = np.sign(np.array(list(near.values())) - start[places])
     if released is not None:
@@ -328,14 +417,28 @@ def _on_bounds(found: Fit, held: Fit, near: Mapping[int, float]) -> Fit:
     x, inner, P, inner_P = np.empty(n), np.full(n, np.nan), np.full((n, n), np.nan), np.full((n, n), np.nan)
     x[list(near)], x[free], inner[free] = list(near.values()), held.x, held.inner
     P[np.ix_(free, free)], inner_P[np.ix_(free, free)] = held.covariance, held.inner_covariance
-    return replace(held, x=x, inner=inner, covariance=P, inner_covariance=inner_P, model=found.model, held=held)
+    of_whole = {"model": found.model, "assumed": found.assumed}
+    return replace(held, x=x, inner=inner, covariance=P, inner_covariance=inner_P, held=held, **of_whole)
 
 
 def _fit_inside(label: str, estimator: Estimator, problem: Problem, z: Array, where: Where, noise: Noise | None) -> Fit:
     """The fit to readings z, which stand `where` among all. `noise` None: its level is not known, and the size of the
     residuals cannot be tested."""
-    (rows, m, order), model, n = where, problem.measurement, problem.measurement.n
     estimates = estimate_safely(estimator, problem, z[None])
+    return _described(label, estimator, problem, estimates, z, where, noise)
+
+
+def _described(
+    label: str,
+    estimator: Estimator,
+    problem: Problem,
+    estimates: Estimates,
+    z: Array,
+    where: Where,
+    noise: Noise | None,
+) -> Fit:
+    """Estimates, with what their residuals say."""
+    (rows, m, order), model, n = where, problem.measurement, problem.measurement.n
     message = estimates.messages.get(0, "")
     r, J = np.full(len(z), np.nan), np.full((len(z), n), np.nan)
     if np.isfinite(estimates.x).all():
@@ -376,6 +479,7 @@ def _fit_inside(label: str, estimator: Estimator, problem: Problem, z: Array, wh
         model=model,
         inner=estimates.x[0],
         inner_covariance=P,
+        assumed=problem,
         with_prior="prior" in estimator.needs,
         prior_inflation=inflation_of(estimator),
         undetermined=open_ones,

@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, fdtri, stdtrit
 
-from ipe_bench.basics.linalg import Array, Mask, squared
+from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.estimators.driver import Limits
-from ipe_bench.estimators.least_squares import Objective, minimize
+from ipe_bench.estimators.least_squares import minimize
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
+from ipe_bench.real.levels import SLACK, Levelled, objective_of
 
 CONFIDENCE = 0.95
 _FIRST = (0.5, 1.0, 1.5)
@@ -64,13 +65,13 @@ class Profile:
         return not max(ends) <= 0.1 * half
 
 
-def half_width(level: float, freedom: int | None) -> float:
+def half_width(level: float, freedom: float | Array | None) -> float | Array:
     """The quantile that a rise of root chi-square is compared with: normal, or Student's t where the level of the noise
-    is estimated from `freedom` degrees of freedom."""
-    return float(stdtrit(np.inf if freedom is None else freedom, (1 + level) / 2))
+    is estimated from `freedom` degrees of freedom, or (n,) of them."""
+    return stdtrit(np.inf if freedom is None else freedom, (1 + level) / 2)
 
 
-def joint_region(parameters: int, level: float, freedom: int | None) -> float:
+def joint_region(parameters: int, level: float, freedom: float | None) -> float:
     """The squared distance, in standard errors, to the edge of a joint confidence region of so many parameters:
     chi-square, or F where the level of the noise is estimated from `freedom` degrees of freedom."""
     if freedom is None:
@@ -84,7 +85,7 @@ def natural_limits(model: Measurement) -> tuple[Array, Array]:
     return ends.min(axis=0), ends.max(axis=0)
 
 
-def wald_interval(model: Measurement, x: Array, deviation: Array, q: float) -> tuple[Array, Array]:
+def wald_interval(model: Measurement, x: Array, deviation: Array, q: float | Array) -> tuple[Array, Array]:
     """The interval (n,), (n,) of q standard deviations (n,) about the estimate x (n,), in the parameters' own units.
 
     It is symmetric in x, the logarithm of a distance to a bound, say. If three times q standard errors reach a bound,
@@ -108,7 +109,7 @@ def profiles(
     P: Array,
     *,
     levels: Array | None = None,
-    freedom: int | None = None,
+    freedom: float | Array | None = None,
     places: Sequence[int] | None = None,
     signs: Sequence[int] = (-1, 1),
     released: Released | None = None,
@@ -116,23 +117,30 @@ def profiles(
     """For each set of readings z (sets, m), all present, the profiles of the parameters `places`, or of all, about the
     least-squares estimates x (sets, n) of covariances P (sets, n, n).
 
-    `levels` (sets,): what each set has found R^1/2 to be multiplied by, and P has been multiplied by the square of.
-    `signs`: on which sides an end is looked for; the other is infinite. `released`: parameters held on bounds, which
-    may leave them inwards where that fits better.
+    `freedom` (n,) stands for several levels of the noise, which are among the parameters. `levels` (sets,): what each
+    set has found R^1/2 to be multiplied by, and P has been multiplied by the square of. `signs`: on which sides an end
+    is looked for; the other is infinite. `released`: parameters held on bounds, which may leave them inwards where that
+    fits better.
 
     Of a parameter whose estimate is on a bound the one end is the bound. The rise of chi-square is compared with the
     same quantile as inside of bounds: beyond the bound the true value may be anywhere, and an estimate on the bound is
     only nearer to it, so that the interval holds it at least as often as it says.
     """
-    q, least = half_width(CONFIDENCE, freedom), squared(problem.R.whiten(problem.measurement.simulate(x) - z))
+    objective = objective_of(problem, z)
+    least = objective.cost(x, objective.residual(x))
+    q = np.broadcast_to(half_width(CONFIDENCE, freedom), x.shape[1])
+    behind = freedom if isinstance(freedom, np.ndarray) else np.full(x.shape[1], np.inf)
     levels = np.ones(len(x)) if levels is None else levels
     where = range(x.shape[1]) if places is None else places
     searches = [
-        [_Search(problem.measurement, z[k], x[k], P[k], float(levels[k]), float(least[k]), j, q) for j in where]
+        [
+            _Search(problem.measurement, z[k], x[k], P[k], float(levels[k]), float(least[k]), j, q[j], behind[j])
+            for j in where
+        ]
         for k in range(len(x))
     ]
     every = [one for row in searches for one in row]
-    asked = [(one, one.centre + s * f * q * one.deviation) for one in every for s in signs for f in _FIRST]
+    asked = [(one, one.centre + s * f * one.q * one.deviation) for one in every for s in signs for f in _FIRST]
     for _ in range(_ROUNDS + 1):
         _look(problem, asked, released)
         asked = [(one, at) for one in every for sign in signs if (at := one.next(sign)) is not None]
@@ -155,6 +163,9 @@ class _Search:
     place: int
     q: float
     """The rise of root chi-square at the ends."""
+    freedom: float
+    """Degrees of freedom f of levels that are among the other parameters: chi-square then rises by f log(1 + t^2 / f)
+    where a linear model would give Student's t; infinite where levels stay as they are."""
 
     def __post_init__(self) -> None:
         self.centre, self.deviation = float(self.x[self.place]), float(np.sqrt(self.P[self.place, self.place]))
@@ -166,9 +177,13 @@ class _Search:
     def note(self, at: float, total: float, point: Array) -> None:
         """Takes in the sum of squares at a value; of two the smaller counts."""
         change = (total - self.least) / self.level**2
+        if np.isfinite(self.freedom):
+            with np.errstate(over="ignore"):
+                change = self.freedom * np.expm1(change / self.freedom)
         if at in self.seen and not change < self.seen[at][0] ** 2:
             return
-        self.lower |= change < -_LOWER * max(1.0, self.least / self.level**2)
+        slack = SLACK if isinstance(self.model, Levelled) else _LOWER * max(1.0, self.least / self.level**2)
+        self.lower |= change < -slack
         zeta = np.sqrt(max(change, 0.0)) if np.isfinite(change) else np.inf
         self.seen[at] = (float(np.sign(at - self.centre) * zeta), point)
 
@@ -313,11 +328,10 @@ def _fit_others(
     for readings z (asked, m), from `begin` (asked, n)."""
     rows = np.arange(len(values))
     model = _Pinned(problem.measurement, EvaluationCount.zeros(len(values)), places=places, values=values)
+    objective = objective_of(problem, z, model)
     x = np.stack([np.delete(start, place) for start, place in zip(begin, places, strict=True)])
     with np.errstate(all="ignore"):
         if x.shape[1]:
-            objective = Objective(model, problem.R, z, rows, problem.x0)
-            method = LevenbergMarquardtMethod(1e-3)
-            x = minimize(objective, method, x, Limits(_TOLERANCE, _MOST_STEPS)).x
-        sums = squared(problem.R.whiten(model.simulate(x, rows) - z))
+            x = minimize(objective, LevenbergMarquardtMethod(1e-3), x, Limits(_TOLERANCE, _MOST_STEPS)).x
+        sums = objective.cost(x, objective.residual(x))
     return model.whole(x, rows), sums

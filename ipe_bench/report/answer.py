@@ -130,7 +130,7 @@ def contents(answer: Answer) -> Iterator[Part]:
 
 def _estimates(answer: Answer) -> Table:
     """Estimates with their errors; what is not an answer stands in brackets, without errors that would be wrong."""
-    parameters = answer.model.physical_parameters
+    parameters = answer.fits[0].model.physical_parameters
     columns = [words("parameter", [p.name for p in parameters]), words("unit", [p.unit for p in parameters])]
     for one in answer.fits:
         if one.passes:
@@ -205,7 +205,15 @@ def _notes(answer: Answer) -> Iterator[str]:
                 f"{one.label}: on its bound: {_values(at)}; the readings want it beyond. It has no error, and those of"
                 " the others are with it held there."
             )
-    if any(one.level is not None for one in fits):
+    if any(one.levels for one in fits):
+        yield (
+            "The levels of the noise are estimated with the parameters by restricted maximum likelihood: they make"
+            " chi-square the degrees of freedom, so the size of the residuals cannot test the model. What can: white p,"
+            " outliers, the levels beside each other and beside what is known of the instruments."
+        )
+        if known := [one.label for one in fits if one.levels and not one.of_likelihood]:
+            yield f"{', '.join(known)}: takes the levels for known, which are those of its own residuals."
+    elif any(one.level is not None for one in fits):
         yield (
             "The level of the noise is estimated from the residuals: standard errors are scaled by it, intervals are"
             " those of Student's t, and the size of the residuals cannot test the model."
@@ -373,7 +381,7 @@ def described(answer: Answer) -> dict[str, Any]:
         "passes": answer.passes,
         "examination": answer.examination and _examined(answer.examination, labels),
         "examination_with_prior": with_prior and _examined(with_prior, labels),
-        "parameters": [picked(p, "name", "unit") for p in model.physical_parameters],
+        "parameters": [picked(p, "name", "unit") for p in answer.fits[0].model.physical_parameters],
         "estimators": {one.label: _fitted(one, labels) for one in answer.fits},
     }
 
@@ -389,7 +397,7 @@ def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
         "p": plain(one.p_value),
         "on_bounds": {names[k]: value for k, value in one.held_at.items()},
         "undetermined": list(one.undetermined),
-        "noise_level_estimated": plain(one.level),
+        "noise_level_estimated": one.levels or plain(one.level),
         "whiteness": whiteness | picked(one.whiteness, "statistic", "lags"),
         "outliers": [
             {**labels[i], "normalised_residual": plain(one.normalised[i])} for i in np.flatnonzero(one.outliers)

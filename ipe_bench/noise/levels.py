@@ -1,0 +1,124 @@
+"""Standard deviations of readings as a formula of levels that are not known, one set of levels for each group."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.linalg import Array
+from ipe_bench.measurements.arithmetic import Arithmetic, read
+from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.measurements.ode.trace import Graph, Program, tangent
+
+READING = "h"
+"""Name of the error-free reading's magnitude in a formula of the standard deviation."""
+_PROBES = 1000
+"""Points at which a formula of the standard deviation is asked for its sign."""
+
+
+def read_sigma(text: str) -> Arithmetic:
+    """The formula of a standard deviation.
+
+    Raises:
+        UserError: it is no formula, has no level, or is negative at some levels and readings, all of them positive.
+    """
+    formula = read(text, "noise.sigma")
+    names = [name for name in formula.names if name != READING]
+    if not names:
+        raise UserError(f"noise.sigma={text}: has no level to estimate; give one, as in a + b*{READING}")
+    points = 10.0 ** np.random.default_rng(0).uniform(-2, 2, (len(names) + 1, _PROBES))
+    with np.errstate(all="ignore"):
+        values = np.broadcast_to(formula(dict(zip((*names, READING), points, strict=True))), _PROBES)
+    if len(wrong := np.flatnonzero(~(values >= 0))):
+        where = ", ".join(f"{n} = {v:.3g}" for n, v in zip((*names, READING), points[:, wrong[0]], strict=True))
+        raise UserError(
+            f"noise.sigma={text}: can be negative ({values[wrong[0]]:.3g} where {where}); give a formula that is"
+            f" positive for all positive levels, such as a + b*{READING}, where {READING} is the reading's magnitude"
+        )
+    return formula
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Standard deviations sigma_i = w_i s(|h_i|, levels of the group of i), as functions of the levels' logarithms."""
+
+    formula: Arithmetic
+    weights: Array
+    """w (m,)."""
+    groups: tuple[str, ...]
+    """Names of the groups; a single one has none."""
+    group: NDArray[np.intp]
+    """Place (m,) of each reading's group among these."""
+    unit: str = ""
+    """Unit of the readings."""
+
+    @classmethod
+    def of(cls, formula: Arithmetic, weights: Array, by: str | None, model: Measurement) -> Levels:
+        """The levels of a model's readings, by a column of its index.
+
+        Raises:
+            UserError: there is no such column, or a level has the name of a parameter.
+        """
+        if by is None:
+            return cls(formula, weights, ("",), np.zeros(model.m, dtype=np.intp), model.reading_unit).checked(model)
+        if by not in model.index:
+            raise UserError(f"noise.by={by}: {unknown(by, model.index, 'column of the readings')}")
+        entries = [f"{entry:g}" if isinstance(entry, float) else str(entry) for entry in model.index[by]]
+        groups = tuple(dict.fromkeys(entries))
+        group = np.array([groups.index(entry) for entry in entries], dtype=np.intp)
+        return cls(formula, weights, groups, group, model.reading_unit).checked(model)
+
+    def checked(self, model: Measurement) -> Levels:
+        taken = {p.name for p in model.physical_parameters}
+        if both := [p.name for p in self.parameters if p.name in taken]:
+            raise UserError(f"noise.sigma: {both[0]} is a parameter of the model; give the level another name")
+        return self
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the levels of a group."""
+        return tuple(name for name in self.formula.names if name != READING)
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The levels, group by group."""
+        alone = len(self.formula.names) == 1
+        named = [f"{name}_{group}" if group else name for group in self.groups for name in self.names]
+        return tuple(Parameter(name, self.unit if alone else "") for name in named)
+
+    def values(self, levels: Mapping[str, float]) -> Array:
+        """Logarithms (k,) of levels that are given by name."""
+        return np.log([levels[p.name] for p in self.parameters])
+
+    def restricted(self, rows: NDArray[np.intp]) -> Levels:
+        """Those of some of the readings."""
+        kept, group = np.unique(self.group[rows], return_inverse=True)
+        groups = tuple(self.groups[k] for k in kept)
+        return replace(self, weights=self.weights[rows], groups=groups, group=group)
+
+    @cached_property
+    def _recorded(self) -> Program:
+        """The formula and its derivatives by the reading and by each level."""
+        graph = Graph()
+        known = {name: graph.input(name) for name in (READING, *self.names)}
+        value, one = graph.apply("add", self.formula(known), 0.0), graph.constant(1.0)
+        slopes = [tangent([value], {place: one})[0] for place in known.values()]
+        return Program.of([value, *slopes], list(known.values()))
+
+    def at(self, h: Array, theta: Array) -> tuple[Array, Array, Array]:
+        """log sigma (trials, m) for readings h (trials, m) and logarithms theta (trials, k) of the levels, and its
+        derivatives by h (trials, m) and by theta (trials, m, k); not finite where sigma is not positive."""
+        trials, m = h.shape
+        levels = np.exp(theta).reshape(trials, len(self.groups), -1)[:, self.group]
+        values = [np.abs(h), *(levels[:, :, i] for i in range(len(self.names)))]
+        with np.errstate(all="ignore"):
+            s, by_h, *by_level = (np.broadcast_to(a, h.shape) for a in self._recorded(values))
+            slopes = np.zeros((trials, m, len(self.groups), len(self.names)))
+            for i, slope in enumerate(by_level):
+                slopes[:, np.arange(m), self.group, i] = slope * levels[:, :, i] / s
+            return np.log(self.weights * s), by_h * np.sign(h) / s, slopes.reshape(trials, m, -1)

@@ -1,0 +1,319 @@
+"""Levels of the noise as further parameters: what a restricted likelihood minimises, in the form of least squares.
+
+Each reading comes with a second residual, of the logarithm of its standard deviation sigma. The gradient of
+
+    sum_i (r_i / sigma_i)^2 + 2 f_i log sigma_i
+
+is then that of a sum of squares (McCullagh and Nelder, Generalized Linear Models, 1989, chapter 10). f_i = 1 makes the
+likelihood; f_i = 1 - leverage_i makes up for the degrees of freedom that the parameters take, and is exact for a linear
+model with levels by groups (Patterson and Thompson, Biometrika 58, 1971).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.estimators.driver import Limits
+from ipe_bench.estimators.least_squares import Minima, Objective, inverse_factor, minimize
+from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
+from ipe_bench.measurements.base import Measurement, Parameter, WrappedModel
+from ipe_bench.measurements.counted import CountingModel, EvaluationCount
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.noise.levels import Levels
+from ipe_bench.real.residuals import explained
+
+_TOLERANCE = 1e-8
+_MOST_STEPS = 200
+_MOST_ROUNDS = 30
+"""Maximisations until leverages change no more."""
+_SAME_LEVERAGE = 1e-9
+_LEAST_SHARE = 1e-8
+"""Residuals that are smaller than this share of the readings are round-off."""
+_HOLD = 1e-2
+"""The weight with which the logarithm of a level is held where a search begins: that of a level of zero is infinite."""
+_LEAST_PART = 1e-4
+"""A level that makes up a smaller share of every standard deviation is as good as zero, and is taken for this share."""
+SLACK = 1e-2
+"""The objective of such a level is above its minimum by less than this."""
+_SHIFT = 3.0
+"""What is added to the logarithm of sigma over R's in the objective, which the methods want to be positive."""
+_LEAST_SPARE = 1e-9
+"""The least that a reading counts for in the likelihood of a level, so that its residual may be divided by it."""
+
+
+@dataclass(frozen=True)
+class Levelled(WrappedModel):
+    """The readings h of a model, then the logarithms of their standard deviations, then those of the levels; x has the
+    logarithms of the levels behind the parameters."""
+
+    whole: Measurement
+    noise: Levels
+    theta: Array
+    """Logarithms (k,) of the levels at the start."""
+    spare: Array
+    """f (m,): the part of each reading's degree of freedom that the levels are estimated from."""
+
+    epochs = recorded = None
+
+    def __post_init__(self) -> None:
+        """Made of a model that has been checked."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (*self.whole.parameters, *self.noise.parameters)
+
+    @property
+    def physical_parameters(self) -> tuple[Parameter, ...]:
+        return (*self.whole.physical_parameters, *self.noise.parameters)
+
+    @property
+    def nominal(self) -> Array:
+        return np.concatenate([self.whole.nominal, self.theta])
+
+    @cached_property
+    def m(self) -> int:
+        return 2 * self.whole.m + len(self.theta)
+
+    def physical(self, x: Array) -> Array:
+        with np.errstate(over="ignore"):
+            return np.concatenate([self.whole.physical(self.whole_x(x)), np.exp(self._logarithms(x))], axis=1)
+
+    def physical_slope(self, x: Array) -> Array:
+        return np.concatenate([self.whole.physical_slope(self.whole_x(x)), np.exp(self._logarithms(x))], axis=1)
+
+    def near_bounds(self, x: Array) -> dict[int, float]:
+        return dict(self.whole.near_bounds(x[: self.whole.n]))
+
+    def whole_x(self, x: Array) -> Array:
+        return x[:, : self.whole.n]
+
+    def _logarithms(self, x: Array) -> Array:
+        return x[:, self.whole.n :]
+
+    def own_readings(self, x: Array, z: Array) -> Array:
+        theta = self._logarithms(x)
+        return np.concatenate([z, self.noise.at(z, theta)[0], theta], axis=1)
+
+    def own_jacobian(self, x: Array, J: Array) -> Array:
+        theta = self._logarithms(x)
+        _, by_h, by_theta = self.noise.at(self.whole.simulate(self.whole_x(x)), theta)
+        trials, m, n = J.shape
+        whole = np.zeros((trials, self.m, n + theta.shape[1]))
+        whole[:, :m, :n], whole[:, m : 2 * m, :n], whole[:, m : 2 * m, n:] = J, by_h[:, :, None] * J, by_theta
+        whole[:, 2 * m :, n:] = np.eye(theta.shape[1])
+        return whole
+
+
+@dataclass(frozen=True)
+class _Known(Measurement):
+    """Readings without a parameter."""
+
+    h: Array
+    parameters = property(lambda model: ())  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        """Made of numbers."""
+
+    index = property(lambda model: {"row": range(len(model.h))})  # type: ignore[assignment]
+
+    def simulate(self, x: Array) -> Array:
+        return np.repeat(self.h[None], len(x), axis=0)
+
+    def jacobian(self, x: Array) -> Array:
+        return np.zeros((len(x), len(self.h), 0))
+
+
+@dataclass(frozen=True)
+class Likelihood(Objective):
+    """The objective of this page, with sigma in multiples of R's that are small."""
+
+    @property
+    def _levelled(self) -> Levelled:
+        model = self.model.measurement
+        assert isinstance(model, Levelled)
+        return model
+
+    def _split(self, x: Array) -> tuple[Array, Array, Array]:
+        """Whitened residuals (trials, m), the logarithms of standard deviations, and how far those of the levels are
+        from their start (trials, k)."""
+        h, log, theta = np.split(self.model.simulate(x, self.rows), [self.readings, 2 * self.readings], axis=1)
+        return (h - self.z) * np.exp(-log), log, theta - self._levelled.theta
+
+    def residual(self, x: Array) -> Array:
+        w, _, moved = self._split(x)
+        f = self._levelled.spare
+        return np.concatenate([w, (f - w**2) / np.sqrt(f + w**2), _HOLD * moved], axis=1)
+
+    def slopes(self, x: Array, *, coarse: bool) -> tuple[Array, None]:
+        """The second residuals' information is f + w^2, whose mean is Fisher's 2 f: steps of log sigma are below 1."""
+        w, log, moved = self._split(x)
+        weights = [np.exp(-log), np.sqrt(self._levelled.spare + w**2), np.full(moved.shape, _HOLD)]
+        J = self.model.jacobian(x, self.rows, coarse=coarse)
+        return J * np.concatenate(weights, axis=1)[:, :, None], None
+
+    def cost(self, x: Array, r: Array) -> Array:
+        w, log, moved = self._split(x)
+        change = 2 * self._levelled.spare * (log - np.log(self.R.factor) + _SHIFT)
+        return np.sum(w**2 + change, axis=1) + np.sum((_HOLD * moved) ** 2, axis=1)
+
+
+def objective_of(problem: Problem, z: Array, model: CountingModel | None = None) -> Objective:
+    """What is minimised for readings z (trials, m): the likelihood where levels are among the parameters, else the sum
+    of squares. `model` replaces the problem's."""
+    kind = Likelihood if isinstance(problem.measurement, Levelled) else Objective
+    model = model or CountingModel(problem.measurement, EvaluationCount.zeros(len(z)))
+    return kind(model, problem.R, z, np.arange(len(z)), problem.x0)
+
+
+def minimise(problem: Problem, z: Array, x: Array) -> Minima:
+    """The minima of the objective for readings z (trials, m), from x (trials, n); their `chi_square` is its value, less
+    the sum of all 2 f log sigma at R's."""
+    with np.errstate(all="ignore"):
+        objective = objective_of(problem, z)
+        minima = minimize(objective, LevenbergMarquardtMethod(1e-3), x, Limits(_TOLERANCE, _MOST_STEPS))
+        value = objective.cost(minima.x, objective.residual(minima.x))
+        model = problem.measurement
+        shift = 2 * _SHIFT * model.spare.sum() if isinstance(model, Levelled) else 0.0
+        return replace(minima, chi_square=value - shift)
+
+
+@dataclass(frozen=True)
+class Estimated:
+    """A model's parameters and levels, with what is known of their errors."""
+
+    problem: Problem
+    """Its measurement is `Levelled`, its R is that of the levels."""
+    x: Array
+    """(n + k,): the parameters, and the logarithms of the levels."""
+    converged: bool
+    P: Array
+    """Covariance (n + k, n + k): the inverse of Fisher's information."""
+    freedom: Array
+    """Degrees of freedom (n + k,) behind each variance of a parameter (Satterthwaite, Biometrics Bulletin 2, 1946);
+    infinite for levels."""
+    deviance: float
+    """Twice the negative logarithm of the likelihood, less a constant of the readings."""
+    maximal: bool = False
+    """Whether the parameters, too, are those of maximum likelihood."""
+
+    @property
+    def reading_freedom(self) -> Array:
+        """The degrees of freedom (m,) that the level of each reading's group is estimated from."""
+        levels, spare = self.model.noise, self.model.spare
+        return np.bincount(levels.group, spare)[levels.group]
+
+    @property
+    def fitted(self) -> Array:
+        """h (m,) at the parameters."""
+        return self.model.simulate(self.x[None])[0, : len(self.model.spare)]
+
+    @property
+    def model(self) -> Levelled:
+        model = self.problem.measurement
+        assert isinstance(model, Levelled)
+        return model
+
+
+def levels_at(problem: Problem, levels: Levels, theta: Array, z: Array, x: Array) -> Estimated:
+    """The levels of maximum restricted likelihood at x (n,), from theta (k,); R is taken for the leverages.
+
+    Raises:
+        UserError: a group has too few readings for its levels, or residuals of zero.
+    """
+    h, J = problem.measurement.simulate(x[None])[0], problem.measurement.jacobian(x[None])[0]
+    _require_residuals(levels, z, z - h, J)
+    spare = _spare(J, problem.R)
+    w = (z - h) * np.exp(-levels.at(h[None], theta[None])[0][0])
+    theta = theta + first_levels(levels, w * levels.weights)
+    known = Levelled(_Known(h), levels, theta, spare)
+    found = minimise(Problem(known, _covariance(levels, known.whole, theta)), z[None], theta[None])
+    return _estimated(problem, levels, spare, z, np.concatenate([x, found.x[0]]), bool(found.converged[0]))
+
+
+def unknown_levels(problem: Problem, levels: Levels, x: Array) -> Estimated:
+    """No levels, where the readings at x (n,) are not known."""
+    theta = np.full(len(levels.parameters), np.nan)
+    joint = replace(problem, measurement=Levelled(problem.measurement, levels, theta, np.ones(problem.R.m)))
+    unknown = np.full((len(x) + len(theta),) * 2, np.nan)
+    return Estimated(joint, np.concatenate([x, theta]), False, unknown, unknown[0], np.inf)
+
+
+def maximum(start: Estimated, z: Array) -> Estimated:
+    """The maximum of the restricted likelihood of readings z (m,) near a start."""
+    found = start
+    for _ in range(_MOST_ROUNDS):
+        minima = minimise(found.problem, z[None], found.x[None])
+        model, n = found.model, found.model.whole.n
+        problem = replace(found.problem, measurement=model.whole)
+        x, last = minima.x[0], found.model.spare
+        if not np.isfinite(x).all():
+            return replace(found, converged=False)
+        J = model.whole.jacobian(x[None, :n])[0]
+        _require_residuals(model.noise, z, z - model.whole.simulate(x[None, :n])[0], J)
+        R = _covariance(model.noise, model.whole, x)
+        spare = _spare(J, R)
+        found = _estimated(replace(problem, R=R), model.noise, spare, z, x, bool(minima.converged[0]))
+        if np.abs(spare - last).max() < _SAME_LEVERAGE:
+            break
+    return replace(found, maximal=True)
+
+
+def _covariance(levels: Levels, model: Measurement, x: Array) -> Covariance:
+    """R where the parameters and the logarithms of levels are x (n + k,)."""
+    h = model.simulate(x[None, : model.n])
+    return Covariance(np.exp(levels.at(h, x[None, model.n :])[0][0]))
+
+
+def _spare(J: Array, R: Covariance) -> Array:
+    """1 - leverage (m,) of each reading."""
+    return np.maximum(1.0 - np.sum(explained(J, R) ** 2, axis=1), _LEAST_SPARE)
+
+
+def _estimated(problem: Problem, levels: Levels, spare: Array, z: Array, x: Array, converged: bool) -> Estimated:
+    n, whole = problem.measurement.n, problem.measurement
+    share = np.abs(levels.at(whole.simulate(x[None, :n]), x[None, n:])[2][0]).max(axis=0)
+    x = np.concatenate([x[:n], x[n:] + np.log(np.maximum(_LEAST_PART / np.maximum(share, 1e-300), 1.0))])
+    model, R = Levelled(whole, levels, x[n:], spare), _covariance(levels, whole, x)
+    deviation = problem.prior_deviation
+    starts = None if deviation is None else np.concatenate([deviation, np.ones(len(x) - n)])
+    joint = replace(problem, measurement=model, R=R, prior_deviation=starts, prior_correlation=None)
+    w, slopes = R.whiten(z - whole.simulate(x[None, :n])[0]), model.jacobian(x[None])[0]
+    J, L = R.whiten_jacobian(slopes[: len(z)]), slopes[len(z) : 2 * len(z)]
+    with np.errstate(all="ignore"):
+        inverse_U = inverse_factor(np.concatenate([J, np.sqrt(2 * spare)[:, None] * L])[None])[0]
+        P = inverse_U @ inverse_U.T
+        # The logarithm of a variance changes with the logarithms of levels by this, and those have a covariance.
+        inner, by_theta = P[:n, :n], L[:, n:]
+        change = 2 * ((J[:, :n] @ inner) ** 2).T @ by_theta / np.diag(inner)[:, None]
+        freedom = 2.0 / np.einsum("ik,kl,il->i", change, P[n:, n:], change)
+    deviance = float(np.sum(w**2 + 2 * np.log(R.factor)))
+    return Estimated(joint, x, converged, P, np.concatenate([freedom, np.full(len(x) - n, np.inf)]), deviance)
+
+
+def _require_residuals(levels: Levels, z: Array, r: Array, J: Array) -> None:
+    """Refuses levels of groups that the parameters can meet exactly, or have met."""
+    size = np.linalg.norm(J, axis=0)
+    for k, name in enumerate(levels.groups):
+        rows, told = np.flatnonzero(levels.group == k), f"of {name} " if name else ""
+        rank = np.linalg.matrix_rank(J[rows] / np.where(size > 0, size, 1.0)) if np.isfinite(J).all() else 0
+        if len(rows) - rank < len(levels.names):
+            raise UserError(
+                f"noise=unknown: the {len(rows)} readings {told}are too few to tell {', '.join(levels.names)} beside"
+                f" {rank} parameters; state the noise, as in noise.deviation=0.1, or let more readings share a level"
+            )
+        if not np.linalg.norm(r[rows]) > _LEAST_SHARE * np.linalg.norm(z[rows]):
+            raise UserError(
+                f"noise=unknown: the level {told}cannot be estimated from residuals of zero; state the noise, as in"
+                " noise.deviation=0.1"
+            )
+
+
+def first_levels(levels: Levels, z: Array) -> Array:
+    """Logarithms (k,) of levels as large as each group's readings."""
+    mean = np.sqrt(np.bincount(levels.group, (z / levels.weights) ** 2) / np.bincount(levels.group))
+    return np.repeat(np.log(np.where(mean > 0, mean, 1.0)), len(levels.names))

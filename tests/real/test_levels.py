@@ -1,0 +1,256 @@
+"""Levels of the noise that are estimated with the parameters: the likelihood, its intervals, and what is refused."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize as nelder_mead
+from scipy.optimize import root
+from scipy.special import digamma
+
+import ipe_bench as ib
+from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
+from ipe_bench.basics.linalg import Covariance
+from ipe_bench.measurements import Formula, Nist
+from ipe_bench.measurements.known import ParameterInfo, informed
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.noise import Unknown
+from ipe_bench.noise.levels import Levels, read_sigma
+from ipe_bench.real.examination import examine
+from ipe_bench.real.fits import fit
+from ipe_bench.real.levels import Levelled, minimise
+from ipe_bench.real.profiles import CONFIDENCE, half_width
+
+LM = {"lm": LevenbergMarquardt(tolerance=1e-10, max_iterations=500)}
+TIMES = np.tile(np.linspace(0.2, 8.0, 30), 2)
+SECOND = np.repeat([0, 1], 30)
+DECAY = Formula(
+    "(1 - second)*a*exp(-k*t) + second*a*k/(l - k)*(exp(-k*t) - exp(-l*t))",
+    {"a": 10.0, "k": 0.9, "l": 0.3},
+    {"t": tuple(TIMES), "second": tuple(SECOND)},
+)
+"""A substance that decays into another, both read; its parameters at the truth are 1 in multiples of their sizes."""
+NOISES = {
+    "by output": (Unknown(by="second"), np.array([0.4, 0.1])),
+    "a + b h": (Unknown(sigma="floor + share*h"), np.array([0.1, 0.08])),
+}
+
+
+def decay(x):
+    """The same in NumPy, for complex x (3,) too."""
+    amount, fast, slow = x * np.array([10.0, 0.9, 0.3])
+    first, other = np.exp(-fast * TIMES), np.exp(-slow * TIMES)
+    return np.where(SECOND == 0, amount * first, amount * fast / (slow - fast) * (first - other))
+
+
+def sigma(case, h, levels):
+    return levels[SECOND] if case == "by output" else levels[0] + levels[1] * h
+
+
+def readings(case, seed):
+    h = decay(np.ones(3))
+    return h + sigma(case, h, NOISES[case][1]) * np.random.default_rng(seed).standard_normal(60)
+
+
+def fitted(case, z):
+    return fit(Problem(DECAY, Covariance(np.ones(60))), z, LM, NOISES[case][0])[0]
+
+
+def gradient(function, u):
+    return np.array([function(u + 1e-30j * e).imag for e in np.eye(len(u))]) / 1e-30
+
+
+@pytest.mark.parametrize("case", NOISES)
+def test_the_maximum_of_the_likelihood_is_that_of_a_direct_search(case):
+    z, noise = readings(case, 3), NOISES[case][0]
+    levels = noise.levels_of(DECAY)
+
+    def deviance(u):
+        h = decay(u[:3])
+        s = sigma(case, h, np.exp(u[3:]))
+        return np.sum(((z - h) / s) ** 2 + 2 * np.log(s))
+
+    start = np.concatenate([[1.1, 0.9, 1.05], np.log([0.3, 0.3])])
+    near = nelder_mead(deviance, start, method="Nelder-Mead", options={"maxiter": 5000, "maxfev": 5000})
+    direct = root(lambda u: gradient(deviance, u), near.x, tol=1e-13).x
+    assert deviance(direct) <= near.fun
+    found = start
+    for _ in range(2):  # the second from the first, since the logarithm of a level is held a little at its start
+        model = Levelled(DECAY, levels, found[3:], np.ones(60))
+        found = minimise(Problem(model, Covariance(np.full(60, 0.2))), z[None], found[None]).x[0]
+    assert found == pytest.approx(direct, abs=1e-8)
+
+
+def test_levels_of_a_linear_model_maximise_the_restricted_likelihood():
+    """Of Patterson and Thompson: that of all contrasts of the readings whose mean is zero."""
+    t, group = np.linspace(0.0, 1.0, 15), np.repeat([0, 1, 2], 5)
+    line = Formula("a + b*t + 0*group", {"a": 1.0, "b": 1.0}, {"t": tuple(t), "group": tuple(group)})
+    z = 1 + 2 * t + np.array([0.1, 0.3, 1.0])[group] * np.random.default_rng(4).standard_normal(15)
+    X = np.column_stack([np.ones(15), t])
+    contrasts = np.linalg.qr(np.column_stack([X, np.random.default_rng(0).standard_normal((15, 13))]))[0][:, 2:]
+    y = contrasts.T @ z
+
+    def deviance(u):
+        V = contrasts.T @ (np.exp(2 * u[group])[:, None] * contrasts)
+        return y @ np.linalg.solve(V, y) + np.log(np.linalg.det(V))
+
+    near = nelder_mead(deviance, np.log([0.1, 0.3, 1.0]), method="Nelder-Mead").x
+    direct = root(lambda u: gradient(deviance, u), near, tol=1e-13).x
+    found = fit(Problem(line, Covariance(np.ones(15))), z, LM, Unknown(by="group"))[0]
+    weights = np.exp(-2 * direct[group])
+    best = np.linalg.solve(X.T @ (weights[:, None] * X), X.T @ (weights * z))
+    assert np.log(found.x[2:]) == pytest.approx(direct, abs=1e-8)
+    assert found.x[:2] == pytest.approx(best, abs=1e-8)
+
+
+@pytest.mark.parametrize("dataset", ["Misra1a", "Thurber", "Chwirut2"])
+def test_a_single_level_is_certified(dataset):
+    model = Nist(dataset)
+    problem = Problem(model, Covariance(np.ones(model.m)))
+    single, old = (fit(problem, model.recorded.z, LM, noise)[0] for noise in (Unknown(sigma="s"), Unknown()))
+    n = model.n
+    assert single.x[n] == pytest.approx(model.certified.residual_deviation, rel=1e-6)
+    assert single.x[:n] == pytest.approx(model.certified.parameters, rel=1e-6)
+    assert single.standard_errors[:n] == pytest.approx(model.certified.deviations, rel=1e-5)
+    assert np.array(single.interval())[:, :n] == pytest.approx(np.array(old.interval()), rel=1e-5)
+    assert single.normalised == pytest.approx(old.normalised, rel=1e-4, abs=1e-6)
+
+
+@pytest.mark.parametrize("case", NOISES)
+def test_profile_ends_are_where_the_likelihood_has_risen_by_the_quantile(case):
+    z = readings(case, 8)
+    one = fitted(case, z)
+    found = examine(Problem(DECAY, Covariance(np.ones(60))), z, [one], bootstraps=4)
+    spare, best = one.estimated.model.spare, one.estimated.x
+
+    def deviance(u):
+        h = decay(u[:3])
+        s = sigma(case, h, np.exp(u[3:]))
+        return np.sum(((z - h) / s) ** 2 + 2 * spare * np.log(s))
+
+    names = [p.name for p in found.model.physical_parameters]
+    assert found.least
+    for place in (2, 3, 4):
+        profile = found.profiles[place]
+        others = [k for k in range(5) if k != place]
+        f = one.estimated.freedom[place]
+        q = half_width(CONFIDENCE, f) ** 2
+        expected = q if np.isinf(f) else f * np.log1p(q / f)
+        for end in (profile.low, profile.high):
+            u = best.copy()
+            u[place] = end / DECAY.sizes[place] if place < 3 else np.log(end)
+
+            def held(v, u=u, others=others):
+                whole = u.copy()
+                whole[others] = v
+                return deviance(whole)
+
+            options = {"xatol": 1e-8, "fatol": 1e-10, "maxiter": 5000, "maxfev": 5000}
+            rise = nelder_mead(held, best[others], method="Nelder-Mead", options=options).fun - deviance(best)
+            assert rise == pytest.approx(expected, rel=1e-3), names[place]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", NOISES)
+def test_intervals_hold_the_truth_and_levels_have_no_bias(case):
+    true = np.concatenate([[10.0, 0.9, 0.3], NOISES[case][1]])
+    held, excess = np.zeros(5), []
+    for seed in range(500):
+        z = readings(case, seed)
+        one = fitted(case, z)
+        low, high = one.interval()
+        held += (low <= true) & (true <= high)
+        if case == "by output":
+            # What the logarithm of a variance is beyond that of the same errors about the truth, whose mean is known.
+            about = np.array([np.mean((z - decay(np.ones(3)))[j == SECOND] ** 2) for j in (0, 1)])
+            f = np.bincount(SECOND, one.estimated.model.spare)
+            mean = [digamma(v / 2) - np.log(v / 2) for v in (f, 30.0)]
+            excess.append(np.log(one.x[3:] ** 2 / about) - (mean[0] - mean[1]))
+    assert (held[:3] >= 0.93 * 500).all(), held
+    if excess:
+        assert np.abs(np.mean(excess, axis=0)).max() < 0.02
+
+
+def test_levels_stand_beside_the_parameters_of_every_estimator():
+    answer = ib.estimate(DECAY, readings("by output", 1), {**LM, "linear": LinearLSE()}, noise=NOISES["by output"][0])
+    assert answer.table()["parameter"].tolist() == ["a", "k", "l", "sigma_0", "sigma_1"] * 2
+    shown = str(answer)
+    assert "linear: takes the levels for known" in shown
+    assert "the size of the residuals cannot test the model" in shown
+    assert answer["lm"].fits is None
+
+
+def test_missing_readings_leave_their_groups_smaller():
+    z = readings("by output", 2)
+    z[[3, 40, 41]] = np.nan
+    kept = np.isfinite(z)
+    columns = {"t": tuple(TIMES[kept]), "second": tuple(SECOND[kept])}
+    fewer = Formula(DECAY.expression, dict(DECAY.start), columns)
+    alone = fit(Problem(fewer, Covariance(np.ones(57))), z[kept], LM, Unknown(by="second"))[0]
+    assert fitted("by output", z).x == pytest.approx(alone.x, rel=1e-7)
+
+
+def test_a_parameter_on_its_bound_is_held_there_beside_the_levels():
+    model = informed(DECAY, (ParameterInfo("k", lower=1.0, nominal=1.2),))
+    z = readings("by output", 1)
+    (found,) = (answer := ib.estimate(model, z, LM, noise=Unknown(by="second"))).examinations
+    fixed = informed(DECAY, (ParameterInfo("k", fixed=1.0),))
+    alone = ib.estimate(fixed, z, LM, noise=Unknown(by="second"))["lm"]
+    assert answer["lm"].held_at == {1: 1.0}
+    assert answer["lm"].x[[0, 2, 3, 4]] == pytest.approx(alone.x, rel=1e-6)
+    assert [p.name for p in found.model.physical_parameters] == ["a", "l", "sigma_0", "sigma_1"]
+    assert found.on_bounds[0].other > 1.0
+
+
+def test_a_level_of_zero_has_an_upper_limit_alone():
+    """Errors of one size for readings of many, so that half of all estimates of a share are zero."""
+    for seed in range(10):
+        z = readings("by output", seed)
+        one = fit(Problem(DECAY, Covariance(np.ones(60))), z, LM, Unknown(sigma="floor + share*h"))[0]
+        if one.x[4] < 1e-5:
+            break
+    found = examine(Problem(DECAY, Covariance(np.ones(60))), z, [one], bootstraps=4)
+    assert found.least
+    assert found.profiles[4].low == 0.0
+    assert 0.0 < found.profiles[4].high < 0.1
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"sigma": "a0 - b0*h"}, r"noise.sigma=a0 - b0\*h: can be negative .* such as a \+ b\*h"),
+        ({"sigma": "0.1*h"}, "has no level to estimate"),
+        ({"sigma": "a + b*h"}, "a is a parameter of the model; give the level another name"),
+        ({"sigma": "floor + "}, r"noise.sigma: 'floor \+ ' is not a formula"),
+        ({"by": "output"}, "noise.by=output: there is no such column of the readings .*row, second, t"),
+    ],
+)
+def test_a_noise_that_cannot_be_is_refused_in_one_line(options, words):
+    with pytest.raises(ib.UserError, match=words) as raised:
+        ib.estimate(DECAY, readings("by output", 1), LM, noise=Unknown(**options))
+    assert "\n" not in str(raised.value)
+
+
+def test_too_few_readings_for_a_level_are_refused():
+    z = readings("by output", 1)
+    z[32:] = np.nan
+    with pytest.raises(ib.UserError, match="the 2 readings of 1 are too few to tell sigma beside 2 parameters"):
+        fitted("by output", z)
+
+
+def test_residuals_of_zero_are_refused():
+    """The likelihood is infinite where an output is met exactly."""
+    z = readings("by output", 1)
+    z[:30] = 0.0
+    model = Formula("second*(a + b*t)", {"a": 1.0, "b": 1.0}, dict(DECAY.columns))
+    with pytest.raises(ib.UserError, match="the level of 0 cannot be estimated from residuals of zero"):
+        fit(Problem(model, Covariance(np.ones(60))), z, LM, Unknown(by="second"))
+
+
+def test_a_formula_of_the_standard_deviation_has_exact_slopes():
+    levels = Levels.of(read_sigma("floor + sqrt(share*h)"), np.linspace(1, 2, 60), "second", DECAY)
+    h, theta = np.random.default_rng(0).normal(0, 3, (2, 60)), np.log([[0.5, 0.1, 0.4, 2.0]] * 2)
+    _, by_h, by_theta = levels.at(h, theta)
+    step = 1e-6
+    assert by_h == pytest.approx((levels.at(h + step, theta)[0] - levels.at(h - step, theta)[0]) / (2 * step), rel=1e-4)
+    for k, e in enumerate(np.eye(4)):
+        change = levels.at(h, theta + step * e)[0] - levels.at(h, theta - step * e)[0]
+        assert by_theta[:, :, k] == pytest.approx(change / (2 * step), abs=1e-7)
