@@ -18,22 +18,26 @@ __version__ = "0.2.0"
 if TYPE_CHECKING:
     from ipe_bench import baselines, measurements, noise, priors, solvers, states
     from ipe_bench.api import audit, check, compare, design, estimate, load, posterior, report, run, status
+    from ipe_bench.baselines.sequential import Sequential, Track
     from ipe_bench.basics.errors import UserError
     from ipe_bench.basics.statuses import Status
     from ipe_bench.estimators.base import Estimates, Estimator
-    from ipe_bench.estimators.ipe import IPE
+    from ipe_bench.estimators.ipe import IPE, State, System
     from ipe_bench.measurements.base import Measurement, Parameter
+    from ipe_bench.measurements.ode.model import OdeMeasurement
     from ipe_bench.measurements.problem import Problem
     from ipe_bench.noise.base import Noise
     from ipe_bench.trials.scenario import Scenario
 
 _HOMES = {
     "api": ("audit", "check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status"),
+    "baselines.sequential": ("Sequential", "Track"),
     "basics.errors": ("UserError",),
     "basics.statuses": ("Status",),
     "estimators.base": ("Estimates", "Estimator"),
-    "estimators.ipe": ("IPE",),
+    "estimators.ipe": ("IPE", "State", "System"),
     "measurements.base": ("Measurement", "Parameter"),
+    "measurements.ode.model": ("OdeMeasurement",),
     "measurements.problem": ("Problem",),
     "noise.base": ("Noise",),
     "trials.scenario": ("Scenario",),
@@ -47,10 +51,15 @@ __all__ = [
     "Estimator",
     "Measurement",
     "Noise",
+    "OdeMeasurement",
     "Parameter",
     "Problem",
     "Scenario",
+    "Sequential",
+    "State",
     "Status",
+    "System",
+    "Track",
     "UserError",
     "__version__",
     "audit",

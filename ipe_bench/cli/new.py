@@ -19,8 +19,7 @@ RECORDS = {"statistic": "STATISTIC", "figure": "FIGURE", "table": "table", "sect
 ALONE = {
     "function": (
         "{name}.py",
-        'measurement=function measurement.of={name}:{name} "measurement.columns.t=[0,1,2,3,4,5,6,7]"'
-        " noise=gaussian noise.deviation=0.01",
+        'measurement=function measurement.of={name}:{name} "measurement.columns.t=[0,1,2,3,4]"',
     ),
     "ode": ("{name}.yaml", "measurement=ode measurement.file={name}.yaml"),
 }
@@ -29,15 +28,25 @@ ALONE = {
 
 def main(kind: str, name: str) -> int:
     """Writes plugins/NAME in the working folder, or the one file of a function or of differential equations."""
+    kind = "measurement" if kind == "model" else kind
+    if kind == "skill":
+        from ipe_bench.cli.skill import write_skill
+
+        files = write_skill(Path(name))
+        print(f"{name} is ready: {', '.join(path.name for path in files)}")
+        return 0
     if kind not in (*MODELS, *KINDS):
-        raise UserError(f"{kind}: {unknown(kind, (*MODELS, *KINDS), 'kind')}")
-    _check_name(kind, name)
+        raise UserError(f"{kind}: {unknown(kind, (*MODELS, *KINDS, 'skill'), 'kind')}")
+    group = "baseline" if kind == "filter" else kind
+    _check_name(group, name)
     if kind in ALONE:
         file, choice = (text.format(name=name) for text in ALONE[kind])
         if Path(file).exists():
             raise UserError(f"{file}: is there already and is not overwritten; choose another name")
         _fill(Path(file), f"{kind}{Path(file).suffix}", {"name": name})
-        print(f"{file} is ready. Try:\n  ipe-bench run {choice} error_scale=0.1 trials=100")
+        noise = "noise=gaussian noise.deviation=0.01 " if kind == "function" else ""
+        print(f"{file} is ready. Try:\n  ipe-bench check {choice}")
+        print(f"  ipe-bench run {choice} {noise}error_scale=0.1 trials=100")
         return 0
     folder, package = Path("plugins") / name, f"ipe_bench_{name}"
     if folder.exists():
@@ -50,7 +59,7 @@ def main(kind: str, name: str) -> int:
         "README.md": f"{family}readme.md" if family else "README.md",
         f"{package}/__init__.py": f"{family}init.py",
         f"{package}/{name}.py": f"{kind}.py",
-        f"{package}/conf/{kind}/{name}.yaml": "record.yaml" if kind in RECORDS else f"{kind}.yaml",
+        f"{package}/conf/{group}/{name}.yaml": "record.yaml" if kind in RECORDS else f"{kind}.yaml",
         f"tests/test_{name}.py": f"{family}test.py",
     }
     if kind == "experiment":  # it has no class
@@ -58,7 +67,7 @@ def main(kind: str, name: str) -> int:
     for target, source in texts.items():
         _fill(folder / target, source, words)
     choices = {"solver": f'"solver=[{name}]"', "baseline": f'"baseline=[{name}]"', "experiment": f"+experiment={name}"}
-    choose = "" if kind in RECORDS else choices.get(kind, f"{kind}={name}") + " "
+    choose = "" if kind in RECORDS else choices.get(group, f"{group}={name}") + " "
     choose = "figures=all " if kind == "figure" else choose  # the figures of main are chosen among our own
     print(f"{folder} is ready. Try:\n  ipe-bench check {folder}\n  ipe-bench run {choose}trials=100")
     return 0

@@ -24,7 +24,7 @@ Exit codes: 0 done; 1 done, but some pieces failed or are missing; 2 a mistake i
 """
 MODELS = ("function", "ode")
 """Models of one file."""
-KINDS = ("solver", "baseline", "measurement", "noise", "prior", "execution")
+KINDS = ("solver", "baseline", "filter", "measurement", "noise", "prior", "execution")
 KINDS += ("statistic", "figure", "table", "section", "experiment")
 """Of plugins that `new` makes."""
 INFO_TOPICS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
@@ -242,14 +242,19 @@ The same results give the same file, so that the digest may stand in a paper. Ot
         "whether a plugin keeps the promises that every component makes",
         "0 all checks passed; 1 some failed",
         "",
-        (_several("folders", "DIR", "folders of plugins, such as plugins/my_plugin"),),
+        (_several("words", "DIR", "folders of plugins, or KEY=VALUE: measurement=ode measurement.file=my.yaml"),),
     ),
     "new": (
         "a working model of one file, or a plugin in plugins/NAME, to start from",
         "",
-        "",
+        """
+  ipe-bench new solver my_solver                  plugins/my_solver; model means measurement, a filter is a baseline
+  ipe-bench new ode my_model                      my_model.yaml, differential equations
+  ipe-bench new function my_model                 my_model.py, a function of parameters and columns
+  ipe-bench new skill DIR                         pages by which a coding agent writes plugins, into a new folder DIR
+""",
         (
-            _argument("kind", metavar="KIND", help=f"{', '.join((*MODELS, *KINDS[:-1]))} or {KINDS[-1]}"),
+            _argument("kind", metavar="KIND", help=f"{', '.join((*MODELS, *KINDS))} or skill"),
             _argument("name", metavar="NAME", help="small letters, digits and underscores"),
         ),
     ),
