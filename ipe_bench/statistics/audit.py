@@ -7,7 +7,7 @@ errors of Student's law with the stated covariance are honest, and chi-square li
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -172,14 +172,13 @@ def audit(claims: Claims) -> Audit:
                     f"audit: errors of {name} are {factor.value:.3g} times as large as reported, the factor between "
                     "degrees and radians; give both in one unit"
                 )
-    families = _Families(claims, nees)
     (scale,) = _factors(claims, nees[:, None] / claims.n, 1 - ALPHA / 2)
-    refused = _holm(families.tests, {"scale"} if scale.wrong else set())
+    questions = _questions(claims, nees)
+    refused = _holm({name: p for name, (p, _) in questions.items()}, {"scale"} if scale.wrong else set())
     whole = claims.joint and claims.runs == len(nees)
     limits = mean_limits(claims.n, claims.runs) if whole else (np.nan, np.nan)
-    told = [_of_scale(claims, scale, nees)]
-    told += [families.words[name]() for name in ("direction", "bias", "tails", "trend") if name in refused]
-    return Audit(claims, scale, each, _bias(claims), float(nees.mean() / claims.n), limits, tuple(told[:3]))
+    told = [_of_scale(claims, scale, nees), *(words for name, (_, words) in questions.items() if name in refused)]
+    return Audit(claims, scale, each, _bias(claims)[0], float(nees.mean() / claims.n), limits, tuple(told[:3]))
 
 
 def _of_scale(claims: Claims, scale: Factor, nees: Array) -> str:
@@ -202,75 +201,50 @@ def _runs_needed(claims: Claims, nees: Array) -> int:
     return int(np.ceil(spread * ((ndtri(1 - ALPHA / 4) + ndtri(0.8)) / (2 * np.log(MATTERS))) ** 2))
 
 
-def _holm(tests: Mapping[str, Callable[[float], bool]], refused: set[str]) -> set[str]:
-    """The families that are refused at `ALPHA` over all of them, each given as whether it is refused at a level, with
-    the weights of `_WEIGHTS` (Holm, Scand. J. Statist. 6, 1979, section 4); `refused` says if the scale is."""
+def _holm(p: Mapping[str, float], refused: set[str]) -> set[str]:
+    """The families that are refused at `ALPHA` over all of them, with the weights of `_WEIGHTS` (Holm, Scand. J.
+    Statist. 6, 1979, section 4); `refused` says if the scale is."""
     while True:
-        remaining = {name: _WEIGHTS[name] for name in ("scale", *tests) if name not in refused}
+        remaining = {name: _WEIGHTS[name] for name in ("scale", *p) if name not in refused}
         share = ALPHA / max(sum(remaining.values()), 1.0)
-        new = {name for name, weight in remaining.items() if name in tests and tests[name](share * weight)}
+        new = {name for name, weight in remaining.items() if name in p and p[name] <= share * weight}
         if not new:
             return refused
         refused = refused | new
 
 
-class _Families:
-    """The questions that are asked of a report beside how large errors are: tests by level, and words."""
+def _questions(claims: Claims, nees: Array) -> dict[str, tuple[float, str]]:
+    """By family, how often chance does as much in an honest report, and what is said if that is rare."""
+    found = {}
+    if claims.n > 1 and claims.joint:
+        p, directions = _worst_direction(claims)
+        found["direction"] = p, _direction_words(claims, directions)
+    bias, p = _bias(claims)
+    worst = int(np.argmax(np.abs(bias[:, 0]) / (bias[:, 2] - bias[:, 1])))
+    value, low, high = bias[worst]
+    said = f"{claims.names[worst]} is biased by {value:+.2f} reported deviations ({low:+.2f} to {high:+.2f})."
+    found["bias"] = p, said
+    if claims.runs == len(nees):
+        parts = [_tails(w) for w in ([claims.w] if claims.joint else np.split(claims.z, claims.n, axis=1))]
+        ratio = max(ratio for _, ratio in parts)
+        said = f"their fourth moment is {ratio:.1f} times that of a normal law."
+        p = min(1.0, len(parts) * min(p for p, _ in parts))
+        found["tails"] = p, f"Errors have heavier tails than normal ones: {said}"
+    if trend := _trend(claims, nees):
+        p, what, column = trend
+        found["trend"] = p, f"{what} changes with {column} (p = {p:.1g})."
+    return found
 
-    def __init__(self, claims: Claims, nees: Array) -> None:
-        self.claims = claims
-        self.independent = claims.runs == len(nees)
-        self.tests: dict[str, Callable[[float], bool]] = {"bias": self._biased}
-        self.words: dict[str, Callable[[], str]] = {"bias": self._bias_words}
-        if claims.n > 1 and claims.joint:
-            self.tests["direction"], self.words["direction"] = self._directed, self._direction_words
-        if self.independent:
-            parts = [claims.w] if claims.joint else [column[:, None] for column in claims.z.T]
-            found = [_tails(part) for part in parts]
-            self._tails = min(1.0, len(found) * min(p for p, _ in found)), max(ratio for _, ratio in found)
-            self.tests["tails"], self.words["tails"] = lambda level: self._tails[0] <= level, self._tail_words
-        self._trend = _trend(claims, nees)
-        if self._trend is not None:
-            p = self._trend[0]
-            self.tests["trend"], self.words["trend"] = lambda level: p <= level, self._trend_words
 
-    def _biased(self, level: float) -> bool:
-        bias = _bias(self.claims, level)
-        return bool(((bias[:, 1] > 0) | (bias[:, 2] < 0)).any())
-
-    def _bias_words(self) -> str:
-        bias = _bias(self.claims)
-        worst = int(np.argmax(np.abs(bias[:, 0]) / (bias[:, 2] - bias[:, 1])))
-        value, low, high = bias[worst]
-        return f"{self.claims.names[worst]} is biased by {value:+.2f} reported deviations ({low:+.2f} to {high:+.2f})."
-
-    @cached_property
-    def _direction(self) -> tuple[float, Array]:
-        return _worst_direction(self.claims)
-
-    def _directed(self, level: float) -> bool:
-        return self._direction[0] <= level
-
-    def _direction_words(self) -> str:
-        claims = self.claims
-        assert claims.correlation is not None
-        found = [(_factors(claims, np.square(claims.w @ v)[:, None], 1 - ALPHA)[0], v) for v in self._direction[1]]
-        factor, v = max(found, key=lambda pair: abs(np.log(pair[0].value)))
-        values, vectors = np.linalg.eigh(claims.correlation.mean(axis=0))
-        c = (vectors * values**-0.5) @ vectors.T @ v
-        named = _combination(c / np.linalg.norm(c), claims.names)
-        return f"In the worst direction, {named} in reported deviations, true errors are {factor.words}."
-
-    def _tail_words(self) -> str:
-        return (
-            f"Errors have heavier tails than normal ones: their fourth moment is {self._tails[1]:.1f} times that of a "
-            "normal law."
-        )
-
-    def _trend_words(self) -> str:
-        assert self._trend is not None
-        p, what, column = self._trend
-        return f"{what} changes with {column} (p = {p:.1g})."
+def _direction_words(claims: Claims, directions: Array) -> str:
+    """Of the directions (2, n) of w the one in which errors are farther from what is reported."""
+    assert claims.correlation is not None
+    found = [(_factors(claims, np.square(claims.w @ v)[:, None], 1 - ALPHA)[0], v) for v in directions]
+    factor, v = max(found, key=lambda pair: abs(np.log(pair[0].value)))
+    values, vectors = np.linalg.eigh(claims.correlation.mean(axis=0))
+    c = (vectors * values**-0.5) @ vectors.T @ v
+    named = _combination(c / np.linalg.norm(c), claims.names)
+    return f"In the worst direction, {named} in reported deviations, true errors are {factor.words}."
 
 
 def _per_run(claims: Claims, values: Array) -> Array:
@@ -288,11 +262,14 @@ def _factors(claims: Claims, squares: Array, level: float) -> tuple[Factor, ...]
     return tuple(map(Factor, np.sqrt(mean.mean(axis=0)).tolist(), low.tolist(), high.tolist()))
 
 
-def _bias(claims: Claims, alpha: float = ALPHA) -> Array:
+def _bias(claims: Claims) -> tuple[Array, float]:
+    """The mean errors with their intervals (n, 3), and how often chance does as much to any."""
     mean = _per_run(claims, claims.z)
     centre, error = mean.mean(axis=0), mean.std(axis=0, ddof=1) / np.sqrt(claims.runs)
-    reach = stdtrit(claims.runs - 1, 1 - alpha / 2 / claims.n) * error
-    return np.column_stack([centre, centre - reach, centre + reach])
+    reach = stdtrit(claims.runs - 1, 1 - ALPHA / 2 / claims.n) * error
+    farthest = float((np.abs(centre) / np.maximum(error, 1e-300)).max())
+    p = min(1.0, 2 * claims.n * float(stdtr(claims.runs - 1, -farthest)))
+    return np.column_stack([centre, centre - reach, centre + reach]), p
 
 
 def _worst_direction(claims: Claims) -> tuple[float, Array]:

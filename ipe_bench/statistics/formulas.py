@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import betaincinv, gammaincinv, ndtri
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.statistics.calibration import shared_level
+from ipe_bench.statistics.calibration import overall_p, overall_words, shared_level
 from ipe_bench.statistics.consistency import mean_limits
 from ipe_bench.statistics.histories import FixedPointBound, fixed_point_bound, observed_constant
 from ipe_bench.statistics.intervals import (
@@ -80,14 +80,14 @@ def rms(values: Array) -> float:
     return float(size * np.sqrt(np.mean((values / size) ** 2)))
 
 
-def over_linear_bound(values: Callable[[Sample], Array]) -> Callable[[Sample], float]:
-    """The root mean square over parameters of values (n,) over the linear bound."""
-    return lambda s: rms(values(s) / s.linear_bound)
+def in_units(values: Array, s: Sample) -> Array:
+    """Values (n,) in the parameters' own units, and behind them their root mean square over the linear bound."""
+    return np.append(values * s.sizes, rms(values / s.linear_bound))
 
 
-def in_units(values: Callable[[Sample], Array]) -> Callable[[Sample], Array]:
-    """Values (n,) in the parameters' own units."""
-    return lambda s: values(s) * s.sizes
+def of_each(values: Callable[[Sample], Array]) -> Callable[[Sample], Array]:
+    """The formula of values (n,) that gives what is shown of them (n + 1,); see `in_units`."""
+    return lambda s: in_units(values(s), s)
 
 
 # Errors --------------------------------------------------------------------------------------------------------------
@@ -184,22 +184,13 @@ def rmse_ends_anytime(s: Sample) -> tuple[Array, Array]:
     return rms_sequence(squares(s), degrees(s))
 
 
-def overall_ends(ends: Callable[[Sample], tuple[Array, Array]]) -> Callable[[Sample], Limits]:
-    return lambda s: tuple(float(end[s.n]) for end in ends(s))
+def ends_in_units(ends: Callable[[Sample], tuple[Array, Array]]) -> Callable[[Sample], Limits]:
+    return lambda s: tuple(end * np.append(s.sizes, 1.0) for end in ends(s))
 
 
-def each_ends(ends: Callable[[Sample], tuple[Array, Array]]) -> Callable[[Sample], Limits]:
-    return lambda s: tuple(end[: s.n] * s.sizes for end in ends(s))
-
-
-def error_quantile(q: float) -> tuple[Callable[[Sample], float], Callable[[Sample], Array]]:
-    def overall(s: Sample) -> float:
-        return quantile(together(s), q)
-
-    def each(s: Sample) -> Array:
-        return np.array([quantile(np.abs(e), q) for e in s.error.T]) * s.sizes
-
-    return overall, each
+def error_quantile(s: Sample, q: float) -> Array:
+    """Of each parameter's absolute error, and of `together` (n + 1,)."""
+    return np.append(np.array([quantile(np.abs(e), q) for e in s.error.T]) * s.sizes, quantile(together(s), q))
 
 
 def over_bound(s: Sample) -> Array:
@@ -289,22 +280,18 @@ def bound_all(s: Sample) -> Array:
     return np.sqrt(mean(s.of_truth(s.bound_kind) ** 2))
 
 
-def efficiency(s: Sample) -> float:
-    return float(ratio(over_linear_bound(applying_bound)(s), over_linear_bound(rmse)(s)))
-
-
-def efficiency_each(s: Sample) -> Array:
-    return ratio(applying_bound(s) * s.sizes, rmse(s) * s.sizes)
+def efficiency(s: Sample) -> Array:
+    return ratio(in_units(applying_bound(s), s), in_units(rmse(s), s))
 
 
 def efficiency_limits(s: Sample) -> Limits:
-    bound, (low, high) = over_linear_bound(applying_bound)(s), overall_ends(rmse_ends)(s)
-    return float(ratio(bound, high)), float(ratio(bound, low))
-
-
-def efficiency_limits_each(s: Sample) -> Limits:
-    bound, (low, high) = applying_bound(s) * s.sizes, each_ends(rmse_ends)(s)
+    bound, (low, high) = in_units(applying_bound(s), s), ends_in_units(rmse_ends)(s)
     return ratio(bound, high), ratio(bound, low)
+
+
+def efficiency_all(s: Sample) -> Array:
+    whole = ratio(rms(bound_all(s) / s.linear_bound), rms(rmse_all(s) / s.linear_bound))
+    return np.append(ratio(bound_all(s), rmse_all(s)), whole)
 
 
 @once
@@ -321,18 +308,10 @@ def van_trees(s: Sample) -> Array:
     return _van_trees(s)[0]
 
 
-def _van_trees_ends(s: Sample) -> tuple[Array, Array]:
-    """Where the bound (n,) lies for truths without end, by the scatter of the information among those it is from."""
-    bound, error = _van_trees(s)
-    return np.maximum(bound - NORMAL_95 * error, 0.0), bound + NORMAL_95 * error
-
-
 def van_trees_limits(s: Sample) -> Limits:
-    return tuple(rms(end / s.linear_bound) for end in _van_trees_ends(s))
-
-
-def van_trees_limits_each(s: Sample) -> Limits:
-    return tuple(end * s.sizes for end in _van_trees_ends(s))
+    """Where the bound lies for truths without end, by the scatter of the information among those it is from."""
+    bound, error = _van_trees(s)
+    return in_units(np.maximum(bound - NORMAL_95 * error, 0.0), s), in_units(bound + NORMAL_95 * error, s)
 
 
 def eq_14(s: Sample) -> Array:
@@ -392,25 +371,19 @@ def reported(s: Sample) -> Array:
     return np.sqrt(mean(s.deviation**2, s.solved & np.isfinite(s.deviation).all(axis=1)))
 
 
-def nees(s: Sample) -> float:
-    known = reports_covariance(s) and s.solved.any()
-    return float(np.mean(s.scalars["nees"][s.solved]) / s.n) if known else np.nan
-
-
 @once
-def nees_each(s: Sample) -> Array:
+def nees(s: Sample) -> Array:
     if not (reports_covariance(s) and s.solved.any()):
-        return np.full(s.n, np.nan)
-    return mean((np.abs(s.error) / s.deviation) ** 2, s.solved)
+        return np.full(s.n + 1, np.nan)
+    each = mean((np.abs(s.error) / s.deviation) ** 2, s.solved)
+    return np.append(each, np.mean(s.scalars["nees"][s.solved]) / s.n)
 
 
 def nees_limits(s: Sample) -> Limits:
-    return mean_limits(s.n, int(s.solved.sum())) if reports_covariance(s) else (np.nan, np.nan)
-
-
-def nees_limits_each(s: Sample) -> Limits:
-    low, high = mean_limits(1, int(s.solved.sum())) if reports_covariance(s) else (np.nan, np.nan)
-    return np.full(s.n, low), np.full(s.n, high)
+    if not reports_covariance(s):
+        return np.nan, np.nan
+    each, whole = (mean_limits(degrees, int(s.solved.sum())) for degrees in (1, s.n))
+    return tuple(np.append(np.full(s.n, one), end) for one, end in zip(each, whole, strict=True))
 
 
 def nees_median(s: Sample) -> float:
@@ -426,29 +399,25 @@ def nees_median_limits(s: Sample) -> Limits:
     return tuple(np.array([low, high]) / (2 * gammaincinv(s.n / 2, 0.5)))
 
 
-def coverage(s: Sample) -> float:
-    return share(s.scalars["nees"] <= 2 * gammaincinv(s.n / 2, 0.95)) if reports_covariance(s) else np.nan
-
-
 @once
-def coverage_each(s: Sample) -> Array:
+def coverage(s: Sample) -> Any:
     if not reports_covariance(s):
-        return np.full(s.n, np.nan)
-    return mean(np.abs(s.error) / s.deviation <= NORMAL_95)
+        return np.nan
+    each = mean(np.abs(s.error) / s.deviation <= NORMAL_95)
+    return np.append(each, share(s.scalars["nees"] <= 2 * gammaincinv(s.n / 2, 0.95)))
 
 
 def claims(s: Sample) -> int:
     return int((s.converged & ~np.isnan(s.scalars["nees"])).sum())
 
 
-def calibrated_each(s: Sample, name: str) -> Array:
-    """A number of each parameter's calibration."""
-    return np.array([getattr(part, name) for part in s.calibrations[:-1]] or [np.nan] * s.n)
+def calibration_p(s: Sample) -> Any:
+    return [*(part.p for part in s.calibrations[:-1]), overall_p(s.calibrations)] if s.calibrations else np.nan
 
 
-def calibration_each(s: Sample) -> Array:
-    level = shared_level(s.calibrations)
-    return np.array([part.words(level) for part in s.calibrations[:-1]] or ["-"] * s.n, dtype=object)
+def calibration(s: Sample) -> Any:
+    each = [part.words(shared_level(s.calibrations)) for part in s.calibrations[:-1]]
+    return [*each, overall_words(s.calibrations, s.names)] if s.calibrations else "-"
 
 
 def mean_nis(s: Sample) -> float:

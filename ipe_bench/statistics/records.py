@@ -14,8 +14,6 @@ import numpy as np
 
 import ipe_bench.statistics.formulas as f
 from ipe_bench.basics.errors import UserError, place_of
-from ipe_bench.basics.linalg import Array
-from ipe_bench.statistics.calibration import overall_p, overall_words
 from ipe_bench.statistics.consistency import SEEN, clopper_pearson, verdict
 from ipe_bench.statistics.histories import CLOSE, orders_of
 from ipe_bench.statistics.intervals import FIRST, HEAVY, LARGEST_SAMPLE, RESAMPLES, quantile, share_sequence
@@ -46,9 +44,8 @@ Limits = f.Limits
 class Statistic:
     """One statistic of a scenario under an estimator.
 
-    `overall` gives its value over all parameters; `each` gives those of the parameters (n,) in their own units, and
-    where there is none, it is a property of whole trials, the same in every row. `limits` and `each_limits` give an
-    interval, whose ends are columns of their own.
+    `values` gives one value, of whole trials, or those of the parameters in their own units, and of all parameters last
+    (n + 1,). `limits` gives the same of both ends of an interval, which are columns of their own.
     """
 
     name: str
@@ -57,10 +54,8 @@ class Statistic:
     over: str
     """The trials that count."""
     meaning: str
-    overall: Callable[[Sample], Any]
-    each: Callable[[Sample], Array] | None = None
+    values: Callable[[Sample], Any]
     limits: Callable[[Sample], Limits] | None = None
-    each_limits: Callable[[Sample], Limits] | None = None
     given: Given = ""
     """The trials that it is conditional on: their number is the column `count`."""
     kind: Kind = "number"
@@ -87,16 +82,9 @@ class Statistic:
 
     def columns_of(self, sample: Sample) -> dict[str, list[Any]]:
         """Its columns, a value for each parameter and one for all together."""
-        values = [_column(sample.n, self.overall(sample), None if self.each is None else self.each(sample))]
-        if self.limits is not None:
-            ends = self.limits(sample)
-            each = (None, None) if self.each_limits is None else self.each_limits(sample)
-            values += [_column(sample.n, end, own) for end, own in zip(ends, each, strict=True)]
-        return dict(zip(self.columns, values, strict=True))
-
-
-def _column(n: int, overall: Any, each: Array | None) -> list[Any]:
-    return [overall] * (n + 1) if each is None else [*each.tolist(), overall]
+        found = [self.values(sample), *(() if self.limits is None else self.limits(sample))]
+        columns = [np.asarray(one).tolist() if np.ndim(one) else [one] * (sample.n + 1) for one in found]
+        return dict(zip(self.columns, columns, strict=True))
 
 
 def frame_columns(statistics: Sequence[Statistic]) -> tuple[str, ...]:
@@ -108,13 +96,6 @@ def rows_of(statistics: Sequence[Statistic], sample: Sample) -> list[dict[str, A
     columns = {name: values for s in statistics for name, values in s.columns_of(sample).items()}
     return [{name: values[i] for name, values in columns.items()} for i in range(sample.n + 1)]
 
-
-def _in_both(values: Callable[[Sample], Array]) -> tuple[Callable[[Sample], float], Callable[[Sample], Array]]:
-    """Values (n,) as a root mean square over parameters of the value over the linear bound, and in their own units."""
-    return f.over_linear_bound(values), f.in_units(values)
-
-
-_MEDIAN, _Q95 = f.error_quantile(0.5), f.error_quantile(0.95)
 
 STATISTICS: tuple[Statistic, ...] = (
     Statistic("trials", "trials", "all trials", "Their number.", len, kind="count", where=("all_trials",)),
@@ -279,7 +260,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "bias",
         "solved trials",
         "Mean error.",
-        *_in_both(f.bias),
+        f.of_each(f.bias),
         given="solved",
         kind="physical",
         where=("parameters", "theory"),
@@ -289,7 +270,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "std",
         "solved trials",
         "Standard deviation of the error (n - 1).",
-        *_in_both(f.std),
+        f.of_each(f.std),
         given="solved",
         kind="physical",
         where=("parameters",),
@@ -303,9 +284,8 @@ STATISTICS: tuple[Statistic, ...] = (
         f" estimator; above {LARGEST_SAMPLE} trials, groups of consecutive trials are resampled. None for fewer than"
         f" {FEW} trials, and none where a few trials carry the sum of squares: where its effective number of trials is"
         f" less than that of normal errors in all but {100 * HEAVY:g} % of cases.",
-        *_in_both(f.rmse),
-        limits=f.overall_ends(f.rmse_ends),
-        each_limits=f.each_ends(f.rmse_ends),
+        f.of_each(f.rmse),
+        limits=f.ends_in_units(f.rmse_ends),
         given="solved",
         kind="physical",
         where=("parameters", "covariances", "theory"),
@@ -318,9 +298,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "The same root mean square error, with an asymptotic interval of 95 % that stays valid however often one looks"
         f" and whenever one stops (Waudby-Smith et al., Ann. Statist. 52, 2024); none for fewer than {FIRST} trials,"
         " nor where a few trials carry the sum of squares.",
-        *_in_both(f.rmse),
-        limits=f.overall_ends(f.rmse_ends_anytime),
-        each_limits=f.each_ends(f.rmse_ends_anytime),
+        f.of_each(f.rmse),
+        limits=f.ends_in_units(f.rmse_ends_anytime),
         given="solved",
         kind="physical",
     ),
@@ -331,8 +310,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "How many equal ones would share the sum of squared errors as evenly as the trials do, (Σ e²)² / Σ e⁴ (Kish,"
         " Survey Sampling, 1965): a third of the trials for normal errors of one parameter, one where a single trial"
         " carries all.",
-        lambda s: float(f.squares(s).effective[s.n]),
-        lambda s: f.squares(s).effective[: s.n],
+        lambda s: f.squares(s).effective,
         given="solved",
         where=("parameters",),
     ),
@@ -341,7 +319,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "rmse, common",
         "trials that every estimator of the scenario solved",
         "Root mean square error.",
-        *_in_both(f.rmse_common),
+        f.of_each(f.rmse_common),
         given="common",
         where=("solved_trials",),
     ),
@@ -350,8 +328,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "linear bound",
         "no trials: the same for all",
         "Standard deviation of the linear least-squares estimate, eq. (5), if the model were linear.",
-        lambda s: 1.0,
-        lambda s: s.linear_bound * s.sizes,
+        lambda s: np.append(s.linear_bound * s.sizes, 1.0),
         kind="physical",
         where=("parameters",),
     ),
@@ -360,7 +337,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "CRLB",
         "solved trials",
         "Cramér-Rao bound (J' R⁻¹ J)⁻¹ at the truth: root mean square of its standard deviation.",
-        *_in_both(f.crlb),
+        f.of_each(f.crlb),
         given="solved",
         kind="physical",
         where=("parameters", "covariances", "theory"),
@@ -371,7 +348,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "solved trials",
         "(J' R⁻¹ J + P₀⁻¹)⁻¹ at the truth, which estimators that use a prior are compared with: root mean square of its"
         " standard deviation. It is a local bound, for each truth its own, and not Van Trees's.",
-        *_in_both(f.bayes),
+        f.of_each(f.bayes),
         given="solved",
         kind="physical",
         where=("parameters",),
@@ -383,9 +360,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "(E[J' R⁻¹ J] + P₀⁻¹)⁻¹, which no estimator can beat on average over the prior, biased or not (Van Trees,"
         " Detection, Estimation, and Modulation Theory I, 1968, sec. 2.4): standard deviation. The mean E is over"
         f" {EXPECTED} truths of each seed; its interval, 95 %, is that of this mean.",
-        *_in_both(f.van_trees),
+        f.of_each(f.van_trees),
         limits=f.van_trees_limits,
-        each_limits=f.van_trees_limits_each,
         kind="physical",
         where=("parameters",),
     ),
@@ -396,7 +372,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "Mean error that theory expects of least squares: under a wrong model, the distance to the parameters that come"
         " closest to the error-free readings (Vuong, Caltech working paper 652, 1986); under the right one, the bias of"
         " second order (Box, J. R. Stat. Soc. B 33, 1971).",
-        *_in_both(f.predicted_bias),
+        f.of_each(f.predicted_bias),
         given="solved",
         kind="physical",
         where=("theory",),
@@ -409,7 +385,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " that distance and the asymptotic covariance A⁻¹ B A⁻¹ of least squares about it (Vuong, 1986; Richmond and"
         " Horowitz, IEEE Trans. Signal Processing 63, 2015), which is no bound: others may err less; under the right"
         " one, of the Cramér-Rao bound and the bias of second order.",
-        *_in_both(f.predicted_rmse),
+        f.of_each(f.predicted_rmse),
         given="solved",
         kind="physical",
         where=("theory",),
@@ -437,7 +413,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "solved trials",
         "Root mean square of the standard deviation that the estimator itself reports: eq. (5) for the linear LSE, the"
         " sandwich (H⁺J)⁻¹ H⁺RH⁺' (H⁺J)⁻ᵀ at the estimate for the frozen root.",
-        *_in_both(f.reported),
+        f.of_each(f.reported),
         given="solved",
         kind="physical",
         where=("covariances",),
@@ -449,7 +425,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "Standard deviation by eq. (14), eq. (5) with the compensation error N(x) - N(x̂) of a root of eq. (11) added"
         " as if it were independent of the noise. It is not: x̂ is made from the noise, and the cross terms that"
         " eq. (14) leaves out are of the same order. The sandwich has them, to first order.",
-        *_in_both(f.eq_14),
+        f.of_each(f.eq_14),
         given="solved",
         kind="physical",
         where=("covariances",),
@@ -459,8 +435,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "rmse / bound",
         "solved trials",
         "Root mean square error over the linear bound.",
-        f.over_linear_bound(f.rmse),
-        lambda s: f.ratio(f.rmse(s) * s.sizes, s.linear_bound * s.sizes),
+        lambda s: f.ratio(f.in_units(f.rmse(s), s), np.append(s.linear_bound * s.sizes, 1.0)),
         given="solved",
         where=("parameters",),
     ),
@@ -471,9 +446,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "Bound over rmse, as standard deviations: 1 for an efficient estimator. The bound is the one at the truth,"
         " Cramér and Rao's or, for estimators that use a prior, the Bayesian one. Interval: from that of rmse.",
         f.efficiency,
-        f.efficiency_each,
         limits=f.efficiency_limits,
-        each_limits=f.efficiency_limits_each,
         given="solved",
         where=("solved_trials", "parameters"),
         titles={"solved_trials": "efficiency"},
@@ -484,7 +457,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "rmse, all",
         "all trials",
         "Root mean square error, whatever became of the trial; infinite where one has no finite estimate.",
-        *_in_both(f.rmse_all),
+        f.of_each(f.rmse_all),
         kind="physical",
         where=("all_trials", "parameters"),
         titles={"all_trials": "rmse / linear bound"},
@@ -495,8 +468,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "all trials",
         "The same bound over the root mean square error of all trials: it lets nobody off a trial, so it compares"
         " estimators that solve an equation with those that do not.",
-        lambda s: float(f.ratio(f.over_linear_bound(f.bound_all)(s), f.over_linear_bound(f.rmse_all)(s))),
-        lambda s: f.ratio(f.bound_all(s), f.rmse_all(s)),
+        f.efficiency_all,
         where=("all_trials", "parameters"),
         titles={"all_trials": "efficiency, uncapped"},
     ),
@@ -506,7 +478,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "all trials",
         "Median of the absolute error, what is not finite counting as infinite; over all parameters, of each trial's"
         " root mean square over parameters of error over linear bound.",
-        *_MEDIAN,
+        lambda s: f.error_quantile(s, 0.5),
         kind="physical",
         where=("parameters",),
     ),
@@ -515,7 +487,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "95 % abs error",
         "all trials",
         "95 % quantile of the same.",
-        *_Q95,
+        lambda s: f.error_quantile(s, 0.95),
         kind="physical",
         where=("parameters",),
     ),
@@ -528,9 +500,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " normal (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, sec."
         " 5.4).",
         f.nees,
-        f.nees_each,
         limits=f.nees_limits,
-        each_limits=f.nees_limits_each,
         given="solved",
         where=("solved_trials", "parameters"),
         titles={"parameters": "NEES", "solved_trials": "NEES / n"},
@@ -543,7 +513,6 @@ STATISTICS: tuple[Statistic, ...] = (
         "Share whose truth lies inside the estimator's own 95 % ellipsoid; per parameter, interval. What is not finite"
         " counts as not covered.",
         f.coverage,
-        f.coverage_each,
         kind="share",
         where=("calibration", "parameters"),
     ),
@@ -577,8 +546,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " squared error under chi-square, is so far from uniform by chance: both are held against bands that an honest"
         " one leaves anywhere with a stated probability (Säilynoja, Bürkner and Vehtari, Stat. Comput. 32, 2022), and"
         " the smaller p is doubled. Of all, the smallest p of the n parameters and of NEES times n + 1 (Bonferroni).",
-        lambda s: overall_p(s.calibrations),
-        lambda s: f.calibrated_each(s, "p"),
+        f.calibration_p,
         kind="probability",
         where=("calibration",),
     ),
@@ -587,8 +555,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "excursion",
         "the same trials",
         "The largest difference between these distribution functions and the uniform one; of all, that of NEES.",
-        lambda s: s.calibrations[-1].excursion if s.calibrations else np.nan,
-        lambda s: f.calibrated_each(s, "excursion"),
+        lambda s: [part.excursion for part in s.calibrations] if s.calibrations else np.nan,
         where=("calibration",),
     ),
     Statistic(
@@ -599,8 +566,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " together: shifted is the median of error over reported deviation (estimate less truth); deviations too small"
         " or too large, the median of its size over that of an honest one; far outside, the share beyond the quantile"
         f" that {GATE:g} should lie beyond, after that factor.",
-        lambda s: overall_words(s.calibrations, s.names),
-        f.calibration_each,
+        f.calibration,
         kind="word",
         where=("calibration", "parameters"),
     ),
@@ -852,7 +818,9 @@ def columns_of_added(record: Statistic, sample: Sample) -> dict[str, list[Any]]:
         raise UserError(place_of(error)) from error
     for name, values in columns.items():
         if len(values) != sample.n + 1:
-            raise UserError(f"{name}: has {len(values) - 1} values for {sample.n} parameters")
+            raise UserError(
+                f"{name}: has {len(values)} values; return one, or one for each of {sample.n} parameters and for all"
+            )
         for value in values:
             if not isinstance(value, str if record.kind == "word" else int | float | np.number):
                 raise UserError(f"{name}: a value is a {type(value).__name__}; return a float, or NaN for none")

@@ -189,7 +189,7 @@ STATISTIC = Statistic({!r}, "mine", "all trials", "Mine.", lambda s: {}{})
 FAULTY = {
     "other": (STATISTIC.format("rmse", "1.0", ""), "is called rmse; give file and record one name"),
     "text": (STATISTIC.format("text", "'one'", ""), "a value is a str; return a float"),
-    "short": (STATISTIC.format("short", "1.0", ", lambda s: s.sizes[:-1]"), "has 3 values for 4 parameters"),
+    "short": (STATISTIC.format("short", "s.sizes", ""), "has 4 values; return one, or one for each of 4 parameters"),
     "colour": (STATISTIC.format("colour", "1.0", ", kind='colour'"), "kind=colour: choose from"),
     "nowhere": (STATISTIC.format("nowhere", "1.0", ", where=('nowhere',)"), "where=nowhere: choose from"),
     "outside": (
