@@ -38,7 +38,7 @@ BUDGETS = {
     "statistics": 4318,
     "real": 2519,
     "plugins": 1249,
-    "report": 4687,
+    "report": 4686,
     "cli": 2878,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""

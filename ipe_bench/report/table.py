@@ -163,7 +163,7 @@ def plain_text(parts: Iterable[Part], width: int = 120) -> str:
     from rich.console import Console
 
     shown = io.StringIO()
-    Console(width=width, file=shown).print(terminal(parts, width))
+    Console(width=width, file=shown, force_jupyter=False).print(terminal(parts, width))
     return shown.getvalue()
 
 
@@ -239,8 +239,8 @@ def environment() -> Environment:
 
 
 def html(parts: Iterable[Part]) -> str:
-    """Tables and sentences as a piece of a page."""
-    return environment().get_template("parts.html.j2").module.fragment(list(parts))  # type: ignore[attr-defined]
+    """Tables and sentences as a piece of a page that has no style for them, such as a notebook."""
+    return environment().get_template("notebook.html.j2").render(parts=list(parts))
 
 
 # Files ---------------------------------------------------------------------------------------------------------------

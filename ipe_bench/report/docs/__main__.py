@@ -16,9 +16,13 @@ SETTINGS = {
     "version": version("ipe-bench"),
     "release": version("ipe-bench"),
     "copyright": "the authors of ipe-bench",
-    "extensions": ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "ipe_bench.report.docs"],
-    "myst_enable_extensions": ["dollarmath", "deflist", "colon_fence"],
+    "extensions": ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "ipe_bench.report.docs"],
+    "myst_enable_extensions": ["attrs_inline", "dollarmath", "deflist", "colon_fence"],
     "myst_heading_anchors": 3,
+    "nb_execution_mode": "force",
+    "nb_execution_in_temp": True,
+    "nb_execution_raise_on_error": True,
+    "nb_execution_timeout": 120,
     "html_theme": "pydata_sphinx_theme",
     "html_title": "ipe-bench",
     "html_show_sourcelink": False,
@@ -57,6 +61,6 @@ def build(output: Path, trials: int) -> int:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("output", nargs="?", default="outputs/docs", type=Path)
-    parser.add_argument("--trials", type=int, default=20, help="of an experiment that has 1000 by itself")
+    parser.add_argument("--trials", type=int, default=10, help="of an experiment that has 1000 by itself")
     arguments = parser.parse_args()
     sys.exit(build(arguments.output, arguments.trials))

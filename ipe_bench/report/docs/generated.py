@@ -1,4 +1,4 @@
-"""Pages that nobody writes: a reference from the program's own descriptions, and a gallery of executed experiments."""
+"""The pages that are made of what the program says of itself, and of what its experiments print and draw."""
 
 from __future__ import annotations
 
@@ -10,8 +10,12 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
+from typing import Any
+
+import pandas as pd
 
 import ipe_bench
 from ipe_bench.basics.errors import UserError
@@ -21,8 +25,10 @@ from ipe_bench.plugins.description import described
 from ipe_bench.plugins.discovery import ESTIMATOR_GROUPS, Option, options
 from ipe_bench.report.definitions import DEFINITIONS
 from ipe_bench.report.figures import INDEX
-from ipe_bench.report.words import duration
+from ipe_bench.report.table import environment
+from ipe_bench.report.words import brief, duration, percent
 from ipe_bench.statistics.records import STATISTICS
+from ipe_bench.statistics.summary import ALL
 
 GROUPS = {
     "measurement": "Measurement models",
@@ -36,8 +42,13 @@ FIGURES = 3
 """Pictures of an experiment that its page shows."""
 ORDINARY, LEAST = 1000, 3
 """Trials of an ordinary experiment, and the least number that a costly one is cut to."""
-_PARTS = {"beyond": "error_scale=300,1000,3000", "mgh": "measurement.start=1", "nist": "measurement.start=2"}
-"""What is asked for of experiments that take minutes even with few trials."""
+_PARTS = {
+    "beyond": ["error_scale=300,1000,3000"],
+    "headline": ["trials=40"],
+    "mgh": ["measurement.start=1"],
+    "nist": ["measurement.start=2"],
+}
+"""The part that is computed of experiments that take minutes, and the trials of the picture on the first page."""
 _STYLE = re.compile(r"\x1b\[[0-9;]*m")
 
 
@@ -55,102 +66,86 @@ def printed_by(command: Sequence[str], columns: int = 80) -> str:
     return "\n".join(line.rstrip() for line in _STYLE.sub("", done.stdout).splitlines())
 
 
+def write_page(path: Path, template: str, **content: Any) -> None:
+    """Writes a page from its template, in which the filter `cell` makes any text a cell of a Markdown table."""
+    made = environment().overlay(autoescape=False)
+    made.filters["cell"] = lambda text: " ".join(str(text).replace("|", "\\|").replace("<", "&lt;").split())
+    write_text(path, made.get_template(f"docs/{template}.md.j2").render(content))
+
+
 def _ours(group: str) -> list[Option]:
     return [option for option in options(group) if option.source.name == "ipe-bench"]
 
 
-# Reference -----------------------------------------------------------------------------------------------------------
-
-
 def write_reference(folder: Path) -> None:
     """Adds pages of options, commands, statuses, statistics and Python names to a folder."""
-    pages = {group: _group_page(group, title) for group, title in GROUPS.items()}
-    statuses = [(f"`{status.label}`", status.reason) for status in Status if status is not Status.RUNNING]
-    pages["statuses"] = [
-        *("# Statuses", "", "How a trial ended. Nothing is left out of the tables because it ended badly.", ""),
-        *_table(("status", "a trial ended so because"), statuses),
-    ]
-    columns = [(f"`{'`, `'.join(r.columns)}`", r.definition) for r in STATISTICS]
-    pages["statistics"] = [
-        *("# Statistics", "", "Columns of `summary.csv`; a scenario, an estimator and a parameter have a row.", ""),
-        *(*_table(("column", "meaning"), columns), "", "## Words of the report", ""),
-        *_table(("word", "meaning"), DEFINITIONS),
-    ]
-    # What each command says of itself when asked.
+    for group, title in GROUPS.items():
+        rows = [(option, described(option)) for option in _ours(group)]
+        key = "estimators.NAME" if group in ESTIMATOR_GROUPS else group
+        write_page(folder / f"{group}.md", "options", group=group, title=title, key=key, options=rows)
+    statuses = [status for status in Status if status is not Status.RUNNING]
+    write_page(folder / "statuses.md", "statuses", statuses=statuses)
+    write_page(folder / "statistics.md", "statistics", records=STATISTICS, definitions=DEFINITIONS)
     summary = printed_by(["--help"], columns=100).rstrip()
-    pages["commands"] = ["# Commands", "", "```text", summary, "```", ""]
-    for command in re.findall(r"^    (\w+)(?:  |$)", summary, re.MULTILINE):
-        said = printed_by([command, "--help"], columns=100).rstrip()
-        pages["commands"] += [f"## {command}", "", "```text", said, "```", ""]
-    pages["python"] = _python_page()
-    for name, lines in pages.items():
-        write_text(folder / f"{name}.md", "\n".join(lines))
-
-
-def _group_page(group: str, title: str) -> list[str]:
-    key = "estimators.NAME" if group in ESTIMATOR_GROUPS else group
-    lines = [f"# {title}", "", f"Config group `{group}`. Keys are set as `{key}.KEY=VALUE`.", ""]
-    for option in _ours(group):
-        rows = [(f"`{o.name}`", f"`{o.value}`" if o.value else "", o.kind, o.meaning) for o in described(option)]
-        lines += [f"## {option.name}", "", option.summary, ""]
-        lines += _table(("option", "value", "takes", "meaning"), rows) if rows else []
-        lines += ["", f"Class `{option.target}`.", ""] if option.target else []
-    return lines
-
-
-def _python_page() -> list[str]:
-    lines = ["# Python", "", "`import ipe_bench as ib` loads nothing; each name is loaded when it is first used.", ""]
-    for name in ipe_bench.__all__:
-        thing = getattr(ipe_bench, name)
-        if hasattr(thing, "__qualname__"):
-            kind, members = ("autoclass", "\n   :members:") if isinstance(thing, type) else ("autofunction", "")
-            place = f"{thing.__module__}.{thing.__qualname__}"
-            lines += [f"```{{eval-rst}}\n.. {kind}:: {place}{members}\n```", ""]
-    return lines
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """The lines of a Markdown table."""
-    cells = [[" ".join(c.replace("|", "\\|").replace("<", "&lt;").split()) for c in row] for row in rows]
-    return [f"| {' | '.join(row)} |" for row in (heads, ["---"] * len(heads), *cells)]
-
-
-# Gallery -------------------------------------------------------------------------------------------------------------
+    names = re.findall(r"^    (\w+)(?:  |$)", summary, re.MULTILINE)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        said = pool.map(lambda name: printed_by([name, "--help"], columns=100).rstrip(), names)
+        write_page(folder / "commands.md", "commands", commands={"": summary, **dict(zip(names, said, strict=True))})
+    things = [getattr(ipe_bench, name) for name in ipe_bench.__all__]
+    places = [(t, f"{t.__module__}.{t.__qualname__}") for t in things if hasattr(t, "__qualname__")]
+    kinds = [("autoclass" if isinstance(thing, type) else "autofunction", place) for thing, place in places]
+    write_page(folder / "python.md", "python", names=kinds)
 
 
 def write_gallery(folder: Path, results: Path, trials: int) -> None:
-    """A page for each experiment, and one that lists them; `trials` is for an experiment that has 1000 by itself, and
-    others have as large a part of theirs."""
-    chosen = _ours("experiment")
-    for k, option in enumerate(chosen, 1):
-        own = (option.config or {}).get("trials", ORDINARY)
-        number = min(own, max(round(own * trials / ORDINARY), min(trials, LEAST)))
-        counted = f"{number} trial{'s' * (number != 1)}"
-        print(f"experiment {k} of {len(chosen)}: {option.name}, {counted} ...", end=" ", flush=True)
-        began = time.perf_counter()
-        write_text(folder / f"{option.name}.md", _page(option, folder, results / option.name, number))
-        print(duration(time.perf_counter() - began, 2), flush=True)
-    lines = ["# Gallery", "", "Every experiment, or a part of it, with few of the trials that it has by itself.", ""]
-    lines += [f"- [{option.name}]({option.name}.md): {option.summary}" for option in chosen]
-    lines += ["", "```{toctree}", ":hidden:", *(option.name for option in chosen), "```"]
-    write_text(folder / "index.md", "\n".join(lines))
+    """A page for each experiment, one that lists them, and a table of the best estimators by model; `trials` is for an
+    experiment that has 1000 by itself, and others have as large a part of theirs."""
+    chosen, found, began = _ours("experiment"), {}, time.perf_counter()
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        running = {pool.submit(_executed, option, folder, results / option.name, trials): option for option in chosen}
+        for number, done in enumerate(as_completed(running), 1):
+            name, figures = running[done].name, done.result()
+            found[name] = figures
+            print(
+                f"experiment {number} of {len(chosen)}: {name}, at {duration(time.perf_counter() - began, 2)}",
+                flush=True,
+            )
+    write_page(folder / "index.md", "gallery", experiments=[(option, found[option.name]) for option in chosen])
+    summaries = [results / option.name / "summary.csv" for option in chosen]
+    rows = [row for path in summaries if path.exists() for row in _best(pd.read_csv(path))]
+    write_page(folder / "best.inc", "best", rows=sorted(rows))
 
 
-def _page(option: Option, folder: Path, results: Path, trials: int) -> str:
-    """What one experiment printed and drew, with its config."""
-    command = ["run", f"+experiment={option.name}"]
-    command += [_PARTS[option.name]] if option.name in _PARTS else []
-    command += [f"trials={trials}"] if (option.config or {}).get("trials") != trials else []
+def _executed(option: Option, folder: Path, results: Path, trials: int) -> list[dict[str, str]]:
+    """Runs one experiment, writes its page, and returns the figures that the page shows."""
+    command, own = (
+        ["run", f"+experiment={option.name}", *_PARTS.get(option.name, ())],
+        (option.config or {}).get("trials", ORDINARY),
+    )
+    number = min(own, max(round(own * trials / ORDINARY), min(trials, LEAST)))
+    if number != own and not any(word.startswith("trials=") for word in command):
+        command.append(f"trials={number}")
     # The paths at its end are of no use to a reader.
-    printed = printed_by([*command, f"output={results.resolve()}"]).partition("\nSummary ")[0].strip()
-    lines = [f"# {option.name}", "", option.summary, "", "```console", f"$ ipe-bench {shlex.join(command)}", "```", ""]
-    lines += ["```text", printed, "```", ""]
+    printed = (
+        printed_by([*command, "execution=serial", f"output={results.resolve()}"]).partition("\nSummary ")[0].strip()
+    )
+    index = results / "figures" / INDEX  # there is none without figures
+    figures = json.loads(index.read_text(encoding="utf-8"))[:FIGURES] if index.exists() else []
     make_folder(folder / "pictures")
-    # A report on certified readings alone may have no figures.
-    index = results / "figures" / INDEX
-    for entry in json.loads(index.read_text(encoding="utf-8"))[:FIGURES] if index.exists() else ():
-        name = entry["name"]
-        shutil.copyfile(results / "figures" / f"{name}.png", folder / "pictures" / f"{option.name}_{name}.png")
-        title = name.replace("_", " ")
-        lines += [f"![{title}](pictures/{option.name}_{name}.png)", "", f"*{entry['caption']}*", ""]
-    return "\n".join([*lines, "## Its config", "", "```yaml", option.text.rstrip(), "```", ""])
+    for figure in figures:
+        picture = results / "figures" / f"{figure['name']}.png"
+        shutil.copyfile(picture, folder / "pictures" / f"{option.name}_{figure['name']}.png")
+    text = {"command": shlex.join(command), "printed": printed, "figures": figures}
+    write_page(folder / f"{option.name}.md", "experiment", option=option, **text)
+    return figures
+
+
+def _best(summary: pd.DataFrame) -> Iterator[tuple[str, ...]]:
+    """For the least and the largest error scale of each simulated model: who succeeds most often, and at what cost."""
+    totals = summary[(summary["parameter"] == ALL) & (summary["noise"] != "certified")]
+    for model, rows in totals.groupby("measurement"):
+        for scale in sorted({rows["error_scale"].min(), rows["error_scale"].max()}):
+            here = rows[rows["error_scale"] == scale].groupby("estimator")[["success", "simulations_median"]].mean()
+            best = here[here["success"] == here["success"].max()].sort_values("simulations_median")
+            cost = brief(best["simulations_median"].iloc[0])
+            yield str(model), f"{scale:g}", ", ".join(best.index), percent(best["success"].iloc[0]), best.index[0], cost
