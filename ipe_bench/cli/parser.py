@@ -105,7 +105,8 @@ readings=FILE       CSV or Parquet; `ipe-bench list measurement -v` says which r
                     A missing reading keeps its row, with an empty cell. A column sigma has standard deviations.
 readings=[A,B]      several files, which share all parameters but those in measurement.own=[NAME].
 noise.deviation=X   the standard deviation of a reading; standard errors and tests rest on it.
-noise=unknown       nobody knows it: it is estimated from the residuals, and the size of these tests nothing.
+noise=unknown       it is estimated, so the size of residuals tests nothing; noise.by=COLUMN: a level for each entry;
+                    "noise.sigma=a + b*h": a formula of the reading's magnitude h and of levels a and b.
 ignore_rows=[3,7]   rows to leave out, by their numbers; ignore_columns=[NAME] leaves out columns.
 parameters.NAME.fixed=X, .lower=X, .upper=X   what is known of a parameter; parameters=FILE.yaml has that of many.
 error_scale=X       how far the parameters may lie from the nominal point: the prior of filters and map_lm.

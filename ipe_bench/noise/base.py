@@ -40,6 +40,14 @@ class Noise(Component, Named, ABC):
     def covariance(self, m: int) -> Covariance:
         """R of m readings, as the estimators assume it."""
 
+    def nominal_covariance(self, model: Measurement) -> Covariance:
+        """R of a model's readings, as estimators are told it."""
+        return self.covariance(model.m)
+
+    def true_levels(self, m: int) -> tuple[Levels, Array] | None:
+        """Levels of m readings, and their logarithms (k,), if bounds are to count them among what is not known."""
+        del m
+
     def levels_of(self, model: Measurement) -> Levels | None:
         """Levels of which standard deviations are formulas, if these are to be estimated with the parameters."""
         del model

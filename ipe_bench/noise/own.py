@@ -11,8 +11,12 @@ from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.options import Positive
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.noise.base import Noise
-from ipe_bench.noise.levels import Levels, read_sigma
+from ipe_bench.noise.levels import READING, Levels, read_sigma
 from ipe_bench.noise.white import Gaussian, Quantization
+
+NO_LEVEL = (
+    "noise=unknown: has no level to simulate with; choose another noise, give noise.levels=[...], or use `estimate`"
+)
 
 
 @dataclass(frozen=True)
@@ -47,11 +51,18 @@ class Unknown(Noise):
     sigma: str = "sigma"
     """Formula of the standard deviation: h is the magnitude of the error-free reading, all other names are levels."""
 
-    estimated = True
+    levels: tuple[Positive, ...] | None = None
+    """True levels in the order of the formula, for `run`: estimators are told R with these, of the nominal readings."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        read_sigma(self.sigma)
+        names = [name for name in read_sigma(self.sigma).names if name != READING]
+        if self.levels is not None and len(self.levels) != len(names):
+            raise UserError(f"noise.levels: has {len(self.levels)} numbers; give one for each of {', '.join(names)}")
+        if self.levels is not None and self.by is not None:
+            raise UserError("noise.by: does not go with noise.levels; state what is known, as in noise=gaussian")
+
+    estimated = True
 
     def levels_of(self, model: Measurement) -> Levels | None:
         """The levels of a model's readings; None if a single one multiplies all standard deviations."""
@@ -59,8 +70,31 @@ class Unknown(Noise):
             return None
         return Levels.of(read_sigma(self.sigma), self.covariance(model.m).factor, self.by, model)
 
+    def true_levels(self, m: int) -> tuple[Levels, Array] | None:
+        if self.levels is None:
+            return None
+        formula, weights = read_sigma(self.sigma), self.covariance(m).factor
+        return Levels(formula, weights, ("",), np.zeros(m, dtype=np.intp)), np.log(self.levels)
+
+    def nominal_covariance(self, model: Measurement) -> Covariance:
+        if self.levels is None:
+            return self.covariance(model.m)
+        return Covariance(self._deviations(model.simulate(model.nominal[None])[0]))
+
+    def _deviations(self, h: Array) -> Array:
+        """Standard deviations (m,) of readings h (m,)."""
+        known = self.true_levels(len(h))
+        if known is None:
+            raise UserError(NO_LEVEL)
+        levels, theta = known
+        return np.exp(levels.at(h[None], theta[None])[0][0])
+
+    @property
+    def true_covariance(self) -> bool:
+        return READING not in read_sigma(self.sigma).names
+
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
-        raise UserError("noise=unknown: has no level to simulate with; choose another noise, or use `estimate`")
+        return h + self._deviations(h) * rng.standard_normal(h.shape)
 
     def covariance(self, m: int) -> Covariance:
         if self.weights is None:

@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from ipe_bench.report.table import Column, Table, column, words
-from ipe_bench.report.terminal import LEGEND, leading, overview_columns, statistics
+from ipe_bench.report.terminal import leading, legend, overview_columns, statistics
 from ipe_bench.report.words import p_value, percent, plain, short
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.comparisons import ALPHA
@@ -98,7 +98,7 @@ def overview(analysis: Analysis) -> Table:
     first, told = head(analysis, rows), _told(rows)
     columns = [*first, *overview_columns(told, leading(told, [*analysis.setting_columns, "error_scale"]))]
     columns += statistics("overview", told)
-    return Table("overview", "Overview", "", columns, rows, notes=LEGEND, grouped=len(first))
+    return Table("overview", "Overview", "", columns, rows, notes=legend(rows["noise"].tolist()), grouped=len(first))
 
 
 def theory(analysis: Analysis) -> Table | None:

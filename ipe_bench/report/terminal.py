@@ -29,6 +29,17 @@ LEGEND = (
     " diverged (!) is lost and does not know. cost: simulations.",
 )
 """What the columns of the overview mean."""
+_TOLD = (
+    "noise=unknown: every estimator here is told R, that of the true levels at the nominal readings; bounds and success"
+    " are those of parameters that are estimated together with the levels."
+)
+
+
+def legend(noises: Iterable[str]) -> tuple[str, ...]:
+    """What the columns of the overview mean, and what estimators are told of these noises."""
+    return (*LEGEND, _TOLD) if "unknown" in noises else LEGEND
+
+
 _VERDICTS = {"consistent": ("", ""), "optimistic": ("optimistic", "+"), "pessimistic": ("pessimistic", "-")}
 _VERDICTS |= {"diverged but confident": ("diverged", "!"), "-": ("", "")}
 
@@ -59,7 +70,7 @@ def summary_tables(listed: Sequence[Mapping[str, Any]], totals: Sequence[Table],
         settings.setdefault(title, []).append(row)
     tables = [_setting(title, part, width) for title, part in settings.items()]
     if tables:
-        tables[-1] = replace(tables[-1], notes=LEGEND)
+        tables[-1] = replace(tables[-1], notes=legend({row["noise"] for row in rows}))
     return [*totals, *tables] or ["nothing is stored yet"]
 
 

@@ -22,6 +22,7 @@ from ipe_bench.basics.errors import StorageError, UserError
 from ipe_bench.basics.machine import cores, library_versions
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.repeatable import require_repeatable
+from ipe_bench.noise.own import NO_LEVEL
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.key import ResultKey
 from ipe_bench.runs.parts import TRUTH, Unusable
@@ -128,8 +129,8 @@ def validate(
     for scenario in scenarios:
         if scenario.noise.real and trials != 1:
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
-        if scenario.noise.estimated:
-            mistakes.append("noise=unknown: has no level to simulate with; choose another noise, or use `estimate`")
+        if scenario.noise.estimated and scenario.noise.true_levels(scenario.measurement.m) is None:
+            mistakes.append(NO_LEVEL)
         elif untried is None or scenario in untried:
             mistakes += _beyond_numbers(scenario)
             require_repeatable(scenario.measurement)

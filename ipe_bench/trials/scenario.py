@@ -81,7 +81,7 @@ class Scenario:
             return recorded_problem(self.measurement)
         model = self.measurement
         deviation, correlation = self.prior.deviation(model.n, self.error_scale), self.prior.correlation(model.n)
-        return Problem(model, self.noise.covariance(model.m), deviation, correlation)
+        return Problem(model, self.noise.nominal_covariance(model), deviation, correlation)
 
     @cached_property
     def simulator(self) -> Measurement:

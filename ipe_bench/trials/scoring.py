@@ -27,7 +27,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Equation, Estimates, Estimator, estimate_safely
 from ipe_bench.measurements.counted import CountingModel
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.trials.bounds import bound_deviations
+from ipe_bench.trials.bounds import bound_deviations, informative_rows
 from ipe_bench.trials.fit_test import Spread, fit_probability, inflation_of, spread_of
 from ipe_bench.trials.roots import Known, frozen_root, least_squares_root
 from ipe_bench.trials.scenario import Scenario, Trials
@@ -81,9 +81,16 @@ class Block:
 
     @cached_property
     def crlb_information(self) -> Array:
-        """J' R^-1 J at the truth (trials, n, n): the inverse of the Cramér-Rao bound."""
+        """J' R^-1 J at the truth (trials, n, n), the inverse of the Cramér-Rao bound; see `informative_rows`."""
         with np.errstate(all="ignore"):
-            return information(self.jacobian, self.problem.R)
+            return self._information(self.jacobian, self.readings)
+
+    def _information(self, J: Array, h: Array) -> Array:
+        """Of readings h (trials, m) of slopes J (trials, m, n)."""
+        if self.scenario.noise.true_levels(h.shape[1]) is None:
+            return information(J, self.problem.R)
+        A = informative_rows(self.scenario.noise, self.problem.R, J, h)
+        return np.matmul(A.swapaxes(1, 2), A)
 
     @cached_property
     def bayes_information(self) -> Array:
@@ -108,8 +115,8 @@ class Block:
             return bound_deviations(self.bayes_information, lambda ill: _below(self._white(ill), root))
 
     def _white(self, kept: Mask) -> Array:
-        """R^-1/2 J of some of the trials."""
-        return self.problem.R.whiten_jacobian(self.jacobian[kept])
+        """R^-1/2 J of some of the trials, or what else makes their information."""
+        return informative_rows(self.scenario.noise, self.problem.R, self.jacobian[kept], self.readings[kept])
 
     def truth_columns(self) -> Columns:
         """The truth and its bounds, in multiples of the parameters' units, what the noise alone makes of the linear
@@ -144,10 +151,11 @@ class Block:
             x = self.scenario.truths(0, EXPECTED)
             with np.errstate(all="ignore"):
                 J, R = self.problem.measurement.jacobian(x), self.problem.R
-                each = information(J, R)
+                h = self.readings_at(x)
+                each = self._information(J, h)
                 mean = each.mean(axis=0)
                 expected = (mean + prior.inverse())[None]
-                rows = R.whiten_jacobian(J).reshape(1, -1, x.shape[1]) / np.sqrt(len(x))
+                rows = informative_rows(self.scenario.noise, R, J, h).reshape(1, -1, x.shape[1]) / np.sqrt(len(x))
                 root = prior.whiten_jacobian(np.eye(x.shape[1]))
                 bound[0] = bound_deviations(expected, lambda ill: _below(rows[ill], root))[0]
                 P = inverse(expected)[0][0]
@@ -234,7 +242,9 @@ class Block:
         """How the residuals that an estimator leaves scatter, with the slopes at the truth."""
         key = (estimator.equation, "prior" in estimator.needs, inflation_of(estimator))
         if key not in self._spreads:
-            self._spreads[key] = spread_of(estimator, self.problem, self.jacobian, self.crlb_information)
+            same = self.scenario.noise.true_levels(self.problem.R.m) is None
+            inner = self.crlb_information if same else None
+            self._spreads[key] = spread_of(estimator, self.problem, self.jacobian, inner)
         return self._spreads[key]
 
     def score(self, estimator: Estimator, estimates: Estimates) -> Columns:
