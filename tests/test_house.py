@@ -38,7 +38,7 @@ BUDGETS = {
     "statistics": 4318,
     "real": 2519,
     "plugins": 1249,
-    "report": 4697,
+    "report": 4730,
     "cli": 2879,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""

@@ -12,10 +12,12 @@ from pathlib import Path
 
 import pytest
 
+import ipe_bench
 from ipe_bench.cli.main import COMMANDS
 from ipe_bench.plugins import discovery
 from ipe_bench.plugins.description import described
 from ipe_bench.report.docs import generated as pages
+from ipe_bench.report.docs import show_type, type_of
 
 PAGES = Path(str(files("ipe_bench.report.docs"))) / "pages"
 WRITTEN = sorted(PAGES.rglob("*.md"))
@@ -72,6 +74,17 @@ def test_the_cells_of_the_notebook_run(tmp_path, monkeypatch):
         exec(code, names)
     assert next(iter(names["table"].figures)) == "headline"
     assert (tmp_path / "outputs" / "notebook" / "report.html").exists()
+
+
+def test_attributes_of_public_classes_have_types_that_are_types():
+    lines = ["no limit.", "", ":type: Simulations that a trial may cost; None"]  # as napoleon leaves them
+    show_type(None, "attribute", "ipe_bench.IPE.budget", None, None, lines)
+    assert lines == ["Simulations that a trial may cost; None: no limit.", "", "", ":type: float | None"]
+    classes = [thing for name in ipe_bench.__all__ if isinstance(thing := getattr(ipe_bench, name), type)]
+    assert {ipe_bench.IPE, ipe_bench.State, ipe_bench.Sequential, ipe_bench.OdeMeasurement} <= set(classes)
+    names = [(cls, name) for cls in classes for name in vars(cls).get("__annotations__", {})]
+    assert len(names) > 50
+    assert [one for one in names if not re.fullmatch(r"[\w.]+(\[.*\])?( \| .*)?", type_of(*one))] == []
 
 
 @pytest.mark.slow

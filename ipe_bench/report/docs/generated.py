@@ -91,9 +91,9 @@ def write_reference(folder: Path) -> None:
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         said = pool.map(lambda name: printed_by([name, "--help"], columns=100).rstrip(), names)
         write_page(folder / "commands.md", "commands", commands={"": summary, **dict(zip(names, said, strict=True))})
-    things = [getattr(ipe_bench, name) for name in ipe_bench.__all__]
-    places = [(t, f"{t.__module__}.{t.__qualname__}") for t in things if hasattr(t, "__qualname__")]
-    kinds = [("autoclass" if isinstance(thing, type) else "autofunction", place) for thing, place in places]
+    things = [(name, getattr(ipe_bench, name)) for name in ipe_bench.__all__]
+    shown = [(name, thing) for name, thing in things if hasattr(thing, "__qualname__")]
+    kinds = [("autoclass" if isinstance(t, type) else "autofunction", f"ipe_bench.{name}") for name, t in shown]
     write_page(folder / "python.md", "python", names=kinds)
 
 
