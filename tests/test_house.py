@@ -35,7 +35,7 @@ BUDGETS = {
     "baselines": 2415,
     "trials": 2084,
     "runs": 2220,
-    "statistics": 4318,
+    "statistics": 4312,
     "real": 2519,
     "plugins": 1249,
     "report": 4730,

@@ -19,6 +19,7 @@ from scipy.special import ndtr, ndtri, stdtr, stdtrit
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.statistics.comparisons import holm
 from ipe_bench.statistics.consistency import mean_limits
 from ipe_bench.statistics.intervals import rms_interval
 
@@ -174,11 +175,14 @@ def audit(claims: Claims) -> Audit:
                 )
     (scale,) = _factors(claims, nees[:, None] / claims.n, 1 - ALPHA / 2)
     questions = _questions(claims, nees)
-    refused = _holm({name: p for name, (p, _) in questions.items()}, {"scale"} if scale.wrong else set())
+    # The scale has been tested at its share of the level.
+    p = [0.0 if scale.wrong else 1.0, *(p for p, _ in questions.values())]
+    corrected = holm(p, [_WEIGHTS[name] for name in ("scale", *questions)])[1:]
+    faults = [words for (_, words), q in zip(questions.values(), corrected, strict=True) if q <= ALPHA]
     whole = claims.joint and claims.runs == len(nees)
     limits = mean_limits(claims.n, claims.runs) if whole else (np.nan, np.nan)
-    told = [_of_scale(claims, scale, nees), *(words for name, (_, words) in questions.items() if name in refused)]
-    return Audit(claims, scale, each, _bias(claims)[0], float(nees.mean() / claims.n), limits, tuple(told[:3]))
+    told = _of_scale(claims, scale, nees), *faults
+    return Audit(claims, scale, each, _bias(claims)[0], float(nees.mean() / claims.n), limits, told[:3])
 
 
 def _of_scale(claims: Claims, scale: Factor, nees: Array) -> str:
@@ -199,18 +203,6 @@ def _runs_needed(claims: Claims, nees: Array) -> int:
     mean = _per_run(claims, nees[:, None])[:, 0]
     spread = float(mean.var(ddof=1) / mean.mean() ** 2)
     return int(np.ceil(spread * ((ndtri(1 - ALPHA / 4) + ndtri(0.8)) / (2 * np.log(MATTERS))) ** 2))
-
-
-def _holm(p: Mapping[str, float], refused: set[str]) -> set[str]:
-    """The families that are refused at `ALPHA` over all of them, with the weights of `_WEIGHTS` (Holm, Scand. J.
-    Statist. 6, 1979, section 4); `refused` says if the scale is."""
-    while True:
-        remaining = {name: _WEIGHTS[name] for name in ("scale", *p) if name not in refused}
-        share = ALPHA / max(sum(remaining.values()), 1.0)
-        new = {name for name, weight in remaining.items() if name in p and p[name] <= share * weight}
-        if not new:
-            return refused
-        refused = refused | new
 
 
 def _questions(claims: Claims, nees: Array) -> dict[str, tuple[float, str]]:

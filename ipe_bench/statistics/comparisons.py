@@ -111,11 +111,13 @@ def mcnemar(only_first: int, only_second: int) -> float:
     return min(1.0, 2 * float(bdtr(min(only_first, only_second), only_first + only_second, 0.5)))
 
 
-def holm(p: Sequence[float]) -> Array:
-    """P-values corrected so that any error among them has the stated probability (Holm, Scand. J. Statist. 6, 1979)."""
-    values = np.asarray(p, dtype=float)
+def holm(p: Sequence[float], weights: Sequence[float] | None = None) -> Array:
+    """P-values corrected so that any error among them has the stated probability, which is shared by the weights, or
+    evenly (Holm, Scand. J. Statist. 6, 1979, section 4)."""
+    shares = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=float)
+    values = np.asarray(p, dtype=float) / shares
     order = np.argsort(values, kind="stable")
-    steps = values[order] * np.arange(len(values), 0, -1)
+    steps = values[order] * np.cumsum(shares[order][::-1])[::-1]
     result = np.empty(len(values))
     result[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
     return result
