@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from ipe_bench.measurements.problem import Problem
     from ipe_bench.noise.base import Noise
     from ipe_bench.trials.scenario import Scenario
+    from ipe_bench.trials.tracking import Tracking
 
 _HOMES = {
     "api": ("audit", "check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status"),
@@ -41,6 +42,7 @@ _HOMES = {
     "measurements.problem": ("Problem",),
     "noise.base": ("Noise",),
     "trials.scenario": ("Scenario",),
+    "trials.tracking": ("Tracking",),
 }
 """Public names, by the module that they are in."""
 _ROOMS = ("baselines", "measurements", "noise", "priors", "solvers", "states")
@@ -60,6 +62,7 @@ __all__ = [
     "Status",
     "System",
     "Track",
+    "Tracking",
     "UserError",
     "__version__",
     "audit",

@@ -22,7 +22,10 @@ from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.results import Results, require_results
 from ipe_bench.runs.run import TRIALS, compute, validate
 from ipe_bench.runs.schedule import Watcher
+from ipe_bench.states.base import StateModel
+from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.scenario import Scenario
+from ipe_bench.trials.tracking import AnyScenario, Tracking
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -41,8 +44,8 @@ Directories = Path | str | Sequence[Path | str]
 
 
 def run(
-    scenarios: Scenario | Measurement | Sequence[Scenario],
-    estimators: Mapping[str, Estimator],
+    scenarios: AnyScenario | Measurement | StateModel | Sequence[AnyScenario],
+    estimators: Mapping[str, Any],
     trials: int | None = None,
     *,
     noise: Noise | None = None,
@@ -58,7 +61,8 @@ def run(
     """Runs every estimator on the same trials of every scenario and summarises what is known of them.
 
     What `output` holds already is not computed again; without `output` nothing is kept. A model with its `noise`,
-    `prior` and `error_scale` stands for a scenario of its own. Returns a frame with a row per scenario, estimator and
+    `prior` and `error_scale` stands for a scenario of its own; a state model stands for its `Tracking`, whose
+    estimators are trackers. Returns a frame with a row per scenario, estimator and
     parameter, plus the parameter `all`, the root mean square over parameters of error over bound; `rmse` and its kin
     are in the parameter's own unit. It shows the table of the terminal, `.trials` has a row per trial, `.figures` has
     Matplotlib's figures by name, and `.report(output)` writes the report. What could not be computed is left out, with
@@ -88,10 +92,11 @@ def run(
     from ipe_bench.statistics import summarize
     from ipe_bench.statistics.stopping import Stop, check_time_limit, compute_until
 
+    stated = {"noise": noise, "prior": prior, "error_scale": error_scale}
     if isinstance(scenarios, Sequence):
-        scenarios = [_scenario(one) for one in scenarios]
+        scenarios = [_tracking(one) or _scenario(one) for one in scenarios]
     else:
-        scenarios = [_scenario(scenarios, noise=noise, prior=prior, error_scale=error_scale)]
+        scenarios = [_tracking(scenarios) or _scenario(scenarios, **stated)]
     estimators, stored = _labelled(estimators), Stored(output)
     options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
     stops: tuple[Stop, ...] = ()
@@ -527,7 +532,12 @@ def _scenario(given: Any, **stated: Any) -> Scenario:
     return Scenario(given, **stated)
 
 
-def _labelled(estimators: Any) -> Mapping[str, Estimator]:
+def _tracking(given: Any) -> Tracking | None:
+    """The scenario of a state model; None if the given is of constants."""
+    return given if isinstance(given, Tracking) else Tracking(given) if isinstance(given, StateModel) else None
+
+
+def _labelled(estimators: Any) -> Mapping[str, Any]:
     """The estimators by their labels.
 
     Raises:
@@ -536,7 +546,7 @@ def _labelled(estimators: Any) -> Mapping[str, Estimator]:
     if not isinstance(estimators, Mapping):
         raise UserError('estimators: give each a label, as in {"newton": ib.solvers.Newton()}')
     for label, one in estimators.items():
-        if not isinstance(one, Estimator):
+        if not isinstance(one, Estimator | Tracker):
             raise UserError(f"estimators: {label}: {_described(one)}; give an estimator such as ib.solvers.Newton()")
     return estimators
 

@@ -14,7 +14,7 @@ from ipe_bench.cli.spec import Spec
 from ipe_bench.runs.key import ResultKey
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import result_keys, validate
-from ipe_bench.trials.scoring import Block
+from ipe_bench.trials.tracking import block_of
 
 _TRIED = 2
 """Trials that an estimator is timed on where the folder holds none of it."""
@@ -68,14 +68,14 @@ class DryRun:
             if times and self.spent > _PATIENCE_S:
                 self.at_least = "at least "
                 return max(times.values())
-            block = Block.draw(scenario, 0, 1 if scenario.noise.real else _TRIED)
+            block = block_of(scenario, 0, 1 if scenario.noise.real else _TRIED)
             if not times:
                 block.estimate(cell.estimator)  # compiled code is loaded
             began = time.perf_counter()
             block.estimate(cell.estimator)
             took = time.perf_counter() - began
             self.spent += took
-            times[scenario.error_scale] = took / len(block.trials.x)
+            times[scenario.error_scale] = took / len(block)
         return times[scenario.error_scale]
 
     def summary(self) -> str:

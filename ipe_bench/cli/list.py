@@ -76,7 +76,8 @@ def _describe(option: plugins.Option) -> None:
     """Every option of a component with its value, what may be given, and what it means."""
     if option.fault is not None:
         raise UserError(f"{option.group}/{option.name}: {option.fault}")
-    prefix = f"estimators.{option.label}." if option.group in plugins.ESTIMATOR_GROUPS else f"{option.group}."
+    key = plugins.PACKAGES.get(option.group)
+    prefix = f"{option.group}." if key is None else f"{key}.{option.label}."
     rows = described(option)
     title = f"{option.group}={option.name}  {option.summary}"
     if rows:

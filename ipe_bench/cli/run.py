@@ -30,6 +30,10 @@ from ipe_bench.runs.provenance import digest
 from ipe_bench.runs.run import accept, compute, record_refusal, result_keys
 from ipe_bench.runs.store import describe_names
 
+OF_CONSTANTS = ("measurement", "truth_measurement", "noise", "prior", "error_scale", "solver", "baseline")
+OF_CONSTANTS += ("estimators", "parameters", "prior_covariance", "write_readings")
+"""Keys of parameters that stand still."""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -76,6 +80,10 @@ def main(arguments: Sequence[str]) -> int:
             show(words, flags)
             return 0
         words.refuse(OF_FILES, "is for `ipe-bench estimate`: run simulates its readings")
+        if jobs.specs[0].model is None:
+            words.refuse(("tracker", "trackers"), "goes with model=NAME")
+        else:
+            words.refuse(OF_CONSTANTS, "is of a measurement, and model= chooses states that move")
         if words.standard_baselines:
             jobs = replace(jobs, specs=[one.suited() for one in jobs.specs])
         for one in jobs.specs:
@@ -102,7 +110,8 @@ def _say_what_is_missing(jobs: Jobs) -> int:
 
 def _left_out(jobs: Sequence[Spec]) -> list[str]:
     """A line on the standard filters that do not suit every job."""
-    models = dict.fromkeys(job.measurement.name for job in jobs if not set(STANDARD_FILTERS) <= job.estimators.keys())
+    lacking = [job for job in jobs if job.model is None and not set(STANDARD_FILTERS) <= job.estimators.keys()]
+    models = dict.fromkeys(job.measurement.name for job in lacking)
     filters = " and ".join(STANDARD_FILTERS)
     return [f"{filters} are left out for {', '.join(models)}: filters need epochs and a prior"] if models else []
 
@@ -242,13 +251,14 @@ def _best(outcomes: Sequence[Outcome], maximises: bool) -> list[str]:
 
 
 _IN_EVERY_TITLE = {"measurement", "measurement.dataset", w.HYDRAS_TRUTH, "noise", "error_scale", "seed"}
-_NOT_TELLING = {*w.NO_PART_OF_A_NAME, "solver", "baseline"} - {"seed"}
+_NOT_TELLING = {*w.NO_PART_OF_A_NAME, "model", "solver", "baseline", "tracker"} - {"seed"}
 """Keys that tell no job of a sweep from another."""
 
 
 def title(job: Spec, words: Sequence[str]) -> str:
     """What a job is about, for its progress bar: everything that may tell it from other jobs of a sweep."""
-    scenario, model = job.scenario, job.measurement
+    scenario = job.scenario
+    model = scenario.measurement
     parts = [f"nist {model.dataset}" if isinstance(model, Nist) else model.name]
     if scenario.truth is not None:
         parts.append(f"truth {scenario.truth.name}")

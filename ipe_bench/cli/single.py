@@ -16,7 +16,7 @@ from ipe_bench.measurements import Nist
 from ipe_bench.report.writer import reserve_output_folder
 
 OF_MANY_TRIALS = ("precision", "time_limit", "block_size", "formats", "execution", "write_readings")
-OF_MANY_TRIALS += ("write_readings_trial", "objective")
+OF_MANY_TRIALS += ("write_readings_trial", "objective", "model", "tracker", "trackers")
 """Keys of runs."""
 OF_FILES = ("readings", "ignore_rows", "ignore_columns")
 """Keys of estimates from real readings."""

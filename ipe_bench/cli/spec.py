@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -26,16 +26,22 @@ from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.provenance import TARGET, canonical_json, describe
 from ipe_bench.runs.run import MOST_TRIALS, TRIALS
+from ipe_bench.states.base import StateModel
+from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.scenario import Scenario
+from ipe_bench.trials.tracking import Tracking
 
 PARTS: dict[str, type] = {
     "measurement": Measurement,
     "truth_measurement": Measurement,
     "noise": Noise,
     "prior": Prior,
+    "model": StateModel,
     "execution": Execution,
 }
 """Keys that hold a component, with its kind."""
+OPTIONAL = ("truth_measurement", "model")
+"""Those that may be null."""
 STANDARD_FILTERS = ("ekf", "ukf")
 """Baselines of a plain run that suit only models with epochs and a prior."""
 
@@ -52,6 +58,10 @@ class Spec(Component):
     """By label."""
     output: str
     """The folder of the results."""
+    model: StateModel | None = None
+    """States that move, in place of a measurement."""
+    trackers: Mapping[str, Any] = field(default_factory=dict)
+    """What estimates them, by label."""
     name: str = "${default_name}"
     """Names the output folder."""
     default_name: str = "gins"
@@ -143,8 +153,10 @@ class Spec(Component):
         return tuple(found)
 
     @cached_property
-    def scenario(self) -> Scenario:
-        """The trials that are simulated."""
+    def scenario(self) -> Any:
+        """The trials that are simulated: a `Scenario`, or a `Tracking` if there is a state model."""
+        if self.model is not None:
+            return Tracking(self.model, self.seed)
         measurement, truth = (m and informed(m, self.known) for m in (self.measurement, self.truth_measurement))
         assert measurement is not None
         prior = prior_stated(self.prior, measurement, self.prior_covariance)
@@ -152,6 +164,8 @@ class Spec(Component):
 
     def suited(self) -> Spec:
         """The job without the standard filters if its model lacks what they need."""
+        if isinstance(self.scenario, Tracking):
+            return self
         problem = self.scenario.problem
         unsuited = {label for label in STANDARD_FILTERS if (e := self.estimators.get(label)) and e.missing(problem)}
         kept = {label: one for label, one in self.estimators.items() if label not in unsuited}
@@ -186,12 +200,12 @@ class Spec(Component):
 
 KEYS = tuple(field.name for field in fields(Spec))
 DEFAULTS = {field.name: "???" if field.default is MISSING else field.default for field in fields(Spec)}
-DEFAULTS["estimators"] = {}
+DEFAULTS |= {"estimators": {}, "trackers": {}}
 
 
 def keys_of_a_run() -> list[Described]:
     """The keys besides the groups, with their types, defaults and meanings."""
-    return [one for one in options_of(Spec, DEFAULTS, {}) if one.name not in (*PARTS, "estimators")]
+    return [one for one in options_of(Spec, DEFAULTS, {}) if one.name not in (*PARTS, "estimators", "trackers")]
 
 
 def spec(plain: Mapping[Any, Any]) -> Spec:
@@ -199,35 +213,38 @@ def spec(plain: Mapping[Any, Any]) -> Spec:
     for key in plain:
         if key not in KEYS:
             raise UserError(f"{key}: {unknown(str(key), KEYS, 'key')}")
-    made = {key: construct(value, key) for key, value in plain.items() if key not in ("estimators", *PARTS)}
+    made = {key: construct(value, key) for key, value in plain.items() if key not in ("estimators", "trackers", *PARTS)}
     for key, kind in PARTS.items():
         config = plain.get(key)
-        if key == "truth_measurement" and config is None:
+        if key in OPTIONAL and config is None:
             made[key] = None
         elif not isinstance(config, Mapping) or TARGET not in config:
             raise UserError(f"{key}={config}: is not a part that can be used; choose one, see `ipe-bench list`")
         else:
             made[key] = _of_kind(construct(config, key), key, kind)
-    made["estimators"] = {str(label): _estimator(str(label), one) for label, one in (plain["estimators"] or {}).items()}
+    made["trackers"] = {}
+    chosen = "estimators" if made["model"] is None else "trackers"
+    made["estimators"] = {str(k): _labelled(chosen, str(k), one) for k, one in (plain[chosen] or {}).items()}
     return instantiate(Spec, made, "")
 
 
-def _estimator(label: str, options: Any) -> Estimator:
-    where = f"estimators.{label}"
+def _labelled(key: str, label: str, options: Any) -> Any:
+    """The estimator or tracker of a label."""
+    where = f"{key}.{label}"
+    known = [one for group, holder in plugins.PACKAGES.items() if holder == key for one in plugins.options(group)]
     if not isinstance(options, Mapping):
         raise UserError(f"{where}={options}: set its options, such as {where}.KEY=VALUE")
     if TARGET not in options:
         keys = ", ".join(f"{where}.{key}" for key in options) or where
-        groups = {o.label: o.group for group in plugins.ESTIMATOR_GROUPS for o in plugins.options(group)}
+        groups = {option.label: option.group for option in known}
         remedy = f"add it to {groups[label]}=" if label in groups else unknown(label, groups, "estimator")
         raise UserError(f"{keys}: is set, but {label} is not chosen; {remedy}")
-    for group in plugins.ESTIMATOR_GROUPS:
-        for option in plugins.options(group):
-            if option.label == label and option.target != str(options[TARGET]):
-                # One estimator would be tabled under the name of another.
-                name = f"{group}={label}"
-                raise UserError(f"{where}: is {options[TARGET]}, under the name of {name}; choose another label")
-    return _of_kind(construct(options, where), where, Estimator)
+    for option in known:
+        if option.label == label and option.target != str(options[TARGET]):
+            # One estimator would be tabled under the name of another.
+            name = f"{option.group}={label}"
+            raise UserError(f"{where}: is {options[TARGET]}, under the name of {name}; choose another label")
+    return _of_kind(construct(options, where), where, Estimator if key == "estimators" else Tracker)
 
 
 def _of_kind(part: Any, key: str, kind: type) -> Any:

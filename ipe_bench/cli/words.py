@@ -31,7 +31,9 @@ MOST_JOBS = 10_000
 TRUTH = "truth_measurement"
 HYDRAS_TRUTH = f"measurement@{TRUTH}"
 _FORMULA = re.compile(
-    rf"(\+*(?:measurement|{TRUTH})\.(?:expression|(?:time_)?unit|(?:initial|rates|outputs)\.\w+))=([^'\"].*)", re.DOTALL
+    rf"(\+*(?:(?:measurement|{TRUTH})\.(?:expression|(?:time_)?unit|(?:initial|rates|outputs)\.\w+)"
+    r"|model\.(?:next|readings)\.\w+))=([^'\"].*)",
+    re.DOTALL,
 )
 """Texts that the shell has taken the quotes from; a list of units is none."""
 _FILE = re.compile(rf"\+*(?:(measurement|{TRUTH})\.file|(parameters))=(?![{{$]|null$)(.*)", re.DOTALL)
@@ -224,7 +226,7 @@ def _parse(command: str, word: str, groups: Groups) -> Override:
     names = [name for name in pattern.filter(groups[group]) if "/" in value or "/" not in name]
     if not names:
         raise UserError(f"{word}: the sweep has no jobs: no option of {group} fits the pattern")
-    one = "[{}]" if group in plugins.ESTIMATOR_GROUPS else "{}"
+    one = "[{}]" if group in plugins.PACKAGES else "{}"
     return OverridesParser.create().parse_override(f"{key}={','.join(map(one.format, names))}")
 
 
@@ -246,9 +248,9 @@ def _check(override: Override, groups: Groups) -> None:
 
 def _check_deletion(override: Override) -> None:
     group = override.key_or_group
-    if group in plugins.ESTIMATOR_GROUPS:
+    if group in plugins.PACKAGES:
         raise UserError(f"{said(override)}: cannot be left out; {group}=[] chooses none")
-    if not group.startswith("estimators."):
+    if not group.startswith(("estimators.", "trackers.")):
         raise UserError(f"{said(override)}: only estimators.LABEL can be left out; give the key another value")
 
 
@@ -257,8 +259,10 @@ def _check_key(override: Override, groups: Groups) -> None:
     first = key.split(".")[0]
     if override.package is not None or ("/" in key and first.split("/")[0] in groups):
         raise UserError(f"{word}: {unknown(key, groups, 'group')}")
-    if first in plugins.ESTIMATOR_GROUPS and "." in key:
-        raise UserError(f"{word}: options are set by label; write estimators.{word.lstrip('+').partition('.')[2]}")
+    if first in plugins.PACKAGES and "." in key:
+        raise UserError(
+            f"{word}: options are set by label; write {plugins.PACKAGES[first]}.{word.lstrip('+').partition('.')[2]}"
+        )
     if first not in KEYS:
         raise UserError(f"{word}: {unknown(first, {*KEYS, *groups, 'experiment'}, 'key')}")
     if key == "estimators":
@@ -280,10 +284,10 @@ def _check_place(override: Override) -> None:
     elif package is None or (group, package) == ("measurement", TRUTH):
         if added:
             raise UserError(f"{word}: {package or group} is there to be chosen, not added; leave out the +")
-    elif group not in plugins.ESTIMATOR_GROUPS:
+    elif group not in plugins.PACKAGES:
         raise UserError(f"{word}: goes nowhere; write {group}=NAME")
-    elif not re.fullmatch(r"estimators\.[^.]+", package):
-        raise UserError(f"{word}: goes nowhere; write +{group}@estimators.LABEL=NAME")
+    elif not re.fullmatch(rf"{plugins.PACKAGES[group]}\.[^.]+", package):
+        raise UserError(f"{word}: goes nowhere; write +{group}@{plugins.PACKAGES[group]}.LABEL=NAME")
     elif not added:
         raise UserError(f"{word}: a label of its own is added; write +{group}@{package}=NAME")
 
@@ -291,14 +295,14 @@ def _check_place(override: Override) -> None:
 def _check_choice(override: Override, groups: Groups) -> None:
     """Whether each value is an option of the group that can be used."""
     group, word = override.key_or_group, said(override)
-    several = group in plugins.ESTIMATOR_GROUPS and override.package is None
+    several = group in plugins.PACKAGES and override.package is None
     key = word.partition("=")[0].lstrip("+")
     if group == "experiment" and override.is_sweep_override():
         raise UserError(f"{word}: a sweep over experiments would ignore their own sweeps; run them one by one")
     if override.is_range_sweep() or override.is_interval_sweep():
         raise UserError(f"{word}: write the names of options of {group}")
     for value in values(override):
-        if value is None and override.package == TRUTH:
+        if value is None and (override.package == TRUTH or group == "model"):
             continue
         if isinstance(value, list) and not several:
             raise UserError(f"{word}: choose one: {group}=NAME")
@@ -310,7 +314,7 @@ def _check_choice(override: Override, groups: Groups) -> None:
             if (fault := plugins.fault(group, name)) is not None:
                 raise UserError(f"{key}={name}: {fault}")
             if names.count(name) > 1:
-                remedy = f"+{group}@estimators.{name}_2={name} runs it again under a label of its own"
+                remedy = f"+{group}@{plugins.PACKAGES[group]}.{name}_2={name} runs it again under a label of its own"
                 raise UserError(f"{word}: {name} stands there twice and would run once; {remedy}")
 
 
@@ -318,7 +322,7 @@ def no_option(group: str, name: str, groups: Groups) -> str:
     """What to write in place of an option that its group lacks: its own group, where another group has it."""
     for other, names in groups.items():
         if name in names and other != group:
-            shown = f"[{name}]" if other in plugins.ESTIMATOR_GROUPS else name
+            shown = f"[{name}]" if other in plugins.PACKAGES else name
             return f"{name} is no {group} but a {other}; write {other}={shown}"
     nist = group == "measurement" and name.lower().startswith("nist/")
     known = [one for one in groups[group] if one.startswith("nist/") == nist]
@@ -331,14 +335,15 @@ def _check_labels(overrides: Sequence[Override]) -> None:
     taken: dict[str, Override] = {}
     for override in overrides:
         group, package = override.key_or_group, override.package
-        if group not in plugins.ESTIMATOR_GROUPS or override.is_delete():
+        if group not in plugins.PACKAGES or override.is_delete():
             continue
         value = plain(override.value())
         for label in [package.partition(".")[2]] if package else value if isinstance(value, list) else []:
-            if label in taken and (package or taken[label] is not override):
+            place = f"{plugins.PACKAGES[group]}.{label}"
+            if place in taken and (package or taken[place] is not override):
                 word = said(override)
-                raise UserError(f"{word}: {label} is the label of {said(taken[label])} already; choose another label")
-            taken[label] = override
+                raise UserError(f"{word}: {label} is the label of {said(taken[place])} already; choose another label")
+            taken[place] = override
 
 
 # Jobs
@@ -373,7 +378,7 @@ NO_PART_OF_A_NAME = ("name", "output", "trials", "block_size", "seed", "executio
 NO_PART_OF_A_NAME += ("precision", "time_limit", "write_readings", "write_readings_trial", "default_name", "objective")
 NO_PART_OF_A_NAME += ("figures", "formats")
 """Keys that change no setting, or add trials to it."""
-_BARE = ("measurement", "measurement.dataset", "noise", *plugins.ESTIMATOR_GROUPS)
+_BARE = ("measurement", "measurement.dataset", "model", "noise", *plugins.PACKAGES)
 """Keys whose values speak for themselves."""
 _LONGEST_NAME = 80
 
@@ -390,17 +395,22 @@ def default_name(words: Words) -> str:
         if file := words.files.get(forced(override)):
             line, held = f"file={Path(file.partition('=')[2]).name}", held + line
         key, _, value = line.partition("=")
-        key = key.lstrip("+~").replace(HYDRAS_TRUTH, "truth").rpartition("@estimators.")[2]
+        key = key.lstrip("+~").replace(HYDRAS_TRUTH, "truth").rpartition("@estimators.")[2].rpartition("@trackers.")[2]
         text = re.sub(r"[\[\]'\" ]", "", value.replace("],[", ";").replace(",", "+") if "[" in value else value)
         if override.key_or_group == "experiment":
             experiment = text
         elif _first(override) not in NO_PART_OF_A_NAME:
             parts[key] = f"no_{key}" if override.is_delete() or text == "" else text
+    if "model" in parts and parts["measurement"] == "gins":
+        parts["measurement"] = parts.pop("model")
     if experiment and parts["measurement"] == "gins":
         parts["measurement"] = experiment
     order = [*_BARE[:2], "truth", *_BARE[2:]]
     keys = sorted(parts, key=lambda k: (order.index(k) if k in order else len(order), k))
-    full = "-".join(parts[k] if k in _BARE else f"{k.removeprefix('estimators.')}={parts[k]}" for k in keys)
+    full = "-".join(
+        parts[k] if k in _BARE else f"{k.removeprefix('estimators.').removeprefix('trackers.')}={parts[k]}"
+        for k in keys
+    )
     full = full.replace("/", "-")
     short = re.sub(r"[^\w.,=+-]", "_", full, flags=re.ASCII)
     if short == full and len(full) <= _LONGEST_NAME and not held:

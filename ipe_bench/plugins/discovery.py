@@ -26,7 +26,9 @@ from ipe_bench.basics.files import own_conf
 
 ENTRY_POINTS = "ipe_bench.plugins"
 ESTIMATOR_GROUPS = ("solver", "baseline")
-COMPONENT_GROUPS = ("measurement", "noise", "prior", *ESTIMATOR_GROUPS, "execution")
+PACKAGES = {**dict.fromkeys(ESTIMATOR_GROUPS, "estimators"), "tracker": "trackers"}
+"""Groups of which several options are chosen, each under a label of its own, by the key that holds them."""
+COMPONENT_GROUPS = ("measurement", "noise", "prior", *ESTIMATOR_GROUPS, "model", "tracker", "execution")
 RECORD_GROUPS = ("statistic", "figure", "table", "section")
 """What a report is made of."""
 CHECKED_GROUPS = (*COMPONENT_GROUPS, *RECORD_GROUPS, "experiment")
@@ -168,8 +170,8 @@ class Option:
             return f"{self.rival} and {self.path} offer it both; rename one of the two files"
         try:
             text = self.path.read_bytes().decode("utf-8")
-            if self.group in ESTIMATOR_GROUPS and self.package != f"estimators.{self.label}":
-                return f"{self.path}: its first line must be '# @package estimators.{self.label}', or it never runs"
+            if (key := PACKAGES.get(self.group)) is not None and self.package != f"{key}.{self.label}":
+                return f"{self.path}: its first line must be '# @package {key}.{self.label}', or it never runs"
             return None if _is_mapping(text) else f"{self.path}: holds no keys; write KEY: VALUE lines"
         except UnicodeDecodeError as error:
             return f"{self.path}: is not UTF-8 ({error.reason} at byte {error.start}); save it as UTF-8"

@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from ipe_bench.report.table import Column, Table, column, words
-from ipe_bench.report.terminal import leading, legend, overview_columns, statistics
+from ipe_bench.report.terminal import TRACKED, leading, legend, overview_columns, statistics
 from ipe_bench.report.words import p_value, percent, plain, short
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.comparisons import ALPHA
@@ -60,7 +60,8 @@ def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]
         rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
         totals = pd.concat([rows, analysis.scores[list(frame_columns(SCORES))]], axis=1)
         made = {w: _recorded(analysis, w, t, c, totals[chosen(totals)]) for w, (t, c, chosen) in _RECORDED.items()}
-        main = (made["costs"], comparisons(analysis), ranks(analysis), parameters(analysis), calibration(analysis))
+        main = (tracks(analysis), made["costs"], comparisons(analysis), ranks(analysis))
+        main = (*main, parameters(analysis), calibration(analysis))
         late = (made["all_trials"], made["solved_trials"], contraction(analysis), made["covariances"])
         late = [*late, theory(analysis), made["iterations"]]
         found = [overview(analysis), *main, *found, *(table and replace(table, appendix=True) for table in late)]
@@ -122,6 +123,13 @@ def parameters(analysis: Analysis) -> Table | None:
     rows = analysis.summary[analysis.summary["parameter"] != ALL]
     table = _recorded(analysis, "parameters", "Parameters", caption, rows, ("parameter", "unit"))
     return table and replace(table, data=rows)
+
+
+def tracks(analysis: Analysis) -> Table | None:
+    """Every state over the whole path, in its own unit."""
+    rows = analysis.summary[analysis.summary["path_rmse"].notna()]
+    caption = f"{TRACKED} all: over the bound at the truth, root mean square over the states."
+    return _recorded(analysis, "tracks", "States over all epochs", caption, rows, ("parameter", "unit"))
 
 
 def calibration(analysis: Analysis) -> Table | None:

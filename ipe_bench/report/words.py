@@ -111,9 +111,9 @@ def shower(kind: Kind, where: Where) -> Callable[[Any], str]:
 
 
 def _applies(record: Statistic, where: Where, row: Mapping[str, Any]) -> bool:
-    """Whether a row can have the statistic: what solves no equation has nothing to say of solved trials. In the table
-    of parameters its finished trials stand in for them."""
-    return record.given != "solved" or where == "parameters" or row["equation"] != "-"
+    """Whether a row can have the statistic: what solves no equation has nothing to say of solved trials. In the
+    tables of parameters and of states its finished trials stand in for them."""
+    return record.given != "solved" or where in ("parameters", "tracks") or row["equation"] != "-"
 
 
 def reported(record: Statistic, rows: Sequence[Mapping[str, Any]]) -> bool:

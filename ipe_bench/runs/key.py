@@ -14,17 +14,17 @@ from ipe_bench.basics.machine import library_versions
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.runs.parts import SCHEMA, TRUTH
 from ipe_bench.runs.provenance import describe, digest, fingerprint
-from ipe_bench.trials.bounds import linear_bound, linear_correlation
-from ipe_bench.trials.scenario import Scenario
+from ipe_bench.states.trackers import Tracker
+from ipe_bench.trials.tracking import AnyScenario, Tracking
 
 
 @dataclass(frozen=True)
 class ResultKey:
     """One scenario under one estimator, or its truth: what a stored file belongs to."""
 
-    scenario: Scenario
+    scenario: AnyScenario
     label: str = TRUTH
-    estimator: Estimator | None = None
+    estimator: Estimator | Tracker | None = None
 
     @property
     def components(self) -> list[Any]:
@@ -88,8 +88,9 @@ class ResultKey:
             "parameters": [describe(p) for p in model.parameters],
             "readings": model.m,
             "about": _first_sentence(model),
-            "linear_bound": linear_bound(scenario.problem).tolist(),
-            "linear_correlation": linear_correlation(scenario.problem).round(4).tolist(),
+            **({"times": scenario.model.times.tolist()} if isinstance(scenario, Tracking) else {}),
+            "linear_bound": scenario.linear_bound.tolist(),
+            "linear_correlation": scenario.linear_correlation.round(4).tolist(),
         }
 
 

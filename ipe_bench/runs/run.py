@@ -30,8 +30,9 @@ from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.schedule import Watcher, block_size_for, plan, run_tasks
 from ipe_bench.runs.store import Store
-from ipe_bench.trials.bounds import linear_bound
+from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.scenario import Scenario
+from ipe_bench.trials.tracking import AnyScenario, Tracking
 
 log = logging.getLogger(__name__)
 
@@ -46,8 +47,8 @@ _FEW = 4
 
 
 def compute(
-    scenarios: Sequence[Scenario],
-    estimators: Mapping[str, Estimator],
+    scenarios: Sequence[AnyScenario],
+    estimators: Mapping[str, Any],
     trials: int,
     output: Path | str,
     *,
@@ -101,12 +102,12 @@ def compute(
 
 
 def validate(
-    scenarios: Sequence[Scenario],
-    estimators: Mapping[str, Estimator],
+    scenarios: Sequence[AnyScenario],
+    estimators: Mapping[str, Any],
     trials: int,
     block_size: int | None = None,
     *,
-    untried: Sequence[Scenario] | None = None,
+    untried: Sequence[AnyScenario] | None = None,
 ) -> None:
     """Raises one UserError with everything that stands in the way of this run.
 
@@ -125,8 +126,15 @@ def validate(
     if TRUTH in estimators:
         mistakes.append(f"estimators.{TRUTH}: is what the truth itself is stored under; choose another label")
     if not estimators:
-        mistakes.append("there is no estimator; choose with solver= and baseline=")
+        mistakes.append("there is no estimator; choose with solver= and baseline=, or with tracker= for a state model")
     for scenario in scenarios:
+        kind, what = Tracker, "estimates constants; a state model takes trackers"
+        if not isinstance(scenario, Tracking):
+            kind, what = Estimator, "tracks states that move; a measurement model takes estimators"
+        other = [f"estimators.{label}: {what}" for label, one in estimators.items() if not isinstance(one, kind)]
+        mistakes += other
+        if isinstance(scenario, Tracking) or other:
+            continue
         if scenario.noise.real and trials != 1:
             mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
         if scenario.noise.estimated and scenario.noise.true_levels(scenario.measurement.m) is None:
@@ -152,7 +160,7 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
         return
     model = scenario.measurement
     with np.errstate(all="ignore"):
-        bound = linear_bound(scenario.problem)
+        bound = scenario.linear_bound
         try:
             few = scenario.draw(0, 1 if scenario.noise.real else _FEW)
         except UserError:
@@ -174,7 +182,7 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
             return
 
 
-def result_keys(scenario: Scenario, estimators: Mapping[str, Estimator]) -> list[ResultKey]:
+def result_keys(scenario: AnyScenario, estimators: Mapping[str, Any]) -> list[ResultKey]:
     """What a run stores of one scenario: its truth, and each estimator."""
     return [ResultKey(scenario), *(ResultKey(scenario, label, estimator) for label, estimator in estimators.items())]
 
@@ -188,8 +196,8 @@ def record_refusal(
     output: Path | str,
     job: str,
     reason: str,
-    scenario: Scenario | None = None,
-    estimators: Mapping[str, Estimator] = MappingProxyType({}),
+    scenario: AnyScenario | None = None,
+    estimators: Mapping[str, Any] = MappingProxyType({}),
     trials: int = 1,
 ) -> None:
     """Notes in a folder that a job of a sweep was asked for and refused, if the folder holds results.
@@ -217,7 +225,7 @@ def _now() -> str:
     return datetime.datetime.now(datetime.UTC).isoformat(timespec="microseconds")
 
 
-def _record(scenarios: Sequence[Scenario], estimators: Mapping[str, Estimator], trials: int) -> dict[str, Any]:
+def _record(scenarios: Sequence[AnyScenario], estimators: Mapping[str, Any], trials: int) -> dict[str, Any]:
     cells = [cell for scenario in scenarios for cell in result_keys(scenario, estimators)]
     return {
         "trials": trials,

@@ -16,19 +16,19 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from ipe_bench.basics.errors import StorageError
-from ipe_bench.estimators.base import estimate_safely
 from ipe_bench.runs.execution.base import FATAL, Execution, Failure
 from ipe_bench.runs.key import ResultKey
 from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.store import Store, describe_names
-from ipe_bench.trials.scenario import Scenario
-from ipe_bench.trials.scoring import HISTORIES, Block
+from ipe_bench.trials.scoring import HISTORIES
+from ipe_bench.trials.tracking import AnyScenario, block_of
 
 log = logging.getLogger(__name__)
 
@@ -120,9 +120,8 @@ def run_task(task: Task) -> Iterator[Done | str]:
     store, cells = Store(task.directory), _recalled(task)
     _check_source(cells)
     with _alone():
-        block = Block.draw(cells[0].scenario, task.start, task.stop)
-        # What all cells share is not to be charged to the first of them.
-        _ = block.crlb_information
+        block = block_of(cells[0].scenario, task.start, task.stop)
+        block.share()  # which is not to be charged to the first of the cells
     for index, cell in enumerate(cells):
         try:
             with _alone():
@@ -160,16 +159,17 @@ def _recalled(task: Task) -> tuple[ResultKey, ...]:
 _prepared: set[str] = set()
 
 
-def _prepare(block: Block, cell: ResultKey) -> None:
+def _prepare(block: Any, cell: ResultKey) -> None:
     """Has an estimator make a first estimate of a first trial, unless it has made one of this model in this process."""
     if cell.estimator is None:
         return
     model = cell.scenario.measurement
-    compiled = describe(model) if model.by_differential_equations else type(model).__qualname__
+    by_equations = getattr(model, "by_differential_equations", False)
+    compiled = describe(model) if by_equations else type(model).__qualname__
     what = digest([describe(cell.estimator), compiled])
     if what not in _prepared:
         _prepared.add(what)
-        estimate_safely(cell.estimator, block.problem, block.trials.z[:1])
+        block.warm(cell.estimator)
 
 
 @contextlib.contextmanager
@@ -184,8 +184,8 @@ def _blas() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def _compute_cell(store: Store, block: Block, cell: ResultKey) -> None:
-    start, stop, history = block.trials.start, block.trials.stop, None
+def _compute_cell(store: Store, block: Any, cell: ResultKey) -> None:
+    start, stop, history = block.start, block.start + len(block), None
     if cell.estimator is None:
         columns = block.truth_columns()
     else:
@@ -206,7 +206,7 @@ def _check_source(cells: Sequence[ResultKey]) -> None:
         )
 
 
-def _history_columns(scenario: Scenario, history: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+def _history_columns(scenario: AnyScenario, history: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
     x = np.concatenate(list(history))
     lengths = [len(rows) for rows in history]
     return {

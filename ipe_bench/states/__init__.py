@@ -2,8 +2,9 @@
 
 from ipe_bench.states.base import Gaussian, Paths, StateModel
 from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
+from ipe_bench.states.formulas import Formulas
 from ipe_bench.states.linearisation import Cubature, GaussHermite, SigmaPoints, Taylor, Unscented
-from ipe_bench.states.models import ConstantVelocity, CoordinatedTurn, Growth, Pendulum
+from ipe_bench.states.models import CoordinatedTurn
 from ipe_bench.states.trackers import (
     Bootstrap,
     Filter,
@@ -20,16 +21,14 @@ from ipe_bench.states.trackers import (
 
 __all__ = [
     "Bootstrap",
-    "ConstantVelocity",
     "CoordinatedTurn",
     "Cubature",
     "Filter",
+    "Formulas",
     "GaussHermite",
     "Gaussian",
-    "Growth",
     "IteratedSmoother",
     "Paths",
-    "Pendulum",
     "SigmaPoints",
     "Smoother",
     "StateModel",

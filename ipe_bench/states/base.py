@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, multiply
 from ipe_bench.basics.naming import Named
 from ipe_bench.basics.options import Component
@@ -95,6 +96,16 @@ class StateModel(Component, Named, ABC):
         return len(self.states)
 
     @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The states, which are what is estimated."""
+        return self.states
+
+    @property
+    def m(self) -> int:
+        """The number of readings of all epochs."""
+        return self.epochs * len(self.R(0))
+
+    @property
     def epochs(self) -> int:
         """K, the number of epochs."""
         return len(self.times)
@@ -140,6 +151,37 @@ class StateModel(Component, Named, ABC):
             paths.x[:, k] = x
             paths.z[:, k] = self.observe(x, k) + multiply(factor(self.R(k)), v[:, k])
         return paths
+
+
+def require_sound(model: StateModel) -> None:
+    """Raises UserError unless the parts of a model suit one another: times, prior, Q, R, f and h."""
+    n, name = model.n, f"model={model.name}"
+    if not model.epochs or not (np.diff(model.times) > 0).all():
+        raise UserError(f"{name}: its times do not increase from epoch to epoch; give epochs in order")
+    m, x = len(model.R(0)), model.prior.mean
+    shapes = {
+        "the mean of the prior": (x, (n,)),
+        "f": (model.transition(x[None], model.epochs - 1), (1, n)),
+        "h": (model.observe(x[None], 0), (1, m)),
+        "periods": (model.periods, (m,) if model.periods else (0,)),
+    }
+    for k in {0, model.epochs - 1}:
+        shapes |= {f"the gain of epoch {k + 1}": (model.gain(k), (n, np.shape(model.gain(k))[-1]))}
+    for what, (value, shape) in shapes.items():
+        if np.shape(value) != shape:
+            raise UserError(f"{name}: {what} has shape {np.shape(value)}, where {shape} belongs")
+    matrices = {"the covariance of the prior": (model.prior.covariance, n)}
+    for k in range(model.epochs):
+        matrices |= {f"Q of epoch {k + 1}": (model.Q(k), n), f"R of epoch {k + 1}": (model.R(k), m)}
+    for what, (P, size) in matrices.items():
+        if np.shape(P) != (size, size):
+            raise UserError(f"{name}: {what} has shape {np.shape(P)}, where {(size, size)} belongs")
+        if not np.allclose(P, P.T, rtol=1e-9, atol=0):
+            raise UserError(f"{name}: {what} is not symmetric; give a covariance")
+        if not np.linalg.eigvalsh(P)[0] >= -1e-12 * np.abs(P).max() * size:
+            raise UserError(f"{name}: {what} has a negative eigenvalue; give a covariance")
+    if not np.isfinite(factor(model.R(0))).all():
+        raise UserError(f"{name}: R is singular; give every reading a standard deviation above 0")
 
 
 def slope(function: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:

@@ -7,9 +7,9 @@ is NaN from then on and disturbs no other.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -34,7 +34,8 @@ class Tracks:
     covariance: Array
     """(trials, K, n, n)"""
     nis: Array
-    """Squared normalised innovations (trials, K), chi-square with `degrees` if the model holds; 0 in smoothers."""
+    """Squared normalised innovations (trials, K), chi-square with `degrees` if the model holds; 0 in smoothers,
+    NaN where there are none."""
     degrees: Array
     """Readings that were there (trials, K)."""
     log_likelihood: Array
@@ -55,9 +56,28 @@ class Tracks:
         means, covariances = np.empty((trials, K, n)), np.empty((trials, K, n, n))
         return cls(means, covariances, nis, degrees, np.zeros(trials), 0.0, spread_prior(model, trials))
 
+    @classmethod
+    def lost(cls, model: StateModel, trials: int) -> Tracks:
+        """Tracks of which nothing is known."""
+        tracks = cls.empty(model, trials)
+        tracks.mean[:], tracks.covariance[:] = np.nan, np.nan
+        return tracks
+
+    @classmethod
+    def join(cls, parts: Sequence[Tracks]) -> Tracks:
+        """The trials of several batches one after another, without what smoothers need."""
+        names = ("mean", "covariance", "nis", "degrees", "log_likelihood")
+        arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        start = Gaussian(*[np.concatenate(several) for several in zip(*(part.start for part in parts), strict=True)])
+        return cls(**arrays, calls=max(part.calls for part in parts), start=start)
+
 
 class Tracker(Component, Named, ABC):
     """Estimates the states of every trial from its readings."""
+
+    needs: ClassVar[frozenset[str]] = frozenset({"epochs", "prior"})
+    equation: ClassVar[None] = None
+    family: ClassVar[str] = "filters"
 
     @abstractmethod
     def track(self, model: StateModel, z: Array) -> Tracks:
@@ -125,9 +145,9 @@ class Filter(Tracker):
     """
 
     rule: Rule = field(default_factory=Taylor)
+    """How transition and reading are linearised."""
     iterations: Count = 1
-    damped: bool = False
-    """Whether steps that raise the cost of the update are halved; for Taylor's rule."""
+    """Linearisations of each reading."""
 
     def track(self, model: StateModel, z: Array) -> Tracks:
         out = Tracks.empty(model, len(z))
@@ -149,14 +169,7 @@ class Filter(Tracker):
         for _ in range(self.iterations):
             read = linearised_reading(model, self.rule, k, z, at)
             found = update(x, read, R, z)
-            new = found.x
-            if self.damped:
-
-                def cost(mean: Array) -> Array:
-                    return mahalanobis(mean - x.mean, x.covariance) + misfit(model, z, mean, k)
-
-                new = Gaussian(_halved(at.mean, new.mean, cost), new.covariance)
-            at = new
+            at = found.x
         out.nis[:, k], out.degrees[:, k] = found.nis, found.degrees  # pyright: ignore[reportPossiblyUnboundVariable]
         out.log_likelihood += found.log_likelihood  # pyright: ignore[reportPossiblyUnboundVariable]
         return at
@@ -167,6 +180,7 @@ class Smoother(Tracker):
     """The smoother of Rauch, Tung and Striebel (AIAA J. 3, 1965) behind a filter."""
 
     filter: Filter = field(default_factory=Filter)
+    """The filter whose tracks are smoothed."""
 
     def track(self, model: StateModel, z: Array) -> Tracks:
         return smoothed(model, self.filter.track(model, z))
@@ -182,9 +196,13 @@ class IteratedSmoother(Tracker):
     """
 
     first: Filter = field(default_factory=Filter)
+    """The filter whose smoothed tracks are the first path."""
     rule: Rule = field(default_factory=Taylor)
+    """How transition and reading are linearised about a path."""
     iterations: Count = 10
+    """Paths at most, after the first."""
     damped: bool = False
+    """Whether steps that raise the cost of the path are halved; for Taylor's rule."""
     tolerance: NonNegative = 0.0
     """Ends where no trial's path moves by more than so many of its own standard deviations."""
 
@@ -288,7 +306,9 @@ class Bootstrap(Tracker):
     every epoch. Each trial's random numbers are those of its readings, in whatever batch."""
 
     particles: Count = 1000
+    """States that stand for the density of a trial."""
     seed: int = 0
+    """A trial's random numbers depend on this and on its readings: on nothing else in the batch."""
 
     def track(self, model: StateModel, z: Array) -> Tracks:
         trials, N = len(z), self.particles
@@ -298,6 +318,7 @@ class Bootstrap(Tracker):
             return np.stack([g.standard_normal((N, columns)) for g in generators])
 
         out = Tracks.empty(model, trials)
+        out.nis[:] = np.nan  # a weighted sample has no innovation
         spread = root(model.prior.covariance)
         x = model.prior.mean + np.matmul(normals(spread.shape[1]), spread.T)
         for k in range(model.epochs):

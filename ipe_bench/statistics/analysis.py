@@ -20,6 +20,7 @@ from ipe_bench.statistics.intervals import quantile, quantiles
 from ipe_bench.statistics.records import SCORES, rows_of
 from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of
 from ipe_bench.statistics.summary import ALL, scenario_rows, to_frame
+from ipe_bench.statistics.tracks import curves
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -60,6 +61,9 @@ class Analysis:
     within in 95 % of cases, and whether this one is `outside` (by either of its curves)."""
     contraction: pd.DataFrame
     """Per scenario, how much the fixed-point iteration contracts at the truth; empty if no file says so."""
+    tracks: pd.DataFrame
+    """Of each state of a tracker: time `at` of each epoch, `rmse`, `bound` at the truth, `posterior` and
+    `posterior_smoothed` Cramér-Rao bounds, and `nees` over n with the ends of its limits."""
     attained: pd.DataFrame
     """Which estimator attains known minima, over all scenarios; see `certified.attained_table`."""
 
@@ -126,6 +130,7 @@ class Begun:
             names = {"row": np.repeat(sample.names, sample.n), "column": np.tile(sample.names, sample.n)}
             self.rows["correlations"].append(numbered | names | {"value": correlation(sample).ravel()})
             self.rows["calibration"] += [numbered | row for row in _calibration_rows(sample)]
+            self.rows["tracks"] += [numbered | row for row in curves(sample)]
             self.rows["convergence"] += [
                 numbered | {"trial": h.trial, "iteration": np.arange(len(h.distances)), "distance": h.distances}
                 for h in sample.histories
@@ -157,6 +162,7 @@ class Begun:
             convergence=_joined(rows["convergence"], ("trial", "iteration", "distance")),
             calibration=_joined(rows["calibration"], ("parameter", "at", "difference", "low", "high", "outside")),
             contraction=pd.DataFrame(rows["contraction"]),
+            tracks=_joined(rows["tracks"], ("parameter", "at", "rmse")),
             attained=attained_table(self.collection),
         )
 

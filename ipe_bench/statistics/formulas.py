@@ -80,6 +80,11 @@ def rms(values: Array) -> float:
     return float(size * np.sqrt(np.mean((values / size) ** 2)))
 
 
+def rms_columns(values: Array) -> Array:
+    """The root mean squares (n,) of columns (trials, n)."""
+    return np.sqrt(mean(values**2))
+
+
 def in_units(values: Array, s: Sample) -> Array:
     """Values (n,) in the parameters' own units, and behind them their root mean square over the linear bound."""
     return np.append(values * s.sizes, rms(values / s.linear_bound))

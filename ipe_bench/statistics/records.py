@@ -13,6 +13,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 import ipe_bench.statistics.formulas as f
+import ipe_bench.statistics.tracks as t
 from ipe_bench.basics.errors import UserError, place_of
 from ipe_bench.statistics.consistency import SEEN, clopper_pearson, verdict
 from ipe_bench.statistics.histories import CLOSE, orders_of
@@ -33,6 +34,7 @@ Where = Literal[
     "iterations",
     "theory",
     "calibration",
+    "tracks",
 ]
 """A table; its columns are in the order of the records. The overview and the terminal's table show those of plugins
 behind their own."""
@@ -347,7 +349,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "Bayesian bound",
         "solved trials",
         "(J' R⁻¹ J + P₀⁻¹)⁻¹ at the truth, which estimators that use a prior are compared with: root mean square of its"
-        " standard deviation. It is a local bound, for each truth its own, and not Van Trees's.",
+        " standard deviation. It is a local bound, for each truth its own, and not Van Trees's. Of states that move: of"
+        " the filter that is linearised at the truth.",
         f.of_each(f.bayes),
         given="solved",
         kind="physical",
@@ -359,7 +362,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "truths drawn from the prior",
         "(E[J' R⁻¹ J] + P₀⁻¹)⁻¹, which no estimator can beat on average over the prior, biased or not (Van Trees,"
         " Detection, Estimation, and Modulation Theory I, 1968, sec. 2.4): standard deviation. The mean E is over"
-        f" {EXPECTED} truths of each seed; its interval, 95 %, is that of this mean.",
+        f" {EXPECTED} truths of each seed; its interval, 95 %, is that of this mean. Of states that move: the posterior"
+        " Cramér-Rao bound (Tichavský, Muravchik and Nehorai, IEEE TSP 46, 1998).",
         f.of_each(f.van_trees),
         limits=f.van_trees_limits,
         kind="physical",
@@ -634,6 +638,71 @@ STATISTICS: tuple[Statistic, ...] = (
         lambda s: quantile(s.scalars["time_s"], 0.5),
         kind="seconds",
         where=("costs",),
+    ),
+    Statistic(
+        "path_rmse",
+        "rmse, all epochs",
+        "solved trials of trackers",
+        "Root mean square error over all epochs; over all states, root mean square of its ratio to the bound at the"
+        " truth. Interval: as that of rmse, over trials.",
+        t.rmse,
+        limits=t.rmse_limits,
+        given="solved",
+        kind="physical",
+        where=("tracks",),
+        limits_titles={"tracks": "95 % of rmse"},
+    ),
+    Statistic(
+        "path_bound",
+        "bound at the truth",
+        "all trials of trackers",
+        "Standard deviation of the extended Kalman filter that is linearised at the true path (Taylor, IEEE TAC 24,"
+        " 1979), root mean square over all epochs: what a good filter attains, and a smoother can fall below.",
+        t.bound,
+        kind="physical",
+        where=("tracks",),
+    ),
+    Statistic(
+        "path_nees",
+        "NEES / n, all epochs",
+        "solved trials of trackers",
+        "Mean over all epochs of e' P⁻¹ e / n with the covariance P that the tracker reports: 1 where it is right; none"
+        " where P is singular by the model.",
+        lambda s: t.mean_score(s, "path_nees") / s.n,
+        where=("tracks",),
+    ),
+    Statistic(
+        "path_verdict",
+        "verdict, all epochs",
+        "converged trials of trackers",
+        "The verdict on each trial's mean NEES over all epochs: epochs are dependent, trials are not.",
+        t.path_verdict,
+        kind="word",
+        where=("tracks",),
+    ),
+    Statistic(
+        "path_nis",
+        "NIS / m",
+        "all trials of filters of states",
+        "Mean normalised innovation squared over the number of readings, 1 where the filter is right.",
+        lambda s: f.mean_nis(s) if t.is_track(s) else np.nan,
+        where=("tracks",),
+    ),
+    Statistic(
+        "log_likelihood",
+        "log likelihood",
+        "solved trials of filters of states",
+        "Mean logarithm of the density of a trial's readings, by the innovations.",
+        lambda s: t.mean_score(s, "log_likelihood"),
+        where=("tracks",),
+    ),
+    Statistic(
+        "first_bad_epoch",
+        "first bad epoch",
+        "solved trials of trackers that have one",
+        f"Mean number of the first epoch whose error lies where a share of {GATE:g} should by the bound at the truth.",
+        lambda s: t.mean_score(s, "first_bad_epoch"),
+        where=("tracks",),
     ),
 )
 """The columns of `summary.csv`, in order."""

@@ -24,7 +24,9 @@ NIS = "extra_nis"
 AMBIGUOUS = "extra_ambiguous"
 """The column in which estimators that look for several minima report 1 if they found some, else 0."""
 SCALARS = ("status", "solved", "success", "iterations", "simulations", "jacobians", "time_s", "nees", "crlb_distance")
-OPTIONAL = ("message", FIT, NIS, AMBIGUOUS, "root_distance")
+PATH = ("path_nees", "log_likelihood", "first_bad_epoch")
+"""Scores of a tracker over the whole path."""
+OPTIONAL = ("message", FIT, NIS, AMBIGUOUS, "root_distance", *PATH)
 """Columns that not every version or estimator stores."""
 CONTRACTION = ("contraction_K", "contraction_norm", "contraction_radius")
 TRUTH = (*CONTRACTION, "curvature_M", "curvature_intrinsic", "curvature_parameter")
@@ -172,9 +174,17 @@ class Sample:
     def of_truth(self, kind: str) -> Array:
         """What is stored of the truth for each parameter (trials, n), or (trials,) by a name in `TRUTH`, read anew; NaN
         where it is not stored."""
+        return self._beside(kind)
+
+    def of_estimate(self, kind: str) -> Array:
+        """What is stored of the estimates for each parameter (trials, n) besides errors and deviations, read anew."""
+        return self._beside(kind, own=True)
+
+    def _beside(self, kind: str, *, own: bool = False) -> Array:
         names = [kind] if kind in TRUTH else [f"{kind}_{name}" for name in self.names]
         values = np.full((len(names), len(self)), np.nan)
-        for _, truth in self.group.cells:
+        for cell, truth in self.group.cells:
+            truth = cell if own else truth
             stored = {} if truth is None else self.collection.load(truth, (), names)
             if truth is None or not len(stored["trial"]):
                 continue

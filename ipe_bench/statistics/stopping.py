@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.estimators.base import Estimator
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.key import ResultKey
 from ipe_bench.runs.results import Results
@@ -24,7 +23,7 @@ from ipe_bench.statistics.formulas import rmse_ends_anytime
 from ipe_bench.statistics.intervals import share_sequence
 from ipe_bench.statistics.records import SCORES, rows_of, summary_columns_of
 from ipe_bench.statistics.sample import Sample, samples
-from ipe_bench.trials.scenario import Scenario
+from ipe_bench.trials.tracking import AnyScenario
 
 NARROW = "every interval is narrow enough"
 """Why a scenario stops that has come to the precision that was asked for."""
@@ -76,7 +75,7 @@ def reached(sample: Sample, wanted: Mapping[str, float]) -> list[tuple[float, st
 class Stop:
     """How many trials a scenario took until its intervals were narrow enough, or why it took no more."""
 
-    scenario: Scenario
+    scenario: AnyScenario
     trials: int
     reason: str
     widest: str
@@ -95,8 +94,8 @@ class Stop:
 
 
 def compute_until(
-    scenarios: Sequence[Scenario],
-    estimators: Mapping[str, Estimator],
+    scenarios: Sequence[AnyScenario],
+    estimators: Mapping[str, Any],
     most: int | None,
     output: Path | str,
     *,
@@ -161,7 +160,7 @@ def next_trials(trials: int, ratio: float, block: int, most: int) -> int:
 
 
 def _first_trials(
-    scenario: Scenario, estimators: Mapping[str, Estimator], output: Path, block_size: int, most: int
+    scenario: AnyScenario, estimators: Mapping[str, Any], output: Path, block_size: int, most: int
 ) -> int:
     """Where to begin: with what is stored of every estimator, or one block."""
     cells = result_keys(scenario, estimators)
@@ -171,7 +170,7 @@ def _first_trials(
     return min(most, max(stored, block_size))
 
 
-def _stored(scenario: Scenario, estimators: Mapping[str, Estimator], output: Path | str) -> Iterator[Sample]:
+def _stored(scenario: AnyScenario, estimators: Mapping[str, Any], output: Path | str) -> Iterator[Sample]:
     """The stored trials of every estimator that has some."""
     collection = collect([output], {cell.key for cell in result_keys(scenario, estimators)})
     return samples(collection, collection.groups)
@@ -186,7 +185,7 @@ def check_time_limit(time_limit: float | None, precision: Any = None) -> None:
 
 
 def objective(
-    scenario: Scenario, estimators: Mapping[str, Estimator], label: str, column: str, output: Path | str
+    scenario: AnyScenario, estimators: Mapping[str, Any], label: str, column: str, output: Path | str
 ) -> float:
     """What is known of an estimator by one number: a column of its row over all parameters, of all stored trials.
 

@@ -15,6 +15,7 @@ from ipe_bench.measurements.problem import Problem, recorded_problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.own import ModelNoise, resolved
 from ipe_bench.priors import GaussianPrior, Prior
+from ipe_bench.trials.bounds import linear_bound, linear_correlation
 
 _PARAMETERS, _NOISE = 0, 1
 """The two random streams of a trial."""
@@ -60,8 +61,7 @@ class Scenario:
         object.__setattr__(self, "noise", resolved(self.noise, self.measurement))
         if not (np.isfinite(self.error_scale) and self.error_scale > 0):
             raise UserError(f"error_scale={self.error_scale}: give a finite number above 0")
-        if not 0 <= self.seed < _SEEDS:
-            raise UserError(f"seed={self.seed}: give a whole number from 0 to {_SEEDS - 1}")
+        check_seed(self.seed)
         if self.noise.real and self.measurement.recorded is None:
             raise UserError(
                 f"noise=certified: measurement={self.measurement.name} comes with no readings of its own; choose "
@@ -82,6 +82,16 @@ class Scenario:
         model = self.measurement
         deviation, correlation = self.prior.deviation(model.n, self.error_scale), self.prior.correlation(model.n)
         return Problem(model, self.noise.nominal_covariance(model), deviation, correlation)
+
+    @cached_property
+    def linear_bound(self) -> Array:
+        """Standard deviations (n,) of eq. (5)."""
+        return linear_bound(self.problem)
+
+    @property
+    def linear_correlation(self) -> Array:
+        """Correlation (n, n) of the covariance of eq. (5)."""
+        return linear_correlation(self.problem)
 
     @cached_property
     def simulator(self) -> Measurement:
@@ -121,6 +131,12 @@ class Scenario:
             # After the parameters, from the same stream: a richer truth keeps the parameters of the trial.
             row[n:] = deviation * rng.standard_normal(len(deviation))
         return drawn
+
+
+def check_seed(seed: int) -> None:
+    """Raises UserError unless the seed can be one."""
+    if not 0 <= seed < _SEEDS:
+        raise UserError(f"seed={seed}: give a whole number from 0 to {_SEEDS - 1}")
 
 
 def _recorded_trial(measurement: Measurement, start: int, stop: int) -> Trials:

@@ -127,12 +127,12 @@ class Block:
         van_trees, van_trees_error = self._van_trees()
         return {
             "trial": np.arange(self.trials.start, self.trials.stop),
-            **_by_parameter("x", names, self.trials.x),
-            **_by_parameter("crlb", names, self.crlb_deviation),
-            **_by_parameter("bayes", names, self.bayes_deviation),
-            **_by_parameter("van_trees", names, van_trees),
-            **_by_parameter("van_trees_error", names, van_trees_error),
-            **_by_parameter("linear_error", names, multiply(H_plus, self.trials.z - self.readings)),
+            **by_parameter("x", names, self.trials.x),
+            **by_parameter("crlb", names, self.crlb_deviation),
+            **by_parameter("bayes", names, self.bayes_deviation),
+            **by_parameter("van_trees", names, van_trees),
+            **by_parameter("van_trees_error", names, van_trees_error),
+            **by_parameter("linear_error", names, multiply(H_plus, self.trials.z - self.readings)),
             "contraction_K": contracts.K,
             "contraction_norm": contracts.infinity_norm,
             "contraction_radius": contracts.spectral_radius,
@@ -187,7 +187,7 @@ class Block:
             "curvature_M": M,
             "curvature_intrinsic": intrinsic,
             "curvature_parameter": parametric,
-            **_by_parameter("box_bias", names, bias),
+            **by_parameter("box_bias", names, bias),
         }
 
     def _misspecification_columns(self, names: list[str]) -> Columns:
@@ -199,8 +199,8 @@ class Block:
         with np.errstate(all="ignore"):
             found = misspecified(self.problem, h, self.trials.x, self.jacobian)
         return {
-            **_by_parameter("pseudo_bias", names, found.bias),
-            **_by_parameter("misspecified", names, found.deviation),
+            **by_parameter("pseudo_bias", names, found.bias),
+            **by_parameter("misspecified", names, found.deviation),
         }
 
     def reference_root(self, equation: Equation, inflation: float = 1.0) -> Array:
@@ -222,6 +222,21 @@ class Block:
         if self.problem.rankless:  # there is no such equation; the estimators that solve it say so
             return np.full(trials.x.shape, np.nan)
         return frozen_root(self.problem, trials.z, trials.x, known)
+
+    def warm(self, estimator: Estimator) -> None:
+        """Has an estimator do what it does once in a process."""
+        estimate_safely(estimator, self.problem, self.trials.z[:1])
+
+    def share(self) -> None:
+        """Computes what all estimators share."""
+        _ = self.crlb_information
+
+    def __len__(self) -> int:
+        return len(self.trials.x)
+
+    @property
+    def start(self) -> int:
+        return self.trials.start
 
     def estimate(self, estimator: Estimator) -> tuple[Estimates, Columns]:
         """What an estimator makes of the block, and its score."""
@@ -272,8 +287,8 @@ class Block:
         deviation = np.full(error.shape, np.nan) if P is None else deviations(P)
         return {
             "trial": np.arange(self.trials.start, self.trials.stop),
-            **_by_parameter("error", names, error),
-            **_by_parameter("deviation", names, deviation),
+            **by_parameter("error", names, error),
+            **by_parameter("deviation", names, deviation),
             "status": np.array([labels[s] for s in status.tolist()], dtype=object),
             "message": np.array([estimates.messages.get(i, "") for i in range(trials)], dtype=object),
             "iterations": estimates.iterations,
@@ -325,5 +340,5 @@ def _nees_of_any(e: Array, C: Array) -> Array:
     return np.where(definite, np.einsum("ti,ti->t", e, x), np.inf)
 
 
-def _by_parameter(prefix: str, names: list[str], values: Array) -> Columns:
+def by_parameter(prefix: str, names: list[str], values: Array) -> Columns:
     return {f"{prefix}_{name}": np.ascontiguousarray(values[:, i]) for i, name in enumerate(names)}

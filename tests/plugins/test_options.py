@@ -159,13 +159,20 @@ PRESETS = {
     ("measurement", "gins_nonlinear"): {"accelerometer_quadratic"},
     ("measurement", "gins_random_walk"): {"gyro_random_walk"},
     ("measurement", "gins_tilted"): {"platform_misalignment"},
+    # The filters and smoothers are rules and numbers of iterations.
+    **{("tracker", name): {"rule"} for name in ("ukf", "ckf", "ghkf")},
+    ("tracker", "iekf"): {"iterations"},
+    ("tracker", "iplf"): {"rule", "iterations"},
+    ("tracker", "ukf_rts"): {"filter"},
+    ("tracker", "ieks"): {"first"},
+    ("tracker", "ipls"): {"first", "rule"},
 }
 
 
 PARTS_OF_A_REPORT = ("statistic", "figure", "table", "section")
 
 
-DESCRIBED = "_target_: ipe_bench.measurements.Ode"
+DESCRIBED = "_target_: ipe_bench.measurements.Ode", "_target_: ipe_bench.states.Formulas"
 """Of models that are nothing but their config."""
 
 
@@ -175,7 +182,7 @@ DESCRIBED = "_target_: ipe_bench.measurements.Ode"
         o
         for o in discovery.options()
         if o.group not in ("experiment", *PARTS_OF_A_REPORT)
-        and not any(text in o.path.read_text(encoding="utf-8") for text in ("???", DESCRIBED))
+        and not any(text in o.path.read_text(encoding="utf-8") for text in ("???", *DESCRIBED))
     ],
     ids=lambda o: f"{o.group}={o.name}",
 )

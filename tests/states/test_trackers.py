@@ -14,21 +14,20 @@ from filterpy.kalman import (
     UnscentedKalmanFilter,
     spherical_radial_sigmas,
 )
+from python_models import ConstantVelocity, Growth, Pendulum
 from scipy.optimize import least_squares
+from walking_gins import WalkingGins
 
 import ipe_bench as ib
 from ipe_bench.measurements import Gins, Parameter
 from ipe_bench.states import (
     Bootstrap,
-    ConstantVelocity,
     CoordinatedTurn,
     Cubature,
     Filter,
     GaussHermite,
     Gaussian,
-    Growth,
     IteratedSmoother,
-    Pendulum,
     Smoother,
     StateModel,
     Taylor,
@@ -42,7 +41,6 @@ from ipe_bench.states import (
     ukf,
 )
 from ipe_bench.states.trackers import path_cost
-from ipe_bench.states.walking_gins import WalkingGins
 
 BOOK = {
     "EKF": (Taylor(), 1, 0.16830859061153763, 0.057446202494837),
@@ -207,7 +205,7 @@ def test_the_damped_gauss_newton_smoother_finds_the_path_of_a_dense_solver():
     [
         ekf(),
         ukf(),
-        Filter(Taylor(), 5, damped=True),
+        Filter(Taylor(), 5),
         Smoother(ckf()),
         IteratedSmoother(ukf(), Taylor(), 5, damped=True),
         Bootstrap(200),

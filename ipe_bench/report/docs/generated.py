@@ -22,7 +22,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import make_folder, write_text
 from ipe_bench.basics.statuses import Status
 from ipe_bench.plugins.description import described
-from ipe_bench.plugins.discovery import ESTIMATOR_GROUPS, Option, options
+from ipe_bench.plugins.discovery import PACKAGES, Option, options
 from ipe_bench.report.definitions import DEFINITIONS
 from ipe_bench.report.figures import INDEX
 from ipe_bench.report.table import environment
@@ -36,6 +36,8 @@ GROUPS = {
     "prior": "Priors",
     "solver": "Solvers",
     "baseline": "Baseline estimators",
+    "model": "State models",
+    "tracker": "Filters and smoothers of states",
     "execution": "Executions",
 }
 FIGURES = 3
@@ -81,7 +83,7 @@ def write_reference(folder: Path) -> None:
     """Adds pages of options, commands, statuses, statistics and Python names to a folder."""
     for group, title in GROUPS.items():
         rows = [(option, described(option)) for option in _ours(group)]
-        key = "estimators.NAME" if group in ESTIMATOR_GROUPS else group
+        key = f"{PACKAGES[group]}.NAME" if group in PACKAGES else group
         write_page(folder / f"{group}.md", "options", group=group, title=title, key=key, options=rows)
     statuses = [status for status in Status if status is not Status.RUNNING]
     write_page(folder / "statuses.md", "statuses", statuses=statuses)

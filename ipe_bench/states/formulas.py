@@ -1,0 +1,136 @@
+"""State models written in a config: transition, readings and noise as formulas of named states."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.linalg import Array
+from ipe_bench.measurements.arithmetic import Arithmetic, read, require_finite
+from ipe_bench.measurements.base import Parameter, differentiate
+from ipe_bench.states.base import Gaussian
+from ipe_bench.states.models import Steady
+
+_OTHER_PLACES = 0.0, 0.7, -1.3
+"""Multiples of the prior's deviations at which the gain of the process noise has to be the same."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Formulas(Steady):
+    """States whose next values, and readings, are formulas of the states, constants, the number k of the epoch from 1
+    on, and its time t in s; the transition may contain the names of the process noise, with constant factors.
+
+    The language is that of `ipe_bench.measurements.arithmetic`: + - * / ** and elementary functions, angles in rad.
+    """
+
+    next: Mapping[str, str]
+    """The next value of each state."""
+    readings: Mapping[str, str]
+    """Each reading."""
+    noise: Mapping[str, float] = field(default_factory=dict)
+    """Standard deviation of each independent process noise, by the name that it has in the transition."""
+    deviation: Mapping[str, float]
+    """Standard deviation of each reading."""
+    start: Mapping[str, float] = field(default_factory=dict)
+    """Mean of each state in the prior; 0 where absent."""
+    spread: Mapping[str, float]
+    """Standard deviation of each state in the prior."""
+    constants: Mapping[str, float] = field(default_factory=dict)
+    """Numbers that the formulas name."""
+    units: Mapping[str, str] = field(default_factory=dict)
+    """Units of states."""
+    period: Mapping[str, float] = field(default_factory=dict)
+    """Periods of readings that come round, such as 6.283185307 of a bearing in rad."""
+    title: str = "formulas"
+    """The name of the model in tables."""
+
+    name = property(lambda model: model.title)  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        known = {*self.next, *self.constants, "k", "t"}
+        for key, formulas, names in (
+            ("next", self._transitions, {*known, *self.noise}),
+            ("readings", self._readings, known),
+        ):
+            if not formulas:
+                raise UserError(f"{key}: is empty; write {key}.NAME=FORMULA")
+            for label, formula in formulas.items():
+                for name in formula.names:
+                    if name not in names:
+                        raise UserError(f"{key}.{label}: {unknown(name, names, 'name')}")
+        of_states, of_readings = set(self.next), set(self.readings)
+        for key, owners, whole in (
+            ("deviation", of_readings, True),
+            ("period", of_readings, False),
+            ("spread", of_states, True),
+            ("start", of_states, False),
+            ("noise", set(self.noise), False),
+            ("constants", set(self.constants), False),
+        ):
+            for label, value in getattr(self, key).items():
+                require_finite(f"{key}.{label}", value)
+                if label not in owners:
+                    raise UserError(f"{key}.{label}: {unknown(label, owners, 'name')}")
+                if value < 0 and key in ("deviation", "spread", "noise"):
+                    raise UserError(f"{key}.{label}={value}: give 0 or a number above")
+            if whole and (absent := owners - set(getattr(self, key))):
+                raise UserError(f"{key}.{min(absent)}: is not given; give it a value")
+        gains = [self._gain_at(multiple) for multiple in _OTHER_PLACES]
+        if not all(np.allclose(gain, gains[0], rtol=1e-9, atol=0) for gain in gains):
+            raise UserError("next: the factor of a process noise depends on a state; give it a constant one")
+
+    @cached_property
+    def _transitions(self) -> dict[str, Arithmetic]:
+        return {name: read(text, f"next.{name}") for name, text in self.next.items()}
+
+    @cached_property
+    def _readings(self) -> dict[str, Arithmetic]:
+        return {name: read(text, f"readings.{name}") for name, text in self.readings.items()}
+
+    @property
+    def states(self) -> tuple[Parameter, ...]:
+        return tuple(Parameter(name, self.units.get(name, "")) for name in self.next)
+
+    @property
+    def periods(self) -> tuple[float, ...]:
+        return tuple(self.period.get(name, 0.0) for name in self.readings) if self.period else ()
+
+    @property
+    def prior(self) -> Gaussian:
+        mean = np.array([self.start.get(name, 0.0) for name in self.next], dtype=float)
+        return Gaussian(mean, np.diag([float(self.spread[name]) ** 2 for name in self.next]))
+
+    def transition(self, x: Array, k: int) -> Array:
+        return self._moved(x, np.zeros(len(self.noise)), k)
+
+    def observe(self, x: Array, k: int) -> Array:
+        return self._values(self._readings, x, k, {})
+
+    def gain(self, k: int) -> Array:
+        return self._gain_at(0.0, k)
+
+    def R(self, k: int) -> Array:
+        return np.diag([float(self.deviation[name]) ** 2 for name in self.readings])
+
+    def _gain_at(self, multiple: float, k: int = 0) -> Array:
+        """G (n, q) of the step into epoch k, from states that many deviations of the prior away from its mean."""
+        x = self.prior.mean + multiple * np.sqrt(np.diagonal(self.prior.covariance))
+        slopes = differentiate(lambda w: self._moved(x, w, k), np.zeros((1, len(self.noise))), analytic=True)[0]
+        return slopes * np.array([float(value) for value in self.noise.values()])
+
+    def _moved(self, x: Array, w: Array, k: int) -> Array:
+        return self._values(self._transitions, x, k, dict(zip(self.noise, np.moveaxis(w, -1, 0), strict=True)))
+
+    def _values(self, formulas: Mapping[str, Arithmetic], x: Array, k: int, noise: Mapping[str, Any]) -> Array:
+        """Those formulas (..., number) at states x (..., n) at epoch k."""
+        known = dict(zip(self.next, np.moveaxis(x, -1, 0), strict=True)) | dict(noise)
+        known |= {**self.constants, "k": k + 1.0, "t": float(self.times[k])}
+        with np.errstate(all="ignore"):
+            values = np.broadcast_arrays(x[..., 0], *(formula(known) for formula in formulas.values()))[1:]
+        return np.stack(np.broadcast_arrays(*values), axis=-1)

@@ -1,0 +1,98 @@
+"""Statistics of tracks: errors over all epochs, and how they and NEES run from epoch to epoch.
+
+Epochs are dependent, so intervals and verdicts are those over trials.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ipe_bench.basics.linalg import Array
+from ipe_bench.statistics import formulas as f
+from ipe_bench.statistics.consistency import mean_limits, verdict
+from ipe_bench.statistics.sample import Sample
+from ipe_bench.trials.tracking import unpacked
+
+
+@dataclass(frozen=True, eq=False)
+class PathSample(Sample):
+    """The same trials with the root mean square over all epochs in the place of errors and of bounds."""
+
+    @cached_property
+    def linear_bound(self) -> Array:
+        return f.rms_columns(self.of_truth("path_bound"))
+
+
+def is_track(s: Sample) -> bool:
+    return "path_nees" in s.scalars
+
+
+@f.once
+def path(s: Sample) -> PathSample:
+    known = {field.name: getattr(s, field.name) for field in fields(Sample)}
+    return PathSample(**known | {"error": s.of_estimate("path"), "kept": {}})
+
+
+def of_path(formula: Callable[[Sample], Array]) -> Callable[[Sample], Array]:
+    """A formula (n,) of errors over all epochs, as it is shown (n + 1,); NaN if nothing is tracked."""
+    return lambda s: f.in_units(formula(path(s)), path(s)) if is_track(s) else np.full(s.n + 1, np.nan)
+
+
+rmse = of_path(f.rmse)
+bound = of_path(lambda s: s.linear_bound)
+
+
+def rmse_limits(s: Sample) -> f.Limits:
+    """Ends (n + 1,) of the intervals of these root mean squares."""
+    return f.ends_in_units(f.rmse_ends)(path(s)) if is_track(s) else (np.full(s.n + 1, np.nan),) * 2
+
+
+def mean_score(s: Sample, name: str) -> float:
+    """The mean of a score over the trials that have one."""
+    values = s.scalars[name][s.solved] if name in s.scalars else np.empty(0)
+    values = values[~np.isnan(values)]
+    return float(values.mean()) if len(values) else np.nan
+
+
+def path_verdict(s: Sample) -> str:
+    return verdict(s.scalars["path_nees"][s.converged], s.n) if is_track(s) else "-"
+
+
+def curves(s: Sample) -> Iterator[dict[str, Any]]:
+    """Of each state of a track: time, root mean square error, bounds, and NEES with its limits, epoch by epoch."""
+    times = np.array(s.group.footer.get("times", ()), dtype=float)
+    if not len(times):
+        return
+    K, n = len(times), s.n
+    own = sum(_sums(s, [cell for cell, _ in s.group.cells], K), np.zeros((K, n + 4)))
+    truths = _sums(s, [truth for _, truth in s.group.cells if truth is not None], K)
+    errors, nees, count = own[:, :n], own[:, n], own[:, -1]
+    total = sum((block[:, : n + 1] for block in truths), np.zeros((K, n + 1)))
+    posterior = next((block[:, n + 1 :] for block in truths if np.isfinite(block).all()), np.full((K, 2 * n), np.nan))
+    with np.errstate(all="ignore"):
+        low, high = mean_limits(n, int(count[0]))
+        for i, name in enumerate(s.names):
+            size = s.sizes[i]
+            yield {
+                "parameter": name,
+                "unit": s.parameters[i]["unit"],
+                "at": times,
+                "rmse": size * np.sqrt(errors[:, i] / count),
+                "bound": size * np.sqrt(total[:, i] / total[:, n]),
+                "posterior": size * np.sqrt(posterior[:, i]),
+                "posterior_smoothed": size * np.sqrt(posterior[:, n + i]),
+                "nees": nees / count / n,
+                "nees_low": low,
+                "nees_high": high,
+            }
+
+
+def _sums(s: Sample, cells: list[Any], epochs: int) -> list[Array]:
+    """The sums (K, columns) of each stored block."""
+    stored = (s.collection.load(cell, (), ("curves",)).get("curves", np.empty(0)) for cell in cells)
+    return [block for texts in stored for block in unpacked(texts, epochs)]

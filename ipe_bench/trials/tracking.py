@@ -1,0 +1,266 @@
+"""State models on trial: true paths that move with process noise, trackers on their readings, and the scores of these.
+
+A trial's parameters are its states at the last epoch, so that whatever is said of estimates of constants is said of
+these; what is said of the whole path stands in columns of its own.
+"""
+
+from __future__ import annotations
+
+import base64
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+from scipy.special import chdtri
+
+from ipe_bench.basics.errors import describe_exception
+from ipe_bench.basics.linalg import Array, Mask, deviations, finite, read_only
+from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.base import Estimates
+from ipe_bench.noise import ModelNoise, Noise
+from ipe_bench.priors import GaussianPrior, Prior
+from ipe_bench.states.base import Paths, StateModel, require_sound
+from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
+from ipe_bench.states.trackers import Tracker, Tracks
+from ipe_bench.trials.scenario import Scenario, check_seed
+from ipe_bench.trials.scoring import Block, Columns, by_parameter, nees
+from ipe_bench.trials.thresholds import EXPECTED, GATE
+
+_PARTS = 10
+"""Groups of paths by whose scatter the standard error of the posterior bound is known."""
+_INDEFINITE = 1e-10
+"""A covariance of which an eigenvalue is below this, in its own deviations, has no inverse."""
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """Everything that determines the trials of a state model. Paths and readings are drawn by the model's own prior, Q
+    and R; trial t is the same in whatever block it is drawn."""
+
+    model: StateModel
+    seed: int = 0
+
+    error_scale: ClassVar[float] = 1.0
+    truth: ClassVar[None] = None
+    noise: ClassVar[Noise] = ModelNoise()
+    prior: ClassVar[Prior] = GaussianPrior()
+
+    def __post_init__(self) -> None:
+        check_seed(self.seed)
+        require_sound(self.model)
+
+    @property
+    def measurement(self) -> StateModel:
+        """The model, as the other scenario calls it."""
+        return self.model
+
+    @property
+    def linear_bound(self) -> Array:
+        """Standard deviations (n,) of the states at the last epoch in a filter that is linearised along the path
+        without process noise from the mean of the prior."""
+        return deviations(self._nominal)
+
+    @property
+    def linear_correlation(self) -> Array:
+        """Their correlation (n, n)."""
+        return self._nominal / np.outer(self.linear_bound, self.linear_bound)
+
+    @cached_property
+    def _nominal(self) -> Array:
+        model = self.model
+        start = x = model.prior.mean[None]
+        path = np.empty((1, model.epochs, model.n))
+        for k in range(model.epochs):
+            x = path[:, k] = model.transition(x, k) if model.moves(k) else x
+        with np.errstate(all="ignore"):
+            return bound_at_truth(model, Paths(start, path, np.empty(0)))[0, -1]
+
+    def draw(self, start: int, stop: int) -> Paths:
+        """Paths of trials start to stop."""
+        return self.model.draw(start, stop, self.seed)
+
+
+AnyScenario = Scenario | Tracking
+
+
+@dataclass(frozen=True)
+class PathBlock:
+    """Trials of a state model with what the truth says of them."""
+
+    scenario: Tracking
+    start: int
+    paths: Paths
+
+    @classmethod
+    def draw(cls, scenario: Tracking, start: int, stop: int) -> PathBlock:
+        with np.errstate(all="ignore"):
+            return cls(scenario, start, scenario.draw(start, stop))
+
+    def __len__(self) -> int:
+        return len(self.paths.x)
+
+    @property
+    def numbers(self) -> Array:
+        return np.arange(self.start, self.start + len(self))
+
+    @property
+    def names(self) -> list[str]:
+        return [p.name for p in self.scenario.model.states]
+
+    @cached_property
+    def bound(self) -> Array:
+        """Covariances (trials, K, n, n) of the filter that is linearised at the truth."""
+        with np.errstate(all="ignore"):
+            return bound_at_truth(self.scenario.model, self.paths)
+
+    @cached_property
+    def variances(self) -> Array:
+        """Their diagonals (trials, K, n)."""
+        return np.ascontiguousarray(np.diagonal(self.bound, axis1=2, axis2=3))
+
+    @cached_property
+    def definite(self) -> Mask:
+        """Whether the covariance at the last epoch has an inverse (trials,), so that NEES says something."""
+        P, d = self.bound[:, -1], deviations(self.bound[:, -1])
+        usable = finite(P) & (d > 0).all(axis=1)
+        C = np.where(usable[:, None, None], P / (d[:, :, None] * d[:, None, :]), 0.0)
+        return np.linalg.eigvalsh(C)[:, 0] > _INDEFINITE
+
+    def warm(self, tracker: Tracker) -> None:
+        """Has a tracker do what it does once in a process."""
+        track_safely(tracker, self.scenario.model, self.paths.z[:1])
+
+    def share(self) -> None:
+        """Computes what all trackers share."""
+        _ = self.variances
+
+    def truth_columns(self) -> Columns:
+        """The states at the last epoch with their bounds, and the bounds along the whole path."""
+        model, names = self.scenario.model, self.names
+        posterior, error = np.full((2, len(self), model.n), np.nan)
+        curves = np.full((2, model.epochs, model.n), np.nan)
+        if self.start == 0 and len(self) and _has_density(model):
+            drawn = self.scenario.draw(0, EXPECTED)
+            with np.errstate(all="ignore"):
+                filtered, smoothed = posterior_bounds(model, drawn)
+                parts = [posterior_bounds(model, _some(drawn, i))[0][-1] for i in range(_PARTS)]
+                posterior[0] = deviations(filtered[-1:])[0]
+                error[0] = deviations(np.array(parts)).std(axis=0, ddof=1) / np.sqrt(_PARTS)
+            curves = np.stack([np.diagonal(P, axis1=1, axis2=2) for P in (filtered, smoothed)])
+        sums = [self.variances.sum(axis=0), np.full((model.epochs, 1), len(self)), *curves]
+        return {
+            "trial": self.numbers,
+            **by_parameter("x", names, self.paths.x[:, -1]),
+            **by_parameter("bayes", names, np.sqrt(self.variances[:, -1])),
+            **by_parameter("path_bound", names, np.sqrt(self.variances.mean(axis=1))),
+            **by_parameter("van_trees", names, posterior),
+            **by_parameter("van_trees_error", names, error),
+            "curves": packed(len(self), sums),
+        }
+
+    def estimate(self, tracker: Tracker) -> tuple[Estimates, Columns]:
+        """What a tracker makes of the states at the last epoch, and its scores over the whole path."""
+        model, z = self.scenario.model, self.paths.z
+        began = time.perf_counter()
+        tracks, messages = track_safely(tracker, model, z)
+        seconds = np.full(len(self), (time.perf_counter() - began) / max(1, len(self)))
+        with np.errstate(all="ignore"):
+            return self._scored(tracks, messages, seconds)
+
+    def _scored(self, tracks: Tracks, messages: dict[int, str], seconds: Array) -> tuple[Estimates, Columns]:
+        trials, K, n = tracks.mean.shape
+        e, P = tracks.mean - self.paths.x, tracks.covariance
+        known: Mask = np.asarray(np.isfinite(e).all(axis=2) & np.isfinite(P).all(axis=(2, 3)))
+        for i in np.flatnonzero(~known.all(axis=1)):
+            messages.setdefault(int(i), f"the track is not finite from epoch {int(np.argmin(known[i])) + 1} on")
+        status = np.where(known.all(axis=1), Status.CONVERGED, Status.NONFINITE).astype(np.int8)
+        status[[i for i in messages if not messages[i].startswith("the track is not finite")]] = Status.ERROR
+        status[~np.isfinite(self.paths.x).all(axis=(1, 2))] = Status.NO_READINGS
+        converged = status == Status.CONVERGED
+        estimates = Estimates(
+            x=tracks.mean[:, -1],
+            status=status,
+            covariance=P[:, -1],
+            iterations=np.full(trials, K),
+            simulations=np.full(trials, tracks.calls),
+            messages=messages,
+            seconds=seconds,
+        )
+        each = nees(e.reshape(-1, n), P.reshape(-1, n, n)).reshape(trials, K)
+        each[~self.definite] = np.nan
+        normalised = np.sum(np.where(self.variances > 0, e**2 / self.variances, 0.0), axis=2)
+        distance = normalised.mean(axis=1)
+        lost = ~(normalised <= chdtri(n, GATE))
+        read = tracks.degrees.sum(axis=1)
+        sums = [e[converged] ** 2, each[converged, :, None], tracks.nis[converged, :, None]]
+        sums = [part.sum(axis=0) for part in [*sums, tracks.degrees[converged, :, None]]]
+        kept = converged & (distance <= chdtri(n, GATE))
+        columns = {
+            "trial": self.numbers,
+            **by_parameter("error", self.names, e[:, -1]),
+            **by_parameter("deviation", self.names, deviations(P[:, -1])),
+            **by_parameter("path", self.names, np.sqrt(np.mean(e**2, axis=1))),
+            "status": np.array([Status(s).label for s in status.tolist()], dtype=object),
+            "message": np.array([messages.get(i, "") for i in range(trials)], dtype=object),
+            "iterations": estimates.iterations,
+            "simulations": estimates.simulations,
+            "jacobians": estimates.jacobians,
+            "time_s": seconds,
+            "crlb_distance": distance,
+            "nees": each[:, -1],
+            "solved": converged,
+            "success": kept,
+            "path_nees": each.mean(axis=1),
+            "extra_nis": np.where(read > 0, tracks.nis.sum(axis=1) / np.maximum(read, 1), np.nan),
+            "log_likelihood": np.where(read > 0, tracks.log_likelihood, np.nan),
+            "first_bad_epoch": np.where(lost.any(axis=1), lost.argmax(axis=1) + 1.0, np.nan),
+            "curves": packed(trials, [*sums, np.full((K, 1), converged.sum())]),
+        }
+        return estimates, columns
+
+
+def block_of(scenario: AnyScenario, start: int, stop: int) -> Any:
+    """Trials start to stop of a scenario: a `PathBlock` or a `Block`."""
+    return (PathBlock if isinstance(scenario, Tracking) else Block).draw(scenario, start, stop)  # type: ignore[arg-type]
+
+
+def track_safely(tracker: Tracker, model: StateModel, z: Array) -> tuple[Tracks, dict[int, str]]:
+    """The tracks of readings z (trials, K, m), and why trials have none: a batch that raises is tracked trial by trial,
+    and one that raises alone is NaN."""
+    try:
+        with np.errstate(all="ignore"):
+            return tracker.track(model, read_only(z)), {}
+    except MemoryError:
+        raise
+    except Exception as error:
+        if len(z) == 1:
+            return Tracks.lost(model, 1), {0: describe_exception(error)}
+    parts = [track_safely(tracker, model, row[None]) for row in z]
+    return Tracks.join([part for part, _ in parts]), {i: m[0] for i, (_, m) in enumerate(parts) if m}
+
+
+def packed(trials: int, sums: Sequence[Array]) -> Array:
+    """Texts (trials,) of which the first holds sums (K, columns) over the trials of a block."""
+    text = base64.b64encode(np.concatenate(sums, axis=1).astype("<f8").tobytes()).decode()
+    return np.array([text, *[""] * (trials - 1)], dtype=object)[:trials]
+
+
+def unpacked(texts: Array, epochs: int) -> Array:
+    """The sums (blocks, K, columns) that `packed` wrote."""
+    found = [np.frombuffer(base64.b64decode(text), "<f8").reshape(epochs, -1) for text in texts if text]
+    return np.array(found).reshape(len(found), epochs, -1)
+
+
+def _has_density(model: StateModel) -> bool:
+    """Whether every step's process noise has full rank, so that the posterior bound exists."""
+    Q = [model.Q(k) for k in range(model.epochs) if model.moves(k)]
+    return bool((np.linalg.matrix_rank(np.array(Q)) == model.n).all()) and bool(
+        np.linalg.matrix_rank(model.prior.covariance) == model.n
+    )
+
+
+def _some(paths: Paths, part: int) -> Paths:
+    return Paths(*(a[part::_PARTS] for a in (paths.start, paths.x, paths.z)))

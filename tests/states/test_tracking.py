@@ -1,0 +1,229 @@
+"""State models on trial: what is stored, pooled and shown of tracks, against direct computation and closed forms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from python_models import ConstantVelocity, Growth, Pendulum
+from walking_gins import WalkingGins
+
+import ipe_bench as ib
+from ipe_bench.measurements import Gins
+from ipe_bench.plugins.construct import construct
+from ipe_bench.plugins.discovery import options
+from ipe_bench.states import Bootstrap, Formulas, Smoother, Tracker, ckf, ekf, ukf
+from ipe_bench.statistics import analyse
+from ipe_bench.trials.tracking import PathBlock, Tracking
+
+LINEAR = ConstantVelocity(count=30, spread=3.0)
+
+
+def row(table, estimator, parameter="all"):
+    (found,) = table[(table["estimator"] == estimator) & (table["parameter"] == parameter)].to_dict("records")
+    return found
+
+
+def test_a_run_says_what_direct_computation_says(tmp_path):
+    model = Pendulum(count=40, start=(0.5, 0.0), spread=0.2)
+    trackers = {"ekf": ekf(), "rts": Smoother(ukf())}
+    table = ib.run(Tracking(model, seed=3), trackers, 60, block_size=25, output=tmp_path)
+    paths = model.draw(0, 60, 3)
+    for label, tracker in trackers.items():
+        tracks = tracker.track(model, paths.z)
+        e = tracks.mean - paths.x
+        nees = np.einsum("tki,tkij,tkj->tk", e, np.linalg.inv(tracks.covariance), e)
+        found = row(table, label, "angle")
+        assert found["path_rmse"] == pytest.approx(np.sqrt(np.mean(e[..., 0] ** 2)), rel=1e-12)
+        assert found["rmse"] == pytest.approx(np.sqrt(np.mean(e[:, -1, 0] ** 2)), rel=1e-12)
+        assert found["path_nees"] == pytest.approx(nees.mean() / 2, rel=1e-9)
+        assert found["nees"] == pytest.approx(np.mean(e[:, -1, 0] ** 2 / tracks.covariance[:, -1, 0, 0]), rel=1e-9)
+        curve = analyse([tmp_path]).tracks.query(f"estimator == '{label}' and parameter == 'rate'")
+        np.testing.assert_allclose(curve["rmse"], np.sqrt(np.mean(e[..., 1] ** 2, axis=0)), rtol=1e-12)
+        np.testing.assert_allclose(curve["nees"], nees.mean(axis=0) / 2, rtol=1e-9)
+        np.testing.assert_array_equal(curve["at"], model.times)
+    tracks = ekf().track(model, paths.z)
+    assert row(table, "ekf")["path_nis"] == pytest.approx(tracks.nis.mean(), rel=1e-12)
+    assert row(table, "ekf")["log_likelihood"] == pytest.approx(tracks.log_likelihood.mean(), rel=1e-12)
+    assert np.isnan(row(table, "rts")["path_nis"])
+
+
+def test_the_kalman_filter_attains_both_bounds_on_its_own_model():
+    table = ib.run(Tracking(LINEAR), {"kf": ekf()}, 400)
+    found = row(table, "kf")
+    assert found["success"] == 1.0
+    assert found["path_rmse"] == pytest.approx(1.0, abs=0.06)
+    assert (found["verdict"], found["path_verdict"]) == ("consistent", "consistent")
+    assert found["path_nees"] == pytest.approx(1.0, abs=0.06)
+    assert found["path_nis"] == pytest.approx(1.0, abs=4 * np.sqrt(2 / (400 * 30)))
+    assert found["error_median"] == pytest.approx(1.0, abs=0.1)
+    P = ekf().track(LINEAR, LINEAR.draw(0, 1).z).covariance[0]
+    for i, name in enumerate(("position", "velocity")):
+        one = row(table, "kf", name)
+        for column in ("van_trees", "bayes_bound", "linear_bound", "reported"):
+            assert one[column] == pytest.approx(np.sqrt(P[-1, i, i]), rel=1e-8)
+        assert one["path_bound"] == pytest.approx(np.sqrt(P[:, i, i].mean()), rel=1e-8)
+
+
+def test_blocks_and_further_trials_change_no_trial(tmp_path):
+    scenario, trackers = Tracking(LINEAR, seed=1), {"ckf": ckf(), "particles": Bootstrap(50)}
+    for trials, size in ((7, 3), (20, 50)):
+        ib.run(scenario, trackers, trials, block_size=size, output=tmp_path / "parts")
+    ib.run(scenario, trackers, 20, output=tmp_path / "whole")
+    parts, whole = (
+        ib.load(tmp_path / name).drop(columns=["time_s", "curves"], errors="ignore") for name in ("parts", "whole")
+    )
+    order = ["estimator", "trial"]
+    columns = [c for c in whole.columns if not c.startswith("curves")]
+    assert (
+        parts.sort_values(order)[columns]
+        .reset_index(drop=True)
+        .equals(whole.sort_values(order)[columns].reset_index(drop=True))
+    )
+
+
+@dataclass(frozen=True)
+class Brittle(Tracker):
+    """The Kalman filter, which raises where a reading is large and is lost where one is very negative."""
+
+    def track(self, model, z):
+        if (z > 1e5).any():
+            raise ArithmeticError("a reading is beyond 1e5")
+        tracks = ekf().track(model, z)
+        tracks.mean[(z < -1e5).any(axis=(1, 2)), 5:] = np.nan
+        return tracks
+
+
+def test_a_tracker_that_fails_in_one_trial_fails_in_that_alone():
+    paths = LINEAR.draw(0, 6)
+    paths.z[2, 9], paths.z[4, 9] = 1e6, -1e6
+    block = PathBlock(Tracking(LINEAR), 0, paths)
+    estimates, columns = block.estimate(Brittle())
+    assert columns["status"].tolist() == ["converged"] * 2 + ["error", "converged", "nonfinite", "converged"]
+    assert "a reading is beyond 1e5" in columns["message"][2]
+    assert columns["message"][4] == "the track is not finite from epoch 6 on"
+    alone = ekf().track(LINEAR, paths.z)
+    np.testing.assert_array_equal(estimates.x[[0, 1, 3, 5]], alone.mean[[0, 1, 3, 5], -1])
+    assert columns["success"].tolist() == [True, True, False, True, False, True]
+
+
+def test_a_singular_covariance_has_neither_nees_nor_posterior_bound():
+    table = ib.run(Tracking(WalkingGins(gins=Gins(readings_per_case=2))), {"ekf": ekf()}, 8)
+    found = row(table, "ekf")
+    assert np.isnan(found["path_nees"])
+    assert np.isnan(found["nees"])
+    assert np.isnan(found["van_trees"])
+    assert found["path_verdict"] == "-"
+    assert found["path_rmse"] > 0
+
+
+def test_the_growth_model_loses_the_extended_filter_and_keeps_what_knows_both_signs():
+    table = ib.run(Tracking(Growth()), {"ekf": ekf(), "particles": Bootstrap(1000)}, 60)
+    assert row(table, "ekf", "state")["rmse"] > 10
+    assert row(table, "ekf", "state")["path_rmse"] == pytest.approx(22.0, abs=2.5)
+    assert row(table, "particles", "state")["path_rmse"] == pytest.approx(4.7, abs=0.3)
+    assert row(table, "ekf")["path_verdict"] == "diverged but confident"
+    assert row(table, "particles")["success"] > row(table, "ekf")["success"]
+
+
+def test_filters_of_constants_and_of_states_are_told_apart():
+    with pytest.raises(ib.UserError, match=r"estimators\.ekf: estimates constants; a state model takes trackers"):
+        ib.run(Tracking(LINEAR), {"ekf": ib.baselines.EKF()}, 3)
+    constant = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
+    with pytest.raises(ib.UserError, match=r"estimators\.ekf: tracks states that move"):
+        ib.run(constant, {"ekf": ekf()}, 3)
+
+
+@dataclass(frozen=True)
+class Odd(ConstantVelocity):
+    """A model of which one part is wrong."""
+
+    part: str = ""
+
+    @property
+    def times(self):
+        return super().times[::-1] if self.part == "times" else super().times
+
+    def Q(self, k):
+        wrong = {"size": np.eye(3), "skew": np.array([[1.0, 0.5], [0.0, 1.0]]), "negative": -np.eye(2)}
+        return wrong.get(self.part, super().Q(k))
+
+    def observe(self, x, k):
+        return x if self.part == "reading" else super().observe(x, k)
+
+    def R(self, k):
+        return np.zeros((1, 1)) if self.part == "noise" else super().R(k)
+
+
+@pytest.mark.parametrize(
+    ("part", "complaint"),
+    [
+        ("times", "its times do not increase from epoch to epoch"),
+        ("size", r"Q of epoch 1 has shape \(3, 3\), where \(2, 2\) belongs"),
+        ("skew", "Q of epoch 1 is not symmetric"),
+        ("negative", "Q of epoch 1 has a negative eigenvalue"),
+        ("reading", r"h has shape \(1, 2\), where \(1, 1\) belongs"),
+        ("noise", "R is singular"),
+    ],
+)
+def test_a_model_whose_parts_do_not_suit_one_another_is_refused(part, complaint):
+    Tracking(Odd())
+    with pytest.raises(ib.UserError, match=f"model=odd: {complaint}"):
+        Tracking(Odd(part=part))
+
+
+@pytest.mark.slow
+def test_nees_of_the_kalman_filter_lies_within_its_limits_as_often_as_is_said():
+    """1,000 studies of 40 trials: the mean NEES at the last epoch, and the verdict on the whole path."""
+    table = ib.run([Tracking(LINEAR, seed=s) for s in range(2)], {"kf": ekf()}, 20)
+    low, high = row(table, "kf")["nees_low"], row(table, "kf")["nees_high"]
+    paths = LINEAR.draw(0, 40_000)
+    tracks = ekf().track(LINEAR, paths.z)
+    e = (tracks.mean - paths.x)[:, -1]
+    nees = np.einsum("ti,tij,tj->t", e, np.linalg.inv(tracks.covariance[:, -1]), e).reshape(1000, 40).mean(axis=1) / 2
+    assert np.mean((low < nees) & (nees < high)) >= 0.93
+
+
+@pytest.mark.parametrize("ours", [Pendulum(), Growth(), ConstantVelocity()], ids=lambda model: model.name)
+def test_models_by_formulas_are_those_written_in_python(ours):
+    theirs = construct(next(o for o in options("model") if o.name == ours.name).config, "model")
+    x = np.random.default_rng(0).standard_normal((6, ours.n)) * 3
+    for k in (0, 7):
+        np.testing.assert_allclose(theirs.transition(x, k), ours.transition(x, k), rtol=1e-12)
+        np.testing.assert_allclose(theirs.observe(x, k), ours.observe(x, k), rtol=1e-13)
+        np.testing.assert_allclose(theirs.Q(k), ours.Q(k), rtol=1e-12)
+        np.testing.assert_allclose(theirs.R(k), ours.R(k), rtol=1e-12)
+    np.testing.assert_array_equal(theirs.times, ours.times)
+    np.testing.assert_allclose(theirs.prior.covariance, ours.prior.covariance, rtol=1e-12)
+    z = ours.draw(0, 4).z
+    means = [Smoother(ukf()).track(model, z).mean for model in (ours, theirs)]
+    np.testing.assert_allclose(means[1], means[0], atol=1e-8)
+
+
+WALK = {
+    "next": {"x": "x + h*v", "v": "v + w"},
+    "readings": {"z": "x"},
+    "noise": {"w": 0.3},
+    "deviation": {"z": 1.0},
+    "spread": {"x": 1.0, "v": 1.0},
+    "constants": {"h": 1.0},
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"next": {"x": "x + y", "v": "v + w"}}, r"next\.x: there is no such name"),
+        ({"next": {"x": "x +", "v": "v"}}, r"next\.x: 'x \+' is not a formula"),
+        ({"next": {"x": "x", "v": "v + x*w"}}, "the factor of a process noise depends on a state"),
+        ({"readings": {}}, "readings: is empty"),
+        ({"readings": {"z": "x + w"}}, r"readings\.z: there is no such name"),
+        ({"spread": {"x": 1.0}}, r"spread\.v: is not given"),
+        ({"deviation": {"z": -1.0}}, r"deviation\.z=-1\.0: give 0 or a number above"),
+    ],
+)
+def test_formulas_that_make_no_model_are_refused(changes, complaint):
+    Tracking(Formulas(**WALK))
+    with pytest.raises(ib.UserError, match=complaint):
+        Formulas(**WALK | changes)
