@@ -332,6 +332,7 @@ def estimate(
     noise: Noise | None = None,
     prior: Prior | None = None,
     error_scale: float | None = None,
+    parameters: Mapping[str, Mapping[str, Any]] | None = None,
     ignore_rows: Sequence[int | str] = (),
     ignore_columns: Sequence[str] = (),
 ) -> Answer:
@@ -343,9 +344,11 @@ def estimate(
     column sigma, or the model of its own noise, or else one level for all is estimated from the residuals (`Unknown`),
     whose size then cannot test the fit. Filters and `map_lm` need a prior: `error_scale` is the standard deviation of
     each parameter in multiples of its size, and `prior` widens or narrows some, or makes them depend on each other
-    (`ipe_bench.priors.prior_of` makes one of a covariance). `ignore_rows` and `ignore_columns` of the files are left
-    out. `x` and `covariance` of a fit are in the parameters' own units. The answer is the sequence of the fits; it
-    shows itself in a notebook, and `table()` is a frame.
+    (`ipe_bench.priors.prior_of` makes one of a covariance). `parameters` says what is known of each, as in
+    {"k": {"fixed": 2.0}, "c": {"positive": True, "nominal": 3.0}}; also `lower`, `upper` and `deviation`. `ignore_rows`
+    and `ignore_columns` of the files are left out. A fit has its estimates by name in `values`, and `x` and
+    `covariance` in the parameters' own units. The answer is the sequence of the fits; it shows itself in a notebook,
+    and `table()` is a frame.
 
     >>> import ipe_bench as ib
     >>> model = ib.measurements.Polynomial()
@@ -361,6 +364,7 @@ def estimate(
             what is not given.
     """
     from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
+    from ipe_bench.plugins.construct import known_parameters
     from ipe_bench.real.estimation import Question
     from ipe_bench.real.readings import LeftOut
     from ipe_bench.report.answer import Answer
@@ -378,6 +382,7 @@ def estimate(
     given = readings if readings is None or isinstance(readings, np.ndarray) else tuple(map(Path, readings))
     left_out = LeftOut(tuple(ignore_columns), tuple(ignore_rows))
     stated: dict[str, Any] = {"noise": noise, "prior": prior, "error_scale": error_scale, "left_out": left_out}
+    stated["known"] = known_parameters(parameters or {})
     return Answer.to(Question(model=model, readings=given, estimators=estimators, **stated).opened())
 
 

@@ -89,9 +89,10 @@ class MultipleShooting(Estimator):
 def _whole(model: Measurement) -> tuple[Measurement, NDArray[np.intp]]:
     """The equations, and which of all their readings there are."""
     kept = np.arange(model.m)
-    if isinstance(model, SubsetModel):
-        model, kept = model.whole, np.array(model.kept, dtype=np.intp)
-    return (model.whole if isinstance(model, Ode) else model), kept
+    while isinstance(model, SubsetModel | Ode):
+        kept = np.array(model.kept, dtype=np.intp)[kept] if isinstance(model, SubsetModel) else kept
+        model = model.whole
+    return model, kept
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,7 @@ class Pieces:
         steps = np.concatenate([np.zeros((1, n)), _COMPLEX_STEP * 1j * np.eye(n)])
         p = (x[:, None] + steps) * self.model.si_sizes
         p = np.repeat(p[:, :, None], len(self.model.cases), axis=2)
-        c = np.broadcast_to(self.model.cases, (trials, n + 1, *self.model.cases.shape))
+        c = np.broadcast_to(self.model.tables[0], (trials, n + 1, *self.model.tables.shape[1:]))
         y = self.model.start(list(np.moveaxis(p, -1, 0)), list(np.moveaxis(c, -1, 0)))
         y = np.stack(np.broadcast_arrays(*y, p[..., 0])[:-1], axis=-1)
         return np.real(y[:, 0]), np.moveaxis(np.imag(y[:, 1:]), 1, -1) / _COMPLEX_STEP
@@ -143,10 +144,15 @@ class Pieces:
         """What `interval` takes for the states y at the times grid[k] (segments,)."""
         shape = y.shape[:3]
         p = np.broadcast_to((x * self.model.si_sizes)[:, None, None], (*shape, x.shape[1]))
-        c = np.broadcast_to(self.model.cases, (*shape, self.model.cases.shape[1]))
+        c = np.broadcast_to(self._constants(k), (*shape, self._constants(k).shape[2]))
         times = np.stack([self.grid[k], self.grid[k + 1] - self.grid[k]], axis=1)
         t = np.broadcast_to(times[None, :, None], (*shape, 2))
         return np.concatenate([p, y, c, t], axis=3).reshape(-1, self.interval.n)
+
+    def _constants(self, k: NDArray[np.intp]) -> Array:
+        """The constants (segments, cases, ...) from the times grid[k] on, and those at the reading after each."""
+        tables = self.model.tables
+        return tables[0 * k] if self.model.driven is None else np.concatenate([tables[k], tables[k + 1]], axis=2)
 
     def follow(self, x: Array, y: Array) -> tuple[Array, Array]:
         """The ends of all segments that begin at y, and all readings h (trials, cases, times, outputs)."""
@@ -210,7 +216,8 @@ class Pieces:
         steps = np.concatenate([np.zeros((1, states)), _COMPLEX_STEP * 1j * np.eye(states)])
         at = y[:, :, None] + steps
         p = np.broadcast_to((x * self.model.si_sizes)[:, None, None], (*at.shape[:3], x.shape[1]))
-        c = np.broadcast_to(self.model.cases[:, None], (*at.shape[:3], self.model.cases.shape[1]))
+        tables = self.model.tables
+        c = np.broadcast_to(tables[min(k + 1, len(tables) - 1)][:, None], (*at.shape[:3], tables.shape[2]))
         h: Any = self.model.read(self.grid[k + 1], *(list(np.moveaxis(a, -1, 0)) for a in (at, p, c)))
         h = np.stack(np.broadcast_arrays(*h, at[..., 0])[:-1], axis=-1)
         return np.real(h[:, :, 0]), np.moveaxis(np.imag(h[:, :, 1:]), 2, -1) / _COMPLEX_STEP

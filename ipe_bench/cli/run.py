@@ -47,6 +47,8 @@ class Outcome:
     failures: tuple[str, ...] = ()
     stop: str = ""
     """How many trials a job with a precision took, and why no more."""
+    remarks: tuple[str, ...] = ()
+    """What the model says of itself."""
     precision_missed: bool = False
     """Whether it did not come to its precision."""
     objective: float | None = None
@@ -197,7 +199,7 @@ def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
 
         value = objective(job.scenario, job.estimators, *job.aim, job.output)
     cells = {one.key: describe_names(one.names) for one in result_keys(job.scenario, job.estimators)}
-    return replace(done, cells=cells, objective=value)
+    return replace(done, cells=cells, objective=value, remarks=job.measurement.remarks(job.measurement.nominal))
 
 
 def _conclude(jobs: Jobs, outcomes: list[Outcome]) -> int:
@@ -214,6 +216,7 @@ def _conclude(jobs: Jobs, outcomes: list[Outcome]) -> int:
     for output, cells in folders.items():
         if (Path(output) / "trials").is_dir() and first.write_readings is None:
             code = max(code, show_command(Path(output), cells, first.figures, first.formats))
+    say(*dict.fromkeys(f"Note: {remark}" for one in outcomes for remark in one.remarks))
     say(*_best(outcomes, jobs.maximises), *(one.stop for one in outcomes if one.stop))
     if refused:
         raise UserError(_refused(refused, told=jobs.multirun and len(outcomes) > 1))

@@ -17,7 +17,7 @@ from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.noise import ModelNoise, Noise
 from ipe_bench.plugins import discovery as plugins
-from ipe_bench.plugins.construct import construct, instantiate
+from ipe_bench.plugins.construct import construct, instantiate, known_parameters
 from ipe_bench.plugins.description import Described, options_of
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.real.estimation import Question, prior_stated
@@ -144,13 +144,7 @@ class Spec(Component):
     @cached_property
     def known(self) -> tuple[ParameterInfo, ...]:
         """What is known of each parameter."""
-        found = []
-        for name, options in (self.parameters or {}).items():
-            where = f"parameters.{name}"
-            if not isinstance(options, Mapping):
-                raise UserError(f"{where}={options}: say what that is, such as {where}.fixed={options}")
-            found.append(instantiate(ParameterInfo, {"name": str(name), **options}, where))
-        return tuple(found)
+        return known_parameters(self.parameters or {})
 
     @cached_property
     def scenario(self) -> Any:

@@ -164,6 +164,11 @@ class Measurement(Component, Named, ABC):
         """Why the readings at x (n,) are not to be had; empty where they are."""
         return "" if np.isfinite(self.simulate(x[None])).all() else "the readings are not finite"
 
+    def remarks(self, x: Array) -> tuple[str, ...]:
+        """Sentences that users should read of this model at x (n,), such as by which method it is computed."""
+        del x
+        return ()
+
     @property
     def inputs(self) -> tuple[Input, ...]:
         """What the model takes from the columns of a readings file, where the file has them."""
@@ -362,6 +367,9 @@ class WrappedModel(Measurement):
     def hindrance(self, x: Array) -> str:
         return self.whole.hindrance(self.whole_x(x[None])[0])
 
+    def remarks(self, x: Array) -> tuple[str, ...]:
+        return self.whole.remarks(self.whole_x(x[None])[0])
+
     def fixed_at(self, values: Mapping[int, float]) -> Measurement:
         return self._around(self.whole.fixed_at(values))
 
@@ -420,10 +428,13 @@ class SubsetModel(WrappedModel):
         """The whole model's epochs that still have readings, renumbered."""
         if self.whole.epochs is None:
             return None
-        place = np.full(self.whole.m, -1)
-        place[self._rows] = np.arange(self.m)
-        renumbered = (place[epoch] for epoch in self.whole.epochs[: self.stop])
-        return tuple(kept for rows in renumbered if len(kept := rows[rows >= 0]))
+        place = np.empty(self.whole.m, dtype=np.intp)
+        for k, epoch in enumerate(self.whole.epochs):
+            place[epoch] = k
+        numbered = place[self._rows]
+        order = np.argsort(numbered, kind="stable")
+        starts = np.flatnonzero(np.diff(numbered[order])) + 1
+        return tuple(np.split(order, starts)) if len(order) else ()
 
     @cached_property
     def _rows(self) -> NDArray[np.intp]:

@@ -15,7 +15,14 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.arithmetic import Arithmetic, read, require_finite, require_parameters
+from ipe_bench.measurements.arithmetic import (
+    Arithmetic,
+    comparisons,
+    never_switches,
+    read,
+    require_finite,
+    require_parameters,
+)
 from ipe_bench.measurements.base import Input
 from ipe_bench.measurements.ode.trace import Graph, Program, tangent
 from ipe_bench.measurements.written import WrittenModel
@@ -118,6 +125,14 @@ class Formula(WrittenModel):
     def _values(self, x: Array) -> list[Array]:
         p = dict(zip(self.start, (x * self.sizes).T[:, :, None], strict=True))
         return [p[name] if name in p else self._column(name)[None] for name in self.arithmetic.names]
+
+    def remarks(self, x: Array) -> tuple[str, ...]:
+        """Which conditionals never switch at x."""
+        values = dict(zip(self.arithmetic.names, (value[0] for value in self._values(x[None, : self.n])), strict=True))
+        found = comparisons({"expression": self.arithmetic})
+        with np.errstate(all="ignore"):
+            said = [never_switches(where, tree, Arithmetic("", tree, ())(values)) for where, tree in found]
+        return tuple(sentence for one in said for sentence in one)
 
     def simulate(self, x: Array) -> Array:
         value, _ = self._recorded

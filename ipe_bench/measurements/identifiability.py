@@ -47,8 +47,8 @@ class Structure:
 
 def structure(model: Measurement) -> Structure | None:
     """Which parameters of a model by `Ode` or `Formula` no readings tell, locally, with the real constants of its
-    cases; None for other models, and for formulas that are not examined (sin, tanh and their kin; an exponent that
-    changes with time; a denominator that is 0 at the start)."""
+    cases; None for other models, and for formulas that are not examined (sin, tanh and their kin; conditionals; inputs
+    or exponents that change with time; a denominator that is 0 at the start)."""
     known: dict[str, float] = {}
     while isinstance(model, WrappedModel) and not isinstance(model, Ode):
         known = {**model.fixed, **known}
@@ -64,6 +64,8 @@ def structure(model: Measurement) -> Structure | None:
 
 
 def _of_equations(model: Ode, fixed: Mapping[str, float]) -> Structure:
+    if model.driven_by:
+        raise NotImplementedError("inputs that change with time")
     unknowns = [name for name in model.start if name not in fixed]
     constants = [dict(zip(model.constant_names, map(float, case), strict=True)) for case in model.cases]
     formulas = (model.rate_formulas, model.initial_formulas, model.output_formulas)

@@ -142,6 +142,10 @@ class Joint(Measurement):
         known = [part.usual_noise for part in self.parts]
         return known[0] if all(one == known[0] for one in known) else None
 
+    def remarks(self, x: Array) -> tuple[str, ...]:
+        said = [part.remarks(x[places]) for part, places in zip(self.parts, self._places, strict=True)]
+        return tuple(dict.fromkeys(sentence for one in said for sentence in one))
+
     def simulate(self, x: Array) -> Array:
         return np.concatenate(self._of_parts("simulate", x), axis=1)
 

@@ -13,6 +13,7 @@ from typing import Any
 
 from ipe_bench.basics.errors import UserError, place_of, unknown
 from ipe_bench.basics.options import checked, option_types
+from ipe_bench.measurements.known import ParameterInfo
 from ipe_bench.runs.provenance import TARGET
 
 _registered_packages: set[str] = {"ipe_bench"}
@@ -64,6 +65,17 @@ def find_object(target: Any, where: str) -> Any:
         if module_name.startswith("ipe_bench."):
             raise
         raise UserError(f"{where}: its module cannot be imported: {place_of(error)}") from None
+
+
+def known_parameters(parameters: Mapping[str, Any]) -> tuple[ParameterInfo, ...]:
+    """What is known of each parameter, by name: {"k": {"fixed": 2.0}} fixes k."""
+    found = []
+    for name, options in parameters.items():
+        where = f"parameters.{name}"
+        if not isinstance(options, Mapping):
+            raise UserError(f"{where}={options}: say what that is, such as {where}.fixed={options}")
+        found.append(instantiate(ParameterInfo, {"name": str(name), **options}, where))
+    return tuple(found)
 
 
 def instantiate(cls: type, options: Mapping[str, Any], where: str) -> Any:

@@ -102,6 +102,11 @@ class Fit:
         return {k: float(self.x[k]) for k in on_bound}
 
     @property
+    def values(self) -> dict[str, float]:
+        """The estimates in physical units, by the names of the parameters."""
+        return dict(zip((p.name for p in self.model.physical_parameters), self.x.tolist(), strict=True))
+
+    @property
     def standard_errors(self) -> Array:
         """(n,) in physical units; NaN where the estimator reports none."""
         with np.errstate(invalid="ignore"):

@@ -10,14 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ipe_bench.baselines import LeastSquares
+import ipe_bench as ib
+from ipe_bench.baselines import LeastSquares, LevenbergMarquardt
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Formula, Nist
 from ipe_bench.measurements.arithmetic import read
 from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.nist import datasets, digits
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.noise import Unknown
+from ipe_bench.noise import Gaussian, Unknown
 from ipe_bench.real.fits import fit
 from ipe_bench.real.readings import open_together
 
@@ -104,6 +105,13 @@ def test_nist_answers_come_from_the_formula_with_an_unknown_noise(dataset, tmp_p
         ("log10(1000)+ln(1)", 3.0),
         ("4*atan(1)-pi", 0.0),
         ("sqrt(a*b*4)-tanh(0)", 4.0),
+        ("min(a, 5, c) + max(1, b)", 4.0),
+        ("abs(a-c) + abs(1)", 2.0),
+        ("erf(0.5) + erfc(0.5)", 1.0),
+        ("(1 < a <= 2) + (c != 3) + (a == b)", 2.0),
+        ("1 if a > 2 else 2 if c > 2 else 3", 2.0),
+        ("not a > 1 or c > 2 and b < 3", 1.0),
+        ("1/(a-2) if a != b else c", 3.0),
     ],
 )
 def test_the_language_is_that_of_algebra(text, value):
@@ -112,12 +120,13 @@ def test_the_language_is_that_of_algebra(text, value):
 
 
 REFUSED = [
-    "__import__('os')", "b1.real", "b1[0]", "b1 if t else 2", "lambda: 1", "b1; b2", "b1=2", "open(b1)", "eval(b1)",
-    "b1*(t",
-    "b1*t)", "2t", "b1 b2", "", "()", "b1**", "*b1", "1,5*t", "b1 and t", "'b1'", "b1@t", "b1//t*", "exp", "exp()",
+    "__import__('os')", "b1.real", "b1[0]", "b1 if t", "b1 else t", "lambda: 1", "b1; b2", "b1=2", "open(b1)",
+    "eval(b1)", "b1*(t",
+    "b1*t)", "2t", "b1 b2", "", "()", "b1**", "*b1", "1,5*t", "b1 and", "not", "b1 < ", "min(b1)", "abs(b1,t)",
+    "'b1'", "b1@t", "b1//t*", "exp", "exp()",
     "exp(b1,t)",
     "b1%t", "{b1}", "b1\\n", "0x10", "1e", "1_000*b1", "b1!", "é*t", "sin t", "(" * 60 + "b1" + ")" * 60,
-    "-" * 60 + "b1",
+    "-" * 60 + "b1", "not " * 60 + "b1", "1 if t else " * 60 + "b1",
     "b1*" * 4000 + "t", "9**9**9*b1", "b1*log(0)", "b1/(1-1)", "b1*sqrt(-1)",
 ]  # fmt: skip
 
@@ -132,7 +141,7 @@ def test_nothing_that_looks_like_a_formula_reaches_the_interpreter():
     """Text of any kind is a formula or a user's mistake, and never any other exception."""
 
     @settings(max_examples=1500, deadline=None)
-    @given(st.text(alphabet="abt12.e+-*/^() ,_'\"[]{}:=<>!%\\\nsincoexplg", max_size=40))
+    @given(st.text(alphabet="abt12.e+-*/^() ,_'\"[]{}:=<>!%\\\nsincoexplgifmn", max_size=40))
     def check(text):
         with contextlib.suppress(UserError):
             read(text, "expression")
@@ -163,3 +172,67 @@ def test_a_formula_is_evaluated_or_refused_however_long():
     for text in ("+".join(["b1*t"] * 900), "b1" + "*t" * 2000, "b1" + "**b1" * 2000):
         with pytest.raises(UserError, match=r"^expression: .*(one after another; group|nested more than 50 deep)"):
             read(text, "expression")
+
+
+numbers = st.sampled_from(["t", "p", "q", "0.5", "-1.5", "2"])
+drawn = st.recursive(
+    numbers,
+    lambda inner: st.one_of(
+        st.tuples(st.sampled_from(["({} + {})", "({} - {})", "({}*{})", "min({}, {})", "max({}, {})"]), inner, inner),
+        st.tuples(st.sampled_from(["abs({})", "erf({})", "erfc({})", "sin({})", "sqrt({} + t)", "log({} + t)"]), inner),
+        st.tuples(st.sampled_from(["({} if {} < {} else {})", "({} if {} >= {} else {})"]), *[inner] * 4),
+        st.tuples(st.sampled_from(["({} if {} < {} and {} <= {} else {})"]), *[inner] * 6),
+    ).map(lambda parts: parts[0].format(*parts[1:])),
+    max_leaves=8,
+)
+PYTHON = {"abs": abs, "min": min, "max": max, "sin": math.sin, "erf": math.erf, "erfc": math.erfc}
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(drawn)
+def test_a_drawn_formula_is_what_python_makes_of_it_and_its_slopes_are_differences(text):
+    """A branch that is not taken has no effect, even where it is not a number."""
+    t = np.array([-1.7, -0.2, 0.3, 0.9, 2.4])
+    model = Formula(f"{text} + 0*p*q*t", {"p": 0.8, "q": -1.3}, {"t": t.tolist()})
+    x = np.array([[1.0, -1.0], [1.37, 0.61]])
+
+    def python(x, k):
+        p, q = x * model.sizes
+        names = PYTHON | {"log": math.log, "sqrt": math.sqrt, "t": float(t[k]), "p": float(p), "q": float(q)}
+        return eval(text, {}, names)
+
+    z, J = model.simulate(x), model.jacobian(x)
+    for i, row in enumerate(x):
+        for k in range(len(t)):
+            try:
+                expected = python(row, k)
+            except ValueError:  # of a root or a logarithm on the way to the value
+                continue
+            assert z[i, k] == pytest.approx(expected, rel=1e-12, abs=1e-13)
+            for j, step in enumerate(1e-6 * np.eye(2)):
+                with contextlib.suppress(ValueError):
+                    sides = [(python(row + s * step, k) - expected) / (s * 1e-6) for s in (1, -1)]
+                    if abs(sides[0] - sides[1]) < 1e-3 * (1 + abs(sides[0])):  # neither a kink nor a jump
+                        assert J[i, k, j] == pytest.approx(sum(sides) / 2, rel=1e-5, abs=1e-6)
+
+
+def test_a_conditional_that_never_switches_is_named():
+    model = Formula("a + (b*(t-c) if t > c else 0)", {"a": 1.0, "b": 1.0, "c": 2.5}, {"t": (1.0, 2.0, 3.0, 4.0)})
+    assert model.remarks(np.array([1.0, 1.0, 1.0])) == ()
+    (said,) = model.remarks(np.array([1.0, 1.0, 2.0]))
+    assert said.startswith("measurement.expression: t > c holds at no reading")
+
+
+def test_parameters_stand_as_they_are_written():
+    model = Formula("exp(-k*t)*y0", {"y0": 2.0, "k": 1.0}, {"t": (0.0, 1.0)})
+    assert [p.name for p in model.parameters] == ["y0", "k"]
+    np.testing.assert_allclose(model.jacobian(np.ones((1, 2)))[0], [[2.0, 0.0], [2 * math.exp(-1), -2 * math.exp(-1)]])
+
+
+def test_python_takes_what_is_known_of_parameters_and_has_estimates_by_name():
+    model = Formula("a*exp(-k*t)", {"k": 1.0, "a": 1.0}, {"t": (0.0, 1.0, 2.0, 3.0)})
+    z, lm = 2.0 * np.exp(-0.5 * np.arange(4.0)), {"lm": LevenbergMarquardt()}
+    (found,) = ib.estimate(model, z, lm, noise=Gaussian(0.01), parameters={"k": {"fixed": 0.5}})
+    assert found.values == {"a": pytest.approx(2.0, rel=1e-6)}
+    with pytest.raises(UserError, match=r"parameters.k.fixd"):
+        ib.estimate(model, z, lm, parameters={"k": {"fixd": 0.5}})

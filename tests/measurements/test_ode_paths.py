@@ -13,6 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
+from scipy.special import erf, erfc
 
 from ipe_bench.basics import compiled
 from ipe_bench.measurements import LotkaVolterra, Ode, OdeMeasurement, Parameter, SubsetModel
@@ -309,17 +310,30 @@ OPERATIONS = {
     "hyperbolic": lambda a, b: np.sinh(np.sin(a)) - np.cosh(np.cos(b)),
     "tan": lambda a, b: np.tan(np.sin(a) / 2.0) - b,
 }
-expressions = st.recursive(
-    st.sampled_from(["t", "y0", "y1", "p0", "p1", "p2", "c0"]) | st.sampled_from([0.0, 1.0, -1.0, 0.5, 3.0]),
-    lambda inner: st.tuples(st.sampled_from(sorted(OPERATIONS)), inner, inner),
-    max_leaves=8,
-)
+PIECES = {
+    "least": lambda a, b: np.minimum(a, b),
+    "most": lambda a, b: np.maximum(a, b),
+    "size": lambda a, b: np.where(np.less(a, 0.0), -a, a) - b,
+    "root of what is positive": lambda a, b: np.where(np.less_equal(a, 0.0), 0.0 * b, a * np.sqrt(a)) + b,
+    "erf": lambda a, b: erf(a) * b,
+    "erfc": lambda a, b: erfc(b) - a,
+}
+"""Continuous, in pieces; NumPy orders complex numbers by their real parts."""
+
+
+def built(operations):
+    """Expressions of these operations on the arguments of a right-hand side."""
+    return st.recursive(
+        st.sampled_from(["t", "y0", "y1", "p0", "p1", "p2", "c0"]) | st.sampled_from([0.0, 1.0, -1.0, 0.5, 3.0]),
+        lambda inner: st.tuples(st.sampled_from(operations), inner, inner),
+        max_leaves=8,
+    )
 
 
 def value(expression, t, y, p, c):
     if isinstance(expression, tuple):
         name, a, b = expression
-        return OPERATIONS[name](value(a, t, y, p, c), value(b, t, y, p, c))
+        return (OPERATIONS | PIECES)[name](value(a, t, y, p, c), value(b, t, y, p, c))
     if isinstance(expression, float):
         return expression
     return t if expression == "t" else {"y": y, "p": p, "c": c}[expression[0]][int(expression[1])]
@@ -372,8 +386,8 @@ class Drawn(OdeMeasurement):
 
 written = st.fixed_dictionaries(
     {
-        "rates": st.tuples(expressions, expressions),
-        "shown": st.tuples(expressions, expressions),
+        "rates": st.tuples(*[built(sorted(OPERATIONS))] * 2),
+        "shown": st.tuples(*[built(sorted(OPERATIONS) + 3 * sorted(PIECES))] * 2),
         "gaps": st.lists(st.sampled_from([0.0, 1e-9, 0.1, 0.25, 0.5]), min_size=2, max_size=3),
         "batch": st.sampled_from((1, 7, 8, 9)),
         "seed": st.integers(0, 2**31),
@@ -381,6 +395,7 @@ written = st.fixed_dictionaries(
 )
 
 
+@np.errstate(invalid="ignore")  # of branches that are not taken
 def check_drawn(rates, shown, gaps, batch, seed):
     model = Drawn(rates, shown, tuple(np.cumsum(gaps).tolist()))
     x = np.random.default_rng(seed).uniform(-1.0, 1.0, (batch, 3))

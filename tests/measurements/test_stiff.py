@@ -65,7 +65,7 @@ def follower(**options):
     ids=["robertson", "van der pol", "hires"],
 )
 def test_the_digits_of_the_test_set(model, expected, left):
-    z = Rodas5P(model.whole, 1e-8).simulate(model.nominal[None], len(model.times))[0]
+    z = Rodas5P(model.engine, 1e-8).simulate(model.nominal[None], len(model.times))[0]
     np.testing.assert_allclose(z[-len(expected) :], expected, rtol=left)
 
 
@@ -73,7 +73,7 @@ def test_a_stiff_model_is_found_and_is_within_its_tolerance():
     model = follower()
     t, k = np.array(model.times), 100.0
     exact = k / (k - 0.01) * (np.exp(-0.01 * t) - np.exp(-k * t))
-    assert model.whole.stiff
+    assert model.engine.stiff
     np.testing.assert_allclose(model.simulate(np.array([[1.0]]))[0], exact, atol=1e-8)
     slope = -0.01 / (k - 0.01) ** 2 * (np.exp(-0.01 * t) - np.exp(-k * t)) + k / (k - 0.01) * t * np.exp(-k * t)
     np.testing.assert_allclose(model.jacobian(np.array([[1.0]]))[0, :, 0], k * slope, atol=1e-8)
@@ -86,7 +86,7 @@ def test_readings_beside_radau_and_slopes_beside_differences():
     for row, p in zip(z, x * model.sizes, strict=True):
 
         def rhs(t, y, p=p):
-            return model.whole.rhs(t, y, p, ())
+            return model.engine.rhs(t, y, p, ())
 
         solved = solve_ivp(rhs, (0, 1e5), [1.0, 0.0, 0.0], "Radau", model.times, rtol=1e-10, atol=1e-16)
         np.testing.assert_allclose(row.reshape(-1, 3), solved.y.T, rtol=1e-7)
@@ -104,7 +104,7 @@ def test_a_trial_and_a_prefix_have_the_same_bits_alone_and_in_a_batch():
 
 @pytest.mark.parametrize(("mu", "stiff"), [(3.0, False), (30.0, False), (300.0, True)])
 def test_the_rule_tells_stiff_oscillators_from_others(mu, stiff):
-    assert van_der_pol(mu, 2 * mu).whole.stiff == stiff
+    assert van_der_pol(mu, 2 * mu).engine.stiff == stiff
 
 
 def test_a_stiff_model_that_was_used_goes_to_worker_processes(tmp_path):

@@ -254,7 +254,6 @@ def files_of_models() -> Iterator[Case]:
     )
     yield Case("a beacon as 1.0", written(Ranging(), replaced(2, "1,1,", "1.0,1e0,")), model=Ranging())
     yield Case("a beacon with weights", written(Ranging(), with_weights), model=Ranging())
-    yield Case("a day twice", written(Sir(), lambda r: [*r, r[1]]), "stands there twice", model=Sir())
     yield Case(
         "a day before the start",
         written(Sir(), replaced(2, "1,1.0,", "1,-1.0,")),

@@ -15,8 +15,17 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.files import own_conf
 from ipe_bench.basics.linalg import Array, Covariance, own
 from ipe_bench.basics.options import Count, Positive
-from ipe_bench.measurements.arithmetic import Arithmetic, read, require_finite, require_parameters
+from ipe_bench.measurements.arithmetic import (
+    Arithmetic,
+    Tree,
+    comparisons,
+    never_switches,
+    read,
+    require_finite,
+    require_parameters,
+)
 from ipe_bench.measurements.base import Input, Measurement, Recorded, SubsetModel, UsualNoise, WrappedModel
+from ipe_bench.measurements.ode.driven import course, courses, grid, middles, separated, switching_times
 from ipe_bench.measurements.ode.model import OdeMeasurement, time_heading
 from ipe_bench.measurements.ode.rodas import Rodas5P, Work
 from ipe_bench.measurements.written import WrittenModel
@@ -94,9 +103,15 @@ class Ode(WrittenModel, WrappedModel):
     """The integrator: explicit (DOP853), implicit (Rodas5P, for stiff equations), or as the equations ask for."""
     title: str = "ode"
     """The name of the model in tables."""
+    driven_by: Mapping[str, Literal["hold", "linear"]] = field(default_factory=dict)
+    """Inputs that change with time, by name: `hold` keeps a row's value from its time on, at its own reading too, until
+    the next row of the case; `linear` is straight between rows. A row without a reading only changes them."""
+    columns: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    """The inputs of `driven_by`, where no file brings them: time, one column each, and `case` where cases differ."""
 
     name = property(lambda model: model.title)  # type: ignore[assignment]
     index = WrappedModel.index
+    reading_name = Measurement.reading_name
     own_parameters = property(lambda model: model.own)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
@@ -112,8 +127,9 @@ class Ode(WrittenModel, WrappedModel):
                 raise UserError(f"start.{name}: is a state or the time, and not a parameter; rename one of them")
         for name, formula in self.initial_formulas.items():
             for used in formula.names:
-                if used in self.rates or used == "t":
-                    raise UserError(f"initial.{name}: {used} is a state or the time, which a start cannot depend on")
+                if used in self.rates or used in self.driven_by or used == "t":
+                    what = "changes with time" if used in self.driven_by else "is a state or the time"
+                    raise UserError(f"initial.{name}: {used} {what}, which a start cannot depend on")
         used = {
             name
             for part in (self.rate_formulas, self.initial_formulas, self.output_formulas)
@@ -135,6 +151,7 @@ class Ode(WrittenModel, WrappedModel):
                     raise UserError(f"tolerance: {name} is neither a constant nor t")
         require_parameters("own", self.own, self.start)
         self._check_constants()
+        self._check_inputs()
 
     def _check_constants(self) -> None:
         for name in self.constant_names:
@@ -151,10 +168,22 @@ class Ode(WrittenModel, WrappedModel):
         if len(set(lengths.values())) > 1 or 0 in lengths.values():
             raise UserError(f"constants: have different lengths: {lengths}; give one number for each case")
 
+    def _check_inputs(self) -> None:
+        used = {name for part in (self.rate_formulas, self.output_formulas) for f in part.values() for name in f.names}
+        for name in self.driven_by:
+            if name in (*self.start, *self.rates, *_COLUMNS, "t"):
+                raise UserError(f"driven_by.{name}: is a state, a parameter, the time or another column; rename it")
+            if name not in used:
+                raise UserError(f"driven_by.{name}: appears in no rate and in no output")
+        for name in self.columns:
+            if name not in ("case", "time", *self.driven_by):
+                raise UserError(f"columns.{name}: {unknown(name, ['case', 'time', *self.driven_by], 'input')}")
+        self.require_equal_lengths()
+
     @property
     def _named(self) -> set[str]:
         """The names that mean something without a constant of that name."""
-        return {*self.start, *self.rates, "t"}
+        return {*self.start, *self.rates, *self.driven_by, "t"}
 
     @cached_property
     def constant_names(self) -> tuple[str, ...]:
@@ -175,7 +204,9 @@ class Ode(WrittenModel, WrappedModel):
                     f"measurement.constants.{name}=[...]"
                 )
         columns = [np.atleast_1d(self.constants[name]) for name in self.constant_names]
-        count = max((len(column) for column in columns), default=1)
+        count = max([len(self.courses), *map(len, columns)], default=1) or 1
+        if any(len(column) not in (1, count) for column in [*columns, *([self.courses] if self.courses else [])]):
+            raise UserError(f"columns.case: numbers {len(self.courses)} cases, and the constants have {count}")
         return np.array([np.broadcast_to(column, count) for column in columns], dtype=float).reshape(-1, count).T
 
     @cached_property
@@ -192,9 +223,33 @@ class Ode(WrittenModel, WrappedModel):
         return {name: read(str(text), f"outputs.{name}") for name, text in shown.items()}
 
     @cached_property
-    def whole(self) -> OdeMeasurement:  # type: ignore[override]
-        """The equations as the integrator takes them."""
+    def courses(self) -> list[dict[str, Array]]:
+        """The inputs of `driven_by` over time in each case; of one where all are alike."""
+        return courses(self.columns, self.driven_by) if self.driven_by else []
+
+    @cached_property
+    def piecewise_rates(self) -> tuple[dict[str, Arithmetic], dict[str, Tree]]:
+        """The rates with a name in place of every comparison of t with constants, and these comparisons."""
+        return separated(self.rate_formulas, self.constant_names)
+
+    @cached_property
+    def reading_times(self) -> Array:
+        if not (self.times or self.readings):
+            raise UserError("measurement.times: is empty; give the times of the readings, or readings=FILE")
+        return np.asarray(self.times) if self.times else self.interval * np.arange(1.0, (self.readings or 0) + 1)
+
+    @cached_property
+    def engine(self) -> _Engine:
+        """The equations as the integrator takes them, with readings wherever an input or a rate changes, too."""
         return _Engine(self)
+
+    @cached_property
+    def whole(self) -> Measurement:  # type: ignore[override]
+        engine, read = self.engine, np.searchsorted(self.engine.times, self.reading_times)
+        if len(read) == len(engine.times):
+            return engine
+        rows = np.arange(engine.m).reshape(len(engine.cases), len(engine.times), -1)[:, read]
+        return SubsetModel(engine, tuple(rows.ravel().tolist()))
 
     @property
     def usual_noise(self) -> UsualNoise | None:  # type: ignore[override]
@@ -210,18 +265,61 @@ class Ode(WrittenModel, WrappedModel):
             Input(time_heading(self.time_unit)),
             Input("output", str, label=True, default=outputs[0] if len(outputs) == 1 else None),
             *constants,
+            *map(Input, self.driven_by),
         )
 
     @property
     def input_columns(self) -> Mapping[str, Sequence[Any]]:
         cases = np.asarray(self.index["case"]) - 1
-        return {name: self.cases[cases, k].tolist() for k, name in enumerate(self.constant_names)}
+        found = {name: self.cases[cases, k].tolist() for k, name in enumerate(self.constant_names)}
+        return found | {name: self._input_at_readings(name) for name in self.driven_by}
+
+    def _input_at_readings(self, name: str) -> list[float]:
+        """The values (m,) of an input at the readings.
+
+        Raises:
+            UserError: it changes at other times, too, which would be lost with the readings alone.
+        """
+        index, found = self.index, []
+        for case, time in zip(index["case"], index[time_heading(self.time_unit)], strict=True):
+            one = self.courses[min(case, len(self.courses)) - 1]
+            u, *line = (float(a) for a in course(self.driven_by[name], one["time"], one[name], np.asarray(time)))
+            found.append(u + line[0] * (time - line[1]) if line else u)
+        if lost := sorted(
+            {float(t) for one in self.courses for t in one["time"]} - {0.0, *map(float, self.reading_times)}
+        ):
+            remedy = "add it to measurement.times to write the readings with their inputs"
+            raise UserError(f"measurement.columns.time: {name} changes at {lost[0]:g} without a reading; {remedy}")
+        return found
 
     @property
     def input_columns_known(self) -> bool:
-        return bool(self.times or self.readings) and all(name in self.constants for name in self.constant_names)
+        known = {*self.constants, *self.columns}
+        return bool(self.times or self.readings) and known.issuperset((*self.constant_names, *self.driven_by))
+
+    def remarks(self, x: Array) -> tuple[str, ...]:
+        """That the implicit method is chosen, and which conditionals never switch along the solution at x."""
+        found, engine = [], self.engine
+        if self.method == "auto" and engine.stiff:
+            found.append(engine.said_stiff)
+        formulas = {f"rates.{name}": f for name, f in self.rate_formulas.items()}
+        formulas |= {f"outputs.{name}": f for name, f in self.output_formulas.items()}
+        conditions = comparisons(formulas)
+        if not conditions:
+            return tuple(found)
+        known = engine.along(x)
+        switches = {tree: k for k, tree in enumerate(self.piecewise_rates[1].values(), start=len(self.constant_names))}
+        for where, tree in conditions:
+            if where.startswith("rates") and tree in switches:
+                met = engine.tables[:-1, :, switches[tree]]
+            else:
+                met = Arithmetic("", tree, ())(known)
+            found += never_switches(where, tree, met)
+        return tuple(found)
 
     def absent_input(self, heading: str, columns: Sequence[str]) -> str:
+        if heading in self.driven_by:
+            return f"measurement.driven_by.{heading} takes it from the file, in every row"
         if heading not in self.constant_names:
             return Measurement.absent_input(self, heading, columns)
         alike = f"if it is the same in all cases, measurement.constants.{heading}=VALUE"
@@ -229,11 +327,10 @@ class Ode(WrittenModel, WrappedModel):
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
         del readings
-        count = _cases(columns["case"]) if self.constant_names else 1
+        count = _cases(columns["case"]) if self.constant_names or self.driven_by else 1
         constants = {name: _of_cases(name, columns[name], columns["case"], count) for name in self.constant_names}
         outputs, heading = list(self.output_formulas), time_heading(self.time_unit)
         rows = list(zip(columns["case"], map(float, columns[heading]), columns["output"], strict=True))
-        seen: set[tuple[Any, ...]] = set()
         for case, time, output in rows:
             if output not in outputs:
                 raise UserError(f"output={output}: {unknown(str(output), outputs, 'output')}")
@@ -241,11 +338,9 @@ class Ode(WrittenModel, WrappedModel):
                 raise UserError(f"case={case}: there are {count} cases")
             if time < 0:
                 raise UserError(f"{heading}={time}: comes before the start, which is at 0")
-            if (case, time, output) in seen:
-                raise UserError(f"case={case}, {heading}={time}, output={output} stands there twice; keep one of them")
-            seen.add((case, time, output))
         times = sorted({time for _, time, _ in rows})
-        whole = replace(self, constants=constants, times=tuple(times))
+        inputs = {name: columns[name] for name in self.driven_by}
+        whole = replace(self, constants=constants, times=tuple(times), columns=_over_time(rows, inputs))
         place = {time: k for k, time in enumerate(times)}
         kept = [((case - 1) * len(times) + place[t]) * len(outputs) + outputs.index(o) for case, t, o in rows]
         return whole if kept == list(range(whole.m)) else SubsetModel(whole, tuple(kept))
@@ -257,15 +352,19 @@ class Ode(WrittenModel, WrappedModel):
         if not whole or self.deviation is None:
             return None
         formulas = [read(self.exact[name], f"exact.{name}") for name in self.output_formulas]
-        z = np.concatenate([[formula({**self.answer, **known}) for formula in formulas] for known in self.known])
+        known = self.known(self.reading_times)
+        z = np.concatenate([[formula({**self.answer, **one}) for formula in formulas] for one in known])
         x = np.array([self.answer[name] for name in self.start]) / self.sizes
         return Recorded(z, Covariance(np.full(self.m, self.deviation)), x)
 
     @cached_property
-    def known(self) -> list[dict[str, float]]:
-        """The constants and t at each time of each case."""
-        constants = [dict(zip(self.constant_names, case.tolist(), strict=True)) for case in self.cases]
-        return [{**known, "t": t} for known in constants for t in self.whole.times.tolist()]
+    def known_of_cases(self) -> list[dict[str, float]]:
+        """The constants of each case, by name."""
+        return [dict(zip(self.constant_names, case.tolist(), strict=True)) for case in self.cases]
+
+    def known(self, times: Array) -> list[dict[str, float]]:
+        """The constants and t at each of these times of each case."""
+        return [{**case, "t": t} for case in self.known_of_cases for t in times.tolist()]
 
 
 @dataclass(frozen=True)
@@ -274,6 +373,7 @@ class _Engine(OdeMeasurement):
 
     described: Ode
 
+    name = property(lambda engine: engine.described.title)  # type: ignore[assignment]
     stiff_remedy = "measurement.method=implicit follows them"
     states = property(lambda engine: len(engine.described.rates))  # type: ignore[assignment]
     outputs = property(lambda engine: tuple(engine.described.output_formulas))  # type: ignore[assignment]
@@ -286,11 +386,26 @@ class _Engine(OdeMeasurement):
     @cached_property
     def times(self) -> Array:
         described = self.described
-        if not (described.times or described.readings):
-            raise UserError("measurement.times: is empty; give the times of the readings, or readings=FILE")
-        if described.times:
-            return np.asarray(described.times)
-        return described.interval * np.arange(1.0, (described.readings or 0) + 1)
+        changes = [float(time) for one in described.courses for time in one["time"]]
+        for comparison in described.piecewise_rates[1].values():
+            changes += switching_times(comparison, described.known_of_cases)
+        return grid(described.reading_times, changes)
+
+    @cached_property
+    def driven(self) -> Array | None:
+        """The comparisons of t and the inputs, of each interval."""
+        described, at = self.described, middles(self.times)
+        _, switches = described.piecewise_rates
+        if not (switches or described.driven_by):
+            return None
+        tables = []
+        for k, case in enumerate(described.known_of_cases):
+            columns = [Arithmetic("", tree, ())({**case, "t": at}) for tree in switches.values()]
+            for name, kind in described.driven_by.items():
+                one = described.courses[min(k, len(described.courses) - 1)]
+                columns += course(kind, one["time"], one[name], at)
+            tables.append(np.stack([np.broadcast_to(column, at.shape) for column in columns], axis=1))
+        return np.stack(tables, axis=1)
 
     @cached_property
     def _shape(self) -> tuple[Array, Work]:
@@ -310,6 +425,23 @@ class _Engine(OdeMeasurement):
             return False
         z, work = self._shape
         return bool(np.isfinite(z).all() and work.explicit[0] > _STIFF * work.steps[0])
+
+    @property
+    def said_stiff(self) -> str:
+        _, work = self._shape
+        return (
+            f"the equations are stiff: an explicit method would need {work.explicit[0]:.1e} steps for stability where "
+            f"the solution needs {int(work.steps[0])}; they are integrated by the implicit method "
+            "(measurement.method=explicit or implicit fixes it)"
+        )
+
+    def along(self, x: Array) -> dict[str, Any]:
+        """What the names in the formulas stand for at x (n,), at the times of each case: (cases, times)."""
+        shown = replace(self.described, outputs={}, exact={}, answer={}).engine
+        y = shown.simulate(x[None]).reshape(len(self.cases), len(self.times), self.states)
+        c = np.moveaxis(self.tables[1:] if len(self.tables) > 1 else self.tables, 0, 1)
+        p = list(x[: self.n] * self.si_sizes)
+        return self._values(self.times[None], list(np.moveaxis(y, 2, 0)), p, list(np.moveaxis(c, 2, 0)))
 
     @cached_property
     def _implicit(self) -> Rodas5P:
@@ -357,22 +489,30 @@ class _Engine(OdeMeasurement):
         if not isinstance(self.described.tolerance, str):
             return super()._tolerances
         formula = read(self.described.tolerance, "tolerance")
-        return np.repeat([float(formula(known)) for known in self.described.known], len(self.outputs))
+        return np.repeat([float(formula(known)) for known in self.described.known(self.times)], len(self.outputs))
 
-    def _known(self, p: Sequence[Any], c: Sequence[Any]) -> dict[str, Any]:
-        return dict(zip(self.described.start, p, strict=True)) | dict(
-            zip(self.described.constant_names, c, strict=True)
-        )
+    def _values(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> dict[str, Any]:
+        """What the names in the formulas stand for."""
+        described = self.described
+        values = dict(zip((*described.rates, *described.start), (*y, *p), strict=True)) | {"t": t}
+        constants = iter(c)
+        for name in (*described.constant_names, *described.piecewise_rates[1]):
+            values[name] = next(constants)
+        for name, kind in described.driven_by.items():
+            u = next(constants)
+            values[name] = u if kind == "hold" else u + next(constants) * (t - next(constants))
+        return values
 
     def start(self, p, c):
-        return [formula(self._known(p, c)) for formula in self.described.initial_formulas.values()]
+        values = self._values(0.0, [0.0] * self.states, p, c)
+        return [formula(values) for formula in self.described.initial_formulas.values()]
 
     def rhs(self, t, y, p, c):
-        values = {**self._known(p, c), **dict(zip(self.described.rates, y, strict=True)), "t": t}
-        return [formula(values) for formula in self.described.rate_formulas.values()]
+        values = self._values(t, y, p, c)
+        return [formula(values) for formula in self.described.piecewise_rates[0].values()]
 
     def read(self, t, y, p, c):
-        values = {**self._known(p, c), **dict(zip(self.described.rates, y, strict=True)), "t": t}
+        values = self._values(t, y, p, c)
         return [formula(values) for formula in self.described.output_formulas.values()]
 
 
@@ -392,6 +532,20 @@ def _of_cases(name: str, values: Sequence[float], numbers: Sequence[int], count:
             remedy = "" if count > 1 else "; number the cases in a column case"
             raise UserError(f"case={case}: {name} is {found[case]:g} in one row and {value:g} in another{remedy}")
     return tuple(found[case] for case in range(1, count + 1))
+
+
+def _over_time(rows: Sequence[tuple[int, float, str]], inputs: Mapping[str, Sequence[float]]) -> dict[str, Any]:
+    """The columns of a file's inputs over time, from all its rows: one value of each at a time of a case."""
+    found: dict[tuple[int, float], tuple[float, ...]] = {}
+    for (case, time, _), values in zip(rows, zip(*inputs.values(), strict=True), strict=False):
+        known = found.setdefault((case, time), values)
+        for name, one, other in zip(inputs, known, values, strict=True):
+            if one != other:
+                raise UserError(f"case={case}, time={time:g}: {name} is {one:g} in one row and {other:g} in another")
+    ordered = sorted(found)
+    columns = zip(*(found[key] for key in ordered), strict=True)
+    times = {"case": [case for case, _ in ordered], "time": [time for _, time in ordered]}
+    return times | dict(zip(inputs, columns, strict=True)) if inputs else {}
 
 
 def packaged(name: str) -> Callable[..., Ode]:

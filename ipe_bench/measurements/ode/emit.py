@@ -4,7 +4,7 @@
                    double *times, int64 *steps, int64 n_times, double *offset, int64 stride, double *out, double *frame)
 
 Lane l is the problem of trial rows[l / n_cases] in case l % n_cases, for first <= l < last; a group that is not full
-repeats its last lane.
+repeats its last lane. Where constants are driven, `cases` holds those of every interval, and those after the last time.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class _Writer:
 
     def _step(self, b: ir.IRBuilder, frame: Value, t: Value, h: Value) -> None:
         v, plan, weights = Vectors(b, self.width), self.plan, self._weights(b, frame)
-        y, fixed = v.load(frame, plan.y), v.load(frame, plan.fixed)
+        y, fixed = v.load(frame, plan.y), v.load(frame, [*plan.driven, *plan.fixed])
         slopes: list[list[Value]] = []
         for s, row in enumerate(plan.tableau.weights[:-1]):
             at = _combine(v, y, weights[s], [slopes[j] for j, _ in row])
@@ -133,7 +133,7 @@ class _Writer:
     def _read(self, b: ir.IRBuilder, frame: Value, t: Value) -> None:
         v, plan = Vectors(b, self.width), self.plan
         time = [v.spread(t)] if plan.read_timed else []
-        v.store(_run(v, plan.read, [*time, *v.load(frame, [*plan.y, *plan.fixed])]), frame, plan.noted)
+        v.store(_run(v, plan.read, [*time, *v.load(frame, [*plan.y, *plan.driven, *plan.fixed])]), frame, plan.noted)
 
     def _move(self, move: Moving, together: int, b: ir.IRBuilder, frame: Value, first: Value, driving: Value) -> None:
         """One step of some tangents; `driving` points to the places of their sources."""
@@ -164,7 +164,7 @@ class _Writer:
         b, plan, width = ir.IRBuilder(made.append_basic_block()), self.plan, self.width
         n, nc, no = len(plan.x), len(plan.constants), len(plan.shown)
         columns = n if plan.moving else 1
-        target, shift = (room(b, I64, width) for _ in range(2))
+        target, shift, own = (room(b, I64, width) for _ in range(3))
         t, taken = room(b, F64), room(b, F64)
 
         def at(place: int, lane: Value) -> Value:
@@ -185,6 +185,7 @@ class _Writer:
                 place = b.add(b.mul(trial, n_cases), case)
                 put(b, b.mul(b.mul(place, n_times), integer(no * columns)), target, lane)
                 put(b, b.mul(case, stride), shift, lane)
+                put(b, constants, own, lane)
             b.call(self.begin, [frame])
             b.store(ir.Constant(F64, 0.0), t)
             b.store(ir.Constant(F64, float("nan")), taken)  # unlike any step, so that the weights are always written
@@ -200,6 +201,12 @@ class _Writer:
                     b.call(self.step, [frame, b.fadd(since, b.fmul(b.sitofp(s, F64), h)), h])
                     self._tangents(b, frame)
                 b.store(to, t)
+                if plan.driven:
+                    later = b.mul(b.add(k, integer(1)), b.mul(n_cases, integer(nc)))
+                    with loop(b, integer(0), integer(width)) as lane:
+                        row = b.add(later, number_at(b, own, lane, I64))
+                        for j, place in enumerate(plan.driven, start=nc - len(plan.driven)):
+                            put(b, number_at(b, cases, b.add(row, integer(j))), frame, at(place, lane))
                 b.call(self.read, [frame, to])
                 done = b.mul(k, integer(no))
                 with loop(b, integer(0), integer(columns)) as j:

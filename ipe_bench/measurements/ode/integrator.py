@@ -97,9 +97,11 @@ class Kernel:
         *more: Array,
     ) -> None:
         """Integrates the trials in these rows of x (trials, n) from time 0, in every case, `steps[k]` equal steps to
-        `times[k]`. The last of `more` takes the results, C-contiguous, in the same rows; before it, for simulations,
-        what is subtracted from the readings."""
-        lanes = len(rows) * len(cases)
+        `times[k]`. `cases` has the constants (cases, constants), or where some are driven those of every interval and
+        those after the last time (times + 1, cases, constants). The last of `more` takes the results, C-contiguous, in
+        the same rows; before it, for simulations, what is subtracted from the readings."""
+        count = cases.shape[-2]
+        lanes = len(rows) * count
         *offset, out = more
         if bool(offset) != (self.plan.moving is None):
             raise TypeError("simulations take an offset, Jacobians take none")
@@ -109,8 +111,8 @@ class Kernel:
             interpret(self.plan, x, si, cases, rows, times, steps, *more)
             return
         function, size = self._narrow if lanes <= _NARROW else self._wide
-        given = (at(x), at(si), at(cases), len(cases), at(rows, WHOLE))
-        stride = len(offset[0]) // len(cases) if offset else 0
+        given = (at(x), at(si), at(cases), count, at(rows, WHOLE))
+        stride = len(offset[0]) // count if offset else 0
         taken = (at(times), at(steps, WHOLE), len(times), at(offset[0]) if offset else None, stride, at(out))
 
         def work_on(pieces: Sequence[tuple[int, int]] | Any) -> None:
@@ -126,8 +128,8 @@ class Kernel:
             work_on([(0, lanes)])
             return
         # More pieces than threads, so that a core slowed by other work does not hold up the rest.
-        count = min(lanes // width, workers * min(4, max(1, work // _WORTH_THREADS)))
-        bounds = [width * (i * (lanes // width) // count) for i in range(count)] + [lanes]
+        shares = min(lanes // width, workers * min(4, max(1, work // _WORTH_THREADS)))
+        bounds = [width * (i * (lanes // width) // shares) for i in range(shares)] + [lanes]
         pieces = iter(list(itertools.pairwise(bounds)))
         others = [_pool(workers - 1, os.getpid()).submit(work_on, pieces) for _ in range(workers - 1)]
         work_on(pieces)
@@ -146,10 +148,12 @@ def interpret(
     *more: Array,
 ) -> None:
     """`Kernel.run` operation by operation in NumPy, all lanes at once; products are rounded before they are added."""
-    trial, case = np.repeat(rows, len(cases)), np.tile(np.arange(len(cases)), len(rows))
+    intervals = cases.reshape(-1, *cases.shape[-2:])
+    count = intervals.shape[1]
+    trial, case = np.repeat(rows, count), np.tile(np.arange(count), len(rows))
     lanes, no, move = len(trial), len(plan.shown), plan.moving
     frame: list[Any] = [np.zeros(lanes)] * plan.size
-    out = more[-1].reshape(len(x), len(cases), len(times), no, -1)
+    out = more[-1].reshape(len(x), count, len(times), no, -1)
 
     def load(places: Any, beyond: int = 0) -> list[Any]:
         return [frame[i + beyond] for i in places]
@@ -171,7 +175,7 @@ def interpret(
 
     with np.errstate(all="ignore"):
         store([x[trial, j] * si[j] for j in range(len(plan.x))], plan.x)
-        store([cases[case, j] for j in range(len(plan.constants))], plan.constants)
+        store(list(intervals[0, case].T), plan.constants)
         store(plan.begin(load([*plan.x, *plan.constants])), plan.begun)
         t = 0.0
         for k, to in enumerate(times.tolist()):
@@ -181,7 +185,7 @@ def interpret(
 
                 def slope(stage: int, y: list[Any], since: float = since, h: float = h, ny: int = ny) -> list[Any]:
                     time = [since + plan.tableau.C[stage] * h] if plan.step_timed else []
-                    result = plan.step([*time, *y, *load(plan.fixed)])
+                    result = plan.step([*time, *y, *load(plan.driven), *load(plan.fixed)])
                     store(result[ny:], plan.kept[stage])
                     return result[:ny]
 
@@ -195,9 +199,13 @@ def interpret(
 
                     store(advance(load(lie), h, moving), lie)
             t = to
-            store(plan.read([*([t] if plan.read_timed else []), *load([*plan.y, *plan.fixed])]), plan.noted)
+            if plan.driven:
+                store(list(intervals[k + 1, case, -len(plan.driven) :].T), plan.driven)
+            store(
+                plan.read([*([t] if plan.read_timed else []), *load([*plan.y, *plan.driven, *plan.fixed])]), plan.noted
+            )
             if move is None:
-                less = more[0].reshape(len(cases), -1, no)[case, k]
+                less = more[0].reshape(count, -1, no)[case, k]
                 for i, value in enumerate(load(plan.shown)):
                     out[trial, case, k, i, 0] = value - less[:, i]
             for j, (lie, sources) in enumerate(zip(move.lie, move.show_sources, strict=True) if move else ()):

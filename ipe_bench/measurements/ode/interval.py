@@ -16,9 +16,9 @@ from ipe_bench.measurements.ode.model import OdeMeasurement
 
 @dataclass(frozen=True)
 class Interval(OdeMeasurement):
-    """x is the whole model's p in SI units, the state at the beginning, a case's constants, the time of the beginning
-    and the length, so that all intervals of all trials and cases are one batch; read are the state and the whole
-    model's outputs at the end. Time counts in lengths of the interval."""
+    """x is the whole model's p in SI units, the state at the beginning, a case's constants within and at the end (once
+    where none are driven), the time of the beginning and the length, so that all intervals of all trials and cases are
+    one batch; read are the state and the whole model's outputs at the end. Time counts in lengths of the interval."""
 
     whole: OdeMeasurement
     step: float | None = 0.125
@@ -32,7 +32,11 @@ class Interval(OdeMeasurement):
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        return tuple(Parameter(f"x{i}") for i in range(self.whole.n + self.states + self.whole.cases.shape[1] + 2))
+        return tuple(Parameter(f"x{i}") for i in range(self.whole.n + self.states + self._constants + 2))
+
+    @property
+    def _constants(self) -> int:
+        return self.whole.tables.shape[2] * (1 if self.whole.driven is None else 2)
 
     @property
     def times(self) -> Array:
@@ -43,11 +47,12 @@ class Interval(OdeMeasurement):
 
     def rhs(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
         own, _, constants, t0, length = self._split(p)
+        constants = constants[: self.whole.tables.shape[2]]
         return [length * slope for slope in self.whole.rhs(t0 + length * t, y, own, constants)]
 
     def read(self, t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
         own, _, constants, t0, length = self._split(p)
-        return [*y, *self.whole.read(t0 + length * t, y, own, constants)]
+        return [*y, *self.whole.read(t0 + length * t, y, own, constants[-self.whole.tables.shape[2] :])]
 
     def _split(self, p: Sequence[Any]) -> tuple[list[Any], list[Any], list[Any], Any, Any]:
         """The parameters, the state at the beginning, the constants, the time of the beginning, and the length."""

@@ -18,7 +18,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, own
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.ode.integrator import Kernel, Rates
-from ipe_bench.measurements.ode.plan import Equations, Variation, jacobian, simulation
+from ipe_bench.measurements.ode.plan import Equations, Variation, jacobian, jumps, simulation
 from ipe_bench.measurements.ode.steps import (
     CONTRACTION,
     MOST_RK4,
@@ -38,7 +38,7 @@ from ipe_bench.measurements.ode.stiffness import diagnose
 from ipe_bench.measurements.ode.tableau import DOP853, RK4
 from ipe_bench.measurements.ode.trace import Graph, Program
 
-_STAYS = ("_readings_kernel", "_rk4_kernel", "_rate_function", "_jacobian_kernel", "_equations", "_remembered")
+_STAYS = ("_readings_kernel", "_rk4_kernel", "_rate_function", "_jacobian_kernel", "equations", "_remembered")
 _FAR = 1e3
 """Tolerances by which readings with the shortest steps are off where the integrator cannot follow the equations."""
 _ANGLE_AT_START = 0.7
@@ -82,6 +82,20 @@ class OdeMeasurement(Measurement):
     def cases(self) -> Array:
         """The constants of each case: (cases, constants). One case without constants unless overridden."""
         return np.zeros((1, 0))
+
+    @property
+    def driven(self) -> Array | None:
+        """Constants that change with time (times + 1, cases, further constants), behind those of the cases: entry k
+        holds from times[k - 1] on, at that reading too, until times[k]."""
+        return None
+
+    @cached_property
+    def tables(self) -> Array:
+        """All constants (intervals, cases, constants); a single interval where none changes."""
+        cases = own(self.cases)[None]
+        if self.driven is None:
+            return cases
+        return own(np.concatenate([np.repeat(cases, len(self.driven), axis=0), self.driven], axis=2))
 
     @property
     def si_sizes(self) -> Array:
@@ -204,7 +218,7 @@ class OdeMeasurement(Measurement):
     def _simulate(self, x: Array, rows: Indices, steps: NDArray[np.int64], offset: Array, z: Array) -> None:
         """Fills these rows of z (trials, readings), as many times as it has room for, with so many steps to each."""
         times = self._times[: z.shape[1] // (len(self._cases) * len(self.outputs))]
-        self._readings_kernel.run(x, self._si_sizes, self._cases, rows, times, steps, offset, z.reshape(-1))
+        self._readings_kernel.run(x, self._si_sizes, self.tables, rows, times, steps, offset, z.reshape(-1))
 
     _zeros = cached_property(lambda self: np.zeros(self.m))
     _si_sizes = cached_property(lambda self: own(self.si_sizes))
@@ -352,13 +366,13 @@ class OdeMeasurement(Measurement):
                 rk4 = k
                 break
         # Half the level; where that is half a step, every second reading.
-        if level == 1 and len(self._times) == 1:
+        if level == 1 and (len(self._times) == 1 or self.driven is not None):
             return Coarseness(rk4, np.inf)
         every = slice(None) if level > 1 else slice(1, None, 2)
         rows = np.arange(self.m).reshape(len(self._cases), everything, -1)[:, every].ravel()
         times, steps = self._times[every], max(1, level // 2) * self._parts[every]
         z, coarse = np.empty((1, len(rows))), np.empty((1, len(rows), self.n))
-        given = (x, self._si_sizes, self._cases, np.arange(1), np.ascontiguousarray(times), steps)
+        given = (x, self._si_sizes, self.tables, np.arange(1), np.ascontiguousarray(times), steps)
         self._readings_kernel.run(*given, np.zeros(len(rows)), z.reshape(-1))
         self._jacobian_kernel.run(*given, coarse.reshape(-1))
         with np.errstate(all="ignore"):
@@ -372,7 +386,7 @@ class OdeMeasurement(Measurement):
     def _differentiate(self, kernel: Kernel, x: Array, rows: Indices, steps: NDArray[np.int64], J: Array) -> None:
         """Fills these rows of J (trials, readings, n), as many times as it has room for."""
         times = self._times[: J.shape[1] // (len(self._cases) * len(self.outputs))]
-        kernel.run(x, self._si_sizes, self._cases, rows, times, steps, J.reshape(-1))
+        kernel.run(x, self._si_sizes, self.tables, rows, times, steps, J.reshape(-1))
 
     @cached_property
     def jacobian_cost(self) -> float:  # type: ignore[override]
@@ -393,14 +407,27 @@ class OdeMeasurement(Measurement):
         """Without what is compiled and remembered, which stays with a process."""
         return {k: v for k, v in self.__dict__.items() if k not in _STAYS}
 
-    _readings_kernel = cached_property(lambda self: Kernel(simulation, self._equations, DOP853))
-    _jacobian_kernel = cached_property(lambda self: Kernel(jacobian, self._equations, DOP853))
-    _rk4_kernel = cached_property(lambda self: Kernel(jacobian, self._equations, RK4))
+    _readings_kernel = cached_property(lambda self: Kernel(simulation, self.equations, DOP853))
+    _jacobian_kernel = cached_property(lambda self: Kernel(jacobian, self.equations, DOP853))
+    _rk4_kernel = cached_property(lambda self: Kernel(jacobian, self.equations, RK4))
 
     @cached_property
-    def _equations(self) -> Equations:
-        constants, outputs = self.cases.shape[1], len(self.outputs)
-        return Equations(self.states, self.n, constants, outputs, self.start, self.rhs, self.read, self.variation)
+    def equations(self) -> Equations:
+        """What is integrated.
+
+        Raises:
+            UserError: a rate jumps where the solution decides.
+        """
+        constants, driven = self.tables.shape[2], self.tables.shape[2] - self.cases.shape[1]
+        arithmetic = (self.start, self.rhs, self.read, self.variation, driven)
+        equations = Equations(self.states, self.n, constants, len(self.outputs), *arithmetic)
+        if jumps(equations):
+            remedy = "let both sides agree there, or blend them, as by 1/(1+exp((b-a)/width)) for a > b"
+            raise UserError(
+                f"measurement={self.name}: a rate jumps at a moment that a state or a parameter decides, which no step "
+                f"can end at; {remedy}"
+            )
+        return equations
 
 
 def time_heading(unit: str) -> str:

@@ -9,8 +9,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from ipe_bench.measurements.ode.tableau import Tableau
 from ipe_bench.measurements.ode.trace import (
+    COMPARISONS,
     Expression,
     Graph,
     Program,
@@ -23,6 +26,8 @@ from ipe_bench.measurements.ode.trace import (
 )
 
 Arithmetic = Callable[..., Sequence[Any]]
+_POINTS, _NEWTON = 64, 30
+"""Points at which a comparison is examined, and the steps that move them to where it changes."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,8 @@ class Equations:
     rhs: Arithmetic
     read: Arithmetic
     variation: Variation | None = None
+    driven: int = 0
+    """How many of the constants, the last ones, change from one interval between readings to the next."""
 
 
 class _Tape:
@@ -59,6 +66,7 @@ class _Tape:
         self.t = graph.input("t")
         self.y, self.p = graph.inputs("y", equations.states), graph.inputs("p", equations.parameters)
         self.c = graph.inputs("c", equations.constants)
+        self.u = self.c[equations.constants - equations.driven :]
         self.start = self._values(equations.start(self.p, self.c), equations.states, "start")
         self.slope = self._values(equations.rhs(self.t, self.y, self.p, self.c), equations.states, "rhs")
         self.shown = self._values(equations.read(self.t, self.y, self.p, self.c), equations.outputs, "read")
@@ -71,12 +79,12 @@ class _Tape:
 
     def fixed(self, *outputs: Expression) -> list[Expression]:
         """What is computed once for each lane: it depends on the parameters and the case alone."""
-        return border(outputs, dependent(outputs, (self.t, *self.y)))
+        return border(outputs, dependent(outputs, (self.t, *self.y, *self.u)))
 
     def along_the_way(self, outputs: Sequence[Expression], fixed: Sequence[Expression]) -> tuple[Program, bool]:
         """The program that computes the outputs from the state, and whether it needs the time."""
         timed = self.t in in_order(outputs, fixed)
-        return Program.of(outputs, [*([self.t] if timed else []), *self.y, *fixed]), timed
+        return Program.of(outputs, [*([self.t] if timed else []), *self.y, *self.u, *fixed]), timed
 
     def beginning(self, outputs: Sequence[Expression]) -> Program:
         return Program.of(outputs, [*self.p, *self.c])
@@ -96,7 +104,7 @@ class _Linear:
         """The value (n, sources) of each source along each parameter."""
         needed = border(outputs, dependent(outputs, (*d, *names)))
         values = [e for row in self.sources for e in row]
-        varying = dependent([*needed, *values], (tape.t, *tape.y))
+        varying = dependent([*needed, *values], (tape.t, *tape.y, *tape.u))
         self.fixed = [e for e in needed if e not in varying]
         self.saved = [e for e in needed if e in varying]
         self.driving = _distinct(e for e in values if e in varying and e not in self.saved)
@@ -153,9 +161,11 @@ class Plan:
     begun: tuple[int, ...]
     """Where the results of `begin` lie: state, what is fixed, and for Jacobians tangents and constant sources."""
     y: range
+    driven: range
+    """Where the constants lie that change from interval to interval, the last ones."""
     fixed: range
     step: Program
-    """From (t, y, fixed): the slope, and what tangents need of a stage."""
+    """From (t, y, driven, fixed): the slope, and what tangents need of a stage."""
     step_timed: bool
     kept: tuple[range, ...]
     """Where each stage keeps what tangents need."""
@@ -181,6 +191,36 @@ class Plan:
         return self.tableau.stages * counted + numbers * sum(map(len, self.tableau.weights))
 
 
+def jumps(equations: Equations) -> bool:
+    """Whether the rates jump at a moment that the solution decides: it is no end of a step, and slopes would lack what
+    they owe to it. A kink, where both sides of a comparison agree, is no jump.
+
+    Both sides are evaluated at points that are moved to where the operands of the comparison are equal.
+    """
+    tape = _Tape(equations)
+    graph, inputs = tape.graph, [tape.t, *tape.y, *tape.p, *tape.c]
+    moving = dependent(tape.slope, (tape.t, *tape.y))
+    for e in (e for e in in_order(tape.slope) if e.operation in COMPARISONS and e in moving):
+        if e.operands[0] is e.operands[1]:  # asks whether it is a number
+            continue
+        gap = graph.apply("sub", *e.operands)
+        sides = [substitute(f, {e: graph.constant(side)}) for side in (1.0, 0.0) for f in tape.slope]
+        for place, along in enumerate(inputs[: 1 + equations.states]):
+            program = Program.of([gap, *tangent([gap], {along: graph.constant(1.0)}), *sides], inputs)
+            point = list(np.random.default_rng(1).uniform(-2.0, 2.0, (len(inputs), _POINTS)))
+            with np.errstate(all="ignore"):
+                for _ in range(_NEWTON):
+                    value, slope, *_ = program(point)
+                    point[place] = point[place] - value / slope
+                value, _, *shown = program(point)
+                count = equations.states
+                a, b = (np.stack(np.broadcast_arrays(value, *side)) for side in (shown[:count], shown[count:]))
+                apart = np.abs(a - b) > 1e-6 * (1.0 + np.abs(a) + np.abs(b))
+                if (apart & (np.abs(value) < 1e-9)).any():
+                    return True
+    return False
+
+
 def simulation(equations: Equations, tableau: Tableau) -> Plan:
     """How readings are computed."""
     tape, frame = _Tape(equations), _Frame()
@@ -189,7 +229,8 @@ def simulation(equations: Equations, tableau: Tableau) -> Plan:
     x, constants = frame.room(equations.parameters), frame.room(equations.constants)
     y, fixed_at, shown = (frame.room(k) for k in (equations.states, len(fixed), equations.outputs))
     return Plan(
-        tableau, x, constants, tape.beginning([*tape.start, *fixed]), (*y, *fixed_at), y, fixed_at, step, step_timed,
+        tableau, x, constants, tape.beginning([*tape.start, *fixed]), (*y, *fixed_at), y,
+        constants[len(constants) - equations.driven :], fixed_at, step, step_timed,
         tuple(range(0) for _ in tableau.B), read, read_timed, shown, shown, frame.size,
     )  # fmt: skip
 
@@ -222,7 +263,8 @@ def jacobian(equations: Equations, tableau: Tableau) -> Plan:
         reading.program(fixed), reading.places(at_reading.start), at_reading[: len(reading.saved)],
     )  # fmt: skip
     return Plan(
-        tableau, x, constants, tape.beginning(started), tuple(begun), y, fixed_at, step, step_timed,
+        tableau, x, constants, tape.beginning(started), tuple(begun), y,
+        constants[len(constants) - equations.driven :], fixed_at, step, step_timed,
         tuple(stage[:k] for stage in stages), note, note_timed, at_reading[:r], out, frame.size, moving,
     )  # fmt: skip
 

@@ -99,7 +99,7 @@ class Rodas5P:
     def _programs(self) -> dict[str, Program]:
         """The equations and the derivatives that the method needs, on arrays over lanes."""
         model, g = self.model, Graph()
-        n, q, constants = model.states, model.n, model.cases.shape[1]
+        n, q, constants, do = model.states, model.n, model.tables.shape[2], model.equations
         t, y, p, c = g.input("t"), g.inputs("y", n), g.inputs("p", q), g.inputs("c", constants)
         k, s, d = g.inputs("k", n), g.inputs("s", n), g.inputs("d", q)
         one, point, ways = g.constant(1.0), [t, *y, *p, *c], [*s, *d]
@@ -107,7 +107,7 @@ class Rodas5P:
         def lift(values: Sequence[Any]) -> list[Expression]:
             return [v if isinstance(v, Expression) else g.constant(float(v)) for v in values]
 
-        f, h, start = lift(model.rhs(t, y, p, c)), lift(model.read(t, y, p, c)), lift(model.start(p, c))
+        f, h, start = lift(do.rhs(t, y, p, c)), lift(do.read(t, y, p, c)), lift(do.start(p, c))
         along = dict(zip([*y, *p], ways, strict=True))
         in_time, turned = tangent(f, {t: one}), tangent(f, dict(zip(y, k, strict=True)))
         columns = [tangent(f, {a: one}) for a in y]
@@ -159,15 +159,16 @@ class _Run:
         cases, self.q = model.cases, model.n if sensitive else 0
         lanes, n = len(x) * len(cases), model.states
         self.p = np.repeat(x * model.si_sizes, len(cases), axis=0).T.copy()
-        self.c = np.tile(cases, (len(x), 1)).T.copy()
+        self.tables, self.case = model.tables, np.tile(np.arange(len(cases)), len(x))
         self.directions = np.eye(model.n)[:, :, None]
-        self.y = _stacked(self.do["start"], [*self.p, *self.c], (lanes,))
+        self.t, self.place, self.steps = np.zeros(lanes), np.zeros(lanes, int), np.zeros(lanes, int)
+        c = self._constants(np.arange(lanes))
+        self.y = _stacked(self.do["start"], [*self.p, *c], (lanes,))
         self.S = np.zeros((n, 0, lanes))
         if sensitive:
-            self.S = _stacked(self.do["dstart"], [*self.p, *self.c, *self.directions], (self.q, lanes))
+            self.S = _stacked(self.do["dstart"], [*self.p, *c, *self.directions], (self.q, lanes))
         self.z = np.full((len(model.outputs), stop, lanes), np.nan)
         self.J = np.full((len(model.outputs), stop, self.q, lanes), np.nan)
-        self.t, self.place, self.steps = np.zeros(lanes), np.zeros(lanes, int), np.zeros(lanes, int)
         self.stretch, self.stretched = np.zeros(lanes), stretch
 
     def all_steps(self) -> None:
@@ -211,12 +212,16 @@ class _Run:
             self.place[here] += 1
 
     def _at(self, lanes: Array) -> tuple[Any, ...]:
-        return (self.t[lanes], *self.y[:, lanes], *self.p[:, lanes], *self.c[:, lanes])
+        return (self.t[lanes], *self.y[:, lanes], *self.p[:, lanes], *self._constants(lanes, 1))
+
+    def _constants(self, lanes: Array, later: int = 0) -> Array:
+        """Of the interval to the next time of each lane, or those that hold from that time on."""
+        return self.tables[np.minimum(self.place[lanes] + later, len(self.tables) - 1), self.case[lanes]].T
 
     def _step(self, live: Array, h: Array) -> tuple[Array, Array, Array]:
         """States, sensitivities and the error in units of the tolerance after a step h of the lanes `live`."""
         do, q, lanes = self.do, self.q, len(live)
-        t, y, p, c, S = self.t[live], self.y[:, live], self.p[:, live], self.c[:, live], self.S[:, :, live]
+        t, y, p, c, S = self.t[live], self.y[:, live], self.p[:, live], self._constants(live), self.S[:, :, live]
         n, at = len(y), (t, *y, *p, *c)
         J = _stacked(do["J"], at, (lanes,)).reshape(n, n, lanes)
         if self.stretched:
@@ -250,7 +255,8 @@ class _Run:
     def _first_step(self) -> Array:
         end = self.end or 1.0
         scale = self.atol + self.rtol * np.abs(self.y)
-        f = _stacked(self.do["f"], [np.zeros(len(self.t)), *self.y, *self.p, *self.c], self.t.shape)
+        c = self._constants(np.arange(len(self.t)))
+        f = _stacked(self.do["f"], [np.zeros(len(self.t)), *self.y, *self.p, *c], self.t.shape)
         speed, size = (np.abs(f) / scale).max(axis=0), (np.abs(self.y) / scale).max(axis=0)
         return np.where((speed > 1e-5) & (size > 1e-5), np.minimum(1e-3 * size / speed, end), 1e-6 * end)
 

@@ -27,7 +27,7 @@ _STIFF = 20.0
 def diagnose(model: OdeMeasurement, x: Array, shortest: float) -> str:
     """What hinders the integrator from following the solution at x (n,), whose shortest step that is."""
     p, unit = list(x * model.si_sizes), f" {model.time_unit}".rstrip()
-    found = [_follow(model, p, list(c)) for c in model.cases]
+    found = [_follow(model, p, case) for case in range(len(model.cases))]
     fastest, t, slow, ended = max(found, key=lambda one: (one[3] is not None, one[0]))
     if ended is not None:
         return f"the solution itself leaves all numbers near t = {ended:.4g}{unit}"
@@ -38,21 +38,23 @@ def diagnose(model: OdeMeasurement, x: Array, shortest: float) -> str:
     return f"the equations need steps of {needed:.2g}{unit} at t = {t:.4g}, and the shortest is {shortest:.2g}{looks}"
 
 
-def _follow(model: OdeMeasurement, p: list[float], c: list[float]) -> tuple[float, float, float, float | None]:
+def _follow(model: OdeMeasurement, p: list[float], case: int) -> tuple[float, float, float, float | None]:
     """The fastest rate along the solution, when it is met, how fast the solution changes there, and where it ends too
     soon."""
     from scipy.integrate import solve_ivp
 
     calls, reached = 0, 0.0
+    tables, times = model.tables[:, case].tolist(), np.asarray(model.times)
 
     def rhs(t: float, y: Array) -> Array:
         nonlocal calls, reached
         calls, reached = calls + 1, t
         if calls > _MOST_CALLS:
             raise ArithmeticError
+        c = tables[min(int(np.searchsorted(times, t)), len(tables) - 1)]
         return np.array(model.rhs(t, list(y), p, c), dtype=float)
 
-    start, end = np.array(model.start(p, c), dtype=float), float(model.times[-1])
+    start, end = np.array(model.start(p, tables[0]), dtype=float), float(model.times[-1])
     with np.errstate(all="ignore"):
         if not (np.isfinite(start).all() and np.isfinite(rhs(0.0, start)).all()):
             return 0.0, 0.0, 0.0, 0.0

@@ -162,18 +162,18 @@ _COMPOSED: dict[str, Callable[..., Any]] = {
     "equal": lambda apply, a, b: apply("mul", apply("less_equal", a, b), apply("less_equal", b, a)),
     "not_equal": lambda apply, a, b: apply("add", apply("less", a, b), apply("less", b, a)),
     "absolute": lambda apply, a: apply("where", apply("less", a, 0.0), apply("neg", a), a),
-    "minimum": lambda apply, a, b: _first_if(apply, "less", a, b, a, b),
-    "maximum": lambda apply, a, b: _first_if(apply, "less", b, a, a, b),
+    "minimum": lambda apply, a, b: _first_if(apply, apply("less", a, b), a, b),
+    "maximum": lambda apply, a, b: _first_if(apply, apply("less", b, a), a, b),
 }
 """NumPy's functions that are made of several operations."""
 
 
-def _first_if(apply: Callable[..., Any], comparison: str, low: Any, high: Any, a: Any, b: Any) -> Any:
-    """a where `low` is less than `high`, b where it is not, and not a number where one of them is not."""
-    return apply("where", apply(comparison, low, high), a, apply("where", apply("less_equal", high, low), b, a + b))
+def _first_if(apply: Callable[..., Any], condition: Any, a: Any, b: Any) -> Any:
+    """a where the condition holds or a is not a number, else b."""
+    return apply("where", condition, a, apply("where", apply("less_equal", a, a), b, a))
 
 
-def _special(name: str) -> Callable[[Any], Any]:
+def special(name: str) -> Callable[[Any], Any]:
     """A function of scipy.special, which is imported where one is needed."""
     return lambda a: getattr(importlib.import_module("scipy.special"), name)(a)
 
@@ -203,7 +203,7 @@ _ARRAYS: dict[str, Callable[..., Any]] = {
     "fma": lambda a, b, c: a * b + c,
     "fms": lambda a, b, c: a * b - c,
     "fnma": lambda a, b, c: c - a * b,
-} | {name: getattr(np, name, None) or _special(name) for name in _FUNCTIONS}
+} | {name: getattr(np, name, None) or special(name) for name in _FUNCTIONS}
 """The operations of a program, on arrays; products are rounded before they are added."""
 _DERIVATIVES: dict[str, Callable[[Any, Any, Any], Any]] = {
     "tan": lambda e, a, one: one + e * e,

@@ -1,0 +1,116 @@
+"""What changes with time and is known: inputs that are held or straight between rows, and comparisons of t in rates.
+
+A change is the end of a step, so that no step crosses it: within an interval between two such times a comparison of t
+holds throughout or nowhere, a held input is a constant, and one that is straight is a line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
+from ipe_bench.measurements.arithmetic import COMPARISONS, Arithmetic, Tree, names_in, parts, rewritten
+
+_PIECEWISE = ("min", "max", "abs", *COMPARISONS)
+_SAME = 1e-12
+"""Of the whole span: times this close are one."""
+
+
+def separated(
+    formulas: Mapping[str, Arithmetic], constants: Collection[str]
+) -> tuple[dict[str, Arithmetic], dict[str, Tree]]:
+    """The formulas with a name in place of every comparison of t with constants, and the comparisons by those names."""
+    switches: dict[Tree, str] = {}
+
+    def new(tree: Tree) -> Tree | None:
+        names = set(names_in(tree)) if tree[0] in _PIECEWISE else set()
+        if "t" not in names or not names <= {"t", *constants}:
+            return None
+        if tree[0] in COMPARISONS:
+            return ("name", switches.setdefault(tree, f"switch {len(switches)}"))
+        operation, a, *other = tree
+        b = other[0] if other else ("negative", a)
+        return rewritten(("if", ("<" if operation == "min" else ">", a, b, f"the {operation} of t"), a, b), new)
+
+    found = {}
+    for key, formula in formulas.items():
+        tree = formula.tree
+        if any(part[0] in _PIECEWISE for part in parts(tree)):
+            tree = rewritten(tree, new)
+        found[key] = Arithmetic(formula.text, tree, tuple(dict.fromkeys(names_in(tree))))
+    return found, {name: tree for tree, name in switches.items()}
+
+
+def switching_times(comparison: Tree, cases: Sequence[Mapping[str, float]]) -> list[float]:
+    """When a comparison of t begins or ceases to hold in one of the cases, given by their constants.
+
+    Raises:
+        UserError: t does not stand there by itself, or times a constant.
+    """
+    _, left, right, text = comparison
+    found = []
+    for case in cases:
+        first, second, third = (
+            float(Arithmetic(text, ("-", left, right), ())({**case, "t": time})) for time in (0.0, 1.0, 2.0)
+        )
+        slope = second - first
+        if not abs(third - second - slope) <= 1e-9 * (abs(first) + abs(second) + abs(third)):
+            raise UserError(
+                f"rates: {text}: compare t itself with a constant, so that the moment of the switch is known"
+            )
+        if slope:
+            found.append(-first / slope)
+    return found
+
+
+def grid(readings: Array, changes: Sequence[float]) -> Array:
+    """The times of the readings, and those of the changes between 0 and the last of them."""
+    end = float(readings.max(initial=0.0))
+    inside = np.unique([time for time in changes if _SAME * end < time < end])
+    nearest = np.abs(inside[:, None] - readings).min(axis=1, initial=np.inf)
+    return np.union1d(readings, inside[nearest > _SAME * end])
+
+
+def middles(times: Array) -> Array:
+    """A time within each interval that ends at one of these times, and the last of them."""
+    return (np.append(0.0, times) + np.append(times, times[-1:])) / 2
+
+
+def course(kind: str, times: Array, values: Array, at: Array) -> list[Array]:
+    """The constants, of the intervals around `at`, of an input with these values: a held one, or the line
+    u + slope (t - since) as u, slope and since. It is level before its first row and after its last."""
+    k = np.searchsorted(times, at, side="right") - 1
+    place = np.maximum(k, 0)
+    if kind == "hold":
+        return [values[place]]
+    slopes = np.append(np.diff(values) / np.diff(times), 0.0)
+    return [values[place], np.where(k < 0, 0.0, slopes[place]), times[place]]
+
+
+def courses(columns: Mapping[str, Sequence[Any]], names: Collection[str]) -> list[dict[str, Array]]:
+    """The columns `time` and those of the inputs, of each case.
+
+    Raises:
+        UserError: a column is missing, or its times do not ascend.
+    """
+    for name in ("time", *names):
+        if not len(columns.get(name, ())):
+            here = " ".join(f"measurement.columns.{one}=[...]" for one in ("time", *names))
+            raise UserError(
+                f"measurement.columns: {name} is not known; give readings=FILE with columns time and "
+                f"{', '.join(names)}, or {here}"
+            )
+    arrays = {name: np.asarray(columns[name], dtype=float) for name in ("time", *names)}
+    case = np.asarray(columns.get("case", np.ones(len(arrays["time"]))))
+    numbers = np.unique(case)
+    if numbers.tolist() != list(range(1, len(numbers) + 1)):
+        raise UserError(f"columns.case: has {numbers[-1]:g}; cases are numbered 1, 2 and so on")
+    found = [{name: column[case == number] for name, column in arrays.items()} for number in numbers]
+    for one in found:
+        if one["time"][0] < 0 or (np.diff(one["time"]) <= 0).any():
+            raise UserError("columns.time: give ascending numbers from 0 on in each case")
+    return found

@@ -1,0 +1,194 @@
+"""Equations that change with time: inputs held or straight between rows, and rates in pieces, by both integrators."""
+
+from dataclasses import replace
+from itertools import pairwise
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from ipe_bench.baselines import LevenbergMarquardt, MultipleShooting
+from ipe_bench.basics import compiled
+from ipe_bench.basics.errors import UserError
+from ipe_bench.measurements import Ode
+from ipe_bench.measurements.base import differentiate
+from ipe_bench.measurements.problem import Problem
+from ipe_bench.noise import Gaussian
+from ipe_bench.plugins.conformance import check_component
+from ipe_bench.real.estimation import Question
+from ipe_bench.real.fits import fit
+from ipe_bench.real.readings import open_together
+
+T = np.arange(0.0, 600.0, 10.0)
+CURRENT = np.repeat(np.random.default_rng(0).choice([0.0, 1.0, 2.5, -1.0], 12), 5)
+BATTERY = Ode(
+    {"soc": "-current/9000", "v": "current/c1 - v/(r1*c1)"},
+    {"r0": 0.02, "r1": 0.015, "c1": 2000.0},
+    {"soc": 1.0},
+    {"voltage": "3.4 + 0.7*soc - v - r0*current"},
+    tuple(T),
+    driven_by={"current": "hold"},
+    columns={"time": T.tolist(), "current": CURRENT.tolist()},
+    tolerance=1e-11,
+)
+
+LM = {"lm": LevenbergMarquardt()}
+
+
+def circuit(r0, r1, c1):
+    """The exact steps of the linear circuit."""
+    v, soc, z = 0.0, 1.0, []
+    for current in CURRENT:
+        z.append(3.4 + 0.7 * soc - v - r0 * current)
+        v = current * r1 + (v - current * r1) * np.exp(-10 / (r1 * c1))
+        soc -= current * 10 / 9000
+    return np.array(z)
+
+
+@pytest.mark.parametrize("method", ["explicit", "implicit"])
+def test_a_battery_follows_its_current(method):
+    model = replace(BATTERY, method=method)
+    x = model.nominal * np.array([[1.0, 1.0, 1.0], [1.2, 0.8, 1.5]])
+    z = model.simulate(x)
+    for row, p in zip(z, x * model.sizes, strict=True):
+        np.testing.assert_allclose(row, circuit(*p), atol=1e-10)
+    np.testing.assert_allclose(model.jacobian(x), differentiate(model.simulate, x, analytic=False), atol=1e-9)
+    assert np.array_equal(model.simulate(x[1:])[0], z[1])
+    assert np.array_equal(model.simulate_until(x, 30), z[:, :30])
+    with patch.object(compiled, "available", lambda: False):
+        np.testing.assert_allclose(replace(model).simulate(x), z, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", ["explicit", "implicit"])
+def test_a_stiff_follower_of_a_straight_input_has_its_exact_solution(method):
+    """y' = k (u - y), where u is straight between its rows."""
+    t = np.linspace(0.0, 10.0, 21)
+    u, k, y, exact = np.sin(t), 300.0, 0.0, [0.0]
+    for a, b in pairwise(u):
+        s = (b - a) / 0.5
+        y = b - s / k + (y - a + s / k) * np.exp(-k * 0.5)
+        exact.append(y)
+    columns = {"time": t.tolist(), "u": u.tolist()}
+    model = Ode({"y": "k*(u-y)"}, {"k": k}, times=tuple(t), driven_by={"u": "linear"}, columns=columns, method=method,
+                tolerance=1e-11)  # fmt: skip
+    x = model.nominal[None]
+    np.testing.assert_allclose(model.simulate(x)[0], exact, atol=1e-10)
+    np.testing.assert_allclose(model.jacobian(x), differentiate(model.simulate, x, analytic=False), atol=1e-8)
+    early = replace(
+        model, columns={"time": [2.0, 3.0], "u": [1.0, 1.0]}
+    )  # level before the first row and after the last
+    np.testing.assert_allclose(early.simulate(x)[0, 1:], 1.0, atol=1e-10)
+
+
+def test_few_readings_of_many_changes_are_those_of_all():
+    few = replace(BATTERY, times=tuple(T[5::7]))
+    x = BATTERY.nominal[None] * 1.1
+    np.testing.assert_allclose(few.simulate(x), BATTERY.simulate(x)[:, 5::7], atol=1e-12)
+    assert (few.m, len(few.epochs or ())) == (8, 8)
+    assert not [f for f in check_component("ode", BATTERY) if f.complaint]
+    with pytest.raises(UserError, match=r"current changes at 10 without a reading; add it to measurement.times"):
+        _ = few.input_columns
+
+
+@pytest.mark.parametrize("method", ["explicit", "implicit"])
+def test_rates_in_pieces_of_time_have_their_exact_solution(method):
+    """y' = dose - k y within [1, 2.3) and -k y outside, then with a ramp q (t - 3)."""
+    model = Ode(
+        {"y": "(dose if 1 <= t < begin + 1.3 else 0) - k*y + q*max(0, t-3)"}, {"k": 0.7, "q": 0.2},
+        times=(0.5, 1.5, 2.5, 6.0), constants={"dose": (2.0, 3.0), "begin": 1.0}, tolerance=1e-11, method=method,
+    )  # fmt: skip
+    k, q = 0.7, 0.2
+
+    def exact(t, dose):
+        y = dose / k * (1 - np.exp(-k * (min(t, 2.3) - 1))) * np.exp(-k * max(t - 2.3, 0)) if t > 1 else 0.0
+        return y + (q / k * (t - 3) - q / k**2 * (1 - np.exp(-k * (t - 3))) if t > 3 else 0.0)
+
+    x = model.nominal[None]
+    expected = [exact(t, dose) for dose in (2.0, 3.0) for t in model.times]
+    np.testing.assert_allclose(model.simulate(x)[0], expected, atol=1e-10)
+    np.testing.assert_allclose(model.jacobian(x), differentiate(model.simulate, x, analytic=False), atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("rate", "message"),
+    [
+        ("(1 if y < 0.5 else 0) - k*y", "a rate jumps at a moment that a state or a parameter decides"),
+        ("-k*y if t < 10*k else 0", "a rate jumps at a moment"),
+        ("-k*y if t < 2 and y > 0.5 else -k", "a rate jumps at a moment"),
+        ("-k*y if sin(t) > 0 else 0", "sin.t. > 0: compare t itself with a constant"),
+    ],
+)
+@pytest.mark.parametrize("method", ["auto", "implicit"])
+def test_a_jump_at_an_unknown_moment_is_refused(rate, message, method):
+    model = Ode({"y": rate}, {"k": 0.3}, {"y": 1.0}, times=(1.0, 2.0, 5.0), method=method)
+    with pytest.raises(UserError, match=message):
+        model.simulate(model.nominal[None])
+
+
+@pytest.mark.parametrize("rate", ["-k*sqrt(y) if y > 0 else 0", "-k*min(y, 0.5) - 0*abs(y)", "-k*y if k > 0.1 else 0"])
+def test_a_kink_is_integrated(rate):
+    model = Ode({"y": rate}, {"k": 0.3}, {"y": 1.0}, times=(1.0, 2.0, 5.0))
+    x = model.nominal[None]
+    by_differences = differentiate(model.simulate, x, analytic=False)
+    np.testing.assert_allclose(model.jacobian(x), by_differences, rtol=2e-3, atol=1e-8)
+
+
+def test_a_switch_after_the_readings_is_named():
+    model = Ode({"y": "(1 if t < 9 else 2) - k*y"}, {"k": 0.3}, times=(1.0, 2.0, 5.0))
+    (said,) = model.remarks(model.nominal)
+    assert said.startswith("measurement.rates.y: t < 9 holds at every reading")
+    assert replace(model, times=(1.0, 10.0)).remarks(model.nominal) == ()
+
+
+def file(path, rows, header="time,current,reading"):
+    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
+    return path
+
+
+def test_a_row_without_a_reading_only_changes_the_input(tmp_path):
+    rng = np.random.default_rng(1)
+    z = circuit(0.022, 0.013, 2100.0) + 1e-4 * rng.standard_normal(len(T))
+    z = np.where(np.arange(len(T)) % 3 == 0, np.nan, z)
+    path = file(tmp_path / "a.csv", [(t, c, "" if np.isnan(v) else v) for t, c, v in zip(T, CURRENT, z, strict=True)])
+    model = replace(BATTERY, times=(), columns={}, tolerance=None)
+    opened = Question(model=model, readings=(path,), estimators=LM, noise=Gaussian(1e-4)).opened()
+    (found,) = fit(opened.problem, opened.readings.z, LM, Gaussian(1e-4))
+    assert np.abs((found.x - [0.022, 0.013, 2100.0]) / found.standard_errors).max() < 3.5
+    assert list(found.values) == ["r0", "r1", "c1"]
+    shooting = MultipleShooting(segments=3).estimate(
+        Problem(found.model, Gaussian(1e-4).covariance(40)), z[np.isfinite(z)][None]
+    )
+    np.testing.assert_allclose(shooting.x[0] * model.sizes, found.x, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("rows", "header", "message"),
+    [
+        ([(0, 1)], "time,reading", "column current is missing; measurement.driven_by.current takes it from the file"),
+        ([(0, 1, 3), (10, "", 3)], "time,current,reading", "row 3, column current: is empty"),
+        ([(0, 1, 3), (0, 2, 3)], "time,current,reading", "case=1, time=0: current is 1 in one row and 2 in another"),
+    ],
+)
+def test_an_input_that_is_missing_or_has_gaps_is_refused(tmp_path, rows, header, message):
+    with pytest.raises(UserError, match=message):
+        open_together([file(tmp_path / "a.csv", rows, header)], replace(BATTERY, times=(), columns={}), enough=False)
+
+
+def test_two_readings_of_one_thing_at_one_time_both_count(tmp_path):
+    model = Ode({"y": "-k*y"}, {"k": 0.5, "y0": 1.0}, {"y": "y0"})
+    rows = [(1, 0.62), (1, 0.6), (2, 0.37), (3, 0.23), (2, 0.36)]
+    found = open_together([file(tmp_path / "a.csv", rows, "time,reading")], model)
+    x = found.model.nominal[None]
+    np.testing.assert_allclose(found.model.simulate(x)[0], np.exp(-0.5 * np.array([1, 1, 2, 3, 2])), atol=1e-7)
+    assert [rows.tolist() for rows in found.model.epochs or ()] == [[0, 1], [2, 4], [3]]
+
+
+@pytest.mark.slow
+def test_intervals_of_the_battery_cover_as_they_say():
+    truth = np.array([1.1, 0.9, 1.05])
+    model, rng, deviation = replace(BATTERY, tolerance=1e-7), np.random.default_rng(5), 1e-3
+    z = model.simulate(truth[None]) + deviation * rng.standard_normal((300, len(T)))
+    found = LevenbergMarquardt().estimate(Problem(model, Gaussian(deviation).covariance(len(T))), z)
+    assert found.covariance is not None
+    within = np.abs(found.x - truth) < 1.96 * np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    assert (within.mean(axis=0) >= 0.93).all()
