@@ -95,11 +95,15 @@ class Question:
         stated = self.noise.of(found.model) if isinstance(self.noise, ModelNoise) else self.noise
         if self.readings is None and stated is None:
             return Certified()
+        if isinstance(stated, Unknown) and stated.levels is not None:
+            raise UserError(
+                "noise.levels: are for `run`, which simulates with them; `estimate` finds them, so leave them out"
+            )
         if found.deviations is None:
             return stated or ModelNoise().of(found.model) or Unknown()
         deviations = tuple(np.where(np.isfinite(found.deviations), found.deviations, 1.0).tolist())
         if isinstance(stated, Unknown):
-            return Unknown(deviations)
+            return replace(stated, weights=deviations)
         if stated is not None:
             raise UserError(
                 f"noise: is given, and the readings have a column {SIGMA}, too; leave one of them out, or set"

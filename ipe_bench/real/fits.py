@@ -158,11 +158,6 @@ class Fit:
         return self.chi_square * (1.0 if self.level is None else self.level**2)
 
     @property
-    def of_likelihood(self) -> bool:
-        """Whether the parameters, too, are those of maximum likelihood where there are several levels of the noise."""
-        return self.estimated is not None and self.estimated.maximal
-
-    @property
     def levels(self) -> dict[str, float]:
         """Several levels of the noise by name."""
         names = [] if self.estimated is None else [p.name for p in self.estimated.model.noise.parameters]

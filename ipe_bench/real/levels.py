@@ -128,46 +128,42 @@ class _Known(Measurement):
         return np.zeros((len(x), len(self.h), 0))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Likelihood(Objective):
     """The objective of this page, with sigma in multiples of R's that are small."""
 
-    @property
-    def _levelled(self) -> Levelled:
-        model = self.model.measurement
-        assert isinstance(model, Levelled)
-        return model
+    levelled: Levelled
 
     def _split(self, x: Array) -> tuple[Array, Array, Array]:
         """Whitened residuals (trials, m), the logarithms of standard deviations, and how far those of the levels are
         from their start (trials, k)."""
         h, log, theta = np.split(self.model.simulate(x, self.rows), [self.readings, 2 * self.readings], axis=1)
-        return (h - self.z) * np.exp(-log), log, theta - self._levelled.theta
+        return (h - self.z) * np.exp(-log), log, theta - self.levelled.theta
 
     def residual(self, x: Array) -> Array:
         w, _, moved = self._split(x)
-        f = self._levelled.spare
+        f = self.levelled.spare
         return np.concatenate([w, (f - w**2) / np.sqrt(f + w**2), _HOLD * moved], axis=1)
 
     def slopes(self, x: Array, *, coarse: bool) -> tuple[Array, None]:
         """The second residuals' information is f + w^2, whose mean is Fisher's 2 f: steps of log sigma are below 1."""
         w, log, moved = self._split(x)
-        weights = [np.exp(-log), np.sqrt(self._levelled.spare + w**2), np.full(moved.shape, _HOLD)]
+        weights = [np.exp(-log), np.sqrt(self.levelled.spare + w**2), np.full(moved.shape, _HOLD)]
         J = self.model.jacobian(x, self.rows, coarse=coarse)
         return J * np.concatenate(weights, axis=1)[:, :, None], None
 
     def cost(self, x: Array, r: Array) -> Array:
         w, log, moved = self._split(x)
-        change = 2 * self._levelled.spare * (log - np.log(self.R.factor) + _SHIFT)
+        change = 2 * self.levelled.spare * (log - np.log(self.R.factor) + _SHIFT)
         return np.sum(w**2 + change, axis=1) + np.sum((_HOLD * moved) ** 2, axis=1)
 
 
 def objective_of(problem: Problem, z: Array, model: CountingModel | None = None) -> Objective:
     """What is minimised for readings z (trials, m): the likelihood where levels are among the parameters, else the sum
     of squares. `model` replaces the problem's."""
-    kind = Likelihood if isinstance(problem.measurement, Levelled) else Objective
-    model = model or CountingModel(problem.measurement, EvaluationCount.zeros(len(z)))
-    return kind(model, problem.R, z, np.arange(len(z)), problem.x0)
+    model, whole = model or CountingModel(problem.measurement, EvaluationCount.zeros(len(z))), problem.measurement
+    given = model, problem.R, z, np.arange(len(z)), problem.x0
+    return Likelihood(*given, levelled=whole) if isinstance(whole, Levelled) else Objective(*given)
 
 
 def minimise(problem: Problem, z: Array, x: Array) -> Minima:
@@ -280,7 +276,7 @@ def _estimated(problem: Problem, levels: Levels, spare: Array, z: Array, x: Arra
     x = np.concatenate([x[:n], x[n:] + np.log(np.maximum(_LEAST_PART / np.maximum(share, 1e-300), 1.0))])
     model, R = Levelled(whole, levels, x[n:], spare), _covariance(levels, whole, x)
     deviation = problem.prior_deviation
-    starts = None if deviation is None else np.concatenate([deviation, np.ones(len(x) - n)])
+    starts = None if deviation is None else np.concatenate([deviation[:n], np.ones(len(x) - n)])
     joint = replace(problem, measurement=model, R=R, prior_deviation=starts, prior_correlation=None)
     w, slopes = R.whiten(z - whole.simulate(x[None, :n])[0]), model.jacobian(x[None])[0]
     J, L = R.whiten_jacobian(slopes[: len(z)]), slopes[len(z) : 2 * len(z)]

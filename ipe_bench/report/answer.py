@@ -219,7 +219,7 @@ def _notes(answer: Answer) -> Iterator[str]:
             " chi-square the degrees of freedom, so the size of the residuals cannot test the model. What can: white p,"
             " outliers, the levels beside each other and beside what is known of the instruments."
         )
-        if known := [one.label for one in fits if one.levels and not one.of_likelihood]:
+        if known := [one.label for one in fits if one.estimated and not one.estimated.maximal]:
             yield f"{', '.join(known)}: takes the levels for known, which are those of its own residuals."
     elif any(one.level is not None for one in fits):
         yield (

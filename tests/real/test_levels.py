@@ -7,7 +7,7 @@ from scipy.optimize import root
 from scipy.special import digamma
 
 import ipe_bench as ib
-from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
+from ipe_bench.baselines import LevenbergMarquardt, LinearLSE, MapLM
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.measurements import Formula, Nist
 from ipe_bench.measurements.known import ParameterInfo, informed
@@ -178,6 +178,26 @@ def test_levels_stand_beside_the_parameters_of_every_estimator():
     assert answer["lm"].fits is None
 
 
+def test_estimates_with_a_prior_have_the_levels_of_their_residuals():
+    """A wide prior says next to nothing, so that its estimate is that without one."""
+    estimators = {**LM, "map": MapLM(tolerance=1e-10, prior_inflation=1e6)}
+    answer = ib.estimate(DECAY, readings("by output", 1), estimators, noise=Unknown(by="second"), error_scale=1.0)
+    assert answer["map"].x == pytest.approx(answer["lm"].x, rel=1e-3)
+    assert [one.with_prior for one in answer.examinations] == [False, True]
+    assert len(answer.examinations[1].profiles) == 3
+    assert "map: takes the levels for known" in str(answer)
+
+
+def test_a_column_of_standard_deviations_weighs_the_levels(tmp_path):
+    z, weight = readings("by output", 1), np.where(SECOND == 0, 4.0, 1.0)
+    rows = zip(TIMES.tolist(), SECOND.tolist(), z.tolist(), weight.tolist(), strict=True)
+    (tmp_path / "my.csv").write_text("\n".join(["t,second,y,sigma", *(",".join(map(str, row)) for row in rows)]))
+    model = Formula(DECAY.expression, dict(DECAY.start))
+    noise = Unknown(by="second", sigma="s")
+    weighted, plain = ib.estimate(model, tmp_path / "my.csv", LM, noise=noise)["lm"], fitted("by output", z)
+    assert weighted.x * [1, 1, 1, 4, 1] == pytest.approx(plain.x, rel=1e-6)
+
+
 def test_missing_readings_leave_their_groups_smaller():
     z = readings("by output", 2)
     z[[3, 40, 41]] = np.nan
@@ -220,6 +240,7 @@ def test_a_level_of_zero_has_an_upper_limit_alone():
         ({"sigma": "0.1*h"}, "has no level to estimate"),
         ({"sigma": "a + b*h"}, "a is a parameter of the model; give the level another name"),
         ({"sigma": "floor + "}, r"noise.sigma: 'floor \+ ' is not a formula"),
+        ({"levels": (1.0,)}, "noise.levels: are for `run`"),
         ({"by": "output"}, "noise.by=output: there is no such column of the readings .*row, second, t"),
     ],
 )
