@@ -36,7 +36,7 @@ BUDGETS = {
     "trials": 2381,
     "runs": 2226,
     "statistics": 4499,
-    "real": 2524,
+    "real": 2511,
     "plugins": 1263,
     "report": 4813,
     "cli": 2917,

@@ -19,7 +19,7 @@ from ipe_bench.estimators.least_squares import Minima, inverse_factor
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.real.fits import Fit, at_rows, falls_beyond, holding, scaled
-from ipe_bench.real.levels import SLACK, Levelled, maximum, minimise, objective_of
+from ipe_bench.real.levels import Levelled, maximum, minimise, objective_of
 from ipe_bench.real.penalised import penalised
 from ipe_bench.real.profiles import (
     CONFIDENCE,
@@ -296,7 +296,6 @@ class _Least:
             # Where all readings are as good, so is one that is missing; else nobody knows.
             deviations[:] = known[0]
         minima = self.minima()
-        slack = SLACK if isinstance(self.model, Levelled) else 1e-6 * max(1.0, self.chi_square)
         return Examination(
             label=label,
             model=model,
@@ -314,7 +313,7 @@ class _Least:
             new_errors=np.hypot(errors, deviations),
             half_width=float(np.max(q)),
             minima=minima,
-            least=self.chi_square <= minima[0].chi_square + slack,
+            least=self.chi_square <= minima[0].chi_square + 1e-6 * max(1.0, self.chi_square),
             with_prior=self.readings < len(self.z),
         )
 

@@ -36,10 +36,6 @@ _LEAST_SHARE = 1e-8
 """Residuals that are smaller than this share of the readings are round-off."""
 _HOLD = 1e-2
 """The weight with which the logarithm of a level is held where a search begins: that of a level of zero is infinite."""
-_LEAST_PART = 1e-4
-"""A level that makes up a smaller share of every standard deviation is as good as zero, and is taken for this share."""
-SLACK = 1e-2
-"""The objective of such a level is above its minimum by less than this."""
 _SHIFT = 3.0
 """What is added to the logarithm of sigma over R's in the objective, which the methods want to be positive."""
 _LEAST_SPARE = 1e-9
@@ -272,8 +268,6 @@ def _spare(J: Array, R: Covariance) -> Array:
 
 def _estimated(problem: Problem, levels: Levels, spare: Array, z: Array, x: Array, converged: bool) -> Estimated:
     n, whole = problem.measurement.n, problem.measurement
-    share = np.abs(levels.at(whole.simulate(x[None, :n]), x[None, n:])[2][0]).max(axis=0)
-    x = np.concatenate([x[:n], x[n:] + np.log(np.maximum(_LEAST_PART / np.maximum(share, 1e-300), 1.0))])
     model, R = Levelled(whole, levels, x[n:], spare), _covariance(levels, whole, x)
     deviation = problem.prior_deviation
     starts = None if deviation is None else np.concatenate([deviation[:n], np.ones(len(x) - n)])

@@ -21,7 +21,7 @@ from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.real.levels import SLACK, Levelled, objective_of
+from ipe_bench.real.levels import objective_of
 
 CONFIDENCE = 0.95
 _FIRST = (0.5, 1.0, 1.5)
@@ -182,8 +182,7 @@ class _Search:
                 change = self.freedom * np.expm1(change / self.freedom)
         if at in self.seen and not change < self.seen[at][0] ** 2:
             return
-        slack = SLACK if isinstance(self.model, Levelled) else _LOWER * max(1.0, self.least / self.level**2)
-        self.lower |= change < -slack
+        self.lower |= change < -_LOWER * max(1.0, self.least / self.level**2)
         zeta = np.sqrt(max(change, 0.0)) if np.isfinite(change) else np.inf
         self.seen[at] = (float(np.sign(at - self.centre) * zeta), point)
 

@@ -114,9 +114,10 @@ def test_a_single_level_is_certified(dataset):
     assert single.normalised == pytest.approx(old.normalised, rel=1e-4, abs=1e-6)
 
 
-@pytest.mark.parametrize("case", NOISES)
-def test_profile_ends_are_where_the_likelihood_has_risen_by_the_quantile(case):
-    z = readings(case, 8)
+@pytest.mark.parametrize(("case", "data"), [*zip(NOISES, NOISES, strict=True), ("a + b h", "by output")])
+def test_profile_ends_are_where_the_likelihood_has_risen_by_the_quantile(case, data):
+    """In the last case errors do not grow with the readings, and the share of these is zero."""
+    z = readings(data, 8)
     one = fitted(case, z)
     found = examine(Problem(DECAY, Covariance(np.ones(60))), z, [one], bootstraps=4)
     spare, best = one.estimated.model.spare, one.estimated.x
@@ -126,8 +127,8 @@ def test_profile_ends_are_where_the_likelihood_has_risen_by_the_quantile(case):
         s = sigma(case, h, np.exp(u[3:]))
         return np.sum(((z - h) / s) ** 2 + 2 * spare * np.log(s))
 
-    names = [p.name for p in found.model.physical_parameters]
     assert found.least
+    assert (found.profiles[4].low == 0.0) == (case != data)
     for place in (2, 3, 4):
         profile = found.profiles[place]
         others = [k for k in range(5) if k != place]
@@ -135,6 +136,8 @@ def test_profile_ends_are_where_the_likelihood_has_risen_by_the_quantile(case):
         q = half_width(CONFIDENCE, f) ** 2
         expected = q if np.isinf(f) else f * np.log1p(q / f)
         for end in (profile.low, profile.high):
+            if end == 0.0:
+                continue
             u = best.copy()
             u[place] = end / DECAY.sizes[place] if place < 3 else np.log(end)
 
@@ -144,8 +147,10 @@ def test_profile_ends_are_where_the_likelihood_has_risen_by_the_quantile(case):
                 return deviance(whole)
 
             options = {"xatol": 1e-8, "fatol": 1e-10, "maxiter": 5000, "maxfev": 5000}
-            rise = nelder_mead(held, best[others], method="Nelder-Mead", options=options).fun - deviance(best)
-            assert rise == pytest.approx(expected, rel=1e-3), names[place]
+            # A level of zero is far, in its logarithm, from where it is in the profile of another parameter.
+            starts = (best[others], np.maximum(best[others], np.log(0.01)))
+            tried = [nelder_mead(held, start, method="Nelder-Mead", options=options).fun for start in starts]
+            assert min(tried) - deviance(best) == pytest.approx(expected, rel=1e-2 if case != data else 1e-3)
 
 
 @pytest.mark.slow
@@ -218,19 +223,6 @@ def test_a_parameter_on_its_bound_is_held_there_beside_the_levels():
     assert answer["lm"].x[[0, 2, 3, 4]] == pytest.approx(alone.x, rel=1e-6)
     assert [p.name for p in found.model.physical_parameters] == ["a", "l", "sigma_0", "sigma_1"]
     assert found.on_bounds[0].other > 1.0
-
-
-def test_a_level_of_zero_has_an_upper_limit_alone():
-    """Errors of one size for readings of many, so that half of all estimates of a share are zero."""
-    for seed in range(10):
-        z = readings("by output", seed)
-        one = fit(Problem(DECAY, Covariance(np.ones(60))), z, LM, Unknown(sigma="floor + share*h"))[0]
-        if one.x[4] < 1e-5:
-            break
-    found = examine(Problem(DECAY, Covariance(np.ones(60))), z, [one], bootstraps=4)
-    assert found.least
-    assert found.profiles[4].low == 0.0
-    assert 0.0 < found.profiles[4].high < 0.1
 
 
 @pytest.mark.parametrize(
