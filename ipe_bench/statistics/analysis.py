@@ -15,7 +15,7 @@ from ipe_bench.statistics.calibration import POINTS, shared_level
 from ipe_bench.statistics.certified import attained_table
 from ipe_bench.statistics.collect import Collection, Group, collect
 from ipe_bench.statistics.comparisons import Outcomes, Ranking, compare_pairs, corrected, profiles, rank_over_replicates
-from ipe_bench.statistics.formulas import capped_error, correlation
+from ipe_bench.statistics.formulas import capped_error
 from ipe_bench.statistics.intervals import quantile, quantiles
 from ipe_bench.statistics.records import SCORES, rows_of
 from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of
@@ -49,8 +49,6 @@ class Analysis:
     """Estimator, profile (performance or data), `at` (cost ratio or budget) and share, over all scenarios."""
     distributions: pd.DataFrame
     """Quantiles of the Mahalanobis error: probability (of `PROBABILITIES`) and distance."""
-    correlations: pd.DataFrame
-    """Of the parameters' errors over solved trials: row, column (both parameters' names) and value."""
     convergence: pd.DataFrame
     """Of each converged trial with a stored history: trial, iteration, and the iterate's distance from the last one in
     deviations of the bound; none of filters, whose epochs are not iterations. The last distance is zero by definition,
@@ -127,8 +125,6 @@ class Begun:
             ]
             distances = quantiles(outcome.distance, PROBABILITIES)
             self.rows["distributions"].append(numbered | {"probability": PROBABILITIES, "distance": distances})
-            names = {"row": np.repeat(sample.names, sample.n), "column": np.tile(sample.names, sample.n)}
-            self.rows["correlations"].append(numbered | names | {"value": correlation(sample).ravel()})
             self.rows["calibration"] += [numbered | row for row in _calibration_rows(sample)]
             self.rows["tracks"] += [numbered | row for row in curves(sample)]
             self.rows["convergence"] += [
@@ -158,7 +154,6 @@ class Begun:
             ranking=ranking(pd.DataFrame(rows["replicates"]), everywhere),
             profiles=profiles([{k: o for k, o in several.items() if k in everywhere} for _, several in self.compared]),
             distributions=_joined(rows["distributions"], ("probability", "distance")),
-            correlations=_joined(rows["correlations"], ("row", "column", "value")),
             convergence=_joined(rows["convergence"], ("trial", "iteration", "distance")),
             calibration=_joined(rows["calibration"], ("parameter", "at", "difference", "low", "high", "outside")),
             contraction=pd.DataFrame(rows["contraction"]),

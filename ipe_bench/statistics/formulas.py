@@ -139,13 +139,6 @@ def std(s: Sample) -> Array:
 
 
 @once
-def correlation(s: Sample) -> Array:
-    """(n, n), NaN where an error does not vary or there are too few trials."""
-    scale = np.sqrt(np.diag(products(s)))
-    return products(s) / np.outer(scale, scale) if s.solved.sum() > 2 else np.full((s.n, s.n), np.nan)
-
-
-@once
 def together(s: Sample) -> Array:
     """Root mean square over parameters of error over linear bound (trials,)."""
     return np.sqrt((s.normalised**2).T.mean(axis=0))

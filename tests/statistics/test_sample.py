@@ -108,14 +108,6 @@ def test_every_sum_is_that_of_pandas_over_all_rows_at_once(store, analysis):
             assert found["rmse_low"] < found["rmse"] < found["rmse_high"]
 
 
-def test_correlations_are_those_of_pandas(store, analysis):
-    rows = ib.load(store)
-    for label, part in analysis.correlations.groupby("estimator"):
-        mine = rows[(rows["estimator"] == label) & rows["solved"]]
-        expected = mine[[f"error_{n}" for n in "abc"]].corr().to_numpy()
-        assert part["value"].to_numpy().reshape(3, 3) == pytest.approx(expected, rel=1e-9, abs=1e-12)
-
-
 def test_no_bit_depends_on_how_rows_are_cut_into_files(analysis, tmp_path):
     fill(tmp_path, (277, TRIALS, 734))
     pd.testing.assert_frame_equal(summarize([tmp_path]), analysis.summary, check_exact=True)
