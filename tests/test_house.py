@@ -35,7 +35,7 @@ BUDGETS = {
     "baselines": 2422,
     "trials": 2381,
     "runs": 2226,
-    "statistics": 4487,
+    "statistics": 4477,
     "real": 2511,
     "plugins": 1263,
     "report": 4813,

@@ -250,7 +250,7 @@ def _per_run(claims: Claims, values: Array) -> Array:
 def _factors(claims: Claims, squares: Array, level: float) -> tuple[Factor, ...]:
     """Roots of the means of squares (rows, k), with bootstrap-t intervals over runs."""
     mean = _per_run(claims, squares)
-    low, high = rms_interval(mean, np.ones(len(mean), dtype=bool), level)
+    low, high = rms_interval(mean, level=level)
     return tuple(map(Factor, np.sqrt(mean.mean(axis=0)).tolist(), low.tolist(), high.tolist()))
 
 

@@ -167,13 +167,11 @@ def _matches(
                 f"{_where(collection)}: holds no trials to compare; `ipe-bench status` says what is missing"
             )
     a, b = _by_scenario(first), _by_scenario(second)
-    setting: _Setting = {}
-    if not a.keys() & b.keys():
-        setting = _differing_setting(a, b)
-        a, b = (
-            {tuple(leaf for leaf in leaves if leaf[0] not in setting): groups for leaves, groups in scenarios.items()}
-            for scenarios in (a, b)
-        )
+    setting: _Setting = {} if a.keys() & b.keys() else _differing_setting(a, b)
+    a, b = (
+        {tuple(leaf for leaf in leaves if leaf[0] not in setting): groups for leaves, groups in scenarios.items()}
+        for scenarios in (a, b)
+    )
     shared = [key for key in a if key in b]
     if not shared:
         raise UserError(

@@ -68,7 +68,7 @@ def verdict(nees: Array, n: int, level: float = 0.95) -> Verdict:
         return "diverged but confident"
     if few_carry(Squares.of(x[None]), np.array([n]))[0]:
         return "optimistic" if above else "undecided"
-    low, high = rms_interval(x[:, None], np.ones(len(x), dtype=bool), level)
+    low, high = rms_interval(x[:, None], level=level)
     if high[0] < 1:
         return "pessimistic" if len(claims) >= SEEN else "undecided"
     return "optimistic" if low[0] > 1 else "consistent"

@@ -19,10 +19,8 @@ from ipe_bench.statistics.histories import FixedPointBound, fixed_point_bound, o
 from ipe_bench.statistics.intervals import (
     Squares,
     few_carry,
-    grouped,
     quantile,
     rms_interval,
-    rms_interval_of,
     rms_sequence,
 )
 from ipe_bench.statistics.sample import AMBIGUOUS, FIT, NIS, Sample
@@ -170,8 +168,7 @@ def degrees(s: Sample) -> Array:
 def rmse_ends(s: Sample) -> tuple[Array, Array]:
     """Ends (n + 1,) of the intervals of rmse: per parameter, and of all over the linear bound; NaN where few trials
     carry it, see `intervals.few_carry`."""
-    sums = grouped(np.where(s.solved, _all_squares(s), 0.0))
-    low, high = rms_interval_of(sums, grouped(s.solved[None].astype(float)))
+    low, high = rms_interval(_all_squares(s).T, s.solved)
     few = few_carry(squares(s), degrees(s))
     return np.where(few, np.nan, low), np.where(few, np.nan, high)
 
@@ -208,7 +205,7 @@ def efficiency_capped_limits(s: Sample) -> Limits:
     square = _capped(s) ** 2
     if few_carry(Squares.of(square[None]), np.array([s.n]))[0]:
         return np.nan, np.nan
-    low, high = rms_interval(square[:, None], np.ones(len(s), dtype=bool))
+    low, high = rms_interval(square[:, None])
     return float(ratio(1.0, high[0])), float(ratio(1.0, low[0]))
 
 

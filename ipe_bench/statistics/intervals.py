@@ -37,33 +37,19 @@ FIRST = 100
 # Root mean squares of a fixed number of trials -----------------------------------------------------------------------
 
 
-def rms_interval(squares: Array, used: Array, level: float = LEVEL) -> tuple[Array, Array]:
+def rms_interval(squares: Array, used: Array | None = None, level: float = LEVEL) -> tuple[Array, Array]:
     """Bootstrap-t interval of the root mean square over the trials used, per column; NaN for fewer than `FEW` of them.
 
-    squares is (trials, k), used (trials,) boolean. The logarithm of the mean square is studentised (Efron and
-    Tibshirani, An Introduction to the Bootstrap, 1993, ch. 12), which makes its variance nearly constant: the plain
-    percentile interval of 20 normal errors holds the truth in 88 % of cases instead of 95 %. Its standard error s is
-    taken s times larger, since where few large errors carry the mean, s itself comes out too small: found by
-    simulation, coverage is then 94 % or more from 20 trials on for errors from uniform to Student's t with 5 degrees.
-    Trials are drawn with replacement, used or not; the draws are the same for every estimator. Of more than
+    squares is (trials, k), used (trials,) boolean, all where it is not given. The logarithm of the mean square is
+    studentised (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, ch. 12), which makes its variance nearly
+    constant: the plain percentile interval of 20 normal errors holds the truth in 88 % of cases instead of 95 %. Its
+    standard error s is taken s times larger, since where few large errors carry the mean, s itself comes out too small:
+    found by simulation, coverage is then 94 % or more from 20 trials on for errors from uniform to Student's t with 5
+    degrees. Trials are drawn with replacement, used or not; the draws are the same for every estimator. Of more than
     `LARGEST_SAMPLE` trials, groups of consecutive ones are drawn, which is as good since trials are independent.
     """
-    sums = grouped(np.where(used[:, None], squares, 0.0).T)
-    return rms_interval_of(sums, grouped(used.astype(float)[None]), level)
-
-
-def grouped(values: Array, groups: int = LARGEST_SAMPLE) -> Array:
-    """Sums (groups, k) of values (k, trials) over groups of trials in succession, as alike as can be; the values
-    themselves where there are no more trials than groups."""
-    trials = values.shape[1]
-    if trials > groups:
-        values = np.add.reduceat(values, np.linspace(0, trials, groups, endpoint=False).astype(int), axis=1)
-    return np.ascontiguousarray(values.T)
-
-
-def rms_interval_of(sums: Array, counts: Array, level: float = LEVEL) -> tuple[Array, Array]:
-    """The same from sums of squares (groups, k) of groups of trials in succession, and how many were used (groups, 1)
-    in each; see `rms_interval`."""
+    used = np.ones(len(squares), dtype=bool) if used is None else used
+    sums, counts = grouped(np.where(used, squares.T, 0.0)), grouped(used.astype(float)[None])
     if counts.sum() < FEW:
         return np.full(sums.shape[1], np.nan), np.full(sums.shape[1], np.nan)
     with np.errstate(all="ignore"):
@@ -78,6 +64,15 @@ def rms_interval_of(sums: Array, counts: Array, level: float = LEVEL) -> tuple[A
         widened = error[0] * (1 + error[0])
         ends = [np.sqrt(size) * np.exp((centre[0] - t * widened) / 2) for t in (high, low)]
     return np.where(size > 0, ends[0], 0.0), np.where(size > 0, ends[1], 0.0)
+
+
+def grouped(values: Array, groups: int = LARGEST_SAMPLE) -> Array:
+    """Sums (groups, k) of values (k, trials) over groups of trials in succession, as alike as can be; the values
+    themselves where there are no more trials than groups."""
+    trials = values.shape[1]
+    if trials > groups:
+        values = np.add.reduceat(values, np.linspace(0, trials, groups, endpoint=False).astype(int), axis=1)
+    return np.ascontiguousarray(values.T)
 
 
 def _log_ratio(draws: Array, sums: Array, counts: Array) -> tuple[Array, Array]:
