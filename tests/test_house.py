@@ -38,7 +38,7 @@ BUDGETS = {
     "statistics": 4477,
     "real": 2511,
     "plugins": 1263,
-    "report": 4813,
+    "report": 4761,
     "cli": 2917,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""

@@ -82,7 +82,7 @@ def _print_table(rows: Sequence[Mapping[str, Any]], collection: Collection) -> N
 
     totals = []
     if any(row["noise"] == "certified" for row in rows):
-        from ipe_bench.report.certified_tables import certified_tables
+        from ipe_bench.report.tables import certified_tables
 
         totals = [table for table in certified_tables(collection) if table.whole]
     out = console()

@@ -7,8 +7,8 @@ from typing import Any
 
 import pandas as pd
 
-from ipe_bench.report.certified_tables import without_certified
 from ipe_bench.report.figures.views import family_of
+from ipe_bench.report.tables import without_certified
 from ipe_bench.report.words import brief, duration, enumerate_few, percent, plain, short
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.certified import attained_totals, certified_averages, certified_table

@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ipe_bench.basics.errors import StorageError
 from ipe_bench.basics.files import write_text
+from ipe_bench.plugins.extensions import digest_of_all, use_statistics
 from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
+from ipe_bench.runs.store import Store
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from ipe_bench.statistics.analysis import Begun
+
+STAMP = ".report.json"
+"""The file that says what a report was made from."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -65,22 +75,19 @@ class Pending:
 
     def write_unless_current(self) -> None:
         """Writes all files, unless they are there already."""
-        from ipe_bench.report.stamp import is_current
-
-        if not is_current(self.output, self.made):
+        if not _is_current(self.output, self.made):
             self.written()
 
     def written(self) -> ReportResult:
         """Writes all files."""
-        from ipe_bench.report.certified_tables import without_certified
         from ipe_bench.report.charts import charts
         from ipe_bench.report.figures import draw_all
         from ipe_bench.report.figures.views import views
         from ipe_bench.report.headline import headline
         from ipe_bench.report.html import render_page
         from ipe_bench.report.sections import report_tables, written
-        from ipe_bench.report.stamp import leave
         from ipe_bench.report.table import write_table
+        from ipe_bench.report.tables import without_certified
         from ipe_bench.statistics.certified import certified_averages, certified_table
 
         analysis, output = self.begun.finish(), self.output
@@ -109,7 +116,7 @@ class Pending:
             headline=tuple(headline(analysis)),
         )
         if len(problems) == known:  # what plugins cannot make is said each time
-            leave(output, self.made, result.files)
+            _leave(output, self.made, result.files)
         return result
 
 
@@ -121,13 +128,48 @@ def begin_report(
     Raises:
         UserError: there is no such choice of `figures` (all, main or none) or of `formats` (png, pdf and svg).
     """
-    from ipe_bench.plugins.extensions import use_statistics
-    from ipe_bench.report.stamp import made_from
     from ipe_bench.statistics.analysis import begin
 
     kinds, which = file_formats(formats), which_figures(figures)
     place = folders[0] if output is None else Path(output)
-    made, faults = made_from(folders, place, which, kinds), use_statistics()
+    made, faults = _made_from(folders, place, which, kinds), use_statistics()
     begun = begin(folders)
     begun.collection.extra_problems += faults
     return Pending(begun, place, which, kinds, made)
+
+
+def _made_from(directories: Sequence[Path], output: Path, *choices: object) -> str:
+    """A digest of what a report on these directories with these choices is made from.
+
+    It is taken before anything is read, so that results written meanwhile make the next report another one.
+    """
+    sources = [p for p in Path(__file__).parents[1].rglob("*") if p.suffix in {".py", ".j2", ".css", ".js"}]
+    stores = [Store(directory) for directory in directories]
+    stored = [p for s in stores for folder in (s.trials, s.runs, s.failed) for p in folder.glob("*")]
+    libraries = [version(name) for name in ("jinja2", "matplotlib", "numpy", "pandas", "scipy", "seaborn")]
+    names = [str(path.absolute()) for path in (output, *directories)]
+    known = [names, choices, libraries, digest_of_all(), _digests(sources), _digests(stored)]
+    return hashlib.sha256(repr(known).encode()).hexdigest()
+
+
+def _is_current(output: Path, made: str) -> bool:
+    """Whether the report under `output` was made from this, and its files are as written."""
+    with contextlib.suppress(OSError, ValueError):
+        known = json.loads((output / STAMP).read_text(encoding="utf-8"))
+        return known == {"from": made, "files": _digests(map(Path, known["files"]))}
+    return False
+
+
+def _leave(output: Path, made: str, files: Iterable[Path]) -> None:
+    """States what the report under `output` was made from, and which files belong to it."""
+    with contextlib.suppress(StorageError):
+        write_text(output / STAMP, json.dumps({"from": made, "files": _digests(files)}, indent=1) + "\n")
+
+
+def _digests(paths: Iterable[Path]) -> dict[str, str]:
+    """By absolute path; a file that another command removes at this moment is left out."""
+    found = {}
+    for path in sorted(paths):
+        with contextlib.suppress(FileNotFoundError):
+            found[str(path.absolute())] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return found

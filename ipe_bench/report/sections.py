@@ -13,9 +13,8 @@ from typing import Any
 from ipe_bench.basics.errors import UserError
 from ipe_bench.plugins.discovery import Option
 from ipe_bench.plugins.extensions import guarded, records, require_type
-from ipe_bench.report.certified_tables import certified_tables, without_certified
 from ipe_bench.report.table import Part, Table, comma_separated, latex, markdown
-from ipe_bench.report.tables import all_tables
+from ipe_bench.report.tables import all_tables, certified_tables, without_certified
 from ipe_bench.statistics.analysis import Analysis
 
 

@@ -8,7 +8,7 @@ from ipe_bench.baselines import LeastSquares, LevenbergMarquardt
 from ipe_bench.measurements import Mgh
 from ipe_bench.measurements.mgh import functions
 from ipe_bench.noise import Certified
-from ipe_bench.report.certified_tables import certified_tables
+from ipe_bench.report.tables import certified_tables
 from ipe_bench.report.terminal import render
 from ipe_bench.runs.run import compute
 from ipe_bench.solvers import Auto, Progressive

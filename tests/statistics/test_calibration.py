@@ -8,7 +8,7 @@ from scipy.stats import binom
 from synthetic_store import Seeker
 
 import ipe_bench as ib
-from ipe_bench.report.figures import calibration as figure
+from ipe_bench.report.figures import errors as figure
 from ipe_bench.report.figures.views import views
 from ipe_bench.report.style import house_style
 from ipe_bench.report.tables import calibration as table
@@ -220,7 +220,7 @@ def test_summary_table_and_figures_say_so(synthetic):
     (view,), _ = views(analysis)
     with house_style():
         drawings = {d.name: d for kind in figure.FIGURES for d in kind.draw(view)}
-    assert set(drawings) == {"calibration"}
+    assert set(drawings) == {"headline", "calibration"}
     assert "boaster: deviations 2.0 times too small" in drawings["calibration"].caption
 
 

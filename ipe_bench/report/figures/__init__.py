@@ -19,7 +19,7 @@ from ipe_bench.report.figures.views import FRAMES, View, views
 from ipe_bench.report.style import house_style
 from ipe_bench.statistics.analysis import Analysis
 
-FIGURES = ("errors", "costs", "parameters", "calibration", "convergence", "tracks")
+FIGURES = ("errors", "costs", "parameters", "convergence", "tracks")
 """The modules in the order of the report; each holds its kinds of figures in FIGURES."""
 INDEX = "index.json"
 

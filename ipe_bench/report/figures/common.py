@@ -19,28 +19,21 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
+MOST_PANELS = 6
 REACH = 0.3
 """Part of the span of the points that intervals may add to an axis at either end."""
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def most_panels() -> int:
-    """Panels of a figure: six on the page, two rows in a column of print."""
-    return 4 if 0 < column() <= 5 else 6
-
-
 def panels(count: int, look: Mapping[str, Look] | None = None, *, height: float = 2.7) -> tuple[Figure, list[Axes]]:
-    """A figure with that many panels, in print in at most two rows, and room for the legend of the estimators."""
+    """A figure with that many panels, and room for the legend of the estimators."""
     from matplotlib.figure import Figure
 
-    if column():
-        across = min(count, max(2, -(-count // 2)) if column() < 5 or count == 4 else 3)
-        size, height = column(), max(1.2, 0.85 * column() / across)
-    else:
-        across = min(count, {4: 2, 7: 4, 8: 4}.get(count, 3))
-        size = {1: 5.2, 2: 8.0, 3: 9.2}.get(across, 11.0)
-    down = -(-count // across)
-    fig = Figure(figsize=(size, height * down + 0.4 + 0.05 * len(look or ())), layout="constrained")
+    down = -(-count // (max(2, int(column() / 1.7)) if column() else 4))
+    across = -(-count // down)
+    width = column() or min(2.0 + 3.2 * across, 11.0)
+    size = width, min(height, 0.85 * width / across) * down + 0.4 + 0.05 * len(look or ())
+    fig = Figure(figsize=size, layout="constrained")
     axes: list[Axes] = list(fig.subplots(down, across, squeeze=False).flat)
     for ax in axes[count:]:
         ax.set_axis_off()
@@ -54,7 +47,7 @@ def at_scale(frame: pd.DataFrame, scale: float) -> pd.DataFrame:
 def panels_of_scales(rows: pd.DataFrame, look: Mapping[str, Look]) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
     """A figure with a panel for each error scale, or for some with both ends, and the panels, each with its rows."""
     every = sorted(set(rows["error_scale"]))
-    scales = [every[round(i)] for i in np.linspace(0, len(every) - 1, min(most_panels(), len(every)))]
+    scales = [every[round(i)] for i in np.linspace(0, len(every) - 1, min(MOST_PANELS, len(every)))]
     fig, axes = panels(len(scales), look)
     for scale, ax in zip(scales, axes, strict=True):
         title(ax, f"error scale {plain(scale)}")

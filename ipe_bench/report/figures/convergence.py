@@ -34,7 +34,7 @@ def draw(view: View) -> Iterator[Drawing]:
     if medians.empty:
         return
     look = view.with_look(medians["estimator"])
-    shown = sorted(look, key=lambda label: look[label].color == GREY)[: common.most_panels()]
+    shown = sorted(look, key=lambda label: look[label].color == GREY)[: common.MOST_PANELS]
     scales = sorted(set(medians["error_scale"]))
     names = {scale: f"error scale {plain(scale)}" for scale in scales}
     colors = sns.color_palette("crest", len(scales)).as_hex()

@@ -61,10 +61,8 @@ def draw_costs(view: View) -> Iterator[Drawing]:
     fig, panels = common.panels_of_scales(rows, look)
     style = {**common.seaborn_style(look), "edgecolor": "white", "linewidth": 0.6, "zorder": 3}
     # Equal points lie upon each other: the later ones are smaller, so that all are seen.
-    areas = np.linspace(90, 40, len(look)) / (1 if common.most_panels() > 4 else 2)
-    sizes = {
-        label: a if look[label].color != GREY else 20.0 for label, a in zip(style["hue_order"], areas, strict=True)
-    }
+    areas = zip(style["hue_order"], np.linspace(80, 30, len(look)), strict=True)
+    sizes = {label: area if look[label].color != GREY else 20.0 for label, area in areas}
     for ax, here in panels:
         common.decades(ax, [*rows["error"], 1.0])
         sns.scatterplot(here, x="cost", y="error", ax=ax, size="estimator", sizes=sizes, **style)

@@ -19,7 +19,7 @@ def draw(view: View) -> Iterator[Drawing]:
     if rows.empty:
         return
     look = view.with_look(rows["estimator"])
-    states = list(dict.fromkeys(rows["parameter"]))[: common.most_panels() - 1]
+    states = list(dict.fromkeys(rows["parameter"]))[: common.MOST_PANELS - 1]
     fig, axes = common.panels(len(states) + 1, look)
     for state, ax in zip(states, axes, strict=False):
         part = rows[rows["parameter"] == state]
