@@ -18,6 +18,7 @@ from ipe_bench.statistics.certified import (
     attained_totals,
     certified_averages,
     certified_table,
+    published_table,
 )
 from ipe_bench.statistics.collect import Collection
 from ipe_bench.statistics.comparisons import ALPHA
@@ -241,6 +242,8 @@ def certified_tables(collection: Collection) -> list[Table]:
     that there are data for. What a terminal shows of them is what names the file that holds the whole."""
     digits, minima = certified_table(collection), attained_table(collection)
     found = [] if digits.empty else _digits(digits)
+    if len(rows := published_table(collection)):
+        found.append(_published(rows, collection))
     return found if minima.empty else [*found, attained_totals_table(attained_totals(minima)), _problems(minima)]
 
 
@@ -270,6 +273,19 @@ def _digits(digits: pd.DataFrame) -> list[Table]:
     caption += " Averaged over the data sets; solved: four digits or more of every parameter."
     title, whole = "Certified readings, averages", "tables/certified_averages.csv"
     return [Table("certified_averages", title, caption, columns, rows.round(2), whole=whole), each]
+
+
+def _published(rows: pd.DataFrame, collection: Collection) -> Table:
+    models = (group.footer["identity"]["scenario"].get("model", {}) for group in collection.groups)
+    columns = [
+        *(words(name, rows[name]) for name in ("model", "state", "estimator")),
+        *(column(name, rows[name], lambda v: f"{v:.12f}") for name in ("published", "found")),
+        column("difference", rows["difference"], lambda v: f"{v:.1e}"),
+    ]
+    sources = " ".join(dict.fromkeys(model["source"] for model in models if "source" in model))
+    caption = f"Root mean square errors over all epochs of one stored path, beside those that are published. {sources}"
+    title = "Published errors of trackers"
+    return Table("published", title, caption, columns, rows, whole="tables/published.csv")
 
 
 def _lre(rows: pd.DataFrame, prefix: str) -> list[Column]:

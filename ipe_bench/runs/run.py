@@ -128,6 +128,8 @@ def validate(
     if not estimators:
         mistakes.append("there is no estimator; choose with solver= and baseline=, or with tracker= for a state model")
     for scenario in scenarios:
+        if scenario.noise.real and trials != 1:
+            mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
         kind, what = Tracker, "estimates constants; a state model takes trackers"
         if not isinstance(scenario, Tracking):
             kind, what = Estimator, "tracks states that move; a measurement model takes estimators"
@@ -135,8 +137,6 @@ def validate(
         mistakes += other
         if isinstance(scenario, Tracking) or other:
             continue
-        if scenario.noise.real and trials != 1:
-            mistakes.append(f"trials={trials}: certified readings are one trial; set trials=1")
         if scenario.noise.estimated and scenario.noise.true_levels(scenario.measurement.m) is None:
             mistakes.append(NO_LEVEL)
         elif untried is None or scenario in untried:

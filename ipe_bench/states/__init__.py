@@ -2,7 +2,7 @@
 
 from ipe_bench.states.base import Gaussian, Paths, StateModel
 from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
-from ipe_bench.states.formulas import Formulas
+from ipe_bench.states.formulas import Formulas, Recorded
 from ipe_bench.states.linearisation import Cubature, GaussHermite, SigmaPoints, Taylor, Unscented
 from ipe_bench.states.models import CoordinatedTurn
 from ipe_bench.states.trackers import (
@@ -29,6 +29,7 @@ __all__ = [
     "Gaussian",
     "IteratedSmoother",
     "Paths",
+    "Recorded",
     "SigmaPoints",
     "Smoother",
     "StateModel",

@@ -116,7 +116,8 @@ class StateModel(Component, Named, ABC):
 
     def Q(self, k: int) -> Array:
         """Covariance (n, n) of the process noise of the step into epoch k."""
-        return self.gain(k) @ self.gain(k).T
+        G = self.gain(k)
+        return G @ G.T
 
     def nearest(self, z: Array, to: Array) -> Array:
         """z (..., m), each periodic reading shifted by whole periods next to that of `to` (..., m)."""

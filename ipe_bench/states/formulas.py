@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.arithmetic import Arithmetic, read, require_finite
 from ipe_bench.measurements.base import Parameter, differentiate
-from ipe_bench.states.base import Gaussian
+from ipe_bench.states.base import Gaussian, Paths
 from ipe_bench.states.models import Steady
 
 _OTHER_PLACES = 0.0, 0.7, -1.3
@@ -113,7 +114,12 @@ class Formulas(Steady):
         return self._values(self._readings, x, k, {})
 
     def gain(self, k: int) -> Array:
-        return self._gain_at(0.0, k)
+        named = {name for formula in self._transitions.values() for name in formula.names}
+        return self._gain_at(0.0, k) if named & {"k", "t"} else self._steady_gain
+
+    @cached_property
+    def _steady_gain(self) -> Array:
+        return self._gain_at(0.0)
 
     def R(self, k: int) -> Array:
         return np.diag([float(self.deviation[name]) ** 2 for name in self.readings])
@@ -134,3 +140,23 @@ class Formulas(Steady):
         with np.errstate(all="ignore"):
             values = np.broadcast_arrays(x[..., 0], *(formula(known) for formula in formulas.values()))[1:]
         return np.stack(np.broadcast_arrays(*values), axis=-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded(Formulas):
+    """A model with one path and its readings that somebody has stored, and what is published of trackers on them."""
+
+    recorded: str
+    """The CSV file of this package: time, states, readings."""
+    published: Mapping[str, Mapping[str, float]]
+    """By state and label of the tracker: root mean square error over all epochs."""
+    source: str
+    """Where path and figures come from."""
+
+    def draw(self, start: int, stop: int, seed: int = 0) -> Paths:
+        """The stored path; its state before the first epoch is not stored, and the first one stands for it."""
+        if (start, stop) != (0, 1):
+            raise UserError(f"model={self.name}: has one path; set trials=1")
+        rows = np.loadtxt(Path(__file__).with_name(f"{self.recorded}.csv"), delimiter=",", skiprows=1)[None]
+        x = np.ascontiguousarray(rows[..., 1 : 1 + self.n])
+        return Paths(x[:, 0], x, np.ascontiguousarray(rows[..., 1 + self.n :]))

@@ -112,3 +112,17 @@ def _estimate(collection: Collection, cell: StoredCell, model: Any) -> tuple[dic
     """The one row of a result, and its estimate: what is stored is the error against the certified answer."""
     columns = collection.load(cell, None)
     return columns, model.recorded.x + np.array([columns[f"error_{p.name}"][0] for p in model.parameters])
+
+
+def published_table(collection: Collection) -> pd.DataFrame:
+    """A row per state and tracker of stored paths: the published root mean square error, and the one found."""
+    import pandas as pd
+
+    rows = []
+    for group in collection.groups:
+        model = group.footer["identity"]["scenario"].get("model", {})
+        for state, published in model.get("published", {}).items():
+            if (known := published.get(group.label)) is not None:
+                (found,) = collection.load(group.cells[0][0], [f"path_{state}"])[f"path_{state}"]
+                rows.append((group.columns["measurement"], state, group.estimator, known, found, found - known))
+    return pd.DataFrame(rows, columns=["model", "state", "estimator", "published", "found", "difference"])

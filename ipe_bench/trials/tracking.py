@@ -20,10 +20,11 @@ from ipe_bench.basics.errors import describe_exception
 from ipe_bench.basics.linalg import Array, Mask, deviations, finite, read_only
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
-from ipe_bench.noise import ModelNoise, Noise
+from ipe_bench.noise import Certified, ModelNoise, Noise
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.states.base import Paths, StateModel, require_sound
 from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
+from ipe_bench.states.formulas import Recorded
 from ipe_bench.states.trackers import Tracker, Tracks
 from ipe_bench.trials.scenario import Scenario, check_seed
 from ipe_bench.trials.scoring import Block, Columns, by_parameter, nees
@@ -45,12 +46,15 @@ class Tracking:
 
     error_scale: ClassVar[float] = 1.0
     truth: ClassVar[None] = None
-    noise: ClassVar[Noise] = ModelNoise()
     prior: ClassVar[Prior] = GaussianPrior()
 
     def __post_init__(self) -> None:
         check_seed(self.seed)
         require_sound(self.model)
+
+    @property
+    def noise(self) -> Noise:
+        return Certified() if isinstance(self.model, Recorded) else ModelNoise()
 
     @property
     def measurement(self) -> StateModel:
@@ -142,7 +146,7 @@ class PathBlock:
         model, names = self.scenario.model, self.names
         posterior, error = np.full((2, len(self), model.n), np.nan)
         curves = np.full((2, model.epochs, model.n), np.nan)
-        if self.start == 0 and len(self) and _has_density(model):
+        if self.start == 0 and len(self) and not self.scenario.noise.real and _has_density(model):
             drawn = self.scenario.draw(0, EXPECTED)
             with np.errstate(all="ignore"):
                 filtered, smoothed = posterior_bounds(model, drawn)

@@ -172,7 +172,7 @@ PRESETS = {
 PARTS_OF_A_REPORT = ("statistic", "figure", "table", "section")
 
 
-DESCRIBED = "_target_: ipe_bench.measurements.Ode", "_target_: ipe_bench.states.Formulas"
+DESCRIBED = "_target_: ipe_bench.measurements.Ode", "_target_: ipe_bench.states.Formulas", "ipe_bench.states.Recorded"
 """Of models that are nothing but their config."""
 
 

@@ -19,6 +19,7 @@ from scipy.optimize import least_squares
 from walking_gins import WalkingGins
 
 import ipe_bench as ib
+import ipe_bench.states
 from ipe_bench.measurements import Gins, Parameter
 from ipe_bench.states import (
     Bootstrap,
@@ -50,14 +51,15 @@ BOOK = {
     "GHKF": (GaussHermite(5), 1, 0.0998062421916222, 0.03710181978632009),
     "IPLF": (GaussHermite(3), 10, 0.14055766458714145, 0.034733224044175594),
 }
-"""RMSE of the angle over 500 epochs, filter and smoother, as stored in the notebooks of the book (see NOTICE.md)."""
+"""RMSE of the angle over 500 epochs, filter and smoother, as stored in the notebooks of the book (see the NOTICE.md of
+the data)."""
 NEAR = Pendulum(count=60, start=(1.0, 0.0), spread=0.1)
 
 
 @pytest.fixture(scope="module")
 def stored():
     """The book's path (1, 500, 2) and readings (1, 500, 1)."""
-    rows = np.loadtxt(Path(__file__).with_name("pendulum.csv"), delimiter=",", skiprows=1)
+    rows = np.loadtxt(Path(ipe_bench.states.__file__).with_name("pendulum.csv"), delimiter=",", skiprows=1)
     return rows[None, :, 1:3], rows[None, :, 3:]
 
 

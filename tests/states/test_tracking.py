@@ -12,9 +12,11 @@ from walking_gins import WalkingGins
 import ipe_bench as ib
 from ipe_bench.measurements import Gins
 from ipe_bench.plugins.construct import construct
-from ipe_bench.plugins.discovery import options
+from ipe_bench.plugins.discovery import composed, options
 from ipe_bench.states import Bootstrap, Formulas, Smoother, Tracker, ckf, ekf, ukf
 from ipe_bench.statistics import analyse
+from ipe_bench.statistics.certified import published_table
+from ipe_bench.statistics.collect import collect
 from ipe_bench.trials.tracking import PathBlock, Tracking
 
 LINEAR = ConstantVelocity(count=30, spread=3.0)
@@ -227,3 +229,15 @@ def test_formulas_that_make_no_model_are_refused(changes, complaint):
     Tracking(Formulas(**WALK))
     with pytest.raises(ib.UserError, match=complaint):
         Formulas(**WALK | changes)
+
+
+def test_published_errors_stand_beside_those_found(tmp_path):
+    """Four of the twelve; the others take the same path through +experiment=pendulum_book."""
+    model = construct(composed(next(o for o in options("model") if o.name == "pendulum_book")), "model")
+    trackers = {"ekf": ekf(), "ukf": ukf(), "ckf": ckf(), "ckf_rts": Smoother(ckf())}
+    ib.run(Tracking(model), trackers, 1, output=tmp_path)
+    table = published_table(collect([tmp_path]))
+    assert table["estimator"].tolist() == list(trackers)
+    assert table["difference"].abs().max() < 1e-10
+    with pytest.raises(ib.UserError, match="has one path; set trials=1"):
+        Tracking(model).draw(0, 2)
