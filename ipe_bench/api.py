@@ -341,14 +341,14 @@ def estimate(
     A scenario stands for its model with its noise, prior and error scale. `readings` is a CSV file (see
     `ipe_bench.real.readings`), several that share parameters, or an array z (m,) in the model's order and unit, NaN
     where missing; None: those that come with the model. `noise` states R; without it R is what the file says in its
-    column sigma, or the model of its own noise, or else one level for all is estimated from the residuals (`Unknown`),
-    whose size then cannot test the fit. Filters and `map_lm` need a prior: `error_scale` is the standard deviation of
-    each parameter in multiples of its size, and `prior` widens or narrows some, or makes them depend on each other
-    (`ipe_bench.priors.prior_of` makes one of a covariance). `parameters` says what is known of each, as in
-    {"k": {"fixed": 2.0}, "c": {"positive": True, "nominal": 3.0}}; also `lower`, `upper` and `deviation`. `ignore_rows`
-    and `ignore_columns` of the files are left out. A fit has its estimates by name in `values`, and `x` and
-    `covariance` in the parameters' own units. The answer is the sequence of the fits; it shows itself in a notebook,
-    and `table()` is a frame.
+    column sigma, or the model of its own noise, or else one level for all is estimated from the residuals (`Unknown`,
+    which can also have a level for each instrument, or a formula of levels), whose size then cannot test the fit.
+    Filters and `map_lm` need a prior: `error_scale` is the standard deviation of each parameter in multiples of its
+    size, and `prior` widens or narrows some, or makes them depend on each other (`ipe_bench.priors.prior_of` makes one
+    of a covariance). `parameters` says what is known of each, as in {"k": {"fixed": 2.0}, "c": {"positive": True,
+    "nominal": 3.0}}; also `lower`, `upper` and `deviation`. `ignore_rows` and `ignore_columns` of the files are left
+    out. A fit has its estimates by name in `values`, and `x` and `covariance` in the parameters' own units. The answer
+    is the sequence of the fits; it shows itself in a notebook, and `table()` is a frame.
 
     >>> import ipe_bench as ib
     >>> model = ib.measurements.Polynomial()

@@ -27,7 +27,7 @@ LINE = (
 BUDGETS = {
     "basics": 1135,
     "measurements": 7529,
-    "noise": 616,
+    "noise": 610,
     "priors": 175,
     "states": 1152,
     "estimators": 1273,
@@ -36,7 +36,7 @@ BUDGETS = {
     "trials": 2385,
     "runs": 2226,
     "statistics": 4491,
-    "real": 2511,
+    "real": 2507,
     "plugins": 1263,
     "report": 4777,
     "cli": 2917,

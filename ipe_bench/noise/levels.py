@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,6 +21,7 @@ _PROBES = 1000
 """Points at which a formula of the standard deviation is asked for its sign."""
 
 
+@functools.cache
 def read_sigma(text: str) -> Arithmetic:
     """The formula of a standard deviation.
 
@@ -64,20 +65,16 @@ class Levels:
         Raises:
             UserError: there is no such column, or a level has the name of a parameter.
         """
-        if by is None:
-            return cls(formula, weights, ("",), np.zeros(model.m, dtype=np.intp), model.reading_unit).checked(model)
-        if by not in model.index:
+        if by is not None and by not in model.index:
             raise UserError(f"noise.by={by}: {unknown(by, model.index, 'column of the readings')}")
-        entries = [f"{entry:g}" if isinstance(entry, float) else str(entry) for entry in model.index[by]]
+        column = [""] * model.m if by is None else model.index[by]
+        entries = [f"{entry:g}" if isinstance(entry, float) else str(entry) for entry in column]
         groups = tuple(dict.fromkeys(entries))
         group = np.array([groups.index(entry) for entry in entries], dtype=np.intp)
-        return cls(formula, weights, groups, group, model.reading_unit).checked(model)
-
-    def checked(self, model: Measurement) -> Levels:
-        taken = {p.name for p in model.physical_parameters}
-        if both := [p.name for p in self.parameters if p.name in taken]:
-            raise UserError(f"noise.sigma: {both[0]} is a parameter of the model; give the level another name")
-        return self
+        found, taken = cls(formula, weights, groups, group, model.reading_unit), model.physical_parameters
+        if both := {p.name for p in found.parameters} & {p.name for p in taken}:
+            raise UserError(f"noise.sigma: {min(both)} is a parameter of the model; give the level another name")
+        return found
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -91,24 +88,11 @@ class Levels:
         named = [f"{name}_{group}" if group else name for group in self.groups for name in self.names]
         return tuple(Parameter(name, self.unit if alone else "") for name in named)
 
-    def values(self, levels: Mapping[str, float]) -> Array:
-        """Logarithms (k,) of levels that are given by name."""
-        return np.log([levels[p.name] for p in self.parameters])
-
     def restricted(self, rows: NDArray[np.intp]) -> Levels:
         """Those of some of the readings."""
         kept, group = np.unique(self.group[rows], return_inverse=True)
         groups = tuple(self.groups[k] for k in kept)
         return replace(self, weights=self.weights[rows], groups=groups, group=group)
-
-    @cached_property
-    def _recorded(self) -> Program:
-        """The formula and its derivatives by the reading and by each level."""
-        graph = Graph()
-        known = {name: graph.input(name) for name in (READING, *self.names)}
-        value, one = graph.apply("add", self.formula(known), 0.0), graph.constant(1.0)
-        slopes = [tangent([value], {place: one})[0] for place in known.values()]
-        return Program.of([value, *slopes], list(known.values()))
 
     def at(self, h: Array, theta: Array) -> tuple[Array, Array, Array]:
         """log sigma (trials, m) for readings h (trials, m) and logarithms theta (trials, k) of the levels, and its
@@ -117,8 +101,19 @@ class Levels:
         levels = np.exp(theta).reshape(trials, len(self.groups), -1)[:, self.group]
         values = [np.abs(h), *(levels[:, :, i] for i in range(len(self.names)))]
         with np.errstate(all="ignore"):
-            s, by_h, *by_level = (np.broadcast_to(a, h.shape) for a in self._recorded(values))
+            s, by_h, *by_level = (np.broadcast_to(a, h.shape) for a in _recorded(self.formula)(values))
             slopes = np.zeros((trials, m, len(self.groups), len(self.names)))
             for i, slope in enumerate(by_level):
                 slopes[:, np.arange(m), self.group, i] = slope * levels[:, :, i] / s
             return np.log(self.weights * s), by_h * np.sign(h) / s, slopes.reshape(trials, m, -1)
+
+
+@functools.cache
+def _recorded(formula: Arithmetic) -> Program:
+    """The formula and its derivatives by the reading and by each level."""
+    graph = Graph()
+    names = [name for name in formula.names if name != READING]
+    known = {name: graph.input(name) for name in (READING, *names)}
+    value, one = graph.apply("add", formula(known), 0.0), graph.constant(1.0)
+    slopes = [tangent([value], {place: one})[0] for place in known.values()]
+    return Program.of([value, *slopes], list(known.values()))

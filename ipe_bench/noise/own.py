@@ -50,9 +50,10 @@ class Unknown(Noise):
     """Column of the readings whose entries have levels of their own: `output`, say, or `file`."""
     sigma: str = "sigma"
     """Formula of the standard deviation: h is the magnitude of the error-free reading, all other names are levels."""
-
     levels: tuple[Positive, ...] | None = None
-    """True levels in the order of the formula, for `run`: estimators are told R with these, of the nominal readings."""
+    """True levels in the order of the formula, for `run`: estimators are told R with these, at the nominal readings."""
+
+    estimated = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -61,8 +62,6 @@ class Unknown(Noise):
             raise UserError(f"noise.levels: has {len(self.levels)} numbers; give one for each of {', '.join(names)}")
         if self.levels is not None and self.by is not None:
             raise UserError("noise.by: does not go with noise.levels; state what is known, as in noise=gaussian")
-
-    estimated = True
 
     def levels_of(self, model: Measurement) -> Levels | None:
         """The levels of a model's readings; None if a single one multiplies all standard deviations."""

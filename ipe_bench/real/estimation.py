@@ -95,10 +95,6 @@ class Question:
         stated = self.noise.of(found.model) if isinstance(self.noise, ModelNoise) else self.noise
         if self.readings is None and stated is None:
             return Certified()
-        if isinstance(stated, Unknown) and stated.levels is not None:
-            raise UserError(
-                "noise.levels: are for `run`, which simulates with them; `estimate` finds them, so leave them out"
-            )
         if found.deviations is None:
             return stated or ModelNoise().of(found.model) or Unknown()
         deviations = tuple(np.where(np.isfinite(found.deviations), found.deviations, 1.0).tolist())

@@ -232,7 +232,6 @@ def test_a_parameter_on_its_bound_is_held_there_beside_the_levels():
         ({"sigma": "0.1*h"}, "has no level to estimate"),
         ({"sigma": "a + b*h"}, "a is a parameter of the model; give the level another name"),
         ({"sigma": "floor + "}, r"noise.sigma: 'floor \+ ' is not a formula"),
-        ({"levels": (1.0,)}, "noise.levels: are for `run`"),
         ({"by": "output"}, "noise.by=output: there is no such column of the readings .*row, second, t"),
     ],
 )
