@@ -42,7 +42,7 @@ def _check_chosen(words: Sequence[str]) -> list[Finding]:
     """The findings on what these keys choose."""
     asked = single("check", words)
     parts = {key: getattr(asked.spec, key) for key in PARTS if key in asked.words.keys}
-    if not set(plugins.ESTIMATOR_GROUPS).isdisjoint(asked.words.keys):
+    if not set(plugins.PACKAGES).isdisjoint(asked.words.keys):
         parts |= asked.spec.estimators
     return [finding for name, part in parts.items() for finding in check_component(name, part)]
 

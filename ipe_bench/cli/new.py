@@ -28,7 +28,6 @@ ALONE = {
 
 def main(kind: str, name: str) -> int:
     """Writes plugins/NAME in the working folder, or the one file of a function or of differential equations."""
-    kind = "measurement" if kind == "model" else kind
     if kind == "skill":
         from ipe_bench.cli.skill import write_skill
 

@@ -24,7 +24,7 @@ Exit codes: 0 done; 1 done, but some pieces failed or are missing; 2 a mistake i
 """
 MODELS = ("function", "ode")
 """Models of one file."""
-KINDS = ("solver", "baseline", "filter", "measurement", "noise", "prior", "execution")
+KINDS = ("solver", "baseline", "filter", "measurement", "model", "noise", "prior", "execution")
 KINDS += ("statistic", "figure", "table", "section", "experiment")
 """Of plugins that `new` makes."""
 INFO_TOPICS = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
@@ -56,6 +56,8 @@ noise=NAME             the errors of the readings
 prior=NAME             the distribution of the true parameters about the nominal point
 solver=[A,B]           iterative solvers of the estimating equation
 baseline=[A,B]         other estimators, on the same trials
+model=NAME             states that move, in place of a measurement
+tracker=[A,B]          filters and smoothers of such states; trackers.NAME.KEY=X sets an option of one
 execution=NAME         where blocks of trials are computed: in this process, on all cores, on a cluster
 GROUP.KEY=VALUE        an option of one of these; `ipe-bench list GROUP/NAME` shows its type and default
 estimators.NAME.KEY=X  an option of a solver or a baseline that is chosen
@@ -249,7 +251,9 @@ The same results give the same file, so that the digest may stand in a paper. Ot
         "a working model of one file, or a plugin in plugins/NAME, to start from",
         "",
         """
-  ipe-bench new solver my_solver                  plugins/my_solver; model means measurement, a filter is a baseline
+  ipe-bench new solver my_solver                  plugins/my_solver
+  ipe-bench new filter my_filter                  plugins/my_filter, a baseline that takes readings epoch by epoch
+  ipe-bench new model my_model                    plugins/my_model, states that move
   ipe-bench new ode my_model                      my_model.yaml, differential equations
   ipe-bench new function my_model                 my_model.py, a function of parameters and columns
   ipe-bench new skill DIR                         pages by which a coding agent writes plugins, into a new folder DIR

@@ -29,6 +29,7 @@ KINDS = {
     "function": "run measurement=function measurement.of=my_function:my_function measurement.columns.t=[0,1,2] "
     f"error_scale=0.1 {SMALL}",
     "ode": "run measurement=ode measurement.file=my_ode.yaml error_scale=0.1 trials=50 figures=none",
+    "model": "run model=my_model trials=50 figures=none",
     "noise": "run measurement=polynomial noise=my_noise trials=50 figures=none",
     "statistic": f"run {BENT}",
 }

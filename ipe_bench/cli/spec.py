@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cloudpickle
 
@@ -20,8 +20,6 @@ from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct, instantiate, known_parameters
 from ipe_bench.plugins.description import Described, options_of
 from ipe_bench.priors import GaussianPrior, Prior
-from ipe_bench.real.estimation import Question, prior_stated
-from ipe_bench.real.readings import LeftOut
 from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.provenance import TARGET, canonical_json, describe
@@ -30,6 +28,9 @@ from ipe_bench.states.base import StateModel
 from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.tracking import Tracking
+
+if TYPE_CHECKING:
+    from ipe_bench.real.estimation import Question
 
 PARTS: dict[str, type] = {
     "measurement": Measurement,
@@ -153,7 +154,11 @@ class Spec(Component):
             return Tracking(self.model, self.seed)
         measurement, truth = (m and informed(m, self.known) for m in (self.measurement, self.truth_measurement))
         assert measurement is not None
-        prior = prior_stated(self.prior, measurement, self.prior_covariance)
+        prior = self.prior
+        if self.known or self.prior_covariance is not None:
+            from ipe_bench.real.estimation import prior_stated
+
+            prior = prior_stated(prior, measurement, self.prior_covariance)
         return Scenario(measurement, self.noise, prior, self.error_scale, self.seed, truth)
 
     def suited(self) -> Spec:
@@ -168,6 +173,9 @@ class Spec(Component):
     def question(self, stated: Collection[str]) -> Question:
         """What is asked of real readings; `stated` are the keys that a user has given, and a part that stands there by
         default is stated by nobody."""
+        from ipe_bench.real.estimation import Question
+        from ipe_bench.real.readings import LeftOut
+
         given = (self.readings,) if isinstance(self.readings, str) else self.readings
         if given == ():
             raise UserError("readings=[]: name a file, or several as readings=[a.csv,b.csv]")

@@ -31,6 +31,9 @@ from ipe_bench.plugins.discovery import COMPONENT_GROUPS, Option, blame, compose
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.runs.execution import Execution, Failure
 from ipe_bench.runs.provenance import TARGET, describe
+from ipe_bench.states import Formulas
+from ipe_bench.states.base import StateModel, require_sound
+from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import nees
 
@@ -526,6 +529,43 @@ def draws_what_is_told(prior: Prior) -> None:
     assert not prior.normal or p > _IMPROBABLE, f"the draws are not normal (p = {p:.1g}); set `normal` to False"
 
 
+# States that move
+
+
+def suits_itself(model: StateModel) -> None:
+    """Has times, a prior, covariances, a transition and readings of the same shapes."""
+    try:
+        require_sound(model)
+    except UserError as error:
+        raise AssertionError(str(error)) from None
+
+
+def moves_batches(model: StateModel) -> None:
+    """Moves and reads a stack of states as one by one, bit for bit, and analytically: slopes are complex steps."""
+    x, k = model.draw(0, 4).x[:, -1], model.epochs - 1
+    for name, function in (("transition", model.transition), ("observe", model.observe)):
+        values = function(x, k)
+        alone = np.concatenate([function(one[None], k) for one in x])
+        assert np.array_equal(values, alone), f"{name} gives a state alone other bits: compute each by itself"
+        exact, rough = (differentiate(lambda u, f=function: f(u, k), x, analytic=how) for how in (True, False))
+        close = np.allclose(exact, rough, rtol=1e-4, atol=1e-6 * np.abs(rough).max())
+        assert close, f"{name} is not analytic: write np.where(u.real < 0, -u, u) for np.abs(u), and the like"
+
+
+def tracks_its_trials(tracker: Tracker) -> None:
+    """Tracks a linear model with covariances that agree with its errors, and a trial alone with the same bits."""
+    linear = {"next": {"x": "0.9*x + w"}, "readings": {"z": "x"}, "noise": {"w": 1.0}}
+    model = Formulas(**linear, deviation={"z": 0.5}, spread={"x": 3.0}, count=20)
+    paths = model.draw(0, SCATTERED)
+    tracks = tracker.track(model, paths.z)
+    _shaped("mean", tracks.mean, paths.x.shape)
+    _shaped("covariance", tracks.covariance, (*paths.x.shape, model.n))
+    alone = tracker.track(model, paths.z[:1])
+    assert np.array_equal(alone.mean[0], tracks.mean[0], equal_nan=True), "trial 0 alone has other bits than in a batch"
+    ratio = float(nees((tracks.mean - paths.x)[:, -1], tracks.covariance[:, -1]).mean()) / model.n
+    assert 0.5 < ratio < 2, f"the mean squared error of the last epoch is {ratio:.3g} times the reported covariance"
+
+
 # Executions
 
 
@@ -604,5 +644,7 @@ _CHECKS: dict[type, tuple[Callable[[Any], None], ...]] = {
     Measurement: (names_its_readings, simulates_batches, differentiates, orders_its_epochs),
     Noise: (states_its_covariance, corrupts_reproducibly, draws_what_it_states, states_its_law),
     Prior: (states_its_deviations, draws_reproducibly, draws_what_is_told),
+    StateModel: (suits_itself, moves_batches),
+    Tracker: (tracks_its_trials,),
     Execution: (does_every_task, fails_a_task_alone, ends_with_the_run),
 }

@@ -14,7 +14,6 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy.special import chdtri
 
 from ipe_bench.basics.errors import describe_exception
 from ipe_bench.basics.linalg import Array, Mask, deviations, finite, read_only
@@ -193,6 +192,8 @@ class PathBlock:
             messages=messages,
             seconds=seconds,
         )
+        from scipy.special import chdtri
+
         each = nees(e.reshape(-1, n), P.reshape(-1, n, n)).reshape(trials, K)
         each[~self.definite] = np.nan
         normalised = np.sum(np.where(self.variances > 0, e**2 / self.variances, 0.0), axis=2)

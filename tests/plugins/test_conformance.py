@@ -20,8 +20,9 @@ from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.plugins.construct import construct
 from ipe_bench.solvers import IPE, Newton, State
+from ipe_bench.states import CoordinatedTurn, Filter
 
-GROUPS = ("measurement", "noise", "prior", "solver", "baseline")
+GROUPS = ("measurement", "noise", "prior", "solver", "baseline", "model", "tracker")
 OURS = [
     o
     for o in plugins.options()
@@ -185,6 +186,42 @@ class Silent(Quantization):
 
 
 @dataclass(frozen=True)
+class Kinked(CoordinatedTurn):
+    """As analytic as np.abs is."""
+
+    def observe(self, x, k):
+        return super().observe(x, k) + np.abs(x[..., :1])
+
+
+@dataclass(frozen=True)
+class Crowded(CoordinatedTurn):
+    """A state depends on the others of the stack."""
+
+    def transition(self, x, k):
+        return super().transition(x, k) + 1e-9 * len(x)
+
+
+@dataclass(frozen=True)
+class Shapeless(CoordinatedTurn):
+    def R(self, k):
+        return np.eye(3)
+
+
+@dataclass(frozen=True)
+class Proud(Filter):
+    """Claims a quarter of its covariance, or looks at the other trials."""
+
+    share: float = 0.25
+    leaning: float = 0.0
+
+    def track(self, model, z):
+        tracks = super().track(model, z)
+        tracks.covariance *= self.share
+        tracks.mean += self.leaning * len(z)
+        return tracks
+
+
+@dataclass(frozen=True)
 class Forgetful(Noise):
     def corrupt(self, h, offset, rng):
         return h + np.random.default_rng().standard_normal(h.shape)
@@ -222,6 +259,11 @@ class Forgetful(Noise):
         (Mislabelled(), "two readings have one label"),
         (Slanted(), "off by"),
         (Forgetful(), "besides the stream"),
+        (Kinked(), "observe is not analytic"),
+        (Crowded(), "transition gives a state alone other bits"),
+        (Shapeless(), "h has shape (1, 2), where (1, 3) belongs"),
+        (Proud(), "times the reported covariance"),
+        (Proud(share=1.0, leaning=1e-9), "trial 0 alone has other bits"),
         (42, "neither"),
     ],
     ids=lambda value: getattr(value, "fault", type(value).__name__) if not isinstance(value, str) else "",
