@@ -27,7 +27,7 @@ LINE = (
 BUDGETS = {
     "basics": 1135,
     "measurements": 7529,
-    "noise": 610,
+    "noise": 624,
     "priors": 175,
     "states": 1152,
     "estimators": 1273,
@@ -36,7 +36,7 @@ BUDGETS = {
     "trials": 2386,
     "runs": 2226,
     "statistics": 4491,
-    "real": 2507,
+    "real": 2506,
     "plugins": 1305,
     "report": 4777,
     "cli": 2926,

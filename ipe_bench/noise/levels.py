@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.measurements.arithmetic import Arithmetic, read
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.ode.trace import Graph, Program, tangent
@@ -93,6 +93,20 @@ class Levels:
         kept, group = np.unique(self.group[rows], return_inverse=True)
         groups = tuple(self.groups[k] for k in kept)
         return replace(self, weights=self.weights[rows], groups=groups, group=group)
+
+    def covariance(self, h: Array, theta: Array) -> Covariance:
+        """R of readings h (m,) for logarithms theta (k,) of the levels.
+
+        Raises:
+            UserError: the standard deviation of a reading is zero, which makes its likelihood infinite.
+        """
+        sigma = np.exp(self.at(h[None], theta[None])[0][0])
+        if none := int(np.sum(sigma == 0)):
+            raise UserError(
+                f"noise.sigma={self.formula.text}: is 0 at {none} of {len(h)} readings, where {READING} is 0; add a"
+                f" level, as in a + b*{READING}"
+            )
+        return Covariance(sigma)
 
     def at(self, h: Array, theta: Array) -> tuple[Array, Array, Array]:
         """log sigma (trials, m) for readings h (trials, m) and logarithms theta (trials, k) of the levels, and its

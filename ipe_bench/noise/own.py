@@ -86,7 +86,7 @@ class Unknown(Noise):
         if known is None:
             raise UserError(NO_LEVEL)
         levels, theta = known
-        return np.exp(levels.at(h[None], theta[None])[0][0])
+        return levels.covariance(h, theta).factor
 
     @property
     def true_covariance(self) -> bool:

@@ -292,7 +292,7 @@ def _fit_with_levels(label: str, estimator: Estimator, problem: Problem, z: Arra
     theta, h = first_levels(levels, z), z
     found: tuple[Fit, Fit, Estimated] | None = None
     for _ in range(_MOST_LEVELS):
-        R = Covariance(np.exp(levels.at(h[None], theta[None])[0][0]))
+        R = levels.covariance(h, theta)
         again = _fit_one(label, estimator, replace(problem, R=R), z, where, None)
         if found is not None and again.status is not Status.CONVERGED:
             break

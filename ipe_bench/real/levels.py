@@ -220,7 +220,7 @@ def levels_at(problem: Problem, levels: Levels, theta: Array, z: Array, x: Array
     h, J = problem.measurement.simulate(x[None])[0], problem.measurement.jacobian(x[None])[0]
     _require_residuals(levels, z, z - h, J)
     spare = _spare(J, problem.R)
-    w = (z - h) * np.exp(-levels.at(h[None], theta[None])[0][0])
+    w = levels.covariance(h, theta).whiten(z - h)
     theta = theta + first_levels(levels, w * levels.weights)
     known = Levelled(_Known(h), levels, theta, spare)
     found = minimise(Problem(known, _covariance(levels, known.whole, theta)), z[None], theta[None])
@@ -257,8 +257,7 @@ def maximum(start: Estimated, z: Array) -> Estimated:
 
 def _covariance(levels: Levels, model: Measurement, x: Array) -> Covariance:
     """R where the parameters and the logarithms of levels are x (n + k,)."""
-    h = model.simulate(x[None, : model.n])
-    return Covariance(np.exp(levels.at(h, x[None, model.n :])[0][0]))
+    return levels.covariance(model.simulate(x[None, : model.n])[0], x[model.n :])
 
 
 def _spare(J: Array, R: Covariance) -> Array:

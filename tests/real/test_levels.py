@@ -257,6 +257,14 @@ def test_residuals_of_zero_are_refused():
         fit(Problem(model, Covariance(np.ones(60))), z, LM, Unknown(by="second"))
 
 
+def test_a_standard_deviation_of_zero_is_refused():
+    """The likelihood of a reading of zero is infinite if its standard deviation is a share of it."""
+    z = readings("a + b h", 1)
+    z[5] = 0.0
+    with pytest.raises(ib.UserError, match=r"noise.sigma=share\*h: is 0 at 1 of 60 readings"):
+        fit(Problem(DECAY, Covariance(np.ones(60))), z, LM, Unknown(sigma="share*h"))
+
+
 def test_a_formula_of_the_standard_deviation_has_exact_slopes():
     levels = Levels.of(read_sigma("floor + sqrt(share*h)"), np.linspace(1, 2, 60), "second", DECAY)
     h, theta = np.random.default_rng(0).normal(0, 3, (2, 60)), np.log([[0.5, 0.1, 0.4, 2.0]] * 2)
