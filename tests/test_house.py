@@ -35,7 +35,7 @@ BUDGETS = {
     "baselines": 2422,
     "trials": 2386,
     "runs": 2226,
-    "statistics": 4493,
+    "statistics": 4487,
     "real": 2506,
     "plugins": 1305,
     "report": 4782,

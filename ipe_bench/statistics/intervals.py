@@ -7,6 +7,7 @@ with the stated probability, so that one may look as often as one likes.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -29,7 +30,7 @@ TIGHTEST = 1000
 """The number of trials at which sequences are about as narrow as they can be; at others they are valid as well."""
 _WEIGHT = TIGHTEST / (2 * math.log(20) + math.log(2 * math.log(20)) + 1)
 """Of the mixtures, in trials: what makes those of 95 % tightest there (Waudby-Smith et al., 2024, appendix)."""
-_STEPS = 60
+_HALVINGS = 50
 FIRST = 100
 """Trials from which an asymptotic sequence begins; one that begins earlier misses errors with rare large ones."""
 
@@ -188,16 +189,18 @@ def share_sequence(count: int, trials: int, level: float = LEVEL) -> tuple[float
         own = (count * math.log(p) if count else 0.0) + (failures * math.log1p(-p) if failures else 0.0)
         return mixture - own > -math.log(1 - level)
 
-    def crossing(inside: float, outside: float) -> float:
-        """Where, from the share that was seen to that end, shares begin to be beaten."""
-        for _ in range(_STEPS):
-            middle = (inside + outside) / 2
-            if middle in (0.0, 1.0):
-                break
-            inside, outside = (inside, middle) if beaten(middle) else (middle, outside)
-        return outside
+    low = first_that(beaten, count / trials, 0.0) if count else 0.0
+    return low, first_that(beaten, count / trials, 1.0) if count < trials else 1.0
 
-    return crossing(count / trials, 0.0), crossing(count / trials, 1.0)
+
+def first_that(holds: Callable[[float], bool], inside: float, outside: float) -> float:
+    """The first value, on the way from inside to outside, of which something holds, by bisection."""
+    for _ in range(_HALVINGS):
+        middle = (inside + outside) / 2
+        if middle in (inside, outside):
+            break
+        inside, outside = (inside, middle) if holds(middle) else (middle, outside)
+    return outside
 
 
 def mean_sequence(deviation: Array, count: int, level: float = LEVEL) -> Array:

@@ -12,13 +12,12 @@ from scipy.special import betaln, ndtri
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.comparisons import ALPHA, mcnemar
 from ipe_bench.statistics.consistency import clopper_pearson
-from ipe_bench.statistics.intervals import grouped
+from ipe_bench.statistics.intervals import first_that, grouped
 
 FLIPS = 4999
 """Random assignments of signs."""
 LARGEST_SAMPLE = 1000
 """Of more trials, groups of consecutive ones share a sign: as good, since trials are independent."""
-_STEPS = 50
 _BETS = np.concatenate([-(2.0 ** -np.arange(9)), 2.0 ** -np.arange(9)]) * 0.99
 """Shares of the stake, on either side."""
 _TILTS = np.concatenate([-(2.0 ** np.arange(-12, 5)), 2.0 ** np.arange(-12, 5)])
@@ -73,15 +72,7 @@ def _tango(losses: int, gains: int, trials: int, alpha: float) -> float:
         variance = trials * max(2 * lost + difference * (1 - difference), 0.0)
         return bool(gains - losses - trials * difference <= quantile * np.sqrt(variance))
 
-    return _least(inside, -1.0, (gains - losses) / trials)
-
-
-def _least(holds: Callable[[float], bool], low: float, high: float) -> float:
-    """The least value from which on something holds, by bisection."""
-    for _ in range(_STEPS):
-        middle = (low + high) / 2
-        low, high = (low, middle) if holds(middle) else (middle, high)
-    return high
+    return first_that(inside, -1.0, (gains - losses) / trials)
 
 
 def ratio_effect(
@@ -134,7 +125,7 @@ def _p_of_ratio(a: Array, b: Array) -> Callable[[float], float]:
 def _least_ratio(a: Array, b: Array, alpha: float) -> float:
     """The least ratio of b over a that is not rejected."""
     p = _p_of_ratio(a, b)
-    return 0.0 if p(0.0) >= alpha else _least(lambda ratio: p(ratio) >= alpha, 0.0, float(b.sum() / a.sum()))
+    return 0.0 if p(0.0) >= alpha else first_that(lambda ratio: p(ratio) >= alpha, 0.0, float(b.sum() / a.sum()))
 
 
 def _unseen(first: Array, second: Array, alpha: float) -> float:
