@@ -24,6 +24,7 @@ from scipy.integrate import solve_ivp
 
 import ipe_bench as ib
 from ipe_bench.basics.machine import library_versions
+from ipe_bench.measurements.ode.rodas import Rodas5P
 from ipe_bench.trials.scoring import Block
 
 STEP_S = 180.0
@@ -119,6 +120,26 @@ def jacobians() -> Iterator[Row]:
             yield Row("Jacobian", what, 1e6 * seconds / BATCH, "µs", "own simulation", 1e6 * simulate / BATCH)
 
 
+def stiff() -> Iterator[Row]:
+    """Robertson's equations to t = 4e5, beside what SciPy has for stiff ones, all with a relative tolerance of 1e-8."""
+    rates = {"a": "-k1*a + k3*b*c", "b": "k1*a - k3*b*c - k2*b*b", "c": "k2*b*b"}
+    times = tuple(np.logspace(0, np.log10(4e5), 20).tolist())
+    model = ib.measurements.Ode(rates, {"k1": 0.04, "k2": 3e7, "k3": 1e4}, {"a": 1.0}, times=times)
+    method, x = Rodas5P(model.engine, 1e-8), 1 + 0.01 * np.random.default_rng(0).normal(size=(BATCH, 3))
+
+    def scipy(name: str) -> Any:
+        p = (x[0] * model.sizes).tolist()
+        tolerances = {"rtol": 1e-8, "atol": [1e-12, 1e-16, 1e-12]}
+        rhs = partial(model.engine.rhs, p=p, c=())
+        return solve_ivp(rhs, (0.0, times[-1]), [1.0, 0.0, 0.0], method=name, t_eval=times, **tolerances)
+
+    for batch in (1, BATCH):
+        for name in ("LSODA", "Radau"):
+            ours, theirs = least(partial(method.simulate, x[:batch], len(times)), partial(scipy, name), rounds=2)
+            what = f"Rodas5P on Robertson's equations, batch {batch}"
+            yield Row("stiff", what, 1e3 * ours / batch, "ms", f"SciPy {name}", 1e3 * theirs)
+
+
 def estimation() -> Iterator[Row]:
     s = scenario(33.0)
     block = Block.draw(s, 0, BATCH)
@@ -196,7 +217,7 @@ def scale() -> Iterator[Row]:
     yield Row("scale", f"{what}: on disk", many.files, "files", tenth, few.files)
 
 
-PARTS = {f.__name__: f for f in (simulation, jacobians, estimation, filters, loop)}
+PARTS = {f.__name__: f for f in (simulation, jacobians, stiff, estimation, filters, loop)}
 LONG = {"scale": scale}
 """Takes minutes: only where it is asked for."""
 

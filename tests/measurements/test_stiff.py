@@ -1,6 +1,7 @@
 """Stiff equations: published digits, exact solutions, SciPy's Radau, and which method a model is given."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -74,6 +75,10 @@ def test_a_stiff_model_is_found_and_is_within_its_tolerance():
     t, k = np.array(model.times), 100.0
     exact = k / (k - 0.01) * (np.exp(-0.01 * t) - np.exp(-k * t))
     assert model.engine.stiff
+    (said,) = model.remarks(model.nominal)
+    assert said.startswith("the equations are stiff: an explicit method would need ")
+    assert "measurement.method=" in said
+    assert replace(model, method="implicit").remarks(model.nominal) == ()
     np.testing.assert_allclose(model.simulate(np.array([[1.0]]))[0], exact, atol=1e-8)
     slope = -0.01 / (k - 0.01) ** 2 * (np.exp(-0.01 * t) - np.exp(-k * t)) + k / (k - 0.01) * t * np.exp(-k * t)
     np.testing.assert_allclose(model.jacobian(np.array([[1.0]]))[0, :, 0], k * slope, atol=1e-8)
