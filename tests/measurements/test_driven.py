@@ -17,7 +17,7 @@ from ipe_bench.noise import Gaussian
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.real.estimation import Question
 from ipe_bench.real.fits import fit
-from ipe_bench.real.readings import open_together
+from ipe_bench.real.readings import open_together, write_readings
 
 T = np.arange(0.0, 600.0, 10.0)
 CURRENT = np.repeat(np.random.default_rng(0).choice([0.0, 1.0, 2.5, -1.0], 12), 5)
@@ -86,8 +86,17 @@ def test_few_readings_of_many_changes_are_those_of_all():
     np.testing.assert_allclose(few.simulate(x), BATTERY.simulate(x)[:, 5::7], atol=1e-12)
     assert (few.m, len(few.epochs or ())) == (8, 8)
     assert not [f for f in check_component("ode", BATTERY) if f.complaint]
-    with pytest.raises(UserError, match=r"current changes at 10 without a reading; add it to measurement.times"):
+    with pytest.raises(UserError, match=r"current changes at 0 without a reading; add it to measurement.times"):
         _ = few.input_columns
+
+
+def test_readings_are_written_with_their_inputs_and_read_again(tmp_path):
+    ramp = replace(BATTERY, driven_by={"current": "linear"})
+    x = BATTERY.nominal[None] * 1.1
+    for k, model in enumerate((BATTERY, ramp)):
+        write_readings(tmp_path / f"{k}.csv", model, model.simulate(x)[0])
+        again = open_together([tmp_path / f"{k}.csv"], replace(model, times=(), columns={}))
+        np.testing.assert_allclose(again.model.simulate(x), model.simulate(x), atol=1e-12)
 
 
 @pytest.mark.parametrize("method", ["explicit", "implicit"])

@@ -125,3 +125,7 @@ def test_formulas(expression, lost):
 def test_what_cannot_be_examined_has_no_answer():
     assert structure(Gins()) is None
     assert structure(Formula("a*sin(b*t)", {"a": 1.0, "b": 1.0})) is None
+    assert structure(Formula("a*max(b, t) + erf(t)", {"a": 1.0, "b": 1.0})) is None
+    driven = {"driven_by": {"u": "hold"}, "columns": {"time": [0.0], "u": [1.0]}, "times": (1.0, 2.0)}
+    assert structure(Ode({"y": "u - k*y"}, {"k": 1.0}, **driven)) is None
+    assert structure(Ode({"y": "(1 if t < 1 else 0) - k*y"}, {"k": 1.0}, times=(1.0, 2.0))) is None

@@ -25,9 +25,17 @@ from ipe_bench.measurements.arithmetic import (
     require_parameters,
 )
 from ipe_bench.measurements.base import Input, Measurement, Recorded, SubsetModel, UsualNoise, WrappedModel
-from ipe_bench.measurements.ode.driven import course, courses, grid, middles, separated, switching_times
+from ipe_bench.measurements.ode.driven import (
+    course,
+    courses,
+    grid,
+    middles,
+    numbered_cases,
+    separated,
+    switching_times,
+)
 from ipe_bench.measurements.ode.model import OdeMeasurement, time_heading
-from ipe_bench.measurements.ode.rodas import Rodas5P, Work
+from ipe_bench.measurements.ode.rodas import SHAPE, Rodas5P, Work
 from ipe_bench.measurements.written import WrittenModel
 
 _SHARE = 1e-8
@@ -37,8 +45,6 @@ _TRIAL_STEPS = 16
 _EASY = 16
 """Explicit steps between two readings up to which nominal equations are not asked whether they are stiff."""
 _STIFF = 10.0
-_SHAPE = 1e-4
-"""A relative tolerance that shows the shape of a solution."""
 _IN_HAND = 0.3
 _COLUMNS = ("case", "time", "output", "reading", "sigma")
 """Columns that mean something else than a constant."""
@@ -130,15 +136,10 @@ class Ode(WrittenModel, WrappedModel):
                 if used in self.rates or used in self.driven_by or used == "t":
                     what = "changes with time" if used in self.driven_by else "is a state or the time"
                     raise UserError(f"initial.{name}: {used} {what}, which a start cannot depend on")
-        used = {
-            name
-            for part in (self.rate_formulas, self.initial_formulas, self.output_formulas)
-            for f in part.values()
-            for name in f.names
-        }
-        for name in self.start:
-            if name not in used:
-                raise UserError(f"start.{name}: appears in no formula")
+        for key, names in (("start", self.start), ("driven_by", self.driven_by)):
+            for name in names:
+                if name not in self._used:
+                    raise UserError(f"{key}.{name}: appears in no formula")
         for key, given in (("size", self.size), ("units", self.units), ("answer", self.answer)):
             require_parameters(key, tuple(given), self.start)
         if not self.start:
@@ -169,12 +170,9 @@ class Ode(WrittenModel, WrappedModel):
             raise UserError(f"constants: have different lengths: {lengths}; give one number for each case")
 
     def _check_inputs(self) -> None:
-        used = {name for part in (self.rate_formulas, self.output_formulas) for f in part.values() for name in f.names}
         for name in self.driven_by:
             if name in (*self.start, *self.rates, *_COLUMNS, "t"):
                 raise UserError(f"driven_by.{name}: is a state, a parameter, the time or another column; rename it")
-            if name not in used:
-                raise UserError(f"driven_by.{name}: appears in no rate and in no output")
         for name in self.columns:
             if name not in ("case", "time", *self.driven_by):
                 raise UserError(f"columns.{name}: {unknown(name, ['case', 'time', *self.driven_by], 'input')}")
@@ -188,10 +186,13 @@ class Ode(WrittenModel, WrappedModel):
     @cached_property
     def constant_names(self) -> tuple[str, ...]:
         """The names that are constants of a case, in order of appearance."""
-        formulas = [
-            f for part in (self.rate_formulas, self.initial_formulas, self.output_formulas) for f in part.values()
-        ]
-        return tuple(dict.fromkeys(name for f in formulas for name in f.names if name not in self._named))
+        return tuple(name for name in self._used if name not in self._named)
+
+    @cached_property
+    def _used(self) -> tuple[str, ...]:
+        """The names in all formulas, in order of appearance."""
+        parts = (self.rate_formulas, self.initial_formulas, self.output_formulas)
+        return tuple(dict.fromkeys(name for part in parts for formula in part.values() for name in formula.names))
 
     @cached_property
     def cases(self) -> Array:
@@ -272,25 +273,21 @@ class Ode(WrittenModel, WrappedModel):
     def input_columns(self) -> Mapping[str, Sequence[Any]]:
         cases = np.asarray(self.index["case"]) - 1
         found = {name: self.cases[cases, k].tolist() for k, name in enumerate(self.constant_names)}
-        return found | {name: self._input_at_readings(name) for name in self.driven_by}
+        return found | {name: self._at_readings(name) for name in self.driven_by}
 
-    def _input_at_readings(self, name: str) -> list[float]:
-        """The values (m,) of an input at the readings.
+    def _at_readings(self, name: str) -> list[float]:
+        """The values (m,) of an input.
 
         Raises:
             UserError: it changes at other times, too, which would be lost with the readings alone.
         """
-        index, found = self.index, []
-        for case, time in zip(index["case"], index[time_heading(self.time_unit)], strict=True):
-            one = self.courses[min(case, len(self.courses)) - 1]
-            u, *line = (float(a) for a in course(self.driven_by[name], one["time"], one[name], np.asarray(time)))
-            found.append(u + line[0] * (time - line[1]) if line else u)
-        if lost := sorted(
-            {float(t) for one in self.courses for t in one["time"]} - {0.0, *map(float, self.reading_times)}
-        ):
+        if lost := {float(t) for one in self.courses for t in one["time"]} - set(map(float, self.reading_times)):
             remedy = "add it to measurement.times to write the readings with their inputs"
-            raise UserError(f"measurement.columns.time: {name} changes at {lost[0]:g} without a reading; {remedy}")
-        return found
+            raise UserError(f"measurement.columns.time: {name} changes at {min(lost):g} without a reading; {remedy}")
+        engine = self.engine
+        values = engine.at_times([0.0] * engine.states, [0.0] * self.n)[name]
+        read = np.searchsorted(engine.times, self.reading_times)
+        return np.repeat(values[:, read], len(engine.outputs), axis=1).ravel().tolist()
 
     @property
     def input_columns_known(self) -> bool:
@@ -327,7 +324,7 @@ class Ode(WrittenModel, WrappedModel):
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
         del readings
-        count = _cases(columns["case"]) if self.constant_names or self.driven_by else 1
+        count = numbered_cases(columns["case"]) if self.constant_names or self.driven_by else 1
         constants = {name: _of_cases(name, columns[name], columns["case"], count) for name in self.constant_names}
         outputs, heading = list(self.output_formulas), time_heading(self.time_unit)
         rows = list(zip(columns["case"], map(float, columns[heading]), columns["output"], strict=True))
@@ -410,7 +407,7 @@ class _Engine(OdeMeasurement):
     @cached_property
     def _shape(self) -> tuple[Array, Work]:
         """The nominal readings (1, m) by the implicit method, near enough to show their size, and what they took."""
-        return Rodas5P(self, _SHAPE).measured(own(self.nominal[None]))
+        return Rodas5P(self, SHAPE).measured(own(self.nominal[None]))
 
     @cached_property
     def stiff(self) -> bool:
@@ -424,14 +421,14 @@ class _Engine(OdeMeasurement):
         if self.step is not None or self._ladder[self._nominal_place] <= _EASY:
             return False
         z, work = self._shape
-        return bool(np.isfinite(z).all() and work.explicit[0] > _STIFF * work.steps[0])
+        return bool(np.isfinite(z).all() and work.explicit > _STIFF * work.steps)
 
     @property
     def said_stiff(self) -> str:
         _, work = self._shape
         return (
-            f"the equations are stiff: an explicit method would need {work.explicit[0]:.1e} steps for stability where "
-            f"the solution needs {int(work.steps[0])}; they are integrated by the implicit method "
+            f"the equations are stiff: an explicit method would need {work.explicit:.1e} steps for stability where "
+            f"the solution needs {work.steps}; they are integrated by the implicit method "
             "(measurement.method=explicit or implicit fixes it)"
         )
 
@@ -439,9 +436,12 @@ class _Engine(OdeMeasurement):
         """What the names in the formulas stand for at x (n,), at the times of each case: (cases, times)."""
         shown = replace(self.described, outputs={}, exact={}, answer={}).engine
         y = shown.simulate(x[None]).reshape(len(self.cases), len(self.times), self.states)
-        c = np.moveaxis(self.tables[1:] if len(self.tables) > 1 else self.tables, 0, 1)
-        p = list(x[: self.n] * self.si_sizes)
-        return self._values(self.times[None], list(np.moveaxis(y, 2, 0)), p, list(np.moveaxis(c, 2, 0)))
+        return self.at_times(list(np.moveaxis(y, 2, 0)), list(x[: self.n] * self.si_sizes))
+
+    def at_times(self, y: Sequence[Any], p: Sequence[float]) -> dict[str, Any]:
+        """What the names stand for where the states are y, each (cases, times)."""
+        c = self.tables[1:] if len(self.tables) > 1 else self.tables
+        return self._values(self.times[None], y, p, list(np.moveaxis(c, (2, 1), (0, 1))))
 
     @cached_property
     def _implicit(self) -> Rodas5P:
@@ -514,14 +514,6 @@ class _Engine(OdeMeasurement):
     def read(self, t, y, p, c):
         values = self._values(t, y, p, c)
         return [formula(values) for formula in self.described.output_formulas.values()]
-
-
-def _cases(numbers: Sequence[int]) -> int:
-    """How many cases a file has, by the column that numbers them."""
-    known = sorted(set(numbers))
-    if known != list(range(1, len(known) + 1)):
-        raise UserError(f"case={known[-1]}: cases are numbered 1, 2 and so on; there are {', '.join(map(str, known))}")
-    return len(known)
 
 
 def _of_cases(name: str, values: Sequence[float], numbers: Sequence[int], count: int) -> tuple[float, ...]:

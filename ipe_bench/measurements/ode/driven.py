@@ -91,6 +91,18 @@ def course(kind: str, times: Array, values: Array, at: Array) -> list[Array]:
     return [values[place], np.where(k < 0, 0.0, slopes[place]), times[place]]
 
 
+def numbered_cases(numbers: Sequence[int]) -> int:
+    """How many cases a column numbers.
+
+    Raises:
+        UserError: a number is left out.
+    """
+    known = sorted(set(numbers))
+    if known != list(range(1, len(known) + 1)):
+        raise UserError(f"case={known[-1]}: cases are numbered 1, 2 and so on; there are {', '.join(map(str, known))}")
+    return len(known)
+
+
 def courses(columns: Mapping[str, Sequence[Any]], names: Collection[str]) -> list[dict[str, Array]]:
     """The columns `time` and those of the inputs, of each case.
 
@@ -105,10 +117,8 @@ def courses(columns: Mapping[str, Sequence[Any]], names: Collection[str]) -> lis
                 f"{', '.join(names)}, or {here}"
             )
     arrays = {name: np.asarray(columns[name], dtype=float) for name in ("time", *names)}
-    case = np.asarray(columns.get("case", np.ones(len(arrays["time"]))))
-    numbers = np.unique(case)
-    if numbers.tolist() != list(range(1, len(numbers) + 1)):
-        raise UserError(f"columns.case: has {numbers[-1]:g}; cases are numbered 1, 2 and so on")
+    case = np.asarray(columns.get("case", np.ones(len(arrays["time"]))), dtype=int)
+    numbers = range(1, numbered_cases(case.tolist()) + 1)
     found = [{name: column[case == number] for name, column in arrays.items()} for number in numbers]
     for one in found:
         if one["time"][0] < 0 or (np.diff(one["time"]) <= 0).any():

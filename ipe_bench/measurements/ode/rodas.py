@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 GAMMA = 0.21193756319429014
 _SIXTH = (-7.502846399306121, 2.561846144803919, -11.627539656261098, -0.18268767659942256, 0.030198172008377946)
+# fmt: off
 A: tuple[tuple[float, ...], ...] = (
     (),
     (3.0,),
@@ -47,23 +48,15 @@ C: tuple[tuple[float, ...], ...] = (
     (165.43517024871676, -0.4592823456491126, 42.90938336958603, -5.961986721573306),
     (24.854864614690072, -3.0009227002832186, 47.4931110020768, 5.5814197821558125, -0.6610691825249471),
     (
-        30.91273214028599,
-        -3.1208243349937974,
-        77.79954646070892,
-        34.28646028294783,
-        -19.097331116725623,
+        30.91273214028599, -3.1208243349937974, 77.79954646070892, 34.28646028294783, -19.097331116725623,
         -28.087943162872662,
     ),
     (
-        37.80277123390563,
-        -3.2571969029072276,
-        112.26918849496327,
-        66.9347231244047,
-        -40.06618937091002,
-        -54.66780262877968,
-        -9.48861652309627,
+        37.80277123390563, -3.2571969029072276, 112.26918849496327, 66.9347231244047, -40.06618937091002,
+        -54.66780262877968, -9.48861652309627,
     ),
 )
+# fmt: on
 NODES = (0.0, 0.6358126895828704, 0.4095798393397535, 0.9769306725060716, 0.4288403609558664, 1.0, 1.0, 1.0)
 TIME_WEIGHTS = (
     *(0.21193756319429014, -0.42387512638858027, -0.3384627126235924, 1.8046452872882734, 2.325825639765069),
@@ -71,7 +64,9 @@ TIME_WEIGHTS = (
 )
 _REACH = 6.0
 """About where the stability region of DOP853 ends on the negative real axis."""
-_MOST_STEPS = 4000
+MOST_STEPS = 4000
+SHAPE = 1e-4
+"""A relative tolerance that shows the shape of a solution."""
 _SMALLEST = 1e-9
 """Of the relative tolerance: the absolute one, in units of the states."""
 _SAFETY, _SHRINK, _GROW = 0.9, 0.2, 6.0
@@ -79,13 +74,18 @@ _SAFETY, _SHRINK, _GROW = 0.9, 0.2, 6.0
 
 @dataclass(frozen=True)
 class Work:
-    """What the integration of each trial took: its hardest case."""
+    """What the integration of a trial took in its hardest case."""
 
-    steps: Array
-    """Steps, rejected ones included, each with a decomposition (trials,)."""
-    explicit: Array
-    """Steps that an explicit method would need for stability alone (trials,): the integral of the spectral radius of
-    the Jacobian along the solution, over what a step may cover; 0 unless asked for."""
+    steps: int
+    """Rejected ones included, each with a decomposition."""
+    explicit: float
+    """Steps that an explicit method would need for stability alone: the integral of the spectral radius of the Jacobian
+    along the solution, over what a step may cover."""
+    fastest: float
+    """The largest spectral radius, and `met`, when that was."""
+    met: float
+    reached: float
+    """The time that all cases reached."""
 
 
 @dataclass(frozen=True)
@@ -125,28 +125,33 @@ class Rodas5P:
         }
         return {name: Program.of(outputs, inputs) for name, (outputs, inputs) in recorded.items()}
 
+    def measured(self, x: Array) -> tuple[Array, Work]:
+        """The readings (1, m) at x (1, n), and what they take; a tolerance that shows the shape will do."""
+        run = self._run(x, len(self.model.times), stretch=True)
+        k = int(np.argmax(run.stretch))
+        explicit, fastest, met = (float(a[k]) for a in (run.stretch, run.fastest, run.met))
+        return self._readings(run), Work(int(run.steps.max()), explicit, fastest, met, float(run.t.min()))
+
     def simulate(self, x: Array, stop: int) -> Array:
         """Readings (trials, cases x stop x outputs) at the first `stop` times; NaN from where a trial breaks down."""
-        return self._integrated(x, stop, sensitive=False)[0]
+        return self._readings(self._run(x, stop))
 
     def jacobian(self, x: Array, stop: int) -> Array:
         """Their derivatives by x (trials, cases x stop x outputs, n)."""
-        return self._integrated(x, stop, sensitive=True)[1]
+        J = self._run(x, stop, sensitive=True).J
+        readings = len(self.model.cases) * stop * len(self.model.outputs)
+        return J.transpose(3, 1, 0, 2).reshape(len(x), readings, self.model.n) * self.model.si_sizes
 
-    def measured(self, x: Array) -> tuple[Array, Work]:
-        """All readings, and what their integration takes; any tolerance that shows the solution's shape will do."""
-        z, _, work = self._integrated(x, len(self.model.times), sensitive=False, stretch=True)
-        return z, work
-
-    def _integrated(self, x: Array, stop: int, *, sensitive: bool, stretch: bool = False) -> tuple[Array, Array, Work]:
+    def _run(self, x: Array, stop: int, *, sensitive: bool = False, stretch: bool = False) -> _Run:
         run = _Run(self, x, stop, sensitive=sensitive, stretch=stretch)
         with np.errstate(all="ignore"):
             run.all_steps()
-        cases, outputs, trials = len(self.model.cases), len(self.model.outputs), len(x)
-        z = run.z.transpose(2, 1, 0).reshape(trials, cases * stop * outputs)
-        J = run.J.transpose(3, 1, 0, 2).reshape(trials, cases * stop * outputs, -1)
-        steps, explicit = (a.reshape(trials, cases).max(axis=1, initial=0) for a in (run.steps, run.stretch))
-        return z, J * self.model.si_sizes if sensitive else J, Work(steps, explicit)
+        return run
+
+    def _readings(self, run: _Run) -> Array:
+        outputs, stop, lanes = run.z.shape
+        cases = len(self.model.cases)
+        return run.z.transpose(2, 1, 0).reshape(lanes // cases, cases * stop * outputs)
 
 
 class _Run:
@@ -169,7 +174,8 @@ class _Run:
             self.S = _stacked(self.do["dstart"], [*self.p, *c, *self.directions], (self.q, lanes))
         self.z = np.full((len(model.outputs), stop, lanes), np.nan)
         self.J = np.full((len(model.outputs), stop, self.q, lanes), np.nan)
-        self.stretch, self.stretched = np.zeros(lanes), stretch
+        self.stretch, self.fastest, self.met = np.zeros(lanes), np.zeros(lanes), np.zeros(lanes)
+        self.stretched = stretch
 
     def all_steps(self) -> None:
         """Integrates every lane to the last time, reading on the way."""
@@ -177,7 +183,7 @@ class _Run:
         live = np.arange(len(self.t))
         while True:
             self._read(live)
-            going = (self.place[live] < len(self.times)) & (self.steps[live] < _MOST_STEPS) & np.isfinite(h[live])
+            going = (self.place[live] < len(self.times)) & (self.steps[live] < MOST_STEPS) & np.isfinite(h[live])
             live = live[going]
             if not len(live):
                 return
@@ -226,7 +232,11 @@ class _Run:
         J = _stacked(do["J"], at, (lanes,)).reshape(n, n, lanes)
         if self.stretched:
             finite = np.nan_to_num(np.moveaxis(J, 2, 0), posinf=0.0, neginf=0.0)
-            self.stretch[live] += np.abs(np.linalg.eigvals(finite)).max(axis=1) * h / _REACH
+            radius = np.abs(np.linalg.eigvals(finite)).max(axis=1)
+            self.stretch[live] += radius * h / _REACH
+            faster = live[radius > self.fastest[live]]
+            self.met[faster] = self.t[faster]
+            self.fastest[live] = np.maximum(self.fastest[live], radius)
         W = -J
         W[range(n), range(n)] += 1 / (h * GAMMA)
         exchanged = _factor(W)
