@@ -45,7 +45,7 @@ LEAST_SQUARES: list[Estimator] = [
 ]
 FILTERS: list[Estimator] = [
     *(kind(engine=e) for kind in (EKF, IteratedEKF, UKF, CKF) for e in ("filterpy", "batched")),
-    *(EnKF(members=30, engine=e) for e in ("filterpy", "batched")),
+    EnKF(members=30),
     *(RecursiveUpdate(), LMIEKF(), IPLF()),
 ]
 ALL = [*SOLVERS, *LEAST_SQUARES, *FILTERS]

@@ -176,13 +176,72 @@ def estimation() -> Iterator[Row]:
 def filters() -> Iterator[Row]:
     B = ib.baselines
     s = scenario(33.0)
-    for cls, trials in ((B.EKF, 100), (B.IteratedEKF, 100), (B.UKF, 100), (B.CKF, 100), (B.EnKF, 20)):
+    for cls, trials in ((B.EKF, 100), (B.IteratedEKF, 100), (B.UKF, 100), (B.CKF, 100)):
         z = s.draw(0, trials).z
         few = z[:10]
         (batched,) = least(lambda cls=cls, z=z: cls(engine="batched").estimate(s.problem, z), rounds=2)
         (plain,) = least(lambda cls=cls, few=few: cls().estimate(s.problem, few), rounds=1)
         beside = "filterpy, trial by trial"
         yield Row("filters", cls.__name__, 1e6 * batched / trials, "µs", beside, 1e6 * plain / len(few))
+
+
+def trackers() -> Iterator[Row]:
+    """A pendulum of 500 epochs, all trials at once, beside filterpy's filters trial by trial and epoch by epoch."""
+    from filterpy import kalman
+
+    S, step, gravity = ib.states, 0.01, 9.81
+    noise = {"angle": f"{step}*sqrt({step}/3)*v", "rate": f"sqrt(3*{step})/2*v + sqrt({step})/2*w"}
+    model = S.Formulas(
+        next={
+            "angle": f"angle + {step}*rate + {noise['angle']}",
+            "rate": f"rate - {step}*{gravity}*sin(angle) + {noise['rate']}",
+        },
+        readings={"sine": "sin(angle)"},
+        noise={"v": 0.1, "w": 0.1},
+        deviation={"sine": np.sqrt(0.1)},
+        spread={"angle": 1.0, "rate": 1.0},
+        count=500,
+        step=step,
+    )
+
+    def moved(x: Any, dt: float) -> Any:
+        return np.array([x[0] + step * x[1], x[1] - step * gravity * np.sin(x[0])])
+
+    def seen(x: Any) -> Any:
+        return np.sin(x[:1])
+
+    def prepared(other: Any, x: Any) -> Any:
+        other.x, other.P, other.Q, other.R = x, np.eye(2), model.Q(0), model.R(0)
+        return other
+
+    def extended(z: Any) -> None:
+        other = prepared(kalman.ExtendedKalmanFilter(2, 1), np.zeros(2))
+        for reading in z:
+            other.F = np.array([[1.0, step], [-step * gravity * np.cos(other.x[0]), 1.0]])
+            x = moved(other.x, step)
+            other.predict()
+            other.x = x
+            other.update(reading, lambda x: np.array([[np.cos(x[0]), 0.0]]), seen)
+
+    def unscented(z: Any) -> None:
+        points = kalman.MerweScaledSigmaPoints(2, alpha=1.0, beta=0.0, kappa=1.0)
+        other = prepared(kalman.UnscentedKalmanFilter(2, 1, step, seen, moved, points), np.zeros(2))
+        for reading in z:
+            other.predict()
+            other.update(reading)
+
+    def cubature(z: Any) -> None:
+        other = prepared(kalman.CubatureKalmanFilter(2, 1, step, seen, moved), np.zeros((2, 1)))
+        for reading in z:
+            other.predict()
+            other.update(reading[:, None])
+
+    z = model.draw(0, BATCH).z
+    for name, ours, theirs in (("EKF", S.ekf(), extended), ("UKF", S.ukf(), unscented), ("CKF", S.ckf(), cubature)):
+        (batch,) = least(lambda ours=ours: ours.track(model, z), rounds=2)
+        (plain,) = least(lambda theirs=theirs: theirs(z[0]), rounds=2)
+        what = f"{name} of states, {BATCH} trials of 500 epochs"
+        yield Row("trackers", what, 1e3 * batch / BATCH, "ms", "filterpy, trial by trial", 1e3 * plain)
 
 
 def loop() -> Iterator[Row]:
@@ -217,7 +276,7 @@ def scale() -> Iterator[Row]:
     yield Row("scale", f"{what}: on disk", many.files, "files", tenth, few.files)
 
 
-PARTS = {f.__name__: f for f in (simulation, jacobians, stiff, estimation, filters, loop)}
+PARTS = {f.__name__: f for f in (simulation, jacobians, stiff, estimation, filters, trackers, loop)}
 LONG = {"scale": scale}
 """Takes minutes: only where it is asked for."""
 

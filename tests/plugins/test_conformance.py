@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from omegaconf import OmegaConf
 
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.basics.statuses import Status
@@ -32,8 +31,7 @@ OURS = [
 
 
 def component(option: plugins.Option):
-    config = OmegaConf.to_container(OmegaConf.load(option.path), resolve=True)
-    return construct(config, option.package or option.group)
+    return construct(plugins.composed(option), option.package or option.group)
 
 
 def complaints(component) -> str:
@@ -194,6 +192,13 @@ class Kinked(CoordinatedTurn):
 
 
 @dataclass(frozen=True)
+class Unwrapped(CoordinatedTurn):
+    """Its bearing jumps."""
+
+    periods = ()
+
+
+@dataclass(frozen=True)
 class Crowded(CoordinatedTurn):
     """A state depends on the others of the stack."""
 
@@ -261,6 +266,7 @@ class Forgetful(Noise):
         (Forgetful(), "besides the stream"),
         (Kinked(), "observe is not analytic"),
         (Crowded(), "transition gives a state alone other bits"),
+        (Unwrapped(), "reading 2 jumps by 6.28: it is an angle; state its period"),
         (Shapeless(), "h has shape (1, 2), where (1, 3) belongs"),
         (Proud(), "times the reported covariance"),
         (Proud(share=1.0, leaning=1e-9), "trial 0 alone has other bits"),
