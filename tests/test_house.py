@@ -35,7 +35,7 @@ BUDGETS = {
     "baselines": 2375,
     "trials": 2386,
     "runs": 2226,
-    "statistics": 4487,
+    "statistics": 4491,
     "real": 2506,
     "plugins": 1315,
     "report": 4782,

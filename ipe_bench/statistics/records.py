@@ -105,8 +105,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "no_readings",
         "no readings",
         "further trials",
-        "Number whose true parameters the model gives no finite readings at: there is nothing to estimate from, so they"
-        " count neither for nor against an estimator, here or in any other column.",
+        "Number of trials whose true parameters give no finite readings. They count neither for nor against an"
+        " estimator in any column.",
         lambda s: len(s.unread),
         kind="count",
         where=("overview", "terminal", "all_trials"),
@@ -116,8 +116,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "converged",
         "converged",
         "all trials",
-        "Share in which the estimating equation holds within the tolerance. The other endings are named with their"
-        " messages.",
+        "Share of trials in which the estimating equation holds within the tolerance. The other endings have their own"
+        " names and messages.",
         lambda s: f.share(s.converged),
         kind="share",
         where=("all_trials",),
@@ -127,7 +127,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "solved",
         "all trials",
         f"Share that converged to the root, within {SAME_ROOT:g} standard deviations, that the same estimating equation"
-        " reaches when it is started at the truth. Filters and the linear LSE solve no equation: for them it means that"
+        " reaches if it starts at the truth. Filters and the linear LSE solve no equation; they count as solved if"
         " they finished.",
         lambda s: f.share(s.solved),
         kind="share",
@@ -148,8 +148,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "success_anytime",
         "success, any time",
         "all trials",
-        "The same share, with an interval of 95 % that stays valid however often one looks and whenever one stops: the"
-        " one for runs with `precision` (beta-binomial confidence sequence: Robbins, Ann. Math. Statist. 41, 1970;"
+        "The same share with a 95 % interval that stays valid if it is looked at repeatedly and at any time of"
+        " stopping, as runs with `precision` do (beta-binomial confidence sequence: Robbins, Ann. Math. Statist. 41,"
+        " 1970;"
         " Howard et al., Ann. Statist. 49, 2021).",
         lambda s: int(s.scalars["success"].sum()) / len(s),
         limits=lambda s: share_sequence(int(s.scalars["success"].sum()), len(s)),
@@ -159,8 +160,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "failed_known",
         "failed and known",
         "all trials",
-        "Share without success of which the estimator itself gives notice: it did not converge, its residuals fail the"
-        " test of fit, or several minima fit.",
+        "Share of trials without success that the estimator itself reports: it did not converge, its residuals fail"
+        " the test of fit, or several minima fit.",
         lambda s: f.failed(s, known=True),
         kind="share",
         where=("all_trials",),
@@ -169,7 +170,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "failed_silent",
         "failed silently",
         "all trials",
-        "Share without success that converged to residuals that fit: wrong answers that look right.",
+        "Share of trials without success that converged to residuals that fit. These answers are wrong and look right.",
         lambda s: f.failed(s, known=False),
         kind="share",
         where=("all_trials",),
@@ -178,8 +179,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "error_median",
         "median error",
         "all trials",
-        "Median of the error over the bound, sqrt(e' J' R⁻¹ J e / n) at the truth: about 1 where an estimate attains"
-        " the Cramér-Rao bound, which is that of estimators with a prior too. What is not finite counts as infinite.",
+        "Median of the error over the bound, sqrt(e' J' R⁻¹ J e / n) at the truth: about 1 if an estimate attains the"
+        " Cramér-Rao bound, which is used for estimators with a prior too. A value that is not finite counts as"
+        " infinite.",
         lambda s: quantile(f.over_bound(s), 0.5),
     ),
     Statistic(
@@ -206,8 +208,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "NEES",
         "all trials",
         "Median of e' P⁻¹ e with the covariance P that the estimator reports, over the median of chi-square with n"
-        " degrees: 1 where the covariance is right. What is not finite counts as infinite. Limits: where the median of"
-        " as many trials lies in 95 % of cases if it is right.",
+        " degrees: 1 if the covariance is right. A value that is not finite counts as infinite. Limits: 95 % of"
+        " medians over as many trials lie between them if the covariance is right.",
         f.nees_median,
         limits=f.nees_median_limits,
         where=("calibration",),
@@ -217,7 +219,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "solved_trials",
         "solved trials",
         "all trials",
-        "Number that is solved: what bias, std, rmse, bounds, efficiency and NEES are over.",
+        "Number of solved trials, over which bias, std, rmse, bounds, efficiency and NEES are computed.",
         lambda s: int(s.solved.sum()),
         kind="count",
         where=("solved_trials",),
@@ -226,7 +228,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "common_trials",
         "common trials",
         "all trials",
-        "Number that every estimator of the scenario solved.",
+        "Number of trials that every estimator of the scenario solved.",
         lambda s: int((s.solved & s.solved_by_all).sum()),
         kind="count",
     ),
@@ -234,8 +236,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "equation",
         "equation",
         "no trials: the same for all",
-        "What the estimator seeks a root of: eq. (11) with the frozen H, the least-squares or the maximum a posteriori"
-        " condition; none for filters and the linear LSE.",
+        "The equation that the estimator solves: eq. (11) with the frozen H, the least-squares condition or the"
+        " maximum a posteriori condition. Filters and the linear LSE have none.",
         lambda s: s.group.footer.get("equation") or "-",
         kind="word",
     ),
@@ -243,7 +245,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "false_root",
         "false root",
         "all trials",
-        "Share that converged and is not solved: another root of the same equation.",
+        "Share of trials that converged to another root of the same equation, so that they are not solved.",
         lambda s: f.share(s.converged & ~s.solved),
         kind="share",
         where=("solved_trials", "covariances"),
@@ -252,8 +254,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "false_root_distance",
         "false root at",
         "converged trials that are not solved",
-        "Median distance from the right root, in standard deviations of the Cramér-Rao bound, of the parameter that is"
-        " farthest off.",
+        "Median over trials of the largest distance of a parameter from the right root, in standard deviations of the"
+        " Cramér-Rao bound.",
         f.false_root_distance,
         where=("covariances",),
     ),
@@ -309,9 +311,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "effective_trials",
         "effective trials",
         "solved trials",
-        "How many equal ones would share the sum of squared errors as evenly as the trials do, (Σ e²)² / Σ e⁴ (Kish,"
-        " Survey Sampling, 1965): a third of the trials for normal errors of one parameter, one where a single trial"
-        " carries all.",
+        "Number of equal trials that would share the sum of squared errors as evenly, (Σ e²)² / Σ e⁴ (Kish,"
+        " Survey Sampling, 1965): a third of the trials for normal errors of one parameter, one if a single trial"
+        " carries the whole sum.",
         lambda s: f.squares(s).effective,
         given="solved",
         where=("parameters",),
@@ -373,9 +375,9 @@ STATISTICS: tuple[Statistic, ...] = (
         "predicted_bias",
         "bias by theory",
         "solved trials under a wrong model, else the first trials",
-        "Mean error that theory expects of least squares: under a wrong model, the distance to the parameters that come"
-        " closest to the error-free readings (Vuong, Caltech working paper 652, 1986); under the right one, the bias of"
-        " second order (Box, J. R. Stat. Soc. B 33, 1971).",
+        "Mean error of least squares by theory. Under a wrong model it is the distance to the parameters that come"
+        " closest to the error-free readings (Vuong, Caltech working paper 652, 1986); under the right one it is the"
+        " bias of second order (Box, J. R. Stat. Soc. B 33, 1971).",
         f.of_each(f.predicted_bias),
         given="solved",
         kind="physical",
@@ -385,10 +387,10 @@ STATISTICS: tuple[Statistic, ...] = (
         "predicted_rmse",
         "rmse by theory",
         "solved trials",
-        "Root mean square error that theory expects of least squares, without any noise drawn: under a wrong model, of"
-        " that distance and the asymptotic covariance A⁻¹ B A⁻¹ of least squares about it (Vuong, 1986; Richmond and"
-        " Horowitz, IEEE Trans. Signal Processing 63, 2015), which is no bound: others may err less; under the right"
-        " one, of the Cramér-Rao bound and the bias of second order.",
+        "Root mean square error of least squares by theory, without any draw of noise. Under a wrong model it combines"
+        " that distance with the asymptotic covariance A⁻¹ B A⁻¹ of least squares about it (Vuong, 1986; Richmond and"
+        " Horowitz, IEEE Trans. Signal Processing 63, 2015), which is not a bound, since another estimator may have a"
+        " smaller error; under the right one it combines the Cramér-Rao bound with the bias of second order.",
         f.of_each(f.predicted_rmse),
         given="solved",
         kind="physical",
@@ -407,7 +409,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "curvature_parameter",
         "parameter curvature",
         "the first trials",
-        "The same of the parameters' lines on that surface: how uneven they are.",
+        "The same for the parameter lines on that surface, which shows how unevenly they lie.",
         lambda s: f.median_of_truth(s, "curvature_parameter"),
         where=("theory",),
     ),
@@ -460,7 +462,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "rmse_all",
         "rmse, all",
         "all trials",
-        "Root mean square error, whatever became of the trial; infinite where one has no finite estimate.",
+        "Root mean square error over all trials; infinite if one of them has no finite estimate.",
         f.of_each(f.rmse_all),
         kind="physical",
         where=("all_trials", "parameters"),
@@ -470,7 +472,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "efficiency_all",
         "efficiency, all",
         "all trials",
-        "The same bound over the root mean square error of all trials: it lets nobody off a trial, so it compares"
+        "The same bound over the root mean square error of all trials. Because no trial is left out, it compares"
         " estimators that solve an equation with those that do not.",
         f.efficiency_all,
         where=("all_trials", "parameters"),
@@ -480,8 +482,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "median_abs_error",
         "median abs error",
         "all trials",
-        "Median of the absolute error, what is not finite counting as infinite; over all parameters, of each trial's"
-        " root mean square over parameters of error over linear bound.",
+        "Median of the absolute error, where a value that is not finite counts as infinite. Over all parameters it is"
+        " the median of the root mean square over parameters of the error over the linear bound.",
         lambda s: f.error_quantile(s, 0.5),
         kind="physical",
         where=("parameters",),
@@ -499,9 +501,10 @@ STATISTICS: tuple[Statistic, ...] = (
         "nees",
         "NEES / n, solved",
         "solved trials",
-        "Mean of e' P⁻¹ e / n with the covariance P that the estimator reports: 1 where it is right; per parameter, of"
-        " squared error over reported variance. Limits: 95 % chi-square, which honest errors keep within if they are"
-        " normal (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, sec."
+        "Mean of e' P⁻¹ e / n with the covariance P that the estimator reports: 1 if it is right. For a parameter it"
+        " is the mean of the squared error over the reported variance. Limits: 95 % of chi-square, which hold for a"
+        " right covariance and normal errors (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking"
+        " and Navigation, 2001, sec."
         " 5.4).",
         f.nees,
         limits=f.nees_limits,
@@ -514,8 +517,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "coverage95",
         "coverage",
         "all trials",
-        "Share whose truth lies inside the estimator's own 95 % ellipsoid; per parameter, interval. What is not finite"
-        " counts as not covered.",
+        "Share of trials whose truth lies inside the 95 % ellipsoid that the estimator reports, or for a parameter"
+        " inside its interval. A value that is not finite counts as not covered.",
         f.coverage,
         kind="share",
         where=("calibration", "parameters"),
@@ -537,7 +540,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "claims",
         "claims",
         "all trials",
-        "Number that converged and report a covariance: what calibration is over.",
+        "Number of trials that converged and report a covariance, over which calibration is computed.",
         f.claims,
         kind="count",
         where=("calibration",),
@@ -558,7 +561,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "calibration_excursion",
         "excursion",
         "the same trials",
-        "The largest difference between these distribution functions and the uniform one; of all, that of NEES.",
+        "The largest difference between these distribution functions and the uniform one; over all parameters, that of"
+        " NEES.",
         lambda s: [part.excursion for part in s.calibrations] if s.calibrations else np.nan,
         where=("calibration",),
     ),
