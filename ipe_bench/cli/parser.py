@@ -58,7 +58,7 @@ solver=[A,B]           iterative solvers of the estimating equation
 baseline=[A,B]         other estimators, on the same trials
 model=NAME             states that move, in place of a measurement
 tracker=[A,B]          filters and smoothers of such states; trackers.NAME.KEY=X sets an option of one
-execution=NAME         where blocks of trials are computed: in this process, on all cores, on a cluster
+execution=NAME         where blocks of trials are computed: in this process, or in several at once
 GROUP.KEY=VALUE        an option of one of these; `ipe-bench list GROUP/NAME` shows its type and default
 estimators.NAME.KEY=X  an option of a solver or a baseline that is chosen
 truth_measurement=NAME the model that simulates the readings, if estimators assume another one
