@@ -26,7 +26,7 @@ LINE = (
 )
 BUDGETS = {
     "basics": 1135,
-    "measurements": 7496,
+    "measurements": 7489,
     "noise": 624,
     "priors": 175,
     "states": 1152,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import operator
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -143,35 +143,38 @@ class _Parser:
             self.refuse(f"{token} is missing")
         self.advance()
 
-    def conditional(self, depth: int) -> Tree:
+    def deeper(self, depth: int, what: str) -> int:
         if depth > _DEEPEST:
-            self.refuse(f"parentheses are nested more than {_DEEPEST} deep")
+            self.refuse(f"{what} are nested more than {_DEEPEST} deep")
+        return depth + 1
+
+    def row(self, operators: Collection[str], operand: Callable[[int], Tree], depth: int) -> Tree:
+        """Operands with operators between them, which bind from the left."""
+        tree = operand(depth)
+        while self.token in operators:
+            tree = (self.advance(), tree, operand(depth))
+        return tree
+
+    def conditional(self, depth: int) -> Tree:
+        deeper = self.deeper(depth, "parentheses")
         tree = self.either(depth)
         if self.token != "if":
             return tree
         self.advance()
         condition = self.either(depth)
         self.expect("else")
-        return ("if", condition, tree, self.conditional(depth + 1))
+        return ("if", condition, tree, self.conditional(deeper))
 
     def either(self, depth: int) -> Tree:
-        tree = self.both(depth)
-        while self.token == "or":
-            tree = (self.advance(), tree, self.both(depth))
-        return tree
+        return self.row(["or"], self.both, depth)
 
     def both(self, depth: int) -> Tree:
-        tree = self.comparison(depth)
-        while self.token == "and":
-            tree = (self.advance(), tree, self.comparison(depth))
-        return tree
+        return self.row(["and"], self.comparison, depth)
 
     def comparison(self, depth: int) -> Tree:
         if self.token == "not":
             self.advance()
-            if depth > _DEEPEST:
-                self.refuse(f"`not` is nested more than {_DEEPEST} deep")
-            return ("==", self.comparison(depth + 1), ("number", 0.0))
+            return ("if", self.comparison(self.deeper(depth, "negations")), ("number", 0.0), ("number", 1.0))
         begin = self.begin
         tree = left = self.sum(depth)
         while self.token in COMPARISONS:
@@ -181,23 +184,15 @@ class _Parser:
         return tree
 
     def sum(self, depth: int) -> Tree:
-        tree = self.product(depth)
-        while self.token in ("+", "-"):
-            tree = (self.advance(), tree, self.product(depth))
-        return tree
+        return self.row(["+", "-"], self.product, depth)
 
     def product(self, depth: int) -> Tree:
-        tree = self.signed(depth)
-        while self.token in ("*", "/"):
-            tree = (self.advance(), tree, self.signed(depth))
-        return tree
+        return self.row(["*", "/"], self.signed, depth)
 
     def signed(self, depth: int) -> Tree:
         if self.token in ("+", "-"):
             sign = self.advance()
-            if depth > _DEEPEST:
-                self.refuse(f"signs are nested more than {_DEEPEST} deep")
-            inner = self.signed(depth + 1)
+            inner = self.signed(self.deeper(depth, "signs"))
             return ("negative", inner) if sign == "-" else inner
         return self.power(depth)
 
@@ -205,9 +200,7 @@ class _Parser:
         base = self.atom(depth)
         if self.token in ("**", "^"):
             self.advance()
-            if depth > _DEEPEST:
-                self.refuse(f"powers are nested more than {_DEEPEST} deep")
-            return ("**", base, self.signed(depth + 1))
+            return ("**", base, self.signed(self.deeper(depth, "powers")))
         return base
 
     def atom(self, depth: int) -> Tree:

@@ -13,7 +13,9 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.arithmetic import COMPARISONS, Arithmetic, Tree, names_in, parts, rewritten
+from ipe_bench.measurements.arithmetic import COMPARISONS, CONSTANTS, Arithmetic, Tree, names_in, parts, rewritten
+from ipe_bench.measurements.ode.trace import COMPARISONS as OF_COMPARISON
+from ipe_bench.measurements.ode.trace import Graph, Program, in_order, tangent
 
 _PIECEWISE = ("min", "max", "abs", *COMPARISONS)
 _SAME = 1e-12
@@ -28,7 +30,7 @@ def separated(
 
     def new(tree: Tree) -> Tree | None:
         names = set(names_in(tree)) if tree[0] in _PIECEWISE else set()
-        if "t" not in names or not names <= {"t", *constants}:
+        if "t" not in names or not names <= {"t", *constants, *CONSTANTS}:
             return None
         if tree[0] in COMPARISONS:
             return ("name", switches.setdefault(tree, f"switch {len(switches)}"))
@@ -54,16 +56,14 @@ def switching_times(comparison: Tree, cases: Sequence[Mapping[str, float]]) -> l
     _, left, right, text = comparison
     found = []
     for case in cases:
-        first, second, third = (
-            float(Arithmetic(text, ("-", left, right), ())({**case, "t": time})) for time in (0.0, 1.0, 2.0)
-        )
-        slope = second - first
-        if not abs(third - second - slope) <= 1e-9 * (abs(first) + abs(second) + abs(third)):
-            raise UserError(
-                f"rates: {text}: compare t itself with a constant, so that the moment of the switch is known"
-            )
+        t = Graph().input("t")
+        gap = t.graph.apply("add", Arithmetic(text, ("-", left, right), ())({**case, "t": t}), 0.0)
+        slope = tangent([gap], {t: t.graph.constant(1.0)})[0].value
+        if slope is None or any(e.operation in OF_COMPARISON for e in in_order([gap])):
+            remedy = "compare t itself with a constant, so that the moment of the switch is known"
+            raise UserError(f"rates: {text}: {remedy}")
         if slope:
-            found.append(-first / slope)
+            found.append(-float(Program.of([gap], [t])([0.0])[0]) / slope)
     return found
 
 
