@@ -27,7 +27,7 @@ LINE = (
 BUDGETS = {
     "basics": 1135,
     "measurements": 7489,
-    "noise": 624,
+    "noise": 626,
     "priors": 175,
     "states": 1152,
     "estimators": 1273,
@@ -35,7 +35,7 @@ BUDGETS = {
     "baselines": 2375,
     "trials": 2386,
     "runs": 2226,
-    "statistics": 4491,
+    "statistics": 4506,
     "real": 2506,
     "plugins": 1308,
     "report": 4782,

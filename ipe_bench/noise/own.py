@@ -108,6 +108,8 @@ class ModelNoise(Noise):
     A scenario never holds it: it holds what `of` makes of it.
     """
 
+    name = "model"
+
     deviation: Positive | tuple[Positive, ...] | None = None
     """Standard deviation of the readings in their unit, or one for each."""
     step: Positive | None = None

@@ -693,6 +693,15 @@ STATISTICS: tuple[Statistic, ...] = (
         where=("tracks",),
     ),
     Statistic(
+        "nis_verdict",
+        "verdict of NIS",
+        "converged trials of filters of states",
+        "The verdict on each trial's mean NIS, which needs no truth.",
+        t.nis_verdict,
+        kind="word",
+        where=("tracks",),
+    ),
+    Statistic(
         "log_likelihood",
         "log likelihood",
         "solved trials of filters of states",

@@ -15,7 +15,7 @@ import numpy as np
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics import formulas as f
 from ipe_bench.statistics.consistency import mean_limits, verdict
-from ipe_bench.statistics.sample import Sample
+from ipe_bench.statistics.sample import NIS, Sample
 from ipe_bench.trials.tracking import unpacked
 
 
@@ -61,6 +61,12 @@ def mean_score(s: Sample, name: str) -> float:
 
 def path_verdict(s: Sample) -> str:
     return verdict(s.scalars["path_nees"][s.converged], s.n) if is_track(s) else "-"
+
+
+def nis_verdict(s: Sample) -> str:
+    """By as many degrees as a trial has readings."""
+    m = int(s.group.footer["readings"])
+    return verdict(m * s.scalars[NIS][s.converged], m) if is_track(s) and NIS in s.scalars else "-"
 
 
 def curves(s: Sample) -> Iterator[dict[str, Any]]:

@@ -57,3 +57,23 @@ def test_every_command_that_composes_refuses_it(command, ipe_bench):
 def test_what_is_right_is_taken(words, ipe_bench):
     code, _, err = ipe_bench("run", *words, "--cfg", "job")
     assert (code, err) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["model=pendulum", "baseline=[ekf]"], "baseline: is of a measurement, and model= chooses states that move"),
+        (["model=pendulum", "error_scale=3"], "error_scale: is of a measurement, and model= chooses states that move"),
+        (["measurement=polynomial", "tracker=[ekf]"], "tracker: goes with model=NAME"),
+        (["model=pendulum", "tracker=[newton]"], "tracker=newton: newton is no tracker but a solver"),
+        (["model=pendulum", "trackers.ukf.iterations=0"], "trackers.ukf.iterations=0: give a whole number above 0"),
+        (["model=pendulum", "trackers.bootstrap.particles=5"], "trackers.bootstrap.particles: is set, but bootstrap"),
+        (["model=growth", "model.next.state=x"], "model.next.state: there is no such name"),
+        (["model=pendulum_book", "trials=2"], "trials=2: certified readings are one trial"),
+    ],
+)
+def test_what_does_not_go_with_a_state_model_is_refused(words, complaint, ipe_bench):
+    code, _, err = ipe_bench("run", *words, "output=out")
+    assert code == 2
+    assert err.splitlines()[-1].startswith(f"ipe-bench: {complaint}")
+    assert not list(Path().rglob("*.parquet"))

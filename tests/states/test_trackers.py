@@ -16,6 +16,7 @@ from filterpy.kalman import (
 )
 from python_models import ConstantVelocity, Growth, Pendulum
 from scipy.optimize import least_squares
+from scipy.optimize._numdiff import approx_derivative
 from walking_gins import WalkingGins
 
 import ipe_bench as ib
@@ -297,6 +298,32 @@ def test_the_bounds_of_a_linear_model_are_its_covariances():
     np.testing.assert_allclose(filtered, ekf().track(model, paths.z).covariance[0], rtol=1e-9)
     np.testing.assert_allclose(smoothed, Smoother(ekf()).track(model, paths.z).covariance[0], rtol=1e-9)
     np.testing.assert_allclose(bound_at_truth(model, paths)[2], filtered, rtol=1e-9)
+
+
+@pytest.mark.parametrize("model", [Pendulum(count=12), Growth(count=12)], ids=lambda model: model.name)
+def test_the_posterior_bound_is_the_inverse_of_the_information_of_whole_paths(model):
+    """The second derivatives of the log density, one matrix for all epochs up to each, by differences of slopes."""
+    paths, n = model.draw(0, 40), model.n
+    filtered, smoothed = posterior_bounds(model, paths)
+    path = np.concatenate([paths.start[:, None], paths.x], axis=1)
+    for upto in (1, 5, 12):
+        total = np.zeros((n * (upto + 1), n * (upto + 1)))
+        total[:n, :n] = np.linalg.inv(model.prior.covariance)
+        for k in range(upto):
+            here, there = slice(n * k, n * (k + 1)), slice(n * (k + 1), n * (k + 2))
+            Q, R = np.linalg.inv(model.Q(k)), np.linalg.inv(model.R(k))
+            for before, after in zip(path[:, k], path[:, k + 1], strict=True):
+                F = approx_derivative(lambda x, k=k: model.transition(x, k), before, method="cs").reshape(n, n)
+                H = approx_derivative(lambda x, k=k: model.observe(x, k), after, method="cs").reshape(-1, n)
+                D = np.hstack([-F, np.eye(n)])
+                rows = np.r_[here, there]
+                total[np.ix_(rows, rows)] += D.T @ Q @ D / len(path)
+                total[there, there] += H.T @ R @ H / len(path)
+        P = np.linalg.inv(total)
+        np.testing.assert_allclose(filtered[upto - 1], P[-n:, -n:], rtol=1e-6)
+    for k in range(12):
+        block = slice(n * (k + 1), n * (k + 2))
+        np.testing.assert_allclose(smoothed[k], P[block, block], rtol=1e-6)
 
 
 def test_a_path_without_a_density_has_no_posterior_bound():
