@@ -39,7 +39,7 @@ BUDGETS = {
     "real": 2506,
     "plugins": 1308,
     "report": 4782,
-    "cli": 2926,
+    "cli": 2921,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""
 PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}

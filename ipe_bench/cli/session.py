@@ -229,7 +229,6 @@ def _no_such_key(name: str) -> str:
     return f"{name}: {unknown(key, known, 'key')}"
 
 
-_KINDS = {"Integer": "a whole number", "Float": "a number", "Boolean": "true or false"}
 _EXPLAINED: tuple[tuple[str, Callable[..., str]], ...] = (
     (r"Could not (?:find|load) '([^']+)'", _no_such_option),
     (r"Could not override '([^']+)'", _no_such_key),
@@ -237,10 +236,6 @@ _EXPLAINED: tuple[tuple[str, Callable[..., str]], ...] = (
     (
         r"Error merging override (\S+)\s+Invalid value '([^']+)', expected one of \[([^]]+)\]",
         lambda word, value, choices: f"{word}: {value} cannot be chosen (there are: {choices})",
-    ),
-    (
-        r"Value '(.*)' of type '[^']*' could not be converted to (\w+)[\s\S]*?full_key: (\S+)",
-        lambda value, kind, key: f"{key}={value}: give {_KINDS.get(kind, kind)}",
     ),
     (
         r"Interpolation key '([^']+)' not found\s+full_key: (\S+)",

@@ -362,7 +362,7 @@ def _swept(override: Override) -> list[Override]:
     except (HydraException, ValueError, ArithmeticError, TypeError):
         values = []
     if not 0 < len(values) <= MOST_JOBS:
-        raise UserError(f"{said(override)}: is a sweep of 1 to {MOST_JOBS} finite values; give fewer, or any")
+        raise UserError(f"{said(override)}: has no value, or too many; give 1 to {MOST_JOBS} finite values")
     return [OverridesParser.create().parse_override(f"{override.get_key_element()}={value}") for value in values]
 
 

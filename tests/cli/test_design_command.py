@@ -26,7 +26,7 @@ def test_tables_and_files_say_the_same(command, tmp_path):
         rows = [row for row in csv.DictReader(file) if row["choice"] == "sharpest"]
     assert [float(row["time"]) for row in rows] == [pytest.approx(unit[0]) for unit in way["sharpest"]["units"]]
     assert len(rows) == way["sharpest"]["readings"] == 20
-    assert all((folder / name).stat().st_size > 5000 for name in ("design.png", "design.pdf"))
+    assert {path.name for path in folder.iterdir()} == {"design.json", "readings.csv", "design.html"}
     # The same command writes there again, another one elsewhere.
     assert command(*SMALL, "--readings", "20")[0] == 0
     assert not (tmp_path / "outputs" / "design-polynomial-2").exists()
