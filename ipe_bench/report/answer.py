@@ -148,7 +148,7 @@ def _estimates(answer: Answer) -> Table:
             failing = "MISFIT" if one.status is Status.CONVERGED else one.status.label.replace("_", " ").upper()
             cells = [f"({value:.4g})" if math.isfinite(value) else "-" for value in one.x]
             columns.append(texts(f"{one.label}: {failing}", cells))
-    return Table("estimates", f"{answer.name}: estimate ± standard error", "", columns, repeated=2)
+    return Table("estimates", f"{answer.name}: estimate ± standard error", "", columns)
 
 
 def with_error(value: float, error: float) -> str:
@@ -287,7 +287,7 @@ def _intervals(found: Examination) -> Table:
     ]
     prior = " with its prior" if found.with_prior else ""
     title = f"{100 * CONFIDENCE:.0f} % intervals of {found.label}{prior}, by three ways"
-    return Table("intervals", title, "", columns, repeated=2)
+    return Table("intervals", title, "", columns)
 
 
 def _interval(low: float, high: float) -> str:

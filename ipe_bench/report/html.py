@@ -36,48 +36,31 @@ def render_page(
     from markupsafe import Markup
 
     collection, runs = analysis.collection, _runs(analysis.collection.runs)
-    main, appendix = ([table for table in tables if table.appendix is last] for last in (False, True))
-    nothing_failed = analysis.endings.empty and not analysis.summary.empty
-    # The first figure, or else the first chart, opens the page.
-    sections = {
-        "explore": ("Explore", len(charts) > (not figures)),
-        "figures": ("Figures", len(figures) > 1),
-        "tables": ("Tables", len(main) > 1 or nothing_failed),
-        **{f"section-{section.name}": (section.title, True) for section in written},
-        "appendix": ("Further tables", bool(appendix)),
-        "provenance": ("Configuration and provenance", True),
-        "definitions": ("Definitions", True),
-        "cite": ("How to cite", True),
-    }
     commands = dict.fromkeys(run["command"] for run in runs if run["command"] not in (_PYTHON, _UNKNOWN))
     templates = resources.files("ipe_bench.report") / "templates"
     script, style = ((templates / name).read_text(encoding="utf-8") for name in ("report.js", "report.css"))
-    return (
-        environment()
-        .get_template("report.html.j2")
-        .render(
-            version=__version__,
-            script=Markup(script),
-            style=Markup(style),
-            policy=_policy(script, style),
-            about=about(analysis),
-            headline=headline(analysis),
-            collection=collection,
-            title=", ".join(d.resolve().name or str(d) for d in collection.directories),
-            computed=_minute(collection.runs[-1].started) if collection.runs else "",
-            commands=list(commands)[:MOST_COMMANDS],
-            sections=[(name, title) for name, (title, there) in sections.items() if there],
-            tables=main,
-            written=written,
-            appendix=appendix,
-            figures=[_picture(figure) for figure in figures],
-            charts=charts,
-            nothing_failed=nothing_failed,
-            runs=runs[:MOST_RUNS],
-            older_runs=max(0, len(runs) - MOST_RUNS),
-            citation=CITATION,
-            definitions=definitions(),
-        )
+    page = environment().get_template("report.html.j2")
+    return page.render(
+        version=__version__,
+        script=Markup(script),
+        style=Markup(style),
+        policy=_policy(script, style),
+        about=about(analysis),
+        headline=headline(analysis),
+        collection=collection,
+        title=", ".join(d.resolve().name or str(d) for d in collection.directories),
+        computed=_minute(collection.runs[-1].started) if collection.runs else "",
+        commands=list(commands)[:MOST_COMMANDS],
+        tables=[table for table in tables if not table.appendix],
+        written=written,
+        appendix=[table for table in tables if table.appendix],
+        figures=[_picture(figure) for figure in figures],
+        charts=charts,
+        nothing_failed=analysis.endings.empty and not analysis.summary.empty,
+        runs=runs[:MOST_RUNS],
+        older_runs=max(0, len(runs) - MOST_RUNS),
+        citation=CITATION,
+        definitions=definitions(),
     )
 
 

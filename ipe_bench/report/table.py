@@ -68,9 +68,6 @@ class Table:
     notes: Sequence[str] = ()
     grouped: int = 0
     """Number of leading columns whose texts make a group of rows: a terminal shows them once a group."""
-    repeated: int = 1
-    """Number of leading columns that a terminal repeats when it shows the others in several tables, one below the
-    other."""
     whole: str = ""
     """The file that has the columns for which a terminal has no room: they are named and not shown below."""
 
@@ -142,7 +139,7 @@ def terminal(parts: Iterable[Part], width: int) -> Group:
         if part.title:
             shown += [Text()] if shown and isinstance(shown[-1], Text) else []
             shown.append(Text(part.title, style="bold"))
-        kept, notes = max(part.repeated, part.naming + 1), [text for text in (part.caption, *part.notes) if text]
+        kept, notes = part.naming + 1, [text for text in (part.caption, *part.notes) if text]
         head, rest = list(part.columns[:kept]), list(part.columns[kept:])
         while True:
             count = min(1, len(rest))

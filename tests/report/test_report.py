@@ -260,7 +260,7 @@ def test_what_a_terminal_has_no_room_for_is_named_with_its_file_or_goes_below():
     head = next(line for line in left if "estimator" in line)
     assert re.findall(r"value \d", head) + named == [f"value {i}" for i in range(9)]
     assert sum(line.split()[:1] == ["one"] for line in left) == 1  # once a group
-    below = shown_at(60, replace(Table("t", "T", "", columns), repeated=1))
+    below = shown_at(60, replace(Table("t", "T", "", columns)))
     assert sum("estimator" in line for line in below) > 1
     assert re.findall(r"value \d", " ".join(below)) == [f"value {i}" for i in range(9)]
     assert max(map(len, left + below)) <= 60

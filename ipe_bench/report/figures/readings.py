@@ -83,7 +83,8 @@ def _abscissa(model: Measurement) -> tuple[Array, str]:
     """Where each reading (m,) stands along the axis: at its time if there is such a column, else in its row."""
     for name, column in model.index.items():
         values = np.asarray(column)
-        if np.issubdtype(values.dtype, np.number) and np.ptp(values) > 0 and (np.diff(values) >= 0).all():
+        several = 3 * len(set(column)) < model.m  # many readings at one number, such as a case's
+        if np.issubdtype(values.dtype, np.number) and not several and (np.diff(values) >= 0).all():
             return values.astype(float), name
     return np.arange(1.0, model.m + 1), "reading"
 
