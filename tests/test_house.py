@@ -29,7 +29,7 @@ BUDGETS = {
     "measurements": 7489,
     "noise": 626,
     "priors": 175,
-    "states": 1152,
+    "states": 1053,
     "estimators": 1273,
     "solvers": 1250,
     "baselines": 2375,

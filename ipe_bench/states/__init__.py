@@ -4,7 +4,6 @@ from ipe_bench.states.base import Gaussian, Paths, StateModel
 from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
 from ipe_bench.states.formulas import Formulas, Recorded
 from ipe_bench.states.linearisation import Cubature, GaussHermite, SigmaPoints, Taylor, Unscented
-from ipe_bench.states.models import CoordinatedTurn
 from ipe_bench.states.trackers import (
     Bootstrap,
     Filter,
@@ -14,14 +13,11 @@ from ipe_bench.states.trackers import (
     Tracks,
     ckf,
     ekf,
-    ghkf,
-    iplf,
     ukf,
 )
 
 __all__ = [
     "Bootstrap",
-    "CoordinatedTurn",
     "Cubature",
     "Filter",
     "Formulas",
@@ -40,8 +36,6 @@ __all__ = [
     "bound_at_truth",
     "ckf",
     "ekf",
-    "ghkf",
-    "iplf",
     "posterior_bounds",
     "ukf",
 ]

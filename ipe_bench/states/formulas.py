@@ -12,17 +12,17 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Count, Positive
 from ipe_bench.measurements.arithmetic import Arithmetic, read, require_finite
 from ipe_bench.measurements.base import Parameter, differentiate
-from ipe_bench.states.base import Gaussian, Paths
-from ipe_bench.states.models import Steady
+from ipe_bench.states.base import Gaussian, Paths, StateModel
 
 _OTHER_PLACES = 0.0, 0.7, -1.3
 """Multiples of the prior's deviations at which the gain of the process noise has to be the same."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Formulas(Steady):
+class Formulas(StateModel):
     """States whose next values, and readings, are formulas of the states, constants, the number k of the epoch from 1
     on, and its time t in s; the transition may contain the names of the process noise, with constant factors.
 
@@ -47,6 +47,10 @@ class Formulas(Steady):
     """Units of states."""
     period: Mapping[str, float] = field(default_factory=dict)
     """Periods of readings that come round, such as 6.283185307 of a bearing in rad."""
+    count: Count = 100
+    """K, the number of epochs, the first of them a step after the prior."""
+    step: Positive = 1.0
+    """Seconds between epochs."""
     title: str = "formulas"
     """The name of the model in tables."""
 
@@ -93,6 +97,10 @@ class Formulas(Steady):
     @cached_property
     def _readings(self) -> dict[str, Arithmetic]:
         return {name: read(text, f"readings.{name}") for name, text in self.readings.items()}
+
+    @property
+    def times(self) -> Array:
+        return self.step * np.arange(1, self.count + 1)
 
     @property
     def states(self) -> tuple[Parameter, ...]:

@@ -19,7 +19,7 @@ from ipe_bench.basics.options import Component, Count, NonNegative
 from ipe_bench.basics.streams import own_generators
 from ipe_bench.states.algebra import divide, factor, lower_solve, mahalanobis, root, symmetric, transposed, upper_solve
 from ipe_bench.states.base import Gaussian, StateModel
-from ipe_bench.states.linearisation import Affine, Cubature, GaussHermite, Rule, Taylor, Unscented
+from ipe_bench.states.linearisation import Affine, Cubature, Rule, Taylor, Unscented
 
 _HALVINGS = 12
 """Halvings of a damped step."""
@@ -374,13 +374,3 @@ def ukf(kappa: float | None = None) -> Filter:
 def ckf() -> Filter:
     """The cubature Kalman filter, which draws its points again after the prediction."""
     return Filter(Cubature())
-
-
-def ghkf(order: int = 5) -> Filter:
-    """The Gauss-Hermite Kalman filter."""
-    return Filter(GaussHermite(order))
-
-
-def iplf(order: int = 3, iterations: int = 10) -> Filter:
-    """The iterated posterior linearisation filter."""
-    return Filter(GaussHermite(order), iterations)

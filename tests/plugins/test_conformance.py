@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from state_models import CoordinatedTurn
 
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.basics.statuses import Status
@@ -19,7 +20,7 @@ from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.plugins.construct import construct
 from ipe_bench.solvers import IPE, Newton, State
-from ipe_bench.states import CoordinatedTurn, Filter
+from ipe_bench.states import Filter
 
 GROUPS = ("measurement", "noise", "prior", "solver", "baseline", "model", "tracker")
 OURS = [

@@ -14,9 +14,9 @@ from filterpy.kalman import (
     UnscentedKalmanFilter,
     spherical_radial_sigmas,
 )
-from python_models import ConstantVelocity, Growth, Pendulum
 from scipy.optimize import least_squares
 from scipy.optimize._numdiff import approx_derivative
+from state_models import ConstantVelocity, CoordinatedTurn, Growth, Pendulum
 from walking_gins import WalkingGins
 
 import ipe_bench as ib
@@ -24,7 +24,6 @@ import ipe_bench.states
 from ipe_bench.measurements import Gins, Parameter
 from ipe_bench.states import (
     Bootstrap,
-    CoordinatedTurn,
     Cubature,
     Filter,
     GaussHermite,
