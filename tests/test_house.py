@@ -26,7 +26,7 @@ LINE = (
 )
 BUDGETS = {
     "basics": 1135,
-    "measurements": 7489,
+    "measurements": 7477,
     "noise": 626,
     "priors": 175,
     "states": 1053,

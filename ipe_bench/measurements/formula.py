@@ -23,7 +23,6 @@ from ipe_bench.measurements.arithmetic import (
     require_finite,
     require_parameters,
 )
-from ipe_bench.measurements.base import Input
 from ipe_bench.measurements.ode.trace import Graph, Program, tangent
 from ipe_bench.measurements.written import WrittenModel
 
@@ -75,16 +74,11 @@ class Formula(WrittenModel):
     def arithmetic(self) -> Arithmetic:
         return read(self.expression, "expression")
 
-    reading_name = property(lambda model: model.reading)  # type: ignore[assignment]
     own_parameters = property(lambda model: model.own)  # type: ignore[assignment]
 
     @cached_property
-    def inputs(self) -> tuple[Input, ...]:
-        return tuple(Input(name) for name in self.arithmetic.names if name not in self.start)
-
-    @property
-    def input_columns(self) -> Mapping[str, Sequence[Any]]:
-        return {i.heading: self._column(i.heading).tolist() for i in self.inputs}
+    def headings(self) -> tuple[str, ...]:
+        return tuple(name for name in self.arithmetic.names if name not in self.start)
 
     @property
     def input_columns_known(self) -> bool:
@@ -93,19 +87,11 @@ class Formula(WrittenModel):
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Formula:
         return replace(self, columns=dict(columns), readings=readings)
 
-    def _column(self, name: str) -> Array:
-        if name not in self.columns:
-            raise UserError(
-                f"measurement.expression: {name} is neither a column nor a parameter; give a parameter its start, "
-                f"measurement.start.{name}=VALUE, or the column, by readings=FILE or measurement.columns.{name}=[...]"
-            )
-        return np.asarray(self.columns[name], dtype=float)
-
     @cached_property
     def m(self) -> int:
         if self.readings is not None:
             return self.readings
-        return len(self._column(self.inputs[0].heading)) if self.inputs else 0
+        return len(self.column(self.headings[0])) if self.headings else 0
 
     @cached_property
     def _recorded(self) -> tuple[Program, Program]:
@@ -124,7 +110,7 @@ class Formula(WrittenModel):
 
     def _values(self, x: Array) -> list[Array]:
         p = dict(zip(self.start, (x * self.sizes).T[:, :, None], strict=True))
-        return [p[name] if name in p else self._column(name)[None] for name in self.arithmetic.names]
+        return [p[name] if name in p else self.column(name)[None] for name in self.arithmetic.names]
 
     def remarks(self, x: Array) -> tuple[str, ...]:
         """Which conditionals never switch at x."""

@@ -20,7 +20,7 @@ from ipe_bench.basics.errors import UserError, describe_exception, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Finite, Positive
 from ipe_bench.measurements.arithmetic import require_parameters
-from ipe_bench.measurements.base import Input, differentiate
+from ipe_bench.measurements.base import differentiate
 from ipe_bench.measurements.written import WrittenModel
 
 _CHUNK = 8
@@ -81,9 +81,9 @@ class Function(WrittenModel):
                 f"start: {self.of} has no parameter; give an argument a number as default, or start.NAME=VALUE "
                 f"(its arguments are {', '.join(arguments) or 'none'})"
             )
-        if self.time and self.time not in self._headings:
-            raise UserError(f"time={self.time}: {unknown(self.time, self._headings, 'column')}")
-        if self.columns and (absent := [name for name in self._headings if name not in self.columns]):
+        if self.time and self.time not in self.headings:
+            raise UserError(f"time={self.time}: {unknown(self.time, self.headings, 'column')}")
+        if self.columns and (absent := [name for name in self.headings if name not in self.columns]):
             raise UserError(
                 f"columns: {absent[0]} is missing; give columns.{absent[0]}=[...], or start.{absent[0]}=VALUE"
             )
@@ -147,8 +147,7 @@ class Function(WrittenModel):
         return found
 
     @cached_property
-    def _headings(self) -> tuple[str, ...]:
-        """The columns of the readings, in the order of the signature."""
+    def headings(self) -> tuple[str, ...]:
         return tuple(name for name in self._signature if name not in self.starts and name not in self._keywords)
 
     @cached_property
@@ -162,48 +161,30 @@ class Function(WrittenModel):
         return {name: found[0] for name, found in texts.items() if found} | dict(self.units)
 
     @property
-    def reading_name(self) -> str:
-        return self.reading
-
-    @property
-    def inputs(self) -> tuple[Input, ...]:
-        return tuple(Input(name) for name in self._headings)
-
-    @property
-    def input_columns(self) -> Mapping[str, Sequence[Any]]:
-        return {name: [float(value) for value in self.columns[name]] for name in self._headings}
-
-    @property
     def input_columns_known(self) -> bool:
-        return bool(self.columns) or not self._headings
+        return bool(self.columns) or not self.headings
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Function:
-        return replace(self, columns={name: tuple(map(float, columns[name])) for name in self._headings})
+        return replace(self, columns={name: tuple(map(float, columns[name])) for name in self.headings})
 
     @cached_property
     def m(self) -> int:
-        if not self._headings:
+        if not self.headings:
             return len(self._checked(self._at(self.starts.values()), None))
-        if not self.columns:
-            wanted = self._headings[0]
-            raise UserError(
-                f"measurement.columns: {self.of} takes {', '.join(self._headings)} of each reading; give readings=FILE "
-                f"with these columns, or measurement.columns.{wanted}=[...]"
-            )
-        return len(self.columns[self._headings[0]])
+        return len(self.column(self.headings[0]))
 
     @cached_property
     def epochs(self) -> tuple[NDArray[np.intp], ...] | None:
-        chosen = next((name for name in _TIMES if name in self._headings), "") if self.time is None else self.time
+        chosen = next((name for name in _TIMES if name in self.headings), "") if self.time is None else self.time
         if not chosen:
             return None
-        times = np.asarray(self.columns[chosen], dtype=float)
+        times = self.column(chosen)
         return tuple(np.flatnonzero(times == time) for time in np.unique(times))
 
     @cached_property
     def _known(self) -> dict[str, Any]:
         """The arguments that are not parameters: columns as arrays (m,), and constants."""
-        return {name: np.asarray(self.columns[name], dtype=float) for name in self._headings} | dict(self.constants)
+        return {name: self.column(name) for name in self.headings} | dict(self.constants)
 
     def _at(self, values: Any) -> Any:
         """h where the parameters have these values (n,), in their own units."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.base import Measurement, Parameter
+from ipe_bench.measurements.base import Input, Measurement, Parameter
 
 
 class WrittenModel(Measurement):
@@ -25,7 +25,12 @@ class WrittenModel(Measurement):
     size: Mapping[str, float] = {}
     units: Mapping[str, str] = {}
 
+    headings: tuple[str, ...]
+    """The names of the columns that it takes from the readings."""
+    reading: str
+
     reading_unit = property(lambda model: model.unit)  # type: ignore[assignment]
+    reading_name = property(lambda model: model.reading)  # type: ignore[assignment]
 
     @cached_property
     def starts(self) -> dict[str, float]:
@@ -44,6 +49,22 @@ class WrittenModel(Measurement):
     @cached_property
     def nominal(self) -> Array:
         return np.array(list(self.starts.values())) / self.sizes
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        return tuple(map(Input, self.headings))
+
+    @property
+    def input_columns(self) -> Mapping[str, Sequence[Any]]:
+        return {name: self.column(name).tolist() for name in self.headings}
+
+    def column(self, name: str) -> Array:
+        if name not in self.columns:
+            raise UserError(
+                f"measurement: {name} is neither a column nor a parameter; give a parameter its start, "
+                f"measurement.start.{name}=VALUE, or the column, by readings=FILE or measurement.columns.{name}=[...]"
+            )
+        return np.asarray(self.columns[name], dtype=float)
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
