@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import inspect
 import math
 import numbers
 import types
@@ -50,10 +51,11 @@ class Component:
 
     def __new__(cls, *_: Any, **options: Any) -> Self:
         """Refuses an option that the class does not have, with those that it has."""
-        known = {f.name for f in dataclasses.fields(cls) if f.init} if dataclasses.is_dataclass(cls) else options
-        if not options.keys() <= known:
-            name = next(name for name in options if name not in known)
-            raise UserError(f"{cls.__name__}: {name}=: {unknown(name, known, 'option')}")
+        takes = inspect.signature(cls.__init__).parameters.values()
+        known = [one.name for one in takes if one.kind is one.POSITIONAL_OR_KEYWORD or one.kind is one.KEYWORD_ONLY][1:]
+        if not any(one.kind is one.VAR_KEYWORD for one in takes):
+            for name in options.keys() - set(known):
+                raise UserError(f"{cls.__name__}: {name}=: {unknown(name, known, 'option')}")
         return super().__new__(cls)
 
     def __post_init__(self) -> None:

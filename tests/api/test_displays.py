@@ -45,7 +45,7 @@ def test_trials_and_figures_are_those_of_the_folder_which_goes_with_the_last_fra
     monkeypatch.setattr(figures, "FIGURES", ("errors", "costs"))
     kept = ib.run(BENCH, ESTIMATORS, trials=20, output=tmp_path / "kept")
     pd.testing.assert_frame_equal(kept.trials, ib.load(tmp_path / "kept"))
-    result = kept.report()
+    result = kept.report(figures="all")
     assert list(kept.figures) == [path.stem for path in result.figures]
     headline = table.figures["headline"]
     assert isinstance(headline, Figure)
@@ -101,3 +101,17 @@ def test_a_wrong_argument_is_answered_in_one_sentence(call, said):
         call()
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+class Scaled(ib.noise.Gaussian):
+    """A plain subclass whose constructor takes something else."""
+
+    def __init__(self, *, hundredths: float) -> None:
+        super().__init__(hundredths / 100)
+
+
+def test_a_subclass_may_have_a_constructor_of_its_own():
+    assert Scaled(hundredths=3.0).deviation == 0.03
+    assert copy.deepcopy(Scaled(hundredths=3.0)).deviation == 0.03
+    with pytest.raises(ib.UserError, match="deviation=: there is no such option"):
+        Scaled(deviation=0.03)
