@@ -69,22 +69,17 @@ class Formulas(StateModel):
                 for name in formula.names:
                     if name not in names:
                         raise UserError(f"{key}.{label}: {unknown(name, names, 'name')}")
-        of_states, of_readings = set(self.next), set(self.readings)
-        for key, owners, whole in (
-            ("deviation", of_readings, True),
-            ("period", of_readings, False),
-            ("spread", of_states, True),
-            ("start", of_states, False),
-            ("noise", set(self.noise), False),
-            ("constants", set(self.constants), False),
-        ):
-            for label, value in getattr(self, key).items():
+        owners = {"deviation": self.readings, "period": self.readings, "spread": self.next, "start": self.next}
+        owners |= {"noise": self.noise, "constants": self.constants}
+        for key, labels in owners.items():
+            given = getattr(self, key)
+            for label, value in given.items():
                 require_finite(f"{key}.{label}", value)
-                if label not in owners:
-                    raise UserError(f"{key}.{label}: {unknown(label, owners, 'name')}")
-                if value < 0 and key in ("deviation", "spread", "noise"):
+                if label not in labels:
+                    raise UserError(f"{key}.{label}: {unknown(label, labels, 'name')}")
+                if value < 0 and key not in ("start", "constants"):
                     raise UserError(f"{key}.{label}={value}: give 0 or a number above")
-            if whole and (absent := owners - set(getattr(self, key))):
+            if key in ("deviation", "spread") and (absent := set(labels) - set(given)):
                 raise UserError(f"{key}.{min(absent)}: is not given; give it a value")
         gains = [self._gain_at(multiple) for multiple in _OTHER_PLACES]
         if not all(np.allclose(gain, gains[0], rtol=1e-9, atol=0) for gain in gains):

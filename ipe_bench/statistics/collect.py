@@ -89,6 +89,7 @@ def trials_frame(collection: Collection) -> pd.DataFrame:
             rows = rows.merge(pd.DataFrame(known), on="trial", how="left") if known else rows
             belongs = {name: cell.names[name] for name in NAMES} | dict(group.columns) | dict(group.options)
             rows.insert(0, "trial", rows.pop("trial"))
+            rows = rows.loc[:, ~rows.columns.str.startswith("curves")]  # sums over trials, and no trial's
             parts.append(pd.concat([pd.DataFrame(belongs, index=rows.index), rows], axis=1))
     if not parts:
         return pd.DataFrame(columns=[*NAMES, "trial"])

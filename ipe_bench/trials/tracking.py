@@ -106,10 +106,6 @@ class PathBlock:
         return len(self.paths.x)
 
     @property
-    def numbers(self) -> Array:
-        return np.arange(self.start, self.start + len(self))
-
-    @property
     def names(self) -> list[str]:
         return [p.name for p in self.scenario.model.states]
 
@@ -155,7 +151,7 @@ class PathBlock:
             curves = np.stack([np.diagonal(P, axis1=1, axis2=2) for P in (filtered, smoothed)])
         sums = [self.variances.sum(axis=0), np.full((model.epochs, 1), len(self)), *curves]
         return {
-            "trial": self.numbers,
+            "trial": np.arange(self.start, self.start + len(self)),
             **by_parameter("x", names, self.paths.x[:, -1]),
             **by_parameter("bayes", names, np.sqrt(self.variances[:, -1])),
             **by_parameter("path_bound", names, np.sqrt(self.variances.mean(axis=1))),
@@ -204,7 +200,7 @@ class PathBlock:
         sums = [part.sum(axis=0) for part in [*sums, tracks.degrees[converged, :, None]]]
         kept = converged & (distance <= chdtri(n, GATE))
         columns = {
-            "trial": self.numbers,
+            "trial": np.arange(self.start, self.start + len(self)),
             **by_parameter("error", self.names, e[:, -1]),
             **by_parameter("deviation", self.names, deviations(P[:, -1])),
             **by_parameter("path", self.names, np.sqrt(np.mean(e**2, axis=1))),
