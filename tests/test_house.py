@@ -38,7 +38,7 @@ BUDGETS = {
     "statistics": 4507,
     "real": 2506,
     "plugins": 1308,
-    "report": 4763,
+    "report": 4776,
     "cli": 2921,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""

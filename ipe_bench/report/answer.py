@@ -197,8 +197,9 @@ def _verdicts(answer: Answer) -> Table:
 def _notes(answer: Answer) -> Iterator[str]:
     fits = answer.fits
     yield (
-        f"fits: p of chi-square is at least {FIT_LEVEL:g}. white p: Ljung-Box; small where successive residuals"
-        " resemble each other. deviation: of the residuals, in the readings' unit."
+        f"An estimate fits if p of chi-square is at least {FIT_LEVEL:g}. white p is that of the Ljung-Box test; it is"
+        " small if successive residuals resemble each other. deviation is the standard deviation of the residuals, in"
+        " the unit of the readings."
     )
     yield from (f"{one.label}: {one.message}" for one in fits if one.message)
     for one in fits:
@@ -215,16 +216,17 @@ def _notes(answer: Answer) -> Iterator[str]:
             )
     if any(one.levels for one in fits):
         yield (
-            "The levels of the noise are estimated with the parameters by restricted maximum likelihood: they make"
-            " chi-square the degrees of freedom, so the size of the residuals cannot test the model. What can: white p,"
-            " outliers, the levels beside each other and beside what is known of the instruments."
+            "The noise levels are estimated with the parameters by restricted maximum likelihood. They make chi-square"
+            " equal to the degrees of freedom, so the size of the residuals cannot test the model. Three things can:"
+            " white p, outliers, and a comparison of the levels with each other and with what is known of the"
+            " instruments."
         )
         if known := [one.label for one in fits if one.estimated and not one.estimated.maximal]:
             yield f"{', '.join(known)}: takes the levels for known, which are those of its own residuals."
     elif any(one.level is not None for one in fits):
         yield (
-            "The level of the noise is estimated from the residuals: standard errors are scaled by it, intervals are"
-            " those of Student's t, and the size of the residuals cannot test the model."
+            "The noise level is estimated from the residuals. Standard errors are scaled by it, intervals are those of"
+            " Student's t, and the size of the residuals cannot test the model."
         )
     if suspect := [one.label for one in fits if one.level is not None and one.whiteness.p_value < FIT_LEVEL]:
         yield (
@@ -307,7 +309,7 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
     if not found.least:
         best = found.minima[0]
         yield (
-            f"NOT THE LEAST MINIMUM: chi-square is {best.chi_square:.5g} at {at(best.x)}; start there, or choose an"
+            f"NOT THE GLOBAL MINIMUM: chi-square is {best.chi_square:.5g} at {at(best.x)}; start there, or choose an"
             " estimator that searches, such as multiscale_lm."
         )
     for one in found.ambiguous[:_MOST_MINIMA]:
@@ -325,8 +327,8 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
         )
     if found.with_prior:
         yield (
-            f"Intervals of {found.label} count the prior as further readings: profiles are of the penalised likelihood,"
-            " and the bootstrap draws the prior's means, too."
+            f"Intervals of {found.label} treat the prior as further readings: profiles use the penalised likelihood,"
+            " and the bootstrap also draws the means of the prior."
         )
     if len(names) > 1:
         # Components count by what they are in standard errors.

@@ -23,8 +23,9 @@ def contents(found: Audit) -> list[Part]:
     ]
     runs, left_out = found.claims.runs, found.claims.left_out
     notes = [
-        "true over reported: root mean square of errors in reported standard deviations, 1 if the report is right; "
-        "bias: their mean. Intervals hold for all parameters together, and for heavy tails."
+        "true over reported is the root mean square of errors in reported standard deviations, 1 if the report is"
+        " right;  "
+        "bias is their mean. Intervals hold for all parameters together, and for heavy tails."
     ]
     low, high = found.nees_limits
     if math.isfinite(low):

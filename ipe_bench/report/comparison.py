@@ -29,9 +29,10 @@ def contents(frame: pd.DataFrame, alpha: float) -> list[Table]:
         needed = [_needed(row) for row in rows if row.get("power", math.nan) > 0]
         tables.append(Table("comparison", title, "", columns, notes=needed))
     note = (
-        "error: mean Mahalanobis error, each trial's at most the radius of the gate of success. cost: simulations."
-        " p: McNemar's exact test, random signs for ratios; Holm over all rows. e: evidence that may be looked at as"
-        " often as one likes, 20 being as rare as p = 0.05. Intervals are each row's own. time: not tested."
+        "error is the mean Mahalanobis error, where a trial counts as at most the radius of the gate of success; cost"
+        " counts simulations. p comes from McNemar's exact test for success and from random signs for ratios, with"
+        " Holm's correction over all rows. e is evidence that may be looked at repeatedly; e = 20 is as rare as p ="
+        " 0.05. Each interval is that of its row alone. Times are not tested."
     )
     if (frame["matched_by"] == "order").any():
         note += " Without common trials nothing is gained from pairing: the intervals are wider."

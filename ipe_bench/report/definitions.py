@@ -28,28 +28,31 @@ DEFINITIONS: tuple[tuple[str, str], ...] = (
     *((record.title, record.definition) for record in SCORES),
     (
         "win, tie, loss",
-        f"Paired by trial; Mahalanobis errors that differ by less than {TIE:g} are a tie: estimators that share a root"
-        " differ by round-off alone.",
+        f"Errors are paired by trial. Mahalanobis errors that differ by less than {TIE:g} are a tie, because"
+        " estimators that share a root differ by round-off alone.",
     ),
     (
         "p of error",
-        "Wilcoxon's signed-rank test, two-sided, ties left out (Biometrics Bulletin 1, 1945), Holm's correction over"
+        "Wilcoxon's two-sided signed-rank test without ties (Biometrics Bulletin 1, 1945), with Holm's correction over"
         " the pairs of a scenario (Scandinavian Journal of Statistics 6, 1979).",
     ),
     (
         "p of success",
-        "McNemar's exact test on the trials in which one of two succeeds (Psychometrika 12, 1947), Holm's correction.",
+        "McNemar's exact test on the trials in which only one of the two succeeds (Psychometrika 12, 1947), with"
+        " Holm's correction.",
     ),
     (
         "may be the best (bold)",
-        "No rival surely succeeds more often in the same trials, by the gate of the Cramér-Rao bound for all: McNemar's"
+        "No rival succeeds significantly more often in the same trials, by the gate of the Cramér-Rao bound for all:"
+        " McNemar's"
         " exact one-sided test against every rival at 5 % over their number, which leaves a true best out in at most"
-        " 5 % of scenarios (Hsu, Annals of Statistics 9, 1981). Nothing is bold where nobody is beaten.",
+        " 5 % of scenarios (Hsu, Annals of Statistics 9, 1981). Nothing is bold if no estimator is beaten.",
     ),
     (
         "ranks",
-        "By capped error within a scenario, ties sharing their mean rank; a scenario is one observation. Friedman's"
-        " test (Journal of the American Statistical Association 32, 1937) and Nemenyi's critical difference (Demšar,"
+        "Estimators are ranked by capped error within a scenario, and ties share their mean rank. A scenario is one"
+        " observation of Friedman's test (Journal of the American Statistical Association 32, 1937) and Nemenyi's"
+        " critical difference (Demšar,"
         " Journal of Machine Learning Research 7, 2006).",
     ),
     (

@@ -59,8 +59,8 @@ def _parameters(name: str, design: Design) -> Table:
         most = np.argmax(np.abs(others), axis=1)
         columns.append(words("most", [f"{parameters[j].name} {others[i, j]:+.2f}" for i, j in enumerate(most)]))
     notes = [
-        "bound: of the standard deviation, root mean square over the prior. with the others: multiple correlation of"
-        " its error; most: the one it goes with most.",
+        "bound is that of the standard deviation, as a root mean square over the prior. with the others is the"
+        " multiple correlation of its error; most is the parameter with the largest correlation.",
         f"Singular values of the whitened Jacobian, per parameter's size: {s[0]:.3g} to {s[-1]:.3g}.",
     ]
     title = f"{name}, {scenario.noise.name}, error scale {scenario.error_scale:g}: what {scenario.measurement.m}"
@@ -92,8 +92,9 @@ def _suspects(design: Design) -> Iterator[Part]:
         return
     shown = design.suspects[:_MOST_SUSPECTS]
     note = (
-        f"noticed: trials in which the test of fit at {FIT_LEVEL:g} will say so. hidden: wrong by more than a bound,"
-        " and noticed in less than half. looks like: what cancels in the readings."
+        f"noticed is the share of trials in which the test of fit at {FIT_LEVEL:g} will report the error. It is hidden"
+        " if it makes a parameter wrong by more than its bound and is noticed in less than half. looks like names the"
+        " parameters that imitate it."
     )
     columns = [
         words("error", [s.name for s in shown]),
@@ -108,7 +109,7 @@ def _suspects(design: Design) -> Iterator[Part]:
     unseen = [s for s in design.suspects if s.hidden and s.noticed < _UNSEEN]
     if unseen:
         yield Strong(
-            f"No test of residuals will see {enumerate_few([s.name for s in unseen])}: the parameters imitate it."
+            f"No test of residuals will detect {enumerate_few([s.name for s in unseen])}: the parameters imitate it."
             f" {unseen[0].parameter} will be wrong by {unseen[0].bounds:.3g} bounds where {unseen[0].name} is"
             f" {unseen[0].deviation:.3g} {unseen[0].unit}."
         )
@@ -129,8 +130,8 @@ def _ways(design: Design) -> Iterator[Part]:
     ]
     title = f"What to take instead (bounds as shares of today's, criterion {design.criterion})"
     note = (
-        f"fewest readings: with no larger bound than today's {today}. Of {design.candidates.m} candidates those that"
-        " gain most are taken one after another; another choice may be a little better."
+        f"fewest readings is the number whose bound is no larger than today's {today}. Among {design.candidates.m}"
+        " candidates those that gain most are taken one after another; another choice may be slightly better."
     )
     yield Table("ways", title, "", columns, notes=[note])
     for way in design.ways:

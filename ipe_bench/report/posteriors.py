@@ -46,17 +46,18 @@ def _status(one: Reference, label: str) -> str:
 
 def _notes(found: Sequence[Reference]) -> Iterator[str]:
     yield (
-        "diverg.: divergence of the estimator's Gaussian from the posterior's moments, in nats; noise: the same of two"
-        " populations of particles, so what is not above it is chance. shift: of the mean, in the posterior's"
-        " deviations per root of the number of parameters. width: deviations over the posterior's, geometric mean."
-        f" energy: distance of draws. honest: a single mode, divergence at most {HONEST:g} or twice the noise, and"
-        f" energy at most {ALIKE:g}."
+        "diverg. is the divergence of the estimator's Gaussian from the moments of the posterior, in nats; noise is"
+        " the same between two populations of particles, so a divergence below it is chance. shift is that of the"
+        " mean, in standard deviations of the posterior per root of the number of parameters. width is the geometric"
+        " mean of the standard deviations over those of the posterior."
+        " energy is the distance between draws. An estimate is honest if there is a single mode, the divergence is at"
+        f" most {HONEST:g} or twice the noise, and the energy is at most {ALIKE:g}."
     )
     for one in found:
         if not one.posterior.settled:
             yield (
                 f"Trial {one.trial}: the populations differ by {one.posterior.apart:.2g} deviations, so its posterior"
-                " is not to be believed; give more --particles."
+                " cannot be relied on; give more --particles."
             )
         if len(one.posterior.modes) > 1:
             shares = ", ".join(percent(float(share)) for share in one.posterior.shares)

@@ -28,33 +28,35 @@ from ipe_bench.statistics.summary import ALL
 _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     "costs": (
         "Costs",
-        "Medians per trial over all trials; a Jacobian counts as many simulations as its model says. To 0.05 σ of limit"
-        " and order: over the converged trials with a stored history.",
+        "Medians over all trials; a Jacobian counts as many simulations as its model states. The cost to 0.05 σ of the"
+        " limit and the order are over the converged trials with a stored history.",
         lambda rows: rows["trials"] > 0,
     ),
     "all_trials": (
         "All trials",
-        "Over all trials. Root mean squares and efficiency here are not capped: one trial may decide them.",
+        "Over all trials. Root mean squares and efficiency are not capped here, so a single trial may decide them.",
         lambda rows: rows["trials"] > 0,
     ),
     "solved_trials": (
         "Solved trials",
-        "A diagnostic of estimators that solve an equation, and no comparison with others: each over the trials in"
-        " which it found the root that belongs to the truth. Their number stands in brackets where it is not all.",
+        "This table diagnoses estimators that solve an equation and does not compare them with others: each row is"
+        " over the trials in which the estimator found the root that belongs to the truth. Their number stands in"
+        " brackets if it is not all.",
         lambda rows: rows["equation"] != "-",
     ),
     "covariances": (
         "Covariance of the frozen root",
         "Standard deviations over the linear bound of eq. (5), root mean square over parameters, of the estimators that"
-        " solve eq. (11), over solved trials. rmse is by Monte Carlo; reported is the sandwich at the estimate, which"
-        " holds to first order; eq. (14) takes the compensation error for independent of the noise, which it is not.",
+        " solve eq. (11), over solved trials. rmse comes from Monte Carlo. reported is the sandwich at the estimate,"
+        " which holds to first order. eq. (14) treats the compensation error as independent of the noise, which it is"
+        " not.",
         lambda rows: rows["eq_14"].notna(),
     ),
     "iterations": (
         "Bounds on the iterations",
-        "Over the first trials, whose iterates are stored. Eq. (18) bounds fixed-point iteration where K of eq. (15) is"
-        " below 1; eq. (23) bounds Newton's method by the curvature M of its g. Constants are taken at the truth, the"
-        " last iterate stands for the root.",
+        "Over the first trials, whose iterates are stored. Eq. (18) bounds fixed-point iteration if K of eq. (15) is"
+        " below 1; eq. (23) bounds Newton's method by the curvature M of its g. Constants are taken at the truth, and"
+        " the last iterate is taken for the root.",
         lambda rows: (rows["eq_18_trials"] > 0) | rows["eq_23_observed"].notna(),
     ),
 }
@@ -115,9 +117,9 @@ def theory(analysis: Analysis) -> Table | None:
     """What theory expects of least squares, parameter by parameter, beside what happened."""
     caption = (
         "Estimators that minimise the sum of squares, over solved trials, in the parameters' own units; all: over the"
-        " linear bound, root mean square over parameters. By theory: without any noise drawn, from the slopes of the"
-        " models alone; where readings come from another model than is assumed, from those of both. Relative curvatures"
-        " say how far linear theory reaches: they are small below 0.3."
+        " linear bound, root mean square over parameters. The theory uses the Jacobians of the models and no draw of"
+        " noise; if readings come from another model than the assumed one, it uses those of both. Linear theory holds"
+        " if the relative curvatures are below 0.3."
     )
     rows = analysis.summary[analysis.summary["predicted_rmse"].notna()]
     return _recorded(analysis, "theory", "Theory beside experiment", caption, rows, ("parameter", "unit"))
@@ -144,7 +146,7 @@ def tracks(analysis: Analysis) -> Table | None:
 def calibration(analysis: Analysis) -> Table | None:
     """How each reported covariance lies, in words; the file says so of each parameter, too."""
     caption = (
-        "Whether the truth lies under the Gaussian that an estimator reports as that Gaussian says: over converged"
+        "This table tests whether the truth is distributed as the Gaussian that an estimator reports, over converged"
         " trials with a covariance, for NEES and every parameter together, at 5 % for each row. The median NEES with"
         " its limits is over all trials."
     )
@@ -192,8 +194,8 @@ def comparisons(analysis: Analysis) -> Table | None:
         words("finding", [f"{label} is closer" if label else "no difference" for label in rows["closer"]]),
     ]
     caption = (
-        "On the trials that both have. First, second alone: trials in which only that one succeeds, by the gate of the"
-        " Cramér-Rao bound, prior or not. p: Wilcoxon's signed-rank and McNemar's exact test, Holm-corrected over all"
+        "Over the trials that both have. First alone and second alone count trials in which only that one succeeds, by"
+        " the gate of the Cramér-Rao bound. p: Wilcoxon's signed-rank and McNemar's exact test, Holm-corrected over all"
         " pairs of all scenarios."
     )
     return Table("comparisons", "Paired comparisons", caption, columns, rows)
@@ -211,8 +213,8 @@ def ranks(analysis: Analysis) -> Table | None:
     apart = ["yes" if rejects and v - values[0] >= ranking.critical_difference else "no" for v in values]
     columns = [words("estimator", ordered), column("mean rank", values, short), words("apart from the first", apart)]
     caption = (
-        f"Over {ranking.replicates} seeds, by capped mean error over all scenarios. Friedman's test that all rank"
-        f" alike: p = {p_value(ranking.friedman)}. Nemenyi's critical difference at 5 %:"
+        f"Ranks are by capped mean error over all scenarios and over {ranking.replicates} seeds. Friedman's test that"
+        f" all rank alike: p = {p_value(ranking.friedman)}. Nemenyi's critical difference at 5 %:"
         f" {ranking.critical_difference:.2f}."
     )
     data = pd.DataFrame({"estimator": ordered, "mean_rank": values, "apart_from_first": apart}).assign(
@@ -250,8 +252,8 @@ def certified_tables(collection: Collection) -> list[Table]:
 def _digits(digits: pd.DataFrame) -> list[Table]:
     """The mean digits of an estimator from each start, the most first, and its digits per data set."""
     caption = (
-        "Log relative error against the certified answer, at most 11: the fewest over a data set's parameters, over"
-        " their standard deviations, and of the residual sum of squares."
+        "Log relative error against the certified answer, at most 11. It is the smallest over the parameters of a data"
+        " set, the smallest over their standard deviations, and that of the residual sum of squares."
     )
     columns = [
         words("data set", digits["dataset"]),
@@ -309,10 +311,11 @@ def attained_totals_table(totals: pd.DataFrame) -> Table:
         *(column(f"in {b}", rows[f"within_{b}"], str) for b in BUDGETS),
     ]
     caption = (
-        "Problems whose least minimum the estimate attains: f at most f* (1 + 1e-6) + 1e-12. 1 x, 10 x: from these"
-        " multiples of the standard start. Converged: solved, and the status says so. Elsewhere: unsolved, and the"
-        " status says converged. Median cost: simulations over all problems, a Jacobian counting n, infinite where"
-        " unsolved. In 10, 100, 1000: solved within so many simplex gradients of n + 1 simulations."
+        "A problem is solved if the estimate attains its global minimum, f at most f* (1 + 1e-6) + 1e-12. 1 x and 10 x"
+        " are multiples of the standard start. Converged counts solved problems whose status says so; elsewhere counts"
+        " unsolved problems whose status says converged. Median cost counts simulations over all problems, a Jacobian"
+        " as n, and is infinite for unsolved ones. In 10, 100, 1000 counts problems solved within that number of"
+        " simplex gradients of n + 1 simulations."
     )
     return Table("attained", "Known minima", caption, columns, rows, whole="tables/attained.csv")
 
@@ -330,7 +333,7 @@ def _problems(minima: pd.DataFrame) -> Table:
         column("cost", rows["cost"], short),
     ]
     caption = (
-        "Which of a function's minima has the estimate's sum of squares, the lowest being 1; a dash: none of them."
+        "The number of the minimum whose sum of squares the estimate has, where 1 is the lowest; a dash means none."
     )
     return Table("attained_problems", "Known minima, problem by problem", caption, columns, rows)
 

@@ -20,26 +20,27 @@ if TYPE_CHECKING:
 _WIDE_ENOUGH = 100
 """Letters of a screen that has room for failures, and for verdicts in words."""
 LEGEND = (
-    "success: of all trials, in per cent, with its 95 % interval; bold: may be the best, since no rival surely succeeds"
-    " more often. failed (on wide screens): known / silently, by whether the status or the test of fit says so.",
-    "error: median / 95 % quantile of all trials, in multiples of the bound at the truth, 1 at best; efficiency: one"
-    f" over its root mean square, a trial counting at most {CAP:g}.",
-    "NEES: squared error over the variance that the estimator claims, 1 if honest, the median of all trials; the word"
-    " or sign is the verdict on the converged trials alone: optimistic (+) claims too much, pessimistic (-) too little,"
-    " diverged (!) is lost and does not know. cost: simulations.",
+    "success is the percentage of all trials, with its 95 % interval; bold marks estimators that may be the best,"
+    " since no rival succeeds significantly more often. failed (on wide screens) gives known / silent failures: the"
+    " status or the test of fit reports a known one.",
+    "error is the median / 95 % quantile over all trials, in multiples of the bound at the truth; 1 is the best"
+    " possible. efficiency is the reciprocal of its root mean square, where a trial counts as at most {CAP:g}.",
+    "NEES is the median of the squared error over the variance that the estimator claims; 1 is right. The word or sign"
+    " is the verdict on the converged trials: optimistic (+) claims too small a variance, pessimistic (-) too large a"
+    " one, diverged (!) is lost without reporting it. cost counts simulations.",
 )
 """What the columns of the overview mean."""
 _TOLD = (
-    "noise=unknown: every estimator here is told R, that of the true levels at the nominal readings; bounds and success"
-    " are those of parameters that are estimated together with the levels."
+    "With noise=unknown every estimator here is given R, that of the true levels at the nominal readings; bounds and"
+    " success are those of parameters that are estimated together with the levels."
 )
 
 
 TRACKED = (
-    "States that move: success is the share of trials that keep the track, and the error a root mean square over all"
-    " epochs, both by the variances of the filter that is linearised at the true path; the posterior bound is far below"
-    " what can be attained. NEES and all that is said of single states elsewhere are of the last epoch. Cost is counted"
-    " in evaluations of transition and reading."
+    "For states that move, success is the share of trials that keep the track, and the error is a root mean square"
+    " over all epochs. Both are in units of the filter that is linearised at the true path, because the posterior"
+    " bound is far below what can be attained. NEES and the statistics of single states refer to the last epoch. Cost"
+    " counts evaluations of transition and reading."
 )
 """What a track is held against."""
 

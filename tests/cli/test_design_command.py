@@ -42,7 +42,7 @@ def test_every_richer_version_of_the_model_is_suspected(command):
         assert name in rows
     assert "yes" in rows["tilt y"]
     assert "tilt y + 0.97 bx" in rows["tilt y"]
-    assert "No test of residuals will see tilt y, tilt x, tilt z" in out
+    assert "No test of residuals will detect tilt y, tilt x, tilt z" in out
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,7 @@ def test_a_formula_and_a_file_are_enough_where_nobody_knows_the_noise(estimate, 
     code, printed, answer = estimate(*SATURATION, "readings=my.csv", "figures=all")
     assert code == 0, printed
     assert list(answer["estimators"]) == ["auto", "linear_lse", "levenberg_marquardt"]
-    assert "The level of the noise is estimated from the residuals" in printed
+    assert "The noise level is estimated from the residuals" in printed
     # Chi-square is the degrees of freedom where the level is estimated: the level is told instead.
     (heading,) = [line.split() for line in printed.splitlines() if line.startswith(" estimator  ")]
     assert heading == ["estimator", "status", "fits", "dof", "white", "p", "outliers", "deviation"]

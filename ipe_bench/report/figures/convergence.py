@@ -66,9 +66,9 @@ def draw(view: View) -> Iterator[Drawing]:
         fig,
         "convergence",
         "Convergence, converged trials",
-        "Largest component of an iterate's distance from the trial's last one, in standard deviations of the"
-        " Cramér-Rao bound: median over the first converged trials. The last iterate itself, whose distance is zero by"
-        " definition, is not drawn: a curve ends where half of the trials have ended.",
+        "Median over the first converged trials of the largest component of the distance between an iterate and the"
+        " last one, in standard deviations of the Cramér-Rao bound. The last iterate is not drawn, since its distance"
+        " is zero by definition; a curve ends when half of the trials have ended.",
         f"Iterations until the median is within {CLOSE:g} standard deviations at scale {plain(scales[-1])}:"
         f" {common.enumerate_few(seen, 20)}.",
         f"{len(look) - len(shown)} further estimators are not shown." * (len(look) > len(shown)),

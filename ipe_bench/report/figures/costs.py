@@ -78,8 +78,8 @@ def draw_costs(view: View) -> Iterator[Drawing]:
         fig,
         "cost_against_accuracy",
         "Cost against accuracy, all trials",
-        "Median cost of a trial in simulations, a Jacobian counting what it costs, against what 95 % of all trials err"
-        " by at most, over the same of an efficient estimator; down and left is better.",
+        "Median cost of a trial in simulations against the 95 % quantile of the error over that of an efficient"
+        " estimator, over all trials; down and left is better.",
         f"Errors beyond {common.number(_HIGHEST)} stand at the edge." * bool((rows["error"] == _HIGHEST).any()),
         f"The cheapest within 5 % of the least error at scale {plain(view.scales[-1])}: {good['estimator']}"
         f" ({good['cost_median']:g} simulations).",

@@ -54,10 +54,10 @@ def draw(view: View) -> Iterator[Drawing]:
     yield view.drawing(
         fig,
         "headline",
-        f"Success, error and honesty {over}",
-        "All trials of everybody. Left: share whose error lies inside the gate of the bound, with Clopper-Pearson 95 %"
-        " intervals. Middle: median error over the bound at the truth, with a bar up to the 95 % quantile. Right:"
-        " squared error over the variance that the estimator claims, 1 where it is honest.",
+        f"Success, error and reported covariance {over}",
+        "All panels are over all trials. Left: share of trials whose error lies inside the gate of the bound, with"
+        " Clopper-Pearson 95 % intervals. Middle: median error over the bound at the truth, with a bar up to the 95 %"
+        " quantile. Right: squared error over the variance that the estimator claims; 1 is right.",
         f"{most}, stands at the top." if beyond else "",
         f"At scale {plain(view.scales[-1])} succeed: {common.enumerate_few(ranked, 20)}.",
     )
@@ -88,10 +88,10 @@ def draw_calibration(view: View) -> Iterator[Drawing]:
         fig,
         "calibration",
         "Calibration of NEES, converged trials",
-        "NEES of the converged trials: the share of trials below each quantile of chi-square less its nominal"
-        " probability. Grey: what chance explains (simultaneous bands, in which all parameters and NEES of an honest"
-        " estimator stay in 95 % of cases; light where fewer trials converged). Below 0 in the middle: standard"
-        f" deviations too small; above: too large. The vertical axis is logarithmic beyond ±{LINEAR / 2:g}.",
+        "Share of converged trials whose NEES is below each quantile of chi-square, less its nominal probability. The"
+        " grey bands are simultaneous: all parameters and NEES stay inside them in 95 % of cases if the covariance is"
+        " right; they are light where fewer trials converged. A curve below 0 in the middle means standard deviations"
+        " that are too small, one above 0 too large. The vertical axis is logarithmic beyond ±{LINEAR / 2:g}.",
         f"At scale {plain(top)}, parameters included, {common.enumerate_few(last, 4)}.",
     )
 

@@ -71,7 +71,7 @@ def draw_residuals(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]
     common.legend(fig, axes)
     parts = [f"{one.label} {int(one.outliers.sum())}" for one in shown]
     caption = common.sentence(
-        "Normalised residuals of the readings; each is standard normal where the model and the noise are right."
+        "Normalised residuals of the readings; each is standard normal if the model and the noise are right."
         f" Beyond ±{limit:.2f} a reading is an outlier: {common.enumerate_few(parts, 12)}."
         " p is that of chi-square, white that of the Ljung-Box test.",
         f"{len(fits) - len(shown)} further estimators: see residuals.csv." * (len(fits) > len(shown)),
@@ -133,8 +133,8 @@ def draw_ellipses(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]:
         which = f"the {len(pairs)} most correlated of {len(every)} pairs"
     caption = (
         f"Regions that hold the true values with {LEVEL:.0%} probability if the model and the noise are right, for"
-        f" {which}, about the estimates of {best.label}. Equal ones are drawn narrower upon each other; what is"
-        f" more than {_NEAR:g} deviations off is not drawn."
+        f" {which}, about the estimates of {best.label}. Equal regions are drawn with narrower lines on top of each"
+        f" other; a region more than {_NEAR:g} standard deviations away is not drawn."
     )
     yield Drawing("ellipses", "Covariance ellipses", caption, fig)
 
@@ -187,7 +187,7 @@ def draw_corner(model: Measurement, one: Reference) -> Drawing:
     told = [f"{label} {d.kl:.3g}" for label, d in one.divergences.items() if np.isfinite(d.kl)]
     caption = common.sentence(
         f"Draws of the posterior of trial {one.trial} of {model.name}, and the 95 % ellipses that estimators report, in"
-        f" deviations of the posterior about its mean; what is more than {_VIEW:g} of them off is not in view.",
+        f" standard deviations of the posterior about its mean; the view ends at {_VIEW:g} of them.",
         f"Divergence in nats: {common.enumerate_few(told, 12)}." if told else "",
         f"{len(modes)} modes, crossed." if len(modes) > 1 else "",
         f"The {k} parameters in which estimators are farthest off." if k < model.n else "",

@@ -46,9 +46,9 @@ def draw(view: View) -> Iterator[Drawing]:
         fig,
         "tracks",
         "Tracks, converged trials",
-        "Root mean square error over trials at each epoch, beside that of the filter linearised at the truth, which a"
-        " good filter attains, and the posterior Cramér-Rao bounds, which lie far below. NEES over n: honest"
-        " covariances keep it within the band at 95 % of single epochs; neighbouring epochs are dependent.",
+        "Root mean square error over trials at each epoch, with that of the filter linearised at the truth, which a"
+        " good filter attains, and the posterior Cramér-Rao bounds, which lie far below. NEES over n stays within the"
+        " band at 95 % of single epochs if the covariance is right; neighbouring epochs are dependent.",
         f"{states[0]} over all epochs: {enumerate_few([f'{k} {v:.3g}' for k, v in total.items()], 20)}.",
     )
 
