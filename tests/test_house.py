@@ -29,7 +29,7 @@ BUDGETS = {
     "measurements": 7477,
     "noise": 626,
     "priors": 175,
-    "states": 1048,
+    "states": 1051,
     "estimators": 1273,
     "solvers": 1250,
     "baselines": 2370,

@@ -58,6 +58,9 @@ class Formulas(StateModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        names = [*self.next, *self.noise, *self.constants, "k", "t"]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise UserError(f"next.{twice}: two of states, noise, constants, k and t have this name; choose another")
         known = {*self.next, *self.constants, "k", "t"}
         for key, formulas, names in (
             ("next", self._transitions, {*known, *self.noise}),
