@@ -15,6 +15,7 @@ from ipe_bench.estimators.base import Estimator
 from ipe_bench.runs.parts import SCHEMA, TRUTH
 from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.states.trackers import Tracker
+from ipe_bench.trials.bounds import linear_correlation
 from ipe_bench.trials.tracking import AnyScenario, Tracking
 
 
@@ -88,9 +89,12 @@ class ResultKey:
             "parameters": [describe(p) for p in model.parameters],
             "readings": model.m,
             "about": _first_sentence(model),
-            **({"times": scenario.model.times.tolist()} if isinstance(scenario, Tracking) else {}),
             "linear_bound": scenario.linear_bound.tolist(),
-            "linear_correlation": scenario.linear_correlation.round(4).tolist(),
+            **(
+                {"times": scenario.model.times.tolist()}
+                if isinstance(scenario, Tracking)
+                else {"linear_correlation": linear_correlation(scenario.problem).round(4).tolist()}
+            ),
         }
 
 

@@ -15,7 +15,7 @@ from ipe_bench.measurements.problem import Problem, recorded_problem
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.own import ModelNoise, resolved
 from ipe_bench.priors import GaussianPrior, Prior
-from ipe_bench.trials.bounds import linear_bound, linear_correlation
+from ipe_bench.trials.bounds import linear_bound
 
 _PARAMETERS, _NOISE = 0, 1
 """The two random streams of a trial."""
@@ -87,11 +87,6 @@ class Scenario:
     def linear_bound(self) -> Array:
         """Standard deviations (n,) of eq. (5)."""
         return linear_bound(self.problem)
-
-    @property
-    def linear_correlation(self) -> Array:
-        """Correlation (n, n) of the covariance of eq. (5)."""
-        return linear_correlation(self.problem)
 
     @cached_property
     def simulator(self) -> Measurement:

@@ -9,13 +9,14 @@ from __future__ import annotations
 import base64
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
 
-from ipe_bench.basics.errors import describe_exception
+from ipe_bench.basics.errors import UserError, describe_exception
 from ipe_bench.basics.linalg import Array, Mask, deviations, finite, read_only
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
@@ -65,11 +66,6 @@ class Tracking:
         """Standard deviations (n,) of the states at the last epoch in a filter that is linearised along the path
         without process noise from the mean of the prior."""
         return deviations(self._nominal)
-
-    @property
-    def linear_correlation(self) -> Array:
-        """Their correlation (n, n)."""
-        return self._nominal / np.outer(self.linear_bound, self.linear_bound)
 
     @cached_property
     def _nominal(self) -> Array:
@@ -141,14 +137,15 @@ class PathBlock:
         model, names = self.scenario.model, self.names
         posterior, error = np.full((2, len(self), model.n), np.nan)
         curves = np.full((2, model.epochs, model.n), np.nan)
-        if self.start == 0 and len(self) and not self.scenario.noise.real and _has_density(model):
+        if self.start == 0 and len(self) and not self.scenario.noise.real:
             drawn = self.scenario.draw(0, EXPECTED)
-            with np.errstate(all="ignore"):
+            # Without a density of paths there is no such bound.
+            with np.errstate(all="ignore"), suppress(UserError, np.linalg.LinAlgError):
                 filtered, smoothed = posterior_bounds(model, drawn)
                 parts = [posterior_bounds(model, _some(drawn, i))[0][-1] for i in range(_PARTS)]
                 posterior[0] = deviations(filtered[-1:])[0]
                 error[0] = deviations(np.array(parts)).std(axis=0, ddof=1) / np.sqrt(_PARTS)
-            curves = np.stack([np.diagonal(P, axis1=1, axis2=2) for P in (filtered, smoothed)])
+                curves = np.stack([np.diagonal(P, axis1=1, axis2=2) for P in (filtered, smoothed)])
         sums = [self.variances.sum(axis=0), np.full((model.epochs, 1), len(self)), *curves]
         return {
             "trial": np.arange(self.start, self.start + len(self)),
@@ -253,14 +250,6 @@ def unpacked(texts: Array, epochs: int) -> Array:
     """The sums (blocks, K, columns) that `packed` wrote."""
     found = [np.frombuffer(base64.b64decode(text), "<f8").reshape(epochs, -1) for text in texts if text]
     return np.array(found).reshape(len(found), epochs, -1)
-
-
-def _has_density(model: StateModel) -> bool:
-    """Whether every step's process noise has full rank, so that the posterior bound exists."""
-    Q = [model.Q(k) for k in range(model.epochs) if model.moves(k)]
-    return bool((np.linalg.matrix_rank(np.array(Q)) == model.n).all()) and bool(
-        np.linalg.matrix_rank(model.prior.covariance) == model.n
-    )
 
 
 def _some(paths: Paths, part: int) -> Paths:
