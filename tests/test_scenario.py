@@ -1,10 +1,13 @@
 """Trials: the same whatever the block, with truths from the prior and readings from the model."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Gins, Polynomial, Ranging
+from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Colored, Gaussian, NoNoise, Quantization, StudentT
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.trials.scenario import Scenario
@@ -51,6 +54,17 @@ def test_the_prior_may_differ_by_parameter():
     assert prior.deviation(4, 10.0).tolist() == [10.0, 20.0, 0.0, 10.0]
     x = Scenario(Polynomial(), Gaussian(1.0), prior, 1.0).draw(0, 100).x
     assert (x[:, 2] == 0.0).all()
+
+
+@dataclass(frozen=True)
+class Short(Polynomial):
+    nominal = np.array([5.0])  # type: ignore[assignment]
+
+
+def test_a_nominal_point_of_another_length_is_refused():
+    for make in (lambda: Scenario(Short(), Gaussian(1.0)), lambda: Problem(Short(), Gaussian(1.0).covariance(21))):
+        with pytest.raises(UserError, match=r"^measurement=short: nominal has shape \(1,\); let it return \(4,\)"):
+            make()
 
 
 def test_a_truth_of_its_own_simulates_the_readings():

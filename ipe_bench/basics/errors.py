@@ -1,6 +1,7 @@
 """The exceptions that are meant for users; everything else that is raised is a bug."""
 
 import difflib
+import os
 import traceback
 from collections.abc import Iterable
 
@@ -25,12 +26,13 @@ def describe_exception(error: BaseException) -> str:
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
 
 
-def place_of(error: BaseException) -> str:
-    """What was raised, and the file and line where."""
+def place_of(error: BaseException, within: str | None = None) -> str:
+    """What was raised, and the file and line where; the last line of the file `within` that was running, if any was."""
     if isinstance(error, SyntaxError):
         return f"{error.filename}, line {error.lineno}: {type(error).__name__}: {error.msg}"
     frames = traceback.extract_tb(error.__traceback__)
-    return f"{frames[-1].filename}, line {frames[-1].lineno}: {describe_exception(error)}"
+    frame = [*frames[-1:], *(frame for frame in frames if frame.filename == within)][-1]
+    return f"{frame.filename.removeprefix(os.getcwd() + os.sep)}, line {frame.lineno}: {describe_exception(error)}"
 
 
 def shortened(text: str, length: int = 120) -> str:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.errors import UserError, describe_exception, unknown
+from ipe_bench.basics.errors import UserError, place_of, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Finite, Positive
 from ipe_bench.measurements.arithmetic import require_parameters
@@ -108,7 +108,7 @@ class Function(WrittenModel):
         except Exception as error:
             if isinstance(error, ModuleNotFoundError) and error.name == module.partition(".")[0]:
                 raise UserError(f"of={self.of}: there is no module {module} here; {module}.py would be one") from None
-            raise UserError(f"of={self.of}: {module} cannot be imported ({describe_exception(error)})") from None
+            raise UserError(f"of={self.of}: {module} cannot be imported: {place_of(error)}") from None
         functions = [key for key, value in vars(found).items() if inspect.isfunction(value) or key == name]
         if not callable(getattr(found, name, None)):
             raise UserError(f"of={self.of}: {unknown(name, [f for f in functions if f != name], 'function')}")
@@ -188,7 +188,12 @@ class Function(WrittenModel):
 
     def _at(self, values: Any) -> Any:
         """h where the parameters have these values (n,), in their own units."""
-        return self.function(**dict(zip(self.starts, values, strict=True)), **self._known)
+        known = self._known
+        try:
+            return self.function(**dict(zip(self.starts, values, strict=True)), **known)
+        except Exception as error:
+            file = getattr(sys.modules.get(self.function.__module__), "__file__", None)
+            raise UserError(f"measurement.of={self.of}: {place_of(error, file)}") from error
 
     def _checked(self, z: Any, m: int | None) -> Any:
         shape = np.shape(z)
@@ -199,9 +204,8 @@ class Function(WrittenModel):
 
     def _rows(self, x: Array) -> Array:
         """h of every trial, by one call of the function each; x may be complex."""
-        h, names, known = self.function, list(self.starts), self._known
         with np.errstate(all="ignore"):
-            rows = [h(**dict(zip(names, row, strict=True)), **known) for row in x * self.sizes]
+            rows = [self._at(row) for row in x * self.sizes]
         if any(np.shape(row) != (self.m,) for row in rows):
             rows = [self._checked(row, self.m) for row in rows]
         return np.array(rows) if rows else np.empty((0, self.m))
@@ -230,7 +234,7 @@ class Function(WrittenModel):
             with warnings.catch_warnings():
                 warnings.simplefilter("error")
                 by_complex_step = differentiate(self._rows, x, analytic=True)
-        except (TypeError, ValueError, Warning):
+        except (UserError, ValueError, Warning):
             return False
         known = np.isfinite(by_differences).all(axis=(1, 2))
         size = np.abs(by_differences[known]).max(axis=1, keepdims=True, initial=0.0)

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance, pseudo_inverse, read_only
 from ipe_bench.measurements.base import Measurement
 
@@ -29,6 +30,7 @@ class Problem:
     so that the size of residuals says nothing."""
 
     def __post_init__(self) -> None:
+        require_nominal(self.measurement)
         for name in ("prior_deviation", "prior_correlation"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, read_only(getattr(self, name)))
@@ -73,6 +75,16 @@ class Problem:
 
     def without_prior(self) -> Problem:
         return replace(self, prior_deviation=None, prior_correlation=None)
+
+
+def require_nominal(model: Measurement) -> None:
+    """Refuses a model whose nominal point is not (n,)."""
+    if np.shape(model.nominal) != (model.n,):
+        parameters = ", ".join(p.name for p in model.parameters)
+        raise UserError(
+            f"measurement={model.name}: nominal has shape {np.shape(model.nominal)}; let it return ({model.n},), one "
+            f"number for each of {parameters}"
+        )
 
 
 def recorded_problem(measurement: Measurement) -> Problem:

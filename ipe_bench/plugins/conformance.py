@@ -310,6 +310,7 @@ def names_its_readings(model: Measurement) -> None:
     assert set(lengths.values()) == {model.m}, f"the columns of index have lengths {lengths}, and not {model.m}"
     assert len(set(zip(*model.index.values(), strict=True))) == model.m, "two readings have one label in index"
     assert len({p.name for p in model.parameters}) == model.n, "two parameters have one name"
+    _shaped("nominal", model.nominal, (model.n,), "one number for each parameter")
     assert (model.sizes > 0).all(), "a parameter's size is not above 0"
 
 

@@ -11,7 +11,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, read_only
 from ipe_bench.basics.streams import numbered
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.measurements.problem import Problem, recorded_problem
+from ipe_bench.measurements.problem import Problem, recorded_problem, require_nominal
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.own import ModelNoise, resolved
 from ipe_bench.priors import GaussianPrior, Prior
@@ -62,6 +62,7 @@ class Scenario:
         if not (np.isfinite(self.error_scale) and self.error_scale > 0):
             raise UserError(f"error_scale={self.error_scale}: give a finite number above 0")
         check_seed(self.seed)
+        require_nominal(self.measurement)
         if self.noise.real and self.measurement.recorded is None:
             raise UserError(
                 f"noise=certified: measurement={self.measurement.name} comes with no readings of its own; choose "

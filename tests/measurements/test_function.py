@@ -43,6 +43,9 @@ def starred(t, *rest):
 
 def needs(t, k=1.0, *, g):
     return g * k * t
+
+def boom(t, k=1.0):
+    return np.expp(-k * t)
 """
 JAX = """
 import jax.numpy as np
@@ -153,6 +156,14 @@ def test_a_mistake_is_one_line(laws, of, options, said):
 def test_another_shape_is_refused_by_the_function_s_name(laws, name):
     with pytest.raises(ib.UserError, match=f"measurement.of=some_laws:{name}: returns an array of shape"):
         model(name).simulate(np.array([[1.0], [1.1]]))
+
+
+def test_what_the_function_raises_is_one_line_with_its_place(laws, capsys):
+    line = LAW.splitlines().index("    return np.expp(-k * t)") + 1
+    words = ["measurement=function", "measurement.of=some_laws:boom", "measurement.columns.t=[0,1,2]"]
+    assert main(["run", *words, "noise=gaussian", "noise.deviation=0.01", "trials=2", "figures=none"]) == 2
+    said = f"measurement.of=some_laws:boom: some_laws.py, line {line}: AttributeError: module 'numpy' has no attribute"
+    assert capsys.readouterr().err.startswith(f"ipe-bench: {said} 'expp'")
 
 
 def test_a_function_inside_another_is_refused():

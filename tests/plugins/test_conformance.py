@@ -125,6 +125,11 @@ class Mislabelled(Polynomial):
 
 
 @dataclass(frozen=True)
+class Short(Polynomial):
+    nominal = np.array([5.0])  # type: ignore[assignment]
+
+
+@dataclass(frozen=True)
 class Slanted(Polynomial):
     def jacobian(self, x):
         return super().jacobian(x) * 1.01
@@ -263,6 +268,7 @@ class Forgetful(Noise):
         (Faulty("scribbling"), "it writes into its readings"),
         (Thawed(), "frozen=True"),
         (Mislabelled(), "two readings have one label"),
+        (Short(), "nominal has shape (1,), and not one number for each parameter, which is (4,) here"),
         (Slanted(), "off by"),
         (Forgetful(), "besides the stream"),
         (Kinked(), "observe is not analytic"),
