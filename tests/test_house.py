@@ -27,7 +27,7 @@ LINE = (
 BUDGETS = {
     "basics": 1136,
     "measurements": 7493,
-    "noise": 626,
+    "noise": 671,
     "priors": 175,
     "states": 1051,
     "estimators": 1273,
@@ -37,7 +37,7 @@ BUDGETS = {
     "runs": 2230,
     "statistics": 4507,
     "real": 2506,
-    "plugins": 1309,
+    "plugins": 1313,
     "report": 4776,
     "cli": 2921,
 }

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar, Self
 
 import numpy as np
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.naming import Named
-from ipe_bench.basics.options import Component
-from ipe_bench.measurements.base import Measurement
+from ipe_bench.basics.options import Component, Positive
+from ipe_bench.measurements.base import Measurement, UsualNoise
 from ipe_bench.noise.levels import Levels
 
-GINS_STEP = 0.02286
-"""The velocity read-outs' step of 0.075 ft/s in m/s: what noises are set to, since GINS is the standard model."""
-GINS_DEVIATION = 0.0065991136
-"""That step over the root of 12."""
+UNIFORM_DEVIATION = 1 / np.sqrt(12)
+"""The standard deviation of a uniform number between 0 and 1."""
 
 
 class Noise(Component, Named, ABC):
@@ -26,6 +26,15 @@ class Noise(Component, Named, ABC):
     """True where readings are not simulated at all, but are those that come with the model."""
     estimated: ClassVar[bool] = False
     """True where the level of the errors is estimated from the residuals, R being known up to a factor."""
+
+    def completed(self, usual: UsualNoise | None) -> Noise:
+        """This noise, with what its options leave out taken from the usual noise of the model.
+
+        Raises:
+            UserError: the model names none.
+        """
+        del usual
+        return self
 
     @property
     def true_covariance(self) -> bool:
@@ -58,3 +67,32 @@ class Noise(Component, Named, ABC):
         None, unless a noise says otherwise: they are normal. The test of fit takes its law from here.
         """
         return None
+
+
+@dataclass(frozen=True)
+class ScaledNoise(Noise):
+    """A noise whose size is one standard deviation."""
+
+    deviation: Positive | None = None
+    """Standard deviation of a reading, in the unit of the readings; None: that of the model's usual noise."""
+
+    def completed(self, usual: UsualNoise | None) -> Self:
+        if self.deviation is not None:
+            return self
+        if usual is None or (usual.deviation is None and usual.step is None):
+            raise UserError(self._missing)
+        return replace(self, deviation=usual.deviation or usual.step * UNIFORM_DEVIATION)  # type: ignore[operator]
+
+    @property
+    def stated(self) -> float:
+        """The standard deviation; raises UserError if none is given."""
+        if self.deviation is None:
+            raise UserError(self._missing)
+        return self.deviation
+
+    @property
+    def _missing(self) -> str:
+        return (
+            f"noise.deviation: is not given for noise={self.name}, and the measurement model names no noise of its own;"
+            " give the standard deviation of a reading in its unit, noise.deviation=X"
+        )

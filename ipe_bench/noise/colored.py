@@ -11,12 +11,13 @@ from annotated_types import Ge, Gt, Lt
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
-from ipe_bench.basics.options import Count, Positive
-from ipe_bench.noise.base import GINS_DEVIATION, Noise
+from ipe_bench.basics.options import Count
+from ipe_bench.measurements.base import UsualNoise
+from ipe_bench.noise.base import ScaledNoise
 
 
 @dataclass(frozen=True)
-class Colored(Noise):
+class Colored(ScaledNoise):
     """First-order autoregressive noise, stationary: v_k = correlation v_(k-1) + sqrt(1 - correlation^2) deviation e_k.
 
     The readings are `channels` instruments in turn, each with a series of its own; after `length` readings of each the
@@ -24,8 +25,6 @@ class Colored(Noise):
     estimators are told: `white`, R = deviation^2 I, which is the mistake that the paper warns of; or `full`, the truth.
     """
 
-    deviation: Positive = GINS_DEVIATION
-    """Standard deviation of each reading, in the unit of the readings."""
     correlation: Annotated[float, Gt(-1), Lt(1)] = 0.5
     """Of successive readings of one instrument."""
     channels: Count = 1
@@ -51,19 +50,19 @@ class Colored(Noise):
         fresh = np.sqrt(1 - self.correlation**2)
         for k in range(1, e.shape[1]):
             v[:, k] = self.correlation * v[:, k - 1] + fresh * e[:, k]
-        return h + self.deviation * v.ravel()
+        return h + self.stated * v.ravel()
 
     def covariance(self, m: int) -> Covariance:
         repeats, length, channels = self._series(m)
         if self.assumed == "white":
-            return Covariance(np.full(m, self.deviation))
+            return Covariance(np.full(m, self.stated))
         apart = np.abs(np.subtract.outer(np.arange(length), np.arange(length)))
         series = np.kron(self.correlation**apart, np.eye(channels))
-        return Covariance(np.linalg.cholesky(self.deviation**2 * np.kron(np.eye(repeats), series)))
+        return Covariance(np.linalg.cholesky(self.stated**2 * np.kron(np.eye(repeats), series)))
 
 
 @dataclass(frozen=True)
-class Correlated(Noise):
+class Correlated(ScaledNoise):
     """Gaussian errors of any covariance R.
 
     Either `matrix` is R, in squared units of the readings; or readings of one standard deviation come in blocks of
@@ -71,8 +70,6 @@ class Correlated(Noise):
     is what estimators are told: `full`, R itself; or `white`, its diagonal.
     """
 
-    deviation: Positive = GINS_DEVIATION
-    """Standard deviation of each reading, in the unit of the readings."""
     correlation: Annotated[float, Ge(0), Lt(1)] = 0.5
     """Of two readings of one block."""
     block: Count | None = None
@@ -80,6 +77,9 @@ class Correlated(Noise):
     matrix: tuple[tuple[float, ...], ...] | None = None
     """R (m, m); where it is given, the three options above play no part."""
     assumed: Literal["white", "full"] = "full"
+
+    def completed(self, usual: UsualNoise | None) -> Correlated:
+        return self if self.matrix is not None else super().completed(usual)
 
     @property
     def true_covariance(self) -> bool:
@@ -101,7 +101,7 @@ def _factor(noise: Correlated, m: int) -> Array:
         if m % block:
             raise UserError(f"block={block}: {m} readings do not divide into such blocks")
         within = (1 - noise.correlation) * np.eye(block) + noise.correlation
-        R = noise.deviation**2 * np.kron(np.eye(m // block), within)
+        R = noise.stated**2 * np.kron(np.eye(m // block), within)
     else:
         R = np.array(noise.matrix, dtype=float)
         if R.shape != (m, m) or not np.allclose(R, R.T):

@@ -140,7 +140,7 @@ def resolved(noise: Noise, model: Measurement) -> Noise:
         UserError: the model names no noise and none is given.
     """
     if not isinstance(noise, ModelNoise):
-        return noise
+        return noise.completed(model.usual_noise)
     own = noise.of(model)
     if own is None:
         raise UserError(

@@ -20,7 +20,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, estimate_safely
 from ipe_bench.estimators.ipe import IPE, State, begin
 from ipe_bench.measurements import Polynomial, Sir
-from ipe_bench.measurements.base import Measurement, differentiate
+from ipe_bench.measurements.base import Measurement, UsualNoise, differentiate
 from ipe_bench.measurements.counted import cost
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
@@ -42,6 +42,8 @@ SCATTERED = 60
 """Trials from which the scatter of estimates is known to about 10 %."""
 DRAWS = 10_000
 """Draws from which the covariance of a noise is known to about 1 %, or several where its tails are heavy."""
+_USUAL_NOISE = UsualNoise(deviation=0.007, step=0.02)
+"""What a noise takes where its options leave out how large it is."""
 _IMPROBABLE = 1e-6
 _ROUND_OFF = 1e-9
 _SOME, _MOST = 6, 12
@@ -72,6 +74,8 @@ def check_component(name: str, component: Any) -> Iterator[Finding]:
         if component is None:
             yield Finding(name, "Takes columns of a file that cannot be made up, and is tried where there is one")
             return
+    if isinstance(component, Noise):
+        component = component.completed(_USUAL_NOISE)
     for check in (describes_itself, *checks):
         title, complaint = (check.__doc__ or "").strip().splitlines()[0].rstrip("."), ""
         try:

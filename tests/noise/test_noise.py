@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+import ipe_bench as ib
+from ipe_bench.basics.errors import UserError
 from ipe_bench.noise import Colored, Correlated, Gaussian, NoNoise, Outliers, Quantization, StudentT
 
 TRIALS = 4000
@@ -141,3 +143,33 @@ def test_the_stated_law_is_that_of_whitened_errors(noise):
 
 def test_outliers_that_estimators_are_not_told_of_leave_the_law_normal():
     assert Outliers(0.3).whitened((4, 4), np.random.default_rng(0)) is None
+
+
+# What is left out ----------------------------------------------------------------------------------------------------
+
+SCALED = [ib.noise.Gaussian(), ib.noise.NoNoise(), ib.noise.StudentT(), ib.noise.Outliers(), ib.noise.Colored()]
+
+
+@pytest.mark.parametrize("noise", [*SCALED, ib.noise.Correlated(assumed="white")], ids=lambda noise: noise.name)
+def test_a_deviation_that_is_left_out_is_that_of_the_model_and_of_no_other(noise):
+    """That of GINS is its read-outs' step over the root of 12."""
+    for model, deviation in ((ib.measurements.Ranging(), 0.1), (ib.measurements.Gins(), 0.02286 / 12**0.5)):
+        assert ib.Scenario(model, noise).problem.R.deviations == pytest.approx(deviation, rel=1e-12)
+    own = ib.measurements.Formula("a*t", {"a": 1.0}, {"t": (1.0, 2.0)})
+    with pytest.raises(UserError, match=rf"noise.deviation: is not given for noise={noise.name}"):
+        ib.Scenario(own, noise)
+    with pytest.raises(UserError, match=r"noise.deviation: is not given"):
+        noise.covariance(2)
+
+
+def test_a_step_that_is_left_out_is_that_of_the_model():
+    assert ib.Scenario(ib.measurements.Gins(), ib.noise.Quantization()).noise == ib.noise.Quantization(0.02286)
+    with pytest.raises(UserError, match=r"noise.step: is not given for noise=quantization"):
+        _ = ib.Scenario(ib.measurements.Ranging(), ib.noise.Quantization()).problem
+
+
+def test_estimate_asks_for_a_deviation_that_nobody_has_stated(tmp_path):
+    (tmp_path / "z.csv").write_text("t,reading\n1,2\n2,4\n3,6.1\n")
+    model = ib.measurements.Formula("a*t", {"a": 1.0})
+    with pytest.raises(UserError, match=r"noise.deviation: is not given for noise=gaussian"):
+        ib.estimate(model, tmp_path / "z.csv", noise=ib.noise.Gaussian())
