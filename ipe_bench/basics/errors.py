@@ -40,9 +40,14 @@ def shortened(text: str, length: int = 120) -> str:
     return text if len(text) <= length else f"{text[: length - 24]}...{text[-20:]}"
 
 
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """'; did you mean ...?' with the nearest of the known names, capitals or not; empty if none is near."""
+    cases = {one.lower(): one for one in known}
+    close = difflib.get_close_matches(name.lower(), cases, 1)
+    return f"; did you mean {cases[close[0]]}?" if close else ""
+
+
 def unknown(name: str, known: Iterable[str], noun: str) -> str:
     """'there is no such option; did you mean ...', with everything there is."""
     known = sorted(known)
-    close = difflib.get_close_matches(name, known, 1)
-    hint = f"; did you mean {close[0]}?" if close else ""
-    return f"there is no such {noun}{hint} (there are: {', '.join(known) or 'none'})"
+    return f"there is no such {noun}{did_you_mean(name, known)} (there are: {', '.join(known) or 'none'})"

@@ -229,6 +229,11 @@ def _no_such_key(name: str) -> str:
     return f"{name}: {unknown(key, known, 'key')}"
 
 
+def _missing_value(key: str) -> str:
+    forms = {"measurement.of": "=MODULE:FUNCTION", "measurement.rates": ".STATE=FORMULA"}
+    return f"{key}: is not given; write {key}{forms.get(key, '=VALUE')}"
+
+
 _EXPLAINED: tuple[tuple[str, Callable[..., str]], ...] = (
     (r"Could not (?:find|load) '([^']+)'", _no_such_option),
     (r"Could not override '([^']+)'", _no_such_key),
@@ -241,6 +246,6 @@ _EXPLAINED: tuple[tuple[str, Callable[..., str]], ...] = (
         r"Interpolation key '([^']+)' not found\s+full_key: (\S+)",
         lambda k, key: f"{key}: ${{{k}}} is no key of the config",
     ),
-    (r"Missing mandatory value: \S+[\s\S]*full_key: (\S+)", lambda key: f"{key}: is not given; give it a value"),
+    (r"Missing mandatory value: \S+[\s\S]*full_key: (\S+)", _missing_value),
 )
 """What Hydra says, and the line for it."""

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.errors import UserError, did_you_mean, unknown
 from ipe_bench.measurements.ode.trace import special
 
 
@@ -86,7 +86,8 @@ def require_parameters(where: str, names: Iterable[str], parameters: Iterable[st
     """Refuses a name, under the config key `where`, that is not one of the parameters."""
     for name in names:
         if name not in parameters:
-            raise UserError(f"{where}: {name} is not a parameter; these are {', '.join(parameters)}")
+            hint = did_you_mean(name, parameters)
+            raise UserError(f"{where}: {name} is not a parameter{hint} (these are {', '.join(parameters)})")
 
 
 def read(text: str, where: str) -> Arithmetic:

@@ -67,7 +67,9 @@ class Function(WrittenModel):
     def __post_init__(self) -> None:
         super().__post_init__()
         arguments = [name for name in self._signature if name not in self._keywords]
-        require_parameters("start", self.start, arguments)
+        for name in self.start:
+            if name not in arguments:
+                raise UserError(f"start.{name}: {unknown(name, arguments, 'argument')}")
         for key in ("size", "units"):
             require_parameters(key, getattr(self, key), self.starts)
         for name in self.constants:

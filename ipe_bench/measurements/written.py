@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.errors import UserError, did_you_mean
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Input, Measurement, Parameter
 
@@ -72,7 +72,7 @@ class WrittenModel(Measurement):
 
     def absent_input(self, heading: str, columns: Sequence[str]) -> str:
         remedy = f"If {heading} is a parameter, give it a start: measurement.start.{heading}=VALUE"
-        return f"there are {', '.join(columns)}. {remedy}"
+        return f"there are {', '.join(columns)}{did_you_mean(heading, columns) or '.'} {remedy}"
 
     def require_equal_lengths(self) -> None:
         """Refuses columns of different lengths."""

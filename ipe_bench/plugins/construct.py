@@ -11,7 +11,7 @@ import importlib
 from collections.abc import Mapping
 from typing import Any
 
-from ipe_bench.basics.errors import UserError, place_of, unknown
+from ipe_bench.basics.errors import UserError, did_you_mean, place_of, unknown
 from ipe_bench.basics.options import checked, option_types
 from ipe_bench.measurements.known import ParameterInfo
 from ipe_bench.runs.provenance import TARGET
@@ -53,18 +53,20 @@ def find_object(target: Any, where: str) -> Any:
         known = ", ".join(sorted(_registered_packages))
         raise UserError(f"{where}: only classes of these packages are constructed: {known}")
     try:
-        return getattr(importlib.import_module(module_name), name)
+        module = importlib.import_module(module_name)
+        if hasattr(module, name):
+            return getattr(module, name)
     except ModuleNotFoundError as error:
-        remedy = "" if (error.name or "").startswith(module_name.split(".")[0]) else "; install what the plugin needs"
-        raise UserError(f"{where}: {error.msg.splitlines()[0]}{remedy}") from None
-    except (ImportError, AttributeError) as error:
-        raise UserError(f"{where}: {(str(error).splitlines() or [type(error).__name__])[0]}") from None
+        if (error.name or "").startswith(module_name.split(".")[0]):
+            raise UserError(f"{where}: {error.msg.splitlines()[0]}") from None
+        raise UserError(f"{where}: {place_of(error)}; install what the plugin needs") from None
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # a plugin may do anything while it is imported, sys.exit() too
         if module_name.startswith("ipe_bench."):
             raise
         raise UserError(f"{where}: its module cannot be imported: {place_of(error)}") from None
+    raise UserError(f"{where}: {module_name} has no {name}{did_you_mean(name, dir(module))}")
 
 
 def known_parameters(parameters: Mapping[str, Any]) -> tuple[ParameterInfo, ...]:

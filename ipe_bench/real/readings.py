@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.errors import UserError, did_you_mean, unknown
 from ipe_bench.basics.files import write_atomically
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Input, Measurement
@@ -147,9 +147,11 @@ class Table:
         """Refuses columns that are not known, as what they say would be left out without a word."""
         for name in self.heading:
             if name not in known:
+                meant = did_you_mean(name, [one for one in wanted if one not in self.heading])
                 what = f"column {name}" if name else f"column {self.heading.index(name) + 1}, which has no name,"
                 remedy = f"remove it, or set ignore_columns=[{name.split(' [')[0]}]" if name else "remove it"
-                raise self.error(f"{what} is not understood; {remedy} (the header must be {','.join(wanted)})")
+                hint = f"{meant} Otherwise" if meant else ";"
+                raise self.error(f"{what} is not understood{hint} {remedy} (the header must be {','.join(wanted)})")
 
 
 def _number(text: str) -> float | None:
@@ -177,6 +179,8 @@ def read_table(path: Path, *, key: str = "readings", without: Collection[int] = 
     data = path.read_bytes()
     table = replace(table, digest=hashlib.sha256(data).hexdigest())
     table = (_with_parquet if path.suffix == ".parquet" else _with_text)(table, data)
+    if all(table.number(name) is not None for name in table.heading):
+        raise table.error("the first row has only numbers and is no header; write the names of the columns above it")
     for name in table.heading:
         if table.heading.count(name) > 1:
             what = f"column {name} stands there" if name else "columns without a name stand there"
@@ -457,7 +461,12 @@ def _reading_column(table: Table, model: Measurement) -> str:
         return found
     for name in names:
         _refuse_other_unit(table, name)
-    raise table.error(f"column {names[0]} is missing, which holds the readings; there are {', '.join(table.heading)}")
+    known = [_quantity(wanted.heading) for wanted in model.inputs] + [SIGMA]
+    free = [_quantity(name) for name in table.heading if _quantity(name) not in known]
+    other = free[0] if len(free) == 1 else "COLUMN"
+    remedy = f"set measurement.reading={other}" if hasattr(model, "reading") else f"rename {other}"
+    there = ", ".join(table.heading)
+    raise table.error(f"column {names[0]} is missing, which holds the readings; there are {there}; {remedy}")
 
 
 def _refuse_other_unit(table: Table, name: str) -> None:

@@ -111,6 +111,7 @@ MISTAKES = {
     "a command that is gone": (["completion", "bash"], "completion: is no command any more"),
     "the schema that is gone": (["schema"], "schema: is no command any more; `ipe-bench list GROUP/NAME` shows every"),
     "a flag that is gone": (["run", "--config-path", "x"], "name it with --config-dir"),
+    "no function": (["run", "measurement=function"], "measurement.of: is not given; write measurement.of=MODULE:FUNC"),
     "no readings": (["estimate"], "readings: is not given"),
 }
 

@@ -117,6 +117,10 @@ REFUSED = {
         "time,begin,reading\n1,2,3\n2,2,3\n",
         "column feed is missing; there are time, begin, reading",
     ),
+    "times of another name": (
+        "t,feed,begin,reading\n1,2,2,3\n2,2,2,3\n",
+        "column time is missing; there are t, feed, begin, reading; call the times `time`",
+    ),
 }
 
 
@@ -126,6 +130,14 @@ def test_a_wrong_file_is_refused(tmp_path, case):
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(UserError, match=expected):
         open_together([tmp_path / "a.csv"], MODEL)
+
+
+def test_a_file_that_does_not_say_which_state_was_read_is_refused(tmp_path):
+    (tmp_path / "a.csv").write_text("time,reading\n1,2\n2,3\n")
+    model = Ode({"angle": "speed", "speed": "-k*angle"}, {"k": 0.5})
+    said = "column output is missing; 2 states are read; name the one that is: measurement.outputs.angle=angle"
+    with pytest.raises(UserError, match=said):
+        open_together([tmp_path / "a.csv"], model)
 
 
 MISTAKES = {

@@ -143,6 +143,7 @@ def test_what_a_plugins_class_does_not_check_is_checked_where_it_is_constructed(
         ({"_target_": "Deaf", "tolerance": 0.0}, r"^part\.tolerance=0\.0: give a number above 0$"),
         ({"_target_": "Unreadable"}, r"Unreadable: the type of an option cannot be read \(NameError"),
         ({"_target_": "np"}, "is not a component"),
+        ({"_target_": "Deef"}, r"Deef: test_options has no Deef; did you mean Deaf\?$"),
     ):
         with pytest.raises(UserError, match=said):
             construct({**options, "_target_": f"{__name__}.{options['_target_']}"}, "part")
@@ -170,6 +171,16 @@ PRESETS = {
 
 
 PARTS_OF_A_REPORT = ("statistic", "figure", "table", "section")
+
+
+def test_an_import_that_fails_is_named_by_its_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "my_library.py").write_text("import math\nimport nunpy\n")
+    register_package("my_library")
+    said = r"my_library\.py, line 2: ModuleNotFoundError: No module named 'nunpy'; install what the plugin needs$"
+    with pytest.raises(UserError, match=said):
+        construct({"_target_": "my_library.Model"}, "part")
 
 
 DESCRIBED = "_target_: ipe_bench.measurements.Ode", "_target_: ipe_bench.states.Formulas", "ipe_bench.states.Recorded"

@@ -124,7 +124,7 @@ def odd_tables() -> Iterator[Case]:
     as_text = "\n".join(good)
     yield Case("empty", b"", "is empty")
     yield Case("a mark and nothing else", "\ufeff".encode(), "is empty")
-    yield Case("no header", text(*good[1:]), "column t is missing")
+    yield Case("no header", text(*good[1:]), "the first row has only numbers and is no header; write")
     yield Case("two readings", text(*good[:2]), "1 readings are too few for 2 parameters")
     yield Case("tabs", as_text.replace(",", "\t").encode())
     yield Case(
@@ -163,7 +163,10 @@ def odd_tables() -> Iterator[Case]:
         text("t,y,note", *(",".join(line.split(",")[:2]) + ",fine" for line in good[1:])),
         "column note is not",
     )
-    yield Case("Y", text("t,Y,sigma", *good[1:]), "column y is missing, which holds the readings")
+    for name in ("sigm", "Sigma"):
+        yield Case(name, text(f"t,y,{name}", *good[1:]), f"column {name} is not understood; did you mean sigma")
+    yield Case("T", text("T,y,sigma", *good[1:]), "column t is missing; there are T, y, sigma; did you mean T")
+    yield Case("Y", text("t,Y,sigma", *good[1:]), "column y is missing, .* there are t, Y, sigma; set measurement.read")
     yield Case("x", text("x,y,sigma", *good[1:]), "column t is missing.*If t is a parameter")
     yield Case(
         "another unit of sigma",

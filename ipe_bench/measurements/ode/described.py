@@ -317,8 +317,14 @@ class Ode(WrittenModel, WrappedModel):
     def absent_input(self, heading: str, columns: Sequence[str]) -> str:
         if heading in self.driven_by:
             return f"measurement.driven_by.{heading} takes it from the file, in every row"
-        if heading not in self.constant_names:
-            return Measurement.absent_input(self, heading, columns)
+        if heading == time_heading(self.time_unit):
+            return f"there are {', '.join(columns)}; call the times `{heading}`"
+        if heading == "output":
+            names = tuple(self.output_formulas)
+            if self.outputs:
+                return f"it says which of {', '.join(names)} a row reads"
+            named = f"measurement.outputs.{names[0]}={names[0]}"
+            return f"{len(names)} states are read; name the one that is: {named}, or give the column"
         alike = f"if it is the same in all cases, measurement.constants.{heading}=VALUE"
         return f"{super().absent_input(heading, columns)}; {alike}"
 
