@@ -500,3 +500,23 @@ def differentiate(h: Any, x: Array, *, analytic: bool) -> Array:
     z = h(points.reshape(-1, n)).reshape(2, trials, n, -1)
     width = (np.diagonal(points[0], axis1=1, axis2=2) - np.diagonal(points[1], axis1=1, axis2=2))[:, :, None]
     return np.ascontiguousarray(((z[0] - z[1]) / width).swapaxes(1, 2))
+
+
+def contradicted(h: Any, x: Array, J: Array) -> NDArray[np.bool_]:
+    """The trials (trials,) in which central differences of h along one direction contradict J = dh/dx (trials, m, n).
+
+    Two calls per trial, whatever n is. Every parameter changes the readings by about as much, none by a multiple of
+    what another does, so that a wrong column shows beside larger ones.
+    """
+    trials, n = x.shape
+    unit = np.maximum(1.0, np.abs(x))
+    size = np.nan_to_num(np.fmax.reduce(np.abs(J), axis=1), posinf=0.0) * unit + np.finfo(float).tiny
+    weight = 1.0 / np.maximum(size, 1e-4 * size.max(axis=1, keepdims=True))
+    weight *= np.random.default_rng(1).uniform(0.5, 1.0, n) / weight.max(axis=1, keepdims=True)
+    above, below = x + _CENTRAL_STEP * unit * weight, x - _CENTRAL_STEP * unit * weight
+    z = h(np.concatenate([above, below]))
+    with np.errstate(all="ignore"):
+        change, expected = z[:trials] - z[trials:], (J * (above - below)[:, None]).sum(axis=2)
+        rounding = 100 * np.finfo(float).eps * np.fmax.reduce(np.abs(z[:trials]), axis=1)
+        tolerated = 1e-5 * _CENTRAL_STEP * (size * weight).sum(axis=1) + rounding
+        return (np.isfinite(change) & ~(np.abs(change - expected) <= tolerated[:, None])).any(axis=1)

@@ -20,7 +20,7 @@ from ipe_bench.basics.errors import UserError, place_of, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Finite, Positive
 from ipe_bench.measurements.arithmetic import require_parameters
-from ipe_bench.measurements.base import differentiate
+from ipe_bench.measurements.base import contradicted, differentiate
 from ipe_bench.measurements.written import WrittenModel
 
 _CHUNK = 8
@@ -41,7 +41,7 @@ class Function(WrittenModel):
     Arguments with a number as default are parameters, which start there; arguments without are columns of the readings
     file, arrays (m,); keyword-only arguments are constants. h returns the readings (m,). The type `Annotated[float,
     "m"]` gives a parameter its unit. Slopes are exact: by forward differentiation where h returns JAX arrays, by a
-    complex step where h turns out to be analytic, else by central differences. Readings that have a column `t` or
+    complex step where differences agree with it, else by central differences. Readings that have a column `t` or
     `time` arrive in that order, so that filters take part.
     """
 
@@ -189,11 +189,14 @@ class Function(WrittenModel):
         return {name: self.column(name) for name in self.headings} | dict(self.constants)
 
     def _at(self, values: Any) -> Any:
-        """h where the parameters have these values (n,), in their own units."""
+        """h where the parameters have these values (n,), in their own units; at their real parts if h does not take
+        complex ones."""
         known = self._known
         try:
             return self.function(**dict(zip(self.starts, values, strict=True)), **known)
         except Exception as error:
+            if np.iscomplexobj(values):  # functions of `math` refuse them
+                return self._at(values.real)
             file = getattr(sys.modules.get(self.function.__module__), "__file__", None)
             raise UserError(f"measurement.of={self.of}: {place_of(error, file)}") from error
 
@@ -228,29 +231,34 @@ class Function(WrittenModel):
 
     @cached_property
     def _is_analytic(self) -> bool:
-        """Whether the complex step gives the slopes that differences give, near the start and away from it."""
+        """Whether complex steps give the slopes that differences give, near the start and away from it."""
         offsets = np.random.default_rng(1).uniform(-0.3, 0.3, (4, self.n))
         x = self.nominal + np.vstack([np.zeros(self.n), offsets])
-        by_differences = differentiate(self._rows, x, analytic=False)
-        try:  # functions of `math` refuse complex numbers; some conversions drop the imaginary part with a warning
-            with warnings.catch_warnings():
-                warnings.simplefilter("error")
-                by_complex_step = differentiate(self._rows, x, analytic=True)
-        except (UserError, ValueError, Warning):
-            return False
-        known = np.isfinite(by_differences).all(axis=(1, 2))
-        size = np.abs(by_differences[known]).max(axis=1, keepdims=True, initial=0.0)
-        return bool(known.any() and (np.abs(by_complex_step - by_differences)[known] <= 1e-5 * size).all())
+        return not contradicted(self._rows, x, self._by_complex_step(x)).any()
+
+    def _by_complex_step(self, x: Array) -> Array:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", np.exceptions.ComplexWarning)
+            return differentiate(self._rows, x, analytic=True)
 
     def simulate(self, x: Array) -> Array:
         return self._rows(x) if self._jax is None else self._jax[0](x)
 
     def jacobian(self, x: Array) -> Array:
-        return differentiate(self._rows, x, analytic=self._is_analytic) if self._jax is None else self._jax[1](x)
+        if self._jax is not None:
+            return self._jax[1](x)
+        if not self._is_analytic:
+            return differentiate(self._rows, x, analytic=False)
+        J = self._by_complex_step(x)
+        if (wrong := contradicted(self._rows, x, J)).any():  # in a branch that is not analytic
+            J[wrong] = differentiate(self._rows, x[wrong], analytic=False)
+        return J
 
     @property
     def jacobian_cost(self) -> float:
-        return float(self.n if self._jax is not None or self._is_analytic else 2 * self.n)
+        if self._jax is not None:
+            return float(self.n)
+        return float(self.n + 2 if self._is_analytic else 2 * self.n)
 
 
 def function(h: Callable[..., Any], start: Mapping[str, float] | None = None, **options: Any) -> Function:

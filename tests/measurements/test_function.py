@@ -4,6 +4,7 @@ import sys
 
 import numpy as np
 import pytest
+from scipy.optimize import curve_fit
 
 import ipe_bench as ib
 from ipe_bench.cli.main import main
@@ -25,6 +26,30 @@ def by_math(t, length=1.2, damping=0.1):
 
 def absolute(t, k=0.7):
     return np.abs(np.sin(k * t))
+
+def bell(t, height, centre, width, base):
+    return height * np.exp(-0.5 * ((t - centre) / width) ** 2) + base
+
+def high_by_abs(t, height=2.0, centre=1.5, width=0.5, base=0.3):
+    y = bell(t, height, centre, width, base)
+    return np.where(y > 2.5, np.abs(y), y)
+
+def high_by_norm(t, height=2.0, centre=1.5, width=0.5, base=0.3):
+    y = bell(t, height, centre, width, base)
+    return y if height.real < 2.5 else np.linalg.norm(np.stack([y, 0 * y]), axis=0)
+
+def high_by_math(t, height=2.0, centre=1.5, width=0.5, base=0.3):
+    y = bell(t, height, centre, width, base)
+    return y if height.real < 2.5 else np.array([math.sqrt(s) ** 2 for s in y])
+
+def high_by_array(t, height=2.0, centre=1.5, width=0.5, base=0.3):
+    y = bell(t, height, centre, width, base)
+    z = np.empty(len(t), dtype=y.dtype if height.real < 2.5 else float)
+    z[:] = y
+    return z
+
+def faint(t, height=2e-6, base=0.0):
+    return base + np.exp(-t) * (height if height.real < 2.5e-6 else np.abs(height))
 
 def two_columns(t, k=1.0):
     return np.outer(t, [k, k])
@@ -82,7 +107,7 @@ def test_a_function_is_the_model_that_its_formula_is(laws):
     np.testing.assert_allclose(ours.simulate(x), beside.simulate(x[:, ::-1]), rtol=1e-14, atol=1e-14)
     np.testing.assert_allclose(ours.jacobian(x), beside.jacobian(x[:, ::-1])[:, :, ::-1], rtol=1e-12, atol=1e-12)
     assert [(p.name, p.unit, p.size) for p in ours.parameters] == [("length", "m", 1.2), ("damping", "", 0.1)]
-    assert ours.jacobian_cost == 2.0
+    assert ours.jacobian_cost == 2.0 + 2.0
     assert len(ours.epochs) == len(T)
 
 
@@ -93,6 +118,35 @@ def test_slopes_are_differences_where_the_complex_step_is_wrong(laws, name, cost
     expected = differentiate(ours.simulate, x, analytic=False)
     np.testing.assert_allclose(ours.jacobian(x), expected, rtol=1e-6, atol=1e-8)
     assert ours.jacobian_cost == cost
+
+
+@pytest.mark.parametrize("name", ["high_by_abs", "high_by_norm"])
+def test_an_estimate_is_right_in_a_branch_that_the_start_is_not_in(laws, name):
+    z = 3.0 * np.exp(-0.5 * ((T - 1.5) / 0.5) ** 2) + 0.3 + np.random.default_rng(2).normal(0, 0.03, len(T))
+    (laws / "bell.csv").write_text("t,reading\n" + "".join(f"{t},{value}\n" for t, value in zip(T, z, strict=True)))
+    import some_laws
+
+    law = getattr(some_laws, name)
+    fit = {fit.label: fit for fit in ib.estimate(function(law), "bell.csv")}["auto"]
+    expected, covariance = curve_fit(some_laws.bell, T, z, p0=[3.0, 1.5, 0.5, 0.3], xtol=1e-12, ftol=1e-12)
+    np.testing.assert_allclose(fit.x, expected, rtol=1e-6)
+    np.testing.assert_allclose(np.sqrt(np.diag(fit.covariance)), np.sqrt(np.diag(covariance)), rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["high_by_abs", "high_by_norm", "high_by_math", "high_by_array"])
+def test_slopes_of_a_trial_in_a_branch_that_is_not_analytic_do_not_depend_on_others(laws, name):
+    ours = model(name)
+    x = ours.nominal + np.array([[0.0], [0.5]]) * np.array([1.0, 0.0, 0.0, 0.0])
+    J = ours.jacobian(x)
+    exact = ib.measurements.Function(of="some_laws:bell", columns=ours.columns, start=ours.starts).jacobian(x)
+    np.testing.assert_allclose(J[0], exact[0], rtol=1e-14, atol=1e-14)
+    np.testing.assert_allclose(J[1], exact[1], atol=1e-8)
+    assert all(np.array_equal(J[i : i + 1], ours.jacobian(x[i : i + 1])) for i in range(2))
+
+
+def test_a_wrong_slope_shows_beside_one_that_is_much_larger(laws):
+    expected = np.stack([2e-6 * np.exp(-T), np.ones_like(T)], axis=-1)
+    np.testing.assert_allclose(model("faint").jacobian(np.array([[1.5, 0.0]]))[0], expected, rtol=1e-9, atol=1e-13)
 
 
 def test_a_function_in_jax_has_the_slopes_of_the_one_in_numpy_in_every_batch(laws):
