@@ -32,13 +32,13 @@ BUDGETS = {
     "states": 1051,
     "estimators": 1273,
     "solvers": 1250,
-    "baselines": 2370,
+    "baselines": 2367,
     "trials": 2367,
     "runs": 2230,
     "statistics": 4507,
     "real": 2515,
     "plugins": 1315,
-    "report": 4776,
+    "report": 4791,
     "cli": 2926,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""

@@ -39,6 +39,8 @@ _FEW = 0.05
 """Share of outliers above which the model is wrong, and a list of readings says nothing."""
 _INFLUENCE = ("leverage", "cook", "shift")
 _FITS = {True: "yes", False: "NO", None: "not tested"}
+_TOO_WELL = 0.999
+"""The p of chi-square above which residuals are smaller than the stated noise explains."""
 _COLLINEAR = 10.0
 """Collinearity index from which on the readings hardly tell parameters apart (Brun, Reichert and Künsch, Water
 Resources Research 37)."""
@@ -233,6 +235,14 @@ def _notes(answer: Answer) -> Iterator[str]:
             f"{', '.join(suspect)}: successive residuals resemble each other (white p below {FIT_LEVEL:g}); the model"
             " is in doubt, and standard errors are too small."
         )
+    if small := [one for one in fits if one.level is None and not one.levels and one.p_value > _TOO_WELL]:
+        least = min(small, key=lambda one: one.chi_square)
+        times = math.sqrt(least.degrees_of_freedom / least.chi_square) if least.chi_square else math.inf
+        yield (
+            f"{', '.join(one.label for one in small)}: the residuals are up to {times:.2g} times smaller than the"
+            f" stated noise, by chance in less than {1 - _TOO_WELL:.1g} of cases; if it is overstated, so are standard"
+            " errors."
+        )
     if told := [one.label for one in fits if one.with_prior]:
         yield f"{', '.join(told)}: with a prior, which counts in the standard errors as further readings would."
     if answer.model.fixed:
@@ -279,24 +289,29 @@ def _intervals(found: Examination) -> Table:
     """Three intervals of each parameter; of one on a bound, that of its profile."""
     on_bounds, absent = found.on_bounds, ["-"] * len(found.on_bounds)
     parameters = [*found.model.physical_parameters, *(b.parameter for b in on_bounds)]
+    middle = found.model.physical(found.x[None])[0]
     ends = [(one.low, one.high) for one in found.profiles] + [tuple(sorted((b.bound, b.other))) for b in on_bounds]
     columns = [
         words("parameter", [p.name for p in parameters]),
         words("unit", [p.unit for p in parameters]),
-        texts("standard error", [*map(_interval, *found.wald), *absent]),
-        texts("profile", [_interval(*pair) for pair in ends]),
-        texts("bootstrap", [*map(_interval, found.bootstrap.low, found.bootstrap.high), *absent]),
+        texts("standard error", [*map(_interval, *found.wald, middle), *absent]),
+        texts("profile", [_interval(*pair, at) for pair, at in zip(ends, [*middle, *absent], strict=True)]),
+        texts("bootstrap", [*map(_interval, found.bootstrap.low, found.bootstrap.high, middle), *absent]),
     ]
     prior = " with its prior" if found.with_prior else ""
     title = f"{100 * CONFIDENCE:.0f} % intervals of {found.label}{prior}, by three ways"
     return Table("intervals", title, "", columns)
 
 
-def _interval(low: float, high: float) -> str:
-    """Both ends to a hundredth of the width; infinite ends as such."""
+def _interval(low: float, high: float, middle: Any = "-") -> str:
+    """Each end to a hundredth of twice its distance to the estimate `middle`, if that lies between them, or of the
+    width; infinite ends as such."""
     if not math.isfinite(high - low) or high <= low:
         return f"{low:.6g} … {high:.6g}".replace("-inf", "−∞").replace("inf", "∞").replace("nan", "-")
-    return " … ".join(_rounded((low, high), math.floor(math.log10(high - low)) - 2))
+    inside = middle != "-" and low < middle < high
+    reaches = (2 * (middle - low), 2 * (high - middle)) if inside else (high - low, high - low)
+    ends = zip((low, high), reaches, strict=True)
+    return " … ".join(_rounded((end,), math.floor(math.log10(reach)) - 2)[0] for end, reach in ends)
 
 
 def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator[str]:

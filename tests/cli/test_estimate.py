@@ -260,3 +260,17 @@ def test_the_digest_is_of_the_bytes_that_were_estimated(estimate, misra, tmp_pat
     code, printed, answer = estimate(*SATURATION, *LM, "readings=my.csv")
     assert code == 0, printed
     assert answer["readings"] == [{"file": "my.csv", "sha256": before}]
+
+
+def test_noise_that_is_overstated_is_said_and_rounded_intervals_hold_the_estimate(estimate):
+    """A standard deviation of 3 where errors are .03: 100 times too large."""
+    t = np.linspace(0, 6, 25)
+    z = 2 * np.exp(-0.7 * t) + 0.3 + 0.03 * np.random.default_rng(0).standard_normal(25)
+    rows = [f"{a},{b},3" for a, b in zip(t.tolist(), z.tolist(), strict=True)]
+    Path("sig.csv").write_text("\n".join(["t,reading,sigma", *rows]), encoding="utf-8")
+    decay = ("measurement=formula", "measurement.expression=a*exp(-b*t)+c", "measurement.start.a=1")
+    code, printed, _ = estimate(*decay, "measurement.start.b=0.5", "measurement.start.c=0.1", "readings=sig.csv")
+    assert code == 0, printed
+    printed = " ".join(printed.split())
+    assert "the residuals are up to 1.1e+02 times smaller than the stated noise" in printed
+    assert "a -2.35 … 6.37 -84 … 7.5" in printed  # to tens, as the width is, the upper end would be 10
