@@ -81,14 +81,15 @@ class Sequential(Estimator):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.engine == "batched" and type(self).stack is Sequential.stack:
-            raise UserError("engine=batched: this filter has none; choose engine=filterpy")
+        for engine, method in (("batched", "stack"), ("filterpy", "track")):
+            if self.engine == engine and getattr(type(self), method) is getattr(Sequential, method):
+                raise UserError(f"engine={engine}: this filter has no {method}; choose the other engine")
 
-    @abstractmethod
     def track(self, P0: Array, Q: Array, z: Array) -> Track:
         """The filter of one trial before its first reading, at x = 0 with covariance P0 (n, n) and process noise Q
         (n, n) per epoch. z (m,) are all readings of the trial: for a random stream that is the trial's own, and for
-        nothing else."""
+        nothing else. A filter that has none is computed for all trials at once."""
+        raise NotImplementedError
 
     def stack(self, P0: Array, Q: Array, problem: Problem, z: Array) -> Walk:
         """The filters of all trials at once, for readings z (trials, m). A filter that has none is filterpy's."""

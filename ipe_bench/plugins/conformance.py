@@ -294,11 +294,11 @@ def _with_columns(model: Measurement) -> Measurement | None:
     for columns in (labels | varied, labels | same):
         try:
             tried = model.with_inputs(columns, count)
-            with np.errstate(all="ignore"):
-                if np.isfinite(tried.simulate(_points(tried))).all():
-                    return tried
         except UserError:
             continue
+        with np.errstate(all="ignore"):
+            if np.isfinite(tried.simulate(_points(tried))).all():
+                return tried
     return None
 
 

@@ -223,6 +223,8 @@ def test_what_the_function_raises_is_one_line_with_its_place(laws, capsys):
     assert main(["run", *words, "noise=gaussian", "noise.deviation=0.01", "trials=2", "figures=none"]) == 2
     said = f"measurement.of=some_laws:boom: some_laws.py, line {line}: AttributeError: module 'numpy' has no attribute"
     assert capsys.readouterr().err.startswith(f"ipe-bench: {said} 'expp'")
+    assert main(["check", *words[:2]]) == 2
+    assert capsys.readouterr().err.startswith(f"ipe-bench: {said} 'expp'")
 
 
 def test_a_function_inside_another_is_refused():

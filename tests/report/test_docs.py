@@ -10,10 +10,14 @@ import sys
 from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import ipe_bench
+from ipe_bench.baselines import EKF
 from ipe_bench.cli.main import COMMANDS
+from ipe_bench.measurements import Polynomial
+from ipe_bench.noise import Gaussian
 from ipe_bench.plugins import discovery
 from ipe_bench.plugins.description import described
 from ipe_bench.report.docs import generated as pages
@@ -74,6 +78,19 @@ def test_the_cells_of_the_notebook_run(tmp_path, monkeypatch):
         exec(code, names)
     assert next(iter(names["table"].figures)) == "headline"
     assert (tmp_path / "outputs" / "notebook" / "report.html").exists()
+
+
+def test_the_filter_of_the_page_is_the_kalman_filter_on_a_linear_model():
+    names: dict = {"__name__": __name__}
+    (code,) = blocks(PAGES / "howto" / "write_filter.md", "python")
+    exec(compile(code, "write_filter.md", "exec", dont_inherit=True), names)
+    scenario = ipe_bench.Scenario(Polynomial(strength=0.0), Gaussian(0.01))
+    z = scenario.draw(0, 5).z
+    ours, kalman = (one.estimate(scenario.problem, z) for one in (names["MyFilter"](), EKF()))
+    np.testing.assert_allclose(ours.x, kalman.x, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(ours.covariance, kalman.covariance, rtol=1e-6, atol=1e-12)
+    with pytest.raises(ipe_bench.UserError, match="engine=filterpy: this filter has no track"):
+        type("Neither", (ipe_bench.Sequential,), {})()
 
 
 def test_attributes_of_public_classes_have_types_that_are_types():
