@@ -155,7 +155,8 @@ class Table:
 
 
 def _number(text: str) -> float | None:
-    return float(text) if _NUMBER.fullmatch(text.strip()) else None
+    text = text.strip()  # of separators too, which float() does not take
+    return float(text) if _NUMBER.fullmatch(text) else None
 
 
 def _quantity(heading: str) -> str:

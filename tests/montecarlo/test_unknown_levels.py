@@ -45,7 +45,7 @@ def test_estimators_are_told_the_nominal_level_and_marked_so(tmp_path):
     assert total["success"] > 0.95
     with (shown := Console(width=200)).capture() as printed:
         shown.print(render(frame))
-    assert "every estimator here is told R, that of the true levels" in printed.get()
+    assert "every estimator here is given R, that of the true levels" in printed.get()
 
 
 def test_without_levels_a_run_is_refused():

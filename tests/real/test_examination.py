@@ -216,7 +216,7 @@ def test_an_estimate_that_is_not_the_least_minimum_does_not_pass():
     assert not answer.examination.least
     assert answer.examination.minima[0].x[0] == pytest.approx(2.0, rel=0.02)
     assert not answer.passes
-    assert "NOT THE LEAST MINIMUM" in str(answer)
+    assert "NOT THE GLOBAL MINIMUM" in str(answer)
 
 
 def test_with_as_many_readings_as_parameters_nothing_is_tested_but_a_worse_answer_is_none():
