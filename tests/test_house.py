@@ -26,7 +26,7 @@ LINE = (
 )
 BUDGETS = {
     "basics": 1141,
-    "measurements": 7530,
+    "measurements": 7552,
     "noise": 671,
     "priors": 175,
     "states": 1051,

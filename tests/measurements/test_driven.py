@@ -144,6 +144,18 @@ def test_a_kink_is_integrated(rate):
     np.testing.assert_allclose(model.jacobian(x), by_differences, rtol=2e-3, atol=1e-8)
 
 
+def test_readings_that_a_kink_leaves_off_are_told_of():
+    kinked = Ode({"y": "-a*max(0, y - 1) - 0.3*y"}, {"a": 1.0}, {"y": 2.0}, times=(2.0,))
+    level = 1.0 / 1.3
+    exact = np.exp(-0.3 * (2.0 - np.log((2.0 - level) / (1.0 - level)) / 1.3))
+    off = np.abs(kinked.simulate(kinked.nominal[None])[0, 0] - exact) / kinked.engine.tolerance
+    (said,) = [text for text in kinked.remarks(kinked.nominal) if "kinks" in text]
+    assert float(said.partition("about ")[2].split()[0]) == pytest.approx(off, rel=0.2)
+    assert "measurement.method=implicit" in said
+    for other in (replace(kinked, method="implicit"), replace(kinked, rates={"y": "-a*y*y"}, times=(40.0,))):
+        assert not [text for text in other.remarks(other.nominal) if "kinks" in text]
+
+
 def test_a_switch_after_the_readings_is_named():
     model = Ode({"y": "(1 if t < 3*pi else 2) - k*y"}, {"k": 0.3}, times=(1.0, 2.0, 5.0))
     (said,) = model.remarks(model.nominal)

@@ -20,12 +20,14 @@ from ipe_bench.measurements.arithmetic import (
     Tree,
     comparisons,
     never_switches,
+    parts,
     read,
     require_finite,
     require_parameters,
 )
 from ipe_bench.measurements.base import Input, Measurement, Recorded, SubsetModel, UsualNoise, WrappedModel
 from ipe_bench.measurements.ode.driven import (
+    PIECEWISE,
     course,
     courses,
     grid,
@@ -42,6 +44,8 @@ _SHARE = 1e-8
 """Of the largest reading, what the integration may leave unless told otherwise."""
 _TRIAL_STEPS = 16
 """Steps within the shortest interval that tell how large readings are."""
+_KINKED = 5.0
+"""Tolerances by which readings may be off before it is told of; smooth rates leave less than one."""
 _EASY = 16
 """Explicit steps between two readings up to which nominal equations are not asked whether they are stiff."""
 _STIFF = 10.0
@@ -295,10 +299,19 @@ class Ode(WrittenModel, WrappedModel):
         return bool(self.times or self.readings) and known.issuperset((*self.constant_names, *self.driven_by))
 
     def remarks(self, x: Array) -> tuple[str, ...]:
-        """That the implicit method is chosen, and which conditionals never switch along the solution at x."""
+        """That the implicit method is chosen, or is nearer, and which conditionals never switch along the solution at
+        x."""
         found, engine = [], self.engine
         if self.method == "auto" and engine.stiff:
             found.append(engine.said_stiff)
+        rates = self.piecewise_rates[0].values()
+        kinked = any(part[0] in PIECEWISE for formula in rates for part in parts(formula.tree))
+        if kinked and (off := engine.off(x)) > _KINKED:
+            found.append(
+                f"the explicit method leaves readings off by about {off:.0f} times the tolerance, as it does where "
+                "rates have kinks, and slopes right to two or three digits; measurement.method=implicit brings the "
+                "readings nearer, but not always the slopes"
+            )
         formulas = {f"rates.{name}": f for name, f in self.rate_formulas.items()}
         formulas |= {f"outputs.{name}": f for name, f in self.output_formulas.items()}
         conditions = comparisons(formulas)
@@ -437,6 +450,15 @@ class _Engine(OdeMeasurement):
             f"the solution needs {work.steps}; they are integrated by the implicit method "
             "(measurement.method=explicit or implicit fixes it)"
         )
+
+    def off(self, x: Array) -> float:
+        """By how many tolerances the explicit method differs from the implicit one in a reading at x (n,); 0 where few
+        explicit steps do."""
+        x = own(x[None, : self.n])
+        if self.stiff or self.step is not None or self._ladder[self._search(x, self._zeros).places[0]] <= _EASY:
+            return 0.0
+        difference = np.abs(self.simulate(x) - self._implicit.simulate(x, len(self.times)))
+        return float(np.nan_to_num(difference / self._tolerances, nan=0.0, posinf=0.0).max())
 
     def along(self, x: Array) -> dict[str, Any]:
         """What the names in the formulas stand for at x (n,), at the times of each case: (cases, times)."""

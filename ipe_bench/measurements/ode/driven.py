@@ -17,7 +17,7 @@ from ipe_bench.measurements.arithmetic import COMPARISONS, CONSTANTS, Arithmetic
 from ipe_bench.measurements.ode.trace import COMPARISONS as OF_COMPARISON
 from ipe_bench.measurements.ode.trace import Graph, Program, in_order, tangent
 
-_PIECEWISE = ("min", "max", "abs", *COMPARISONS)
+PIECEWISE = ("min", "max", "abs", *COMPARISONS)
 _SAME = 1e-12
 """Of the whole span: times this close are one."""
 
@@ -29,7 +29,7 @@ def separated(
     switches: dict[Tree, str] = {}
 
     def new(tree: Tree) -> Tree | None:
-        names = set(names_in(tree)) if tree[0] in _PIECEWISE else set()
+        names = set(names_in(tree)) if tree[0] in PIECEWISE else set()
         if "t" not in names or not names <= {"t", *constants, *CONSTANTS}:
             return None
         if tree[0] in COMPARISONS:
@@ -41,7 +41,7 @@ def separated(
     found = {}
     for key, formula in formulas.items():
         tree = formula.tree
-        if any(part[0] in _PIECEWISE for part in parts(tree)):
+        if any(part[0] in PIECEWISE for part in parts(tree)):
             tree = rewritten(tree, new)
         found[key] = Arithmetic(formula.text, tree, tuple(dict.fromkeys(names_in(tree))))
     return found, {name: tree for tree, name in switches.items()}
