@@ -26,8 +26,8 @@ KINDS = {
     "filter": f'run {BENT} "baseline=[linear_lse,ekf,ukf,my_filter]"',
     "baseline": f'run {BENT} "baseline=[linear_lse,gauss_newton,my_baseline]"',
     "measurement": f'run measurement=my_measurement {SMALL} "solver=[newton,auto]" "baseline=[gauss_newton,ekf,ukf]"',
-    "function": "run measurement=function measurement.of=my_function:my_function measurement.columns.t=[0,1,2] "
-    f"error_scale=0.1 {SMALL}",
+    "function": "run measurement=function measurement.of=my_function:my_function "
+    f"measurement.columns.t=[0,1,2,3,4,5,6,7] error_scale=0.1 {SMALL}",
     "ode": "run measurement=ode measurement.file=my_ode.yaml error_scale=0.1 trials=50 figures=none",
     "model": "run model=my_model trials=50 figures=none",
     "noise": "run measurement=polynomial noise=my_noise trials=50 figures=none",
@@ -54,7 +54,8 @@ exits with 0.
 2. A component is a frozen dataclass. Its fields are its options, and its config file sets them.
 3. Arrays are batched: x is (trials, n), readings are (trials, m). A trial has the same bits alone and in any batch: use
    stacked `matmul`, `einsum` or `solve`, and draw random numbers only from the generator that is handed in.
-4. x counts in multiples of the parameters' sizes. SI units everywhere else.
+4. x counts in multiples of the parameters' sizes. SI units everywhere else. At error scale 1 a true parameter scatters
+   about its start by a standard deviation of one size, at 5 by five: choose sizes by how little is known beforehand.
 5. Exit codes: 0 done; 1 done, but checks or trials failed; 2 a mistake in the command, which one line explains.
 6. Claim a difference only if `compare` finds one.
 
@@ -62,6 +63,7 @@ exits with 0.
 
     ipe-bench run {bent} "solver=[fixed_point,newton]" output=out
     ipe-bench compare out first=newton second=fixed_point
+    ipe-bench run -m error_scale=1,5 measurement=polynomial {small}
     ipe-bench run {bent} write_readings=trial.csv
     ipe-bench estimate measurement=polynomial readings=trial.csv noise=gaussian noise.deviation=0.01 figures=none
 
@@ -85,7 +87,7 @@ def write_skill(folder: Path) -> list[Path]:
         texts = {f"new-{kind}": _page(kind) for kind in KINDS}
     pages = "\n".join(f"- a new {kind}: `new-{kind}.md`" for kind in KINDS)
     known = "\n".join(f"- {group}: {', '.join(names)}" for group, names in options.items())
-    texts["SKILL"] = ROUTER.format(version=__version__, bent=BENT, pages=pages, options=known)
+    texts["SKILL"] = ROUTER.format(version=__version__, bent=BENT, small=SMALL, pages=pages, options=known)
     files = [folder / f"{name}.md" for name in sorted(texts)]
     for path in files:
         write_text(path, texts[path.stem])

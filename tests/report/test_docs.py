@@ -87,6 +87,8 @@ def test_the_filter_of_the_page_is_the_kalman_filter_on_a_linear_model():
     scenario = ipe_bench.Scenario(Polynomial(strength=0.0), Gaussian(0.01))
     z = scenario.draw(0, 5).z
     ours, kalman = (one.estimate(scenario.problem, z) for one in (names["MyFilter"](), EKF()))
+    assert ours.covariance is not None
+    assert kalman.covariance is not None
     np.testing.assert_allclose(ours.x, kalman.x, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(ours.covariance, kalman.covariance, rtol=1e-6, atol=1e-12)
     with pytest.raises(ipe_bench.UserError, match="engine=filterpy: this filter has no track"):
