@@ -24,7 +24,7 @@ LEGEND = (
     " since no rival succeeds significantly more often. failed (on wide screens) gives known / silent failures: the"
     " status or the test of fit reports a known one.",
     "error is the median / 95 % quantile over all trials, in multiples of the bound at the truth; 1 is the best"
-    " possible. efficiency is the reciprocal of its root mean square, where a trial counts as at most {CAP:g}.",
+    f" possible. efficiency is the reciprocal of its root mean square, where a trial counts as at most {CAP:g}.",
     "NEES is the median of the squared error over the variance that the estimator claims; 1 is right. The word or sign"
     " is the verdict on the converged trials: optimistic (+) claims too small a variance, pessimistic (-) too large a"
     " one, diverged (!) is lost without reporting it. cost counts simulations.",

@@ -24,7 +24,7 @@ from ipe_bench.report.definitions import DEFINITIONS
 from ipe_bench.report.headline import about, headline
 from ipe_bench.report.table import Strong, Table, column, comma_separated, html, latex, markdown, terminal, texts, words
 from ipe_bench.report.tables import all_tables
-from ipe_bench.report.terminal import render
+from ipe_bench.report.terminal import LEGEND, render
 from ipe_bench.report.words import compact, duration, percent, reported, short
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.records import SCORES, STATISTICS, frame_columns
@@ -264,3 +264,7 @@ def test_what_a_terminal_has_no_room_for_is_named_with_its_file_or_goes_below():
     assert sum("estimator" in line for line in below) > 1
     assert re.findall(r"value \d", " ".join(below)) == [f"value {i}" for i in range(9)]
     assert max(map(len, left + below)) <= 60
+
+
+def test_the_legend_says_at_what_a_trial_is_capped():
+    assert "where a trial counts as at most 5." in " ".join(LEGEND)
