@@ -38,7 +38,7 @@ BUDGETS = {
     "statistics": 4507,
     "real": 2516,
     "plugins": 1315,
-    "report": 4791,
+    "report": 4790,
     "cli": 2928,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""

@@ -289,13 +289,13 @@ def _intervals(found: Examination) -> Table:
     """Three intervals of each parameter; of one on a bound, that of its profile."""
     on_bounds, absent = found.on_bounds, ["-"] * len(found.on_bounds)
     parameters = [*found.model.physical_parameters, *(b.parameter for b in on_bounds)]
-    middle = found.model.physical(found.x[None])[0]
+    middle, nowhere = found.model.physical(found.x[None])[0], [math.nan] * len(on_bounds)
     ends = [(one.low, one.high) for one in found.profiles] + [tuple(sorted((b.bound, b.other))) for b in on_bounds]
     columns = [
         words("parameter", [p.name for p in parameters]),
         words("unit", [p.unit for p in parameters]),
         texts("standard error", [*map(_interval, *found.wald, middle), *absent]),
-        texts("profile", [_interval(*pair, at) for pair, at in zip(ends, [*middle, *absent], strict=True)]),
+        texts("profile", [_interval(low, high, at) for (low, high), at in zip(ends, [*middle, *nowhere], strict=True)]),
         texts("bootstrap", [*map(_interval, found.bootstrap.low, found.bootstrap.high, middle), *absent]),
     ]
     prior = " with its prior" if found.with_prior else ""
@@ -303,13 +303,12 @@ def _intervals(found: Examination) -> Table:
     return Table("intervals", title, "", columns)
 
 
-def _interval(low: float, high: float, middle: Any = "-") -> str:
+def _interval(low: float, high: float, middle: float) -> str:
     """Each end to a hundredth of twice its distance to the estimate `middle`, if that lies between them, or of the
     width; infinite ends as such."""
     if not math.isfinite(high - low) or high <= low:
         return f"{low:.6g} … {high:.6g}".replace("-inf", "−∞").replace("inf", "∞").replace("nan", "-")
-    inside = middle != "-" and low < middle < high
-    reaches = (2 * (middle - low), 2 * (high - middle)) if inside else (high - low, high - low)
+    reaches = (2 * (middle - low), 2 * (high - middle)) if low < middle < high else (high - low, high - low)
     ends = zip((low, high), reaches, strict=True)
     return " … ".join(_rounded((end,), math.floor(math.log10(reach)) - 2)[0] for end, reach in ends)
 
