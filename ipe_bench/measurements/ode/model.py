@@ -50,7 +50,7 @@ class OdeMeasurement(Measurement):
 
     A subclass states `states`, `outputs`, `tolerance`, `parameters` and `times`, and writes `start`, `rhs` and `read`;
     the package's docstring has an example. p are the parameters in SI units (x times `si_sizes`), c the constants of a
-    case. The three functions use + - * / **, NumPy's elementary functions and np.where on the entries of their
+    case. The three functions use arithmetic, powers, NumPy's elementary functions and np.where on the entries of their
     arguments, and nothing that asks for a value (no if). z has C order over (case, time, output); a time is an epoch.
     """
 
