@@ -117,7 +117,7 @@ figures=none        draws nothing.
 output=DIR          where the files go, which are named at the end: outputs/estimate-MODEL unless given, or
                     outputs/estimate-MODEL-2 and so on. Nothing of another command is overwritten.
 """,
-        (_several("arguments", "KEY=VALUE", "whatever `ipe-bench run` takes"),),
+        (_several("arguments", "KEY=VALUE", "any key of `ipe-bench run`"),),
     ),
     "design": (
         "what the readings will say of each parameter, and which to take instead",
@@ -155,7 +155,7 @@ by sequential Monte Carlo: particles go from the prior to the posterior as the l
 estimate and covariance are then held against it. It takes seconds to a minute a trial. output=DIR says where files go.
 """,
         (
-            _several("arguments", "KEY=VALUE", "whatever `ipe-bench run` takes"),
+            _several("arguments", "KEY=VALUE", "any key of `ipe-bench run`"),
             _argument("--particles", metavar="NUMBER", type=int, default=1000, help="1000 unless given"),
         ),
     ),
