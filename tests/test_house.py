@@ -32,7 +32,7 @@ BUDGETS = {
     "states": 1051,
     "estimators": 1273,
     "solvers": 1250,
-    "baselines": 2368,
+    "baselines": 2364,
     "trials": 2367,
     "runs": 2230,
     "statistics": 4507,

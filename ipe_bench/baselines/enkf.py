@@ -11,11 +11,11 @@ from typing import Annotated, Any
 import numpy as np
 from annotated_types import Gt
 
-from ipe_bench.baselines.epochs import symmetric
 from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, turned
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Whole
 from ipe_bench.basics.streams import own_bits
+from ipe_bench.states.algebra import symmetric
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.measurements.base import Measurement, SubsetModel
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
+from ipe_bench.states.algebra import symmetric
 
 Rows = NDArray[np.intp]
 
@@ -191,8 +192,3 @@ class Walk(ABC):
             history=iterates,
             extras={"nis": nis},
         )
-
-
-def symmetric(P: Array) -> Array:
-    """(P + P') / 2 of each trial: what rounding took from P - K S K'."""
-    return (P + P.swapaxes(-1, -2)) / 2

@@ -9,11 +9,11 @@ import numpy as np
 from annotated_types import Gt, Le
 
 from ipe_bench.baselines.batched import Stack
-from ipe_bench.baselines.epochs import symmetric
 from ipe_bench.baselines.sequential import Sequential, Track, in_turn, squared_innovation, turned
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Finite, NonNegative
 from ipe_bench.measurements.problem import Problem
+from ipe_bench.states.algebra import symmetric
 from ipe_bench.states.linearisation import Unscented
 
 
