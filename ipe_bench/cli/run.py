@@ -21,7 +21,7 @@ from ipe_bench.cli.parser import INFO_TOPICS, parsers
 from ipe_bench.cli.progress import shown_progress
 from ipe_bench.cli.report import show_command
 from ipe_bench.cli.session import Jobs, complete, jobs_of, session, show, spec_of
-from ipe_bench.cli.single import OF_FILES
+from ipe_bench.cli.single import OF_FILES, require_one_kind
 from ipe_bench.cli.spec import STANDARD_FILTERS, Spec
 from ipe_bench.measurements import Nist
 from ipe_bench.runs.execution import Serial
@@ -29,10 +29,6 @@ from ipe_bench.runs.execution.processes import end_idle
 from ipe_bench.runs.provenance import digest
 from ipe_bench.runs.run import accept, compute, record_refusal, result_keys
 from ipe_bench.runs.store import describe_names
-
-OF_CONSTANTS = ("measurement", "truth_measurement", "noise", "prior", "error_scale", "solver", "baseline")
-OF_CONSTANTS += ("estimators", "parameters", "prior_covariance", "write_readings")
-"""Keys of parameters that stand still."""
 
 
 @dataclass(frozen=True)
@@ -82,10 +78,7 @@ def main(arguments: Sequence[str]) -> int:
             show(words, flags)
             return 0
         words.refuse(OF_FILES, "is for `ipe-bench estimate`: run simulates its readings")
-        if jobs.specs[0].model is None:
-            words.refuse(("tracker", "trackers"), "goes with model=NAME")
-        else:
-            words.refuse(OF_CONSTANTS, "is of a measurement, and model= chooses states that move")
+        require_one_kind(words, jobs.specs[0])
         if words.standard_baselines:
             jobs = replace(jobs, specs=[one.suited() for one in jobs.specs])
         for one in jobs.specs:

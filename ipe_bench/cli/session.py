@@ -162,6 +162,16 @@ def composed(words: Words) -> dict[str, Any]:
     return _plain(_composed(tuple(map(w.forced, words.overrides)), whole=True))
 
 
+def changed_by_experiment(words: Words) -> dict[str, list[str]]:
+    """The keys that the experiment of a command gives other values, by the word that names it."""
+    without = _composed(())
+    found = {}
+    for word in [one for one in words.overrides if one.key_or_group == "experiment"]:
+        config = _composed((w.forced(word),))
+        found[w.said(word)] = [str(key) for key in config if config._get_node(key) != without._get_node(key)]
+    return found
+
+
 def _plain(config: DictConfig) -> dict[str, Any]:
     try:
         own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import console, say
 from ipe_bench.cli import words as w
-from ipe_bench.cli.session import composed, jobs_of, session
+from ipe_bench.cli.session import changed_by_experiment, composed, jobs_of, session
 from ipe_bench.cli.spec import Spec
 from ipe_bench.cli.words import Words
 from ipe_bench.measurements import Nist
@@ -18,6 +19,9 @@ from ipe_bench.report.writer import reserve_output_folder
 OF_MANY_TRIALS = ("precision", "time_limit", "block_size", "formats", "execution", "write_readings")
 OF_MANY_TRIALS += ("write_readings_trial", "objective", "model", "tracker", "trackers")
 """Keys of runs."""
+OF_CONSTANTS = ("measurement", "truth_measurement", "noise", "prior", "error_scale", "solver", "baseline")
+OF_CONSTANTS += ("estimators", "parameters", "prior_covariance", "write_readings")
+"""Keys of parameters that stand still."""
 OF_FILES = ("readings", "ignore_rows", "ignore_columns")
 """Keys of estimates from real readings."""
 
@@ -60,6 +64,21 @@ def single(command: str, arguments: Sequence[str], standard: Sequence[str] = (),
         given = w.read(command, [one for one in standard if one.partition("=")[0] not in words.keys])
         jobs = jobs_of(Words(given.overrides + words.overrides), multirun=False)
         return Single(command, words, jobs.specs[0], composed(jobs.words))
+
+
+def require_one_kind(words: Words, spec: Spec) -> None:
+    """Refuses a tracker without a state model, and a state model together with a key of measurements, typed or from an
+    experiment."""
+    if spec.model is None:
+        words.refuse(("tracker", "trackers"), "goes with model=NAME")
+        return
+    words.refuse(OF_CONSTANTS, "is of a measurement, and model= chooses states that move")
+    for experiment, changed in changed_by_experiment(words).items():
+        if key := next((key for key in OF_CONSTANTS if key in changed), None):
+            raise UserError(
+                f"{experiment}: sets {key}, which is of a measurement, and model= chooses states that move; leave out"
+                " one of them"
+            )
 
 
 def say_files(files: Sequence[Path]) -> None:

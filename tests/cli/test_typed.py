@@ -69,6 +69,8 @@ def test_what_is_right_is_taken(words, ipe_bench):
         (["model=pendulum", "trackers.ukf.iterations=0"], "trackers.ukf.iterations=0: give a whole number above 0"),
         (["model=pendulum", "trackers.bootstrap.particles=5"], "trackers.bootstrap.particles: is set, but bootstrap"),
         (["model=growth", "model.next.state=x"], "model.next.state: there is no such name"),
+        (["+experiment=polynomial", "model=growth"], "+experiment=polynomial: sets measurement, which is of a measur"),
+        (["+experiment=headline", "model=growth"], "+experiment=headline: sets noise, which is of a measurement"),
         (["model=pendulum_book", "trials=2"], "trials=2: certified readings are one trial"),
     ],
 )
