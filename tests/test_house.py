@@ -35,7 +35,7 @@ BUDGETS = {
     "baselines": 2364,
     "trials": 2367,
     "runs": 2230,
-    "statistics": 4507,
+    "statistics": 4433,
     "real": 2516,
     "plugins": 1315,
     "report": 4790,
