@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance, finite
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.base import Estimates, Estimator
+from ipe_bench.estimators.base import Estimates
 from ipe_bench.measurements.base import Measurement, SubsetModel
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
@@ -55,14 +55,6 @@ class Epoch:
         """The epoch's part of all readings z (..., m), whitened."""
         return self.R.whiten(z[..., self.rows])
 
-    def read(self, x: Array, trials: Rows, tally: EvaluationCount, *, slopes: bool) -> tuple[Array, Array | None]:
-        """Whitened h (trials, points, m) at x (trials, points, n), and dh/dx (trials, m, n) where it is asked for."""
-        h = read_members(self.counted(tally), self.R, x, trials)
-        if not slopes:
-            return h, None
-        H = self.R.whiten_jacobian(self.counted(tally).jacobian(x[:, 0], trials))
-        return h, np.ascontiguousarray(H)
-
 
 def arrivals(problem: Problem) -> Iterator[Epoch]:
     """The epochs in order of arrival."""
@@ -77,26 +69,16 @@ def arrivals(problem: Problem) -> Iterator[Epoch]:
         while not np.isin(kept[rows], arrived).all():
             stop += 1
             arrived = whole.rows(stop)
-        _refuse_correlation(problem.R, rows)
+        if problem.R.factor.ndim == 2:
+            across = problem.R.matrix()[rows]
+            across[:, rows] = 0.0
+            if across.any():
+                raise UserError(
+                    "noise: its errors are correlated between epochs, which a filter cannot use; choose a batch "
+                    "estimator"
+                )
         part = SubsetModel(whole, tuple(kept[rows].tolist()), stop)
         yield Epoch(number, part, rows, problem.R.restricted(rows), stop / len(whole.epochs))
-
-
-def _refuse_correlation(R: Covariance, rows: Rows) -> None:
-    if R.factor.ndim == 1:
-        return
-    across = R.matrix()[rows]
-    across[:, rows] = 0.0
-    if across.any():
-        raise UserError(
-            "noise: its errors are correlated between epochs, which a filter cannot use; choose a batch estimator"
-        )
-
-
-def require_needs(estimator: Estimator, problem: Problem) -> None:
-    """Raises UserError unless the problem has what the estimator needs."""
-    for need in estimator.missing(problem):
-        raise UserError(f"measurement={problem.measurement.name}: has no {need}, which this estimator needs")
 
 
 class Walk(ABC):
@@ -108,9 +90,11 @@ class Walk(ABC):
 
     def __init__(self, problem: Problem, z: Array) -> None:
         self.problem, self.z, self.d = problem, z, np.array(problem.prior_deviation, dtype=float)
-        trials = len(z)
+        trials, n = len(z), len(self.d)
         self.tally = EvaluationCount.zeros(trials)
         self.epochs = list(arrivals(problem))
+        self.x, self.P = np.zeros((trials, n)), np.empty((trials, n, n))
+        """The means and covariances after the last epoch."""
         self.status = np.full(trials, Status.RUNNING, dtype=np.int8)
         self.messages: dict[int, str] = {}
         self.nis = np.zeros(trials)
@@ -122,15 +106,11 @@ class Walk(ABC):
 
     @abstractmethod
     def take_in(self, epoch: Epoch, at: Rows) -> None:
-        """Takes the readings of an epoch in for the trials `at`; `end` ends those that it loses."""
-
-    @abstractmethod
-    def state(self, at: Rows) -> tuple[Array, Array]:
-        """The means (trials, n) and covariances (trials, n, n) of the trials `at`."""
+        """Takes in the readings of an epoch for the trials `at`: sets their `x`, `P`, `nis`, or ends them."""
 
     def covariance(self, at: Rows) -> Array:
         """P (trials, n, n) of the trials `at`, in multiples of the parameters' units."""
-        return symmetric(self.state(at)[1] * self.d * self.d[:, None])
+        return symmetric(self.P[at] * self.d * self.d[:, None])
 
     @property
     def going(self) -> Rows:
@@ -146,11 +126,12 @@ class Walk(ABC):
     def read(self, epoch: Epoch, s: Array, at: Rows, *, slopes: bool) -> tuple[Rows, Array, Array | None]:
         """Whitened h (trials, points, m) at the states s (trials, points, n) of the trials `at`, and dh/dx (trials, m,
         n), for those that the model does not end."""
-        h, H = epoch.read(self.problem.x0 + s * self.d, at, self.tally, slopes=slopes)
-        H = None if H is None else H * self.d
+        model, x = epoch.counted(self.tally), self.problem.x0 + s * self.d
+        h, H = read_members(model, epoch.R, x, at), None
+        if slopes:
+            H = np.ascontiguousarray(epoch.R.whiten_jacobian(model.jacobian(x[:, 0], at))) * self.d
         raised = self.tally.failed(at)
-        for trial in at[raised]:
-            self.end([trial], Status.ERROR, self.tally.messages[int(trial)])
+        self.status[at[raised]] = Status.ERROR
         overflowed = ~raised & ~(finite(h) & (True if H is None else finite(H)))
         self.end(at[overflowed], Status.NONFINITE, f"the model overflowed at epoch {epoch.number}")
         kept = ~(raised | overflowed)
@@ -164,12 +145,11 @@ class Walk(ABC):
             if len(self.going):
                 self.take_in(epoch, self.going)
             at = self.going
-            now, P = self.state(at)
             x = x.copy()
-            x[at] = now
+            x[at] = self.x[at]
             taken[at] += 1
             path.append(x)
-            lost = at[~(finite(now) & finite(P))]
+            lost = at[~(finite(self.x[at]) & finite(self.P[at]))]
             self.end(lost, Status.NONFINITE, f"the filter's state overflowed at epoch {epoch.number}")
         self.status[self.going] = Status.CONVERGED
         finished = np.flatnonzero(self.status == Status.CONVERGED)

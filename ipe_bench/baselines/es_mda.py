@@ -9,8 +9,7 @@ import numpy as np
 from annotated_types import Gt, Le
 
 from ipe_bench.baselines.epochs import read_members
-from ipe_bench.baselines.recursive_update import geometric_weights
-from ipe_bench.basics.errors import UserError
+from ipe_bench.baselines.information import geometric_weights
 from ipe_bench.basics.linalg import Array, Mask, finite, solve
 from ipe_bench.basics.options import Count, Positive, Whole
 from ipe_bench.basics.statuses import Status
@@ -59,8 +58,7 @@ class EsMda(Estimator):
         return "map" if self.polish else None
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        if problem.prior_deviation is None:
-            raise UserError(f"measurement={problem.measurement.name}: has no prior, which an ensemble is drawn from")
+        self.require_needs(problem)
         objective = Objective.of(problem, z, prior=True, inflation=self.prior_inflation)
         with np.errstate(all="ignore"):
             smoothed = self._smooth(objective)

@@ -1,7 +1,7 @@
-"""Filters whose linear algebra is filterpy's own: the parameters as a random constant, the readings epoch by epoch.
+"""Filters epoch by epoch, the parameters as a random constant: a filter of a library's own for each trial, or a
+linearisation rule whose equations are computed for all trials at once.
 
-All trials of a batch advance together: what the model would read at every trial's points of an epoch is one batched
-call, and each trial's filterpy object is then given its share of the answer.
+What the model would read at every trial's points of an epoch is one batched call in either case.
 """
 
 from __future__ import annotations
@@ -14,13 +14,16 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from ipe_bench.baselines.epochs import Epoch, Rows, Walk, require_needs
+from ipe_bench.baselines.epochs import Epoch, Rows, Walk
 from ipe_bench.basics.errors import UserError, describe_exception
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, deviations, finite, multiply
 from ipe_bench.basics.options import NonNegative, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
 from ipe_bench.measurements.problem import Problem
+from ipe_bench.states.base import Gaussian
+from ipe_bench.states.linearisation import Rule
+from ipe_bench.states.trackers import update
 
 LARGEST = 1e150
 """What a filter is given must have squares."""
@@ -61,9 +64,10 @@ class Track(ABC):
 
 @dataclass(frozen=True)
 class Sequential(Estimator):
-    """What all filters have in common. A new filter is a frozen dataclass that says how a trial's `Track` begins.
+    """What all filters have in common. A new filter is a frozen dataclass that says how a trial's `Track` begins, or by
+    which `rule` readings are linearised.
 
-    Reports filterpy's P, and as `extras["nis"]` the trial's squared innovations over their number: 1 on average where
+    Reports the filter's P, and as `extras["nis"]` the trial's squared innovations over their number: 1 on average where
     the filter is consistent (`ipe_bench.statistics.consistency.mean_limits` has the limits).
     """
 
@@ -81,55 +85,64 @@ class Sequential(Estimator):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for engine, method in (("batched", "stack"), ("filterpy", "track")):
+        for engine, method in (("batched", "rule"), ("filterpy", "track")):
             if self.engine == engine and getattr(type(self), method) is getattr(Sequential, method):
                 raise UserError(f"engine={engine}: this filter has no {method}; choose the other engine")
 
     def track(self, P0: Array, Q: Array, z: Array) -> Track:
         """The filter of one trial before its first reading, at x = 0 with covariance P0 (n, n) and process noise Q
-        (n, n) per epoch. z (m,) are all readings of the trial: for a random stream that is the trial's own, and for
-        nothing else. A filter that has none is computed for all trials at once."""
+        (n, n) per epoch. z (m,) are all readings of the trial, for the seed of a random stream."""
         raise NotImplementedError
 
-    def stack(self, P0: Array, Q: Array, problem: Problem, z: Array) -> Walk:
-        """The filters of all trials at once, for readings z (trials, m). A filter that has none is filterpy's."""
+    def rule(self) -> Rule:
+        """How readings are linearised where all trials are computed at once."""
         raise NotImplementedError
+
+    @property
+    def relinearisations(self) -> tuple[int, float]:
+        """How often the readings of an epoch are linearised at most, and the change of a parameter, in deviations of
+        the updated P, up to which that is not done again."""
+        return 1, 0.0
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        require_needs(self, problem)
-        P0 = self.prior_inflation**2 * problem.scaled_prior
-        Q = self.process_noise**2 * np.eye(problem.measurement.n)
+        self.require_needs(problem)
         with np.errstate(all="ignore"), warnings.catch_warnings():
-            if self.engine == "batched":
-                return self.stack(P0, Q, problem, z).estimates(history=history)
             from scipy.linalg import LinAlgWarning
 
             # SciPy warns of an ill-conditioned S, which R's smallness beside a wide prior explains.
             warnings.simplefilter("ignore", LinAlgWarning)
-            return _Tracks(self, P0, Q, problem, z).estimates(history=history)
+            engine = _Tracks if self.engine == "filterpy" else _Stack
+            return engine(self, problem, z).estimates(history=history)
 
 
-class _Tracks(Walk):
-    """filterpy's filters of a batch; an exception ends the trial that raises it and no other."""
+class _Filters(Walk):
+    """The filters of a batch, at x = 0 with covariance P0 (n, n) and process noise Q (n, n) per epoch."""
 
-    def __init__(self, filter: Sequential, P0: Array, Q: Array, problem: Problem, z: Array) -> None:
+    def __init__(self, filter: Sequential, problem: Problem, z: Array) -> None:
         super().__init__(problem, z)
-        self.slopes = filter.slopes
+        self.filter = filter
+        self.P[:] = filter.prior_inflation**2 * problem.scaled_prior
+        self.Q = filter.process_noise**2 * np.eye(problem.measurement.n)
+
+
+class _Tracks(_Filters):
+    """A `Track` for each trial; an exception ends the trial that raises it and no other."""
+
+    def __init__(self, filter: Sequential, problem: Problem, z: Array) -> None:
+        super().__init__(filter, problem, z)
         self.tracks: dict[int, Track] = {}
-        for trial in self.going.tolist():
-            self.tracks[trial] = self.attempt(trial, lambda t=trial: filter.track(P0.copy(), Q.copy(), z[t]))
+        for t in self.going.tolist():
+            self.tracks[t] = self.attempt(t, lambda t=t: filter.track(self.P[t].copy(), self.Q.copy(), z[t]))
 
     def attempt(self, trial: int, action: Callable[[], Any]) -> Any:
         """`action()`, or None where it raises."""
         try:
             return action()
-        except np.linalg.LinAlgError as error:
-            self.end([trial], Status.SINGULAR, describe_exception(error))
-        except OverflowError as error:
-            self.end([trial], Status.NONFINITE, describe_exception(error))
         except Exception as error:
-            self.end([trial], Status.ERROR, describe_exception(error))
-        return None
+            named = {np.linalg.LinAlgError: Status.SINGULAR, OverflowError: Status.NONFINITE}
+            status = next((status for kind, status in named.items() if isinstance(error, kind)), Status.ERROR)
+            self.end([trial], status, describe_exception(error))
+            return None
 
     def take_in(self, epoch: Epoch, at: Rows) -> None:
         for trial in at.tolist():
@@ -141,47 +154,84 @@ class _Tracks(Walk):
             waiting = []
             if points:
                 s = np.stack(list(points.values()))
-                kept, h, H = self.read(epoch, s, np.array(list(points), dtype=np.intp), slopes=self.slopes)
+                kept, h, H = self.read(epoch, s, np.array(list(points), dtype=np.intp), slopes=self.filter.slopes)
                 for i, trial in enumerate(kept.tolist()):
                     z, slope = epoch.whitened(self.z[trial]), None if H is None else H[i]
                     update = self.tracks[trial].update
                     if self.attempt(trial, lambda u=update, z=z, h=h[i], H=slope: u(z, h, H)) is False:
                         waiting.append(trial)
-
-    def state(self, at: Rows) -> tuple[Array, Array]:
-        n = len(self.d)
-        tracks = [self.tracks[trial] for trial in at.tolist()]
-        self.nis[at] = [track.nis for track in tracks]
-        x, P = np.array([track.x for track in tracks]), np.array([track.P for track in tracks])
-        return x.reshape(-1, n), P.reshape(-1, n, n)
+        for trial in self.going.tolist():
+            track = self.tracks[trial]
+            self.x[trial], self.P[trial], self.nis[trial] = track.x, track.P, track.nis
 
 
-def squared_innovation(y: Array, S_inverse: Array) -> float:
-    """y' S^-1 y, as a row or as a column as filterpy has it."""
-    y = y.ravel()
-    return float(y @ S_inverse @ y)
+class _Stack(_Filters):
+    """The filters of all trials at once; a trial's bits do not depend on which others there are."""
+
+    def take_in(self, epoch: Epoch, at: Rows) -> None:
+        rule, (iterations, tolerance) = self.filter.rule(), self.filter.relinearisations
+        self.P[at] += self.Q
+        x, P = self.x.copy(), self.P.copy()
+        for iteration in range(iterations):
+            before = self.x[at]
+            readings = _TurnedReadings(self, epoch, at, P[at])
+            read = rule.linearise(readings, before, self.P[at])
+            found = update(Gaussian(x[at], P[at]), read, np.eye(read.b.shape[-1]), readings.z)
+            self.x[at], self.P[at] = found.x
+            if iteration == 0:
+                self.nis[at] += found.nis  # the innovation of the prediction; later ones have seen z
+            lost = ~finite(found.x.mean)
+            singular = lost & (self.status[at] == Status.RUNNING)
+            self.end(at[singular], Status.SINGULAR, f"S is singular at epoch {epoch.number}")
+            change = (np.abs(self.x[at] - before) / deviations(self.P[at])).max(axis=1)
+            at = at[~(lost | (change <= tolerance))]
+            if not len(at):
+                return
 
 
-def turned(z: Array, h: Array) -> tuple[Array, Array]:
-    """The readings z (m,) and h (points, m) less the points' mean, along the principal axes of the points' spread.
+class _TurnedReadings:
+    """An epoch's whitened readings as functions of the states of the trials `at`, along axes that make S nearly
+    diagonal: white readings stay white, and S keeps its digits where a wide prior makes it as ill-conditioned as 1e10.
 
-    White readings stay white when turned, and the filter is the same; but S is then close to diagonal, so its inverse
-    and P - K S K' keep their digits where a wide prior makes S as ill-conditioned as 1e10.
+    Trials that the model ends are NaN.
     """
-    centre = h.mean(axis=0)
-    spread = h - centre
-    refuse_overflow(spread)
-    axes = np.linalg.svd(spread, full_matrices=len(h) < len(z))[2]
-    return axes @ (z - centre), spread @ axes.T
+
+    def __init__(self, walk: Walk, epoch: Epoch, at: Rows, P: Array) -> None:
+        self.walk, self.epoch, self.at, self.P = walk, epoch, at, P
+        self.z = epoch.whitened(walk.z[at])
+
+    def __call__(self, x: Array) -> Array:
+        """h (trials, points, m) less its mean over the points, and z alike."""
+        h, _ = self._read(x, slopes=False)
+        centre = h.mean(axis=1, keepdims=True)
+        spread = h - centre
+        axes = _principal_axes(np.matmul(spread.swapaxes(1, 2), spread))
+        self.z = multiply(axes.swapaxes(1, 2), self.z - centre[:, 0])
+        return np.matmul(spread, axes)
+
+    def slope(self, x: Array) -> tuple[Array, Array]:
+        """h (trials, m) and dh/dx (trials, m, n)."""
+        h, H = self._read(x[:, None], slopes=True)
+        axes = _principal_axes(np.matmul(np.matmul(H, self.P), H.swapaxes(1, 2))).swapaxes(1, 2)
+        self.z = multiply(axes, self.z)
+        return multiply(axes, h[:, 0]), np.matmul(axes, H)
+
+    def _read(self, x: Array, *, slopes: bool) -> tuple[Array, Array]:
+        """h (trials, points, m) as it is and, for one point, dh/dx (trials, m, n)."""
+        known, m = finite(x), self.z.shape[1]
+        lost = f"the filter's P is not positive definite at epoch {self.epoch.number}"
+        self.walk.end(self.at[~known], Status.SINGULAR, lost)
+        kept, h, H = self.walk.read(self.epoch, x[known], self.at[known], slopes=slopes)
+        beyond = ~(np.abs(h if H is None else H).max(axis=(1, 2), initial=0) < LARGEST)
+        self.walk.end(kept[beyond], Status.NONFINITE, "what the filter is to take in is beyond the range of numbers")
+        rows = np.isin(self.at, kept[~beyond])
+        values, tangents = np.full((*x.shape[:2], m), np.nan), np.full((len(x), m, x.shape[2]), np.nan)
+        values[rows] = h[~beyond]
+        if H is not None:
+            tangents[rows] = H[~beyond]
+        return values, tangents
 
 
-def refuse_overflow(a: Array) -> None:
-    """LAPACK need not come back from an infinite matrix, and a filter needs the squares of what it is given."""
-    if not np.abs(a).max() < LARGEST:
-        raise OverflowError("what the filter is to take in is beyond the range of numbers")
-
-
-def in_turn(h: Array) -> Callable[[Any], Array]:
-    """A stand-in for hx: the rows of h one after another, since filterpy asks for its points in their order."""
-    rows = iter(h)
-    return lambda _: next(rows)
+def _principal_axes(G: Array) -> Array:
+    """Orthonormal axes (trials, m, m), one per column, along which each G (trials, m, m), symmetric, is diagonal."""
+    return np.linalg.eigh(np.nan_to_num(G))[1]

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.errors import describe_exception
+from ipe_bench.basics.errors import UserError, describe_exception
 from ipe_bench.basics.linalg import Array, read_only
 from ipe_bench.basics.options import Component
 from ipe_bench.basics.statuses import Status
@@ -124,6 +124,11 @@ class Estimator(Component, ABC):
             "prior": problem.prior_deviation is not None,
         }
         return [need for need in sorted(self.needs) if not has[need]]
+
+    def require_needs(self, problem: Problem) -> None:
+        """Raises UserError unless the problem has what this estimator needs."""
+        for need in self.missing(problem):
+            raise UserError(f"measurement={problem.measurement.name}: has no {need}, which this estimator needs")
 
 
 def estimate_safely(estimator: Estimator, problem: Problem, z: Array, *, history: bool = False) -> Estimates:

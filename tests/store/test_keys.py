@@ -132,7 +132,7 @@ def test_an_estimator_can_stand_in_a_script_and_what_it_computed_before_an_edit_
 
 
 def test_a_base_class_in_another_module_is_part_of_the_source(copy):
-    edit(copy / "ipe_bench/baselines/linear_lse.py", "import annotations\n", "import annotations\nFACTOR = 2\n")
+    edit(copy / "ipe_bench/baselines/least_squares.py", "import annotations\n", "import annotations\nFACTOR = 2\n")
     (copy / "mine.py").write_text(
         "from dataclasses import dataclass\nimport ipe_bench as ib\n"
         "@dataclass(frozen=True)\nclass Mine(ib.baselines.LinearLSE):\n    pass\n",
@@ -146,5 +146,5 @@ def test_a_base_class_in_another_module_is_part_of_the_source(copy):
         return subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=True).stdout
 
     before = source()
-    edit(copy / "ipe_bench/baselines/linear_lse.py", "FACTOR = 2", "FACTOR = 3")
+    edit(copy / "ipe_bench/baselines/least_squares.py", "FACTOR = 2", "FACTOR = 3")
     assert source() != before

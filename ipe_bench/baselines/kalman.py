@@ -1,0 +1,300 @@
+"""The Kalman filters: extended, unscented, cubature and ensemble, each trial's a filter of filterpy's."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from threading import Lock
+from typing import Annotated, Any
+
+import numpy as np
+from annotated_types import Gt, Le
+
+from ipe_bench.baselines.sequential import LARGEST, Sequential, Track
+from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Count, Finite, NonNegative, Positive, Whole
+from ipe_bench.basics.streams import own_bits
+from ipe_bench.states.algebra import symmetric
+from ipe_bench.states.linearisation import Cubature, Rule, Taylor, Unscented
+
+
+class _Filterpy(Track):
+    """One of filterpy's filters on one trial."""
+
+    filter: Any
+
+    @property
+    def x(self) -> Array:
+        return self.filter.x
+
+    @property
+    def P(self) -> Array:
+        return self.filter.P
+
+
+@dataclass(frozen=True)
+class EKF(Sequential):
+    """Each epoch's readings linearised at the estimate so far (Bar-Shalom et al., 10.3). filterpy updates P in Joseph's
+    form, (I - K H) P (I - K H)' + K R K', which stays positive definite where the prior is much wider than R."""
+
+    slopes = True
+
+    def track(self, P0: Array, Q: Array, z: Array) -> Track:
+        return _EKFTrack(P0, Q, *self.relinearisations)
+
+    def rule(self) -> Rule:
+        return Taylor()
+
+
+@dataclass(frozen=True)
+class IteratedEKF(EKF):
+    """An EKF that linearises each epoch's readings again at its updated estimate until that stays: Gauss-Newton on the
+    epoch's readings and the prior that the earlier epochs left (Bell and Cathey, IEEE TAC 38, 1993)."""
+
+    max_iterations: Count = 20
+    """Linearisations per epoch; one that has not settled by then goes on from where it is."""
+    tolerance: Positive = 1e-3
+    """Largest change of a parameter, in deviations of the updated P, at which an epoch is done."""
+
+    @property
+    def relinearisations(self) -> tuple[int, float]:
+        return self.max_iterations, self.tolerance
+
+
+class _EKFTrack(_Filterpy):
+    """An iteration begins its update again from the epoch's prior, with the readings linearised at the last
+    estimate."""
+
+    def __init__(self, P0: Array, Q: Array, iterations: int, tolerance: float) -> None:
+        from filterpy.kalman import ExtendedKalmanFilter
+
+        n = len(P0)
+        self.filter = ExtendedKalmanFilter(dim_x=n, dim_z=1)
+        # The default x is a column, with which a vector of readings broadcasts to a matrix and no error.
+        self.filter.x, self.filter.P, self.filter.Q = np.zeros(n), P0, Q
+        self.iterations, self.tolerance, self.iteration = iterations, tolerance, 0
+
+    def predict(self) -> None:
+        self.filter.predict()
+        self.iteration = 0
+
+    def points(self) -> Array:
+        return self.filter.x[None]
+
+    def update(self, z: Array, h: Array, H: Array | None) -> bool:
+        assert H is not None
+        f, at = self.filter, self.filter.x
+        f.x, f.P = f.x_prior, f.P_prior
+        # What the readings linearised at the last estimate say at the prior mean.
+        h = h[0] + H @ (f.x - at)
+        # White readings stay white along the principal axes of H P H' (see `_turned`).
+        S = H @ f.P @ H.T
+        _refuse_overflow(S)
+        axes = np.linalg.eigh(S)[1][:, ::-1].T
+        z, h, H = axes @ z, axes @ h, axes @ H
+        f.update(z, HJacobian=lambda _: H, Hx=lambda _: h, R=np.eye(len(z)))
+        self.iteration += 1
+        if self.iteration == 1:
+            # The innovation of the prediction; later ones have seen z.
+            self.nis += _squared_innovation(f.y, f.SI)
+        change = np.abs(f.x - at) / np.sqrt(np.diag(f.P))
+        return self.iteration >= self.iterations or bool(change.max() <= self.tolerance)
+
+
+class _PointsTrack(_Filterpy):
+    """A filter that reads the model at several points, along the principal axes of what it reads there."""
+
+    def points(self) -> Array:
+        return self.filter.sigmas_f
+
+    @abstractmethod
+    def take_in(self, z: Array, hx: Callable[[Any], Array], count: int) -> Array:
+        """Takes in the readings z (m,) by `hx`, which hands out those at the `count` points in turn, and returns the
+        innovation."""
+
+    def update(self, z: Array, h: Array, H: Array | None) -> bool:
+        z, h = _turned(z, h)
+        rows = iter(h)
+        y = self.take_in(z, lambda _: next(rows), len(h))
+        self.filter.P = symmetric(self.filter.P)
+        self.nis += _squared_innovation(y, self.filter.SI)
+        return True
+
+
+@dataclass(frozen=True)
+class UKF(Sequential):
+    """Readings at 2n + 1 sigma points stand for the slopes (van der Merwe, dissertation, 2004).
+
+    The points lie at alpha sqrt(n + kappa) deviations. An alpha of 1e-3, as often advised, gives the centre a weight
+    of -1e6 and costs as many digits; 0.1 does not.
+    """
+
+    alpha: Annotated[float, Gt(0), Le(1)] = 0.1
+    beta: Finite = 2.0
+    """2 is best for Gaussian parameters."""
+    kappa: NonNegative = 0.0
+
+    def track(self, P0: Array, Q: Array, z: Array) -> Track:
+        from filterpy.kalman import MerweScaledSigmaPoints
+
+        return _UKFTrack(P0, Q, MerweScaledSigmaPoints(len(P0), self.alpha, self.beta, self.kappa))
+
+    def rule(self) -> Rule:
+        return Unscented(self.kappa, self.alpha, self.beta)
+
+
+class _UKFTrack(_PointsTrack):
+    def __init__(self, P0: Array, Q: Array, points: Any) -> None:
+        from filterpy.kalman import UnscentedKalmanFilter
+
+        n = len(P0)
+        # hx differs from epoch to epoch, so update is given it.
+        self.filter = UnscentedKalmanFilter(dim_x=n, dim_z=1, dt=1.0, hx=None, fx=lambda x, dt: x, points=points)
+        self.filter.x, self.filter.P, self.filter.Q = np.zeros(n), P0, Q
+
+    def predict(self) -> None:
+        if self.filter.Q.any():
+            self.filter.predict()
+        else:
+            # Constants without process noise: the moments of their sigma points are x and P themselves.
+            self.filter.compute_process_sigmas(dt=1.0)
+
+    def take_in(self, z: Array, hx: Callable[[Any], Array], count: int) -> Array:
+        self.filter.update(z, R=np.eye(len(z)), hx=hx)
+        return self.filter.y
+
+
+@dataclass(frozen=True)
+class CKF(Sequential):
+    """Readings at 2n cubature points, sqrt(n) deviations out (Arasaratnam and Haykin, IEEE TAC 54, 2009)."""
+
+    def track(self, P0: Array, Q: Array, z: Array) -> Track:
+        return _CKFTrack(P0, Q)
+
+    def rule(self) -> Rule:
+        return Cubature()
+
+
+class _CKFTrack(_PointsTrack):
+    """filterpy takes moments as mean(X X') - x x', which loses what x is larger than its deviation, squared. So the
+    filter's state is the distance from a reference that moves to the estimate after each epoch, and its readings are
+    distances from the points' mean: the same filter, with nothing to cancel."""
+
+    def __init__(self, P0: Array, Q: Array) -> None:
+        from filterpy.kalman import CubatureKalmanFilter
+
+        n = len(P0)
+        self.reference = np.zeros(n)
+        self.filter = CubatureKalmanFilter(dim_x=n, dim_z=1, dt=1.0, hx=None, fx=lambda x, dt: x)
+        self.filter.x, self.filter.P, self.filter.Q = np.zeros((n, 1)), P0, Q
+
+    @property
+    def x(self) -> Array:
+        return self.reference
+
+    def predict(self) -> None:
+        from filterpy.kalman import spherical_radial_sigmas
+
+        if self.filter.Q.any():
+            self.filter.predict()
+        # filterpy leaves the points of before the process noise; the filter's authors draw them anew.
+        self.filter.sigmas_f = spherical_radial_sigmas(self.filter.x, self.filter.P)
+
+    def points(self) -> Array:
+        return self.reference + self.filter.sigmas_f
+
+    def take_in(self, z: Array, hx: Callable[[Any], Array], count: int) -> Array:
+        f = self.filter
+        f.hx, f.sigmas_h = hx, np.empty((count, len(z)))
+        # A flat z would make x a matrix: filterpy's x is a column here.
+        f.update(z[:, None], R=np.eye(len(z)))
+        self.reference = self.reference + f.x[:, 0]
+        f.x = np.zeros_like(f.x)
+        return f.y
+
+
+@dataclass(frozen=True)
+class EnKF(Sequential):
+    """An ensemble of states with perturbed readings (Evensen 1994; Crassidis and Junkins, 2nd ed., 4.5).
+
+    Without process noise the ensemble keeps within the span of its first draw, and P carries a sampling error of about
+    sqrt(2 / members): more members than parameters are needed, and many more for a P to be believed.
+    """
+
+    members: Annotated[int, Gt(1)] = 100
+    seed: Whole = 0
+    """A trial's random stream depends on this and on its readings: on nothing else in the batch."""
+
+    family = "ensembles"
+
+    def track(self, P0: Array, Q: Array, z: Array) -> Track:
+        return _EnKFTrack(P0, Q, self.members, own_bits(self.seed, z))
+
+
+class _EnKFTrack(_PointsTrack):
+    def __init__(self, P0: Array, Q: Array, members: int, stream: np.random.BitGenerator) -> None:
+        from filterpy.kalman import EnsembleKalmanFilter
+
+        self.stream = stream
+        with _drawing_from(stream):
+            x = np.zeros(len(P0))
+            self.filter = EnsembleKalmanFilter(x=x, P=P0, dim_z=1, dt=1.0, N=members, hx=None, fx=lambda x, dt: x)
+        self.filter.Q = Q
+
+    def predict(self) -> None:
+        with _drawing_from(self.stream):
+            self.filter.predict()
+
+    def points(self) -> Array:
+        return self.filter.sigmas
+
+    def take_in(self, z: Array, hx: Callable[[Any], Array], count: int) -> Array:
+        # filterpy draws the perturbations about the second; epochs differ in length.
+        self.filter.hx, self.filter._mean_z = hx, np.zeros(len(z))
+        with _drawing_from(self.stream):
+            self.filter.update(z, R=np.eye(len(z)))
+        return z  # the mean of the turned readings at the points is 0
+
+
+_GLOBAL_STATE = Lock()
+
+
+@contextmanager
+def _drawing_from(stream: np.random.BitGenerator) -> Iterator[None]:
+    """Lends NumPy's global generator, which filterpy draws from, another stream, and puts back what was there."""
+    shared: Any = np.random  # NumPy's stubs do not know the two functions below
+    with _GLOBAL_STATE:
+        generator, state = shared.get_bit_generator(), shared.get_state(legacy=False)
+        shared.set_bit_generator(stream)
+        try:
+            yield
+        finally:
+            shared.set_bit_generator(generator)
+            shared.set_state(state)
+
+
+def _squared_innovation(y: Array, S_inverse: Array) -> float:
+    """y' S^-1 y, as a row or as a column as filterpy has it."""
+    y = y.ravel()
+    return float(y @ S_inverse @ y)
+
+
+def _turned(z: Array, h: Array) -> tuple[Array, Array]:
+    """The readings z (m,) and h (points, m) less the points' mean, along the principal axes of the points' spread.
+
+    White readings stay white when turned, and the filter is the same; but S is then close to diagonal, so its inverse
+    and P - K S K' keep their digits where a wide prior makes S as ill-conditioned as 1e10.
+    """
+    centre = h.mean(axis=0)
+    spread = h - centre
+    _refuse_overflow(spread)
+    axes = np.linalg.svd(spread, full_matrices=len(h) < len(z))[2]
+    return axes @ (z - centre), spread @ axes.T
+
+
+def _refuse_overflow(a: Array) -> None:
+    """LAPACK need not come back from an infinite matrix, and a filter needs the squares of what it is given."""
+    if not np.abs(a).max() < LARGEST:
+        raise OverflowError("what the filter is to take in is beyond the range of numbers")
