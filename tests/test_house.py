@@ -26,7 +26,7 @@ LINE = (
 )
 BUDGETS = {
     "basics": 1141,
-    "measurements": 7552,
+    "measurements": 7406,
     "noise": 671,
     "priors": 175,
     "states": 1051,

@@ -1,7 +1,6 @@
 """What a measurement model is: parameters in, readings out, with names, units and the order in which readings arrive.
 
 A new model is a frozen dataclass that derives from `Measurement` and writes `simulate`; everything else has a default.
-Noise, priors and estimators are left to others.
 """
 
 from __future__ import annotations
@@ -10,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import attrgetter
 from typing import Any, ClassVar
 
 import numpy as np
@@ -23,6 +23,9 @@ _COMPLEX_STEP = 1e-100
 _SMALL = 16384
 """Bytes of the Jacobians of one call: an eighth as complex numbers of what NumPy calls a large array."""
 _CENTRAL_STEP = float(np.finfo(float).eps ** (1 / 3))
+
+Epochs = tuple[NDArray[np.intp], ...]
+"""The rows of z that arrive at each epoch, in order of arrival."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Input:
-    """Something known of each reading besides what it is: a column of the file, such as a satellite's place."""
+    """A column of a readings file that a model takes besides the readings, such as a satellite's place."""
 
     heading: str
     """As in the file, with the unit: `x [m]`."""
@@ -63,7 +66,7 @@ class UsualNoise:
 class Recorded:
     """Real readings that come with a model, and what is known of their answer.
 
-    A model whose `recorded` returns this needs no file: `ipe-bench estimate measurement=NAME` estimates from z, and
+    A model whose `recorded` is this needs no file: `ipe-bench estimate measurement=NAME` estimates from z, and
     `ipe-bench run measurement=NAME noise=certified trials=1` scores estimators by x.
     """
 
@@ -72,7 +75,7 @@ class Recorded:
     R: Covariance
     """Their covariance, as far as it is known."""
     x: Array
-    """The answer (n,) that somebody certifies, in multiples of the parameters' sizes."""
+    """The certified answer (n,), in multiples of the parameters' sizes."""
 
 
 class Measurement(Component, Named, ABC):
@@ -90,8 +93,24 @@ class Measurement(Component, Named, ABC):
     """What the column of the readings is called in a file; `reading` is understood too."""
     usual_noise: UsualNoise | None = None
     """The noise of the readings unless told otherwise; None: the model does not know any."""
+    epochs: Epochs | None = None
+    """The rows of z that arrive at each epoch; None where readings have no order."""
+    levels: Mapping[str, Mapping[Any, str]] = {}
+    """Words for entries of `index` that do not speak for themselves, by column: the numbers of cases, say."""
     own_parameters: Sequence[str] = ()
     """Names of parameters of which every file of readings has its own, where several are estimated together."""
+    fixed: Mapping[str, float] = {}
+    """Values of parameters that are known and not estimated, by name."""
+    inputs: tuple[Input, ...] = ()
+    """The columns that the model takes from a readings file, where the file has them."""
+    input_columns: Mapping[str, Sequence[Any]] = {}
+    """The values of those columns, m each, by heading, of this model as it stands."""
+    input_columns_known: bool = True
+    """Whether there are readings without a file, whose inputs stand in the config or are the model's own."""
+    by_differential_equations: bool = False
+    """Whether the readings are taken from a trajectory that can be entered anywhere: `OdeMeasurement`."""
+    recorded: Recorded | None = None
+    """Real readings that come with this model."""
 
     @property
     @abstractmethod
@@ -114,8 +133,7 @@ class Measurement(Component, Named, ABC):
 
     @property
     def nuisance_deviation(self) -> Array:
-        """Standard deviations (k,) of what else acts on the readings where this is a truth richer than what estimators
-        assume: none by default.
+        """Standard deviations (k,) of the further errors of a truth that is richer than what estimators assume.
 
         A scenario draws k such numbers from N(0, deviation^2) in each trial, whatever the error scale, and hands them
         to `simulate` as further columns of x behind the n parameters.
@@ -124,8 +142,7 @@ class Measurement(Component, Named, ABC):
 
     @property
     def nuisances(self) -> tuple[Parameter, ...]:
-        """What the k numbers of `nuisance_deviation` are, in their order: each a multiple of its `size`, in its `unit`.
-        Those of one group are told of together."""
+        """Names, units and groups of the k numbers of `nuisance_deviation`, each a multiple of its `size`."""
         return tuple(Parameter(f"nuisance_{i + 1}", group="nuisances") for i in range(len(self.nuisance_deviation)))
 
     @property
@@ -136,53 +153,23 @@ class Measurement(Component, Named, ABC):
         """
         return self
 
-    @property
-    def levels(self) -> Mapping[str, Mapping[Any, str]]:
-        """Words for entries of `index` that do not speak for themselves, by column: the numbers of cases, say."""
-        return {}
-
     def taking(self, rows: Sequence[int]) -> Measurement:
         """The model with these of its readings (rows of z, ascending) and no others."""
         return SubsetModel(self, tuple(int(row) for row in rows))
-
-    @property
-    def epochs(self) -> tuple[NDArray[np.intp], ...] | None:
-        """The rows of z that arrive at each epoch, in order of arrival; None where readings have no order."""
-        return None
 
     @property
     def offset(self) -> Array:
         """What the instruments show (m,) where h(x) is zero; read-outs are quantised with it added."""
         return np.zeros(self.m)
 
-    @property
-    def by_differential_equations(self) -> bool:
-        """Whether the readings are taken from a trajectory that can be entered anywhere: `OdeMeasurement`."""
-        return False
-
     def hindrance(self, x: Array) -> str:
-        """Why the readings at x (n,) are not to be had; empty where they are."""
+        """Why the readings at x (n,) cannot be computed; empty where they can."""
         return "" if np.isfinite(self.simulate(x[None])).all() else "the readings are not finite"
 
     def remarks(self, x: Array) -> tuple[str, ...]:
         """Sentences that users should read of this model at x (n,), such as by which method it is computed."""
         del x
         return ()
-
-    @property
-    def inputs(self) -> tuple[Input, ...]:
-        """What the model takes from the columns of a readings file, where the file has them."""
-        return ()
-
-    @property
-    def input_columns(self) -> Mapping[str, Sequence[Any]]:
-        """The values of those columns, m each, by heading, of this model as it stands."""
-        return {}
-
-    @property
-    def input_columns_known(self) -> bool:
-        """Whether there are readings without a file, whose inputs stand in the config or are the model's own."""
-        return True
 
     def absent_input(self, heading: str, columns: Sequence[str]) -> str:
         """What to do where a file lacks that column, having others of the inputs."""
@@ -219,11 +206,6 @@ class Measurement(Component, Named, ABC):
     def physical_slope(self, x: Array) -> Array:
         """The derivative of each value by its own entry of x (trials, n)."""
         return np.broadcast_to(self.sizes, x.shape)
-
-    @property
-    def fixed(self) -> Mapping[str, float]:
-        """Values of parameters that are known and not estimated, by name."""
-        return {}
 
     def near_bounds(self, x: Array) -> Mapping[int, float]:
         """Which of the n parameters are next to a bound at x (n,), and that bound in their own unit."""
@@ -283,27 +265,29 @@ class Measurement(Component, Named, ABC):
         """dh/dx in `rows(stop)` alone, near enough for fits that only start another, `|I - J~+ J|` below 0.1."""
         return self.coarse_jacobian(x)[:, self.rows(stop)]
 
-    @property
-    def recorded(self) -> Recorded | None:
-        """Real readings that come with this model; None where it has none."""
-        return None
+
+def _delegating(cls: type[WrappedModel]) -> type[WrappedModel]:
+    """Gives a class the attributes and the methods of the model inside; what is computed passes the class's hooks."""
+
+    def computing(name: str, own: str) -> Any:
+        return lambda model, x, *stop: getattr(model, own)(x, getattr(model.whole, name)(model.whole_x(x), *stop))
+
+    for name in (
+        *("name", "physical_parameters", "nominal", "nuisance_deviation", "nuisances", "fixed"),
+        *("levels", "epochs", "offset", "m", "recorded", "reading_unit", "reading_name", "usual_noise"),
+        *("inputs", "input_columns", "input_columns_known", "absent_input", "own_parameters"),
+        *("by_differential_equations", "physical", "physical_slope", "near_bounds"),
+        *("jacobian_cost", "coarse_jacobian_cost"),
+    ):
+        setattr(cls, name, property(attrgetter(f"whole.{name}")))
+    for name in ("simulate_until", "coarse_simulate_until"):
+        setattr(cls, name, computing(name, "own_readings"))
+    for name in ("jacobian", "coarse_jacobian", "jacobian_until", "coarse_jacobian_until"):
+        setattr(cls, name, computing(name, "own_jacobian"))
+    return cls
 
 
-def of_whole(name: str) -> Any:
-    """An attribute or a method that is that of the model inside."""
-    return property(lambda model: getattr(model.whole, name))
-
-
-def _readings_of_whole(name: str) -> Any:
-    """A method that computes readings by that of the model inside."""
-    return lambda model, x, *stop: model.own_readings(x, getattr(model.whole, name)(model.whole_x(x), *stop))
-
-
-def _jacobian_of_whole(name: str) -> Any:
-    """A method that computes a Jacobian by that of the model inside."""
-    return lambda model, x, *stop: model.own_jacobian(x, getattr(model.whole, name)(model.whole_x(x), *stop))
-
-
+@_delegating
 class WrappedModel(Measurement):
     """A model that is another one, `whole`, but for what a subclass overrides.
 
@@ -312,40 +296,11 @@ class WrappedModel(Measurement):
 
     whole: Measurement
 
-    name = of_whole("name")
-    parameters = of_whole("parameters")
-    physical_parameters = of_whole("physical_parameters")
-    nominal = of_whole("nominal")
-    nuisance_deviation = of_whole("nuisance_deviation")
-    nuisances = of_whole("nuisances")
-    index = of_whole("index")
-    levels = of_whole("levels")
-    epochs = of_whole("epochs")
-    offset = of_whole("offset")
-    m = of_whole("m")
-    fixed = of_whole("fixed")
-    inputs = of_whole("inputs")
-    input_columns = of_whole("input_columns")
-    input_columns_known = of_whole("input_columns_known")
-    absent_input = of_whole("absent_input")
-    by_differential_equations = of_whole("by_differential_equations")
-    recorded = of_whole("recorded")
-    reading_unit = of_whole("reading_unit")
-    reading_name = of_whole("reading_name")
-    usual_noise = of_whole("usual_noise")
-    own_parameters = of_whole("own_parameters")
-    physical = of_whole("physical")
-    physical_slope = of_whole("physical_slope")
-    near_bounds = of_whole("near_bounds")
-    jacobian_cost = of_whole("jacobian_cost")
-    coarse_jacobian_cost = of_whole("coarse_jacobian_cost")
-    simulate = _readings_of_whole("simulate")
-    simulate_until = _readings_of_whole("simulate_until")
-    coarse_simulate_until = _readings_of_whole("coarse_simulate_until")
-    jacobian = _jacobian_of_whole("jacobian")
-    coarse_jacobian = _jacobian_of_whole("coarse_jacobian")
-    jacobian_until = _jacobian_of_whole("jacobian_until")
-    coarse_jacobian_until = _jacobian_of_whole("coarse_jacobian_until")
+    parameters = property(attrgetter("whole.parameters"))
+    index = property(attrgetter("whole.index"))
+
+    def simulate(self, x: Array) -> Array:
+        return self.own_readings(x, self.whole.simulate(self.whole_x(x)))
 
     def whole_x(self, x: Array) -> Array:
         """x (trials, k) as the whole model takes it."""
@@ -424,17 +379,15 @@ class SubsetModel(WrappedModel):
         return len(self.kept)
 
     @property
-    def epochs(self) -> tuple[NDArray[np.intp], ...] | None:
+    def epochs(self) -> Epochs | None:
         """The whole model's epochs that still have readings, renumbered."""
         if self.whole.epochs is None:
             return None
         place = np.empty(self.whole.m, dtype=np.intp)
         for k, epoch in enumerate(self.whole.epochs):
             place[epoch] = k
-        numbered = place[self._rows]
-        order = np.argsort(numbered, kind="stable")
-        starts = np.flatnonzero(np.diff(numbered[order])) + 1
-        return tuple(np.split(order, starts)) if len(order) else ()
+        order = np.argsort(place[self._rows], kind="stable")
+        return tuple(np.split(order, np.flatnonzero(np.diff(place[self._rows][order])) + 1)) if len(order) else ()
 
     @cached_property
     def _rows(self) -> NDArray[np.intp]:
@@ -448,10 +401,9 @@ class SubsetModel(WrappedModel):
 
     def _computed(self, name: str, x: Array) -> Array:
         """What that method of the whole model computes, in the kept rows."""
-        whole = (
-            getattr(self.whole, name)(x) if self.stop is None else getattr(self.whole, f"{name}_until")(x, self.stop)
-        )
-        return whole[:, self._among_arrived]
+        if self.stop is None:
+            return getattr(self.whole, name)(x)[:, self._among_arrived]
+        return getattr(self.whole, f"{name}_until")(x, self.stop)[:, self._among_arrived]
 
     def simulate(self, x: Array) -> Array:
         return self._computed("coarse_simulate" if self.coarse and self.stop is not None else "simulate", x)

@@ -8,8 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from ipe_bench.measurements import Mgh
-from ipe_bench.measurements.mgh import functions, score
-from ipe_bench.measurements.mgh.problems import PROBLEMS
+from ipe_bench.measurements.mgh import PROBLEMS, functions, score
 from ipe_bench.plugins.conformance import check_component
 
 # m and n, as the paper states them.

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from ipe_bench.measurements import Nist
-from ipe_bench.measurements.nist import datasets, digits, score
-from ipe_bench.measurements.nist.formulas import FORMULAS
+from ipe_bench.measurements.nist import FORMULAS, datasets, digits, score
 
 # What NIST's headers say: observations and parameters.
 SIZES = {
