@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, ndtri
 
 from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.trials.whiteness import lags_of, ljung_box
 
 OUTLIER_LEVEL = 0.01
 """Chance that good readings of a whole file give an outlier somewhere."""
@@ -18,7 +19,6 @@ DRAWS = 1999
 """Simulated fits behind the test of whiteness."""
 LEAST_P = 1 / (DRAWS + 1)
 """Its p is a multiple of this; the least says only that no simulated fit was as extreme."""
-_LONGEST_LAG = 10
 _DRAWS_AT_ONCE = 250
 _MANY = 20_000
 """Of more readings than these a fit takes out too little to matter: Q is chi-square, and nothing need be simulated."""
@@ -80,31 +80,20 @@ def whiteness(w: Array, Q: Array, series: NDArray[np.intp], draws: int = DRAWS) 
     test: Davison and Hinkley, Bootstrap Methods and their Application, 1997, section 4.2). The draws are always the
     same ones.
     """
-    lags = min(_LONGEST_LAG, max(1, series.shape[1] // 5))
-    exists = series >= 0
-    pairs = [int(np.sum(exists[:, :-k] & exists[:, k:])) for k in range(1, lags + 1)]
+    lags = lags_of(series.shape[1])
+
+    def statistic(w: Array) -> Array:
+        return ljung_box(np.where(series >= 0, w[:, series], np.nan))
+
+    observed = float(statistic(w[None])[0])
     # A single degree of freedom leaves one direction: its residuals differ in size alone, which Q does not see.
-    if Q.shape[1] >= len(w) - 1 or not (np.isfinite(w).all() and w.any() and any(pairs)):
+    if Q.shape[1] >= len(w) - 1 or not (np.isfinite(w).all() and np.isfinite(observed)):
         return Whiteness(np.nan, lags, np.nan)
-    observed = float(_ljung_box(w[None], series, pairs)[0])
     if len(w) > _MANY:
         return Whiteness(observed, lags, float(chdtrc(lags, observed)))
     rng = np.random.Generator(np.random.Philox(0))
     as_large = 0
     for start in range(0, draws, _DRAWS_AT_ONCE):
         noise = rng.standard_normal((min(_DRAWS_AT_ONCE, draws - start), len(w)))
-        as_large += int(np.sum(_ljung_box(noise - (noise @ Q) @ Q.T, series, pairs) >= observed * (1 - 1e-9)))
+        as_large += int(np.sum(statistic(noise - (noise @ Q) @ Q.T) >= observed * (1 - 1e-9)))
     return Whiteness(observed, lags, (1 + as_large) / (1 + draws))
-
-
-def _ljung_box(w: Array, series: NDArray[np.intp], pairs: list[int]) -> Array:
-    """Q (fits,) of residuals w (fits, m); a pair with a missing reading counts nowhere."""
-    exists = series >= 0
-    placed = np.where(exists, w[:, series], 0.0)
-    count, total = int(exists.sum()), np.sum(placed**2, axis=(1, 2))
-    Q = np.zeros(len(w))
-    for k, number in enumerate(pairs, 1):
-        if number:
-            r = np.sum(placed[:, :, :-k] * placed[:, :, k:], axis=(1, 2)) / total
-            Q += count * (count + 2) * r**2 / number
-    return Q

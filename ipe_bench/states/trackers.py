@@ -36,6 +36,9 @@ class Tracks:
     nis: Array
     """Squared normalised innovations (trials, K), chi-square with `degrees` if the model holds; 0 in smoothers,
     NaN where there are none."""
+    innovations: Array
+    """Normalised innovations (trials, K, m), independent and N(0, 1) if the model holds; NaN of missing readings and
+    in trackers that have none."""
     degrees: Array
     """Readings that were there (trials, K)."""
     log_likelihood: Array
@@ -53,8 +56,10 @@ class Tracks:
     def empty(cls, model: StateModel, trials: int) -> Tracks:
         K, n = model.epochs, model.n
         nis, degrees = np.zeros((trials, K)), np.zeros((trials, K))
+        innovations = np.full((trials, K, len(model.R(0))), np.nan)
         means, covariances = np.empty((trials, K, n)), np.empty((trials, K, n, n))
-        return cls(means, covariances, nis, degrees, np.zeros(trials), 0.0, spread_prior(model, trials))
+        start = spread_prior(model, trials)
+        return cls(means, covariances, nis, innovations, degrees, np.zeros(trials), 0.0, start)
 
     @classmethod
     def lost(cls, model: StateModel, trials: int) -> Tracks:
@@ -66,7 +71,7 @@ class Tracks:
     @classmethod
     def join(cls, parts: Sequence[Tracks]) -> Tracks:
         """The trials of several batches one after another, without what smoothers need."""
-        names = ("mean", "covariance", "nis", "degrees", "log_likelihood")
+        names = ("mean", "covariance", "nis", "innovations", "degrees", "log_likelihood")
         arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         start = Gaussian(*[np.concatenate(several) for several in zip(*(part.start for part in parts), strict=True)])
         return cls(**arrays, calls=max(part.calls for part in parts), start=start)
@@ -106,6 +111,7 @@ class Update(NamedTuple):
     """The states after a reading, and what the innovation says of the filter."""
 
     x: Gaussian
+    innovation: Array
     nis: Array
     degrees: Array
     log_likelihood: Array
@@ -128,11 +134,12 @@ def update(x: Gaussian, read: Affine, R: Array, z: Array) -> Update:
     K = transposed(upper_solve(L, lower_solve(L, transposed(PH))))
     rest = np.eye(m.shape[-1]) - np.matmul(K, H)
     covariance = np.matmul(np.matmul(rest, P), transposed(rest)) + np.matmul(np.matmul(K, noise), transposed(K))
-    e = lower_solve(L, y[..., None])
-    nis, degrees = np.sum(e[..., 0] ** 2, axis=-1), seen.sum(axis=-1)
+    e = lower_solve(L, y[..., None])[..., 0]
+    nis, degrees = np.sum(e**2, axis=-1), seen.sum(axis=-1)
     log_determinant = 2 * np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(axis=-1)
     posterior = Gaussian(m + multiply(K, y), symmetric(covariance))
-    return Update(posterior, nis, degrees, -0.5 * (nis + log_determinant + degrees * np.log(2 * np.pi)))
+    innovation = np.where(seen, e, np.nan)
+    return Update(posterior, innovation, nis, degrees, -0.5 * (nis + log_determinant + degrees * np.log(2 * np.pi)))
 
 
 @dataclass(frozen=True)
@@ -165,13 +172,14 @@ class Filter(Tracker):
         return out
 
     def _updated(self, model: StateModel, x: Gaussian, k: int, z: Array, out: Tracks) -> Gaussian:
-        at, R = x, model.R(k)
+        at, R, found = x, model.R(k), None
         for _ in range(self.iterations):
             read = linearised_reading(model, self.rule, k, z, at)
             found = update(x, read, R, z)
             at = found.x
-        out.nis[:, k], out.degrees[:, k] = found.nis, found.degrees  # pyright: ignore[reportPossiblyUnboundVariable]
-        out.log_likelihood += found.log_likelihood  # pyright: ignore[reportPossiblyUnboundVariable]
+        assert found is not None
+        out.nis[:, k], out.innovations[:, k], out.degrees[:, k] = found.nis, found.innovation, found.degrees
+        out.log_likelihood += found.log_likelihood
         return at
 
 

@@ -702,6 +702,18 @@ STATISTICS: tuple[Statistic, ...] = (
         where=("tracks",),
     ),
     Statistic(
+        "not_white",
+        "not white",
+        "converged trials of filters of states",
+        f"Share of trials whose normalised innovations are autocorrelated at the level {t.NOT_WHITE:g}, by Ljung and"
+        " Box's test (Biometrika 65, 1978) pooled over readings, lags 1 to 10 at most and to a fifth of the epochs:"
+        f" {t.NOT_WHITE:g} where the filter is right. Interval: Clopper and Pearson.",
+        lambda s: t.not_white(s)[0],
+        limits=lambda s: t.not_white(s)[1:],
+        kind="share",
+        where=("tracks",),
+    ),
+    Statistic(
         "log_likelihood",
         "log likelihood",
         "solved trials of filters of states",

@@ -14,9 +14,12 @@ import numpy as np
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics import formulas as f
-from ipe_bench.statistics.consistency import mean_limits, verdict
+from ipe_bench.statistics.consistency import clopper_pearson, mean_limits, verdict
 from ipe_bench.statistics.sample import NIS, Sample
 from ipe_bench.trials.tracking import unpacked
+
+NOT_WHITE = 0.05
+"""Level of the test that innovations are white."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +70,14 @@ def nis_verdict(s: Sample) -> str:
     """By as many degrees as a trial has readings."""
     m = int(s.group.footer["readings"])
     return verdict(m * s.scalars[NIS][s.converged], m) if is_track(s) and NIS in s.scalars else "-"
+
+
+def not_white(s: Sample) -> tuple[float, float, float]:
+    """Share of trials with autocorrelated innovations, and the ends of its interval."""
+    p = s.scalars["white_p"][s.converged] if "white_p" in s.scalars else np.empty(0)
+    p = p[~np.isnan(p)]
+    rejected = int((p < NOT_WHITE).sum())
+    return rejected / len(p) if len(p) else np.nan, *clopper_pearson(rejected, len(p))
 
 
 def curves(s: Sample) -> Iterator[dict[str, Any]]:

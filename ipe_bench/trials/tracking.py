@@ -29,6 +29,7 @@ from ipe_bench.states.trackers import Tracker, Tracks
 from ipe_bench.trials.scenario import Scenario, check_seed
 from ipe_bench.trials.scoring import Block, Columns, by_parameter, nees
 from ipe_bench.trials.thresholds import EXPECTED, GATE
+from ipe_bench.trials.whiteness import lags_of, ljung_box
 
 _PARTS = 10
 """Groups of paths by whose scatter the standard error of the posterior bound is known."""
@@ -185,7 +186,7 @@ class PathBlock:
             messages=messages,
             seconds=seconds,
         )
-        from scipy.special import chdtri
+        from scipy.special import chdtrc, chdtri
 
         each = nees(e.reshape(-1, n), P.reshape(-1, n, n)).reshape(trials, K)
         each[~self.definite] = np.nan
@@ -214,6 +215,7 @@ class PathBlock:
             "path_nees": each.mean(axis=1),
             "extra_nis": np.where(read > 0, tracks.nis.sum(axis=1) / np.maximum(read, 1), np.nan),
             "log_likelihood": np.where(read > 0, tracks.log_likelihood, np.nan),
+            "white_p": chdtrc(lags_of(K), ljung_box(tracks.innovations.swapaxes(1, 2))),
             "first_bad_epoch": np.where(lost.any(axis=1), lost.argmax(axis=1) + 1.0, np.nan),
             "curves": packed(trials, [*sums, np.full((K, 1), converged.sum())]),
         }

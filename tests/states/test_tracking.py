@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 from state_models import ConstantVelocity, CoordinatedTurn, Growth, Pendulum
 from walking_gins import WalkingGins
 
@@ -18,6 +19,7 @@ from ipe_bench.statistics import analyse
 from ipe_bench.statistics.certified import published_table
 from ipe_bench.statistics.collect import collect
 from ipe_bench.trials.tracking import PathBlock, Tracking
+from ipe_bench.trials.whiteness import ljung_box
 
 LINEAR = ConstantVelocity(count=30, spread=3.0)
 
@@ -66,6 +68,46 @@ def test_the_kalman_filter_attains_both_bounds_on_its_own_model():
         for column in ("van_trees", "bayes_bound", "linear_bound", "reported"):
             assert one[column] == pytest.approx(np.sqrt(P[-1, i, i]), rel=1e-8)
         assert one["path_bound"] == pytest.approx(np.sqrt(P[:, i, i].mean()), rel=1e-8)
+
+
+@dataclass(frozen=True)
+class Deceived(Tracker):
+    """The Kalman filter with another process noise than the states have."""
+
+    assumed: ConstantVelocity
+
+    def track(self, model, z):
+        return ekf().track(self.assumed, z)
+
+
+def test_innovations_are_white_where_the_filter_is_right_and_nowhere_else(tmp_path):
+    table = ib.run(
+        Tracking(LINEAR),
+        {"kf": ekf(), "told": Deceived(replace(LINEAR, density=0.05 * LINEAR.density)), "rts": Smoother(ekf())},
+        600,
+        output=tmp_path,
+    )
+    right, wrong = row(table, "kf"), row(table, "told")
+    assert right["not_white"] == pytest.approx(0.05, abs=4 * np.sqrt(0.05 * 0.95 / 600))
+    assert right["not_white_low"] < 0.05 < right["not_white_high"]
+    assert wrong["not_white_low"] > 0.2
+    assert np.isnan(row(table, "rts")["not_white"])
+    p = ib.load(tmp_path).query("estimator == 'kf'").set_index("trial")["white_p"]
+    (e,) = ekf().track(LINEAR, LINEAR.draw(7, 8).z).innovations[..., 0]
+    r = [e[k:] @ e[: len(e) - k] / (e @ e) for k in range(1, 7)]
+    Q = 30 * 32 * sum(r[k - 1] ** 2 / (30 - k) for k in range(1, 7))
+    assert p[7] == pytest.approx(chi2.sf(Q, 6), rel=1e-9)
+
+
+def test_a_missing_reading_has_no_innovation_and_breaks_no_neighbours():
+    model = CoordinatedTurn(count=40)
+    z = model.draw(0, 2).z
+    z[0, 5, 0], z[1, 9] = np.nan, np.nan
+    tracks = ukf().track(model, z)
+    e = tracks.innovations
+    assert np.array_equal(np.isnan(e), np.isnan(z))
+    np.testing.assert_allclose(np.nansum(e**2, axis=2), tracks.nis, rtol=1e-12)
+    assert np.isfinite(ljung_box(e.swapaxes(1, 2))).all()
 
 
 def test_blocks_and_further_trials_change_no_trial(tmp_path):
