@@ -256,7 +256,7 @@ def compare(
         frame.attrs[name] = list(dict.fromkeys(line for c in collections for line in getattr(c, name)))
     frame.attrs["notes"] = left_out(*collections)
     if output is not None:
-        from ipe_bench.report.comparison import write_comparison
+        from ipe_bench.report.questions import write_comparison
 
         write_comparison(frame, Path(output), alpha)
     return frame
@@ -286,7 +286,7 @@ def audit(table: Path | str | pd.DataFrame, *, output: Path | str | None = None)
 
     found = examined(read_claims(table))
     if output is not None:
-        from ipe_bench.report.audited import write_audit
+        from ipe_bench.report.questions import write_audit
 
         write_audit(found, Path(output))
     return found
@@ -499,26 +499,38 @@ def check(component: Any) -> list[Finding]:
 
 
 def _check_records(options: Sequence[Option]) -> list[Finding]:
-    """The findings on what reports are made of, from a small sweep and from a single trial."""
+    """Whether the reports on a small sweep and on a single trial have what each of these options adds to reports."""
     from ipe_bench.baselines import EKF, LinearLSE
     from ipe_bench.measurements.polynomial import Polynomial
     from ipe_bench.noise.white import Gaussian
+    from ipe_bench.plugins.conformance import Finding
     from ipe_bench.plugins.extensions import use_statistics
-    from ipe_bench.report.conformance import check_record
+    from ipe_bench.report.figures import added_drawings
+    from ipe_bench.report.figures.views import views
+    from ipe_bench.report.sections import report_tables, written
+    from ipe_bench.report.style import house_style
     from ipe_bench.solvers import FixedPoint, Newton
     from ipe_bench.statistics import analyse
 
     if not options:
         return []
-    use_statistics()
+    problems = use_statistics()
     # The fixed point fails at the largest scale.
     scenarios = [Scenario(Polynomial(), Gaussian(0.01), error_scale=scale) for scale in (1.0, 10.0, 100.0)]
     estimators = {"linear_lse": LinearLSE(), "fixed_point": FixedPoint(), "newton": Newton(), "ekf": EKF()}
-    with tempfile.TemporaryDirectory(prefix="ipe-bench-") as folder:
+    with tempfile.TemporaryDirectory(prefix="ipe-bench-") as folder, house_style():
         compute(scenarios, estimators, 25, f"{folder}/sweep")
         compute(scenarios[-1:], estimators, 1, f"{folder}/single")
-        analyses = [analyse([f"{folder}/{name}"]) for name in ("sweep", "single")]
-        return [check_record(option, analyses) for option in options]
+        for analysis in (analyse([f"{folder}/{name}"]) for name in ("sweep", "single")):
+            written("section", analysis, report_tables(analysis))
+            for number, drawing in enumerate(added_drawings(analysis, views(analysis))):
+                drawing.save(Path(folder, str(number)))
+            problems += analysis.collection.extra_problems
+    findings = []
+    for name in (f"{option.group}={option.name}" for option in options):
+        own = [line.removeprefix(f"{name}: ") for line in problems if line.startswith(f"{name}: ")]
+        findings.append(Finding(name, "Is part of reports on a small sweep and on a single trial", "; ".join(own[:1])))
+    return findings
 
 
 def _scenario(given: Any, **stated: Any) -> Scenario:

@@ -36,9 +36,9 @@ BUDGETS = {
     "trials": 2399,
     "runs": 2230,
     "statistics": 4456,
-    "real": 2505,
-    "plugins": 1315,
-    "report": 4790,
+    "real": 2500,
+    "plugins": 1313,
+    "report": 4324,
     "cli": 2950,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""

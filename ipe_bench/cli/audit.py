@@ -14,10 +14,10 @@ def main(arguments: Sequence[str]) -> int:
     if len(files) != 1:
         raise UserError("audit: name one table of truths, estimates and deviations, such as runs.csv")
     from ipe_bench.api import audit
-    from ipe_bench.report.audited import contents
+    from ipe_bench.report.questions import audit_parts
 
     found = audit(files[0], output=given.get("output"))
-    show(contents(found))
+    show(audit_parts(found))
     if "output" in given:
         say(f"\nTable   {given['output']}/audit.csv", f"Page    {given['output']}/audit.html")
     return 1 if found.scale.wrong else 0

@@ -29,10 +29,10 @@ def main(arguments: Sequence[str]) -> int:
     if not 1 <= len(folders) <= 2:
         raise UserError("compare: name one or two folders of results, such as outputs/before outputs/after")
     from ipe_bench.api import compare
-    from ipe_bench.report.comparison import contents
+    from ipe_bench.report.questions import comparison_parts
 
     frame = compare(*folders, **keys)
-    show(contents(frame, keys.get("alpha", 0.05)))
+    show(comparison_parts(frame, keys.get("alpha", 0.05)))
     print_problems([*frame.attrs["problems"], *frame.attrs["stale"], *frame.attrs["notes"]])
     if "output" in keys:
         say(f"\nTable   {Path(keys['output']) / 'comparison.csv'}")

@@ -27,7 +27,7 @@ def main(arguments: Sequence[str], by: Sequence[str] | None, readings: int | Non
     errors = richer_models(scenario)
     found = design(scenario, by=by, readings=readings, criterion=criterion, errors=errors)
 
-    from ipe_bench.report.designs import NAME, READINGS, contents, write_design
+    from ipe_bench.report.questions import READINGS, design_parts, write_design
 
     command = {
         "scenario": describe(dataclasses.replace(scenario, truth=None)),
@@ -36,8 +36,8 @@ def main(arguments: Sequence[str], by: Sequence[str] | None, readings: int | Non
         "readings": readings,
         "criterion": criterion,
     }
-    folder = asked.folder(NAME, command, (READINGS,))
-    files = write_design(folder, asked.measurement, found, command)
-    show(contents(asked.measurement, found))
+    folder = asked.folder("design", command, (READINGS,))
+    files = write_design(folder, asked.measurement, found)
+    show(design_parts(asked.measurement, found))
     say_files(files)
     return 0 if found.observability.observable else 1

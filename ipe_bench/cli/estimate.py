@@ -28,7 +28,7 @@ def main(arguments: Sequence[str]) -> int:
     folder = asked.folder(NAME, command, FILES)
     answer = Answer.to(opened, asked.measurement)
     written = {"measurement": asked.measurement, "config": asked.config, **_provenance(opened)}
-    files = write_answer(folder, answer, command, written, which=asked.spec.figures)
+    files = write_answer(folder, answer, command, written, figures=asked.spec.figures != "none")
     show(contents(answer))
     say_files(files)
     return 0 if answer.passes else 1

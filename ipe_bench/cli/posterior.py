@@ -26,7 +26,7 @@ def main(arguments: Sequence[str], particles: int) -> int:
         raise UserError("noise=certified: has no prior to begin with; choose another noise and an error_scale")
     validate([scenario], job.estimators, trials)
 
-    from ipe_bench.report.posteriors import NAME, contents, write_posteriors
+    from ipe_bench.report.questions import posterior_parts, write_posteriors
 
     command = {
         "scenario": describe(scenario),
@@ -34,14 +34,14 @@ def main(arguments: Sequence[str], particles: int) -> int:
         "trials": trials,
         "particles": particles,
     }
-    folder = asked.folder(NAME, command)
+    folder = asked.folder("posterior", command)
 
     def tell(trial: int) -> None:
         print(f"{name}: trial {trial + 1} of {trials}", file=sys.stderr, flush=True)
 
     found = posterior(scenario, job.estimators, trials, particles=particles, watch=tell)
     title = f"{name}, {scenario.noise.name}, error scale {scenario.error_scale:g}"
-    files = write_posteriors(folder, name, title, scenario.measurement, found, command)
-    show(contents(title, found))
+    files = write_posteriors(folder, name, title, scenario.measurement, found)
+    show(posterior_parts(title, found))
     say_files(files)
     return 0 if all(one.posterior.settled for one in found) else 1

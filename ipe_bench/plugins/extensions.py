@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from ipe_bench.basics.errors import StorageError, UserError, place_of
+from ipe_bench.basics.errors import UserError, place_of
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.plugins.construct import construct, find_object
 from ipe_bench.plugins.discovery import RECORD_GROUPS, Option, blame, options
@@ -58,24 +57,19 @@ def find_record(option: Option) -> Any:
     return record
 
 
-def records(group: str, problems: list[str]) -> Iterator[tuple[Option, Any]]:
-    """The records of a group that can be found; a line is added to the problems for every other."""
+def added(group: str, problems: list[str], make: Callable[[Any], Any]) -> Iterator[tuple[str, Any]]:
+    """What `make` makes of each record of a group, with its name; a line is added to the problems for every one that
+    cannot be found or raises."""
     for option in options(group):
+        name = f"{group}={option.name}: "
         try:
-            yield option, find_record(option)
+            made = make(find_record(option))
         except UserError as error:
-            problems.append(f"{error}; it is left out")
-
-
-@contextmanager
-def guarded() -> Iterator[None]:
-    """Runs the code of a plugin; if it raises, raises UserError in a line that says where."""
-    try:
-        yield
-    except (UserError, StorageError):
-        raise
-    except (Exception, SystemExit) as error:
-        raise UserError(blame(error) or place_of(error)) from error
+            problems.append(f"{name}{str(error).removeprefix(name)}; it is left out")
+        except Exception as error:
+            problems.append(f"{name}{blame(error) or place_of(error)}; it is left out")
+        else:
+            yield option.name, made
 
 
 def require_type(thing: Any, kind: type, says: str = "gives") -> None:
@@ -86,10 +80,14 @@ def require_type(thing: Any, kind: type, says: str = "gives") -> None:
 
 def use_statistics() -> list[str]:
     """Has the statistics of all plugins computed beside ours; returns a line for each that cannot be."""
-    from ipe_bench.statistics.records import add_statistics
+    from ipe_bench.statistics.records import Statistic, add_statistics
+
+    def make(record: Any) -> Statistic:
+        require_type(record, Statistic, "is")
+        return record
 
     problems: list[str] = []
-    found = [record for _, record in records("statistic", problems)]
+    found = [record for _, record in added("statistic", problems, make)]
     return problems + add_statistics(found)
 
 

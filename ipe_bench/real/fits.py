@@ -20,7 +20,7 @@ from ipe_bench.noise.base import Noise
 from ipe_bench.noise.levels import Levels
 from ipe_bench.noise.white import Gaussian
 from ipe_bench.real.levels import Estimated, first_levels, levels_at, maximum, objective_of, unknown_levels
-from ipe_bench.real.profiles import Released, half_width, joint_region, wald_interval
+from ipe_bench.real.profiles import Released, half_width, wald_interval
 from ipe_bench.real.residuals import Whiteness, explained, normalised, outlier_limit, whiteness
 from ipe_bench.trials.fit_test import fit_probability, inflation_of, spread_of
 from ipe_bench.trials.observability import in_words
@@ -168,11 +168,6 @@ class Fit:
         with np.errstate(invalid="ignore"):
             deviation = np.sqrt(np.diagonal(self.inner_covariance))
         return wald_interval(self.model, self.inner, deviation, half_width(confidence, self._freedom))
-
-    def region(self, parameters: int, confidence: float = 0.95) -> float:
-        """The squared distance, in standard errors, to the edge of a joint region of so many parameters."""
-        freedom = self._freedom
-        return joint_region(parameters, confidence, None if freedom is None else float(np.min(freedom)))
 
     @property
     def outlier_limit(self) -> float:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ipe_bench.basics.files import write_text
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.base import Measurement
@@ -19,19 +20,17 @@ from ipe_bench.real.estimation import Opened
 from ipe_bench.real.examination import CONFIDENCE, Examination
 from ipe_bench.real.fits import Fit
 from ipe_bench.real.residuals import LEAST_P
-from ipe_bench.report.choice import Which
 from ipe_bench.report.table import Part, Strong, Table, html, plain_text, texts, words
 from ipe_bench.report.words import p_value
-from ipe_bench.report.writer import named, picked, plain, write
+from ipe_bench.report.writer import write
 from ipe_bench.trials.fit_test import DRAWS
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
 if TYPE_CHECKING:
     import pandas as pd
 
-NAME, RESIDUALS, SCHEMA = "estimate", "residuals.csv", 2
-_FIGURES = tuple(f"{name}{suffix}" for name in ("residuals", "ellipses") for suffix in (".png", ".pdf"))
-FILES = (RESIDUALS, *_FIGURES)
+NAME, RESIDUALS, SCHEMA = "estimate", "residuals.csv", 3
+FILES = (RESIDUALS, "residuals.png", "residuals.pdf")
 LEAST_FIT_P = 1 / (DRAWS + 1)
 """Least p of the test of fit if the law of the noise is simulated."""
 _MOST_OUTLIERS = 8
@@ -282,7 +281,7 @@ def _where(label: Mapping[str, Any]) -> str:
 
 def _reading_labels(model: Measurement) -> list[dict[str, Any]]:
     columns = model.index
-    return [{k: plain(v) for k, v in zip(columns, row, strict=True)} for row in zip(*columns.values(), strict=True)]
+    return [{k: as_json(v) for k, v in zip(columns, row, strict=True)} for row in zip(*columns.values(), strict=True)]
 
 
 def _intervals(found: Examination) -> Table:
@@ -365,36 +364,30 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
 
 
 def write_answer(
-    folder: Path, answer: Answer, command: Any, provenance: Mapping[str, Any], *, which: Which = "all"
+    folder: Path, answer: Answer, command: Any, provenance: Mapping[str, Any], *, figures: bool = True
 ) -> list[Path]:
-    """Writes an answer; each file appears whole or not at all. Returns the files.
+    """Writes estimate.json, the page, residuals.csv and the figure; returns the files.
 
-    All its figures are main ones: `which` is all, main or none. `command` tells one command from another;
-    `provenance` is added to the JSON file and overrides what stands there of the same name.
+    `command` tells one command from another; `provenance` overrides what stands in the JSON file of the same name.
     """
-    from ipe_bench.report.figures.readings import draw_ellipses, draw_residuals
+    from ipe_bench.report.figures.errors import draw_residuals
 
-    given = answer.model, answer.fits
-    drawings = chain(draw_residuals(*given), draw_ellipses(*given))
+    content = {"schema": SCHEMA, "command": command, **described(answer), **provenance}
+    write_text(folder / f"{NAME}.json", json.dumps(content, indent=1) + "\n")
     verdict = "an answer that passes" if answer.passes else "NO ANSWER THAT PASSES"
-    return write(
-        folder,
-        NAME,
-        f"{answer.name}: estimates",
-        contents(answer),
-        lead=f"{np.isfinite(answer.z).sum()} readings; {verdict}. {provenance.get('written', '')}",
-        content={"schema": SCHEMA, "command": command, **described(answer), **provenance},
-        table=(RESIDUALS, _residuals(answer)),
-        drawings=() if which == "none" else drawings,
-        old=_FIGURES,
-    )
+    lead = f"{np.isfinite(answer.z).sum()} readings; {verdict}. {provenance.get('written', '')}"
+    drawings = draw_residuals(answer.model, answer.fits) if figures else ()
+    table = RESIDUALS, _residuals(answer)
+    files = write(folder, NAME, f"{answer.name}: estimates", contents(answer), table, lead=lead, drawings=drawings)
+    for old in {folder / each for each in FILES} - set(files):
+        old.unlink(missing_ok=True)
+    return [folder / f"{NAME}.json", *files]
 
 
 def described(answer: Answer) -> dict[str, Any]:
-    """Everything, as plain data for JSON."""
-    model, z = answer.model, answer.z
+    """What estimate.json says of the readings, of the estimates, and of the least minimum."""
+    model, z, found = answer.model, answer.z, answer.examination
     labels = _reading_labels(model)
-    with_prior = next((one for one in answer.examinations if one.with_prior), None)
     return {
         "measurement": model.name,
         "reading_unit": model.reading_unit,
@@ -403,60 +396,53 @@ def described(answer: Answer) -> dict[str, Any]:
         "fixed": dict(model.fixed),
         "left_out": answer.left_out,
         "passes": answer.passes,
-        "examination": answer.examination and _examined(answer.examination, labels),
-        "examination_with_prior": with_prior and _examined(with_prior, labels),
-        "parameters": [picked(p, "name", "unit") for p in answer.fits[0].model.physical_parameters],
+        "examination": found and _examined(found, labels),
         "estimators": {one.label: _fitted(one, labels) for one in answer.fits},
     }
 
 
 def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
     names = [p.name for p in one.model.physical_parameters]
-    whiteness = {"test": "Ljung-Box, p from simulated fits", "p": plain(one.whiteness.p_value)}
+    rows = ("message", "chi_square", "degrees_of_freedom", "fits", "passes", "with_prior", "beaten_by", "iterations")
+    rows += ("simulations", "correlation", "residual_deviation")
     return {
         "status": one.status.label,
-        "estimates": named(names, one.x),
-        "standard_errors": named(names, one.standard_errors),
-        "intervals95": named(names, np.transpose(one.interval())),
-        "p": plain(one.p_value),
+        "estimates": _by_name(names, one.x),
+        "standard_errors": _by_name(names, one.standard_errors),
+        "intervals95": _by_name(names, np.transpose(one.interval())),
+        "p": as_json(one.p_value),
+        "white_p": as_json(one.whiteness.p_value),
         "on_bounds": {names[k]: value for k, value in one.held_at.items()},
-        "undetermined": list(one.undetermined),
-        "noise_level_estimated": one.levels or plain(one.level),
-        "whiteness": whiteness | picked(one.whiteness, "statistic", "lags"),
+        "noise_level_estimated": one.levels or as_json(one.level),
         "outliers": [
-            {**labels[i], "normalised_residual": plain(one.normalised[i])} for i in np.flatnonzero(one.outliers)
+            {**labels[i], "normalised_residual": as_json(one.normalised[i])} for i in np.flatnonzero(one.outliers)
         ],
-        **picked(one, "message", "correlation", "chi_square", "degrees_of_freedom", "fits", "passes", "with_prior"),
-        **picked(one, "beaten_by", "residual_deviation", "outlier_limit", "iterations", "simulations"),
+        **{name: as_json(getattr(one, name)) for name in rows},
     }
 
 
 def _examined(found: Examination, labels: list[dict[str, Any]]) -> dict[str, Any]:
     names, bootstrap = [p.name for p in found.model.physical_parameters], found.bootstrap
-    intervals = {
-        "standard_error": np.transpose(found.wald),
-        "profile": [(p.low, p.high) for p in found.profiles],
-        "bootstrap": np.column_stack([bootstrap.low, bootstrap.high]),
-    }
-    direction = {"direction": named(names, found.direction.weights)}
     return {
         "estimator": found.label,
-        "confidence": CONFIDENCE,
-        "estimates": named(names, found.x),
-        "standard_errors": named(names, found.standard_errors),
-        "intervals": {name: named(names, ends) for name, ends in intervals.items()},
-        "profiles": dict(zip(names, [picked(p, "values", "zeta", "bent") for p in found.profiles], strict=True)),
-        "bootstrap": {**picked(bootstrap, "drawn", "converged"), "bias": named(names, bootstrap.bias)},
-        "least_observable": {**direction, "collinearity_index": plain(found.direction.collinearity)},
-        "minima": [
-            {"estimates": named(names, one.x), "starts": one.found, **picked(one, "chi_square", "as_good")}
-            for one in found.minima
-        ],
-        "is_least_minimum": found.least,
-        "with_prior": found.with_prior,
-        "on_bounds": {one.parameter.name: plain([one.bound, one.other]) for one in found.on_bounds},
+        "estimates": _by_name(names, found.x),
+        "profile95": _by_name(names, [(p.low, p.high) for p in found.profiles]),
+        "bootstrap95": _by_name(names, np.column_stack([bootstrap.low, bootstrap.high])),
         "remarks": list(remarks(found, labels)),
     }
+
+
+def as_json(value: Any) -> Any:
+    """A value as JSON knows it, which has neither arrays nor NaN nor infinity: null in their place."""
+    if isinstance(value, np.generic | np.ndarray):
+        value = value.tolist()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return [as_json(v) for v in value] if isinstance(value, list | tuple) else value
+
+
+def _by_name(names: Sequence[str], values: Any) -> dict[str, Any]:
+    return dict(zip(names, as_json(values), strict=True))
 
 
 def _residuals(answer: Answer) -> pd.DataFrame:

@@ -63,7 +63,7 @@ def _figures(analysis: Analysis, folder: Path, names: Sequence[str], width: floa
     files: list[Path] = []
     captions: dict[str, str] = {}
     with print_style(width):
-        for drawing, _ in drawings(without_certified(analysis)) if names else ():
+        for drawing in drawings(without_certified(analysis)) if names else ():
             captions[drawing.name] = f"**{drawing.name}.** {drawing.title}. {drawing.caption}"
             files += drawing.save(folder) if drawing.name in names else ()
             if set(names) <= captions.keys():

@@ -94,7 +94,7 @@ class Pending:
         simulated, problems = without_certified(analysis), analysis.collection.extra_problems
         known = len(problems)
         tables = report_tables(analysis)
-        sections = written("section", analysis, [table.name for table in tables])
+        sections = written("section", analysis, tables)
         added = [table for section in sections for table in section.tables]
         write_text(output / "summary.csv", analysis.summary.to_csv(index=False))
         files = [path for table in (*tables, *added) for path in write_table(table, output / "tables")]

@@ -48,7 +48,7 @@ class Figures(Mapping[str, "Figure"]):
     def _next(self) -> bool:
         """Draws one more; False if there is none."""
         with house_style():
-            drawing, _ = next(self._left, (None, ""))
+            drawing = next(self._left, None)
         if drawing is not None:
             self._drawn[drawing.name] = drawing.shown()
         return drawing is not None

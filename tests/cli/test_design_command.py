@@ -1,9 +1,10 @@
 """`ipe-bench design`: tables, files, and mistakes in one line."""
 
 import csv
-import json
 
 import pytest
+
+import ipe_bench as ib
 
 SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01")
 
@@ -18,14 +19,15 @@ def test_tables_and_files_say_the_same(command, tmp_path):
     assert code == 0
     assert "what 40 readings say" in out
     folder = tmp_path / "outputs" / "design-polynomial"
-    found = json.loads((folder / "design.json").read_text())
-    (way,) = found["ways"]
-    assert f"Least observable direction: {found['least_observable_direction']}" in out
-    assert f"{way['sharpest']['mean_bound']:.3f}" in out
+    found = ib.design(ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01)), readings=20)
+    best = found.ways[0].sharpest
+    assert f"Least observable direction: {found.observability.words}" in out
+    assert f"{best.mean_bound:.3f}" in out
     with (folder / "readings.csv").open(newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["choice"] == "sharpest"]
-    assert [float(row["time"]) for row in rows] == [pytest.approx(unit[0]) for unit in way["sharpest"]["units"]]
-    assert len(rows) == way["sharpest"]["readings"] == 20
+    times = found.candidates.index["time"]
+    assert [float(row["time"]) for row in rows] == pytest.approx([times[k] for k in best.rows])
+    assert len(rows) == best.readings == 20
     assert {path.name for path in folder.iterdir()} == {"design.json", "readings.csv", "design.html"}
     # The same command writes there again, another one elsewhere.
     assert command(*SMALL, "--readings", "20")[0] == 0

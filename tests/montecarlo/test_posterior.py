@@ -12,7 +12,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates
 from ipe_bench.measurements import Gins, Measurement, Parameter
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.report.posteriors import honesty
+from ipe_bench.report.questions import honesty
 from ipe_bench.trials.posterior import Divergence, Posterior, divergence, reference, sample_posterior
 
 PRIOR = np.array([1.0, 0.5, 2.0])

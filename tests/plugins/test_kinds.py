@@ -192,14 +192,6 @@ FAULTY = {
     "short": (STATISTIC.format("short", "s.sizes", ""), "has 4 values; return one, or one for each of 4 parameters"),
     "colour": (STATISTIC.format("colour", "1.0", ", kind='colour'"), "kind=colour: choose from"),
     "nowhere": (STATISTIC.format("nowhere", "1.0", ", where=('nowhere',)"), "where=nowhere: choose from"),
-    "outside": (
-        STATISTIC.format("outside", "3.0", ", limits=lambda s: (1.0, 2.0)"),
-        "3 of linear_lse is not within its interval",
-    ),
-    "random": (
-        "import numpy\n" + STATISTIC.format("random", "numpy.random.default_rng().random()", ""),
-        "is another value each time",
-    ),
     "number": ("STATISTIC = 3\n", "is a int and not a Statistic"),
     "library": ("import nothing_like_it\n", "nothing_like_it"),
     "syntax": ("def f(:\n", "SyntaxError"),

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.special import gammaincinv
 
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing, Figure
@@ -18,46 +16,18 @@ from ipe_bench.statistics.certified import data_profile
 
 LEAST_COST = 0.5
 """What does not simulate at all stands here: a logarithmic axis has no zero."""
-MOST = 0.95
-"""Share of the trials whose errors lie below what is drawn."""
 _HIGHEST = 1e6
 """Errors beyond this many bounds stand at the upper edge."""
-
-
-def efficient(share: float, n: int) -> float:
-    """The quantile of an efficient estimator's Mahalanobis error: that of chi with n degrees of freedom."""
-    return float(np.sqrt(2 * gammaincinv(n / 2, share)))
-
-
-def quantiles(view: View, share: float) -> pd.DataFrame:
-    """What that share of all trials err less than, over the same of an efficient estimator: 1 at the Cramér-Rao bound.
-
-    A row per error scale and estimator with `trials`, `error` and its 95 % interval from `low` to `high`, which are
-    order statistics: between them lies the true quantile whatever the errors' distribution (binomial counts). An end
-    beyond the last trial is infinite, and so is an error if too many estimates are not finite.
-    """
-    from scipy.stats import binom
-
-    trials: Any = view.totals.set_index(["error_scale", "estimator"])["trials"]
-    found = []
-    for key, part in view["distributions"].groupby(["error_scale", "estimator"], sort=False):
-        count = int(trials[key])
-        at, errors = part["probability"].to_numpy(), part["distance"].to_numpy() / efficient(share, view.n)
-        low, high = np.add(binom.interval(0.95, count, share), (0, 1)) / count
-        ends = errors[at <= low][-1] if low > 0 else 0.0, errors[at >= high][0] if high < 1 else np.inf
-        found.append((*key, count, errors[np.searchsorted(at, share - 1e-9)], *ends))
-    return pd.DataFrame(found, columns=["error_scale", "estimator", "trials", "error", "low", "high"])
 
 
 def draw_costs(view: View) -> Iterator[Drawing]:
     import seaborn as sns
 
-    rows = quantiles(view, MOST).merge(view["scores"][["error_scale", "estimator", "cost_median"]])
-    rows = rows.assign(cost=rows["cost_median"].clip(lower=LEAST_COST), error=rows["error"].clip(upper=_HIGHEST))
-    rows = rows[np.isfinite(rows["cost"])]
+    rows = view.totals[np.isfinite(view.totals["simulations_median"])]
     if rows.empty:
         return
-    look = view.with_look(rows["estimator"])
+    shown = {"cost": rows["simulations_median"].clip(lower=LEAST_COST), "error": rows["error_q95"].clip(upper=_HIGHEST)}
+    rows, look = rows.assign(**shown), view.with_look(rows["estimator"])
     fig, panels = common.panels_of_scales(rows, look)
     style = {**common.seaborn_style(look), "edgecolor": "white", "linewidth": 0.6, "zorder": 3}
     # Equal points lie upon each other: the later ones are smaller, so that all are seen.
@@ -70,19 +40,19 @@ def draw_costs(view: View) -> Iterator[Drawing]:
         ax.set_xscale("log")
         ax.set_xlim(rows["cost"].min() / 1.5, rows["cost"].max() * 1.5)
         common.log_ticks(ax.xaxis, *ax.get_xlim())
-    common.axis_labels(fig, "simulations per trial (median)", "95 % error / efficient estimator's")
+    common.axis_labels(fig, "simulations per trial (median)", "95 % error / bound")
     common.legend(fig, fig.axes, look)
     last = common.at_scale(rows, view.scales[-1])
-    good = last[last["error"] <= last["error"].min() * 1.05].sort_values("cost_median", kind="stable").iloc[0]
+    good = last[last["error"] <= last["error"].min() * 1.05].sort_values("cost", kind="stable").iloc[0]
     yield view.drawing(
         fig,
         "cost_against_accuracy",
         "Cost against accuracy, all trials",
-        "Median cost of a trial in simulations against the 95 % quantile of the error over that of an efficient"
-        " estimator, over all trials; down and left is better.",
+        "Median cost of a trial in simulations against the 95 % quantile of the error over the bound at the truth, over"
+        " all trials; down and left is better.",
         f"Errors beyond {common.number(_HIGHEST)} stand at the edge." * bool((rows["error"] == _HIGHEST).any()),
         f"The cheapest within 5 % of the least error at scale {plain(view.scales[-1])}: {good['estimator']}"
-        f" ({good['cost_median']:g} simulations).",
+        f" ({good['simulations_median']:g} simulations).",
     )
 
 
@@ -119,6 +89,6 @@ def draw_known_minima(view: View) -> Iterator[Drawing]:
 
 
 FIGURES = (
-    Figure(draw_costs, ("summary", "distributions", "scores"), main=True),
+    Figure(draw_costs, ("summary",), main=True),
     Figure(draw_known_minima, ("attained",), together=True, main=True),
 )

@@ -1,0 +1,366 @@
+"""The answers of `design`, `posterior`, `compare` and `audit`: tables, sentences, and files."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ipe_bench.basics.statuses import Status
+from ipe_bench.measurements.identifiability import structure
+from ipe_bench.report.table import Part, Strong, Table, texts, words
+from ipe_bench.report.words import compact, duration, enumerate_few, p_value, percent, plain
+from ipe_bench.report.writer import write
+from ipe_bench.statistics.between import NOT_SETTINGS, described
+from ipe_bench.trials.design import Design, Effect, levels_of
+from ipe_bench.trials.thresholds import FIT_LEVEL
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from ipe_bench.measurements.base import Measurement
+    from ipe_bench.statistics.audit import Audit
+    from ipe_bench.trials.posterior import Divergence, Posterior, Reference
+
+READINGS = "readings.csv"
+"""What the choices of a design take, a row per reading."""
+HONEST = 0.1
+"""Nats below which a Gaussian may stand for another: a deviation 40 % too large in one direction, or a mean that is
+half a deviation off, are about a tenth."""
+ALIKE = 0.05
+"""Energy distance up to which draws may come from one law: of Gaussians in few dimensions, some tenths of a nat."""
+_MOST_SUSPECTS = 12
+_MUST_BREAK = 1.02
+"""Multiple of Van Trees's bound above which false roots are felt by any estimator."""
+_UNSEEN = 0.05
+"""Share of trials below which an error goes unnoticed by any test of residuals."""
+
+
+# Design --------------------------------------------------------------------------------------------------------------
+
+
+def design_parts(name: str, design: Design) -> Iterator[Part]:
+    """The tables and sentences of a design; `name` is what the model is called in the title."""
+    yield _parameters(name, design)
+    seen = design.observability
+    direction = "Least observable direction" if seen.observable else "The readings do not determine"
+    yield Strong(f"{direction}: {seen.words}")
+    told = structure(design.scenario.measurement)
+    if told is not None and not told.lost:
+        yield f"Exact readings would tell all {len(told.unknowns)} parameters from their neighbours."
+    yield from (Strong(f"No data can tell: {sentence}.") for sentence in (told.sentences if told else ()))
+    if design.threshold:
+        yield _threshold(design)
+    yield from _suspects(design)
+    yield from _ways(design)
+    if design.effects:
+        yield _effects(design)
+
+
+def _parameters(name: str, design: Design) -> Table:
+    seen, scenario = design.observability, design.scenario
+    parameters, others = seen.parameters, seen.correlation - np.eye(len(seen.parameters))
+    s = np.median(seen.singular_values, axis=0)
+    columns = [
+        words("parameter", [p.name for p in parameters]),
+        words("unit", [p.unit for p in parameters]),
+        texts("bound", [f"{bound * p.size:.3g}" for p, bound in zip(parameters, seen.bound, strict=True)]),
+        texts("with the others", [f"{r:.2f}" for r in seen.multiple_correlation]),
+    ]
+    if len(parameters) > 1:
+        most = np.argmax(np.abs(others), axis=1)
+        columns.append(words("most", [f"{parameters[j].name} {others[i, j]:+.2f}" for i, j in enumerate(most)]))
+    notes = [
+        "bound is that of the standard deviation, as a root mean square over the prior. with the others is the"
+        " multiple correlation of its error; most is the parameter with the largest correlation.",
+        f"Singular values of the whitened Jacobian, per parameter's size: {s[0]:.3g} to {s[-1]:.3g}.",
+    ]
+    title = f"{name}, {scenario.noise.name}, error scale {scenario.error_scale:g}: what {scenario.measurement.m}"
+    return Table("parameters", f"{title} readings say", "", columns, notes=notes)
+
+
+def _threshold(design: Design) -> str:
+    """Whether false roots are the estimator's own fault, or anyone's."""
+    limit = design.threshold
+    assert limit is not None
+    if not limit.false_roots:
+        return f"False roots: none in {limit.runs} runs of least squares from other truths."
+    loss = float(np.max(limit.weiss_weinstein / limit.van_trees))
+    if loss > _MUST_BREAK:
+        blame = f"so no estimator can do better than {loss:.2f} times Van Trees's bound"
+    elif limit.confusion < _UNSEEN:
+        blame = "so ending there is the estimator's fault and not that of noise"
+    else:
+        blame = "which the Weiss-Weinstein bound, averaged over the prior, does not feel"
+    return (
+        f"False roots: {limit.false_roots} of {limit.runs} runs of least squares from other truths; readings of the"
+        f" nearest are {limit.nearest:.3g} deviations off, and noise makes it fit better in {percent(limit.confusion)},"
+        f" {blame}."
+    )
+
+
+def _suspects(design: Design) -> Iterator[Part]:
+    if not design.suspects:
+        return
+    shown = design.suspects[:_MOST_SUSPECTS]
+    note = (
+        f"noticed is the share of trials in which the test of fit at {FIT_LEVEL:g} will report the error. It is hidden"
+        " if it makes a parameter wrong by more than its bound and is noticed in less than half. looks like names the"
+        " parameters that imitate it."
+    )
+    columns = [
+        words("error", [s.name for s in shown]),
+        texts("size", [f"{s.deviation:.3g} {s.unit}" for s in shown]),
+        words("moves", [s.parameter for s in shown]),
+        texts("bounds", [f"{s.bounds:.3g}" for s in shown]),
+        texts("noticed", [percent(s.noticed) for s in shown]),
+        words("hidden", ["yes" if s.hidden else "" for s in shown]),
+        words("looks like", [s.words for s in shown]),
+    ]
+    yield Table("suspects", "Errors that the model leaves out", "", columns, notes=[note])
+    unseen = [s for s in design.suspects if s.hidden and s.noticed < _UNSEEN]
+    if unseen:
+        yield Strong(
+            f"No test of residuals will detect {enumerate_few([s.name for s in unseen])}: the parameters imitate it."
+            f" {unseen[0].parameter} will be wrong by {unseen[0].bounds:.3g} bounds where {unseen[0].name} is"
+            f" {unseen[0].deviation:.3g} {unseen[0].unit}."
+        )
+
+
+def _ways(design: Design) -> Iterator[Part]:
+    if not design.ways:
+        why = "they are too few" if design.observability.observable else "they do not determine all parameters"
+        yield f"There is nothing to choose among the candidates: {why}."
+        return
+    today = design.scenario.measurement.m
+    columns = [
+        words("chosen", [way.title for way in design.ways]),
+        texts("fewest readings", [f"{way.saving.readings if way.saving else today}" for way in design.ways]),
+        texts("bound", [f"{way.saving.mean_bound:.3f}" if way.saving else "1" for way in design.ways]),
+        texts("at most", [f"{way.sharpest.readings}" for way in design.ways]),
+        texts("smallest bound", [f"{way.sharpest.mean_bound:.3f}" for way in design.ways]),
+    ]
+    title = f"What to take instead (bounds as shares of today's, criterion {design.criterion})"
+    note = (
+        f"fewest readings is the number whose bound is no larger than today's {today}. Among {design.candidates.m}"
+        " candidates those that gain most are taken one after another; another choice may be slightly better."
+    )
+    yield Table("ways", title, "", columns, notes=[note])
+    for way in design.ways:
+        if way.saving and len(way.units.by) == 1:
+            entries = [way.units.entries[u][0] for u in way.saving.taken]
+            levels = ", ".join(levels_of(design.candidates, way.units.by[0], entry) for entry in entries)
+            yield f"{way.saving.readings} readings {way.title}: {levels}"
+
+
+def _effects(design: Design) -> Table:
+    best: dict[tuple[str, str], Effect] = {}
+    for e in sorted(design.effects, key=lambda e: e.mean_bound):
+        if np.isfinite(e.mean_bound):
+            best.setdefault((e.column, e.action), e)
+    found = sorted(best.values(), key=lambda e: (list(design.candidates.index).index(e.column), e.action))
+    cells = [
+        words("what", [f"{e.action} {e.column} {levels_of(design.candidates, e.column, e.entry)}" for e in found]),
+        texts("readings", [str(e.readings) for e in found]),
+        texts("bound", [f"{e.mean_bound:.3f}" for e in found]),
+    ]
+    note = "The best to add, and the one that is missed least."
+    return Table("effects", "One more, one less", "", cells, notes=[note])
+
+
+def write_design(folder: Path, name: str, design: Design) -> list[Path]:
+    """Writes the page of a design, and readings.csv with what each choice takes; returns the files."""
+    return write(folder, "design", f"{name}: design", design_parts(name, design), (READINGS, _readings(design)))
+
+
+def _readings(design: Design) -> pd.DataFrame:
+    """What each choice takes, a row per reading."""
+    import pandas as pd
+
+    index = pd.DataFrame(dict(design.candidates.index))
+    chosen = [
+        index.iloc[list(choice.rows)].assign(by=" and ".join(way.units.by), choice=name)
+        for way in design.ways
+        for name, choice in (("saving", way.saving), ("sharpest", way.sharpest))
+        if choice
+    ]
+    columns = ["by", "choice", *index]
+    return pd.concat(chosen)[columns] if chosen else pd.DataFrame(columns=columns)
+
+
+# Posterior -----------------------------------------------------------------------------------------------------------
+
+
+def posterior_parts(name: str, found: Sequence[Reference]) -> list[Table]:
+    """A row per trial and estimator; `name` is what the scenario is called in the title."""
+    rows = [(one, label, d) for one in found for label, d in one.divergences.items()]
+    columns = [
+        texts("trial", [str(one.trial) for one, *_ in rows]),
+        texts("modes", [str(len(one.posterior.modes)) for one, *_ in rows]),
+        texts("noise", [compact(one.posterior.noise) for one, *_ in rows]),
+        words("estimator", [label for _, label, _ in rows]),
+        words("status", [_status(one, label) for one, label, _ in rows]),
+        words("honest", [honesty(d, one.posterior) for one, _, d in rows]),
+    ]
+    numbers = {"kl": "diverg.", "shift": "shift", "width": "width", "energy": "energy"}
+    columns += [texts(title, [compact(getattr(d, key)) for *_, d in rows]) for key, title in numbers.items()]
+    title = f"{name}: estimators beside the posterior"
+    return [Table("posterior", title, "", columns, notes=list(_notes(found)), grouped=3)]
+
+
+def _status(one: Reference, label: str) -> str:
+    return Status(int(one.estimates[label].status[0])).label
+
+
+def _notes(found: Sequence[Reference]) -> Iterator[str]:
+    yield (
+        "diverg. is the divergence of the estimator's Gaussian from the moments of the posterior, in nats; noise is"
+        " the same between two populations of particles, so a divergence below it is chance. shift is that of the"
+        " mean, in standard deviations of the posterior per root of the number of parameters. width is the geometric"
+        " mean of the standard deviations over those of the posterior."
+        " energy is the distance between draws. An estimate is honest if there is a single mode, the divergence is at"
+        f" most {HONEST:g} or twice the noise, and the energy is at most {ALIKE:g}."
+    )
+    for one in found:
+        if not one.posterior.settled:
+            yield (
+                f"Trial {one.trial}: the populations differ by {one.posterior.apart:.2g} deviations, so its posterior"
+                " cannot be relied on; give more --particles."
+            )
+        if len(one.posterior.modes) > 1:
+            shares = ", ".join(percent(float(share)) for share in one.posterior.shares)
+            yield f"Trial {one.trial}: {len(one.posterior.modes)} modes, with {shares} of the draws."
+
+
+def honesty(d: Divergence, sampled: Posterior) -> str:
+    """Whether a Gaussian can be taken for the posterior; a wide one over two modes has the moments and is not."""
+    if not np.isfinite(d.kl):
+        return "-"
+    near = d.kl <= max(HONEST, 2 * sampled.noise) and d.energy <= ALIKE
+    return "yes" if near and len(sampled.modes) == 1 else "NO"
+
+
+def write_posteriors(
+    folder: Path, name: str, scenario: str, model: Measurement, found: Sequence[Reference]
+) -> list[Path]:
+    """Writes a page, and posterior.csv with a row per trial and parameter; returns the files. `name` is the model's and
+    `scenario` says what was sampled."""
+    import pandas as pd
+
+    frames = []
+    for one in found:
+        own: dict[str, Any] = {"trial": one.trial, "parameter": [p.name for p in model.parameters]}
+        own |= {"unit": [p.unit for p in model.parameters], "truth": one.truth * model.sizes}
+        own |= {key: getattr(one.posterior, key) * model.sizes for key in ("mean", "deviation")}
+        frames.append(pd.DataFrame(own))
+    table = "posterior.csv", pd.concat(frames)
+    return write(folder, "posterior", f"{name}: posteriors", posterior_parts(scenario, found), table)
+
+
+# Comparison ----------------------------------------------------------------------------------------------------------
+
+
+def comparison_parts(frame: pd.DataFrame, alpha: float) -> list[Table]:
+    """A table per comparison, within 80 columns; what the columns mean stands below the last."""
+    titles = ("", "first", "second", "change", f"{100 * (1 - alpha):g} %", "p", "e", "second is")
+    tables = []
+    for title, rows in _comparisons(frame):
+        cells = list(zip(*map(_cells, rows), strict=True))
+        last = len(titles) - 1
+        columns = [(words if i in (0, last) else texts)(t, cells[i]) for i, t in enumerate(titles)]
+        needed = [_needed(row) for row in rows if row.get("power", math.nan) > 0]
+        tables.append(Table("comparison", title, "", columns, notes=needed))
+    note = (
+        "error is the mean Mahalanobis error, where a trial counts as at most the radius of the gate of success; cost"
+        " counts simulations. p comes from McNemar's exact test for success and from random signs for ratios, with"
+        " Holm's correction over all rows. e is evidence that may be looked at repeatedly; e = 20 is as rare as p ="
+        " 0.05. Each interval is that of its row alone. Times are not tested."
+    )
+    if (frame["matched_by"] == "order").any():
+        note += " Without common trials nothing is gained from pairing: the intervals are wider."
+    return [*tables[:-1], *(replace(last, notes=[*last.notes, note]) for last in tables[-1:])]
+
+
+def _needed(row: dict[str, Any]) -> str:
+    return (
+        f"{row['trials_needed']:,} trials find a difference of {100 * row['difference']:g} % in success with a"
+        f" probability of {100 * row['power']:g} %: one alone succeeds in {row['discordant']} of {row['trials']}"
+        f" trials, so in at most {percent(row['discordant_high'])} of all (80 % limit)."
+    )
+
+
+def _comparisons(frame: pd.DataFrame) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """Each comparison with its title, in order."""
+    settings = [c for c in frame.columns if c not in NOT_SETTINGS]
+    listed: list[Any] = frame.to_dict("records")
+    for _, part in groupby(listed, key=lambda row: tuple(plain(row[c]) for c in (*settings, "first", "second"))):
+        rows = list(part)
+        first = rows[0]
+        who = first["first"] if first["first"] == first["second"] else f"{first['first']}, then {first['second']}"
+        how = "trials" if first["matched_by"] == "trial" else "trials of other seeds, matched in their order"
+        yield f"{described(first)}: {who}; {first['trials']} {how}", rows
+
+
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    quantity = row["quantity"]
+    show = {"success": percent, "time": lambda v: duration(v, 2)}.get(quantity, compact)
+    if quantity == "success":
+        change, ends = f"{100 * row['change']:+.1f} %", f"{100 * row['low']:+.1f} to {100 * row['high']:+.1f}"
+    else:
+        change, ends = _ratio(row["change"]), f"{_ratio(row['low'])} to {_ratio(row['high'])}"
+    p, e = row["p"], row["e"]
+    return (
+        *(quantity, show(row["first_value"]), show(row["second_value"]), change),
+        ends if math.isfinite(row["low"]) else "-",
+        p_value(p) if math.isfinite(p) else "",
+        compact(e) if math.isfinite(e) else "",
+        row["finding"] or ("-" if quantity != "time" else ""),
+    )
+
+
+def _ratio(value: float) -> str:
+    return f"{value:.3f}" if 0.1 <= value < 9.9995 else compact(value)
+
+
+def write_comparison(frame: pd.DataFrame, output: Path, alpha: float) -> list[Path]:
+    """Writes comparison.csv and a page of all tables; returns the files."""
+    return write(output, "comparison", "Comparison", comparison_parts(frame, alpha), ("comparison.csv", frame))
+
+
+# Audit ---------------------------------------------------------------------------------------------------------------
+
+
+def audit_parts(found: Audit) -> list[Part]:
+    """The sentences, and a row per parameter."""
+    names = found.claims.names
+    columns = [
+        words("parameter", names),
+        texts("true over reported", [f"{f.value:.2f}" for f in found.each]),
+        texts("97.5 %", [f"{f.low:.2f} to {f.high:.2f}" for f in found.each]),
+        words("deviation", [f.verdict for f in found.each]),
+        texts("bias", [f"{value:+.2f}" for value in found.bias[:, 0]]),
+        texts("95 % of bias", [f"{low:+.2f} to {high:+.2f}" for low, high in found.bias[:, 1:]]),
+    ]
+    runs, left_out = found.claims.runs, found.claims.left_out
+    notes = [
+        "true over reported is the root mean square of errors in reported standard deviations, 1 if the report is"
+        " right;  "
+        "bias is their mean. Intervals hold for all parameters together, and for heavy tails."
+    ]
+    low, high = found.nees_limits
+    if math.isfinite(low):
+        notes.append(f"NEES over n is {found.nees:.3f}; normal errors would leave it within {low:.3f} to {high:.3f}.")
+    if not found.claims.joint:
+        notes.append("No covariances are reported, so directions and the NEES are not judged.")
+    title = f"Audit of {runs} runs" + (f", {left_out} rows without an estimate left out" if left_out else "")
+    return [*found.sentences, Table("audit", title, "", columns, notes=notes)]
+
+
+def write_audit(found: Audit, output: Path) -> list[Path]:
+    """Writes audit.csv and audit.html, and returns them."""
+    return write(output, "audit", "Audit", audit_parts(found), ("audit.csv", found.table()))
