@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -10,14 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, Covariance, Mask, finite, inverse, multiply, solve, squared
+from ipe_bench.basics.linalg import Array, Mask, deviations, finite, inverse, multiply, solve
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
 from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, iterate
 from ipe_bench.estimators.least_squares import Minima
-from ipe_bench.measurements.base import Measurement, SubsetModel
+from ipe_bench.measurements.base import SubsetModel
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.ode.described import Ode
 from ipe_bench.measurements.ode.interval import Interval
@@ -62,56 +62,37 @@ class MultipleShooting(Estimator):
     needs: ClassVar[frozenset[Need]] = frozenset({"differential equations"})
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        for need in self.missing(problem):
-            raise UserError(f"measurement={problem.measurement.name}: has no {need}, which multiple shooting needs")
-        model, kept = _whole(problem.measurement)
-        assert isinstance(model, OdeMeasurement)
-        pieces = Pieces(problem, model, kept, self.segments, self.step)
+        self.require_needs(problem)
+        pieces = Pieces.of(problem, self.segments, self.step)
         with np.errstate(all="ignore"):
             shooting = Shooting(pieces, z, EvaluationCount.zeros(len(z)), np.arange(len(z)))
             x = np.repeat(problem.x0[None], len(z), axis=0)
             limits = Limits(self.tolerance, self.max_iterations, self.budget, history)
             ended = iterate(shooting, CondensedGaussNewton(), x, limits)
-            state = ended.state
-            r = state.r
-            minima = Minima(
-                ended.x,
-                ended.status,
-                ended.iterations,
-                ended.history,
-                state.linear.covariance,
-                squared(r),
-                np.median(np.abs(r), axis=1),
-            )
+            minima = Minima.of(ended, ended.state.linear.covariance, ended.state.r)
             return minima.estimates(shooting.tally, z.shape[1])
-
-
-def _whole(model: Measurement) -> tuple[Measurement, NDArray[np.intp]]:
-    """The equations, and which of all their readings there are."""
-    kept = np.arange(model.m)
-    while isinstance(model, SubsetModel | Ode):
-        kept = np.array(model.kept, dtype=np.intp)[kept] if isinstance(model, SubsetModel) else kept
-        model = model.whole
-    return model, kept
 
 
 @dataclass(frozen=True)
 class Pieces:
-    """A model's trajectory cut into segments. Arrays of states are (trials, segments, cases, states)."""
+    """A model's trajectory cut into segments. A lane is one case in one segment, and the lanes of a segment follow one
+    another; states are (trials, lanes, states)."""
 
     problem: Problem
     model: OdeMeasurement
     kept: NDArray[np.intp]
+    """Which of all the model's readings there are."""
     wanted: int
-    step: float
+    interval: Interval
 
-    @property
-    def R(self) -> Covariance:
-        return self.problem.R
-
-    @cached_property
-    def interval(self) -> Interval:
-        return Interval(self.model, self.step)
+    @classmethod
+    def of(cls, problem: Problem, segments: int, step: float) -> Pieces:
+        model, kept = problem.measurement, np.arange(problem.measurement.m)
+        while isinstance(model, SubsetModel | Ode):
+            kept = np.array(model.kept, dtype=np.intp)[kept] if isinstance(model, SubsetModel) else kept
+            model = model.whole
+        assert isinstance(model, OdeMeasurement)
+        return cls(problem, model, kept, segments, Interval(model, step))
 
     @cached_property
     def grid(self) -> Array:
@@ -125,108 +106,115 @@ class Pieces:
         return np.unique(np.linspace(0, intervals, min(self.wanted, intervals) + 1).round().astype(np.intp))
 
     @property
-    def nodes(self) -> int:
-        """Beginnings that are unknown: all but the first."""
-        return len(self.cuts) - 2
+    def cases(self) -> int:
+        return len(self.model.cases)
 
-    def first_states(self, x: Array) -> tuple[Array, Array]:
-        """The state at time 0 (trials, cases, states) and its derivative (..., n) by x, by complex steps."""
-        trials, n = x.shape
-        steps = np.concatenate([np.zeros((1, n)), _COMPLEX_STEP * 1j * np.eye(n)])
-        p = (x[:, None] + steps) * self.model.si_sizes
-        p = np.repeat(p[:, :, None], len(self.model.cases), axis=2)
-        c = np.broadcast_to(self.model.tables[0], (trials, n + 1, *self.model.tables.shape[1:]))
-        y = self.model.start(list(np.moveaxis(p, -1, 0)), list(np.moveaxis(c, -1, 0)))
-        y = np.stack(np.broadcast_arrays(*y, p[..., 0])[:-1], axis=-1)
-        return np.real(y[:, 0]), np.moveaxis(np.imag(y[:, 1:]), 1, -1) / _COMPLEX_STEP
+    def start(self, x: Array) -> tuple[Array, Array]:
+        """The states at time 0 (trials, cases, states) and their derivatives (..., n) by x."""
 
-    def lanes(self, x: Array, y: Array, k: NDArray[np.intp]) -> Array:
-        """What `interval` takes for the states y at the times grid[k] (segments,)."""
-        shape = y.shape[:3]
-        p = np.broadcast_to((x * self.model.si_sizes)[:, None, None], (*shape, x.shape[1]))
-        c = np.broadcast_to(self._constants(k), (*shape, self._constants(k).shape[2]))
+        def states(x: Array) -> Array:
+            shape = (*x.shape[:2], self.cases)
+            p, c = (x * self.model.si_sizes)[:, :, None], self.model.tables[0]
+            return _stacked(self.model.start(_columns(p, shape), _columns(c, shape)), shape)
+
+        return _with_slope(states, x)
+
+    def read(self, x: Array, y: Array, k: int) -> tuple[Array, Array]:
+        """The outputs (trials, cases, outputs) of the states y (trials, cases, states) at times[k], and their
+        derivatives by the states."""
+        p, c = (x * self.model.si_sizes)[:, None, None], self.model.tables[min(k + 1, len(self.model.tables) - 1)]
+
+        def outputs(y: Array) -> Array:
+            shape = y.shape[:3]
+            h = self.model.read(self.grid[k + 1], _columns(y, shape), _columns(p, shape), _columns(c, shape))
+            return _stacked(h, shape)
+
+        return _with_slope(outputs, y)
+
+    def inputs(self, x: Array, y: Array, k: NDArray[np.intp]) -> Array:
+        """What `interval` takes for states y (trials, lanes, states) at the times grid[k] (lanes,)."""
+        tables, case = self.model.tables, np.arange(len(k)) % self.cases
+        c = tables[0 * k, case]
+        if self.model.driven is not None:
+            c = np.concatenate([tables[k, case], tables[k + 1, case]], axis=1)
         times = np.stack([self.grid[k], self.grid[k + 1] - self.grid[k]], axis=1)
-        t = np.broadcast_to(times[None, :, None], (*shape, 2))
-        return np.concatenate([p, y, c, t], axis=3).reshape(-1, self.interval.n)
-
-    def _constants(self, k: NDArray[np.intp]) -> Array:
-        """The constants (segments, cases, ...) from the times grid[k] on, and those at the reading after each."""
-        tables = self.model.tables
-        return tables[0 * k] if self.model.driven is None else np.concatenate([tables[k], tables[k + 1]], axis=2)
+        parts = ((x * self.model.si_sizes)[:, None], y, c, times)
+        parts = [np.broadcast_to(part, (*y.shape[:2], part.shape[-1])) for part in parts]
+        return np.concatenate(parts, axis=2).reshape(-1, self.interval.n)
 
     def follow(self, x: Array, y: Array) -> tuple[Array, Array]:
         """The ends of all segments that begin at y, and all readings h (trials, cases, times, outputs)."""
-        states, cases = self.model.states, len(self.model.cases)
-        h, y = np.empty((len(x), cases, len(self.grid) - 1, len(self.model.outputs))), y.copy()
-        for going, k in self._intervals():
-            read = self.interval.simulate(self.lanes(x, y[:, going], k)).reshape(len(x), len(k), cases, -1)
-            y[:, going], h[:, :, k] = read[..., :states], read[..., states:].swapaxes(1, 2)
+        h, y = np.empty((len(x), self.cases, len(self.grid) - 1, len(self.model.outputs))), y.copy()
+        for lanes, k in self._intervals():
+            read = self.interval.simulate(self.inputs(x, y[:, lanes], k)).reshape(len(x), len(k), -1)
+            y[:, lanes], h[:, lanes % self.cases, k] = np.split(read, [self.model.states], axis=2)
         return y, h
 
     def slopes(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """Derivatives along [x, state at the beginning] of the segments' ends (..., states, n + states) and of the
-        readings of each segment (trials, cases, times, outputs, n + states)."""
+        """Derivatives along [x, state at the beginning] of the segments' ends (trials, lanes, states, n + states) and
+        of all readings (trials, cases, times, outputs, n + states)."""
         model, n = self.model, x.shape[1]
-        states, cases, inputs = model.states, len(model.cases), n + model.states
-        M = np.zeros((*y.shape, inputs))
+        states, size = model.states, np.concatenate([model.si_sizes, np.ones(model.states)])
+        M = np.zeros((*y.shape, len(size)))
         M[..., n:] = np.eye(states)
-        Jh, y = np.empty((len(x), cases, len(self.grid) - 1, len(model.outputs), inputs)), y.copy()
-        for going, k in self._intervals():
-            lanes = self.lanes(x, y[:, going], k)
-            J = self.interval.jacobian(lanes).reshape(len(x), len(k), cases, -1, self.interval.n)
-            J = J[..., :inputs] * np.concatenate([model.si_sizes, np.ones(states)])
-            along = np.matmul(J[..., n:], M[:, going])
+        Jh, y = np.empty((len(x), self.cases, len(self.grid) - 1, len(model.outputs), len(size))), y.copy()
+        for lanes, k in self._intervals():
+            inputs = self.inputs(x, y[:, lanes], k)
+            J = self.interval.jacobian(inputs).reshape(len(x), len(k), -1, self.interval.n)[..., : len(size)] * size
+            along = np.matmul(J[..., n:], M[:, lanes])
             along[..., :n] += J[..., :n]
-            M[:, going], Jh[:, :, k] = along[..., :states, :], along[..., states:, :].swapaxes(1, 2)
-            y[:, going] = self.interval.simulate(lanes).reshape(len(x), len(k), cases, -1)[..., :states]
+            M[:, lanes], Jh[:, lanes % self.cases, k] = np.split(along, [states], axis=2)
+            y[:, lanes] = self.interval.simulate(inputs).reshape(len(x), len(k), -1)[..., :states]
         return M, Jh
 
-    def _intervals(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-        """In turn, which segments go on and through which intervals."""
-        lengths = np.diff(self.cuts)
-        steps = (np.flatnonzero(lengths > j) for j in range(lengths.max()))
-        return [(going, self.cuts[going] + j) for j, going in enumerate(steps)]
+    def _intervals(self) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+        """In turn, which lanes go on and through which intervals."""
+        first, lengths = np.repeat(self.cuts[:-1], self.cases), np.repeat(np.diff(self.cuts), self.cases)
+        for j in range(lengths.max()):
+            lanes = np.flatnonzero(lengths > j)
+            yield lanes, first[lanes] + j
 
     def guess(self, x: Array, z: Array) -> Array:
         """Where the segments begin: the trajectory of x, moved as little as the readings there ask for."""
-        y0, _ = self.first_states(x)
-        whole = replace(self, wanted=1)
-        y, nodes = y0[:, None], [y0]
+        y, _ = self.start(x)
+        nodes = [y]
         for k in range(self.cuts[-2]):
-            read = self.interval.simulate(whole.lanes(x, y, np.array([k]))).reshape(len(x), 1, *y0.shape[1:2], -1)
-            y = read[..., : y0.shape[2]]
+            read = self.interval.simulate(self.inputs(x, y, np.full(self.cases, k)))
+            y = read.reshape(len(x), self.cases, -1)[..., : self.model.states]
             if k + 1 in self.cuts:
-                nodes.append(self._moved(x, y[:, 0], k, z))
-        return np.stack(nodes, axis=1)
+                nodes.append(self._moved(x, y, k, z))
+        return np.concatenate(nodes, axis=1)
 
     def _moved(self, x: Array, y: Array, k: int, z: Array) -> Array:
         """States y (trials, cases, states) moved to where they show the readings z taken at times[k]."""
+        whole = np.full((len(z), self.model.m), np.nan)
+        whole[:, self.kept] = z + self.model.offset[self.kept]
+        shown = whole.reshape(len(z), self.cases, len(self.grid) - 1, -1)[:, :, k]
         y = np.where(np.isfinite(y), y, 0.0)
-        shown = self._placed(z + self.model.offset[self.kept])[:, :, k]
         for _ in range(3):  # the readings are nearly always linear in the state
-            h, B = self._read(x, y, k)
+            h, B = self.read(x, y, k)
             gap = np.where(np.isfinite(shown), shown - h, 0.0)
-            B = np.where(np.isfinite(shown)[..., None], B, 0.0)
-            y = y + np.matmul(np.linalg.pinv(np.where(np.isfinite(B), B, 0.0)), gap[..., None])[..., 0]
+            B = np.where(np.isfinite(shown)[..., None] & np.isfinite(B), B, 0.0)
+            y = y + multiply(np.linalg.pinv(B), gap)
         return y
 
-    def _read(self, x: Array, y: Array, k: int) -> tuple[Array, Array]:
-        """The outputs (trials, cases, outputs) at times[k] and their derivative by the state, by complex steps."""
-        states = y.shape[2]
-        steps = np.concatenate([np.zeros((1, states)), _COMPLEX_STEP * 1j * np.eye(states)])
-        at = y[:, :, None] + steps
-        p = np.broadcast_to((x * self.model.si_sizes)[:, None, None], (*at.shape[:3], x.shape[1]))
-        tables = self.model.tables
-        c = np.broadcast_to(tables[min(k + 1, len(tables) - 1)][:, None], (*at.shape[:3], tables.shape[2]))
-        h: Any = self.model.read(self.grid[k + 1], *(list(np.moveaxis(a, -1, 0)) for a in (at, p, c)))
-        h = np.stack(np.broadcast_arrays(*h, at[..., 0])[:-1], axis=-1)
-        return np.real(h[:, :, 0]), np.moveaxis(np.imag(h[:, :, 1:]), 2, -1) / _COMPLEX_STEP
 
-    def _placed(self, z: Array) -> Array:
-        """Readings (trials, cases, times, outputs); NaN where one is missing."""
-        whole = np.full((len(z), self.model.m), np.nan)
-        whole[:, self.kept] = z
-        return whole.reshape(len(z), len(self.model.cases), len(self.grid) - 1, -1)
+def _columns(a: Array, shape: tuple[int, ...]) -> list[Array]:
+    """The entries of vectors (..., k), each as an array of that shape."""
+    return list(np.moveaxis(np.broadcast_to(a, (*shape, a.shape[-1])), -1, 0))
+
+
+def _stacked(values: Sequence[Any], shape: tuple[int, ...]) -> Array:
+    return np.stack([np.broadcast_to(value, shape) for value in values], axis=-1)
+
+
+def _with_slope(function: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:
+    """A function at x (trials, ..., n) and its derivative (trials, ..., n) there, by complex steps, which come as an
+    axis behind that of the trials."""
+    n = x.shape[-1]
+    steps = _COMPLEX_STEP * 1j * np.eye(n + 1, n, -1)
+    y = function(x[:, None] + steps.reshape(n + 1, *[1] * (x.ndim - 2), n))
+    return np.real(y[:, 0]), np.moveaxis(np.imag(y[:, 1:]), 1, -1) / _COMPLEX_STEP
 
 
 @dataclass(frozen=True)
@@ -247,18 +235,15 @@ class Linear:
 
     @classmethod
     def of(cls, C: Array, J: Array) -> Linear:
-        weights = np.linalg.norm(C, axis=2)
+        weights, usable = np.linalg.norm(C, axis=2), (finite(C) & finite(J))[:, None, None]
         weights = np.where(weights > 0, weights, 1.0)
-        usable = finite(C) & finite(J)
-        C = np.where(usable[:, None, None], C / weights[:, :, None], 0.0)
-        J = np.where(usable[:, None, None], J, np.nan)
-        Q, U = np.linalg.qr(C.swapaxes(1, 2), mode="complete")
-        Z = Q[:, :, C.shape[1] :]
-        JZ = np.matmul(J, Z)
-        Qz, V = np.linalg.qr(np.where(usable[:, None, None], JZ, 0.0))
-        V = np.where(usable[:, None, None], V, np.nan)
         count = C.shape[1]
-        return cls(Q[:, :, :count], U[:, :count], Z, Qz, V, J, weights)
+        Q, U = np.linalg.qr(np.where(usable, C / weights[:, :, None], 0.0).swapaxes(1, 2), mode="complete")
+        Z = Q[:, :, count:]
+        Qz, V = np.linalg.qr(np.matmul(np.where(usable, J, 0.0), Z))
+        return cls(
+            Q[:, :, :count], U[:, :count], Z, Qz, np.where(usable, V, np.nan), np.where(usable, J, np.nan), weights
+        )
 
     def step(self, d: Array, r: Array) -> Array:
         """The unknowns' change (trials, unknowns) that closes the gaps d and fits the residuals r best."""
@@ -271,8 +256,7 @@ class Linear:
     @property
     def covariance(self) -> Array:
         """Of the parameters (trials, n, n), the gaps closed."""
-        n = self.Z.shape[2]
-        S = np.matmul(self.Z[:, :n], inverse(self.V)[0])
+        S = np.matmul(self.Z[:, : self.Z.shape[2]], inverse(self.V)[0])
         return np.matmul(S, S.swapaxes(1, 2))
 
 
@@ -282,11 +266,11 @@ class Trajectory:
 
     x: Array
     nodes: Array
-    """The states (trials, nodes, cases, states) at the beginnings of all segments but the first."""
+    """The states (trials, lanes, states) at the beginnings of all segments but the first."""
     size: Array
     """What the states are measured in (trials, states)."""
     d: Array
-    """Gaps (trials, nodes * cases * states), in those sizes."""
+    """Gaps (trials, lanes * states), in those sizes."""
     r: Array
     """Whitened residuals (trials, m)."""
     linear: Linear
@@ -316,41 +300,36 @@ class Shooting:
     def gaps(self, x: Array, nodes: Array, size: Array) -> tuple[Array, Array]:
         """The gaps in multiples of `size`, and the whitened residuals."""
         self.tally.simulations[self.rows] += 1.0
-        begins = self._begins(x, nodes)
-        ends, h = self.pieces.follow(x, begins)
-        d = (ends[:, :-1] - nodes) / size[:, None, None]
-        h = h.reshape(len(x), -1)[:, self.pieces.kept] - self.pieces.model.offset[self.pieces.kept]
-        return d.reshape(len(x), -1), self.pieces.R.whiten(h - self.z)
+        pieces = self.pieces
+        ends, h = pieces.follow(x, np.concatenate([pieces.start(x)[0], nodes], axis=1))
+        d = (ends[:, : nodes.shape[1]] - nodes) / size[:, None]
+        h = h.reshape(len(x), -1)[:, pieces.kept] - pieces.model.offset[pieces.kept]
+        return d.reshape(len(x), -1), pieces.problem.R.whiten(h - self.z)
 
     def linear(self, x: Array, nodes: Array, size: Array) -> Linear:
         """The gaps' and residuals' derivatives along the parameters and the nodes in multiples of `size`."""
-        pieces, n = self.pieces, x.shape[1]
-        states, cases, count = pieces.model.states, len(pieces.model.cases), pieces.nodes
+        pieces, n, (lanes, states) = self.pieces, x.shape[1], nodes.shape[1:]
         self.tally.jacobians[self.rows] += 1.0 + states / n
-        M, Jh = pieces.slopes(x, self._begins(x, nodes))
-        _, S = pieces.first_states(x)
-        C = np.zeros((len(x), count, cases, states, n + count * cases * states))
-        J = np.zeros((*Jh.shape[:4], C.shape[-1]))
-        segment = np.repeat(np.arange(count + 1), np.diff(pieces.cuts))
-        J[..., :n] = Jh[..., :n]
-        C[..., :n] = M[:, :-1, ..., :n]
+        start, S = pieces.start(x)
+        M, Jh = pieces.slopes(x, np.concatenate([start, nodes], axis=1))
+        C = np.zeros((len(x), lanes, states, n + lanes * states))
+        J = np.zeros((*Jh.shape[:4], n + lanes * states))
+        segment = np.repeat(np.arange(len(pieces.cuts) - 1), np.diff(pieces.cuts))
+        J[..., :n], C[..., :n] = Jh[..., :n], M[:, :lanes, :, :n]
         # The first segment begins where the parameters say.
         J[:, :, segment == 0, :, :n] += np.einsum("tckos,tcsn->tckon", Jh[:, :, segment == 0][..., n:], S)
-        if count:
-            C[:, 0, ..., :n] += np.matmul(M[:, 0, ..., n:], S)
-        for g in range(count):
-            for c in range(cases):
-                columns = slice(n + (g * cases + c) * states, n + (g * cases + c + 1) * states)
-                C[:, g, c, :, columns] -= np.eye(states) * size[:, None]
-                if g + 1 < count:
-                    C[:, g + 1, c, :, columns] += M[:, g + 1, c, :, n:] * size[:, None]
-                J[:, c, segment == g + 1, :, columns] = Jh[:, c, segment == g + 1][..., n:] * size[:, None, None]
-        C = (C / size[:, None, None, :, None]).reshape(len(x), -1, C.shape[-1])
+        if lanes:
+            C[:, : pieces.cases, :, :n] += np.matmul(M[:, : pieces.cases, :, n:], S)
+        for node in range(lanes):
+            columns, following = slice(n + node * states, n + (node + 1) * states), node + pieces.cases
+            C[:, node, :, columns] = -np.eye(states) * size[:, None]
+            if following < lanes:
+                C[:, following, :, columns] = M[:, following, :, n:] * size[:, None]
+            g, c = divmod(following, pieces.cases)
+            J[:, c, segment == g, :, columns] = Jh[:, c, segment == g][..., n:] * size[:, None, None]
+        C = (C / size[:, None, :, None]).reshape(len(x), -1, C.shape[-1])
         J = J.reshape(len(x), -1, J.shape[-1])[:, pieces.kept]
-        return Linear.of(C, pieces.R.whiten_jacobian(J))
-
-    def _begins(self, x: Array, nodes: Array) -> Array:
-        return np.concatenate([self.pieces.first_states(x)[0][:, None], nodes], axis=1)
+        return Linear.of(C, pieces.problem.R.whiten_jacobian(J))
 
 
 @dataclass(frozen=True)
@@ -359,62 +338,49 @@ class CondensedGaussNewton(Solver[Trajectory]):
 
     def begin(self, system: Shooting, x: Array) -> Trajectory:
         nodes = system.pieces.guess(x, np.where(np.isfinite(system.z), system.z, 0.0))
-        largest = np.abs(nodes).max(axis=(1, 2))
+        largest = np.abs(nodes).max(axis=1)
         size = np.where((largest > 0) & np.isfinite(largest), largest, 1.0)
-        nodes = nodes[:, 1:]
+        nodes = nodes[:, system.pieces.cases :]
         system.tally.simulations[system.rows] += 1.0
         d, r = system.gaps(x, nodes, size)
         linear = system.linear(x, nodes, size)
-        far = np.full(len(x), np.inf)
-        return Trajectory(x, nodes, size, d, r, linear, linear.step(d, r), np.ones(len(x)), far)
+        return Trajectory(x, nodes, size, d, r, linear, linear.step(d, r), np.ones(len(x)), np.full(len(x), np.inf))
 
     def step(self, system: Shooting, state: Trajectory) -> Trajectory:
         change = state.share[:, None] * state.step
         n = state.x.shape[1]
         x = state.x + change[:, :n]
-        nodes = state.nodes + change[:, n:].reshape(state.nodes.shape) * state.size[:, None, None]
+        nodes = state.nodes + change[:, n:].reshape(state.nodes.shape) * state.size[:, None]
         d, r = system.gaps(x, nodes, state.size)
         simplified = _length(state, state.linear.step(d, r))
         taken = simplified <= (1 - state.share / 4) * _length(state, state.step)
         state = replace(state, moved=_reach(state, change), share=np.where(taken, 1.0, state.share / 2))
         if not taken.any():
             return state
-        part, accepted = system.subset(taken), (x[taken], nodes[taken])
-        linear = part.linear(*accepted, state.size[taken])
-        new = replace(
-            take(state, taken),
-            x=accepted[0],
-            nodes=accepted[1],
-            d=d[taken],
-            r=r[taken],
-            linear=linear,
-            step=linear.step(d[taken], r[taken]),
-        )
+        x, nodes, d, r = (a[taken] for a in (x, nodes, d, r))
+        linear = system.subset(taken).linear(x, nodes, state.size[taken])
+        new = replace(take(state, taken), x=x, nodes=nodes, d=d, r=r, linear=linear, step=linear.step(d, r))
         return put(state, taken, new)
 
     def check(self, system: Shooting, before: Trajectory | None, state: Trajectory) -> ConvergenceCheck:
         """The step still to go, the gaps, and whether a step can still be shortened."""
-        gap = np.abs(state.d).max(axis=1, initial=0.0)
-        size = np.fmax(_reach(state, state.step), gap)
+        unknown, gap = ~finite(state.step), np.abs(state.d).max(axis=1, initial=0.0)
+        size = np.where(unknown, np.inf, np.fmax(_reach(state, state.step), gap))
         level = np.where(finite(state.r) & finite(state.d), 1.0, np.nan)
-        unknown = ~finite(state.step)
         ending = np.where(unknown, Status.SINGULAR, Status.STALLED)
-        size = np.where(unknown, np.inf, size)
         return ConvergenceCheck(size, level, state.moved, unknown | (state.share < _SHORTEST), ending)
 
 
 def _reach(state: Trajectory, change: Array) -> Array:
     """The largest change (trials,) of a parameter in standard deviations of the local bound."""
-    P = state.linear.covariance
-    deviation = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-    change = change[:, : deviation.shape[1]]
+    change = change[:, : state.x.shape[1]]
     # Where solutions grow as fast as the readings are many, deviations lie below the round-off of an integration.
     invisible = np.abs(change) <= _ROUND_OFF * np.fmax(1.0, np.abs(state.x))
-    return np.where(invisible, 0.0, np.abs(change / deviation)).max(axis=1)
+    return np.where(invisible, 0.0, np.abs(change / deviations(state.linear.covariance))).max(axis=1)
 
 
 def _length(state: Trajectory, change: Array) -> Array:
-    """The length (trials,) of a change of all unknowns, parameters in standard deviations, states in their sizes."""
+    """The length (trials,) of a change of all unknowns, parameters and states in their sizes."""
     n = state.x.shape[1]
     scale = np.fmax(1.0, np.abs(state.x))
     return np.linalg.norm(np.concatenate([change[:, :n] / scale, change[:, n:]], axis=1), axis=1)

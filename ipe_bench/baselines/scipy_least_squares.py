@@ -20,6 +20,8 @@ from ipe_bench.measurements.problem import Problem
 
 _OUT_OF_EVALUATIONS = 0
 """SciPy's status for it."""
+_SCIPYS = ("method", "loss", "f_scale", "ftol", "xtol", "gtol", "max_nfev")
+"""The options that are SciPy's own."""
 
 Rounding = Annotated[float, Ge(float(np.finfo(float).eps)), doc("a number of at least 2.3e-16, the rounding of a 1")]
 
@@ -77,30 +79,18 @@ class LeastSquares(Estimator):
         from scipy.optimize import least_squares
 
         jacobian: Any = residuals.J  # SciPy's stubs know its finite differences only
-        x, status, message, covariance = residuals.start, Status.ERROR, None, None
+        options: Any = {name: getattr(self, name) for name in _SCIPYS}
+        x, status, message, covariance = residuals.start, Status.NONFINITE, None, None
         try:
-            if not np.isfinite(residuals.r(x)).all():
-                status, message = Status.NONFINITE, "a reading, or the model at the start, is not a finite number"
-            else:
-                found = least_squares(
-                    residuals.r,
-                    x,
-                    jac=jacobian,
-                    method=self.method,
-                    ftol=self.ftol,
-                    xtol=self.xtol,
-                    gtol=self.gtol,
-                    x_scale="jac",
-                    loss=self.loss,
-                    f_scale=self.f_scale,
-                    max_nfev=self.max_nfev,
-                )
+            if np.isfinite(residuals.r(x)).all():
+                found = least_squares(residuals.r, x, jac=jacobian, x_scale="jac", **options)
                 x = found.x
                 status, covariance = self._judge(found)
-        except np.linalg.LinAlgError as error:
-            x, status, message = residuals.iterates[-1], Status.SINGULAR, describe_exception(error)
+            else:
+                message = "a reading, or the model at the start, is not a finite number"
         except Exception as error:
-            x, status, message = residuals.iterates[-1], Status.ERROR, describe_exception(error)
+            x, message = residuals.iterates[-1], describe_exception(error)
+            status = Status.SINGULAR if isinstance(error, np.linalg.LinAlgError) else Status.ERROR
         if not np.array_equal(x, residuals.iterates[-1]):
             residuals.iterates.append(x)
         return Estimates(

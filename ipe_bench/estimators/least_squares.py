@@ -347,6 +347,12 @@ class Minima:
     where it is wrong for some of them only."""
 
     @classmethod
+    def of(cls, ended: SolveResult[Any], covariance: Array, r: Array) -> Minima:
+        """Where an iteration ended, with whitened residuals r (trials, m) there."""
+        bulk = np.median(np.abs(r), axis=1)
+        return cls(ended.x, ended.status, ended.iterations, ended.history, covariance, squared(r), bulk)
+
+    @classmethod
     def nowhere(cls, x: Array, history: bool) -> Minima:
         """No minimum for any trial, at its start x (trials, n)."""
         trials, n = x.shape
@@ -402,10 +408,7 @@ def minima_of(ended: SolveResult[Any], slope: NormalEquations, readings: int) ->
     inverse_U, lost = slope.inverse_U, ~finite(slope.inverse_U)
     if lost.any():
         inverse_U = put(inverse_U, lost, inverse(slope.U[lost])[0])
-    covariance = np.matmul(inverse_U, inverse_U.swapaxes(1, 2))
-    r = ended.state.r[:, :readings]
-    bulk = np.median(np.abs(r), axis=1)
-    return Minima(ended.x, ended.status, ended.iterations, ended.history, covariance, squared(r), bulk)
+    return Minima.of(ended, np.matmul(inverse_U, inverse_U.swapaxes(1, 2)), ended.state.r[:, :readings])
 
 
 def _exact_slope(objective: Objective, state: LeastSquaresSystem) -> NormalEquations:
