@@ -119,6 +119,9 @@ def checked(value: Any, hint: Any, key: str) -> Any:
     plain = origin or hint
     if not isinstance(plain, type):
         return value
+    if issubclass(plain, Mapping) and isinstance(value, Mapping) and arguments:
+        entries = {name: checked(entry, arguments[1], f"{key}.{name}") for name, entry in value.items()}
+        return value if all(entries[name] is entry for name, entry in value.items()) else entries
     if plain in (int, float):
         return _number(value, plain, key)
     if isinstance(value, plain):

@@ -1,21 +1,24 @@
 """The language of formulas: numbers, names, + - * / ** ( ), elementary functions, comparisons and `A if C else B`.
 
-Text becomes a tree, and a tree is evaluated on whatever numbers, arrays or recorded expressions it is given. Nothing is
-handed to Python's own interpreter. What the names stand for is left to the models that are written in this language.
+Text becomes a tree, and a tree is evaluated on whatever numbers, arrays or recorded expressions it is given. Python's
+grammar reads the text, and nothing of it is executed.
 """
 
 from __future__ import annotations
 
+import ast
+import functools
 import math
 import operator
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping
+import warnings
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError, did_you_mean, unknown
+from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.measurements.ode.trace import special
 
 
@@ -45,20 +48,19 @@ FUNCTIONS: dict[str, Callable[[Any], Any]] = {
 """Functions of one argument; log is the natural logarithm."""
 SEVERAL: dict[str, Callable[[Any, Any], Any]] = {"min": np.minimum, "max": np.maximum}
 """Functions of two arguments or more."""
+_CALLED = (*FUNCTIONS, *SEVERAL)
 COMPARISONS = {"<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal}
 COMPARISONS |= {"==": np.equal, "!=": np.not_equal}
 """They are 1 where they hold and 0 elsewhere."""
-_WORDS = ("if", "else", "and", "or", "not")
 CONSTANTS = {"pi": math.pi}
-_LONGEST = 10_000
-_DEEPEST = 50
+_SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Pow: "**", ast.And: "and", ast.Or: "or"}
+_SIGNS |= {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 _MOST_IN_A_ROW = 400
 """Operations that build on one another, as in a sum of so many terms."""
-_TOKEN = re.compile(
-    r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>[A-Za-z_]\w*)"
-    r"|(?P<sign>\*\*|[<>=!]=|[-+*/^(),<>]))",
-    re.ASCII,
-)
+_ALPHABET = re.compile(r"[\w\s.,+\-*/^()<>=!]*", re.ASCII)
+_NAME = re.compile(r"(?<![\w.])(?!(?:if|else|and|or|not)\b)(?=[A-Za-z_])")
+"""The place before a name."""
+_NUMBER = re.compile(r"[\d.]+(e[-+]?\d+)?", re.IGNORECASE)
 
 Tree = tuple[Any, ...]
 
@@ -76,20 +78,6 @@ class Arithmetic:
         return _evaluate(self.tree, values)
 
 
-def require_finite(where: str, value: Any) -> None:
-    """Refuses what is not a finite number; `where` is its config key."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise UserError(f"{where}={value}: give a finite number")
-
-
-def require_parameters(where: str, names: Iterable[str], parameters: Iterable[str]) -> None:
-    """Refuses a name, under the config key `where`, that is not one of the parameters."""
-    for name in names:
-        if name not in parameters:
-            hint = did_you_mean(name, parameters)
-            raise UserError(f"{where}: {name} is not a parameter{hint} (these are {', '.join(parameters)})")
-
-
 def read(text: str, where: str) -> Arithmetic:
     """Reads a formula; `where` is the config key, for messages.
 
@@ -100,137 +88,79 @@ def read(text: str, where: str) -> Arithmetic:
     Raises:
         UserError: the text is not a formula of this language, by the place where it ceases to be one.
     """
-    if len(text) > _LONGEST:
-        raise UserError(f"{where}: is longer than {_LONGEST} characters")
-    parser = _Parser(text, where)
-    tree = parser.conditional(0)
-    if parser.token is not None:
-        parser.refuse("an operator such as + - * / ** is missing")
-    if _height(tree) > _MOST_IN_A_ROW:
+    # Names get a letter in front, so that a parameter may be called lambda.
+    source = _NAME.sub("_", " ".join(text.split()).replace("^", "**"))
+    try:
+        if not _ALPHABET.fullmatch(text):
+            raise SyntaxError("a character means nothing here")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            tree = _tree(ast.parse(source, mode="eval").body, source)
+        if _height(tree) > _MOST_IN_A_ROW:
+            raise RecursionError
+    except (RecursionError, MemoryError):
         remedy = "group terms by parentheses, or write the model in Python (`ipe-bench new measurement`)"
-        raise UserError(f"{where}: has more than {_MOST_IN_A_ROW} operations one after another; {remedy}")
+        raise UserError(f"{where}: has more than {_MOST_IN_A_ROW} operations one after another; {remedy}") from None
+    except SyntaxError as error:
+        rest = re.sub(r"\b_", "", source[(error.offset or 1) - 1 :].strip())
+        place = f"at '{rest[:20]}'" if rest else "at its end"
+        known = "numbers, names, + - * / ** ( ), comparisons and `A if C else B` are understood"
+        reason = error.msg.partition(". ")[0]
+        raise UserError(f"{where}: {text[:60]!r} is not a formula {place}: {reason}; {known}") from None
+    except NameError as error:
+        raise UserError(f"{where}: {error.name}(...): {unknown(str(error.name), _CALLED, 'function')}") from None
     names = dict.fromkeys(names_in(tree))
     return Arithmetic(text, tree, tuple(name for name in names if name not in CONSTANTS))
 
 
-class _Parser:
-    """Recursive descent over the tokens of one text; `token` is the one that comes next, None at the end."""
+def _tree(node: ast.expr, source: str) -> Tree:
+    """The tree of a part of the text.
 
-    def __init__(self, text: str, where: str) -> None:
-        self.text, self.where = text, where
-        self.kind, self.token, self.begin, self.end = "", None, 0, 0
-        self.advance()
+    Raises:
+        SyntaxError: the part is Python and no formula.
+        NameError: a function is not known.
+    """
+    reason = "it is no formula"
+    match node:
+        case ast.Constant() if _NUMBER.fullmatch(number := ast.get_source_segment(source, node) or ""):
+            return ("number", float(number))
+        case ast.Name(name):
+            return ("name", name[1:])
+        case ast.UnaryOp(ast.USub(), operand):
+            return ("negative", _tree(operand, source))
+        case ast.UnaryOp(ast.UAdd(), operand):
+            return _tree(operand, source)
+        case ast.UnaryOp(ast.Not(), operand):
+            return ("if", _tree(operand, source), ("number", 0.0), ("number", 1.0))
+        case ast.BinOp(left, sign, right) if type(sign) in _SIGNS:
+            return (_SIGNS[type(sign)], _tree(left, source), _tree(right, source))
+        case ast.IfExp(condition, a, b):
+            return ("if", _tree(condition, source), _tree(a, source), _tree(b, source))
+        case ast.BoolOp(sign, values):
+            return _in_a_row(_SIGNS[type(sign)], [_tree(value, source) for value in values])
+        case ast.Compare(left, signs, others) if all(type(sign) in _SIGNS for sign in signs):
+            held = []
+            for a, sign, b in zip([left, *others], map(_SIGNS.get, map(type, signs)), others, strict=False):
+                text = re.sub(
+                    r"\b_", "", f"{ast.get_source_segment(source, a)} {sign} {ast.get_source_segment(source, b)}"
+                )
+                held.append((sign, _tree(a, source), _tree(b, source), text))
+            return _in_a_row("and", held)
+        case ast.Call(ast.Name(name), arguments, []):
+            if name[1:] not in _CALLED:
+                raise NameError(name=name[1:])
+            inner = [_tree(argument, source) for argument in arguments]
+            if name[1:] in SEVERAL and len(inner) > 1:
+                return _in_a_row(name[1:], inner)
+            if name[1:] in FUNCTIONS and len(inner) == 1:
+                return (name[1:], *inner)
+            reason = f"{name[1:]} takes {'two arguments or more' if name[1:] in SEVERAL else 'one argument'}"
+    raise SyntaxError(reason, (None, 1, node.col_offset + 1, source))
 
-    def advance(self) -> str:
-        """Hands out the token that came next."""
-        last = self.token or ""
-        self.begin = self.end
-        if not self.text[self.end :].strip():
-            self.kind, self.token = "", None
-            return last
-        match = _TOKEN.match(self.text, self.end)
-        if match is None:
-            return self.refuse("only numbers, names, + - * / ** ( ), comparisons and `A if C else B` are understood")
-        self.kind, self.token, self.end = str(match.lastgroup), match[str(match.lastgroup)], match.end()
-        return last
 
-    def refuse(self, reason: str) -> Any:
-        rest = self.text[self.begin :].strip()
-        place = f"at '{rest[:20]}'" if rest else "at its end"
-        raise UserError(f"{self.where}: {self.text[:60]!r} is not a formula {place}: {reason}")
-
-    def expect(self, token: str) -> None:
-        if self.token != token:
-            self.refuse(f"{token} is missing")
-        self.advance()
-
-    def deeper(self, depth: int, what: str) -> int:
-        if depth > _DEEPEST:
-            self.refuse(f"{what} are nested more than {_DEEPEST} deep")
-        return depth + 1
-
-    def row(self, operators: Collection[str], operand: Callable[[int], Tree], depth: int) -> Tree:
-        """Operands with operators between them, which bind from the left."""
-        tree = operand(depth)
-        while self.token in operators:
-            tree = (self.advance(), tree, operand(depth))
-        return tree
-
-    def conditional(self, depth: int) -> Tree:
-        deeper = self.deeper(depth, "parentheses")
-        tree = self.either(depth)
-        if self.token != "if":
-            return tree
-        self.advance()
-        condition = self.either(depth)
-        self.expect("else")
-        return ("if", condition, tree, self.conditional(deeper))
-
-    def either(self, depth: int) -> Tree:
-        return self.row(["or"], self.both, depth)
-
-    def both(self, depth: int) -> Tree:
-        return self.row(["and"], self.comparison, depth)
-
-    def comparison(self, depth: int) -> Tree:
-        if self.token == "not":
-            self.advance()
-            return ("if", self.comparison(self.deeper(depth, "negations")), ("number", 0.0), ("number", 1.0))
-        begin = self.begin
-        tree = left = self.sum(depth)
-        while self.token in COMPARISONS:
-            sign, right = self.advance(), self.sum(depth)
-            held = (sign, left, right, self.text[begin : self.begin].strip())
-            tree, left = held if tree is left else ("and", tree, held), right
-        return tree
-
-    def sum(self, depth: int) -> Tree:
-        return self.row(["+", "-"], self.product, depth)
-
-    def product(self, depth: int) -> Tree:
-        return self.row(["*", "/"], self.signed, depth)
-
-    def signed(self, depth: int) -> Tree:
-        if self.token in ("+", "-"):
-            sign = self.advance()
-            inner = self.signed(self.deeper(depth, "signs"))
-            return ("negative", inner) if sign == "-" else inner
-        return self.power(depth)
-
-    def power(self, depth: int) -> Tree:
-        base = self.atom(depth)
-        if self.token in ("**", "^"):
-            self.advance()
-            return ("**", base, self.signed(self.deeper(depth, "powers")))
-        return base
-
-    def atom(self, depth: int) -> Tree:
-        if self.kind == "number":
-            return ("number", float(self.advance()))
-        if self.kind == "name" and self.token not in _WORDS:
-            name = self.advance()
-            if self.token != "(":
-                return ("name", name)
-            return self.call(name, depth)
-        if self.token == "(":
-            self.advance()
-            tree = self.conditional(depth + 1)
-            self.expect(")")
-            return tree
-        return self.refuse("a number, a name or ( is missing")
-
-    def call(self, name: str, depth: int) -> Tree:
-        if name not in FUNCTIONS and name not in SEVERAL:
-            raise UserError(f"{self.where}: {name}(...): {unknown(name, [*FUNCTIONS, *SEVERAL], 'function')}")
-        self.advance()
-        tree = self.conditional(depth + 1)
-        if name in SEVERAL and self.token != ",":
-            self.refuse(f"{name} takes two arguments or more")
-        while name in SEVERAL and self.token == ",":
-            self.advance()
-            tree = (name, tree, self.conditional(depth + 1))
-        self.expect(")")
-        return tree if name in SEVERAL else (name, tree)
+def _in_a_row(operation: str, trees: Iterable[Tree]) -> Tree:
+    """Operands that an operation joins from the left."""
+    return functools.reduce(lambda left, right: (operation, left, right), trees)
 
 
 def parts(tree: Tree) -> list[Tree]:
@@ -246,22 +176,20 @@ def names_in(tree: Tree) -> list[str]:
     return [part[1] for part in parts(tree) if part[0] == "name"]
 
 
-def comparisons(formulas: Mapping[str, Arithmetic]) -> list[tuple[str, Tree]]:
-    """Every comparison in some formulas, each once, with the key of its formula."""
+def never_switching(formulas: Mapping[str, Arithmetic], values: Mapping[str, Any]) -> list[str]:
+    """A sentence for each comparison in some formulas that holds for all readings, or for none, at these values."""
     found: dict[Tree, str] = {}
     for where, formula in formulas.items():
         for part in parts(formula.tree):
             if part[0] in COMPARISONS:
                 found.setdefault(part, where)
-    return [(where, part) for part, where in found.items()]
-
-
-def never_switches(where: str, comparison: Tree, met: Any) -> list[str]:
-    """A sentence if a comparison, which holds where `met` is not 0, holds for all readings or for none."""
-    if not (np.all(met) or not np.any(met)):
-        return []
-    said = "holds at every reading" if np.all(met) else "holds at no reading"
-    return [f"measurement.{where}: {comparison[3]} {said}, so these readings say nothing of the other branch"]
+    said = []
+    for tree, where in found.items():
+        met = _evaluate(tree, values)
+        if np.all(met) or not np.any(met):
+            held = "holds at every reading" if np.all(met) else "holds at no reading"
+            said.append(f"measurement.{where}: {tree[3]} {held}, so these readings say nothing of the other branch")
+    return said
 
 
 def rewritten(tree: Tree, new: Callable[[Tree], Tree | None]) -> Tree:
@@ -294,26 +222,16 @@ _BINARY: dict[str, Callable[[Any, Any], Any]] = {
 
 
 def _evaluate(tree: Tree, values: Mapping[str, Any]) -> Any:
-    row = []  # a sum of many terms is as many operations in a row, deeper than Python calls
-    while tree[0] in _BINARY:
-        row.append(tree)
-        tree = tree[1]
-    result = _simple(tree, values)
-    for operation, _, right, *_ in reversed(row):
-        result = _BINARY[operation](result, _evaluate(right, values))
-    return result
-
-
-def _simple(tree: Tree, values: Mapping[str, Any]) -> Any:
-    """A number, a name, a sign, a function or a conditional."""
-    operation, operand, *branches = tree
+    operation, first, *others = tree
     if operation == "number":
-        return operand
+        return first
     if operation == "name":
-        return values[operand] if operand in values else CONSTANTS[operand]
-    value = _evaluate(operand, values)
+        return values[first] if first in values else CONSTANTS[first]
+    value = _evaluate(first, values)
     if operation == "if":
         if isinstance(value, float):  # the other branch may have no value
-            return _evaluate(branches[0] if value else branches[1], values)
-        return choose(value, *(_evaluate(branch, values) for branch in branches))
+            return _evaluate(others[0] if value else others[1], values)
+        return np.where(value, _evaluate(others[0], values), _evaluate(others[1], values))
+    if operation in _BINARY:
+        return _BINARY[operation](value, _evaluate(others[0], values))
     return -value if operation == "negative" else FUNCTIONS[operation](value)

@@ -1,7 +1,7 @@
-"""A measurement model that is one formula: no plugin, no Python, only its text and the columns of a file.
+"""Measurement models that users write out: names with a start are parameters, other names are columns of a file.
 
-The text is read by `arithmetic` and recorded by `ode.trace`, which differentiates it exactly; here the recording is
-carried out on arrays.
+`Formula` is one formula: no plugin, no Python, only its text and the columns. `arithmetic` reads the text, and
+`ode.trace` records it, differentiates it exactly and computes it on arrays.
 """
 
 from __future__ import annotations
@@ -13,18 +13,85 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.errors import UserError, did_you_mean
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.arithmetic import (
-    Arithmetic,
-    comparisons,
-    never_switches,
-    read,
-    require_finite,
-    require_parameters,
-)
+from ipe_bench.basics.options import Count, Finite
+from ipe_bench.measurements.arithmetic import Arithmetic, never_switching, read
+from ipe_bench.measurements.base import Input, Measurement, Parameter
 from ipe_bench.measurements.ode.trace import Graph, Program, tangent
-from ipe_bench.measurements.written import WrittenModel
+
+
+class WrittenModel(Measurement):
+    """A model whose parameters are names with a start; `start`, `columns` and `unit` are options of every such model.
+
+    The size of a parameter is the magnitude of its start, or 1 where that is 0, unless `size` says otherwise.
+    """
+
+    start: Mapping[str, float]
+    columns: Mapping[str, Sequence[float]]
+    unit: str
+    size: Mapping[str, float] = {}
+    units: Mapping[str, str] = {}
+
+    headings: tuple[str, ...]
+    """The names of the columns that it takes from the readings."""
+    reading: str
+
+    reading_unit = property(lambda model: model.unit)  # type: ignore[assignment]
+    reading_name = property(lambda model: model.reading)  # type: ignore[assignment]
+
+    @cached_property
+    def starts(self) -> dict[str, float]:
+        """The parameters with their starts, in the order of x."""
+        return {name: float(value) for name, value in self.start.items()}
+
+    @property
+    def parameter_units(self) -> Mapping[str, str]:
+        return self.units
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        sizes = {name: abs(value) or 1.0 for name, value in self.starts.items()} | dict(self.size)
+        return tuple(Parameter(name, self.parameter_units.get(name, ""), float(sizes[name])) for name in self.starts)
+
+    @cached_property
+    def nominal(self) -> Array:
+        return np.array(list(self.starts.values())) / self.sizes
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        return tuple(map(Input, self.headings))
+
+    @property
+    def input_columns(self) -> Mapping[str, Sequence[Any]]:
+        return {name: self.column(name).tolist() for name in self.headings}
+
+    def column(self, name: str) -> Array:
+        if name not in self.columns:
+            raise UserError(
+                f"measurement: {name} is neither a column nor a parameter; give a parameter its start, "
+                f"measurement.start.{name}=VALUE, or the column, by readings=FILE or measurement.columns.{name}=[...]"
+            )
+        return np.asarray(self.columns[name], dtype=float)
+
+    @property
+    def index(self) -> Mapping[str, Sequence[Any]]:
+        return {"row": list(range(1, self.m + 1)), **self.input_columns}
+
+    def absent_input(self, heading: str, columns: Sequence[str]) -> str:
+        remedy = f"If {heading} is a parameter, give it a start: measurement.start.{heading}=VALUE"
+        return f"there are {', '.join(columns)}{did_you_mean(heading, columns) or '.'} {remedy}"
+
+    def require_columns_and_parameters(self, *keys: str) -> None:
+        """Refuses columns of different lengths, and names in the options `keys` that are no parameters."""
+        lengths = {name: len(column) for name, column in self.columns.items()}
+        if len(set(lengths.values())) > 1:
+            raise UserError(f"columns: have different lengths: {lengths}")
+        for key in keys:
+            for name in getattr(self, key):
+                if name not in self.starts:
+                    known = f"{did_you_mean(name, self.starts)} (these are {', '.join(self.starts)})"
+                    raise UserError(f"{key}: {name} is not a parameter{known}")
 
 
 @dataclass(frozen=True)
@@ -40,11 +107,11 @@ class Formula(WrittenModel):
     """
 
     expression: str
-    start: Mapping[str, float] = field(default_factory=dict)
+    start: Mapping[str, Finite] = field(default_factory=dict)
     """Where estimation begins, for each parameter: the nominal point."""
     columns: Mapping[str, Sequence[float]] = field(default_factory=dict)
     """What is known of each reading: the same columns as in a file, for `run`, which has no file."""
-    readings: int | None = None
+    readings: Count | None = None
     """Number of readings; None: the length of the columns."""
     reading: str = "y"
     """What the column of the readings is called in a file; `reading` is understood too."""
@@ -55,8 +122,7 @@ class Formula(WrittenModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, value in self.start.items():
-            require_finite(f"start.{name}", value)
+        for name in self.start:
             if name not in self.arithmetic.names:
                 wanted = ", ".join(self.arithmetic.names)
                 raise UserError(f"start.{name}: does not appear in the expression, whose names are {wanted}")
@@ -67,8 +133,7 @@ class Formula(WrittenModel):
             )
         if self.reading in self.arithmetic.names:
             raise UserError(f"reading={self.reading}: stands in the expression too; what is measured cannot explain it")
-        self.require_equal_lengths()
-        require_parameters("own", self.own, self.start)
+        self.require_columns_and_parameters("own")
 
     @cached_property
     def arithmetic(self) -> Arithmetic:
@@ -115,10 +180,8 @@ class Formula(WrittenModel):
     def remarks(self, x: Array) -> tuple[str, ...]:
         """Which conditionals never switch at x."""
         values = dict(zip(self.arithmetic.names, (value[0] for value in self._values(x[None, : self.n])), strict=True))
-        found = comparisons({"expression": self.arithmetic})
         with np.errstate(all="ignore"):
-            said = [never_switches(where, tree, Arithmetic("", tree, ())(values)) for where, tree in found]
-        return tuple(sentence for one in said for sentence in one)
+            return tuple(never_switching({"expression": self.arithmetic}, values))
 
     def simulate(self, x: Array) -> Array:
         value, _ = self._recorded

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from ipe_bench.basics.errors import UserError, place_of, unknown
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Finite, Positive
-from ipe_bench.measurements.arithmetic import require_parameters
 from ipe_bench.measurements.base import contradicted, differentiate
-from ipe_bench.measurements.written import WrittenModel
+from ipe_bench.measurements.formula import WrittenModel
 
 _CHUNK = 8
 """Trials per call of a compiled JAX program; shorter batches are padded, so that bits do not depend on them."""
@@ -70,8 +69,6 @@ class Function(WrittenModel):
         for name in self.start:
             if name not in arguments:
                 raise UserError(f"start.{name}: {unknown(name, arguments, 'argument')}")
-        for key in ("size", "units"):
-            require_parameters(key, getattr(self, key), self.starts)
         for name in self.constants:
             if name not in self._keywords:
                 raise UserError(f"constants.{name}: {unknown(name, self._keywords, 'keyword-only argument')}")
@@ -89,7 +86,7 @@ class Function(WrittenModel):
             raise UserError(
                 f"columns: {absent[0]} is missing; give columns.{absent[0]}=[...], or start.{absent[0]}=VALUE"
             )
-        self.require_equal_lengths()
+        self.require_columns_and_parameters("size", "units")
 
     @cached_property
     def function(self) -> Callable[..., Any]:

@@ -12,8 +12,8 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
-from ipe_bench.basics.options import Count, Positive
-from ipe_bench.measurements.arithmetic import Arithmetic, read, require_finite
+from ipe_bench.basics.options import Count, Finite, NonNegative, Positive
+from ipe_bench.measurements.arithmetic import Arithmetic, read
 from ipe_bench.measurements.base import Parameter, differentiate
 from ipe_bench.states.base import Gaussian, Paths, StateModel
 
@@ -33,19 +33,19 @@ class Formulas(StateModel):
     """The next value of each state."""
     readings: Mapping[str, str]
     """Each reading."""
-    noise: Mapping[str, float] = field(default_factory=dict)
+    noise: Mapping[str, NonNegative] = field(default_factory=dict)
     """Standard deviation of each independent process noise, by the name that it has in the transition."""
-    deviation: Mapping[str, float]
+    deviation: Mapping[str, NonNegative]
     """Standard deviation of each reading."""
-    start: Mapping[str, float] = field(default_factory=dict)
+    start: Mapping[str, Finite] = field(default_factory=dict)
     """Mean of each state in the prior; 0 where absent."""
-    spread: Mapping[str, float]
+    spread: Mapping[str, NonNegative]
     """Standard deviation of each state in the prior."""
-    constants: Mapping[str, float] = field(default_factory=dict)
+    constants: Mapping[str, Finite] = field(default_factory=dict)
     """Numbers that the formulas name."""
     units: Mapping[str, str] = field(default_factory=dict)
     """Units of states."""
-    period: Mapping[str, float] = field(default_factory=dict)
+    period: Mapping[str, NonNegative] = field(default_factory=dict)
     """Periods of readings that come round, such as 6.283185307 of a bearing in rad."""
     count: Count = 100
     """K, the number of epochs, the first of them a step after the prior."""
@@ -76,12 +76,9 @@ class Formulas(StateModel):
         owners |= {"noise": self.noise, "constants": self.constants}
         for key, labels in owners.items():
             given = getattr(self, key)
-            for label, value in given.items():
-                require_finite(f"{key}.{label}", value)
+            for label in given:
                 if label not in labels:
                     raise UserError(f"{key}.{label}: {unknown(label, labels, 'name')}")
-                if value < 0 and key not in ("start", "constants"):
-                    raise UserError(f"{key}.{label}={value}: give 0 or a number above")
             if key in ("deviation", "spread") and (absent := set(labels) - set(given)):
                 raise UserError(f"{key}.{min(absent)}: is not given; give it a value")
         gains = [self._gain_at(multiple) for multiple in _OTHER_PLACES]

@@ -112,10 +112,11 @@ def test_nist_answers_come_from_the_formula_with_an_unknown_noise(dataset, tmp_p
         ("1 if a > 2 else 2 if c > 2 else 3", 2.0),
         ("not a > 1 or c > 2 and b < 3", 1.0),
         ("1/(a-2) if a != b else c", 3.0),
+        ("min(lambda, c)\n  + 1.e0*(is - 1)", 2.0),
     ],
 )
 def test_the_language_is_that_of_algebra(text, value):
-    values = {"a": 2.0, "b": 2.0, "c": 3.0} if "a-b-c" not in text else {"a": 2.0, "b": 2.0, "c": 1.0}
+    values = {"a": 2.0, "b": 2.0, "c": 3.0 if "a-b-c" not in text else 1.0, "lambda": 2.0, "is": 1.0}
     assert float(read(text, "expression")(values)) == pytest.approx(value, abs=1e-12)
 
 
@@ -125,8 +126,8 @@ REFUSED = [
     "b1*t)", "2t", "b1 b2", "", "()", "b1**", "*b1", "1,5*t", "b1 and", "not", "b1 < ", "min(b1)", "abs(b1,t)",
     "'b1'", "b1@t", "b1//t*", "exp", "exp()",
     "exp(b1,t)",
-    "b1%t", "{b1}", "b1\\n", "0x10", "1e", "1_000*b1", "b1!", "é*t", "sin t", "(" * 60 + "b1" + ")" * 60,
-    "-" * 60 + "b1", "not " * 60 + "b1", "1 if t else " * 60 + "b1",
+    "b1%t", "{b1}", "b1\\n", "0x10", "1e", "1_000*b1", "1j*b1", "b1!", "é*t", "sin t", "None*b1", "exp(a=b1)",
+    "(" * 300 + "b1" + ")" * 300, "-" * 500 + "b1", "not " * 500 + "b1", "1 if t else " * 500 + "b1",
     "b1*" * 4000 + "t", "9**9**9*b1", "b1*log(0)", "b1/(1-1)", "b1*sqrt(-1)",
 ]  # fmt: skip
 
@@ -170,7 +171,7 @@ def test_a_formula_is_evaluated_or_refused_however_long():
     assert formula({"b1": 2.0, "t": 0.5}) == 399.0
     assert pickle.loads(pickle.dumps(formula)).names == ("b1", "t")
     for text in ("+".join(["b1*t"] * 900), "b1" + "*t" * 2000, "b1" + "**b1" * 2000):
-        with pytest.raises(UserError, match=r"^expression: .*(one after another; group|nested more than 50 deep)"):
+        with pytest.raises(UserError, match=r"^expression: .* one after another; group"):
             read(text, "expression")
 
 

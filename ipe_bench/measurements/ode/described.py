@@ -14,20 +14,13 @@ import numpy as np
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.files import own_conf
 from ipe_bench.basics.linalg import Array, Covariance, own
-from ipe_bench.basics.options import Count, Positive
-from ipe_bench.measurements.arithmetic import (
-    Arithmetic,
-    Tree,
-    comparisons,
-    never_switches,
-    parts,
-    read,
-    require_finite,
-    require_parameters,
-)
+from ipe_bench.basics.options import Count, Finite, Positive
+from ipe_bench.measurements.arithmetic import COMPARISONS, Arithmetic, Tree, never_switching, parts, read
 from ipe_bench.measurements.base import Input, Measurement, Recorded, SubsetModel, UsualNoise, WrappedModel
+from ipe_bench.measurements.formula import WrittenModel
 from ipe_bench.measurements.ode.driven import (
     PIECEWISE,
+    agreed,
     course,
     courses,
     grid,
@@ -38,7 +31,6 @@ from ipe_bench.measurements.ode.driven import (
 )
 from ipe_bench.measurements.ode.model import OdeMeasurement, time_heading
 from ipe_bench.measurements.ode.rodas import SHAPE, Rodas5P, Work
-from ipe_bench.measurements.written import WrittenModel
 
 _SHARE = 1e-8
 """Of the largest reading, what the integration may leave unless told otherwise."""
@@ -49,7 +41,9 @@ _KINKED = 5.0
 _EASY = 16
 """Explicit steps between two readings up to which nominal equations are not asked whether they are stiff."""
 _STIFF = 10.0
+"""Explicit steps, for each implicit one, from which on equations are called stiff."""
 _IN_HAND = 0.3
+"""Of the tolerance, what a step of the implicit method may leave."""
 _COLUMNS = ("case", "time", "output", "reading", "sigma")
 """Columns that mean something else than a constant."""
 
@@ -72,13 +66,13 @@ class Ode(WrittenModel, WrappedModel):
     cases `case` (1, 2, ...), and with several outputs `output`.
     """
 
-    rates: Mapping[str, str]
+    rates: Mapping[str, str | float]
     """The time derivative of every state."""
-    start: Mapping[str, float] = field(default_factory=dict)
+    start: Mapping[str, Finite] = field(default_factory=dict)
     """Where estimation begins, for each parameter: the nominal point."""
     initial: Mapping[str, str | float] = field(default_factory=dict)
     """The states at t = 0."""
-    outputs: Mapping[str, str] = field(default_factory=dict)
+    outputs: Mapping[str, str | float] = field(default_factory=dict)
     """What is read at each time; none: every state."""
     times: tuple[float, ...] = ()
     """When it is read; a readings file brings its own."""
@@ -93,9 +87,9 @@ class Ode(WrittenModel, WrappedModel):
     """Unit of the times: s, min, day."""
     own: tuple[str, ...] = ()
     """Parameters of which every file of readings has its own, where there are several."""
-    constants: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
+    constants: Mapping[str, Finite | tuple[Finite, ...]] = field(default_factory=dict)
     """What is known of each case: a number for each, or one for all; a readings file brings its own."""
-    size: Mapping[str, float] = field(default_factory=dict)
+    size: Mapping[str, Positive] = field(default_factory=dict)
     """What one unit of error of a parameter is; where absent, the magnitude of its start."""
     units: Mapping[str, str] = field(default_factory=dict)
     """Units of the parameters."""
@@ -105,9 +99,9 @@ class Ode(WrittenModel, WrappedModel):
     """Time between two of the `readings`."""
     deviation: Positive | None = None
     """The usual standard deviation of a reading."""
-    answer: Mapping[str, float] = field(default_factory=dict)
+    answer: Mapping[str, Finite] = field(default_factory=dict)
     """Parameters whose readings are known exactly: with noise=certified they stand for the truth."""
-    exact: Mapping[str, str] = field(default_factory=dict)
+    exact: Mapping[str, str | float] = field(default_factory=dict)
     """The readings at `answer`: for every output a formula of t, the parameters and the constants."""
     method: Literal["auto", "explicit", "implicit"] = "auto"
     """The integrator: explicit (DOP853), implicit (Rodas5P, for stiff equations), or as the equations ask for."""
@@ -128,59 +122,43 @@ class Ode(WrittenModel, WrappedModel):
         super().__post_init__()
         if not self.rates:
             raise UserError("rates: is empty; give each state its rate, such as rates.y=-k*y")
+        if not self.start:
+            raise UserError("start: is empty, so nothing is to be estimated; give each parameter a start")
         for name in self.initial:
             if name not in self.rates:
                 raise UserError(f"initial.{name}: there is no such state; these have rates: {', '.join(self.rates)}")
-        for name, value in self.start.items():
-            require_finite(f"start.{name}", value)
-            if name in self.rates or name == "t":
-                raise UserError(f"start.{name}: is a state or the time, and not a parameter; rename one of them")
+        changing = {*self.rates, *self.driven_by, "t"}
         for name, formula in self.initial_formulas.items():
-            for used in formula.names:
-                if used in self.rates or used in self.driven_by or used == "t":
-                    what = "changes with time" if used in self.driven_by else "is a state or the time"
-                    raise UserError(f"initial.{name}: {used} {what}, which a start cannot depend on")
-        for key, names in (("start", self.start), ("driven_by", self.driven_by)):
-            for name in names:
+            if used := [used for used in formula.names if used in changing]:
+                raise UserError(f"initial.{name}: {used[0]} changes with time, and a start cannot depend on it")
+        taken = {"start": (*self.rates, "t"), "driven_by": (*self.start, *self.rates, *_COLUMNS, "t")}
+        for key, others in taken.items():
+            for name in getattr(self, key):
+                if name in others:
+                    raise UserError(f"{key}.{name}: the state, parameter, column or time has this name; choose another")
                 if name not in self._used:
                     raise UserError(f"{key}.{name}: appears in no formula")
-        for key, given in (("size", self.size), ("units", self.units), ("answer", self.answer)):
-            require_parameters(key, tuple(given), self.start)
-        if not self.start:
-            raise UserError("start: is empty, so nothing is to be estimated; give each parameter a start")
         if any(time < 0 for time in self.times) or any(b <= a for a, b in itertools.pairwise(self.times)):
             raise UserError(f"times={list(self.times)}: give ascending numbers from 0 on")
         if isinstance(self.tolerance, str):
             for name in read(self.tolerance, "tolerance").names:
                 if name != "t" and name not in self.constant_names:
                     raise UserError(f"tolerance: {name} is neither a constant nor t")
-        require_parameters("own", self.own, self.start)
-        self._check_constants()
-        self._check_inputs()
-
-    def _check_constants(self) -> None:
         for name in self.constant_names:
             if name in _COLUMNS:
                 remedy = "the time is t" if name == "time" else "rename it"
                 raise UserError(f"{name}: is a column of every readings file, and not known in a formula; {remedy}")
-        for name, values in self.constants.items():
+        for name in self.constants:
             if name not in self.constant_names:
                 known = "is a state, a parameter or the time" if name in self._named else "appears in no formula"
                 raise UserError(f"constants.{name}: {known}")
-            for value in values if isinstance(values, tuple | list) else [values]:
-                require_finite(f"constants.{name}", value)
         lengths = {name: len(v) for name, v in self.constants.items() if isinstance(v, tuple | list)}
         if len(set(lengths.values())) > 1 or 0 in lengths.values():
             raise UserError(f"constants: have different lengths: {lengths}; give one number for each case")
-
-    def _check_inputs(self) -> None:
-        for name in self.driven_by:
-            if name in (*self.start, *self.rates, *_COLUMNS, "t"):
-                raise UserError(f"driven_by.{name}: is a state, a parameter, the time or another column; rename it")
         for name in self.columns:
             if name not in ("case", "time", *self.driven_by):
                 raise UserError(f"columns.{name}: {unknown(name, ['case', 'time', *self.driven_by], 'input')}")
-        self.require_equal_lengths()
+        self.require_columns_and_parameters("size", "units", "answer", "own")
 
     @property
     def _named(self) -> set[str]:
@@ -312,19 +290,12 @@ class Ode(WrittenModel, WrappedModel):
                 "rates have kinks, and slopes right to two or three digits; measurement.method=implicit brings the "
                 "readings nearer, but not always the slopes"
             )
-        formulas = {f"rates.{name}": f for name, f in self.rate_formulas.items()}
-        formulas |= {f"outputs.{name}": f for name, f in self.output_formulas.items()}
-        conditions = comparisons(formulas)
-        if not conditions:
-            return tuple(found)
-        known = engine.along(x)
-        switches = {tree: k for k, tree in enumerate(self.piecewise_rates[1].values(), start=len(self.constant_names))}
-        for where, tree in conditions:
-            if where.startswith("rates") and tree in switches:
-                met = engine.tables[:-1, :, switches[tree]]
-            else:
-                met = Arithmetic("", tree, ())(known)
-            found += never_switches(where, tree, met)
+        rates = {f"rates.{name}": formula for name, formula in self.rate_formulas.items()}
+        outputs = {f"outputs.{name}": formula for name, formula in self.output_formulas.items()}
+        if any(part[0] in COMPARISONS for one in (rates | outputs).values() for part in parts(one.tree)):
+            known = engine.along(x)
+            found += never_switching(rates, known | {"t": middles(engine.times)[None, :-1]})
+            found += never_switching(outputs, known)
         return tuple(found)
 
     def absent_input(self, heading: str, columns: Sequence[str]) -> str:
@@ -343,10 +314,9 @@ class Ode(WrittenModel, WrappedModel):
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
         del readings
-        count = numbered_cases(columns["case"]) if self.constant_names or self.driven_by else 1
-        constants = {name: _of_cases(name, columns[name], columns["case"], count) for name in self.constant_names}
-        outputs, heading = list(self.output_formulas), time_heading(self.time_unit)
+        heading, outputs = time_heading(self.time_unit), list(self.output_formulas)
         rows = list(zip(columns["case"], map(float, columns[heading]), columns["output"], strict=True))
+        count = numbered_cases(columns["case"]) if self.constant_names or self.driven_by else 1
         for case, time, output in rows:
             if output not in outputs:
                 raise UserError(f"output={output}: {unknown(str(output), outputs, 'output')}")
@@ -354,9 +324,15 @@ class Ode(WrittenModel, WrappedModel):
                 raise UserError(f"case={case}: there are {count} cases")
             if time < 0:
                 raise UserError(f"{heading}={time}: comes before the start, which is at 0")
+        remedy = "" if count > 1 else "; number the cases in a column case"
+        in_cases = [(case,) for case, *_ in rows]
+        constants = {n: tuple(agreed(n, columns[n], in_cases, remedy).values()) for n in self.constant_names}
+        changes = sorted({(case, time) for case, time, _ in rows})
+        inputs = {n: list(agreed(n, columns[n], [row[:2] for row in rows]).values()) for n in self.driven_by}
+        if inputs:
+            inputs |= {"case": [case for case, _ in changes], "time": [time for _, time in changes]}
         times = sorted({time for _, time, _ in rows})
-        inputs = {name: columns[name] for name in self.driven_by}
-        whole = replace(self, constants=constants, times=tuple(times), columns=_over_time(rows, inputs))
+        whole = replace(self, constants=constants, times=tuple(times), columns=inputs)
         place = {time: k for k, time in enumerate(times)}
         kept = [((case - 1) * len(times) + place[t]) * len(outputs) + outputs.index(o) for case, t, o in rows]
         return whole if kept == list(range(whole.m)) else SubsetModel(whole, tuple(kept))
@@ -367,7 +343,7 @@ class Ode(WrittenModel, WrappedModel):
         whole = set(self.answer) == set(self.start) and set(self.exact) == set(self.output_formulas)
         if not whole or self.deviation is None:
             return None
-        formulas = [read(self.exact[name], f"exact.{name}") for name in self.output_formulas]
+        formulas = [read(str(self.exact[name]), f"exact.{name}") for name in self.output_formulas]
         known = self.known(self.reading_times)
         z = np.concatenate([[formula({**self.answer, **one}) for formula in formulas] for one in known])
         x = np.array([self.answer[name] for name in self.start]) / self.sizes
@@ -542,30 +518,6 @@ class _Engine(OdeMeasurement):
     def read(self, t, y, p, c):
         values = self._values(t, y, p, c)
         return [formula(values) for formula in self.described.output_formulas.values()]
-
-
-def _of_cases(name: str, values: Sequence[float], numbers: Sequence[int], count: int) -> tuple[float, ...]:
-    """What a constant is in each of the cases, by the columns of a file: one number in all rows of a case."""
-    found: dict[int, float] = {}
-    for value, case in zip(values, numbers, strict=True):
-        if found.setdefault(case, value) != value:
-            remedy = "" if count > 1 else "; number the cases in a column case"
-            raise UserError(f"case={case}: {name} is {found[case]:g} in one row and {value:g} in another{remedy}")
-    return tuple(found[case] for case in range(1, count + 1))
-
-
-def _over_time(rows: Sequence[tuple[int, float, str]], inputs: Mapping[str, Sequence[float]]) -> dict[str, Any]:
-    """The columns of a file's inputs over time, from all its rows: one value of each at a time of a case."""
-    found: dict[tuple[int, float], tuple[float, ...]] = {}
-    for (case, time, _), values in zip(rows, zip(*inputs.values(), strict=True), strict=False):
-        known = found.setdefault((case, time), values)
-        for name, one, other in zip(inputs, known, values, strict=True):
-            if one != other:
-                raise UserError(f"case={case}, time={time:g}: {name} is {one:g} in one row and {other:g} in another")
-    ordered = sorted(found)
-    columns = zip(*(found[key] for key in ordered), strict=True)
-    times = {"case": [case for case, _ in ordered], "time": [time for _, time in ordered]}
-    return times | dict(zip(inputs, columns, strict=True)) if inputs else {}
 
 
 def packaged(name: str) -> Callable[..., Ode]:

@@ -103,6 +103,22 @@ def numbered_cases(numbers: Sequence[int]) -> int:
     return len(known)
 
 
+def agreed(
+    name: str, column: Sequence[float], places: Sequence[tuple[float, ...]], remedy: str = ""
+) -> dict[tuple[float, ...], float]:
+    """What a column of a file says of each place in ascending order: a case, or a time of a case.
+
+    Raises:
+        UserError: two rows of a place differ.
+    """
+    found: dict[tuple[float, ...], float] = {}
+    for value, place in zip(column, places, strict=True):
+        if found.setdefault(place, value) != value:
+            where = ", ".join(f"{key}={number:g}" for key, number in zip(("case", "time"), place, strict=False))
+            raise UserError(f"{where}: {name} is {found[place]:g} in one row and {value:g} in another{remedy}")
+    return dict(sorted(found.items()))
+
+
 def courses(columns: Mapping[str, Sequence[Any]], names: Collection[str]) -> list[dict[str, Array]]:
     """The columns `time` and those of the inputs, of each case.
 
