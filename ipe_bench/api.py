@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from ipe_bench.plugins.conformance import Finding
     from ipe_bench.plugins.discovery import Option
     from ipe_bench.report.answer import Answer
-    from ipe_bench.report.choice import Which
     from ipe_bench.report.run import ReportResult
+    from ipe_bench.report.style import Which
     from ipe_bench.report.summary import Summary
     from ipe_bench.statistics.audit import Audit
     from ipe_bench.trials.design import Criterion, Design

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import NAMES, console, places_and_keys, print_problems, say
-from ipe_bench.report.choice import PAGE, Which
 from ipe_bench.report.run import begin_report
+from ipe_bench.report.style import PAGE, Which
 from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
 from ipe_bench.runs.parts import TRUTH
 from ipe_bench.runs.results import require_results

@@ -20,7 +20,7 @@ from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct, instantiate, known_parameters
 from ipe_bench.plugins.description import Described, options_of
 from ipe_bench.priors import GaussianPrior, Prior
-from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
+from ipe_bench.report.style import PAGE, Which, file_formats, which_figures
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.provenance import TARGET, canonical_json, describe
 from ipe_bench.runs.run import MOST_TRIALS, TRIALS

@@ -1,81 +1,72 @@
-"""The page report.html: one file that is readable on a phone, on paper and without a network."""
+"""The page report.html: one file that is readable on a phone, on paper and without a network, and its charts."""
 
 from __future__ import annotations
 
 import base64
-import hashlib
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from importlib import resources
 from typing import Any
 
 from ipe_bench import __version__
-from ipe_bench.report.charts import Chart
 from ipe_bench.report.definitions import CITATION, definitions
 from ipe_bench.report.figures import Drawn
+from ipe_bench.report.figures.views import View, views
 from ipe_bench.report.headline import about, headline
 from ipe_bench.report.sections import Written
+from ipe_bench.report.style import ON_DARK
 from ipe_bench.report.table import Table, environment
+from ipe_bench.report.tables import without_certified
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.collect import Run
+from ipe_bench.trials.thresholds import FEW
 
 MOST_RUNS = 20
 MOST_COMMANDS = 3
 """At the head of the page; all stand with the provenance."""
+FIGURES = 5
+"""Number of significant figures of a number in a chart."""
 _PYTHON, _UNKNOWN = "from Python", "a command that was not recorded"
 
 
 def render_page(
-    analysis: Analysis,
-    tables: Sequence[Table],
-    figures: Sequence[Drawn],
-    written: Sequence[Written] = (),
-    charts: Sequence[Chart] = (),
+    analysis: Analysis, tables: Sequence[Table], figures: Sequence[Drawn], written: Sequence[Written] = ()
 ) -> str:
-    """The page as text; what plugins have written stands behind our tables."""
+    """The page as text, with the charts of simulated trials; what plugins have written stands behind our tables."""
     from markupsafe import Markup
 
     collection, runs = analysis.collection, _runs(analysis.collection.runs)
     commands = dict.fromkeys(run["command"] for run in runs if run["command"] not in (_PYTHON, _UNKNOWN))
     templates = resources.files("ipe_bench.report") / "templates"
-    script, style = ((templates / name).read_text(encoding="utf-8") for name in ("report.js", "report.css"))
-    page = environment().get_template("report.html.j2")
-    return page.render(
-        version=__version__,
-        script=Markup(script),
-        style=Markup(style),
-        policy=_policy(script, style),
-        about=about(analysis),
-        headline=headline(analysis),
-        collection=collection,
-        title=", ".join(d.resolve().name or str(d) for d in collection.directories),
-        computed=_minute(collection.runs[-1].started) if collection.runs else "",
-        commands=list(commands)[:MOST_COMMANDS],
-        tables=[table for table in tables if not table.appendix],
-        written=written,
-        appendix=[table for table in tables if table.appendix],
-        figures=[_picture(figure) for figure in figures],
-        charts=charts,
-        nothing_failed=analysis.endings.empty and not analysis.summary.empty,
-        runs=runs[:MOST_RUNS],
-        older_runs=max(0, len(runs) - MOST_RUNS),
-        citation=CITATION,
-        definitions=definitions(),
-    )
-
-
-def _policy(script: str, style: str) -> str:
-    """Nothing may be fetched or sent, and no other script or style than ours has a say."""
-    digests = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (script, style)]
     return (
-        f"default-src 'none'; script-src 'sha256-{digests[0]}'; style-src 'sha256-{digests[1]}'; img-src data:;"
-        " base-uri 'none'; form-action 'none'"
+        environment()
+        .get_template("report.html.j2")
+        .render(
+            version=__version__,
+            script=Markup((templates / "report.js").read_text(encoding="utf-8")),
+            style=Markup((templates / "report.css").read_text(encoding="utf-8")),
+            about=about(analysis),
+            headline=headline(analysis),
+            collection=collection,
+            title=", ".join(d.resolve().name or str(d) for d in collection.directories),
+            computed=_minute(collection.runs[-1].started) if collection.runs else "",
+            commands=list(commands)[:MOST_COMMANDS],
+            tables=[table for table in tables if not table.appendix],
+            written=written,
+            appendix=[table for table in tables if table.appendix],
+            figures=[
+                vars(figure) | {"data": base64.b64encode(figure.files[0].read_bytes()).decode()} for figure in figures
+            ],
+            charts=list(charts(views(without_certified(analysis))[0])),
+            nothing_failed=analysis.endings.empty and not analysis.summary.empty,
+            runs=runs[:MOST_RUNS],
+            older_runs=max(0, len(runs) - MOST_RUNS),
+            citation=CITATION,
+            definitions=definitions(),
+        )
     )
-
-
-def _picture(figure: Drawn) -> dict[str, Any]:
-    png, names = base64.b64encode(figure.files[0].read_bytes()).decode(), [path.name for path in figure.files]
-    return {"name": figure.name, "title": figure.title, "caption": figure.caption, "data": png, "files": names}
 
 
 def _runs(runs: Sequence[Run]) -> list[dict[str, Any]]:
@@ -106,3 +97,71 @@ def _runs(runs: Sequence[Run]) -> list[dict[str, Any]]:
 
 def _minute(started: str) -> str:
     return started[:16].replace("T", " ")
+
+
+# Charts --------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A column that an axis may show, logarithmic at first or as a share from none to all; the columns of the ends of
+    its interval; and where a line says what is best."""
+
+    column: str
+    title: str
+    log: bool = False
+    share: bool = False
+    low: str = ""
+    high: str = ""
+    reference: float | None = None
+    reference_title: str = ""
+
+
+_SCALE = Axis("error_scale", "error scale", log=True)
+_COST = Axis("simulations_median", "simulations per trial (median)", log=True)
+_BOUND = {"log": True, "reference": 1.0, "reference_title": "the bound"}
+_AXES = (
+    Axis("success", "success", share=True, low="success_low", high="success_high"),
+    Axis("error_median", "median error / bound", **_BOUND),
+    Axis("error_q95", "95 % error / bound", **_BOUND),
+    Axis("efficiency_capped", "efficiency", low="efficiency_capped_low", high="efficiency_capped_high"),
+    Axis("nees_median", "NEES, median", log=True, reference=1.0, reference_title="honest covariance"),
+    Axis("coverage95", "truth in the 95 % ellipsoid", share=True, reference=0.95, reference_title="honest covariance"),
+    Axis("failed_silent", "failed silently", share=True),
+)
+
+
+def charts(views: Sequence[View]) -> Iterator[dict[str, str]]:
+    """The chart of each setting, over all trials: its name, title and caption, and as JSON what the script draws."""
+    for view in views:
+        rows = view.totals
+        shown = [axis for axis in _AXES if len(rows) and rows[axis.column].map(math.isfinite).any()]
+        if not shown:
+            continue
+        # With one scale alone there is nothing to see against it.
+        across = (_SCALE, _COST) if len(view.scales) > 1 else (_COST, _SCALE)
+        columns = {name for axis in (*across, *shown) for name in (axis.column, axis.low, axis.high) if name}
+        series = [
+            {
+                "name": label,
+                "color": look.color,
+                "on_dark": ON_DARK.get(look.color, look.color),
+                "marker": look.marker,
+                "dash": list(look.dash or ()),
+                "values": {c: [_short(v) for v in part[c]] for c in sorted(columns | {"trials"})},
+            }
+            for label, look in view.look.items()
+            for part in (rows[rows["estimator"] == label],)
+        ]
+        data = {"x": [asdict(a) for a in across], "y": [asdict(a) for a in shown], "few": FEW, "series": series}
+        caption = f"{view.label}. Bars: 95 % intervals, where they are known. Hollow: fewer than {FEW} trials."
+        text = json.dumps(data, ensure_ascii=False, separators=(",", ":"))
+        title = "All trials, by any two columns"
+        yield {"name": f"explore{view.suffix}", "title": title, "caption": caption, "data": text}
+
+
+def _short(value: float) -> float | int | None:
+    """A number as it stands on the page; None for what is not there, and for what JSON cannot say."""
+    if not math.isfinite(value):
+        return None
+    return int(value) if value == int(value) and abs(value) < 1e15 else float(f"{value:.{FIGURES}g}")

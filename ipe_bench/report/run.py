@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from ipe_bench.basics.errors import StorageError
 from ipe_bench.basics.files import write_text
 from ipe_bench.plugins.extensions import digest_of_all, use_statistics
-from ipe_bench.report.choice import PAGE, Which, file_formats, which_figures
+from ipe_bench.report.style import PAGE, Which, file_formats, which_figures
 from ipe_bench.runs.store import Store
 
 if TYPE_CHECKING:
@@ -80,9 +80,7 @@ class Pending:
 
     def written(self) -> ReportResult:
         """Writes all files."""
-        from ipe_bench.report.charts import charts
         from ipe_bench.report.figures import draw_all
-        from ipe_bench.report.figures.views import views
         from ipe_bench.report.headline import headline
         from ipe_bench.report.html import render_page
         from ipe_bench.report.sections import report_tables, written
@@ -98,12 +96,8 @@ class Pending:
         added = [table for section in sections for table in section.tables]
         write_text(output / "summary.csv", analysis.summary.to_csv(index=False))
         files = [path for table in (*tables, *added) for path in write_table(table, output / "tables")]
-        if len(simulated.profiles):
-            files.append(output / "tables" / "profiles.csv")
-            write_text(files[-1], simulated.profiles.to_csv(index=False))
         drawn = draw_all(simulated, output / "figures", which=self.figures, formats=self.formats)
-        page = render_page(analysis, tables, drawn, sections, list(charts(views(simulated)[0])))
-        write_text(output / "report.html", page)
+        write_text(output / "report.html", render_page(analysis, tables, drawn, sections))
         result = ReportResult(
             summary=analysis.summary,
             summary_path=output / "summary.csv",

@@ -1,4 +1,5 @@
-"""How figures look: a colour family for each kind of estimator, a marker and a dash for each member, one theme."""
+"""Which figures a report has, as what files, and how they look: a colour family for each kind of estimator, a marker
+and a dash for each member, one theme. No library that draws is imported until something is drawn."""
 
 from __future__ import annotations
 
@@ -6,8 +7,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, cast, get_args
 
+from ipe_bench.basics.errors import UserError
+
+Which = Literal["all", "main", "none"]
+"""All figures that the data allow, the few that answer the question, or none."""
+PAGE = "png"
+"""The format that is always written, as the page shows it."""
+FORMATS = (PAGE, "pdf", "svg")
 FAMILIES: dict[str, tuple[str, ...]] = {
     "IPE": ("#08519c", "#4292c6", "#08a1b8", "#5e4fd0", "#7fb2e5"),
     "filters": ("#d94801", "#fd9a4e", "#8c2d04", "#e31a3c", "#e6ab02"),
@@ -34,6 +42,22 @@ REFERENCE = "linear_lse"
 BOUND_COLOR, BOUND_DASH = "#444444", (0, (2, 2))
 MOST_FACES = 10
 """Estimators up to which each has a colour; of more, `chosen` ones have, and the others are grey."""
+
+
+def which_figures(asked: Any) -> Which:
+    """The choice that this word is; raises UserError if it is none."""
+    if asked not in get_args(Which):
+        raise UserError(f"figures={asked}: choose all, main or none")
+    return cast(Which, asked)
+
+
+def file_formats(asked: Any) -> tuple[str, ...]:
+    """The formats asked for, in one word or several, with the page's; raises UserError if there is no such format."""
+    words = asked if isinstance(asked, Sequence) and not isinstance(asked, str) else str(asked).strip("[]").split(",")
+    names = [str(word).strip() for word in words]
+    if not names or not set(names) <= set(FORMATS):
+        raise UserError(f"formats={','.join(names)}: choose among {', '.join(FORMATS[:-1])} and {FORMATS[-1]}")
+    return tuple(kind for kind in FORMATS if kind == PAGE or kind in names)
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import pandas as pd
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.report.choice import PAGE
 from ipe_bench.report.figures import drawings
 from ipe_bench.report.run import ReportResult, begin_report
-from ipe_bench.report.style import house_style
+from ipe_bench.report.style import PAGE, house_style
 from ipe_bench.report.table import html, plain_text
 from ipe_bench.report.tables import certified_tables, without_certified
 from ipe_bench.report.terminal import summary_tables
