@@ -401,7 +401,7 @@ def design(
 
     The result has `observability` (singular values, bounds, correlations, the least observable direction),
     `suspects` (what each error of the richer models `errors` does to the estimates, and whether a test of residuals
-    will notice), `ways` and `effects`. The richer models are the scenario's truth, or every option of `measurement`
+    will notice) and `ways`. The richer models are the scenario's truth, or every option of `measurement`
     that is the same model with more errors, unless others are given. A way chooses by one column of the model's index
     or reading by reading; `by` names the columns of one way instead. Its `saving` has the fewest readings whose
     mean bound is not above today's, its `sharpest` the smallest mean bound with `readings` readings (today's number

@@ -17,7 +17,7 @@ from ipe_bench.report.table import Part, Strong, Table, texts, words
 from ipe_bench.report.words import compact, duration, enumerate_few, p_value, percent, plain
 from ipe_bench.report.writer import write
 from ipe_bench.statistics.between import NOT_SETTINGS, described
-from ipe_bench.trials.design import Design, Effect, levels_of
+from ipe_bench.trials.design import Design, levels_of
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
 if TYPE_CHECKING:
@@ -58,8 +58,6 @@ def design_parts(name: str, design: Design) -> Iterator[Part]:
         yield _threshold(design)
     yield from _suspects(design)
     yield from _ways(design)
-    if design.effects:
-        yield _effects(design)
 
 
 def _parameters(name: str, design: Design) -> Table:
@@ -156,21 +154,6 @@ def _ways(design: Design) -> Iterator[Part]:
             entries = [way.units.entries[u][0] for u in way.saving.taken]
             levels = ", ".join(levels_of(design.candidates, way.units.by[0], entry) for entry in entries)
             yield f"{way.saving.readings} readings {way.title}: {levels}"
-
-
-def _effects(design: Design) -> Table:
-    best: dict[tuple[str, str], Effect] = {}
-    for e in sorted(design.effects, key=lambda e: e.mean_bound):
-        if np.isfinite(e.mean_bound):
-            best.setdefault((e.column, e.action), e)
-    found = sorted(best.values(), key=lambda e: (list(design.candidates.index).index(e.column), e.action))
-    cells = [
-        words("what", [f"{e.action} {e.column} {levels_of(design.candidates, e.column, e.entry)}" for e in found]),
-        texts("readings", [str(e.readings) for e in found]),
-        texts("bound", [f"{e.mean_bound:.3f}" for e in found]),
-    ]
-    note = "The best to add, and the one that is missed least."
-    return Table("effects", "One more, one less", "", cells, notes=[note])
 
 
 def write_design(folder: Path, name: str, design: Design) -> list[Path]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import tempfile
 import weakref
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -18,7 +17,7 @@ from ipe_bench.report.style import PAGE, house_style
 from ipe_bench.report.table import html, plain_text
 from ipe_bench.report.tables import certified_tables, without_certified
 from ipe_bench.report.terminal import summary_tables
-from ipe_bench.statistics.analysis import Analysis, analyse
+from ipe_bench.statistics.analysis import analyse
 from ipe_bench.statistics.collect import collect, trials_frame
 from ipe_bench.statistics.summary import ALL
 from ipe_bench.statistics.summary import columns as summary_columns
@@ -35,36 +34,6 @@ class Stored:
         self.folder = Path(tempfile.mkdtemp(prefix="ipe-bench-") if folder is None else folder)
         if not self.named:
             weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
-
-
-class Figures(Mapping[str, "Figure"]):
-    """Figures by their names, each drawn when it is first asked for."""
-
-    def __init__(self, analysis: Analysis) -> None:
-        self._left = drawings(analysis)
-        self._drawn: dict[str, Figure] = {}
-
-    def _next(self) -> bool:
-        """Draws one more; False if there is none."""
-        with house_style():
-            drawing = next(self._left, None)
-        if drawing is not None:
-            self._drawn[drawing.name] = drawing.shown()
-        return drawing is not None
-
-    def __getitem__(self, name: str) -> Figure:
-        while name not in self._drawn:
-            if not self._next():
-                raise KeyError(f"{name}: there are the figures {', '.join(self._drawn) or 'none'}")
-        return self._drawn[name]
-
-    def __iter__(self) -> Iterator[str]:
-        while self._next():
-            pass
-        return iter(self._drawn)
-
-    def __len__(self) -> int:
-        return len(list(iter(self)))
 
 
 class Summary(pd.DataFrame):
@@ -90,9 +59,11 @@ class Summary(pd.DataFrame):
         return trials_frame(collect([self._folder]))
 
     @property
-    def figures(self) -> Figures:
+    def figures(self) -> dict[str, Figure]:
         """The figures of `ib.report` by their names, as Matplotlib's figures."""
-        return Figures(without_certified(analyse([self._folder])))
+        with house_style():
+            drawn = drawings(without_certified(analyse([self._folder])))
+            return {drawing.name: drawing.shown() for drawing in drawn}
 
     def report(self, output: Path | str | None = None, *, figures: Any = "main", formats: Any = PAGE) -> ReportResult:
         """Writes the report into `output`, or else into the folder of the run; see `ib.report`."""

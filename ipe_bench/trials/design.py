@@ -31,7 +31,7 @@ _WEAK = 1e-8
 """What every choice is taken to know beforehand, as a share of what all candidates together say: the first readings
 chosen do not determine the parameters by themselves."""
 _FEW = 3
-"""With fewer units there is nothing to choose that the effects of adding and dropping do not say."""
+"""With fewer units there is nothing to choose."""
 _REACH = 1.25
 """How far a curve goes on beyond today's number of readings."""
 
@@ -98,18 +98,6 @@ class Way:
 
 
 @dataclass(frozen=True)
-class Effect:
-    """What adding or dropping everything with one entry in one column would do."""
-
-    column: str
-    entry: Any
-    action: Literal["add", "drop"]
-    readings: int
-    """Readings afterwards."""
-    mean_bound: float
-
-
-@dataclass(frozen=True)
 class Design:
     """What a scenario's readings say, and what others would."""
 
@@ -121,7 +109,6 @@ class Design:
     threshold: Threshold | None
     """What no estimator can beat, false roots counted in; None without a prior."""
     ways: tuple[Way, ...]
-    effects: tuple[Effect, ...]
 
     @property
     def best(self) -> Way | None:
@@ -174,7 +161,7 @@ def design(
     R_all = scenario.noise.covariance(candidates.m)
     whole = Observability.at(candidates, R_all, x)
     if not whole.observable:
-        return Design(scenario, criterion, candidates, today, _largest(found), limit, (), ())
+        return Design(scenario, criterion, candidates, today, _largest(found), limit, ())
     reference = today if today.observable else whole
     bounds = np.sqrt(np.diagonal(reference.covariance, axis1=1, axis2=2))[:, None, :]
     slopes = R_all.whiten_jacobian(candidates.jacobian(x)) * bounds
@@ -196,8 +183,7 @@ def design(
             f"readings={readings}: no choice {titles} of so few determines all parameters, or there are fewer than"
             f" {_FEW} to choose among; give more readings, or choose by other columns"
         )
-    effects = tuple(_effects(judge, model, candidates, slopes)) if today.observable else ()
-    return Design(scenario, criterion, candidates, today, _largest(found), limit, chosen_ways, effects)
+    return Design(scenario, criterion, candidates, today, _largest(found), limit, chosen_ways)
 
 
 def _largest(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
@@ -326,17 +312,6 @@ def _grown(judge: _Judge, units: Units, most: int) -> Iterator[Choice]:
         gains = judge.gains(P, units.slopes) / sizes
         taken[int(np.argmax(np.where(free, gains, -np.inf)))] = True
         yield _choice(judge, units, taken)
-
-
-def _effects(judge: _Judge, model: Measurement, candidates: Measurement, slopes: Array) -> Iterator[Effect]:
-    """What it does to add or to drop everything with one entry in one column, all else as today."""
-    for column in model.index:
-        units = _units(model, candidates, (column,), slopes)
-        for u, (entry, had) in enumerate(zip(units.entries, units.today, strict=True)):
-            taken = units.today.copy()
-            taken[u] = not had
-            value = judge.value(units.information(taken.astype(float))) if taken.any() else float("inf")
-            yield Effect(column, entry[0], "drop" if had else "add", int(units.sizes[taken].sum()), value)
 
 
 def levels_of(model: Measurement, column: str, entry: Any) -> str:

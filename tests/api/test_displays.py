@@ -50,8 +50,6 @@ def test_trials_and_figures_are_those_of_the_folder_which_goes_with_the_last_fra
     headline = table.figures["headline"]
     assert isinstance(headline, Figure)
     assert headline._repr_png_().startswith(b"\x89PNG")
-    with pytest.raises(KeyError, match="there are the figures headline"):
-        table.figures["haedline"]
     with pytest.raises(ib.UserError, match="give output="):
         table.report()
     other = ib.run(BENCH, ESTIMATORS, trials=5)

@@ -113,17 +113,6 @@ def test_a_cubic_is_best_read_where_theory_says():
     assert np.abs(inner - 1 / np.sqrt(5)).max() < 0.06  # the grid has 0.4 and 0.5
 
 
-def test_effects_are_what_is_left_without_and_with():
-    model = Linear()
-    found = design(scenario(model))
-    everything, today = replace(model, count=9).A, model.A
-    for effect in found.effects:
-        rows = [i for i in range(5) if i != effect.entry] if effect.action == "drop" else [*range(5), effect.entry]
-        assert (effect.entry < 5) == (effect.action == "drop")
-        assert effect.readings == len(rows)
-        assert effect.mean_bound == pytest.approx(mean_bound(everything[rows], today, "A"))
-
-
 def test_bounds_and_correlations_are_those_of_the_covariance():
     model = Linear(count=9)
     R = Covariance(np.full(9, 0.1))
