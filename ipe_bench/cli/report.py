@@ -57,11 +57,11 @@ def show_command(output: Path, cells: Mapping[str, str], figures: Which, formats
     others = sum(cell.key not in cells and cell.label != TRUTH for cell in collection.current) if cells else 0
     shown = collection
     if others:
+        from ipe_bench.statistics.analysis import Begun
         from ipe_bench.statistics.collect import collect
-        from ipe_bench.statistics.summary import rows_of_all
 
         shown = collect([output], cells.keys())
-        rows = rows_of_all(shown)
+        rows = Begun(shown).summary
     _print_table(rows, shown)
     report.write_unless_current()
     # What is wrong with a file or a folder may concern anybody; what other commands lack does not.

@@ -122,12 +122,13 @@ def begin_report(
     Raises:
         UserError: there is no such choice of `figures` (all, main or none) or of `formats` (png, pdf and svg).
     """
-    from ipe_bench.statistics.analysis import begin
+    from ipe_bench.statistics.analysis import Begun
+    from ipe_bench.statistics.collect import collect
 
     kinds, which = file_formats(formats), which_figures(figures)
     place = folders[0] if output is None else Path(output)
     made, faults = _made_from(folders, place, which, kinds), use_statistics()
-    begun = begin(folders)
+    begun = Begun(collect(folders))
     begun.collection.extra_problems += faults
     return Pending(begun, place, which, kinds, made)
 

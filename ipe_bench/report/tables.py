@@ -21,7 +21,6 @@ from ipe_bench.statistics.certified import (
     published_table,
 )
 from ipe_bench.statistics.collect import Collection
-from ipe_bench.statistics.comparisons import ALPHA
 from ipe_bench.statistics.records import SCORES, Where, all_statistics, frame_columns
 from ipe_bench.statistics.summary import ALL
 
@@ -71,8 +70,7 @@ def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]
         rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
         totals = pd.concat([rows, analysis.scores[list(frame_columns(SCORES))]], axis=1)
         made = {w: _recorded(analysis, w, t, c, totals[chosen(totals)]) for w, (t, c, chosen) in _RECORDED.items()}
-        main = (tracks(analysis), made["costs"], comparisons(analysis), ranks(analysis))
-        main = (*main, parameters(analysis), calibration(analysis))
+        main = (tracks(analysis), made["costs"], comparisons(analysis), parameters(analysis), calibration(analysis))
         late = (made["all_trials"], made["solved_trials"], contraction(analysis), made["covariances"])
         late = [*late, theory(analysis), made["iterations"]]
         found = [overview(analysis), *main, *found, *(table and replace(table, appendix=True) for table in late)]
@@ -199,28 +197,6 @@ def comparisons(analysis: Analysis) -> Table | None:
         " pairs of all scenarios."
     )
     return Table("comparisons", "Paired comparisons", caption, columns, rows)
-
-
-def ranks(analysis: Analysis) -> Table | None:
-    """Mean ranks over independent replicates."""
-    ranking = analysis.ranking
-    if ranking is None:
-        return None
-    ordered = sorted(ranking.mean_ranks, key=lambda label: ranking.mean_ranks[label])
-    values = [ranking.mean_ranks[label] for label in ordered]
-    # Nemenyi's test is a follow-up: without a rejection by Friedman's it says nothing.
-    rejects = ranking.friedman < ALPHA
-    apart = ["yes" if rejects and v - values[0] >= ranking.critical_difference else "no" for v in values]
-    columns = [words("estimator", ordered), column("mean rank", values, short), words("apart from the first", apart)]
-    caption = (
-        f"Ranks are by capped mean error over all scenarios and over {ranking.replicates} seeds. Friedman's test that"
-        f" all rank alike: p = {p_value(ranking.friedman)}. Nemenyi's critical difference at 5 %:"
-        f" {ranking.critical_difference:.2f}."
-    )
-    data = pd.DataFrame({"estimator": ordered, "mean_rank": values, "apart_from_first": apart}).assign(
-        replicates=ranking.replicates, friedman_p=ranking.friedman, critical_difference=ranking.critical_difference
-    )
-    return Table("ranks", "Ranks over seeds", caption, columns, data)
 
 
 def endings(analysis: Analysis) -> Table | None:

@@ -1,6 +1,5 @@
 """Statistics: what the stored trials say about the estimators."""
 
-from ipe_bench.statistics.analysis import Analysis, analyse
-from ipe_bench.statistics.summary import summarize
+from ipe_bench.statistics.analysis import Analysis, analyse, summarize
 
 __all__ = ["Analysis", "analyse", "summarize"]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,15 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ipe_bench.basics.statuses import Status
-from ipe_bench.statistics.calibration import POINTS, shared_level
+from ipe_bench.statistics.calibration import POINTS, band
 from ipe_bench.statistics.certified import attained_table
 from ipe_bench.statistics.collect import Collection, Group, collect
-from ipe_bench.statistics.comparisons import Outcomes, Ranking, compare_pairs, corrected, profiles, rank_over_replicates
-from ipe_bench.statistics.formulas import capped_error
+from ipe_bench.statistics.comparisons import Outcomes, common, compare_pairs, corrected, may_be_best, profiles
 from ipe_bench.statistics.intervals import quantile, quantiles
 from ipe_bench.statistics.records import SCORES, rows_of
-from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of
-from ipe_bench.statistics.summary import ALL, scenario_rows, to_frame
+from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of, samples
+from ipe_bench.statistics.summary import BEST, summary_rows, to_frame
 from ipe_bench.statistics.tracks import curves
 
 if TYPE_CHECKING:
@@ -44,7 +43,6 @@ class Analysis:
     """Every pair of estimators on every scenario; see `comparisons.compare_pairs`."""
     scores: pd.DataFrame
     """Per scenario and estimator: capped mean error, and median costs."""
-    ranking: Ranking | None
     profiles: pd.DataFrame
     """Estimator, profile (performance or data), `at` (cost ratio or budget) and share, over all scenarios."""
     distributions: pd.DataFrame
@@ -54,9 +52,9 @@ class Analysis:
     deviations of the bound; none of filters, whose epochs are not iterations. The last distance is zero by definition,
     which says nothing of convergence."""
     calibration: pd.DataFrame
-    """Of each parameter, and of NEES under the parameter `all`: `at`, the `difference` of the empirical distribution
-    function from the uniform one there, the ends `low` and `high` of the band that all of an honest estimator's keep
-    within in 95 % of cases, and whether this one is `outside` (by either of its curves)."""
+    """Of NEES: the probability `at`, the `difference` of the empirical distribution function from the uniform one
+    there, and the ends `low` and `high` of the band; NEES and all parameters of an honest estimator keep within theirs
+    in 95 % of cases."""
     contraction: pd.DataFrame
     """Per scenario, how much the fixed-point iteration contracts at the truth; empty if no file says so."""
     tracks: pd.DataFrame
@@ -81,81 +79,80 @@ class Analysis:
 
 
 def analyse(directories: Sequence[Path | str]) -> Analysis:
-    """Reads what is stored under the directories and computes all statistics; raises what `begin` does."""
-    return begin(directories).finish()
-
-
-def begin(directories: Sequence[Path | str]) -> Begun:
-    """Reads what is stored under the directories and computes the summary, which stands long before all the rest.
+    """Reads what is stored under the directories and computes all statistics.
 
     Raises:
         UserError: a directory does not exist.
     """
-    begun = Begun(collect(directories), [], defaultdict(list), [])
-    for number, groups in enumerate(begun.collection.scenarios.values()):
-        begun.add(number, groups)
-    return begun
+    return Begun(collect(directories)).finish()
 
 
-@dataclass(frozen=True)
+def summarize(directories: Sequence[Path | str]) -> pd.DataFrame:
+    """The summary of everything stored under the directories; empty if there is nothing."""
+    return to_frame(Begun(collect(directories)).summary)
+
+
 class Begun:
     """An analysis of which the summary stands; comparisons, and libraries that take long to load, are still to come."""
 
-    collection: Collection
-    summary: list[dict[str, Any]]
-    """The rows of `Analysis.summary`."""
-    rows: dict[str, list[dict[str, Any]]]
-    """What the other tables are made of, by their names; `replicates` are scenario, seed, estimator and error."""
-    compared: list[tuple[dict[str, Any], dict[str, Outcomes]]]
-    """The columns of each scenario, and the outcomes of its estimators."""
+    def __init__(self, collection: Collection) -> None:
+        self.collection = collection
+        self.summary: list[dict[str, Any]] = []
+        """The rows of `Analysis.summary`."""
+        self._rows: defaultdict[str, list[dict[str, Any]]] = defaultdict(list)
+        """What the other tables are made of, by their names."""
+        self._compared: list[tuple[dict[str, Any], dict[str, Outcomes]]] = []
+        """The columns of each scenario, and the outcomes of its estimators."""
+        for number, groups in enumerate(collection.scenarios.values()):
+            self._add(number, groups)
 
-    def add(self, number: int, groups: Sequence[Group]) -> None:
+    def _add(self, number: int, groups: Sequence[Group]) -> None:
         """Adds what each estimator of a scenario came to."""
-        self.rows["contraction"] += _contraction_rows(self.collection, groups[0])
+        found, summary, outcomes = self._rows, [], {}
+        found["contraction"] += _contraction_rows(self.collection, groups[0])
         where = dict(groups[0].columns) | {"scenario": number}
-
-        def also(sample: Sample, outcome: Outcomes) -> None:
-            head = dict(sample.group.columns) | {"estimator": sample.group.estimator}
-            numbered = where | {"estimator": sample.group.estimator}
-            self.rows["endings"] += [head | row for row in _ending_rows(sample)]
-            self.rows["scores"].append(numbered | rows_of(SCORES, sample)[-1])
-            self.rows["replicates"] += [
-                numbered | {"seed": int(seed), "error": capped_error(sample, sample.seeds == seed)}
-                for seed in np.unique(sample.seeds)
-            ]
-            distances = quantiles(outcome.distance, PROBABILITIES)
-            self.rows["distributions"].append(numbered | {"probability": PROBABILITIES, "distance": distances})
-            self.rows["calibration"] += [numbered | row for row in _calibration_rows(sample)]
-            self.rows["tracks"] += [numbered | row for row in curves(sample)]
-            self.rows["convergence"] += [
+        for sample in samples(self.collection, groups):
+            label = {"estimator": sample.group.estimator}
+            numbered = where | label
+            summary += summary_rows(sample)
+            outcomes[sample.group.estimator] = Outcomes(sample.number, sample.distance, sample.inside_gate, sample.cost)
+            found["endings"] += [dict(sample.group.columns) | label | row for row in _ending_rows(sample)]
+            found["scores"].append(numbered | rows_of(SCORES, sample)[-1])
+            distances = quantiles(sample.distance, PROBABILITIES)
+            found["distributions"].append(numbered | {"probability": PROBABILITIES, "distance": distances})
+            for whole in sample.calibrations[-1:]:
+                low, high = band(len(whole.z), whole.level)
+                curve = {"at": POINTS, "difference": whole.size.difference, "low": low, "high": high}
+                found["calibration"].append(numbered | curve)
+            found["tracks"] += [numbered | row for row in curves(sample)]
+            found["convergence"] += [
                 numbered | {"trial": h.trial, "iteration": np.arange(len(h.distances)), "distance": h.distances}
                 for h in sample.histories
             ]
-
-        rows, outcomes = scenario_rows(self.collection, groups, also)
-        self.summary.extend(rows)
-        self.compared.append((where, outcomes))
+        if outcomes:
+            paired = common(outcomes)
+            best = may_be_best(np.column_stack([outcome.success for outcome in paired.values()]))
+            marks = dict(zip(paired, best.tolist(), strict=True))
+            self.summary += [row | {BEST: marks[row["estimator"]]} for row in summary]
+            self._compared.append((where, outcomes))
 
     def finish(self) -> Analysis:
+        """The whole analysis."""
         import pandas as pd
 
-        labels = [{group.estimator for group in groups} for groups in self.collection.scenarios.values()]
-        # Profiles and ranks compare on the same scenarios only.
-        everywhere = set.intersection(*labels) if labels else set()
         # Corrected over all scenarios: a sweep asks all its questions at once.
-        pairs = [where | pair for where, outcomes in self.compared for pair in compare_pairs(outcomes)]
-        rows = self.rows
+        pairs = [where | pair for where, outcomes in self._compared for pair in compare_pairs(outcomes)]
+        rows = self._rows
         return Analysis(
             collection=self.collection,
             summary=to_frame(self.summary),
             endings=pd.DataFrame(rows["endings"]),
             pairs=pd.DataFrame(corrected(pairs)),
             scores=pd.DataFrame(rows["scores"]),
-            ranking=ranking(pd.DataFrame(rows["replicates"]), everywhere),
-            profiles=profiles([{k: o for k, o in several.items() if k in everywhere} for _, several in self.compared]),
+            profiles=profiles([outcomes for _, outcomes in self._compared]),
             distributions=_joined(rows["distributions"], ("probability", "distance")),
             convergence=_joined(rows["convergence"], ("trial", "iteration", "distance")),
-            calibration=_joined(rows["calibration"], ("parameter", "at", "difference", "low", "high", "outside")),
+            calibration=_joined(rows["calibration"], ("at", "difference", "low", "high")),
             contraction=pd.DataFrame(rows["contraction"]),
             tracks=_joined(rows["tracks"], ("parameter", "at", "rmse")),
             attained=attained_table(self.collection),
@@ -170,20 +167,6 @@ def _joined(parts: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> pd.Da
         return pd.DataFrame(columns=["scenario", "estimator", *columns])
     arrays = [name for name, value in parts[0].items() if isinstance(value, np.ndarray)]
     return pd.DataFrame(list(parts)).explode(arrays, ignore_index=True).infer_objects()
-
-
-def ranking(table: pd.DataFrame, everywhere: set[str]) -> Ranking | None:
-    """Ranks over seeds of the estimators that every scenario has, by the mean capped error over the scenarios that all
-    seeds have. The table has the columns scenario, seed, estimator and error."""
-    if table.empty:
-        return None
-    table = table[table["estimator"].isin(everywhere) & table["error"].notna()]
-    seeds = table["seed"].nunique()
-    whole = table.groupby("scenario")["error"].transform("size") == seeds * len(everywhere)
-    means = table[whole].groupby(["seed", "estimator"], sort=False)["error"].mean()
-    return rank_over_replicates(
-        [{str(e): float(v) for e, v in part.droplevel("seed").items()} for _, part in means.groupby("seed")]
-    )
 
 
 def _contraction_rows(collection: Collection, group: Group) -> list[dict[str, Any]]:
@@ -201,28 +184,17 @@ def _contraction_rows(collection: Collection, group: Group) -> list[dict[str, An
 
 def _ending_rows(sample: Sample) -> list[dict[str, Any]]:
     """How trials ended that did not converge, the commonest ending first; trials without readings are last."""
-    messages = sample.scalars.get("message", np.full(len(sample), ""))
-    found: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
-    for i in np.flatnonzero(~sample.converged):
-        found[str(sample.scalars["status"][i]), str(messages[i] or "")].append(sample.number[i])
-    endings = sorted(found.items(), key=lambda ending: -len(ending[1]))
-    reasons = {s.label: s.reason for s in Status}
-    rows = [
-        (status, message or reasons.get(status, ""), len(numbers), label_of(numbers[0]))
-        for (status, message), numbers in endings[:MESSAGES]
+    lost, reasons = np.flatnonzero(~sample.converged), {s.label: s.reason for s in Status}
+    messages = sample.scalars.get("message", np.full(len(sample), ""))[lost]
+    ended = [
+        (str(s), str(m or reasons.get(s, ""))) for s, m in zip(sample.scalars["status"][lost], messages, strict=True)
     ]
-    if rest := sum(len(numbers) for _, numbers in endings[MESSAGES:]):
+    first = dict(zip(reversed(ended), reversed(sample.number[lost]), strict=True))
+    counts = Counter(ended).most_common()
+    rows = [(*ending, count, label_of(first[ending])) for ending, count in counts[:MESSAGES]]
+    if rest := sum(count for _, count in counts[MESSAGES:]):
         rows.append(("others", "further messages, each rarer", rest, ""))
     if count := len(sample.unread):
         rows.append((Status.NO_READINGS.label, Status.NO_READINGS.reason, count, label_of(sample.unread[0])))
     columns, trials = ("status", "message", "trials", "first", "share"), len(sample) + len(sample.unread)
     return [dict(zip(columns, (*row, row[2] / trials), strict=True)) for row in rows]
-
-
-def _calibration_rows(sample: Sample) -> Iterator[dict[str, Any]]:
-    parts = sample.calibrations
-    level = shared_level(parts)
-    for name, part in zip([*sample.names, ALL] if parts else [], parts, strict=True):
-        low, high = part.band(level)
-        curve = {"parameter": name, "at": POINTS, "difference": part.shown.difference, "low": low, "high": high}
-        yield curve | {"outside": part.p < 1 - level}

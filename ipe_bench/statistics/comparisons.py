@@ -1,5 +1,4 @@
-"""Comparisons of estimators on the same trials: differences of error and of success, ranks over replicates, and what
-success costs.
+"""Comparisons of estimators on the same trials: differences of error and of success, and what success costs.
 
 The error of a trial is its Mahalanobis distance sqrt(e' J' R^-1 J e) from the truth, in standard deviations of the
 Cramér-Rao bound: about sqrt(n) for an efficient estimator. An estimate that is not finite is infinitely wrong.
@@ -24,8 +23,6 @@ if TYPE_CHECKING:
 TIE = 1e-3
 """Errors closer than this, in standard deviations, are equal: round-off is never a difference."""
 ALPHA = 0.05
-REPLICATES = 5
-"""Fewer seeds than this are not ranked: the distribution of Friedman's statistic is not known well enough."""
 RATIOS = np.unique(np.round(np.geomspace(1, 1000, 181), 6))
 BUDGETS = np.unique(np.round(np.geomspace(1, 100_000, 301)))
 """Costs at which performance and data profiles are tabulated: over the cheapest success, and in simulations."""
@@ -136,55 +133,9 @@ def may_be_best(success: Array, level: float = ALPHA) -> Array:
     return p.min(axis=1, initial=1.0) > level / max(k - 1, 1)
 
 
-@dataclass(frozen=True)
-class Ranking:
-    """Mean ranks over independent replicates, 1 being the best, with the difference that tells two apart."""
-
-    mean_ranks: Mapping[str, float]
-    replicates: int
-    friedman: float
-    """P of Friedman's test (J. Amer. Statist. Assoc. 32, 1937) that all estimators rank alike."""
-    critical_difference: float
-    """Nemenyi's, q_0.05 sqrt(k (k + 1) / (6 N)) (Demsar, J. Mach. Learn. Res. 7, 2006, sec. 3.2.2)."""
-
-
-def rank_over_replicates(scores: Sequence[Mapping[str, float]]) -> Ranking | None:
-    """Ranks of the estimators that every replicate has, by their scores in it, the smaller the better.
-
-    A replicate is one observation, and must be independent of the others: all trials of one seed, whatever the error
-    scale, model and noise, since one seed gives the same draws everywhere. None with fewer than two estimators, or
-    fewer than `REPLICATES` replicates.
-    """
-    everywhere = [label for label in (scores[0] if scores else ()) if all(label in s for s in scores)]
-    k, count = len(everywhere), len(scores)
-    if k < 2 or count < REPLICATES:
-        return None
-    from scipy.stats import friedmanchisquare, studentized_range  # late: takes longer to load than all else here
-
-    ranks = np.array([tied_ranks(np.array([s[label] for label in everywhere])) for s in scores])
-    if k == 2:
-        # Friedman's test of two is the sign test; the exact one is taken.
-        friedman = mcnemar(int((ranks[:, 0] < ranks[:, 1]).sum()), int((ranks[:, 0] > ranks[:, 1]).sum()))
-    else:
-        friedman = float(friedmanchisquare(*ranks.T).pvalue) if np.ptp(ranks, axis=1).any() else 1.0
-    q = float(studentized_range.ppf(1 - ALPHA, k, np.inf)) / np.sqrt(2)
-    difference = q * float(np.sqrt(k * (k + 1) / (6 * count)))
-    return Ranking(dict(zip(everywhere, ranks.mean(axis=0).tolist(), strict=True)), count, friedman, difference)
-
-
-def tied_ranks(scores: Array) -> Array:
-    """Ranks from 1; scores closer than `TIE` to the next one share their mean rank."""
-    from scipy.stats import rankdata
-
-    scores = np.where(np.isfinite(scores), scores, np.inf)
-    order = np.argsort(scores, kind="stable")
-    with np.errstate(invalid="ignore"):
-        groups = np.cumsum(np.append(0, np.diff(scores[order]) >= TIE))
-    return rankdata(groups[np.argsort(order, kind="stable")])
-
-
 def profiles(scenarios: Sequence[Mapping[str, Outcomes]]) -> pd.DataFrame:
-    """Which share of all trials each estimator solves at what cost: columns estimator, profile, `at` and share.
+    """Which share of all trials the estimators of every scenario solve at what cost: columns estimator, profile, `at`
+    and share.
 
     `performance`: at a cost of at most `RATIOS` times the cheapest estimator's (Dolan and Moré, Math. Program. 91,
     2002). `data`: within `BUDGETS` simulations (Moré and Wild, SIAM J. Optim. 20, 2009). A trial without success costs
@@ -192,22 +143,19 @@ def profiles(scenarios: Sequence[Mapping[str, Outcomes]]) -> pd.DataFrame:
     """
     import pandas as pd
 
-    ratios: dict[str, list[Array]] = {}
-    costs: dict[str, list[Array]] = {}
-    for outcomes in scenarios:
-        spent = {label: np.where(o.success, o.cost, np.inf) for label, o in common(outcomes).items()}
-        best = np.min(list(spent.values()), axis=0) if spent else np.empty(0)
-        for label, cost in spent.items():
-            solved = np.isfinite(cost)
-            # A cost of nothing, without any simulation, is the best there is.
-            ratio = np.divide(cost, best, out=np.where(solved, 1.0, np.inf), where=solved & (best > 0))
-            ratios.setdefault(label, []).append(ratio)
-            costs.setdefault(label, []).append(cost)
-    parts = []
-    for label in costs:
-        for profile, at, values, slack in (("performance", RATIOS, ratios, 1e-9), ("data", BUDGETS, costs, 0.0)):
-            ordered = np.sort(np.concatenate(values[label]))
-            share = np.searchsorted(ordered, at * (1 + slack), side="right") / max(1, len(ordered))
+    everywhere = [label for label in (scenarios[0] if scenarios else ()) if all(label in one for one in scenarios)]
+    shared = [common({label: outcomes[label] for label in everywhere}) for outcomes in scenarios]
+    spent = {
+        label: np.concatenate([np.where(one[label].success, one[label].cost, np.inf) for one in shared])
+        for label in everywhere
+    }
+    best = np.min(list(spent.values()), axis=0, initial=np.inf)
+    parts = [pd.DataFrame(columns=["estimator", "profile", "at", "share"])] if not spent else []
+    for label, cost in spent.items():
+        solved = np.isfinite(cost)
+        # A cost of nothing, without any simulation, is the best there is.
+        ratio = np.divide(cost, best, out=np.where(solved, 1.0, np.inf), where=solved & (best > 0))
+        for profile, at, values, slack in (("performance", RATIOS, ratio, 1e-9), ("data", BUDGETS, cost, 0.0)):
+            share = np.searchsorted(np.sort(values), at * (1 + slack), side="right") / max(1, len(values))
             parts.append(pd.DataFrame({"estimator": label, "profile": profile, "at": at, "share": share}))
-    columns = ["estimator", "profile", "at", "share"]
-    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
+    return pd.concat(parts, ignore_index=True)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import betaincinv, gammaincinv, ndtri
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.statistics.calibration import overall_p, overall_words, shared_level
+from ipe_bench.statistics.calibration import overall_p, overall_words
 from ipe_bench.statistics.consistency import mean_limits
 from ipe_bench.statistics.histories import FixedPointBound, fixed_point_bound, observed_constant
 from ipe_bench.statistics.intervals import (
@@ -209,10 +209,9 @@ def efficiency_capped_limits(s: Sample) -> Limits:
     return float(ratio(1.0, high[0])), float(ratio(1.0, low[0]))
 
 
-def capped_error(s: Sample, among: Array | None = None) -> float:
-    """Mean Mahalanobis error of the trials that all have (and of `among` alone), each at most the gate's radius."""
-    used = s.present if among is None else s.present & among
-    return float(np.minimum(s.distance[used], np.sqrt(gate(s.n))).mean()) if used.any() else np.nan
+def capped_error(s: Sample) -> float:
+    """Mean Mahalanobis error of the trials that all have, each at most the gate's radius."""
+    return float(np.minimum(s.distance[s.present], np.sqrt(gate(s.n))).mean()) if s.present.any() else np.nan
 
 
 def failed(s: Sample, *, known: bool) -> float:
@@ -411,8 +410,8 @@ def calibration_p(s: Sample) -> Any:
 
 
 def calibration(s: Sample) -> Any:
-    each = [part.words(shared_level(s.calibrations)) for part in s.calibrations[:-1]]
-    return [*each, overall_words(s.calibrations, s.names)] if s.calibrations else "-"
+    words = overall_words(s.calibrations, s.names)
+    return [*(part.words for part in s.calibrations[:-1]), words] if s.calibrations else words
 
 
 def mean_nis(s: Sample) -> float:

@@ -118,11 +118,6 @@ class Sample:
         """(n,)"""
         return np.array(self.group.footer["linear_bound"], dtype=float)
 
-    @property
-    def seeds(self) -> Array:
-        """(trials,)"""
-        return self.number // _SEED
-
     @cached_property
     def cost(self) -> Array:
         """(trials,), in simulations."""

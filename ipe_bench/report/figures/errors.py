@@ -15,7 +15,6 @@ from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
 from ipe_bench.report.style import BOUND_COLOR, looks
 from ipe_bench.report.words import p_value, percent, plain
-from ipe_bench.statistics.summary import ALL
 
 if TYPE_CHECKING:
     from ipe_bench.measurements.base import Measurement
@@ -80,7 +79,6 @@ def draw_calibration(view: View) -> Iterator[Drawing]:
     rows = view["calibration"]
     if rows.empty:
         return
-    rows = rows[rows["parameter"] == ALL]
     look, top = view.with_look(rows["estimator"]), rows["error_scale"].max()
     fig, panels = common.panels_of_scales(rows, look)
     reach = 1.15 * max(LINEAR, float(rows[["difference", "low", "high"]].abs().max().max()))
@@ -103,7 +101,7 @@ def draw_calibration(view: View) -> Iterator[Drawing]:
         "Share of converged trials whose NEES is below each quantile of chi-square, less its nominal probability. The"
         " grey bands are simultaneous: all parameters and NEES stay inside them in 95 % of cases if the covariance is"
         " right; they are light where fewer trials converged. A curve below 0 in the middle means standard deviations"
-        " that are too small, one above 0 too large. The vertical axis is logarithmic beyond ±{LINEAR / 2:g}.",
+        f" that are too small, one above 0 too large. The vertical axis is logarithmic beyond ±{LINEAR / 2:g}.",
         f"At scale {plain(top)}, parameters included, {common.enumerate_few(last, 4)}.",
     )
 
