@@ -38,7 +38,7 @@ BUDGETS = {
     "statistics": 4246,
     "real": 2500,
     "plugins": 1313,
-    "report": 4196,
+    "report": 4176,
     "cli": 2950,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""

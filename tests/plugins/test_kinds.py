@@ -173,7 +173,7 @@ def test_those_that_raise_are_named_and_the_rest_is_whole(ours, capsys):
 
 def test_a_figure_under_the_name_of_ours_is_left_out_and_ours_stays(ours, capsys):
     main(["new", "figure", "mine"])
-    edit_figure("mine", ('f"mine{view.suffix}"', '"cost_against_accuracy"'))
+    edit_figure("mine", ('fig, "mine"', 'fig, "cost_against_accuracy"'))
     capsys.readouterr()
     assert main(["report", "out", MAIN]) == 1
     assert "figure=mine: there is a figure cost_against_accuracy already; it is left out" in capsys.readouterr().err

@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 
 from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, GREY, Look, column
-from ipe_bench.report.words import enumerate_few as enumerate_few
 from ipe_bench.report.words import plain
 from ipe_bench.trials.thresholds import FEW
 
@@ -40,10 +39,6 @@ def panels(count: int, look: Mapping[str, Look] | None = None, *, height: float 
     return fig, axes[:count]
 
 
-def at_scale(frame: pd.DataFrame, scale: float) -> pd.DataFrame:
-    return frame[frame["error_scale"] == scale]
-
-
 def panels_of_scales(rows: pd.DataFrame, look: Mapping[str, Look]) -> tuple[Figure, list[tuple[Axes, pd.DataFrame]]]:
     """A figure with a panel for each error scale, or for some with both ends, and the panels, each with its rows."""
     every = sorted(set(rows["error_scale"]))
@@ -51,7 +46,7 @@ def panels_of_scales(rows: pd.DataFrame, look: Mapping[str, Look]) -> tuple[Figu
     fig, axes = panels(len(scales), look)
     for scale, ax in zip(scales, axes, strict=True):
         title(ax, f"error scale {plain(scale)}")
-    return fig, [(ax, at_scale(rows, scale)) for scale, ax in zip(scales, axes, strict=True)]
+    return fig, [(ax, rows[rows["error_scale"] == scale]) for scale, ax in zip(scales, axes, strict=True)]
 
 
 def text(value: Any) -> str:
@@ -94,17 +89,6 @@ def number(value: float) -> str:
     return words.removeprefix("1·").replace("-", "\N{MINUS SIGN}")
 
 
-def values_of(rows: pd.DataFrame, column: str, *, most: int = 20) -> str:
-    """'a 1.02, b 3.4': a column by estimator, in three figures."""
-    pairs = zip(rows["estimator"], rows[column], strict=True)
-    return enumerate_few([f"{e} {v:.3g}" for e, v in pairs if np.isfinite(v)], most)
-
-
-def sentence(*parts: str) -> str:
-    """The parts of a caption that say something, one after another."""
-    return " ".join(part for part in parts if part)
-
-
 def scale_axis(ax: Axes, scales: Sequence[float], labels: Sequence[str]) -> None:
     """A logarithmic axis that shows the error scales themselves; if there is one alone, the labels side by side."""
     if len(scales) == 1:
@@ -128,13 +112,10 @@ def scale_axis(ax: Axes, scales: Sequence[float], labels: Sequence[str]) -> None
 
 def labelled(scales: Sequence[float], letter: float) -> list[float]:
     """Those of ascending scales whose labels have room, a letter taking so many decades: both ends, and what fits."""
-
-    def apart(a: float, b: float) -> bool:
-        return np.log10(b / a) > letter * (len(plain(a)) + len(plain(b)) + 1) / 2
-
     kept = [scales[0]]
     for scale in scales[1:-1]:
-        if apart(kept[-1], scale) and apart(scale, scales[-1]):
+        beside = (kept[-1], scale), (scale, scales[-1])
+        if all(np.log10(b / a) > letter * (len(plain(a)) + len(plain(b)) + 1) / 2 for a, b in beside):
             kept.append(scale)
     return [*kept, *scales[1:][-1:]]
 
@@ -261,6 +242,5 @@ def legend(fig: Figure, axes: Sequence[Axes], look: Mapping[str, Look] | None = 
         return
     # The most columns that fit side by side, each as wide as its longest label.
     lengths, room = np.array([7 + len(label) for label in handles]), _letters(fig.get_figwidth(), "legend.fontsize")
-    counts = range(len(handles), 1, -1)
-    fitting = (n for n in counts if sum(part.max() for part in np.array_split(lengths, n)) <= room)
-    fig.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=next(fitting, 1))
+    fitting = [n for n in range(1, len(handles) + 1) if sum(p.max() for p in np.array_split(lengths, n)) <= room]
+    fig.legend(list(handles.values()), list(handles), loc="outside upper center", ncols=max(fitting, default=1))

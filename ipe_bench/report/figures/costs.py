@@ -11,7 +11,7 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
 from ipe_bench.report.style import GREY, looks
-from ipe_bench.report.words import plain
+from ipe_bench.report.words import enumerate_few, plain
 from ipe_bench.statistics.certified import data_profile
 
 LEAST_COST = 0.5
@@ -42,7 +42,7 @@ def draw_costs(view: View) -> Iterator[Drawing]:
         common.log_ticks(ax.xaxis, *ax.get_xlim())
     common.axis_labels(fig, "simulations per trial (median)", "95 % error / bound")
     common.legend(fig, fig.axes, look)
-    last = common.at_scale(rows, view.scales[-1])
+    last = rows[rows["error_scale"] == view.scales[-1]]
     good = last[last["error"] <= last["error"].min() * 1.05].sort_values("cost", kind="stable").iloc[0]
     yield view.drawing(
         fig,
@@ -84,7 +84,7 @@ def draw_known_minima(view: View) -> Iterator[Drawing]:
         f"{problems} problems: functions of Moré, Garbow and Hillstrom from their starts. Solved: the sum of squares is"
         " the least known one. Data profile of Moré and Wild: the share solved within that cost, a Jacobian counting n"
         " simulations.",
-        f"Most, {round(final['share'].max() * problems)}, are solved by {common.enumerate_few(best)}.",
+        f"Most, {round(final['share'].max() * problems)}, are solved by {enumerate_few(best)}.",
     )
 
 

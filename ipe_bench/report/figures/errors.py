@@ -14,7 +14,7 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
 from ipe_bench.report.style import BOUND_COLOR, looks
-from ipe_bench.report.words import p_value, percent, plain
+from ipe_bench.report.words import enumerate_few, p_value, percent, plain
 
 if TYPE_CHECKING:
     from ipe_bench.measurements.base import Measurement
@@ -59,7 +59,7 @@ def draw(view: View) -> Iterator[Drawing]:
         common.curves(nees, claims, "nees_median", *shown, **words)
     common.legend(fig, axes, view.look)
     over = "over error scales" if len(view.scales) > 1 else f"at error scale {plain(view.scales[0])}"
-    last = common.at_scale(totals, view.scales[-1]).sort_values("success", ascending=False, kind="stable")
+    last = totals[totals["error_scale"] == view.scales[-1]].sort_values("success", ascending=False, kind="stable")
     ranked = [f"{e} {percent(v)}" for e, v in zip(last["estimator"], last["success"], strict=True)]
     most = f"What exceeds {CEILING['error_median']:g} bounds, or {CEILING['nees_median']:g} times the claimed variance"
     yield view.drawing(
@@ -70,7 +70,7 @@ def draw(view: View) -> Iterator[Drawing]:
         " Clopper-Pearson 95 % intervals. Middle: median error over the bound at the truth, with a bar up to the 95 %"
         " quantile. Right: squared error over the variance that the estimator claims; 1 is right.",
         f"{most}, stands at the top." if beyond else "",
-        f"At scale {plain(view.scales[-1])} succeed: {common.enumerate_few(ranked, 20)}.",
+        f"At scale {plain(view.scales[-1])} succeed: {enumerate_few(ranked, 20)}.",
     )
 
 
@@ -102,7 +102,7 @@ def draw_calibration(view: View) -> Iterator[Drawing]:
         " grey bands are simultaneous: all parameters and NEES stay inside them in 95 % of cases if the covariance is"
         " right; they are light where fewer trials converged. A curve below 0 in the middle means standard deviations"
         f" that are too small, one above 0 too large. The vertical axis is logarithmic beyond ±{LINEAR / 2:g}.",
-        f"At scale {plain(top)}, parameters included, {common.enumerate_few(last, 4)}.",
+        f"At scale {plain(top)}, parameters included, {enumerate_few(last, 4)}.",
     )
 
 
@@ -147,12 +147,13 @@ def draw_residuals(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]
     common.axis_labels(fig, common.text(heading), "residual / its deviation")
     common.legend(fig, axes)
     parts = [f"{one.label} {int(one.outliers.sum())}" for one in shown]
-    caption = common.sentence(
+    caption = (
         "Normalised residuals of the readings; each is standard normal if the model and the noise are right."
-        f" Beyond ±{limit:.2f} a reading is an outlier: {common.enumerate_few(parts, 12)}."
-        " p is that of chi-square, white that of the Ljung-Box test.",
-        f"{len(fits) - len(shown)} further estimators: see residuals.csv." * (len(fits) > len(shown)),
+        f" Beyond ±{limit:.2f} a reading is an outlier: {enumerate_few(parts, 12)}."
+        " p is that of chi-square, white that of the Ljung-Box test."
     )
+    if len(fits) > len(shown):
+        caption += f" {len(fits) - len(shown)} further estimators: see residuals.csv."
     yield Drawing("residuals", "Residuals", caption, fig)
 
 

@@ -12,7 +12,7 @@ from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
 from ipe_bench.report.style import BLACK, BOUND_DASH, COLORS, GREY, MARKERS, REFERENCE, Look
-from ipe_bench.report.words import plain
+from ipe_bench.report.words import enumerate_few, plain
 from ipe_bench.statistics.summary import ALL
 
 MOST_GROUPS = 8
@@ -99,7 +99,7 @@ def _missing(totals: pd.DataFrame) -> str:
     lacking = totals[totals["solved_trials"] < totals["trials"]]
     rows = lacking[["solved_trials", "trials", "error_scale"]].to_numpy()
     seen = [f"{solved:.0f} of {trials:.0f} at scale {plain(scale)}" for solved, trials, scale in rows]
-    return common.enumerate_few(seen, 12) or f"all of {totals['trials'].min():.0f}"
+    return enumerate_few(seen, 12) or f"all of {totals['trials'].min():.0f}"
 
 
 FIGURES = (Figure(draw, ("summary",)),)

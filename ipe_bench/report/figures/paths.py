@@ -59,7 +59,7 @@ def draw_convergence(view: View) -> Iterator[Drawing]:
         common.title(ax, f"{label}, logarithmic from 10" if end > LONG else label)
     common.axis_labels(fig, "iteration", "distance to own limit [σ]")
     common.legend(fig, axes, by_scale)
-    last = common.at_scale(medians, scales[-1])
+    last = medians[medians["error_scale"] == scales[-1]]
     arrived = last[last["distance"] > CLOSE].groupby("estimator", sort=False)["iteration"].max().add(1)
     seen = [f"{label} {arrived.get(label, 0):g}" for label in look if label in set(last["estimator"])]
     yield view.drawing(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
 MOST_SETTINGS = 6
 """Settings that have figures of their own; the tables have all."""
 MOST_LETTERS = 70
-"""Of a setting in a file name; longer ones are cut and end in a digest."""
+"""Of a setting in a file name; longer ones are cut and end in a number."""
 FRAMES = tuple(field.name for field in fields(Analysis) if field.type == "pd.DataFrame")
 """The tables of an analysis that a figure may ask for."""
 
@@ -104,7 +103,7 @@ def views(analysis: Analysis) -> tuple[list[View], View]:
             label += f" ({len(settings) - MOST_SETTINGS} further settings are in the tables)"
         suffix = re.sub(r"[^A-Za-z0-9.]+", "-", "_".join(own.values())).strip("-.")
         if varying and (len(suffix) > MOST_LETTERS or f"_{suffix}" in ("_", *(part.suffix for part in parts))):
-            suffix = f"{suffix[:MOST_LETTERS]}-{hashlib.sha256(repr(setting).encode()).hexdigest()[:8]}"
+            suffix = f"{suffix[:MOST_LETTERS]}-{len(parts) + 1}"
         paper = (setting.get("measurement"), setting.get("noise")) == ("gins", "quantization")
         known = footers[key]["parameters"], paper
         parts.append(View(f"_{suffix}" * bool(varying), label, frames, seen, {e: equations[e] for e in seen}, *known))

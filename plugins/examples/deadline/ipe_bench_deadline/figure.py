@@ -34,12 +34,15 @@ def draw(view: View) -> Iterator[Drawing]:
     common.bound_line(tail, 1.0, "every trial alike")
     common.legend(fig, [by, tail], look)
     last = rows[rows["error_scale"] == view.scales[-1]].sort_values("deadline", kind="stable")
-    caption = common.sentence(
+    told = ", ".join(f"{e} {v:.3g}" for e, v in zip(last["estimator"], last["deadline"], strict=True))
+    yield view.drawing(
+        fig,
+        "deadline",
+        "How long the slowest trials take",
         "The cost by which 99 % of trials are done, well or not, with its 95 % interval where there are trials enough"
         " for one; and how many times the median that is: far above 1, a few trials take most of the time.",
-        f"At the largest scale: {common.values_of(last, 'deadline')}. {view.label}.",
+        f"At the largest scale: {told}.",
     )
-    yield Drawing(f"deadline{view.suffix}", "How long the slowest trials take", caption, fig)
 
 
 FIGURE = Figure(draw, ("summary", "scores"))
