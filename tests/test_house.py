@@ -37,9 +37,9 @@ BUDGETS = {
     "runs": 2230,
     "statistics": 4246,
     "real": 2500,
-    "plugins": 1313,
+    "plugins": 1186,
     "report": 4176,
-    "cli": 2950,
+    "cli": 2552,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""
 PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}

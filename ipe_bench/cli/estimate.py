@@ -1,56 +1,199 @@
-"""`ipe-bench estimate`: parameters from a file of real readings."""
+"""The commands on a single scenario, each with one folder of files: estimate, design and posterior."""
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from ipe_bench import api
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.machine import library_versions
-from ipe_bench.cli import show
-from ipe_bench.cli.single import OF_MANY_TRIALS, say_files, single
+from ipe_bench.cli import console, say, show
+from ipe_bench.cli import words as w
+from ipe_bench.cli.session import changed_by_experiment, composed, jobs_of, session
+from ipe_bench.cli.spec import Spec
+from ipe_bench.cli.words import Words
+from ipe_bench.measurements import Nist
+from ipe_bench.plugins.extensions import richer_models
 from ipe_bench.real.estimation import Opened
+from ipe_bench.report.table import Part
+from ipe_bench.report.writer import reserve_output_folder
 from ipe_bench.runs.provenance import describe, fingerprint
+from ipe_bench.runs.run import validate
+from ipe_bench.trials.design import Criterion
 
 STANDARD_ESTIMATORS = ("solver=[auto]", "baseline=[linear_lse,levenberg_marquardt]")
-"""Unless others are chosen: the one that chooses its way by itself, and two that it can be held against."""
-_OF_RUNS = (*OF_MANY_TRIALS, "trials", "seed", "truth_measurement")
+"""Of `estimate`: the one that chooses its way by itself, and two that it can be held against."""
+OF_MANY_TRIALS = ("precision", "time_limit", "block_size", "formats", "execution", "write_readings")
+OF_MANY_TRIALS += ("write_readings_trial", "objective", "model", "tracker", "trackers")
+"""Keys of runs."""
+OF_CONSTANTS = ("measurement", "truth_measurement", "noise", "prior", "error_scale", "solver", "baseline")
+OF_CONSTANTS += ("estimators", "parameters", "prior_covariance", "write_readings")
+"""Keys of parameters that stand still."""
+OF_FILES = ("readings", "ignore_rows", "ignore_columns")
+"""Keys of estimates from real readings."""
+_TRIALS, _MOST_TRIALS = 3, 100
+"""Of `posterior`."""
 
 
-def main(arguments: Sequence[str]) -> int:
+@dataclass(frozen=True)
+class Single:
+    """What a command was asked for."""
+
+    command: str
+    words: Words
+    spec: Spec
+    config: dict[str, Any]
+    """As it was composed."""
+
+    @property
+    def measurement(self) -> str:
+        """The model, as it was asked for."""
+        model = self.spec.measurement
+        if isinstance(model, Nist):
+            return f"nist/{model.dataset.lower()}"
+        return self.words.chosen("measurement") or model.name
+
+    def folder(self, name: str, identity: Any, files: Sequence[str] = ()) -> Path:
+        """Reserves the folder that was named, or one that is named after the command and the model.
+
+        `identity` tells this command from others, as NAME.json says it; `files` are further files of the command.
+        """
+        output, named = Path(self.spec.output), not {"name", "output"}.isdisjoint(self.words.keys)
+        folder = output if named else output.with_name(f"{self.command}-{self.measurement.replace('/', '-')}")
+        return reserve_output_folder(folder, name, identity, elsewhere=not named, files=files)
+
+
+def single(command: str, arguments: Sequence[str], standard: Sequence[str] = (), **refused: Sequence[str]) -> Single:
+    """The one job that the arguments of a command ask for; `standard` are words that stand unless others are given, and
+    `refused` are keys that mean nothing to it, by whom they are for."""
+    with session():
+        words = w.read(command, arguments)
+        for whose, keys in refused.items():
+            words.refuse(keys, f"is for `ipe-bench {whose}`, and nothing in `ipe-bench {command}`")
+        given = w.read(command, [one for one in standard if one.partition("=")[0] not in words.keys])
+        jobs = jobs_of(Words(given.overrides + words.overrides), multirun=False)
+        return Single(command, words, jobs.specs[0], composed(jobs.words))
+
+
+def require_one_kind(words: Words, spec: Spec) -> None:
+    """Refuses a tracker without a state model, and a state model together with a key of measurements, typed or from an
+    experiment."""
+    if spec.model is None:
+        words.refuse(("tracker", "trackers"), "goes with model=NAME")
+        return
+    words.refuse(OF_CONSTANTS, "is of a measurement, and model= chooses states that move")
+    for experiment, changed in changed_by_experiment(words).items():
+        if key := next((key for key in OF_CONSTANTS if key in changed), None):
+            raise UserError(
+                f"{experiment}: sets {key}, which is of a measurement, and model= chooses states that move; leave out"
+                " one of them"
+            )
+
+
+def _show(parts: Iterable[Part], files: Sequence[Path]) -> None:
+    """Prints tables, and which files a command has written into its folder."""
+    show(parts)
+    say(f"\nIn {files[0].parent}:")
+    console().print(", ".join(path.name for path in files), markup=False)
+
+
+def _described(estimators: Any) -> dict[str, Any]:
+    return {label: describe(estimator) for label, estimator in estimators.items()}
+
+
+def estimate_command(arguments: Sequence[str]) -> int:
     """Estimates with every chosen estimator, prints tables and writes files; exit code 1 where none is an answer."""
-    asked = single("estimate", arguments, STANDARD_ESTIMATORS, run=_OF_RUNS)
-    opened = asked.spec.question(asked.words.keys).opened()
-
     from ipe_bench.report.answer import FILES, NAME, Answer, contents, write_answer
 
+    asked = single("estimate", arguments, STANDARD_ESTIMATORS, run=(*OF_MANY_TRIALS, "trials", "seed", w.TRUTH))
+    opened = asked.spec.question(asked.words.keys).opened()
     command = _command(opened)
     folder = asked.folder(NAME, command, FILES)
     answer = Answer.to(opened, asked.measurement)
-    written = {"measurement": asked.measurement, "config": asked.config, **_provenance(opened)}
-    files = write_answer(folder, answer, command, written, figures=asked.spec.figures != "none")
-    show(contents(answer))
-    say_files(files)
+    provenance = {
+        "measurement": asked.measurement,
+        "config": asked.config,
+        "written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "readings": [{"file": file, "sha256": digest} for file, digest in opened.readings.files] or None,
+        "libraries": library_versions(),
+        **fingerprint([opened.scenario, *opened.question.estimators.values()]),
+    }
+    files = write_answer(folder, answer, command, provenance, figures=asked.spec.figures != "none")
+    _show(contents(answer), files)
     return 0 if answer.passes else 1
 
 
 def _command(opened: Opened) -> dict[str, Any]:
-    """What tells this command from others: what was asked for, whatever the file holds today."""
+    """What tells this command from others: what was asked for, not what the file holds today."""
     question = opened.question
     files = question.readings
     return {
         "readings": [str(path.resolve()) for path in files] if isinstance(files, tuple) else None,
         "scenario": describe(opened.scenario),
         "prior": question.has_prior,
-        "estimators": {label: describe(estimator) for label, estimator in question.estimators.items()},
+        "estimators": _described(question.estimators),
         **({"left_out": describe(question.left_out)} if question.left_out else {}),
     }
 
 
-def _provenance(opened: Opened) -> dict[str, Any]:
-    return {
-        "written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "readings": [{"file": file, "sha256": digest} for file, digest in opened.readings.files] or None,
-        "libraries": library_versions(),
-        **fingerprint([opened.scenario, *opened.question.estimators.values()]),
+def design_command(
+    arguments: Sequence[str], by: Sequence[str] | None, readings: int | None, criterion: Criterion
+) -> int:
+    """Prints tables and writes files; exit code 1 where the readings do not determine every parameter."""
+    from ipe_bench.report.questions import READINGS, design_parts, write_design
+
+    if any(word.lstrip("+").startswith("readings=") for word in arguments):
+        raise UserError("readings: is for `ipe-bench estimate`; the number to choose is --readings NUMBER")
+    of_runs = (*OF_MANY_TRIALS, "figures", "trials", "solver", "baseline", "estimators")
+    asked = single("design", arguments, run=of_runs, estimate=OF_FILES)
+    scenario = asked.spec.scenario
+    if scenario.noise.real:
+        raise UserError("noise=certified: a design is of readings that are still to be taken; choose another noise")
+    errors = richer_models(scenario)
+    found = api.design(scenario, by=by, readings=readings, criterion=criterion, errors=errors)
+    command = {
+        "scenario": describe(dataclasses.replace(scenario, truth=None)),
+        "errors": [describe(error) for error in errors],
+        "by": None if by is None else list(by),
+        "readings": readings,
+        "criterion": criterion,
     }
+    files = write_design(asked.folder("design", command, (READINGS,)), asked.measurement, found)
+    _show(design_parts(asked.measurement, found), files)
+    return 0 if found.observability.observable else 1
+
+
+def posterior_command(arguments: Sequence[str], particles: int) -> int:
+    """Samples, prints a table and writes files; exit code 1 where the populations of a trial do not agree."""
+    from ipe_bench.report.questions import posterior_parts, write_posteriors
+
+    asked = single("posterior", arguments, run=(*OF_MANY_TRIALS, "figures"), estimate=OF_FILES)
+    job, name, scenario = asked.spec, asked.measurement, asked.spec.scenario
+    trials = job.count if "trials" in asked.words.keys else _TRIALS
+    if trials > _MOST_TRIALS:
+        raise UserError(f"trials={trials}: each takes up to a minute; give at most {_MOST_TRIALS}")
+    if scenario.noise.real:
+        raise UserError("noise=certified: has no prior to begin with; choose another noise and an error_scale")
+    validate([scenario], job.estimators, trials)
+    command = {
+        "scenario": describe(scenario),
+        "estimators": _described(job.estimators),
+        "trials": trials,
+        "particles": particles,
+    }
+    folder = asked.folder("posterior", command)
+
+    def tell(trial: int) -> None:
+        print(f"{name}: trial {trial + 1} of {trials}", file=sys.stderr, flush=True)
+
+    found = api.posterior(scenario, job.estimators, trials, particles=particles, watch=tell)
+    title = f"{name}, {scenario.noise.name}, error scale {scenario.error_scale:g}"
+    files = write_posteriors(folder, name, title, scenario.measurement, found)
+    _show(posterior_parts(title, found), files)
+    return 0 if all(one.posterior.settled for one in found) else 1

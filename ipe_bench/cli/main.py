@@ -11,10 +11,18 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
+from ipe_bench import __version__
 from ipe_bench.basics.errors import StorageError, UserError, shortened, unknown
-from ipe_bench.cli import discard_output, interrupts
+from ipe_bench.cli import discard_output
 from ipe_bench.cli.parser import COMMANDS, parsers
 
+HOMES = {
+    "run": "run",
+    **dict.fromkeys(("estimate", "design", "posterior"), "estimate"),
+    **dict.fromkeys(("report", "compare", "audit", "bundle", "status"), "results"),
+    **dict.fromkeys(("list", "check", "new"), "components"),
+}
+"""The module of each command, which is loaded when the command is given."""
 GONE = {
     "completion": 'eval "$(ipe-bench -sc install=bash)" lets bash complete (install=zsh, install=fish likewise); names '
     "inside of lists are no longer completed",
@@ -25,7 +33,6 @@ GONE = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit code."""
-    interrupts.install()
     words = list(sys.argv[1:] if argv is None else argv)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # one that knows no Greek letters shows question marks
@@ -56,8 +63,8 @@ def _explain(error: BaseException) -> tuple[int, str]:
     """The exit code and the line for what ended the command; raises again what is a bug."""
     from ipe_bench.plugins.discovery import blame
 
-    if isinstance(error, KeyboardInterrupt) or interrupts.came():
-        return interrupts.EXIT_CODE, interrupts.STOPPED
+    if isinstance(error, KeyboardInterrupt):
+        return 130, "stopped; what was computed is kept, and the same command goes on from there"
     if isinstance(error, UserError | StorageError):
         return 2 if isinstance(error, UserError) else 1, " ".join(str(error).split())
     if isinstance(error, OSError):
@@ -84,8 +91,6 @@ def _dispatch(words: list[str]) -> int:
         parsers()[0].print_help()
         return 0
     if command == "--version":
-        from ipe_bench import __version__
-
         print(f"ipe-bench {__version__}")
         return 0
     if command in ("-sc", "--shell-completion"):  # asked of the bare program; only `run` has anything to complete
@@ -99,5 +104,5 @@ def _dispatch(words: list[str]) -> int:
     if any(word in ("-h", "--help") for word in rest):
         parser.print_help()
         return 0
-    main_of = importlib.import_module(f"ipe_bench.cli.{command}").main
-    return main_of(rest) if command == "run" else main_of(**vars(parser.parse(rest)))
+    begin = getattr(importlib.import_module(f"ipe_bench.cli.{HOMES[command]}"), f"{command}_command")
+    return begin(rest) if command == "run" else begin(**vars(parser.parse(rest)))

@@ -6,14 +6,13 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 
 from rich.console import Console
-from rich.progress import BarColumn, ProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bar
-from rich.progress import Task as BarTask
-from rich.table import Column
-from rich.text import Text
 
+from ipe_bench.basics.errors import shortened
 from ipe_bench.runs.schedule import Progress, Watcher
 
 LINE_EVERY_S = 10.0
@@ -23,15 +22,31 @@ LINE_EVERY_S = 10.0
 def shown_progress(title: str) -> Iterator[Watcher]:
     """Yields what `compute` is to call. Warnings of ipe-bench are shown above the bar meanwhile."""
     console = Console(stderr=True, highlight=False)
-    handler = _Lines(console)
-    logger = logging.getLogger("ipe_bench")
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=10),
+        TextColumn("{task.fields[state]}"),
+        TimeElapsedColumn(),
+    )
+    bar = Bar(*columns, console=console, disable=not console.is_terminal)
+    line = bar.add_task(shortened(title, max(30, console.width - 80)), total=None, state="")
+    spoken = time.monotonic()
+
+    def watch(progress: Progress) -> None:
+        nonlocal spoken
+        state = _state(progress)
+        # A job without estimators to run still has its truth to store: then blocks stand in for trials.
+        total, done = (progress.total, progress.trials) if progress.total else (progress.tasks, progress.done)
+        bar.update(line, total=total or 1, completed=done if total else 1, state=state)
+        if not console.is_terminal and (progress.done == progress.tasks or time.monotonic() - spoken >= LINE_EVERY_S):
+            spoken = time.monotonic()
+            console.print(f"{title}: {state}", markup=False, soft_wrap=True)
+
+    logger, handler = logging.getLogger("ipe_bench"), _Lines(console)
     logger.addHandler(handler)
     try:
-        if console.is_terminal:
-            with _bar(console) as bar:
-                yield _bar_watcher(bar, title)
-        else:
-            yield _line_watcher(console, title)
+        with bar:
+            yield watch
     finally:
         logger.removeHandler(handler)
 
@@ -47,75 +62,17 @@ class _Lines(logging.Handler):
         self.console.print(f"ipe-bench: {record.getMessage()}", markup=False, soft_wrap=True)
 
 
-class _Title(ProgressColumn):
-    """What gives way where the terminal is narrow; the numbers stay whole."""
-
-    def render(self, task: BarTask) -> Text:
-        return Text(task.description, no_wrap=True, overflow="ellipsis")
-
-
-def _bar(console: Console) -> Bar:
-    columns = (
-        _Title(),
-        BarColumn(bar_width=10, table_column=Column(no_wrap=True)),
-        TextColumn("{task.fields[state]}", table_column=Column(no_wrap=True)),
-        TimeElapsedColumn(table_column=Column(no_wrap=True)),
-    )
-    return Bar(*columns, console=console)
-
-
-def _bar_watcher(bar: Bar, title: str) -> Watcher:
-    line = bar.add_task(title, total=None, state="")
-
-    def watch(progress: Progress) -> None:
-        state = _state(progress) if progress.tasks else "nothing left to compute"
-        # A job without estimators to run still has its truth to store: then blocks stand in for trials.
-        total, done = (progress.total, progress.trials) if progress.total else (progress.tasks, progress.done)
-        bar.update(line, total=total or 1, completed=done if total else 1, state=state)
-
-    return watch
-
-
 def _state(progress: Progress) -> str:
     """How far a job is, with the rate and the forecast once there are any."""
-    failed = f", {len(progress.failures)} failed" if progress.failures else ""
-    rate = f", {_rounded(progress.rate)} estimates/s" if progress.rate else ""
-    left = "" if progress.seconds_left is None else f", {duration(progress.seconds_left)} left"
-    return f"block {progress.done}/{progress.tasks}{failed}" + (
-        ", compiling, once" if progress.preparing else rate + left
-    )
-
-
-def _line_watcher(console: Console, title: str) -> Watcher:
-    began = spoken = time.monotonic()
-
-    def say(text: str) -> None:
-        console.print(f"{title}: {text}", markup=False, soft_wrap=True)
-
-    def watch(progress: Progress) -> None:
-        nonlocal spoken
-        now = time.monotonic()
-        if not progress.tasks:
-            say("nothing left to compute")
-        elif progress.done == progress.tasks:
-            failed = f", {len(progress.failures)} failed" if progress.failures else ""
-            blocks = "1 block" if progress.tasks == 1 else f"{progress.tasks} blocks"
-            say(f"{blocks}{failed} in {duration(now - began)}, {_rounded(progress.rate)} estimates/s")
-        elif now - spoken >= LINE_EVERY_S:
-            spoken = now
-            say(_state(progress))
-
-    return watch
-
-
-def _rounded(rate: float) -> str:
-    return f"{rate:.0f}" if rate >= 10 else f"{rate:.2g}"
-
-
-def duration(seconds: float) -> str:
-    """A time for people: 2.5 s, 3 min 20 s, 5 h 07 min."""
-    if seconds < 60:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s"
+    if not progress.tasks:
+        return "nothing left to compute"
+    state = f"block {progress.done}/{progress.tasks}"
+    if progress.failures:
+        state += f", {len(progress.failures)} failed"
+    if progress.preparing:
+        return f"{state}, compiling, once"
+    if progress.rate:
+        state += f", {progress.rate:.0f} estimates/s" if progress.rate >= 10 else f", {progress.rate:.2g} estimates/s"
+    if progress.seconds_left is not None and progress.done < progress.tasks:
+        state += f", {timedelta(seconds=round(progress.seconds_left))} left"
+    return state

@@ -13,21 +13,19 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from ipe_bench.basics.errors import UserError
-from ipe_bench.cli import interrupts, say
+from ipe_bench.basics.errors import UserError, shortened
+from ipe_bench.cli import say
 from ipe_bench.cli import words as w
-from ipe_bench.cli.dry_run import DryRun
-from ipe_bench.cli.parser import INFO_TOPICS, parsers
+from ipe_bench.cli.estimate import OF_FILES, require_one_kind
+from ipe_bench.cli.parser import parsers
 from ipe_bench.cli.progress import shown_progress
-from ipe_bench.cli.report import show_command
+from ipe_bench.cli.results import show_report
 from ipe_bench.cli.session import Jobs, complete, jobs_of, session, show, spec_of
-from ipe_bench.cli.single import OF_FILES, require_one_kind
 from ipe_bench.cli.spec import STANDARD_FILTERS, Spec
-from ipe_bench.measurements import Nist
 from ipe_bench.runs.execution import Serial
 from ipe_bench.runs.execution.processes import end_idle
-from ipe_bench.runs.provenance import digest
-from ipe_bench.runs.run import accept, compute, record_refusal, result_keys
+from ipe_bench.runs.results import Results
+from ipe_bench.runs.run import accept, compute, record_refusal, result_keys, validate
 from ipe_bench.runs.store import describe_names
 
 
@@ -62,7 +60,7 @@ class Outcome:
         return self.objective
 
 
-def main(arguments: Sequence[str]) -> int:
+def run_command(arguments: Sequence[str]) -> int:
     """Computes and shows; exit code 1 where something failed or is missing."""
     flags = _flags(arguments)
     folder = None if flags.config_dir is None else Path(flags.config_dir)
@@ -84,7 +82,8 @@ def main(arguments: Sequence[str]) -> int:
         for one in jobs.specs:
             _ = one.scenario  # whose parts may not suit one another
         if flags.dry_run:
-            return _say_what_is_missing(jobs)
+            say(*_missing(jobs))
+            return 0
         if words.standard_baselines:
             say(*_left_out(jobs.specs))
         task = Task(shlex.join(["ipe-bench", "run", *arguments]), words)
@@ -94,13 +93,22 @@ def main(arguments: Sequence[str]) -> int:
     return _conclude(jobs, outcomes)
 
 
-def _say_what_is_missing(jobs: Jobs) -> int:
-    dry = DryRun()
+def _missing(jobs: Jobs) -> list[str]:
+    """What is stored of each job and what is missing, a line each, and the sums."""
+    lines, stored, missing = [], 0, 0
     # The words of a job are not known where a sweeper of Hydra's chooses them.
-    for told, one in zip(jobs.told or [jobs.words.text] * len(jobs.specs), jobs.specs, strict=True):
-        print(dry.add(one, title(one, w.as_typed(told, jobs.words.files))))
-    print(dry.summary())
-    return 0
+    for told, job in zip(jobs.told or [jobs.words.text] * len(jobs.specs), jobs.specs, strict=True):
+        validate([job.scenario], job.estimators, job.count, job.block_size)
+        cells, output = result_keys(job.scenario, job.estimators)[1:], Path(job.output)
+        results = Results.read([output] if output.is_dir() else [], keys={cell.key for cell in cells})
+        lacking = sum(stop - start for cell in cells for start, stop in results.missing(cell.key, job.count))
+        asked = job.count * len(cells)
+        most = "" if job.precision is None else "at most "
+        more = f", {most}{lacking} are missing" if lacking else ""
+        name = title(job, w.as_typed(told, jobs.words.files))
+        lines.append(f"{name}: {asked - lacking} of {asked} estimates are stored{more}")
+        stored, missing = stored + asked - lacking, missing + lacking
+    return [*lines, f"{stored} estimates are stored, {missing} would be computed; nothing was computed now"]
 
 
 def _left_out(jobs: Sequence[Spec]) -> list[str]:
@@ -113,12 +121,7 @@ def _left_out(jobs: Sequence[Spec]) -> list[str]:
 
 def _flags(arguments: Sequence[str]) -> Namespace:
     """The flags, and the other words as `overrides`."""
-    waiting = list(arguments)
-    for i, word in enumerate(waiting):
-        # The topic may be left out: what follows may be an override as well.
-        if word in ("-i", "--info") and (i + 1 == len(waiting) or waiting[i + 1] not in INFO_TOPICS):
-            waiting[i] = "--info=all"
-    flags = parsers()[1]["run"].parse(waiting)
+    flags = parsers()[1]["run"].parse(arguments)
     asked = [f"--{name}" for name in ("multirun", "cfg", "info", "shell_completion") if vars(flags)[name]]
     if len(asked) > 1:
         raise UserError(f"run: {' '.join(asked).replace('_', '-')}: do not go together; choose one")
@@ -171,7 +174,6 @@ def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
     if job.write_readings is not None:
         write_trial(job, Path(job.write_readings), job.write_readings_trial)
         return begun
-    interrupts.begin_work()
     name = title(job, begun.words)
     asked: Any = ([job.scenario], job.estimators, job.count, job.output)
     options: dict[str, Any] = {"execution": job.execution, "block_size": job.block_size, "command": command}
@@ -200,7 +202,11 @@ def _conclude(jobs: Jobs, outcomes: list[Outcome]) -> int:
     end_idle()  # a report on many trials has use for their memory
     first, refused = jobs.specs[0], [one for one in outcomes if one.mistake]
     if jobs.multirun and first.write_readings is None:
-        _note_refusals(jobs.specs, outcomes)
+        known = jobs.specs if len(jobs.specs) == len(outcomes) else [None] * len(outcomes)
+        for one, spec in zip(outcomes, known, strict=True):
+            if one.mistake:
+                parts: Any = () if spec is None else (spec.scenario, spec.estimators, spec.count)
+                record_refusal(one.output, one.job, one.mistake, *parts)
     code = 1 if any(one.failures or one.precision_missed for one in outcomes) else 0
     folders: dict[str, dict[str, str]] = {}
     # Of jobs that a sweeper ran in other processes nothing is known but the folder.
@@ -208,7 +214,7 @@ def _conclude(jobs: Jobs, outcomes: list[Outcome]) -> int:
         folders.setdefault(one.output, {}).update(one.cells)
     for output, cells in folders.items():
         if (Path(output) / "trials").is_dir() and first.write_readings is None:
-            code = max(code, show_command(Path(output), cells, first.figures, first.formats))
+            code = max(code, show_report([Path(output)], Path(output), first.figures, first.formats, cells))
     say(*dict.fromkeys(f"Note: {remark}" for one in outcomes for remark in one.remarks))
     say(*_best(outcomes, jobs.maximises), *(one.stop for one in outcomes if one.stop))
     if refused:
@@ -225,15 +231,6 @@ def _refused(outcomes: Sequence[Outcome], *, told: bool) -> str:
     return "; ".join(f"{r} (refused: {jobs[0]}{more[r]})" if told else r for r, jobs in which.items())
 
 
-def _note_refusals(specs: Sequence[Spec], outcomes: Sequence[Outcome]) -> None:
-    """Notes the refused jobs of a sweep in its folder, which holds what was asked for."""
-    known = specs if len(specs) == len(outcomes) else [None] * len(outcomes)
-    for one, spec in zip(outcomes, known, strict=True):
-        if one.mistake:
-            parts: Any = () if spec is None else (spec.scenario, spec.estimators, spec.count)
-            record_refusal(one.output, one.job, one.mistake, *parts)
-
-
 def _best(outcomes: Sequence[Outcome], maximises: bool) -> list[str]:
     """The best job in a line, with those of its words that not all jobs have; none where no job has an objective."""
     known = [one for one in outcomes if one.objective is not None and not one.mistake]
@@ -246,28 +243,20 @@ def _best(outcomes: Sequence[Outcome], maximises: bool) -> list[str]:
     return [f"Objective {float(best):.6g}{of}" + (own and f": {own}")]
 
 
-_IN_EVERY_TITLE = {"measurement", "measurement.dataset", w.HYDRAS_TRUTH, "noise", "error_scale", "seed"}
-_NOT_TELLING = {*w.NO_PART_OF_A_NAME, "model", "solver", "baseline", "tracker"} - {"seed"}
+_NOT_TELLING = {*w.NO_PART_OF_A_NAME, "solver", "baseline", "tracker"} - {"seed"}
 """Keys that tell no job of a sweep from another."""
 
 
 def title(job: Spec, words: Sequence[str]) -> str:
-    """What a job is about, for its progress bar: everything that may tell it from other jobs of a sweep."""
-    scenario = job.scenario
-    model = scenario.measurement
-    parts = [f"nist {model.dataset}" if isinstance(model, Nist) else model.name]
-    if scenario.truth is not None:
-        parts.append(f"truth {scenario.truth.name}")
-    if not scenario.noise.real:
-        parts += [scenario.noise.name, f"error scale {scenario.error_scale:g}", f"seed {scenario.seed}"]
-    told = (word for word in _telling(words) if word.partition("=")[0] not in _IN_EVERY_TITLE)
-    parts += [word if len(word) <= 40 else f"{word[:30]}… #{digest(word)[:6]}" for word in told]
-    return ", ".join(parts)
+    """What a job is about, for its progress bar: its model, and everything that may tell it from others of a sweep."""
+    told = _telling(words)
+    model = [] if any(word.startswith(("measurement", "model")) for word in told) else [job.scenario.measurement.name]
+    return ", ".join(shortened(word, 60) for word in (*model, *told))
 
 
 def _telling(words: Sequence[str]) -> list[str]:
     """Those words of a job that may tell it from the others of a sweep."""
-    keys = {word.lstrip("+~"): word.lstrip("+~").partition("=")[0] for word in words}
+    keys = {word.lstrip("+~").replace(w.HYDRAS_TRUTH, w.TRUTH): word.lstrip("+~").partition("=")[0] for word in words}
     return [word for word, key in keys.items() if key not in _NOT_TELLING and not key.startswith("execution")]
 
 

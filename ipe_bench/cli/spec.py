@@ -18,7 +18,6 @@ from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.noise import ModelNoise, Noise
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.construct import construct, instantiate, known_parameters
-from ipe_bench.plugins.description import Described, options_of
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.report.style import PAGE, Which, file_formats, which_figures
 from ipe_bench.runs.execution import Execution
@@ -49,60 +48,36 @@ STANDARD_FILTERS = ("ekf", "ukf")
 
 @dataclass(frozen=True, kw_only=True)
 class Spec(Component):
-    """One job."""
+    """One job; `ipe-bench run --help` says what its keys mean."""
 
     measurement: Measurement
     noise: Noise
     prior: Prior
     execution: Execution
     estimators: Mapping[str, Any]
-    """By label."""
     output: str
-    """The folder of the results."""
     model: StateModel | None = None
-    """States that move, in place of a measurement."""
     trackers: Mapping[str, Any] = field(default_factory=dict)
-    """What estimates them, by label."""
     name: str = "${default_name}"
-    """Names the output folder."""
     default_name: str = "gins"
     """What the command asks for, in short: names the output folder where nothing else does."""
     truth_measurement: Measurement | None = None
-    """What simulates the readings, where it differs from what the estimators assume."""
     error_scale: Positive = 1.0
-    """Standard deviation of the true parameters, in multiples of their units."""
     seed: Whole = 0
-    """Of all random draws."""
     trials: Count | None = None
-    """1000 unless given; with a precision, the most there may be."""
     precision: Any = None
-    """Half-width that success shares are to be known to (0.01), or {success: 0.01, rmse: 0.05}: just enough trials."""
     time_limit: Positive | None = None
-    """Seconds after which, with a precision, no more blocks are begun."""
     figures: Which = "main"
-    """Which to draw: all, main (the few that answer the question), or none."""
     formats: Any = PAGE
-    """Of the figures' files: png, and what is named of pdf and svg as well."""
     block_size: Count | None = None
-    """Trials per unit of work; changes no number. 250 unless given, and up to 1000 of a hundred thousand trials."""
     readings: str | tuple[str, ...] | None = None
-    """A file of real readings, for `estimate`, or a list of files that are estimated together."""
     ignore_rows: Any = None
-    """Rows of the file to leave out, by their numbers: their readings are missing. Of several files FILE:NUMBER."""
     ignore_columns: Any = None
-    """Columns of the file to leave out."""
     write_readings: str | None = None
-    """Write the simulated readings of one trial to this file instead of running."""
     write_readings_trial: Whole = 0
-    """The number of that trial."""
     parameters: Mapping[str, Any] | None = None
-    """What is known of the parameters: parameters.NAME.fixed=, .nominal=, .deviation=, .lower=, .upper=, .positive=; or
-    a YAML file of that, parameters=FILE."""
     prior_covariance: Any = None
-    """P0 of the parameters in their own units, at error scale 1: a matrix in their order, or a CSV file with their
-    names in its header."""
     objective: str | None = None
-    """LABEL.COLUMN, such as newton.capped_error: a number of each job, which sweepers that optimise make small."""
 
     def __post_init__(self) -> None:
         which_figures(self.figures)
@@ -203,11 +178,6 @@ class Spec(Component):
 KEYS = tuple(field.name for field in fields(Spec))
 DEFAULTS = {field.name: "???" if field.default is MISSING else field.default for field in fields(Spec)}
 DEFAULTS |= {"estimators": {}, "trackers": {}}
-
-
-def keys_of_a_run() -> list[Described]:
-    """The keys besides the groups, with their types, defaults and meanings."""
-    return [one for one in options_of(Spec, DEFAULTS, {}) if one.name not in (*PARTS, "estimators", "trackers")]
 
 
 def spec(plain: Mapping[Any, Any]) -> Spec:

@@ -1,27 +1,23 @@
-"""From config to components: `_target_` names the class, the other keys are its fields.
-
-A component is a frozen dataclass: its fields are its config and its identity. Only classes of registered packages are
-constructed, and nothing read back from results ever is.
-"""
+"""From config to components, and the options of a component in words: `_target_` names the class, the other keys are
+its fields. Only classes of registered packages are constructed."""
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import importlib
+import inspect
+import json
+import textwrap
 from collections.abc import Mapping
+from dataclasses import MISSING, dataclass
 from typing import Any
 
 from ipe_bench.basics.errors import UserError, did_you_mean, place_of, unknown
-from ipe_bench.basics.options import checked, option_types
+from ipe_bench.basics.options import checked, describe_type, option_types
 from ipe_bench.measurements.known import ParameterInfo
+from ipe_bench.plugins import discovery
 from ipe_bench.runs.provenance import TARGET
-
-_registered_packages: set[str] = {"ipe_bench"}
-
-
-def register_package(name: str) -> None:
-    """Lets components of that top-level package be constructed from configs."""
-    _registered_packages.add(name)
 
 
 def construct(config: Any, where: str) -> Any:
@@ -49,8 +45,8 @@ def find_object(target: Any, where: str) -> Any:
     """What has that dotted name in a registered package."""
     where = f"{where}.{TARGET}={target}"
     module_name, _, name = str(target).rpartition(".")
-    if module_name.split(".")[0] not in _registered_packages:
-        known = ", ".join(sorted(_registered_packages))
+    if module_name.split(".")[0] not in discovery.packages:
+        known = ", ".join(sorted(discovery.packages))
         raise UserError(f"{where}: only classes of these packages are constructed: {known}")
     try:
         module = importlib.import_module(module_name)
@@ -105,3 +101,63 @@ def instantiate(cls: type, options: Mapping[str, Any], where: str) -> Any:
         if cls.__module__.startswith("ipe_bench."):
             raise
         raise UserError(f"{where}: {cls.__name__} cannot be made: {place_of(error)}") from None
+
+
+@dataclass(frozen=True)
+class Described:
+    """One option of a component, in words."""
+
+    name: str
+    value: str
+    """What it is set to, as a config writes it; empty where it must be given."""
+    kind: str
+    """What may be given."""
+    meaning: str
+    """The docstring of its field, or the comment behind it in the config."""
+
+
+def described(option: discovery.Option) -> list[Described]:
+    """The options of what a config file names, in the order of its class."""
+    config = option.config or {}
+    if option.group in discovery.RECORD_GROUPS:
+        return []
+    if option.target is None:
+        return [Described(str(key), _written(value), "", "") for key, value in config.items() if key != "defaults"]
+    cls = find_class(option.target, f"{option.group}.{option.name}")
+    kinds, texts = option_types(cls), {**option.comments, **_meanings(cls)}
+    found = []
+    for field in dataclasses.fields(cls):
+        if field.init:
+            default = field.default if field.default_factory is MISSING else field.default_factory()
+            kind = "" if kinds[field.name] is Any else describe_type(kinds[field.name])
+            value = _written(config.get(field.name, default))
+            found.append(Described(field.name, value, kind, texts.get(field.name, "")))
+    return found
+
+
+def _written(value: Any) -> str:
+    """A value as one writes it on the command line."""
+    if value is None or isinstance(value, bool):
+        return json.dumps(value)
+    if isinstance(value, float):
+        return f"{value:g}" if float(f"{value:g}") == value else repr(value)
+    if isinstance(value, tuple | list):
+        return f"[{','.join(map(_written, value))}]"
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{k}: {_written(v)}' for k, v in value.items() if k != TARGET)}}}"
+    if dataclasses.is_dataclass(value):
+        return type(value).__name__
+    return "" if value is MISSING or value == "???" else str(value)
+
+
+def _meanings(cls: type) -> dict[str, str]:
+    """By field, the text below it, of the class and its bases."""
+    found: dict[str, str] = {}
+    for base in (base for base in reversed(cls.__mro__) if dataclasses.is_dataclass(base)):
+        (body,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        assert isinstance(body, ast.ClassDef)
+        for field, text in zip(body.body, body.body[1:], strict=False):
+            match field, text:
+                case ast.AnnAssign(target=ast.Name(name)), ast.Expr(value=ast.Constant(value=str(words))):
+                    found[name] = " ".join(words.split())
+    return found

@@ -14,7 +14,7 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ RECORD_GROUPS = ("statistic", "figure", "table", "section")
 CHECKED_GROUPS = (*COMPONENT_GROUPS, *RECORD_GROUPS, "experiment")
 _TARGET_LINE = re.compile(r"^_target_:\s*['\"]?([\w.]+)", re.MULTILINE)
 _PACKAGE_HEADER = re.compile(r"^#\s*@package\s+(\S+)", re.MULTILINE)
+_COMMENT_BEHIND = re.compile(r"^(\w+):.*? # *(.+)$", re.MULTILINE)
 
 
 class _Loader(yaml.SafeLoader):
@@ -118,10 +119,7 @@ class Option:
     @functools.cached_property
     def text(self) -> str:
         """What stands in the file; what is not UTF-8 is replaced, and told by `fault`."""
-        try:
-            return self.path.read_bytes().decode("utf-8", errors="replace")
-        except OSError:
-            return ""
+        return self.path.read_text(encoding="utf-8", errors="replace")
 
     @property
     def summary(self) -> str:
@@ -132,7 +130,7 @@ class Option:
     @property
     def config(self) -> Any:
         """What the file says, as plain data."""
-        return read_yaml(self.path.read_text(encoding="utf-8"))
+        return read_yaml(self.text)
 
     @property
     def package(self) -> str | None:
@@ -148,35 +146,20 @@ class Option:
 
     @property
     def comments(self) -> dict[str, str]:
-        """By key, the comment at the end of its line, or else the one above it, which several keys may share."""
-        found: dict[str, str] = {}
-        above: list[str] = []
-        previous = ""
-        for line in self.text.splitlines():
-            key, _, value = line.partition(":")
-            if line.startswith("#"):
-                above = [*(above if previous.startswith("#") else []), line.lstrip("# ").strip()]
-            elif key == "_target_":
-                above = []
-            elif key.isidentifier():
-                found[key] = value.partition(" #")[2].strip() or " ".join(above)
-            previous = line
-        return found
+        """By key, the comment at the end of its line."""
+        return dict(_COMMENT_BEHIND.findall(self.text))
 
     @functools.cached_property
     def fault(self) -> str | None:
         """Why it cannot be used, in a line with the remedy; None where it can, as far as the file tells."""
         if self.rival is not None:
             return f"{self.rival} and {self.path} offer it both; rename one of the two files"
+        if "\ufffd" in self.text:
+            return f"{self.path}: is not UTF-8; save it as UTF-8"
+        if (key := PACKAGES.get(self.group)) is not None and self.package != f"{key}.{self.label}":
+            return f"{self.path}: its first line must be '# @package {key}.{self.label}', or it never runs"
         try:
-            text = self.path.read_bytes().decode("utf-8")
-            if (key := PACKAGES.get(self.group)) is not None and self.package != f"{key}.{self.label}":
-                return f"{self.path}: its first line must be '# @package {key}.{self.label}', or it never runs"
-            return None if _is_mapping(text) else f"{self.path}: holds no keys; write KEY: VALUE lines"
-        except UnicodeDecodeError as error:
-            return f"{self.path}: is not UTF-8 ({error.reason} at byte {error.start}); save it as UTF-8"
-        except OSError as error:
-            return f"{self.path}: cannot be read ({error.strerror})"
+            return None if _is_mapping(self.text) else f"{self.path}: holds no keys; write KEY: VALUE lines"
         except yaml.YAMLError as error:
             return explain_yaml(error, self.path)
 
@@ -186,6 +169,8 @@ def _is_mapping(text: str) -> bool:
     return isinstance(read_yaml(text), dict)
 
 
+packages = {"ipe_bench"}
+"""Top-level packages whose classes are constructed from configs."""
 _added: dict[Path, None] = {}
 """Folders of plugins besides those in `plugins/`."""
 _problems: dict[str, None] = {}
@@ -226,7 +211,7 @@ def installed_sources() -> list[Source]:
         if spec is None or not spec.submodule_search_locations:
             _problems[f"plugin {entry.name}: {reason}; it is left out, install it again"] = None
             continue
-        _register(entry.value.split(".")[0])
+        packages.add(entry.value.split(".")[0])
         origin = f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.name
         found.append(Source(entry.value, Path(spec.submodule_search_locations[0]) / "conf", origin))
     return found
@@ -243,15 +228,8 @@ def _in_folder(folder: Path) -> Iterator[Source]:
     for conf in sorted(folder.glob("*/conf")):
         if (conf.parent / "__init__.py").is_file():
             _make_importable(str(folder.resolve()))
-            _register(conf.parent.name)
+            packages.add(conf.parent.name)
             yield Source(conf.parent.name, conf, f"{folder.parent.name}/{folder.name}")
-
-
-def _register(package: str) -> None:
-    # Late: it loads NumPy, for which `--help` has no time.
-    from ipe_bench.plugins.construct import register_package
-
-    register_package(package)
 
 
 def _make_importable(path: str) -> None:
@@ -266,13 +244,9 @@ def _make_importable(path: str) -> None:
 def options(group: str | None = None) -> list[Option]:
     """All options of a group, or of all groups; those that cannot be used have a `fault`."""
     found: dict[tuple[str, str], Option] = {}
-    # Those of a group may have rivals in the groups that share its labels, and nowhere else.
-    related = ("",) if group is None else ESTIMATOR_GROUPS if group in ESTIMATOR_GROUPS else (group,)
     for source in sources():
-        for path in sorted(path for name in related for path in (source.conf / name).rglob("*.yaml")):
+        for path in sorted(source.conf.glob("*/**/*.yaml")):
             folder, *name = path.relative_to(source.conf).with_suffix("").parts
-            if not name:
-                continue
             option = Option(folder, "/".join(name), path, source)
             # Solvers and baselines share their labels: of two with one label, only one would run.
             place = ("estimator", option.label) if folder in ESTIMATOR_GROUPS else (folder, option.name)
@@ -282,27 +256,18 @@ def options(group: str | None = None) -> list[Option]:
     return [o for o in found.values() if group is None or o.group == group]
 
 
-def composed(option: Option, seen: Sequence[str] = ()) -> dict[str, Any]:
+def composed(option: Option) -> dict[str, Any]:
     """What an option says together with the options of its group that its `defaults` name, as Hydra composes them:
     later ones replace what earlier ones say, and the file itself comes last unless `_self_` stands elsewhere."""
     config = dict(option.config or {})
-    defaults = config.pop("defaults", [])
-    if not isinstance(defaults, list):
-        raise UserError(f"{option.path}: defaults is not a list; write defaults: [NAME]")
+    entries = [str(entry) for entry in config.pop("defaults", [])]
+    known = {o.name: o for o in options(option.group)} if entries else {}
     found: dict[str, Any] = {}
-    for entry in defaults if "_self_" in defaults else [*defaults, "_self_"]:
-        if entry == "_self_":
-            found = _merged(found, config)
-            continue
-        if not isinstance(entry, str):
-            raise UserError(f"{option.path}: defaults has {entry}; write names of other options of {option.group}")
+    for entry in entries if "_self_" in entries else [*entries, "_self_"]:
         name = entry.removesuffix("@_here_").removeprefix(f"/{option.group}/")
-        if name in (*seen, option.name):
-            raise UserError(f"{option.path}: defaults leads back to {name}; leave one of the two out")
-        known = {o.name: o for o in options(option.group)}
-        if name not in known:
+        if entry != "_self_" and name not in known:
             raise UserError(f"{option.path}: defaults: {unknown(name, known, f'option of {option.group}')}")
-        found = _merged(found, composed(known[name], (*seen, option.name)))
+        found = _merged(found, config if entry == "_self_" else composed(known[name]))
     return found
 
 

@@ -6,8 +6,8 @@ Each of those is a record: `conf/figure/NAME.yaml` has one key, `_target_`, its 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from ipe_bench.basics.errors import UserError, place_of
@@ -49,8 +49,6 @@ def find_record(option: Option) -> Any:
     config = option.config
     if not isinstance(config, Mapping) or set(config) != {TARGET}:
         raise UserError(f"{where}: {option.path}: has other keys than {TARGET}, which names a {option.group}")
-    if not option.name.isidentifier():
-        raise UserError(f"{where}: {option.path}: is not a name; use letters, digits and underscores")
     record = find_object(config[TARGET], where)
     if option.group == "statistic" and getattr(record, "name", option.name) != option.name:
         raise UserError(f"{where}: {config[TARGET]} is called {record.name}; give file and record one name")
@@ -91,12 +89,7 @@ def use_statistics() -> list[str]:
     return problems + add_statistics(found)
 
 
-def digest_of_all() -> str:
-    """Changes with the code of any plugin that adds to reports."""
-    digest = hashlib.sha256()
-    for option in (option for group in RECORD_GROUPS for option in options(group)):
-        digest.update(f"{option.group}={option.name} {option.target};".encode())
-        for path in sorted(option.source.conf.parent.rglob("*")):
-            if path.is_file() and "__pycache__" not in path.parts:
-                digest.update(f"{path}{hashlib.sha256(path.read_bytes()).hexdigest()};".encode())
-    return digest.hexdigest()
+def files_of_records() -> list[Path]:
+    """The files of every plugin that adds to reports."""
+    homes = {option.source.conf.parent for group in RECORD_GROUPS for option in options(group)}
+    return [path for home in homes for path in home.rglob("*") if path.is_file() and path.suffix != ".pyc"]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from ipe_bench.basics.errors import StorageError
 from ipe_bench.basics.files import write_text
-from ipe_bench.plugins.extensions import digest_of_all, use_statistics
+from ipe_bench.plugins.extensions import files_of_records, use_statistics
 from ipe_bench.report.style import PAGE, Which, file_formats, which_figures
 from ipe_bench.runs.store import Store
 
@@ -143,7 +143,7 @@ def _made_from(directories: Sequence[Path], output: Path, *choices: object) -> s
     stored = [p for s in stores for folder in (s.trials, s.runs, s.failed) for p in folder.glob("*")]
     libraries = [version(name) for name in ("jinja2", "matplotlib", "numpy", "pandas", "scipy", "seaborn")]
     names = [str(path.absolute()) for path in (output, *directories)]
-    known = [names, choices, libraries, digest_of_all(), _digests(sources), _digests(stored)]
+    known = [names, choices, libraries, *map(_digests, (files_of_records(), sources, stored))]
     return hashlib.sha256(repr(known).encode()).hexdigest()
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from ipe_bench.cli.components import PAGES
 from ipe_bench.cli.main import main
-from ipe_bench.cli.skill import KINDS
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def test_the_router_names_every_page_and_the_pages_are_short(skill):
 
 
 QUICK = ("filter", "function", "ode", "measurement", "baseline")
-EACH = ["SKILL", *(f"new-{kind}" for kind in KINDS if kind not in QUICK)]
+EACH = ["SKILL", *(f"new-{kind}" for kind in PAGES if kind not in QUICK)]
 
 
 @pytest.mark.parametrize(

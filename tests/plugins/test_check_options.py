@@ -69,11 +69,8 @@ BAD = {
         {"noise/bad": "defaults: [gaussian]\ndeviation: -1\n"}, "noise/bad", "deviation=-1: give a number above 0"
     ),
     "no such option": ({"noise/bad": "defaults: [gausian]\n"}, "noise/bad", "did you mean gaussian"),
-    "a circle": (
-        {"noise/round": "defaults: [about]\n", "noise/about": "defaults: [round]\n"}, "noise/about", "leads back to"
-    ),
-    "of another group": ({"noise/bad": "defaults: [{prior: gaussian}]\n"}, "noise/bad", "write names of other options"),
-    "no list": ({"noise/bad": "defaults: gaussian\n"}, "noise/bad", "defaults is not a list"),
+    "of another group": ({"noise/bad": "defaults: [{prior: gaussian}]\n"}, "noise/bad", "no such option of noise"),
+    "no list": ({"noise/bad": "defaults: gaussian\n"}, "noise/bad", "no such option of noise"),
 }  # fmt: skip
 
 

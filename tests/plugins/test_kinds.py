@@ -12,14 +12,14 @@ import pytest
 from small_models import Bent
 
 from ipe_bench import Scenario, check
+from ipe_bench.cli.components import KINDS, RECORDS
 from ipe_bench.cli.main import main
-from ipe_bench.cli.new import KINDS, RECORDS
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins import discovery
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.priors import Prior
 from ipe_bench.report import figures
-from ipe_bench.runs.execution import Event, Execution
+from ipe_bench.runs.execution import Event, Execution, Serial
 from ipe_bench.statistics.records import add_statistics
 from ipe_bench.trials.posterior import reference
 
@@ -248,9 +248,7 @@ class Hasty(Execution):
     """Does not tell of steps."""
 
     def run(self, work, tasks):
-        for index, task in enumerate(tasks):
-            list(work(task))
-            yield Event(index, ended=True)
+        yield from (event for event in Serial().run(work, tasks) if event.ended)
 
 
 @pytest.mark.parametrize(
@@ -261,8 +259,8 @@ class Hasty(Execution):
         (Faulty("shifted"), "the mean is off x0"),
         (Faulty("common"), "two parameters have the correlation"),
         (Faulty(power=0.0), "at ten times the error scale"),
-        (Swallowing(), "ends without a Failure"),
-        (Hasty(), "it tells the steps []"),
+        (Swallowing(), "of task 1 it tells step 0, step 1, end; right is step 0, step 1, a Failure ValueError: wrong"),
+        (Hasty(), "of task 0 it tells end; right is step 0, step 1, step 2, end"),
     ],
     ids=repr,
 )

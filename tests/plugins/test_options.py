@@ -18,7 +18,7 @@ from ipe_bench.basics.options import Count, Finite, NonNegative, Positive, Share
 from ipe_bench.measurements import Gins, Nist, Ranging
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins import discovery
-from ipe_bench.plugins.construct import construct, register_package
+from ipe_bench.plugins.construct import construct
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.runs.execution import Processes
 from ipe_bench.solvers import Newton, Relinearized, SteepestDescent
@@ -132,7 +132,7 @@ class Unreadable:
 
 
 def test_what_a_plugins_class_does_not_check_is_checked_where_it_is_constructed():
-    register_package(__name__)
+    discovery.packages.add(__name__)
     made = construct({"_target_": f"{__name__}.Own", "size": 2}, "part")
     assert type(made.size) is float
     for options, said in (
@@ -177,7 +177,7 @@ def test_an_import_that_fails_is_named_by_its_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "my_library.py").write_text("import math\nimport nunpy\n")
-    register_package("my_library")
+    discovery.packages.add("my_library")
     said = r"my_library\.py, line 2: ModuleNotFoundError: No module named 'nunpy'; install what the plugin needs$"
     with pytest.raises(UserError, match=said):
         construct({"_target_": "my_library.Model"}, "part")

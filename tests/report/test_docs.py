@@ -19,7 +19,7 @@ from ipe_bench.cli.main import COMMANDS
 from ipe_bench.measurements import Polynomial
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins import discovery
-from ipe_bench.plugins.description import described
+from ipe_bench.plugins.construct import described
 from ipe_bench.report.docs import generated as pages
 from ipe_bench.report.docs import show_type, type_of
 

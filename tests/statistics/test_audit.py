@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.cli.audit import main
+from ipe_bench.cli.results import audit_command
 from ipe_bench.statistics.audit import Claims, audit, read_claims
 
 
@@ -146,7 +146,7 @@ def test_sentence_verdict_and_exit_code_say_the_same(tmp_path, capsys):
         assert (f"the covariance is {found.verdict}" in found.sentences[0]) == wrong
         assert wrong == (not found.scale.low <= 1 <= found.scale.high)
         assert [f.verdict for f in found.each] == [found.verdict] == found.table()["covariance"].tolist()
-        assert main([str(tmp_path / "runs.csv")]) == wrong
+        assert audit_command([str(tmp_path / "runs.csv")]) == wrong
         assert found.sentences[0] in " ".join(capsys.readouterr().out.split())
         seen.add(found.verdict)
     assert {"too small", "undecided"} <= seen

@@ -18,8 +18,8 @@ from ipe_bench import Scenario
 from ipe_bench.baselines import LinearLSE
 from ipe_bench.basics.errors import StorageError
 from ipe_bench.cli.main import main
-from ipe_bench.cli.report import main as report
-from ipe_bench.cli.status import main as status
+from ipe_bench.cli.results import report_command as report
+from ipe_bench.cli.results import status_command as status
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior

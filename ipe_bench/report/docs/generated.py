@@ -21,7 +21,7 @@ import ipe_bench
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import make_folder, write_text
 from ipe_bench.basics.statuses import Status
-from ipe_bench.plugins.description import described
+from ipe_bench.plugins.construct import described
 from ipe_bench.plugins.discovery import PACKAGES, Option, options
 from ipe_bench.report.definitions import DEFINITIONS
 from ipe_bench.report.figures import INDEX

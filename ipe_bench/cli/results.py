@@ -1,0 +1,211 @@
+"""The commands on what is stored: report, status, compare and bundle; and audit, on a table of another program."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from annotated_types import Gt, Lt
+
+from ipe_bench import api
+from ipe_bench.basics.errors import UserError
+from ipe_bench.cli import NAMES, console, places_and_keys, print_problems, say, show
+from ipe_bench.report.run import begin_report
+from ipe_bench.report.style import PAGE, Which
+from ipe_bench.report.table import Table, texts, words
+from ipe_bench.runs.bundles import BUNDLES, SUFFIX, is_bundle, opened, read_bundle, write_bundle
+from ipe_bench.runs.parts import TRUTH
+from ipe_bench.runs.results import CellState, Results, require_results
+
+_REPORT = {"output": str, "figures": str, "formats": str}
+_PAPER = {"output": str, "paper": NAMES, "columns": NAMES, "width": float}
+"""Keys of tables and figures for a paper."""
+_COMPARE = {
+    "first": str,
+    "second": str,
+    "alpha": Annotated[float, Gt(0), Lt(1)],
+    "anytime": bool,
+    "fail_on": NAMES,
+    "power": float,
+    "difference": float,
+    "output": str,
+}
+
+
+def audit_command(arguments: Sequence[str]) -> int:
+    """Prints whether reported covariances describe the errors; exit code 1 if they surely do not."""
+    from ipe_bench.report.questions import audit_parts
+
+    files, keys = places_and_keys("audit", arguments, {"output": str})
+    if len(files) != 1:
+        raise UserError("audit: name one table of truths, estimates and deviations, such as runs.csv")
+    found = api.audit(files[0], **keys)
+    show(audit_parts(found))
+    if "output" in keys:
+        say(f"\nTable   {keys['output']}/audit.csv", f"Page    {keys['output']}/audit.html")
+    return 1 if found.scale.wrong else 0
+
+
+def bundle_command(arguments: Sequence[str]) -> int:
+    """Writes the archive, or checks one; exit code 1 where the folders lack something that was asked for."""
+    from ipe_bench.report.definitions import CITATION
+
+    places, keys = places_and_keys("bundle", arguments, {"output": str})
+    paths = [Path(place) for place in places]
+    if not paths:
+        raise UserError("bundle: name at least one folder of results, such as outputs/paper, or a bundle to check")
+    checked = any(map(is_bundle, paths))
+    if checked and (len(paths) > 1 or keys):
+        raise UserError("bundle: one file is checked by itself; name folders to make a bundle of")
+    problems = []
+    if checked:
+        found = read_bundle(paths[0])
+    else:
+        path = Path(keys.get("output", paths[0].with_name(paths[0].resolve().name)))
+        found = write_bundle(paths, path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX), {"citation": CITATION})
+        problems = Results.read(paths).problems
+        print_problems(problems)
+    held = f"{len(found.files)} files of {', '.join(found.folders)}; {found.size:,} bytes"
+    say(f"{'Whole' if checked else 'Bundle':<8}{found.path} ({held})")
+    say(f"Digest  sha256:{found.digest}")
+    return 1 if problems else 0
+
+
+def compare_command(arguments: Sequence[str]) -> int:
+    """Prints the table; exit code 1 where the second is worse, or lacks what was asked for."""
+    from ipe_bench.report.questions import comparison_parts
+
+    folders, keys = places_and_keys("compare", arguments, _COMPARE)
+    if not 1 <= len(folders) <= 2:
+        raise UserError("compare: name one or two folders of results, such as outputs/before outputs/after")
+    frame = api.compare(*folders, **keys)
+    show(comparison_parts(frame, keys.get("alpha", 0.05)))
+    print_problems([*frame.attrs["problems"], *frame.attrs["stale"], *frame.attrs["notes"]])
+    if "output" in keys:
+        say(f"\nTable   {Path(keys['output']) / 'comparison.csv'}")
+        say(f"Page    {Path(keys['output']) / 'comparison.html'}")
+    say(*(f"worse: {line}" for line in frame.attrs["worse"]))
+    return 1 if frame.attrs["worse"] or frame.attrs["problems"] else 0
+
+
+def status_command(arguments: Sequence[str], verbose: bool = False) -> int:
+    """A line per directory that is complete, else a table; exit code 1 where anything is missing or damaged."""
+    if not arguments:
+        raise UserError("status: name at least one directory of results, such as outputs/paper")
+    with opened(arguments) as folders:
+        require_results(folders)
+        found = [Results.read([folder]) for folder in folders]
+    for folder, results in zip(folders, found, strict=True):
+        # A bundle's folders are called as they were, not as where they are unpacked.
+        name = str(folder) if str(folder) in arguments else folder.name
+        cells = [cell for cell in results.cells if verbose or not cell.complete or cell.stale]
+        if cells:
+            show([_states(name, cells)])
+        verdict = "not complete; the same command as before computes what is missing, failed or damaged"
+        if not results.problems:
+            estimates = [cell for cell in results.cells if cell.names["estimator"] != TRUTH]
+            trials = sum(cell.done for cell in estimates)
+            verdict = f"complete: {len(estimates)} scenarios under an estimator, {trials} trials"
+        say(*(results.problems or results.stale), f"{name}: {verdict}")
+    return 1 if any(results.problems for results in found) else 0
+
+
+def _states(directory: str, cells: Sequence[CellState]) -> Table:
+    names = [cell.names["estimator"] for cell in cells]
+    columns = [
+        words("scenario", [cell.title for cell in cells]),
+        words("estimator", ["(truth)" if name == TRUTH else name for name in names]),
+        texts("done", [f"{cell.done} of {cell.expected or cell.done}" for cell in cells]),
+    ]
+    counts = ("missing", "failed", "stale")
+    columns += [texts(count, [str(getattr(cell, count) or "") for cell in cells]) for count in counts]
+    return Table("status", directory, "", columns, grouped=1)
+
+
+def report_command(arguments: Sequence[str]) -> int:
+    """Writes the report on these folders, or bundles; exit code 1 where something that was asked for is missing."""
+    for_paper = any(word.startswith(("paper=", "columns=", "width=")) for word in arguments)
+    named, keys = places_and_keys("report", arguments, _PAPER if for_paper else _REPORT)
+    output = Path(keys["output"]) if "output" in keys else None
+    if not named:
+        raise UserError("report: name at least one directory of results, such as outputs/paper")
+    if output is None and (bundles := [name for name in named if is_bundle(name)]):
+        raise UserError(f"report: {bundles[0]}: is a bundle; say where the report goes with output=DIR")
+    if output is None and len(named) > 1 and not for_paper:
+        raise UserError("report: several directories need output=DIR, as the report on all is not that of the first")
+    with opened(named, None if output is None else output / BUNDLES) as folders:
+        require_results(folders)
+        if for_paper:
+            return _paper(folders, keys)
+        return show_report(folders, output or folders[0], keys.get("figures", "main"), keys.get("formats", PAGE))
+
+
+def show_report(
+    folders: Sequence[Path], output: Path, figures: Which, formats: Any, cells: Mapping[str, str] | None = None
+) -> int:
+    """Writes the report on all that folders hold, and prints it, or what belongs to these cells; the exit code.
+
+    `cells` has a line for people by key.
+    """
+    from ipe_bench.statistics.analysis import Begun
+    from ipe_bench.statistics.collect import collect
+
+    pending = begin_report(folders, output, figures=figures, formats=formats)
+    collection, rows = pending.begun.collection, pending.begun.summary
+    shown, told = collection, [*collection.problems, *([] if cells else collection.stale)]
+    others = sum(cell.key not in cells and cell.label != TRUTH for cell in collection.current) if cells else 0
+    if cells and others:
+        shown = collect(folders, cells.keys())
+        rows = Begun(shown).summary
+    _print_table(rows, shown)
+    pending.write_unless_current()
+    if cells:
+        # What is wrong with a file or a folder may concern anybody; what other commands lack does not.
+        of_cells = [line for line in told if line.startswith(("missing: ", "failed: "))]
+        elsewhere = [line for line in of_cells if not any(cell in line for cell in cells.values())]
+        told = [line for line in told if line not in elsewhere]
+        if elsewhere:
+            counted = _counted(len(elsewhere), "problem")
+            told.append(f"{output}: {counted} of other commands; `ipe-bench status {output}` lists them")
+    print_problems(told)
+    drawn = f"\nFigures  {output / 'figures'}" if any(output.glob("figures/*.png")) else ""
+    say(f"\nSummary  {output / 'summary.csv'}\nTables   {output / 'tables'}{drawn}\nReport   {output / 'report.html'}")
+    if others:
+        print(f"Here too  {_counted(others, 'result')} of other commands; `ipe-bench report {output}` shows all")
+    return 1 if collection.problems else 0
+
+
+def _print_table(rows: Sequence[Mapping[str, Any]], collection: Any) -> None:
+    from ipe_bench.report.terminal import render
+
+    totals = []
+    if any(row["noise"] == "certified" for row in rows):
+        from ipe_bench.report.tables import certified_tables  # which loads pandas
+
+        totals = [table for table in certified_tables(collection) if table.whole]
+    out = console()
+    out.print(render(rows, totals, out.width))
+    sys.stdout.flush()
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _paper(folders: Sequence[Path], keys: Mapping[str, Any]) -> int:
+    """Writes tables and figures as a paper wants them; exit code 1 where data are missing."""
+    from ipe_bench.plugins.extensions import use_statistics
+    from ipe_bench.report.paper import export
+    from ipe_bench.statistics import analyse
+
+    if not keys.get("paper"):
+        raise UserError("paper=: name tables and figures, such as paper=overview,headline")
+    chosen = {key: keys[key] for key in ("columns", "width") if key in keys}
+    faults = use_statistics()
+    analysis = analyse(folders)
+    analysis.collection.extra_problems += faults
+    say(*map(str, export(analysis, Path(keys.get("output", folders[0] / "paper")), keys["paper"], **chosen)))
+    print_problems([*analysis.problems, *analysis.stale])
+    return 1 if analysis.problems else 0
