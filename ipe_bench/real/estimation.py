@@ -22,7 +22,7 @@ from ipe_bench.measurements.problem import Problem
 from ipe_bench.measurements.repeatable import require_repeatable
 from ipe_bench.noise import Certified, Gaussian, ModelNoise, Noise, Unknown
 from ipe_bench.priors import GaussianPrior, Prior, prior_of
-from ipe_bench.real.examination import Examination, examinations
+from ipe_bench.real.examination import Examination, examine
 from ipe_bench.real.fits import Fit, fit
 from ipe_bench.real.readings import SIGMA, LeftOut, Readings, open_together, read_covariance, require_enough
 from ipe_bench.trials.scenario import Scenario
@@ -140,11 +140,11 @@ class Opened:
         if lacking:
             raise UserError("; ".join(lacking))
 
-    def fitted(self) -> tuple[list[Fit], tuple[Examination, ...]]:
+    def fitted(self) -> tuple[list[Fit], Examination | None]:
         """A fit by every estimator, and what is to be said of the least minimum."""
         z = self.readings.z
         fits = fit(self.problem, z, self.question.estimators, self.scenario.noise)
-        return fits, examinations(self.problem, z, fits)
+        return fits, examine(self.problem, z, fits)
 
 
 def prior_stated(prior: Prior, model: Measurement, covariance: Any = None) -> Prior:

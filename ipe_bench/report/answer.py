@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,18 +37,12 @@ LEAST_FIT_P = 1 / (DRAWS + 1)
 _MOST_OUTLIERS = 8
 _FEW = 0.05
 """Share of outliers above which the model is wrong, and a list of readings says nothing."""
-_INFLUENCE = ("leverage", "cook", "shift")
 _FITS = {True: "yes", False: "NO", None: "not tested"}
 _TOO_WELL = 0.999
 """The p of chi-square above which residuals are smaller than the stated noise explains."""
-_COLLINEAR = 10.0
-"""Collinearity index from which on the readings hardly tell parameters apart (Brun, Reichert and Künsch, Water
-Resources Research 37)."""
 _INFLUENTIAL = 1.0
 """Standard errors by which a parameter moves without a reading from which on that reading is named."""
 _MOST_READINGS, _MOST_MINIMA = 5, 3
-_SMALL_SHARE = 0.1
-"""Share of the largest component below which a component of the least observable direction is left out."""
 
 
 @dataclass(frozen=True)
@@ -61,22 +56,16 @@ class Answer:
     """Readings (m,); NaN if one is missing."""
     fits: list[Fit]
     """One for each estimator, in the order in which they were given."""
-    examinations: tuple[Examination, ...]
-    """That of the least minimum that was found, and that of the minimum with the prior if estimators are told one;
-    none if no estimator found any."""
+    examination: Examination | None
+    """That of the least minimum that was found; None if no estimator without a prior found any."""
     left_out: str = ""
     """What of the files was left out on purpose."""
 
     @classmethod
     def to(cls, opened: Opened, name: str = "") -> Answer:
         """The answer to a question; `name` is what the model is called if that is not its own name."""
-        model, fits_and_examinations = opened.scenario.measurement, opened.fitted()
-        return cls(name or model.name, model, opened.readings.z, *fits_and_examinations, opened.question.left_out.said)
-
-    @property
-    def examination(self) -> Examination | None:
-        """The first: that of least squares, unless all estimators were told a prior."""
-        return self.examinations[0] if self.examinations else None
+        model, fits_and_examination = opened.scenario.measurement, opened.fitted()
+        return cls(name or model.name, model, opened.readings.z, *fits_and_examination, opened.question.left_out.said)
 
     @property
     def passes(self) -> bool:
@@ -121,7 +110,7 @@ def contents(answer: Answer) -> Iterator[Part]:
     yield _estimates(answer)
     yield _verdicts(answer)
     yield from _outliers(answer)
-    for one in answer.examinations:
+    if (one := answer.examination) is not None:
         passes = answer[one.label].passes
         if passes:
             yield _intervals(one)
@@ -209,7 +198,7 @@ def _notes(answer: Answer) -> Iterator[str]:
         if one.undetermined:
             lacking = "; ".join(one.undetermined)
             yield f"{one.label}: the readings do not determine {lacking}; fix parameters, or give prior, until they do."
-        if one.held is not None:
+        if one.held_at:
             at = {one.model.physical_parameters[k].name: value for k, value in one.held_at.items()}
             yield (
                 f"{one.label}: on its bound: {_values(at)}; the readings want it beyond. It has no error, and those of"
@@ -288,17 +277,16 @@ def _intervals(found: Examination) -> Table:
     """Three intervals of each parameter; of one on a bound, that of its profile."""
     on_bounds, absent = found.on_bounds, ["-"] * len(found.on_bounds)
     parameters = [*found.model.physical_parameters, *(b.parameter for b in on_bounds)]
-    middle, nowhere = found.model.physical(found.x[None])[0], [math.nan] * len(on_bounds)
-    ends = [(one.low, one.high) for one in found.profiles] + [tuple(sorted((b.bound, b.other))) for b in on_bounds]
+    middle = [*found.x, *(math.nan for _ in on_bounds)]
+    ends = [*zip(*found.profiles, strict=True), *(sorted((b.bound, b.other)) for b in on_bounds)]
     columns = [
         words("parameter", [p.name for p in parameters]),
         words("unit", [p.unit for p in parameters]),
-        texts("standard error", [*map(_interval, *found.wald, middle), *absent]),
-        texts("profile", [_interval(low, high, at) for (low, high), at in zip(ends, [*middle, *nowhere], strict=True)]),
-        texts("bootstrap", [*map(_interval, found.bootstrap.low, found.bootstrap.high, middle), *absent]),
+        texts("standard error", [*map(_interval, *found.wald, found.x), *absent]),
+        texts("profile", [_interval(low, high, at) for (low, high), at in zip(ends, middle, strict=True)]),
+        texts("bootstrap", [*map(_interval, found.bootstrap.low, found.bootstrap.high, found.x), *absent]),
     ]
-    prior = " with its prior" if found.with_prior else ""
-    title = f"{100 * CONFIDENCE:.0f} % intervals of {found.label}{prior}, by three ways"
+    title = f"{100 * CONFIDENCE:.0f} % intervals of {found.label}, by three ways"
     return Table("intervals", title, "", columns)
 
 
@@ -327,10 +315,9 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
         )
     for one in found.ambiguous[:_MOST_MINIMA]:
         yield f"AMBIGUOUS: the readings fit as well at {at(one.x)} (chi-square {one.chi_square:.5g})."
-    profiles = list(zip(names, found.profiles, strict=True))
-    if bent := [n for n, p in profiles if p.bent]:
+    if bent := list(compress(names, found.bent.tolist())):
         yield f"Profiles that are no parabola: {', '.join(bent)}; trust their profile intervals."
-    if unlimited := [n for n, p in profiles if not math.isfinite(p.high - p.low)]:
+    if unlimited := [n for n, low, high in zip(names, *found.profiles, strict=True) if math.isinf(high - low)]:
         yield f"The readings set no limit to one side of {', '.join(unlimited)}."
     for one in found.on_bounds:
         yield (
@@ -338,23 +325,7 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
             " other is where the profile has risen as far as inside of bounds, so it holds the true value at least as"
             " often as it says. Profiles of the others let it move inwards; their standard errors do not."
         )
-    if found.with_prior:
-        yield (
-            f"Intervals of {found.label} treat the prior as further readings: profiles use the penalised likelihood,"
-            " and the bootstrap also draws the means of the prior."
-        )
-    if len(names) > 1:
-        # Components count by what they are in standard errors.
-        told = np.abs(found.direction.weights / found.standard_errors)
-        pairs = zip(found.direction.weights, names, told >= _SMALL_SHARE * told.max(), strict=True)
-        parts = [f"{n} {w:+.3g}" for w, n, shown in pairs if shown]
-        index = found.direction.collinearity
-        yield (
-            f"Least observable: {', '.join(parts)} together, which changes all readings by {1 / index:.2g} standard"
-            f" deviations; collinearity index {index:.3g}"
-            f"{': the readings hardly tell these apart' if index >= _COLLINEAR else ''}."
-        )
-    shift = np.nan_to_num(found.influence.shift, nan=0.0)
+    shift = np.nan_to_num(found.shift, nan=0.0)
     for i in [i for i in np.argsort(-shift)[:_MOST_READINGS] if shift[i] >= _INFLUENTIAL]:
         where = _where(labels[i])
         yield f"Without the reading {where} a parameter would move by {shift[i]:.1f} standard errors."
@@ -426,7 +397,7 @@ def _examined(found: Examination, labels: list[dict[str, Any]]) -> dict[str, Any
     return {
         "estimator": found.label,
         "estimates": _by_name(names, found.x),
-        "profile95": _by_name(names, [(p.low, p.high) for p in found.profiles]),
+        "profile95": _by_name(names, np.transpose(found.profiles)),
         "bootstrap95": _by_name(names, np.column_stack([bootstrap.low, bootstrap.high])),
         "remarks": list(remarks(found, labels)),
     }
@@ -456,9 +427,9 @@ def _residuals(answer: Answer) -> pd.DataFrame:
     for one in answer.fits:
         examined = found if found is not None and one.label == found.label else None
         fitted = z - one.residuals if examined is None else np.where(np.isnan(z), examined.fitted, z - one.residuals)
-        own = {f"reading{unit}": z, f"fitted{unit}": fitted, f"residual{unit}": one.residuals}
+        own: dict[str, Any] = {f"reading{unit}": z, f"fitted{unit}": fitted, f"residual{unit}": one.residuals}
         own |= {"normalised_residual": one.normalised, "outlier": np.where(one.outliers, "yes", "no")}
-        own |= {name: np.nan if examined is None else getattr(examined.influence, name) for name in _INFLUENCE}
+        own["shift"] = np.nan if examined is None else examined.shift
         own[f"fitted_error{unit}"] = np.nan if examined is None else examined.fitted_errors
         own[f"prediction_error{unit}"] = np.nan if examined is None else examined.new_errors
         frames.append(pd.DataFrame({"estimator": one.label, **model.index, **own}))

@@ -107,7 +107,7 @@ def test_with_an_unknown_level_another_minimum_is_as_good_within_snedecors_regio
     z = 100 * t + odd * s + noise
     columns = {"t": t.tolist(), "s": s.tolist()}
     model = Formula(f"c**2*t+b+{odd:.12f}*(c/10)*s", {"c": 9.0, "b": 1.0}, columns)
-    (found,) = ib.estimate(model, z, {"lm": LevenbergMarquardt(tolerance=1e-10)}, noise=Unknown()).examinations
+    found = ib.estimate(model, z, {"lm": LevenbergMarquardt(tolerance=1e-10)}, noise=Unknown()).examination
     other = next(one for one in found.minima if one.x[0] < 0)
     assert other.chi_square - found.minima[0].chi_square == pytest.approx(excess, rel=0.02)
     assert 2 * f_law.isf(0.05, 2, 21) == pytest.approx(6.93, abs=0.01)
