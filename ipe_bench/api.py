@@ -226,9 +226,9 @@ def compare(
 
     from ipe_bench.statistics.between import JUDGED, compared, described, left_out
     from ipe_bench.statistics.collect import collect
-    from ipe_bench.statistics.power import plan_of
+    from ipe_bench.statistics.paired import Plan
 
-    plan = plan_of(power, difference, anytime=anytime)
+    plan = Plan.of(power, difference, anytime=anytime)
     if not 0 < alpha < 1:
         raise UserError(f"alpha={alpha}: give a number between 0 and 1")
     if wrong := [name for name in fail_on if name not in JUDGED]:

@@ -35,7 +35,7 @@ BUDGETS = {
     "baselines": 2080,
     "trials": 2374,
     "runs": 2230,
-    "statistics": 4246,
+    "statistics": 4198,
     "real": 2233,
     "plugins": 1186,
     "report": 4147,

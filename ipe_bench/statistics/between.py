@@ -12,35 +12,31 @@ from typing import Any
 import numpy as np
 
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.provenance import canonical_json
-from ipe_bench.statistics.collect import Collection, Group, config_leaves, differing, shown_leaf
+from ipe_bench.statistics.collect import Collection, Group, config_leaves, differing, scenario_of, shown_leaf
 from ipe_bench.statistics.comparisons import ALPHA, differences, holm
-from ipe_bench.statistics.paired import Effect, no_drift, no_lean, ratio_effect, success_effect
-from ipe_bench.statistics.power import PLANNED, Plan
+from ipe_bench.statistics.paired import PLANNED, Effect, Plan, ratio_effect, success_effect
 from ipe_bench.statistics.sample import Sample, samples
 from ipe_bench.trials.thresholds import gate
 
 JUDGED = ("success", "error", "cost")
 """Those that are tested. Time is not: the trials of a block share theirs evenly, and machines differ."""
-BOTH = " | "
-"""Stands between the values of what differs."""
 _SAYS_NOTHING = {"null": "-", "None": "-", "false": "-"}
 NOT_SETTINGS = (
     *("first", "second", "trials", "matched_by", "quantity", "first_value", "second_value"),
     *("change", "low", "high", "p", "e", "finding", *PLANNED),
 )
 """The columns of a row that do not say what is compared."""
-_HEADINGS = {"error_scale": "error scale"}
+_Leaves = tuple[tuple[str, str], ...]
+_Setting = Mapping[str, tuple[str, str]]
+"""Keys in which the scenarios of both sides differ, with both values."""
 
 
 def described(row: Mapping[str, Any]) -> str:
     """What a row compares, in a line for people."""
-    named = {k: v for k, v in row.items() if k not in NOT_SETTINGS and v is not None and v == v}
-    return ", ".join(
-        str(value) if key in ("measurement", "noise") else f"{_HEADINGS.get(key, key)} {_plain(value)}"
-        for key, value in named.items()
-    )
+    named = {k: _plain(v) for k, v in row.items() if k not in NOT_SETTINGS and v is not None and v == v}
+    titles = {"measurement": "", "noise": "", "error_scale": "error scale "}
+    return ", ".join(titles.get(key, f"{key} ") + value for key, value in named.items())
 
 
 def _plain(value: Any) -> str:
@@ -66,45 +62,44 @@ def compared(
     """
     rows = [row for match in _matches(first, second, labels) for row in _rows(*match, alpha)]
     judged = [row for row in rows if row["quantity"] in JUDGED]
-    for row in judged:
+    for row, p in zip(judged, holm([row["p"] for row in judged]), strict=True):
         discordant = row.pop("discordant", None)
         if plan is not None and discordant is not None:
             row |= plan.row(discordant, row["trials"], alpha / len(judged))
-    for row, p in zip(judged, holm([row["p"] for row in judged]), strict=True):
         row["p"] = float(p)
-        sure = row["e"] >= len(judged) / alpha if anytime else p < alpha
-        row["finding"] = _direction(row) if sure else ""
+        if row["e"] >= len(judged) / alpha if anytime else p < alpha:
+            more = row["second_value"] > row["first_value"]
+            row["finding"] = "better" if more == (row["quantity"] == "success") else "worse"
     return rows
 
 
-def _direction(row: Mapping[str, Any]) -> str:
-    if row["quantity"] == "success":
-        return "better" if row["change"] > 0 else "worse"
-    return "better" if row["second_value"] < row["first_value"] else "worse"
-
-
 def _rows(a: Sample, b: Sample, setting: _Setting, alpha: float) -> Iterator[dict[str, Any]]:
+    """A row per quantity of two estimators on one scenario."""
     if a.n != b.n:
         raise UserError(
             f"{a.group.label}: has {a.n} parameters in the first and {b.n} in the second; compare results on the"
             " same measurement"
         )
     _, one, other = np.intersect1d(a.number, b.number, assume_unique=True, return_indices=True)
-    by_trial = len(one) > 0
-    if not by_trial:
+    matched_by = "trial" if len(one) else "order"
+    if not len(one):
         # With other seeds trials are matched in their order: right, since all are independent, but nothing is gained.
-        order = np.arange(min(len(a), len(b)))
-        one, other = np.argsort(a.number, kind="stable")[order], np.argsort(b.number, kind="stable")[order]
-    head = _head(a.group, b.group, setting) | {
-        "first": a.group.estimator,
-        "second": b.group.estimator,
-        "trials": len(one),
-        "matched_by": "trial" if by_trial else "order",
+        one = other = np.arange(min(len(a), len(b)))
+    head = _head(a.group, b.group, setting) | {"first": a.group.estimator, "second": b.group.estimator}
+    head |= {"trials": len(one), "matched_by": matched_by}
+    success = a.inside_gate[one], b.inside_gate[other]
+    radius = float(np.sqrt(gate(a.n)))
+    error = np.minimum(a.distance[one], radius), np.minimum(b.distance[other], radius)
+    seconds = float(np.median(a.scalars["time_s"][one])), float(np.median(b.scalars["time_s"][other]))
+    effects = {
+        "success": success_effect(*success, alpha),
+        "error": ratio_effect(error[0], error[0] + differences(error[1], error[0]), alpha, radius),
+        "cost": ratio_effect(a.cost[one], b.cost[other], alpha),
+        "time": Effect(*seconds, seconds[1] / seconds[0] if seconds[0] > 0 else np.nan),
     }
-    discordant = int(np.sum(a.inside_gate[one] != b.inside_gate[other]))
-    for quantity, effect in _effects(a, one, b, other, alpha).items():
-        further = {"discordant": discordant} if quantity == "success" else {}
-        yield head | {"quantity": quantity} | asdict(effect) | {"finding": ""} | further
+    for quantity, effect in effects.items():
+        discordant = {"discordant": int(np.sum(success[0] != success[1]))} if quantity == "success" else {}
+        yield head | {"quantity": quantity} | asdict(effect) | {"finding": ""} | discordant
 
 
 def _head(first: Group, second: Group, setting: _Setting) -> dict[str, Any]:
@@ -120,33 +115,11 @@ def _head(first: Group, second: Group, setting: _Setting) -> dict[str, Any]:
     for key, values in differ.items():
         shown = [_SAYS_NOTHING.get(_plain(v), _plain(v)) for v in values]
         if shown != ["-", "-"]:
-            columns[key] = BOTH.join(shown)
+            columns[key] = " | ".join(shown)
     return columns
 
 
-def _effects(a: Sample, one: Array, b: Sample, other: Array, alpha: float) -> dict[str, Effect]:
-    """Of the rows `one` of the first sample and `other` of the second, in the same order."""
-    radius = float(np.sqrt(gate(a.n)))
-    error = np.minimum(a.distance[one], radius), np.minimum(b.distance[other], radius)
-    cost = a.cost[one], b.cost[other]
-    d = differences(error[1], error[0])
-    # The first trial's cost is the unit: whoever looks later divides by the same.
-    unit = float(cost[0][0] + cost[1][0]) or 1.0
-    seconds = float(np.median(a.scalars["time_s"][one])), float(np.median(b.scalars["time_s"][other]))
-    time = seconds[1] / seconds[0] if seconds[0] > 0 else np.nan
-    return {
-        "success": success_effect(a.inside_gate[one], b.inside_gate[other], alpha),
-        "error": ratio_effect(error[0], error[0] + d, alpha, no_drift(d, radius), radius),
-        "cost": ratio_effect(*cost, alpha, no_lean(cost[1] - cost[0], unit)),
-        "time": Effect(*seconds, time, np.nan, np.nan, np.nan, np.nan),
-    }
-
-
 # Which scenarios and estimators belong together ----------------------------------------------------------------------
-
-
-_Leaves = tuple[tuple[str, str], ...]
-_Setting = Mapping[str, tuple[str, str]]
 
 
 def _matches(
@@ -172,8 +145,7 @@ def _matches(
         {tuple(leaf for leaf in leaves if leaf[0] not in setting): groups for leaves, groups in scenarios.items()}
         for scenarios in (a, b)
     )
-    shared = [key for key in a if key in b]
-    if not shared:
+    if not a.keys() & b.keys():
         raise UserError(
             f"{_where(first)}, {_where(second)}: have no scenario in common, nor differ in one setting; compare runs of"
             " the same measurement, noise and error scales"
@@ -185,7 +157,7 @@ def _matches(
             return one.estimator == other.estimator
         return wanted[0] in (one.estimator, one.label) and wanted[1] in (other.estimator, other.label)
 
-    found = [(one, other) for key in shared for one in a[key] for other in b[key] if asked(one, other)]
+    found = [(one, other) for key in a if key in b for one in a[key] for other in b[key] if asked(one, other)]
     if not found:
         raise _no_estimator(first, second, wanted)
     for one, other in found:
@@ -205,9 +177,9 @@ def left_out(first: Collection, second: Collection) -> list[str]:
 def _by_scenario(collection: Collection) -> dict[_Leaves, list[Group]]:
     found: dict[_Leaves, list[Group]] = {}
     for group in collection.groups:
-        scenario = {k: v for k, v in group.cells[0][0].footer["identity"]["scenario"].items() if k != "seed"}
-        leaves = tuple(sorted((k, canonical_json(v)) for k, (_, v) in config_leaves(scenario).items()))
-        found.setdefault(leaves, []).append(group)
+        leaves = config_leaves(scenario_of(group.cells[0][0])).items()
+        scenario = tuple(sorted((k, canonical_json(v)) for k, (_, v) in leaves))
+        found.setdefault(scenario, []).append(group)
     return found
 
 

@@ -133,17 +133,17 @@ def _groups(cells: Sequence[StoredCell], runs: Sequence[Run]) -> tuple[Group, ..
     found: dict[tuple[str, str, str], list[StoredCell]] = {}
     for cell in cells:
         if cell.label != TRUTH:
-            what = canonical_json(_scenario(cell)), cell.label, canonical_json(cell.footer["identity"]["estimator"])
+            what = canonical_json(scenario_of(cell)), cell.label, canonical_json(cell.footer["identity"]["estimator"])
             found.setdefault(what, []).append(cell)
     firsts = [members[0] for members in found.values()]
-    extra = [k for k in differing([_scenario(cell) for cell in firsts]) if k != "error_scale"]
+    extra = [k for k in differing([scenario_of(cell) for cell in firsts]) if k != "error_scale"]
     extra = [k for k in extra if not _stands_in_a_name(k, firsts)]
     options = _options(firsts)
     groups = []
     for members in found.values():
         first = members[0]
         chosen = _shown(first.footer["identity"]["estimator"], options.get(first.label, ()))
-        columns = {k: first.names[k] for k in ("measurement", "noise")} | _shown(_scenario(first), extra)
+        columns = {k: first.names[k] for k in ("measurement", "noise")} | _shown(scenario_of(first), extra)
         label = first.label + (f" ({', '.join(f'{k}={v}' for k, v in chosen.items())})" if chosen else "")
         pairs = tuple((m, truths.get(m.scenario_id)) for m in sorted(members, key=lambda m: (m.seed, m.key)))
         columns["error_scale"] = first.names["error_scale"]
@@ -157,7 +157,7 @@ def _groups(cells: Sequence[StoredCell], runs: Sequence[Run]) -> tuple[Group, ..
     return tuple(sorted(_told_apart(list(found), groups), key=place))
 
 
-def _scenario(cell: StoredCell) -> dict[str, Any]:
+def scenario_of(cell: StoredCell) -> dict[str, Any]:
     """What a scenario was constructed from, but for its seed: only seeds are pooled."""
     return {key: value for key, value in cell.footer["identity"]["scenario"].items() if key != "seed"}
 
@@ -194,7 +194,7 @@ def _stands_in_a_name(key: str, cells: Sequence[StoredCell]) -> bool:
     component = key.split(".")[0]
     if component not in ("measurement", "noise"):
         return False
-    leaves = [canonical_json(config_leaves(_scenario(cell)).get(key)) for cell in cells]
+    leaves = [canonical_json(config_leaves(scenario_of(cell)).get(key)) for cell in cells]
     said = {(cell.footer["names"].get(component), leaf) for cell, leaf in zip(cells, leaves, strict=True)}
     return len(said) == len({name for name, _ in said})
 

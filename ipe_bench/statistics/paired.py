@@ -1,29 +1,41 @@
-"""Two columns of numbers of the same trials: their effects with intervals, and evidence that may be looked at daily."""
+"""Two columns of numbers of the same trials: their effects with intervals, evidence that may be looked at daily, and
+how many trials a difference of success takes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
-from scipy.special import betaln, ndtri
+from scipy.special import bdtr, betaln, ndtri
 
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.statistics.calibration import least_count
 from ipe_bench.statistics.comparisons import ALPHA, mcnemar
 from ipe_bench.statistics.consistency import clopper_pearson
 from ipe_bench.statistics.intervals import first_that, grouped
+from ipe_bench.trials.thresholds import FEW
 
 FLIPS = 4999
 """Random assignments of signs."""
 LARGEST_SAMPLE = 1000
 """Of more trials, groups of consecutive ones share a sign: as good, since trials are independent."""
-_BETS = np.concatenate([-(2.0 ** -np.arange(9)), 2.0 ** -np.arange(9)]) * 0.99
-"""Shares of the stake, on either side."""
-_TILTS = np.concatenate([-(2.0 ** np.arange(-12, 5)), 2.0 ** np.arange(-12, 5)])
-"""Multiples of the inverse unit by which differences are tilted, to either side."""
 RARE = 10
 """Number of trials from which a sample shows well enough what an unusual trial is like."""
+_TILTS = np.concatenate([-(2.0 ** np.arange(-12, 5)), 2.0 ** np.arange(-12, 5)])
+"""Multiples of the inverse unit by which differences are tilted, to either side."""
+LIMIT = 0.8
+"""Confidence of the upper limit of the discordant share: a plan by the share that a pilot shows is too small as often
+as not."""
+MOST = 10_000_000
+"""Plans end at this many trials."""
+_SAW = 20
+"""Trials over which the power, which is a saw in their number, must stay."""
+PLANNED = ("power", "difference", "discordant", "discordant_high", "trials_needed")
+"""The columns that a plan adds to a row on success."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +46,10 @@ class Effect:
     second_value: float
     change: float
     """A ratio or a difference, as the function that made it says."""
-    low: float
-    high: float
-    p: float
-    e: float
+    low: float = np.nan
+    high: float = np.nan
+    p: float = np.nan
+    e: float = np.nan
     """An e-value: by chance it exceeds 1/alpha, at whatever number of trials one looks, in a share alpha of cases."""
 
 
@@ -75,9 +87,7 @@ def _tango(losses: int, gains: int, trials: int, alpha: float) -> float:
     return first_that(inside, -1.0, (gains - losses) / trials)
 
 
-def ratio_effect(
-    first: Array, second: Array, alpha: float = ALPHA, evidence: float = np.nan, largest: float | None = None
-) -> Effect:
+def ratio_effect(first: Array, second: Array, alpha: float = ALPHA, largest: float | None = None) -> Effect:
     """Ratio of the means of two columns (trials,) of finite numbers that are not negative, second over first.
 
     Where neither is larger by nature, each trial's difference is as likely to have the other sign: the p is the share
@@ -92,9 +102,11 @@ def ratio_effect(
     """
     a, b = grouped(np.array([first, second], dtype=float), LARGEST_SAMPLE).T.copy()
     means, p_equal = (float(first.mean()), float(second.mean())), _p_of_ratio(a, b)(1.0)
+    # The first trial is the unit: whoever looks later divides by the same.
+    evidence = no_lean(second - first, float(first[0] + second[0]) or 1.0)
     total_a, total_b = float(a.sum()), float(b.sum())
     if not total_a > 0 or not total_b > 0:
-        return Effect(*means, total_b / total_a if total_a > 0 else np.nan, np.nan, np.nan, p_equal, evidence)
+        return Effect(*means, total_b / total_a if total_a > 0 else np.nan, p=p_equal, e=evidence)
     value = total_b / total_a
     low, least = _least_ratio(a, b, alpha), _least_ratio(b, a, alpha)
     high = 1 / least if least > 0 else np.inf
@@ -158,25 +170,98 @@ def fair_coin(heads: int, tails: int) -> float:
     return _exp(betaln(heads + 0.5, tails + 0.5) - betaln(0.5, 0.5) + (heads + tails) * np.log(2))
 
 
-def no_drift(differences: Array, largest: float) -> float:
-    """Evidence against a mean of 0 of differences (trials,) that are never beyond `largest`: the mean fortune of those
-    who bet a fixed share on either sign (Waudby-Smith and Ramdas, J. R. Stat. Soc. B 86, 2024)."""
-    return _mean_fortune(np.log1p(_BETS[:, None] * (differences / largest)[None, :]))
-
-
 def no_lean(differences: Array, unit: float) -> float:
     """Evidence against differences (trials,) that are as likely to have the other sign, of any size: the mean of
     exp(t d) / cosh(t d) over both signs of t, which is a martingale under such signs (de la Peña, Ann. Probab. 27,
     1999). It exceeds 1 only on the side of their sum. `unit` is about what differences are of, and knows no signs."""
     tilts = _TILTS[:, None] * (differences / unit)[None, :]
-    return _mean_fortune(tilts - np.logaddexp(tilts, -tilts) + np.log(2))
-
-
-def _mean_fortune(log_gains: Array) -> float:
-    """The mean over bets of what each has made of 1, from the logarithms of its gains (bets, trials)."""
-    return _exp(float(np.logaddexp.reduce(log_gains.sum(axis=1))) - np.log(len(log_gains)))
+    log_gains = tilts - np.logaddexp(tilts, -tilts) + np.log(2)
+    return _exp(float(np.logaddexp.reduce(log_gains.sum(axis=1))) - np.log(len(_TILTS)))
 
 
 def _exp(value: float) -> float:
     """Never beyond what a number holds: evidence that large is written as the largest."""
     return float(np.exp(min(value, 690.0)))
+
+
+# How many trials -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is wanted: a difference of success, second less first, is found with this probability."""
+
+    power: float
+    difference: float
+
+    @classmethod
+    def of(cls, power: float | None, difference: float | None, *, anytime: bool = False) -> Plan | None:
+        """The plan that is asked for; None if none is.
+
+        Raises:
+            UserError: one of both is missing or no share, or the findings are those of e-values.
+        """
+        if power is None and difference is None:
+            return None
+        if power is None or difference is None:
+            missing = "power" if power is None else "difference"
+            raise UserError(f"{missing}: is not given; both go together, such as power=0.9 difference=0.05")
+        for name, value, example in (("power", power, 0.9), ("difference", difference, 0.05)):
+            if not 0 < value < 1:
+                raise UserError(f"{name}={value}: give a number between 0 and 1, such as {example}")
+        if anytime:
+            raise UserError("power: is that of a fixed number of trials; leave out anytime, or see precision= of run")
+        return cls(power, difference)
+
+    def row(self, discordant: int, trials: int, alpha: float) -> dict[str, Any]:
+        """The columns `PLANNED`, from the number of trials, and of those in which one alone succeeds.
+
+        Raises:
+            UserError: there are too few trials to plan from, or the plan has more than `MOST`.
+        """
+        if trials < FEW:
+            raise UserError(f"power: {trials} common trials are too few to plan from; run at least {FEW}")
+        # One end of an interval leaves out half of what both do.
+        high = clopper_pearson(discordant, trials, 2 * LIMIT - 1)[1]
+        needed = trials_needed(max(high, self.difference), self.difference, self.power, alpha)
+        return dict(zip(PLANNED, (self.power, self.difference, discordant, high, needed), strict=True))
+
+
+def mcnemar_power(trials: int, share: float, difference: float, alpha: float) -> float:
+    """The probability that McNemar's exact test at the level `alpha` finds a difference of success, where one estimator
+    alone succeeds in a `share` of the trials.
+
+    The number of these trials is binomial, and so is the number of those that the second wins (Duffy, Biometrics 40,
+    1984).
+    """
+    mean, reach = trials * share, 8 * np.sqrt(trials * share * (1 - share)) + 8
+    m = np.arange(max(1, int(mean - reach)), min(trials, int(mean + reach)) + 1)
+    probability = bdtr(m, trials, share) - bdtr(m - 1, trials, share)
+    # The most that the loser may win for the test to reject.
+    edge = least_count(m, np.array(0.5), np.array(alpha / 2)) - 1
+    won = (1 + difference / share) / 2
+    rejects = bdtr(np.maximum(edge, 0), m, won) + bdtr(np.maximum(edge, 0), m, 1 - won)
+    return float(np.sum(probability * np.where(edge >= 0, rejects, 0.0)))
+
+
+def trials_needed(share: float, difference: float, power: float, alpha: float) -> int:
+    """The least number of trials from which on the power is had.
+
+    Raises:
+        UserError: it is above `MOST`.
+    """
+
+    def enough(trials: int) -> bool:
+        return mcnemar_power(trials, share, difference, alpha) >= power
+
+    low, high = 0, 8
+    while not enough(high):
+        low, high = high, 2 * high
+        if high > MOST:
+            raise UserError(f"difference={difference:g}: needs more than {MOST:,} trials; ask for a larger difference")
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if enough(middle) else (middle, high)
+    while below := [n for n in range(high, high + _SAW) if not enough(n)]:
+        high = below[-1] + 1
+    return high

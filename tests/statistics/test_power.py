@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from ipe_bench.statistics.power import Plan, mcnemar_power, trials_needed
+from ipe_bench.statistics.paired import Plan, mcnemar_power, trials_needed
 
 CASES = [(0.9, 0.95, 0.0), (0.9, 0.95, 0.6), (0.5, 0.6, 0.0), (0.5, 0.6, 0.7), (0.97, 1.0, 0.0), (0.73, 0.67, 0.3)]
 """Success of the first and of the second, and the correlation of both."""
