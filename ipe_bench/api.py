@@ -502,7 +502,7 @@ def _check_records(options: Sequence[Option]) -> list[Finding]:
     """Whether the reports on a small sweep and on a single trial have what each of these options adds to reports."""
     from ipe_bench.baselines import EKF, LinearLSE
     from ipe_bench.measurements.polynomial import Polynomial
-    from ipe_bench.noise.white import Gaussian
+    from ipe_bench.noise import Gaussian
     from ipe_bench.plugins.conformance import Finding
     from ipe_bench.plugins.extensions import use_statistics
     from ipe_bench.report.figures import added_drawings

@@ -2,9 +2,18 @@
 
 from ipe_bench.basics.naming import without_modules
 from ipe_bench.noise.base import Noise
-from ipe_bench.noise.colored import Colored, Correlated
-from ipe_bench.noise.own import Certified, ModelNoise, Unknown
-from ipe_bench.noise.white import Gaussian, NoNoise, Outliers, Quantization, StudentT
+from ipe_bench.noise.kinds import (
+    Certified,
+    Colored,
+    Correlated,
+    Gaussian,
+    ModelNoise,
+    NoNoise,
+    Outliers,
+    Quantization,
+    StudentT,
+)
+from ipe_bench.noise.unknown import Unknown
 
 __all__ = [
     "Certified",

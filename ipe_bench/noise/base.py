@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
@@ -13,7 +13,9 @@ from ipe_bench.basics.linalg import Array, Covariance
 from ipe_bench.basics.naming import Named
 from ipe_bench.basics.options import Component, Positive
 from ipe_bench.measurements.base import Measurement, UsualNoise
-from ipe_bench.noise.levels import Levels
+
+if TYPE_CHECKING:
+    from ipe_bench.noise.unknown import Levels
 
 UNIFORM_DEVIATION = 1 / np.sqrt(12)
 """The standard deviation of a uniform number between 0 and 1."""
@@ -26,6 +28,8 @@ class Noise(Component, Named, ABC):
     """True where readings are not simulated at all, but are those that come with the model."""
     estimated: ClassVar[bool] = False
     """True where the level of the errors is estimated from the residuals, R being known up to a factor."""
+    true_covariance: bool = True
+    """Whether R is that of the errors; False where estimators are told another one on purpose."""
 
     def completed(self, usual: UsualNoise | None) -> Noise:
         """This noise, with what its options leave out taken from the usual noise of the model.
@@ -35,11 +39,6 @@ class Noise(Component, Named, ABC):
         """
         del usual
         return self
-
-    @property
-    def true_covariance(self) -> bool:
-        """Whether R is that of the errors; False where estimators are told another one on purpose."""
-        return True
 
     @abstractmethod
     def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
@@ -71,28 +70,30 @@ class Noise(Component, Named, ABC):
 
 @dataclass(frozen=True)
 class ScaledNoise(Noise):
-    """A noise whose size is one standard deviation."""
+    """A noise whose size is one standard deviation; R is white unless a subclass says otherwise."""
 
     deviation: Positive | None = None
     """Standard deviation of a reading, in the unit of the readings; None: that of the model's usual noise."""
 
     def completed(self, usual: UsualNoise | None) -> Self:
-        if self.deviation is not None:
-            return self
-        if usual is None or (usual.deviation is None and usual.step is None):
-            raise UserError(self._missing)
-        return replace(self, deviation=usual.deviation or usual.step * UNIFORM_DEVIATION)  # type: ignore[operator]
+        if self.deviation is None and usual is not None:
+            return replace(self, deviation=usual.deviation or usual.step * UNIFORM_DEVIATION)  # type: ignore[operator]
+        _ = self.stated
+        return self
 
     @property
     def stated(self) -> float:
-        """The standard deviation; raises UserError if none is given."""
+        """The standard deviation.
+
+        Raises:
+            UserError: none is given.
+        """
         if self.deviation is None:
-            raise UserError(self._missing)
+            raise UserError(
+                f"noise.deviation: is not given for noise={self.name}, and the measurement model names no noise of its"
+                " own; give the standard deviation of a reading in its unit, noise.deviation=X"
+            )
         return self.deviation
 
-    @property
-    def _missing(self) -> str:
-        return (
-            f"noise.deviation: is not given for noise={self.name}, and the measurement model names no noise of its own;"
-            " give the standard deviation of a reading in its unit, noise.deviation=X"
-        )
+    def covariance(self, m: int) -> Covariance:
+        return Covariance(np.full(m, self.stated))

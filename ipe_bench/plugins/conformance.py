@@ -22,9 +22,8 @@ from ipe_bench.measurements import Polynomial, Sir
 from ipe_bench.measurements.base import Measurement, UsualNoise, differentiate
 from ipe_bench.measurements.counted import cost
 from ipe_bench.measurements.problem import Problem
+from ipe_bench.noise import Gaussian, ModelNoise
 from ipe_bench.noise.base import Noise
-from ipe_bench.noise.own import ModelNoise
-from ipe_bench.noise.white import Gaussian
 from ipe_bench.plugins.construct import construct, find_class
 from ipe_bench.plugins.discovery import COMPONENT_GROUPS, Option, blame, composed
 from ipe_bench.priors import GaussianPrior, Prior

@@ -1,6 +1,147 @@
-"""Priors: where true parameters are drawn from. Config group `prior`."""
+"""Priors: where true parameters are drawn from, and what estimators are told of that. Config group `prior`."""
 
-from ipe_bench.priors.base import Prior
-from ipe_bench.priors.gaussian import GaussianPrior, prior_of
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.naming import Named
+from ipe_bench.basics.options import Component, Finite, NonNegative
+from ipe_bench.measurements.base import Measurement
 
 __all__ = ["GaussianPrior", "Prior", "prior_of"]
+
+_SYMMETRIC = 1e-6
+"""Entries that should be equal may differ by this share of the deviations: files are printed with few digits."""
+_DEFINITE = 1e-12
+"""The least eigenvalue of a correlation: below it P0 has no inverse to working precision."""
+
+
+class Prior(Component, Named, ABC):
+    """A prior. A new one is a frozen dataclass that writes `deviation` and `draw`.
+
+    Estimators that use a prior are told N(nominal, P0), P0 being of these deviations and of `correlation`, and the
+    Bayesian bound is the one under that. A prior of another form has draws of the same mean and covariance, and sets
+    `normal` to False: then that bound is one for estimators that know no more than mean and covariance.
+    """
+
+    normal: ClassVar[bool] = True
+    """Whether its draws are normal: the posterior is sampled for such priors alone."""
+
+    @abstractmethod
+    def deviation(self, n: int, error_scale: float) -> Array:
+        """Standard deviations (n,) of the parameters in multiples of their units."""
+
+    def correlation(self, n: int) -> Array | None:
+        """Correlation (n, n) of the parameters, positive definite; None: they are independent."""
+        del n
+        return None
+
+    @abstractmethod
+    def draw(self, x0: Array, error_scale: float, rng: np.random.Generator) -> Array:
+        """One parameter vector (n,) about the nominal point x0 (n,), in multiples of the units."""
+
+
+@dataclass(frozen=True)
+class GaussianPrior(Prior):
+    """N(x0, P0), of deviations error_scale x unit and independent parameters; `deviations` widens or narrows some of
+    them, and `correlations` makes them depend on each other."""
+
+    deviations: tuple[NonNegative, ...] | None = None
+    """Per parameter, in multiples of its unit, at error scale 1; None: 1 for each."""
+    correlations: tuple[tuple[Finite, ...], ...] | None = None
+    """The correlation matrix, a row per parameter; None: they are independent."""
+    name: ClassVar[str] = "gaussian"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.deviations is not None and not any(self.deviations):
+            raise UserError("deviations: give at least one that is above 0")
+        rows = self.correlations or ()
+        for i, row in enumerate(rows, start=1):
+            if len(row) != len(rows):
+                raise UserError(
+                    f"correlations: row {i} has {len(row)} numbers; give a square matrix, {len(rows)} in each row"
+                )
+        if self.correlations is not None:
+            C = np.array(self.correlations)
+            if not np.allclose(np.diag(C), 1.0, atol=_SYMMETRIC):
+                raise UserError("correlations: has a diagonal that is not 1; give correlations, deviations aside")
+            _require_covariance("correlations", C)
+
+    def deviation(self, n: int, error_scale: float) -> Array:
+        if self.deviations is not None and len(self.deviations) != n:
+            raise UserError(
+                f"prior.deviations: has {len(self.deviations)} numbers; give one for each of {n} parameters"
+            )
+        return error_scale * (np.ones(n) if self.deviations is None else np.asarray(self.deviations, dtype=float))
+
+    def correlation(self, n: int) -> Array | None:
+        if self.correlations is None:
+            return None
+        if len(self.correlations) != n:
+            raise UserError(
+                f"prior.correlations: has {len(self.correlations)} rows; give one for each of {n} parameters"
+            )
+        C = np.array(self.correlations, dtype=float)
+        return (C + C.T) / 2
+
+    def draw(self, x0: Array, error_scale: float, rng: np.random.Generator) -> Array:
+        n = len(x0)
+        white, C = rng.standard_normal(n), self.correlation(n)
+        return x0 + self.deviation(n, error_scale) * (white if C is None else np.linalg.cholesky(C) @ white)
+
+
+def prior_of(model: Measurement, P: Array) -> GaussianPrior:
+    """The prior of a covariance P (n, n) in the parameters' own units, at error scale 1.
+
+    Of parameters with bounds it is that of their logarithms or logits, which has this P where it is narrow.
+
+    Raises:
+        UserError: P is not a covariance of n parameters.
+    """
+    P = np.asarray(P, dtype=float)
+    if P.shape != (model.n, model.n):
+        size = " x ".join(map(str, P.shape))
+        names = ", ".join(p.name for p in model.physical_parameters)
+        raise UserError(f"prior_covariance: is {size}; give a row and a column for each of {model.n} ({names})")
+    _require_covariance("prior_covariance", P)
+    deviation = np.sqrt(np.diag(P))
+    slope = model.physical_slope(model.nominal[None])[0]
+    C = P / np.outer(deviation, deviation) * np.outer(np.sign(slope), np.sign(slope))
+    C = (C + C.T) / 2
+    np.fill_diagonal(C, 1.0)
+    return GaussianPrior(tuple((deviation / np.abs(slope)).tolist()), tuple(map(tuple, C.tolist())))
+
+
+def _require_covariance(key: str, P: Array) -> None:
+    """Refuses a square matrix that is not the covariance of anything.
+
+    Raises:
+        UserError: by `key`, and by row and column where one is to blame.
+    """
+    if len(odd := np.argwhere(~np.isfinite(P))):
+        raise UserError(f"{key}: row {odd[0][0] + 1}, column {odd[0][1] + 1} is not a finite number")
+    variances = np.diag(P)
+    if (variances <= 0).any():
+        i = int(np.flatnonzero(variances <= 0)[0])
+        raise UserError(f"{key}: row {i + 1}, column {i + 1} is {variances[i]:g}; a variance is above 0")
+    deviation = np.sqrt(variances)
+    C = P / np.outer(deviation, deviation)
+    if (np.abs(C - C.T) > _SYMMETRIC).any():
+        i, j = np.unravel_index(np.abs(C - C.T).argmax(), C.shape)
+        raise UserError(
+            f"{key}: is not symmetric; row {i + 1}, column {j + 1} is {P[i, j]:g}, and row {j + 1}, column {i + 1} is "
+            f"{P[j, i]:g}"
+        )
+    least = float(np.linalg.eigvalsh((C + C.T) / 2)[0])
+    if least <= _DEFINITE:
+        raise UserError(
+            f"{key}: is not positive definite; the least eigenvalue of its correlations is {least:.2g}, so that some "
+            "combination of the parameters would have no variance"
+        )

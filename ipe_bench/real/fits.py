@@ -17,9 +17,9 @@ from ipe_bench.estimators.base import Estimator, estimate_safely
 from ipe_bench.measurements.base import Measurement, SubsetModel
 from ipe_bench.measurements.counted import cost
 from ipe_bench.measurements.problem import Problem
+from ipe_bench.noise import Gaussian
 from ipe_bench.noise.base import Noise
-from ipe_bench.noise.levels import Levels
-from ipe_bench.noise.white import Gaussian
+from ipe_bench.noise.unknown import Levels
 from ipe_bench.real.levels import Estimated, first_levels, levels_at, maximum, objective_of, unknown_levels
 from ipe_bench.real.profiles import Released, half_width, wald_interval
 from ipe_bench.real.residuals import Whiteness, explained, normalised, outlier_limit, whiteness

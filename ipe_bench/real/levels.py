@@ -24,7 +24,7 @@ from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.measurements.base import Measurement, Parameter, WrappedModel
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.noise.levels import Levels
+from ipe_bench.noise.unknown import Levels
 from ipe_bench.real.residuals import explained
 
 _TOLERANCE = 1e-8

@@ -13,7 +13,7 @@ from ipe_bench.measurements import Formula, Nist
 from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Unknown
-from ipe_bench.noise.levels import Levels, read_sigma
+from ipe_bench.noise.unknown import Levels, read_sigma
 from ipe_bench.real.examination import examine
 from ipe_bench.real.fits import fit
 from ipe_bench.real.levels import Levelled, minimise

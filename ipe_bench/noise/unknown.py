@@ -1,4 +1,4 @@
-"""Standard deviations of readings as a formula of levels that are not known, one set of levels for each group."""
+"""Noise of unknown levels: standard deviations as a formula of levels, one set of levels for each group of readings."""
 
 from __future__ import annotations
 
@@ -11,10 +11,16 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.options import Positive
 from ipe_bench.measurements.arithmetic import Arithmetic, read
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.ode.trace import Graph, Program, tangent
+from ipe_bench.noise.base import Noise
+from ipe_bench.noise.kinds import Gaussian
 
+NO_LEVEL = (
+    "noise=unknown: has no level to simulate with; choose another noise, give noise.levels=[...], or use `estimate`"
+)
 READING = "h"
 """Name of the error-free reading's magnitude in a formula of the standard deviation."""
 _PROBES = 1000
@@ -29,7 +35,7 @@ def read_sigma(text: str) -> Arithmetic:
         UserError: it is no formula, has no level, or is negative at some levels and readings, all of them positive.
     """
     formula = read(text, "noise.sigma")
-    names = [name for name in formula.names if name != READING]
+    names = level_names(formula)
     if not names:
         raise UserError(f"noise.sigma={text}: has no level to estimate; give one, as in a + b*{READING}")
     points = 10.0 ** np.random.default_rng(0).uniform(-2, 2, (len(names) + 1, _PROBES))
@@ -42,6 +48,11 @@ def read_sigma(text: str) -> Arithmetic:
             f" positive for all positive levels, such as a + b*{READING}, where {READING} is the reading's magnitude"
         )
     return formula
+
+
+def level_names(formula: Arithmetic) -> tuple[str, ...]:
+    """The names of the levels of a group of readings."""
+    return tuple(name for name in formula.names if name != READING)
 
 
 @dataclass(frozen=True)
@@ -76,10 +87,9 @@ class Levels:
             raise UserError(f"noise.sigma: {min(both)} is a parameter of the model; give the level another name")
         return found
 
-    @cached_property
+    @property
     def names(self) -> tuple[str, ...]:
-        """Names of the levels of a group."""
-        return tuple(name for name in self.formula.names if name != READING)
+        return level_names(self.formula)
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -126,8 +136,71 @@ class Levels:
 def _recorded(formula: Arithmetic) -> Program:
     """The formula and its derivatives by the reading and by each level."""
     graph = Graph()
-    names = [name for name in formula.names if name != READING]
-    known = {name: graph.input(name) for name in (READING, *names)}
+    known = {name: graph.input(name) for name in (READING, *level_names(formula))}
     value, one = graph.apply("add", formula(known), 0.0), graph.constant(1.0)
     slopes = [tangent([value], {place: one})[0] for place in known.values()]
     return Program.of([value, *slopes], list(known.values()))
+
+
+@dataclass(frozen=True)
+class Unknown(Noise):
+    """Independent normal errors whose level is estimated from the residuals.
+
+    Estimates do not depend on a single level; standard errors are scaled by it, and tests of the level itself are not
+    possible. Several levels, or a standard deviation that depends on the reading, are estimated with the parameters by
+    restricted maximum likelihood.
+    """
+
+    weights: tuple[Positive, ...] | None = None
+    """Standard deviations of the readings up to a common factor; None: they are equal."""
+    by: str | None = None
+    """Column of the readings whose entries have levels of their own: `output`, say, or `file`."""
+    sigma: str = "sigma"
+    """Formula of the standard deviation: h is the magnitude of the error-free reading, all other names are levels."""
+    levels: tuple[Positive, ...] | None = None
+    """True levels in the order of the formula, for `run`: estimators are told R with these, at the nominal readings."""
+
+    estimated = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        names = level_names(read_sigma(self.sigma))
+        if self.levels is not None and len(self.levels) != len(names):
+            raise UserError(f"noise.levels: has {len(self.levels)} numbers; give one for each of {', '.join(names)}")
+        if self.levels is not None and self.by is not None:
+            raise UserError("noise.by: does not go with noise.levels; state what is known, as in noise=gaussian")
+
+    def levels_of(self, model: Measurement) -> Levels | None:
+        """The levels of a model's readings; None if a single one multiplies all standard deviations."""
+        if self.by is None and self.sigma == "sigma":
+            return None
+        return Levels.of(read_sigma(self.sigma), self.covariance(model.m).factor, self.by, model)
+
+    def true_levels(self, m: int) -> tuple[Levels, Array] | None:
+        if self.levels is None:
+            return None
+        formula, weights = read_sigma(self.sigma), self.covariance(m).factor
+        return Levels(formula, weights, ("",), np.zeros(m, dtype=np.intp)), np.log(self.levels)
+
+    def nominal_covariance(self, model: Measurement) -> Covariance:
+        if self.levels is None:
+            return self.covariance(model.m)
+        return self._true_covariance(model.simulate(model.nominal[None])[0])
+
+    def _true_covariance(self, h: Array) -> Covariance:
+        """R of the errors of readings h (m,)."""
+        known = self.true_levels(len(h))
+        if known is None:
+            raise UserError(NO_LEVEL)
+        levels, theta = known
+        return levels.covariance(h, theta)
+
+    @property
+    def true_covariance(self) -> bool:
+        return READING not in read_sigma(self.sigma).names
+
+    def corrupt(self, h: Array, offset: Array, rng: np.random.Generator) -> Array:
+        return h + self._true_covariance(h).factor * rng.standard_normal(h.shape)
+
+    def covariance(self, m: int) -> Covariance:
+        return Covariance(np.ones(m)) if self.weights is None else Gaussian(self.weights).covariance(m)
