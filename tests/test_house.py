@@ -26,9 +26,9 @@ LINE = (
 )
 BUDGETS = {
     "basics": 1144,
-    "measurements": 7222,
-    "noise": 671,
-    "priors": 175,
+    "measurements": 6965,
+    "noise": 634,
+    "priors": 147,
     "states": 1056,
     "estimators": 1281,
     "solvers": 1250,
@@ -37,7 +37,7 @@ BUDGETS = {
     "runs": 2230,
     "statistics": 4198,
     "real": 2233,
-    "plugins": 1186,
+    "plugins": 1185,
     "report": 4147,
     "cli": 2552,
 }

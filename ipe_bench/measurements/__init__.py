@@ -1,7 +1,6 @@
 """Measurement models: what a parameter vector makes the instruments read. Config group `measurement`."""
 
 from ipe_bench.basics.naming import without_modules
-from ipe_bench.measurements.accelerometer import Accelerometer
 from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, SubsetModel, UsualNoise
 from ipe_bench.measurements.bearings import Bearings
 from ipe_bench.measurements.formula import Formula
@@ -15,8 +14,7 @@ from ipe_bench.measurements.ode.described import Ode, packaged
 from ipe_bench.measurements.ode.model import OdeMeasurement
 from ipe_bench.measurements.polynomial import Polynomial
 from ipe_bench.measurements.ranging import Ranging
-from ipe_bench.measurements.six_position import SixPosition
-from ipe_bench.measurements.triad import Triad
+from ipe_bench.measurements.triad import Accelerometer, Triad
 
 Bock, FallingBody, LotkaVolterra, Sir = map(packaged, ("bock", "falling_body", "lotka_volterra", "sir"))
 
@@ -42,7 +40,6 @@ __all__ = [
     "Recorded",
     "RicherGins",
     "Sir",
-    "SixPosition",
     "SubsetModel",
     "Triad",
     "UsualNoise",

@@ -212,13 +212,10 @@ class Measurement(Component, Named, ABC):
         del x
         return {}
 
-    def fixed_at(self, values: Mapping[int, float]) -> Measurement:
-        """This model with some of the n parameters fixed at values in their own units."""
-        raise NotImplementedError(f"{self.name} holds no parameter")
-
-    def unbounded(self, values: Mapping[int, float]) -> Measurement:
-        """This model with some of the n parameters free of bounds, starting at values in their own units."""
-        raise NotImplementedError(f"{self.name} holds no parameter")
+    def stating(self, key: str, values: Mapping[int, float]) -> Measurement:
+        """This model with some of the n parameters `fixed` at values in their own units; or free of bounds, with these
+        `nominal` values."""
+        raise NotImplementedError(f"{self.name} has no bounds")
 
     def jacobian(self, x: Array) -> Array:
         """dh/dx at each trial: (trials, n) -> (trials, m, n); complex step where analytic, else central differences."""
@@ -325,11 +322,8 @@ class WrappedModel(Measurement):
     def remarks(self, x: Array) -> tuple[str, ...]:
         return self.whole.remarks(self.whole_x(x[None])[0])
 
-    def fixed_at(self, values: Mapping[int, float]) -> Measurement:
-        return self._around(self.whole.fixed_at(values))
-
-    def unbounded(self, values: Mapping[int, float]) -> Measurement:
-        return self._around(self.whole.unbounded(values))
+    def stating(self, key: str, values: Mapping[int, float]) -> Measurement:
+        return self._around(self.whole.stating(key, values))
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
         return self._around(self.whole.with_inputs(columns, readings))

@@ -6,15 +6,15 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import count
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Positive
-from ipe_bench.measurements.base import Input, Measurement, Parameter, UsualNoise
+from ipe_bench.measurements.base import Epochs, Input, Measurement, Parameter, UsualNoise
 
 LIGHT = 299792458.0
 """Speed of light in m/s."""
@@ -72,13 +72,9 @@ class Gnss(Measurement):
     System, Living Reviews in Relativity 6, 2003 (rotation).
     """
 
-    satellites: tuple[tuple[float, float, float], ...] | None = None
-    """x, y, z in m (ECEF) for each reading; None: six GPS and four Galileo satellites over the presumed position, each
-    read once in each of `rounds` epochs."""
-    constellations: tuple[str, ...] | None = None
-    """The constellation of each reading; None: all of one."""
-    times: tuple[int, ...] | None = None
-    """The number of the epoch of each reading; None: all of one."""
+    satellites: tuple[tuple[int, str, float, float, float], ...] | None = None
+    """Number of the epoch, constellation, and x, y, z in m (ECEF) for each reading; None: six GPS and four Galileo
+    satellites over the presumed position, each read once in each of `rounds` epochs."""
     position: tuple[float, float, float] = (-3120042.0, 4084614.0, 3764026.0)
     """The presumed position in m (ECEF): the nominal point, with clocks of 0."""
     frame: Literal["enu", "ecef"] = "enu"
@@ -99,31 +95,20 @@ class Gnss(Measurement):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        given = {"constellations": self.constellations, "times": self.times}
-        if self.satellites is None:
-            for name, column in given.items():
-                if column is not None:
-                    raise UserError(f"{name}: give satellites as well, three coordinates for each reading")
-        else:
-            for name, column in given.items():
-                if column is not None and len(column) != len(self.satellites):
-                    raise UserError(f"{name}: {len(column)} entries for {len(self.satellites)} satellites")
         if self.frame == "enu" and math.hypot(*self.position) < _LEAST_RADIUS:
             raise UserError("position: there is no up near the centre of the Earth; set frame=ecef")
         if self.m < self.n:
             raise UserError(f"satellites: {self.m} readings are too few for {self.n} parameters")
 
     @cached_property
-    def _columns(self) -> tuple[Array, tuple[str, ...], tuple[int, ...]]:
-        """Satellite (m, 3), constellation and epoch of each reading."""
+    def _columns(self) -> tuple[tuple[int, ...], tuple[str, ...], Array]:
+        """Epoch, constellation and satellite (m, 3) of each reading."""
         if self.satellites is not None:
-            m = len(self.satellites)
-            systems, times = self.constellations or ("gps",) * m, self.times or (1,) * m
-            return np.asarray(self.satellites, dtype=float), systems, times
+            times, systems, *places = zip(*self.satellites, strict=True)
+            return times, systems, np.array(places, dtype=float).T
         sky = np.array([self._overhead(*place[1:]) for place in _SKY])
-        systems = tuple(place[0] for place in _SKY) * self.rounds
         times = tuple(k for k in range(1, self.rounds + 1) for _ in _SKY)
-        return np.tile(sky, (self.rounds, 1)), systems, times
+        return times, tuple(place[0] for place in _SKY) * self.rounds, np.tile(sky, (self.rounds, 1))
 
     def _overhead(self, radius: float, azimuth: float, elevation: float) -> Array:
         """The place (3,) on a sphere about the Earth's centre that is seen in that direction."""
@@ -142,7 +127,7 @@ class Gnss(Measurement):
 
     @cached_property
     def _times(self) -> tuple[int, ...]:
-        return tuple(sorted(set(self._columns[2])))
+        return tuple(sorted(set(self._columns[0])))
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -162,18 +147,11 @@ class Gnss(Measurement):
         return values / self.sizes
 
     @cached_property
-    def m(self) -> int:
-        return len(self._columns[0])
-
-    @cached_property
     def index(self) -> Mapping[str, Sequence[Any]]:
-        _, systems, times = self._columns
-        seen: dict[tuple[int, str], int] = {}
-        numbers = []
-        for key in zip(times, systems, strict=True):
-            seen[key] = seen.get(key, 0) + 1
-            numbers.append(seen[key])
-        return {"epoch": list(times), "constellation": list(systems), "satellite": numbers}
+        times, systems, _ = self._columns
+        pairs = list(zip(times, systems, strict=True))
+        numbers = {pair: count(1) for pair in pairs}
+        return {"epoch": list(times), "constellation": list(systems), "satellite": [next(numbers[p]) for p in pairs]}
 
     @property
     def inputs(self) -> tuple[Input, ...]:
@@ -183,14 +161,12 @@ class Gnss(Measurement):
 
     @property
     def input_columns(self) -> Mapping[str, Sequence[Any]]:
-        places, systems, times = self._columns
-        axes = {f"{axis} [m]": places[:, i].tolist() for i, axis in enumerate("xyz")}
-        return {"epoch": list(times), "constellation": list(systems), **axes}
+        times, systems, places = self._columns
+        columns = list(times), list(systems), *places.T.tolist()
+        return dict(zip((i.heading for i in self.inputs), columns, strict=True))
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
-        places = tuple(zip(*(columns[f"{axis} [m]"] for axis in "xyz"), strict=True))
-        given = {"constellations": tuple(columns["constellation"]), "times": tuple(columns["epoch"])}
-        return replace(self, satellites=places, **given)
+        return replace(self, satellites=tuple(zip(*(columns[i.heading] for i in self.inputs), strict=True)))
 
     @property
     def own_parameters(self) -> tuple[str, ...]:
@@ -198,26 +174,19 @@ class Gnss(Measurement):
         return tuple(p.name for p in self.parameters if p.group == "clock")
 
     @cached_property
-    def epochs(self) -> tuple[NDArray[np.intp], ...]:
-        times = np.array(self._columns[2])
-        return tuple(np.flatnonzero(times == k) for k in self._times)
+    def epochs(self) -> Epochs:
+        return tuple(np.flatnonzero(np.array(self._columns[0]) == k) for k in self._times)
 
     @cached_property
     def _biases(self) -> Array:
         """Which of the clocks and offsets each reading carries: (n - 3, m) of zeros and ones."""
-        _, systems, times = self._columns
-        return np.array(
-            [
-                *([t == k for t in times] for k in self._times),
-                *([s == name for s in systems] for name in self._systems[1:]),
-            ],
-            dtype=float,
-        )
+        times, systems, _ = self._columns
+        clocks = [np.array(times) == k for k in self._times]
+        return np.array([*clocks, *(np.array(systems) == name for name in self._systems[1:])], dtype=float)
 
     def simulate(self, x: Array) -> Array:
         values = (x * self.sizes)[:, :, None]
-        place = self._place(values)
-        z = self._travelled(place)
+        z = self._travelled(self._place(values))
         for k, carried in enumerate(self._biases):
             z = z + values[:, 3 + k] * carried
         return z
@@ -234,7 +203,7 @@ class Gnss(Measurement):
 
         Each of the three passes takes the error down by the speed of the satellite's turning over that of light, 1e-5.
         """
-        x, y, z = self._columns[0].T
+        x, y, z = self._columns[2].T
         distance: Any = 0.0
         for _ in range(3):
             angle = self.earth_rate / LIGHT * distance

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise
+from ipe_bench.measurements.base import Epochs, Measurement, Parameter, UsualNoise
 
 
 @dataclass(frozen=True)
@@ -35,45 +36,40 @@ class Joint(Measurement):
         if len(units) > 1:
             raise UserError(f"readings: the files have readings in different units: {', '.join(sorted(units))}")
 
-    @cached_property
-    def _places(self) -> tuple[NDArray[np.intp], ...]:
-        """Where the parameters of each part stand among those of all."""
-        names: dict[str, int] = {}
-        each = [[names.setdefault(name, len(names)) for name in self._names(k)] for k in range(len(self.parts))]
-        return tuple(np.array(places) for places in each)
-
-    def _names(self, k: int) -> list[str]:
-        """What the parameters of part k are called among those of all."""
-        part = self.parts[k]
-        return [f"{p.name}_{k + 1}" if p.name in part.own_parameters else p.name for p in part.physical_parameters]
-
-    @cached_property
-    def copies(self) -> Mapping[str, tuple[str, ...]]:
+    @property
+    def copies(self) -> dict[str, list[str]]:
         """What the parameters are called here of which every file has its own, by what the model calls them."""
-        found: dict[str, tuple[str, ...]] = {}
-        for k, part in enumerate(self.parts):
-            for own, name in zip(part.physical_parameters, self._names(k), strict=True):
-                if own.name in part.own_parameters:
-                    found[own.name] = (*found.get(own.name, ()), name)
-        return found
+        return {
+            name: [f"{name}_{k}" for k, part in enumerate(self.parts, 1) if name in part.own_parameters]
+            for name in dict.fromkeys(name for part in self.parts for name in part.own_parameters)
+        }
+
+    @cached_property
+    def _places(self) -> list[NDArray[np.intp]]:
+        """Where the parameters of each part stand among those of all."""
+        numbers: dict[str, int] = {}
+        return [
+            np.array([numbers.setdefault(self._named(p, p, k).name, len(numbers)) for p in part.physical_parameters])
+            for k, part in enumerate(self.parts)
+        ]
+
+    def _named(self, p: Parameter, known: Parameter, k: int) -> Parameter:
+        """A parameter of part k, which users know as `known`, as it is called among those of all."""
+        own = known.name in self.parts[k].own_parameters
+        return replace(p, name=f"{p.name}_{k + 1}", group=p.group or p.name) if own else p
 
     @cached_property
     def _first(self) -> list[tuple[int, int]]:
         """The part in which each parameter appears first, and its place there."""
-        found: dict[int, tuple[int, int]] = {}
-        for part, places in enumerate(self._places):
-            for i, place in enumerate(places.tolist()):
-                found.setdefault(place, (part, i))
-        return [found[j] for j in range(len(found))]
+        places = [(place, k, i) for k, own in enumerate(self._places) for i, place in enumerate(own.tolist())]
+        found = {place: (k, i) for place, k, i in reversed(places)}
+        return [found[place] for place in sorted(found)]
 
     def _each(self, attribute: str) -> tuple[Parameter, ...]:
-        named = []
-        for k, i in self._first:
-            part = self.parts[k]
-            p: Parameter = getattr(part, attribute)[i]
-            own = part.physical_parameters[i].name in part.own_parameters
-            named.append(replace(p, name=f"{p.name}_{k + 1}", group=p.group or p.name) if own else p)
-        return tuple(named)
+        return tuple(
+            self._named(getattr(self.parts[k], attribute)[i], self.parts[k].physical_parameters[i], k)
+            for k, i in self._first
+        )
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -85,24 +81,26 @@ class Joint(Measurement):
 
     @cached_property
     def nominal(self) -> Array:
-        return np.array([self.parts[part].nominal[i] for part, i in self._first])
+        return np.array([self.parts[k].nominal[i] for k, i in self._first])
 
     @property
     def fixed(self) -> Mapping[str, float]:
         return {name: value for part in self.parts for name, value in part.fixed.items()}
 
-    def _of_parts(self, method: str, x: Array) -> list[Array]:
-        """What that method of each part gives for its own parameters."""
+    def _of_parts(self, method: str, x: Array) -> list[Any]:
+        """What that method of each part gives for its own parameters, which are on the last axis of x."""
         pairs = zip(self.parts, self._places, strict=True)
-        return [getattr(part, method)(x[:, places]) for part, places in pairs]
+        return [getattr(part, method)(x[..., places]) for part, places in pairs]
+
+    def _columns(self, method: str, x: Array) -> Array:
+        values = self._of_parts(method, x)
+        return np.stack([values[k][:, i] for k, i in self._first], axis=1)
 
     def physical(self, x: Array) -> Array:
-        values = self._of_parts("physical", x)
-        return np.stack([values[part][:, i] for part, i in self._first], axis=1)
+        return self._columns("physical", x)
 
     def physical_slope(self, x: Array) -> Array:
-        slopes = self._of_parts("physical_slope", x)
-        return np.stack([slopes[part][:, i] for part, i in self._first], axis=1)
+        return self._columns("physical_slope", x)
 
     @cached_property
     def m(self) -> int:
@@ -116,16 +114,14 @@ class Joint(Measurement):
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
         columns = [part.index for part in self.parts]
-        names = dict.fromkeys(name for column in columns for name in column)
-        files = [k for k, part in enumerate(self.parts, 1) for _ in range(part.m)]
-        joined = {
-            name: [v for column, part in zip(columns, self.parts, strict=True) for v in column.get(name, [""] * part.m)]
-            for name in names
-        }
-        return {"file": files, **joined}
+        joined: dict[str, list[Any]] = {"file": [k for k, part in enumerate(self.parts, 1) for _ in range(part.m)]}
+        for name in dict.fromkeys(name for column in columns for name in column):
+            each = (column.get(name, [""] * part.m) for column, part in zip(columns, self.parts, strict=True))
+            joined[name] = list(chain.from_iterable(each))
+        return joined
 
     @cached_property
-    def epochs(self) -> tuple[NDArray[np.intp], ...] | None:
+    def epochs(self) -> Epochs | None:
         """Those of the files after one another; None where a file has none."""
         parts = [part.epochs for part in self.parts]
         if any(epochs is None for epochs in parts):
@@ -137,14 +133,13 @@ class Joint(Measurement):
         return np.concatenate([part.offset for part in self.parts])
 
     @property
-    def usual_noise(self) -> UsualNoise | None:  # type: ignore[override]
+    def usual_noise(self) -> UsualNoise | None:
         """That of the parts, where it is one."""
         known = [part.usual_noise for part in self.parts]
         return known[0] if all(one == known[0] for one in known) else None
 
     def remarks(self, x: Array) -> tuple[str, ...]:
-        said = [part.remarks(x[places]) for part, places in zip(self.parts, self._places, strict=True)]
-        return tuple(dict.fromkeys(sentence for one in said for sentence in one))
+        return tuple(dict.fromkeys(chain.from_iterable(self._of_parts("remarks", x))))
 
     def simulate(self, x: Array) -> Array:
         return np.concatenate(self._of_parts("simulate", x), axis=1)

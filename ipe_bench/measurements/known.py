@@ -6,7 +6,7 @@ numbers, so that no estimator and no draw can leave the bounds.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.options import Component, Finite, Positive
 from ipe_bench.measurements.base import Measurement, Parameter, Recorded, WrappedModel
 from ipe_bench.measurements.joint import Joint
 
@@ -24,41 +25,40 @@ _NEAR = 1e-2
 
 
 @dataclass(frozen=True)
-class ParameterInfo:
+class ParameterInfo(Component):
     """What is known of one parameter; all in its own unit."""
 
     name: str
-    fixed: float | None = None
+    fixed: Finite | None = None
     """Its value, where it is not to be estimated."""
-    nominal: float | None = None
+    nominal: Finite | None = None
     """Where estimation starts and the prior is centred, in place of the model's own value."""
-    deviation: float | None = None
+    deviation: Positive | None = None
     """Standard deviation of the prior at error scale 1, in place of the parameter's size."""
-    lower: float | None = None
-    upper: float | None = None
+    lower: Finite | None = None
+    upper: Finite | None = None
     positive: bool = False
     """The same as lower=0: the prior is then log-normal."""
 
     def __post_init__(self) -> None:
-        for key in ("fixed", "nominal", "deviation", "lower", "upper"):
-            value = getattr(self, key)
-            if value is not None and not np.isfinite(value):
-                raise UserError(f"{key}={value}: give a finite number, or leave it out")
-        if self.deviation is not None and self.deviation <= 0:
-            raise UserError(f"deviation={self.deviation}: give a number above 0; fixed=VALUE fixes a parameter")
+        super().__post_init__()
         if self.positive and self.lower is not None:
             raise UserError(f"lower={self.lower}: is given with positive=true, which is lower=0; leave one of them out")
-        bounds = self.bounds
-        if not bounds[0] < bounds[1]:
-            raise UserError(f"upper={self.upper}: give a number above lower={bounds[0]:g}")
-        others = [key for key in ("nominal", "deviation", "lower", "upper") if getattr(self, key) is not None]
-        if self.fixed is not None and (others or self.positive):
-            raise UserError(f"fixed={self.fixed}: a fixed parameter has no {(others or ['bounds'])[0]}; leave one out")
+        lower, upper = self.bounds
+        if not lower < upper:
+            raise UserError(f"upper={upper}: give a number above lower={lower:g}")
+        if self.fixed is not None and (others := self.stated.keys() - {"name", "fixed"}):
+            raise UserError(f"fixed={self.fixed}: a fixed parameter has no {min(others)}; leave one out")
 
     @property
     def bounds(self) -> tuple[float, float]:
         lower = 0.0 if self.positive else -np.inf if self.lower is None else self.lower
         return lower, np.inf if self.upper is None else self.upper
+
+    @property
+    def stated(self) -> dict[str, Any]:
+        """What is said, by option."""
+        return {f.name: value for f in fields(self) if (value := getattr(self, f.name)) != f.default}
 
 
 def informed(model: Measurement, known: Sequence[ParameterInfo]) -> Measurement:
@@ -70,23 +70,13 @@ def informed(model: Measurement, known: Sequence[ParameterInfo]) -> Measurement:
     Raises:
         UserError: of a parameter that the model does not have, or a start outside of its bounds.
     """
-    if isinstance(model, Joint):
-        known = _of_each_file(known, model)
-    return ConstrainedModel(model, tuple(known)) if known else model
-
-
-def _of_each_file(known: Sequence[ParameterInfo], model: Joint) -> list[ParameterInfo]:
-    """What is known of parameters by the names that they have among those of all files; a file's own counts."""
-    found: dict[str, ParameterInfo] = {}
-    for general in (one for one in known if one.name in model.copies):
-        found |= {name: replace(general, name=name) for name in model.copies[general.name]}
-    for one in (one for one in known if one.name not in model.copies):
-        general = found.get(one.name)
-        if general is not None and one.fixed is None and general.fixed is None:
-            said = {f.name: getattr(one, f.name) for f in fields(one) if getattr(one, f.name) not in (None, False)}
-            one = replace(general, **said)
-        found[one.name] = one
-    return list(found.values())
+    copies = model.copies if isinstance(model, Joint) else {}
+    found = {name: replace(one, name=name) for one in known for name in copies.get(one.name, ())}
+    for one in (one for one in known if one.name not in copies):
+        general = found.get(one.name, one)
+        free = one.fixed is None and general.fixed is None
+        found[one.name] = replace(general, **one.stated) if free else one
+    return ConstrainedModel(model, tuple(found.values())) if found else model
 
 
 @dataclass(frozen=True)
@@ -101,7 +91,7 @@ class ConstrainedModel(WrappedModel):
     whole: Measurement
     known: tuple[ParameterInfo, ...]
 
-    by_differential_equations = False  # type: ignore[assignment]
+    by_differential_equations = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -130,16 +120,14 @@ class ConstrainedModel(WrappedModel):
     def _v0(self) -> Array:
         """Starts and fixed values of all parameters, in their units."""
         starts = self.whole.nominal * self.whole.sizes
-        given = [one.fixed if one.fixed is not None else one.nominal for one in self._known]
+        given = [one.nominal if one.fixed is None else one.fixed for one in self._known]
         return np.array([s if g is None else g for s, g in zip(starts, given, strict=True)], dtype=float)
 
     @cached_property
     def _transformed(self) -> tuple[_Transformation, ...]:
         """Of the parameters that are left."""
-        sizes = self.whole.sizes
-        return tuple(
-            _Transformation(float(self._v0[i]), self._known[i].bounds, float(sizes[i])) for i in self._free.tolist()
-        )
+        sizes = self.whole.sizes.tolist()
+        return tuple(_Transformation(float(self._v0[i]), self._known[i].bounds, sizes[i]) for i in self._free)
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -167,15 +155,19 @@ class ConstrainedModel(WrappedModel):
     def nominal(self) -> Array:
         return np.array([t.inner(t.v0) for t in self._transformed])
 
+    def _each(self, method: str, values: Array) -> Array:
+        """What that method of each transformation makes of its column of values (trials, n)."""
+        return np.stack([getattr(t, method)(values[:, k]) for k, t in enumerate(self._transformed)], axis=1)
+
     def physical(self, x: Array) -> Array:
-        return np.stack([t.value(x[:, k]) for k, t in enumerate(self._transformed)], axis=1)
+        return self._each("value", x)
 
     def physical_slope(self, x: Array) -> Array:
-        return np.stack([t.slope(x[:, k]) for k, t in enumerate(self._transformed)], axis=1)
+        return self._each("slope", x)
 
     def inner(self, values: Array) -> Array:
         """x (trials, n) of values (trials, n) in the parameters' own units."""
-        return np.stack([t.inner(values[:, k]) for k, t in enumerate(self._transformed)], axis=1)
+        return self._each("inner", values)
 
     def near_bounds(self, x: Array) -> dict[int, float]:
         values = self.physical(x[None])[0]
@@ -186,15 +178,9 @@ class ConstrainedModel(WrappedModel):
             if abs(v - bound) <= _NEAR * abs(t.v0 - bound) < np.inf
         }
 
-    def fixed_at(self, values: Mapping[int, float]) -> Measurement:
-        return self._with(ParameterInfo(self.physical_parameters[k].name, fixed=value) for k, value in values.items())
-
-    def unbounded(self, values: Mapping[int, float]) -> Measurement:
-        return self._with(ParameterInfo(self.physical_parameters[k].name, nominal=value) for k, value in values.items())
-
-    def _with(self, known: Iterable[ParameterInfo]) -> ConstrainedModel:
-        """The model in which that is known, in place of what was known of the same parameters."""
-        given = {one.name: one for one in (*self.known, *known)}
+    def stating(self, key: str, values: Mapping[int, float]) -> Measurement:
+        stated = [ParameterInfo(self.physical_parameters[k].name, **{key: value}) for k, value in values.items()]
+        given = {one.name: one for one in (*self.known, *stated)}
         return replace(self, known=tuple(given.values()))
 
     def whole_x(self, x: Array) -> Array:
@@ -203,7 +189,7 @@ class ConstrainedModel(WrappedModel):
         whole = np.repeat((self._v0 / sizes)[None], len(x), axis=0).astype(x.dtype)
         for k, (i, t) in enumerate(zip(self._free, self._transformed, strict=True)):
             whole[:, i] = x[:, k] if t.plain else t.value(x[:, k]) / sizes[i]
-        return whole if x.shape[1] == n else np.concatenate([whole, x[:, n:]], axis=1)
+        return np.concatenate([whole, x[:, n:]], axis=1)
 
     def own_jacobian(self, x: Array, J: Array) -> Array:
         slopes = [
@@ -219,7 +205,7 @@ class ConstrainedModel(WrappedModel):
 
     @property
     def recorded(self) -> Recorded | None:
-        """The whole model's readings; its answer only where nothing of it is fixed otherwise."""
+        """The whole model's readings, and its answer in the parameters that are left."""
         found = self.whole.recorded
         if found is None:
             return None

@@ -1,6 +1,6 @@
 """Calibration of three accelerometers or magnetometers by the magnitude of what they measure.
 
-`Magnitudes` is what such models share, `Triad` the symmetric form in errors; the form in raw counts is `accelerometer`.
+`Triad` is the symmetric form in errors, `Accelerometer` the triangular form in raw counts.
 """
 
 from __future__ import annotations
@@ -10,19 +10,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from annotated_types import MinLen
-from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Positive
-from ipe_bench.measurements.base import Input, Measurement, Parameter, UsualNoise
+from ipe_bench.measurements.base import Epochs, Input, Measurement, Parameter, UsualNoise
+
+Vector = tuple[float, float, float]
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
-_BIAS_SIZE, _SCALE_SIZE, _MISALIGNMENT_SIZE = 2e-3, 2e-3, 2e-3
-"""One unit of error: of a bias in multiples of the field, of a scale factor, of a misalignment in rad."""
 
 
 def attitudes() -> Array:
@@ -34,11 +33,18 @@ def attitudes() -> Array:
 class Magnitudes(Measurement):
     """The magnitude of a vector that a triad was exposed to in each of its attitudes, from the outputs of the triad.
 
-    A subclass gives the outputs and how they are corrected. Each attitude is an epoch. Outputs are taken to be exact,
-    with their noise counted in the readings.
+    Parameters: three biases in the unit of the outputs, three scale factors in ppm, three angles in mrad. Each attitude
+    is an epoch. Outputs are taken to be exact, with their noise counted in the readings.
     """
 
     analytic = True
+    outputs_option: ClassVar[str]
+    """The name of the option that holds the outputs."""
+    angles: ClassVar[tuple[str, str, str]]
+    """The names of the three angles."""
+    output_unit: str
+    error_sizes: Vector
+    """One unit of error: of a bias in the unit of the outputs, of a scale factor as a fraction, of an angle in rad."""
 
     @property
     @abstractmethod
@@ -49,14 +55,14 @@ class Magnitudes(Measurement):
     def corrected(self, x: Array) -> Sequence[Array]:
         """The three components, each (trials, attitudes), of what acted on the triad."""
 
-    @property
-    @abstractmethod
-    def output_unit(self) -> str:
-        """The unit of the outputs."""
-
-    @abstractmethod
-    def with_outputs(self, outputs: tuple[tuple[float, float, float], ...]) -> Measurement:
-        """The same triad with these outputs r_k."""
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        bias, scale, angle = self.error_sizes
+        return (
+            *(Parameter(f"b{a}", self.output_unit, bias, "bias") for a in "xyz"),
+            *(Parameter(f"k{a}", "ppm", 1e6 * scale, "scale factor") for a in "xyz"),
+            *(Parameter(name, "mrad", 1e3 * angle, "misalignment") for name in self.angles),
+        )
 
     @property
     def inputs(self) -> tuple[Input, ...]:
@@ -68,14 +74,15 @@ class Magnitudes(Measurement):
         return {i.heading: self.measured[:, k].tolist() for k, i in enumerate(self.inputs)}
 
     def with_inputs(self, columns: Mapping[str, Sequence[Any]], readings: int) -> Measurement:
-        return self.with_outputs(tuple(zip(*(columns[i.heading] for i in self.inputs), strict=True)))
+        outputs = tuple(zip(*(columns[i.heading] for i in self.inputs), strict=True))
+        return replace(self, **{self.outputs_option: outputs})  # type: ignore[type-var]
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
         return {"attitude": list(range(1, len(self.measured) + 1))}
 
     @cached_property
-    def epochs(self) -> tuple[NDArray[np.intp], ...]:
+    def epochs(self) -> Epochs:
         return tuple(np.arange(self.m)[:, None])
 
     def simulate(self, x: Array) -> Array:
@@ -98,33 +105,23 @@ class Triad(Magnitudes):
     and Technology 11, 2000.
     """
 
-    outputs: Annotated[tuple[tuple[float, float, float], ...], MinLen(10)] | None = None
+    outputs: Annotated[tuple[Vector, ...], MinLen(10)] | None = None
     """Outputs r_k of the triad (attitudes, 3) in `unit`; None: a field of `field` in 26 directions."""
     field: Positive = 1.0
     """The magnitude about which sizes are chosen, in `unit`."""
     unit: str = "g"
-    bias: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    bias: Vector = (0.0, 0.0, 0.0)
     """The presumed bias in `unit`; with the two that follow, the nominal point."""
-    scale: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    scale: Vector = (0.0, 0.0, 0.0)
     """The presumed scale-factor errors, as plain numbers."""
-    misalignment: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    misalignment: Vector = (0.0, 0.0, 0.0)
     """The presumed misalignments in rad."""
 
-    @property
-    def reading_unit(self) -> str:
-        return self.unit
-
-    @property
-    def usual_noise(self) -> UsualNoise:
-        return UsualNoise(1e-5 * self.field)
-
-    @cached_property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (
-            *(Parameter(f"b{a}", self.unit, _BIAS_SIZE * self.field, "bias") for a in "xyz"),
-            *(Parameter(f"k{a}", "ppm", 1e6 * _SCALE_SIZE, "scale factor") for a in "xyz"),
-            *(Parameter(f"m{a}", "mrad", 1e3 * _MISALIGNMENT_SIZE, "misalignment") for a in ("xy", "xz", "yz")),
-        )
+    outputs_option = "outputs"
+    angles = ("mxy", "mxz", "myz")
+    reading_unit = output_unit = property(lambda triad: triad.unit)
+    usual_noise = property(lambda triad: UsualNoise(1e-5 * triad.field))
+    error_sizes = property(lambda triad: (2e-3 * triad.field, 2e-3, 2e-3))
 
     @cached_property
     def _plain_sizes(self) -> Array:
@@ -134,13 +131,6 @@ class Triad(Magnitudes):
     @cached_property
     def nominal(self) -> Array:
         return np.concatenate([self.bias, self.scale, self.misalignment]) / self._plain_sizes
-
-    @property
-    def output_unit(self) -> str:
-        return self.unit
-
-    def with_outputs(self, outputs: tuple[tuple[float, float, float], ...]) -> Measurement:
-        return replace(self, outputs=outputs)
 
     @cached_property
     def measured(self) -> Array:
@@ -154,3 +144,58 @@ class Triad(Magnitudes):
             a[i] = a[i] + p[:, 6 + k] * d[j]
             a[j] = a[j] + p[:, 6 + k] * d[i]
         return a
+
+
+@dataclass(frozen=True)
+class Accelerometer(Magnitudes):
+    """The magnitude |T K (r_k - b)| of specific force, from the counts r_k of a triad at rest in attitude k.
+
+        T = [[1, -ayz, azy], [0, 1, -azx], [0, 0, 1]],   K = diag(kx, ky, kz)
+
+    b is the bias in counts, K the scale in m/s^2 per count, T leads from the axes of the sensors to orthogonal ones, of
+    which x is the first sensor's (small angles, as in the source). The reading of every attitude is the local gravity
+    `gravity`, in m/s^2: it does not tell how the triad was held, and need not. At least 10 attitudes, spread over the
+    sphere.
+
+    Parameters: three biases in counts, three scale factors in ppm of the presumed ones, three angles in mrad. The
+    usual noise is 5e-3 m/s^2 for the averages of an attitude with consumer sensors.
+
+    Source: Tedaldi, Pretto, Menegatti, A robust and easy to implement method for IMU calibration without external
+    equipments, IEEE International Conference on Robotics and Automation, 2014 (there b is added). `Triad` is the same
+    in another form: its symmetric matrix is the polar factor of T K.
+    """
+
+    counts: Annotated[tuple[Vector, ...], MinLen(10)] | None = None
+    """Counts r_k (attitudes, 3); None: those of a triad as presumed, in 26 directions."""
+    bias: Vector = (32768.0, 32768.0, 32768.0)
+    """The presumed bias in counts; with the two that follow, the nominal point."""
+    scale: tuple[Positive, Positive, Positive] = (0.0024, 0.0024, 0.0024)
+    """The presumed scale factors in m/s^2 per count."""
+    misalignment: Vector = (0.0, 0.0, 0.0)
+    """The presumed angles ayz, azy, azx in rad."""
+    gravity: Positive = 9.80665
+    """Local gravity in m/s^2."""
+
+    reading_unit = "m/s^2"
+    usual_noise = UsualNoise(5e-3)
+    outputs_option = output_unit = "counts"
+    angles = ("ayz", "azy", "azx")
+    error_sizes = (50.0, 0.02, 0.01)
+
+    @cached_property
+    def nominal(self) -> Array:
+        return np.concatenate([self.bias, np.zeros(3), 1e3 * np.array(self.misalignment)]) / self.sizes
+
+    @cached_property
+    def measured(self) -> Array:
+        if self.counts is not None:
+            return np.asarray(self.counts, dtype=float)
+        ayz, azy, azx = self.misalignment
+        T = np.array([[1.0, -ayz, azy], [0.0, 1.0, -azx], [0.0, 0.0, 1.0]])
+        return self.bias + self.gravity * attitudes() @ np.linalg.inv(T * self.scale).T
+
+    def corrected(self, x: Array) -> Sequence[Array]:
+        p = (x * self.sizes)[:, :, None]
+        d = [self.scale[i] * (1.0 + 1e-6 * p[:, 3 + i]) * (self.measured[:, i] - p[:, i]) for i in range(3)]
+        ayz, azy, azx = (1e-3 * p[:, 6 + i] for i in range(3))
+        return d[0] - ayz * d[1] + azy * d[2], d[1] - azx * d[2], d[2]

@@ -289,4 +289,9 @@ def resolved(noise: Noise, model: Measurement) -> Noise:
     """
     if not isinstance(noise, ModelNoise):
         return noise.completed(model.usual_noise)
-    return noise.of(model) or Gaussian().completed(None)
+    if (own := noise.of(model)) is None:
+        raise UserError(
+            f"noise: is not given, and measurement={model.name} names no noise of its own; set noise.deviation=X, the "
+            "standard deviation of a reading, or choose a noise"
+        )
+    return own

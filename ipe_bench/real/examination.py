@@ -314,7 +314,7 @@ def _released(problem: Problem, found: Examination, values: Mapping[int, float])
     """The problem in which parameters that are held at bounds may leave them; None if nothing is known of it there."""
     places, bounds = np.array(list(values)), np.array(list(values.values()))
     start = problem.measurement.physical(problem.measurement.nominal[None])[0]
-    given = replace(problem, measurement=problem.measurement.unbounded(values))
+    given = replace(problem, measurement=problem.measurement.stating("nominal", values))
     x = np.array(given.measurement.nominal, dtype=float)
     x[np.setdiff1d(np.arange(len(x)), places)] = found.inner
     with np.errstate(all="ignore"):

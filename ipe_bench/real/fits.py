@@ -418,7 +418,7 @@ def holding(problem: Problem, values: Mapping[int, float]) -> Problem:
     deviation, correlation = problem.prior_deviation, problem.prior_correlation
     deviation = None if deviation is None else deviation[kept]
     correlation = None if correlation is None else correlation[np.ix_(kept, kept)]
-    held = problem.measurement.fixed_at(values)
+    held = problem.measurement.stating("fixed", values)
     return replace(problem, measurement=held, prior_deviation=deviation, prior_correlation=correlation)
 
 
@@ -428,7 +428,7 @@ def falls_beyond(
     """The sets of readings z (sets, m) whose sum of squares falls on beyond every bound, so that its minimum within
     them is on them, where it is `held` (sets, free) (Nocedal and Wright, Numerical Optimization, 2nd ed., 2006, theorem
     12.1)."""
-    model, places = problem.measurement.unbounded(near), list(near)
+    model, places = problem.measurement.stating("nominal", near), list(near)
     x = np.repeat(np.array(model.nominal, dtype=float)[None], len(z), axis=0)
     x[:, [k for k in range(model.n) if k not in near]] = held
     with np.errstate(all="ignore"):

@@ -34,18 +34,13 @@ def on_ellipsoid(latitude, longitude, height):
 
 def sky(model):
     """Satellites (m, 3) of the default sky, found from the readings' directions: the model's own table."""
-    return model._columns[0]
+    return model._columns[2]
 
 
 def given(model, **others):
     """The same readings with everything in fields."""
-    index = model.index
-    return Gnss(
-        satellites=tuple(map(tuple, sky(model).tolist())),
-        constellations=tuple(index["constellation"]),
-        times=tuple(index["epoch"]),
-        **others,
-    )
+    labels = zip(model.index["epoch"], model.index["constellation"], sky(model).tolist(), strict=True)
+    return Gnss(tuple((epoch, name, *place) for epoch, name, place in labels), **others)
 
 
 def test_distances_are_those_of_light_in_axes_that_do_not_turn():
@@ -98,7 +93,7 @@ def test_east_north_up_and_ecef_are_one_model():
 def test_without_rotation_and_with_one_clock_it_is_ranging():
     beacons = Ranging(rounds=2)
     model = Gnss(
-        satellites=beacons.beacons * 2,
+        tuple((1, "gps", *beacon) for beacon in beacons.beacons * 2),
         frame="ecef",
         position=(0.0, 0.0, 0.0),
         earth_rate=0.0,

@@ -12,13 +12,12 @@ from ipe_bench.measurements import (
     Polynomial,
     Ranging,
     Sir,
-    SixPosition,
     Triad,
 )
 from ipe_bench.noise import Colored, Correlated
 
 FEW = ((1.0, 0.0, 0.0),) * 9
-HIGH = ((2e7, 0.0, 0.0),) * 9
+HIGH = ((1, "gps", 2e7, 0.0, 0.0),) * 9
 MISTAKES = [
     (lambda: Bearings(legs=((1.0, 2.0),)), "legs"),
     (lambda: Bearings(target=(1.0, 2.0)), "target"),
@@ -27,12 +26,8 @@ MISTAKES = [
     (lambda: Triad(outputs=FEW), "outputs"),
     (lambda: Accelerometer(counts=FEW), "counts"),
     (lambda: Accelerometer(scale=(0.0, 1.0, 1.0)), "scale"),
-    (lambda: SixPosition(sensors=("ax",)), "sensors: give force and rate with them"),
-    (lambda: SixPosition(sensors=("ux",), force=FEW[:1], rate=FEW[:1]), "sensor=ux: there is no such sensor"),
     (lambda: Gnss(satellites=HIGH[:3]), "satellites: 3 readings"),
-    (lambda: Gnss(satellites=((2e7, 0.0),) * 9), r"satellites\[0\]=\[2.*, 0\.0\]: give a list of 3 numbers"),
-    (lambda: Gnss(satellites=HIGH, times=(1, 2)), "times: 2 entries"),
-    (lambda: Gnss(constellations=("gps",)), "constellations: give"),
+    (lambda: Gnss(satellites=((2e7, 0.0),) * 9), r"satellites\[0\]=\[2.*, 0\.0\]: give a list of 5"),
     (lambda: Gnss(position=(0.0, 0.0, 0.0)), "position:"),
     (lambda: Sir(size={"beta": 1.0}), "size: beta is not a parameter"),
     (lambda: Sir(constants={"population": 763.0}).simulate(np.ones((1, 3))), "measurement: infection is not known"),

@@ -147,7 +147,8 @@ def test_a_satellite_file_brings_its_own_sky(tmp_path):
     """Position and clock of a file with a sky, an order and an epoch of its own, within their intervals, at the answer
     of an independent solution."""
     rng = np.random.default_rng(5)
-    sky = tuple(tuple(v) for v in Gnss(rounds=1)._columns[0][[3, 0, 5, 1, 2, 4]] + rng.normal(0, 3e5, (6, 3)))
+    places = Gnss(rounds=1)._columns[2][[3, 0, 5, 1, 2, 4]] + rng.normal(0, 3e5, (6, 3))
+    sky = tuple((1, "gps", *place) for place in places.tolist())
     truth = Gnss(sky, earth_rate=0.0)
     p = np.array([120.0, -40.0, 30.0, 2500.0])
     z = truth.simulate((p / truth.sizes)[None])[0] + rng.normal(size=6)
@@ -164,7 +165,7 @@ def test_a_satellite_file_brings_its_own_sky(tmp_path):
 
     def residuals(q):
         place = here + axes.T @ q[:3]
-        ranges = np.array([np.sqrt(np.sum((np.array(s) - place) ** 2)) for s in sky])
+        ranges = np.array([np.sqrt(np.sum((np.array(s[2:]) - place) ** 2)) for s in sky])
         return ranges + q[3] - z
 
     expected, deviations = solution(residuals, [1.0, 1.0, 1.0, 1000.0])
