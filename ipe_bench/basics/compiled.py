@@ -17,16 +17,12 @@ import sys
 from collections.abc import Callable
 from ctypes.util import find_library
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ipe_bench.basics.errors import StorageError
 from ipe_bench.basics.files import cache_folder, write_atomically
-
-if TYPE_CHECKING:
-    # Imported where something is compiled, and here so that results are known to depend on it.
-    from ipe_bench.basics import vectors as vectors
 
 _LOG = logging.getLogger(__name__)
 
@@ -85,9 +81,7 @@ def width() -> int:
 
 
 @functools.lru_cache(maxsize=256)
-def load(
-    key: str, write: Callable[[], str], name: str, arguments: tuple[Any, ...], what: str = "an integrator"
-) -> Callable[..., None]:
+def load(key: str, write: Callable[[], str], name: str, arguments: tuple[Any, ...]) -> Callable[..., None]:
     """The function `name` of the module that `write` writes and `key` stands for, compiled once per machine.
 
     A kept file is used only if it was made of this key for this processor, is whole, and belongs to this user or the
@@ -100,7 +94,7 @@ def load(
     content = _own_bytes(path)
     code = content[2 * _DIGEST :]
     if content[: 2 * _DIGEST] != made_of + hashlib.sha256(code).digest():
-        _LOG.info("compiling %s, once per machine: it is kept in %s", what, path.parent)
+        _LOG.info("compiling an integrator, once per machine: it is kept in %s", path.parent)
         code = _object_code(write())
         content = made_of + hashlib.sha256(code).digest() + code
         with contextlib.suppress(StorageError):
@@ -148,10 +142,9 @@ def _machine() -> tuple[str, ...]:
 
 @functools.cache
 def digest_of(file: Path) -> str:
-    """Stands for the code of a module that writes intermediate representation, and of those it writes with: what they
-    compiled before a change is not used after it."""
-    files = [file, Path(__file__), Path(__file__).with_name("vectors.py")]
-    return hashlib.sha256(b"".join(each.read_bytes() for each in files)).hexdigest()
+    """Stands for the code of a module that writes intermediate representation: what it compiled before a change is not
+    used after it."""
+    return hashlib.sha256(file.read_bytes() + Path(__file__).read_bytes()).hexdigest()
 
 
 _NOTHING = ctypes.c_char * 0

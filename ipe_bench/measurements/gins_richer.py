@@ -15,7 +15,7 @@ from ipe_bench.basics.options import NonNegative
 from ipe_bench.measurements.base import Parameter
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.ode.integrator import Kernel
-from ipe_bench.measurements.ode.plan import Equations, simulation
+from ipe_bench.measurements.ode.plan import Equations
 from ipe_bench.measurements.ode.tableau import DOP853
 
 _ARCSEC = np.pi / 180 / 3600
@@ -140,7 +140,7 @@ class RicherGins(Gins):
             return y
 
         equations = Equations(self.states, given + self.states, 0, self.states, start, moving.rhs, read)
-        return Kernel(simulation, equations, DOP853)
+        return Kernel(equations, DOP853)
 
     def __getstate__(self) -> dict[str, Any]:
         return {k: v for k, v in super().__getstate__().items() if k != "_motion"}

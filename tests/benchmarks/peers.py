@@ -13,7 +13,7 @@ import numpy as np
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.ode.model import OdeMeasurement
-from ipe_bench.measurements.ode.plan import _Tape
+from ipe_bench.measurements.ode.plan import Recording
 from ipe_bench.measurements.ode.tableau import DOP853
 from ipe_bench.measurements.ode.trace import Program
 
@@ -57,7 +57,7 @@ def _run(program: Program, inputs: list[Any], library: Any) -> list[Any]:
 
 def _programs(model: OdeMeasurement) -> tuple[Program, Program, Program]:
     """From p and c: the first state and what stays fixed; from t, the state and that: its slope, and what is read."""
-    tape = _Tape(model.equations)
+    tape = Recording(model.equations)
     fixed = tape.fixed(*tape.slope, *tape.shown)
     along = [tape.t, *tape.y, *fixed]
     begin = Program.of([*tape.start, *fixed], [*tape.p, *tape.c])

@@ -5,22 +5,30 @@
 
 Lane l is the problem of trial rows[l / n_cases] in case l % n_cases, for first <= l < last; a group that is not full
 repeats its last lane. Where constants are driven, `cases` holds those of every interval, and those after the last time.
+Every operation is IEEE arithmetic in a fixed order, so the bits of a lane do not depend on the number of lanes.
+`basics.compiled` makes machine code of such modules; this file is imported only where something is compiled.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
 from llvmlite import ir
 
-from ipe_bench.basics.vectors import F64, I64, PTR, VOID, Value, Vectors, function, integer, loop, number_at, put, room
-from ipe_bench.measurements.ode.plan import Moving, Plan
+from ipe_bench.measurements.ode.plan import Plan
 from ipe_bench.measurements.ode.trace import Program
 
+F64, I32, I64, PTR, VOID = ir.DoubleType(), ir.IntType(32), ir.IntType(64), ir.PointerType(), ir.VoidType()
+_ARITHMETIC = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
 _FILLED = 4
 """Numbers of a tangent from which on one alone keeps the processor busy; below, two advance side by side."""
+
+Value = Any
+"""A value of LLVM's intermediate representation."""
 
 
 def integrate(plan: Plan, width: int) -> str:
@@ -29,37 +37,19 @@ def integrate(plan: Plan, width: int) -> str:
 
 
 def rates(program: Program, width: int) -> str:
-    """void rates(double *x, double *si, double *out, int64 trials): one number from the parameters x[i] times si."""
+    """void rates(double *x, double *si, double *out, int64 trials): one number from the parameters x[i] times si, for
+    one trial at a time, a width of 1."""
     made: Any = ir.Function(ir.Module("rates"), ir.FunctionType(VOID, [PTR, PTR, PTR, I64]), "rates")
     x, si, out, trials = made.args
     b: Any = ir.IRBuilder(made.append_basic_block())
     n = program.inputs
     with loop(b, integer(0), trials) as i:
-        v = Vectors(b, width)
+        v = _Vectors(b, width)
         row, size = v.load(v.place(x, b.mul(i, integer(n))), range(n)), v.load(si, range(n))
-        (rate,) = _run(v, program, [b.fmul(value, unit) for value, unit in zip(row, size, strict=True)])
+        (rate,) = v.run(program, [b.fmul(value, unit) for value, unit in zip(row, size, strict=True)])
         put(b, rate, out, i)
     b.ret_void()
     return str(made.module)
-
-
-def _run(v: Vectors, program: Program, inputs: Sequence[Value]) -> list[Value]:
-    values = list(inputs)
-    assert len(values) == program.inputs
-    for name, *numbers in program.operations:
-        constant = name == "constant"
-        values.append(v.constant(*numbers) if constant else v.apply(name, *[values[i] for i in numbers]))
-    return [values[i] for i in program.outputs]
-
-
-def _combine(
-    v: Vectors, start: Sequence[Value], weights: Sequence[Value], slopes: Sequence[Sequence[Value]]
-) -> list[Value]:
-    """start + sum of weight times slope."""
-    result = list(start)
-    for weight, slope in zip(weights, slopes, strict=True):
-        result = [v.call("fma", weight, k, y) for k, y in zip(slope, result, strict=True)]
-    return result
 
 
 class _Writer:
@@ -70,106 +60,112 @@ class _Writer:
         weights = [weight for row in plan.tableau.weights for _, weight in row]
         self.count = -(-len(weights) // width)
         padded = [*weights, *[0.0] * (self.count * width - len(weights))]
-        self.table = self._constant("weights", ir.ArrayType(F64, len(padded)), padded, 8 * width)
-        self.begin = function(self.module, "begin", [PTR], self._begin)
-        self.weigh = function(self.module, "weigh", [PTR, F64], self._weigh)
-        self.step = function(self.module, "step", [PTR, F64, F64], self._step)
-        self.read = function(self.module, "read", [PTR, F64], self._read)
-        if plan.moving is not None:
-            kinds = [PTR, PTR, PTR]
-            self.groups = _side_by_side(plan.moving)
-            self.move = {
-                by: function(self.module, f"move{by}", kinds, partial(self._move, plan.moving, by))
-                for _, _, by in self.groups
-            }
-            self.show = function(self.module, "show", kinds, partial(self._show, plan.moving))
-            self.sources = self._places("sources", plan.moving.sources)
-            self.show_sources = self._places("show_sources", plan.moving.show_sources)
+        self.table = self._constant("weights", F64, padded, 8 * width)
+        self.begin = self._function("begin", [PTR], self._begin)
+        self.weigh = self._function("weigh", [PTR, F64], self._weigh)
+        self.step = self._function("step", [PTR, F64, F64], self._step)
+        self.read = self._function("read", [PTR, F64], self._read)
+        if plan.sensitive:
+            kinds, move, n = [PTR, PTR, PTR], plan.moving, len(plan.moving.lie)
+            paired = n - n % 2 if len(move.lie[0]) < _FILLED else 0
+            self.groups = [group for group in ((0, paired, 2), (paired, n, 1)) if group[0] < group[1]]
+            self.move = {by: self._function(f"move{by}", kinds, partial(self._move, by)) for *_, by in self.groups}
+            self.show = self._function("show", kinds, self._show)
+            self.sources = self._constant("sources", I64, [i for row in move.sources for i in row] or [0], 8)
+            shown = [i for row in move.show_sources for i in row] or [0]
+            self.show_sources = self._constant("show_sources", I64, shown, 8)
         kinds = [PTR, PTR, PTR, I64, PTR, I64, I64, PTR, PTR, I64, PTR, I64, PTR, PTR]
         self._integrate(ir.Function(self.module, ir.FunctionType(VOID, kinds), "integrate"))
 
-    def _constant(self, name: str, kind: ir.Type, values: Any, align: int) -> Value:
-        made: Any = ir.GlobalVariable(self.module, kind, name)
+    def _constant(self, name: str, kind: ir.Type, values: Sequence[Any], align: int) -> Value:
+        made: Any = ir.GlobalVariable(self.module, ir.ArrayType(kind, len(values)), name)
         made.global_constant, made.linkage, made.align = True, "internal", align
-        made.initializer, made.type = ir.Constant(kind, values), PTR
+        made.initializer, made.type = ir.Constant(made.value_type, values), PTR
         return made
 
-    def _places(self, name: str, rows: tuple[tuple[int, ...], ...]) -> Value:
-        flat = [i for row in rows for i in row] or [0]
-        return self._constant(name, ir.ArrayType(I64, len(flat)), flat, 8)
+    def _function(self, name: str, kinds: Sequence[ir.Type], body: Callable[..., None]) -> ir.Function:
+        """A function of its own, never inlined, whose stack is aligned: registers that spill would else lie across
+        cache lines, which takes half as long again."""
+        made: Any = ir.Function(self.module, ir.FunctionType(VOID, kinds), name)
+        made.linkage = "internal"
+        made.attributes.add("noinline")
+        made.attributes.alignstack = 64
+        builder = ir.IRBuilder(made.append_basic_block())
+        body(_Vectors(builder, self.width), *made.args)
+        builder.ret_void()
+        return made
 
-    def _begin(self, b: ir.IRBuilder, frame: Value) -> None:
-        v, plan = Vectors(b, self.width), self.plan
-        v.store(_run(v, plan.begin, v.load(frame, [*plan.x, *plan.constants])), frame, plan.begun)
+    def _begin(self, v: _Vectors, frame: Value) -> None:
+        plan = self.plan
+        v.store(v.run(plan.begin, v.load(frame, [*plan.x, *plan.constants])), frame, plan.begun)
 
-    def _weigh(self, b: ir.IRBuilder, frame: Value, h: Value) -> None:
+    def _weigh(self, v: _Vectors, frame: Value, h: Value) -> None:
         """h times the weights of the formula, behind the vectors of the frame, a vector at a time."""
-        v = Vectors(b, self.width)
         share = v.spread(h)
-        weighed = [b.fmul(share, weight) for weight in v.load(self.table, range(self.count))]
+        weighed = [v.builder.fmul(share, weight) for weight in v.load(self.table, range(self.count))]
         v.store(weighed, frame, range(self.plan.size, self.plan.size + self.count))
 
-    def _weights(self, b: ir.IRBuilder, frame: Value) -> list[list[Value]]:
-        result: list[list[Value]] = []
-        place, v = self.plan.size * self.width, Vectors(b, self.width)
-        for row in self.plan.tableau.weights:
-            result.append([v.spread(number_at(b, frame, integer(place + i))) for i in range(len(row))])
-            place += len(row)
-        return result
+    def _weights(self, v: _Vectors, frame: Value) -> list[list[Value]]:
+        rows, place = self.plan.tableau.weights, itertools.count(self.plan.size * self.width)
+        return [[v.spread(number_at(v.builder, frame, integer(next(place)))) for _ in row] for row in rows]
 
-    def _step(self, b: ir.IRBuilder, frame: Value, t: Value, h: Value) -> None:
-        v, plan, weights = Vectors(b, self.width), self.plan, self._weights(b, frame)
+    def _step(self, v: _Vectors, frame: Value, t: Value, h: Value) -> None:
+        plan, weights = self.plan, self._weights(v, frame)
         y, fixed = v.load(frame, plan.y), v.load(frame, [*plan.driven, *plan.fixed])
         slopes: list[list[Value]] = []
         for s, row in enumerate(plan.tableau.weights[:-1]):
-            at = _combine(v, y, weights[s], [slopes[j] for j, _ in row])
-            share = ir.Constant(F64, plan.tableau.C[s])
-            time = [v.spread(Vectors(b, 1).call("fma", h, share, t))] if plan.step_timed else []
-            result = _run(v, plan.step, [*time, *at, *fixed])
+            at = v.combine(y, weights[s], [slopes[j] for j, _ in row])
+            time = [v.call("fma", v.spread(h), v.constant(plan.tableau.C[s]), v.spread(t))] if plan.step_timed else []
+            result = v.run(plan.step, [*time, *at, *fixed])
             slopes.append(result[: len(plan.y)])
             v.store(result[len(plan.y) :], frame, plan.kept[s])
-        v.store(_combine(v, y, weights[-1], [slopes[j] for j, _ in plan.tableau.weights[-1]]), frame, plan.y)
+        v.store(v.combine(y, weights[-1], [slopes[j] for j, _ in plan.tableau.weights[-1]]), frame, plan.y)
 
-    def _read(self, b: ir.IRBuilder, frame: Value, t: Value) -> None:
-        v, plan = Vectors(b, self.width), self.plan
-        time = [v.spread(t)] if plan.read_timed else []
-        v.store(_run(v, plan.read, [*time, *v.load(frame, [*plan.y, *plan.driven, *plan.fixed])]), frame, plan.noted)
+    def _read(self, v: _Vectors, frame: Value, t: Value) -> None:
+        plan, time = self.plan, [v.spread(t)] if self.plan.read_timed else []
+        v.store(v.run(plan.read, [*time, *v.load(frame, [*plan.y, *plan.driven, *plan.fixed])]), frame, plan.noted)
 
-    def _move(self, move: Moving, together: int, b: ir.IRBuilder, frame: Value, first: Value, driving: Value) -> None:
+    def _move(self, together: int, v: _Vectors, frame: Value, first: Value, driving: Value) -> None:
         """One step of some tangents; `driving` points to the places of their sources."""
-        v, plan, weights = Vectors(b, self.width), self.plan, self._weights(b, frame)
+        plan, move, weights = self.plan, self.plan.moving, self._weights(v, frame)
         one, d, count = range(together), len(move.lie[0]), len(move.sources[0])
         own = [range(k * d, (k + 1) * d) for k in one]
         y, fixed = [v.load(first, place) for place in own], v.load(frame, plan.fixed)
-        places = [[number_at(b, driving, integer(k * count + i), I64) for i in range(count)] for k in one]
+        places = [[number_at(v.builder, driving, integer(k * count + i), I64) for i in range(count)] for k in one]
         slopes: list[list[list[Value]]] = [[] for _ in one]
         for s, row in enumerate(plan.tableau.weights[:-1]):
-            at = [_combine(v, y[k], weights[s], [slopes[k][j] for j, _ in row]) for k in one]
+            at = [v.combine(y[k], weights[s], [slopes[k][j] for j, _ in row]) for k in one]
             stage = v.place(frame, s * move.stage_size)
             saved = v.load(stage, move.saved)
             for k in one:
-                slopes[k].append(_run(v, move.slope, [*at[k], *v.load(stage, places[k]), *saved, *fixed]))
+                slopes[k].append(v.run(move.slope, [*at[k], *v.load(stage, places[k]), *saved, *fixed]))
         for k in one:
-            ended = _combine(v, y[k], weights[-1], [slopes[k][j] for j, _ in plan.tableau.weights[-1]])
+            ended = v.combine(y[k], weights[-1], [slopes[k][j] for j, _ in plan.tableau.weights[-1]])
             v.store(ended, first, own[k])
 
-    def _show(self, move: Moving, b: ir.IRBuilder, frame: Value, first: Value, driving: Value) -> None:
-        v, plan = Vectors(b, self.width), self.plan
-        places = [number_at(b, driving, integer(i), I64) for i in range(len(move.show_sources[0]))]
+    def _show(self, v: _Vectors, frame: Value, first: Value, driving: Value) -> None:
+        move = self.plan.moving
+        places = [number_at(v.builder, driving, integer(i), I64) for i in range(len(move.show_sources[0]))]
         given = [*v.load(first, range(len(move.lie[0]))), *v.load(frame, places), *v.load(frame, move.show_saved)]
-        v.store(_run(v, move.show, [*given, *v.load(frame, plan.fixed)]), frame, plan.shown)
+        v.store(v.run(move.show, [*given, *v.load(frame, self.plan.fixed)]), frame, self.plan.shown)
 
     def _integrate(self, made: Any) -> None:
         x, si, cases, n_cases, rows, first, last, times, steps, n_times, offset, stride, out, frame = made.args
         b, plan, width = ir.IRBuilder(made.append_basic_block()), self.plan, self.width
         n, nc, no = len(plan.x), len(plan.constants), len(plan.shown)
-        columns = n if plan.moving else 1
+        columns = n if plan.sensitive else 1
         target, shift, own = (room(b, I64, width) for _ in range(3))
         t, taken = room(b, F64), room(b, F64)
 
         def at(place: int, lane: Value) -> Value:
             """Of one number in a vector of the frame."""
             return b.add(integer(place * width), lane)
+
+        def tangent(j: Value, table: Value, sources: Sequence[Sequence[int]]) -> tuple[Value, Value]:
+            """Where tangent j lies, and where the places of its sources are listed."""
+            first, size = plan.moving.lie[0].start, len(plan.moving.lie[0])
+            place = _Vectors(b, width).place(frame, b.add(integer(first), b.mul(j, integer(size))))
+            return place, b.gep(table, [b.mul(j, integer(len(sources[0])))], source_etype=I64)
 
         with loop(b, first, last, width) as group:
             with loop(b, integer(0), integer(width)) as lane:
@@ -199,7 +195,9 @@ class _Writer:
                 b.store(h, taken)
                 with loop(b, integer(0), count) as s:
                     b.call(self.step, [frame, b.fadd(since, b.fmul(b.sitofp(s, F64), h)), h])
-                    self._tangents(b, frame)
+                    for begin, end, by in self.groups if plan.sensitive else ():
+                        with loop(b, integer(begin), integer(end), by) as j:
+                            b.call(self.move[by], [frame, *tangent(j, self.sources, plan.moving.sources)])
                 b.store(to, t)
                 if plan.driven:
                     later = b.mul(b.add(k, integer(1)), b.mul(n_cases, integer(nc)))
@@ -210,13 +208,13 @@ class _Writer:
                 b.call(self.read, [frame, to])
                 done = b.mul(k, integer(no))
                 with loop(b, integer(0), integer(columns)) as j:
-                    if plan.moving:
-                        b.call(self.show, [frame, *self._tangent(b, plan.moving, frame, j, self.show_sources)])
+                    if plan.sensitive:
+                        b.call(self.show, [frame, *tangent(j, self.show_sources, plan.moving.show_sources)])
                     with loop(b, integer(0), integer(width)) as lane:
                         begin, less = number_at(b, target, lane, I64), b.add(number_at(b, shift, lane, I64), done)
                         for i, place in enumerate(plan.shown):
                             value = number_at(b, frame, at(place, lane))
-                            if plan.moving:
+                            if plan.sensitive:
                                 value = b.fmul(value, number_at(b, si, j))
                             else:
                                 value = b.fsub(value, number_at(b, offset, b.add(less, integer(i))))
@@ -224,22 +222,121 @@ class _Writer:
                             put(b, value, out, b.add(begin, entry))
         b.ret_void()
 
-    def _tangents(self, b: ir.IRBuilder, frame: Value) -> None:
-        if self.plan.moving is None:
-            return
-        for begin, end, by in self.groups:
-            with loop(b, integer(begin), integer(end), by) as j:
-                b.call(self.move[by], [frame, *self._tangent(b, self.plan.moving, frame, j, self.sources)])
 
-    def _tangent(self, b: ir.IRBuilder, move: Moving, frame: Value, j: Value, table: Value) -> tuple[Value, Value]:
-        """Where tangent j lies, and where the places of its sources are listed."""
-        count = len((move.sources if table is self.sources else move.show_sources)[0])
-        lies = b.add(integer(move.lie[0].start), b.mul(j, integer(len(move.lie[0]))))
-        return Vectors(b, self.width).place(frame, lies), b.gep(table, [b.mul(j, integer(count))], source_etype=I64)
+class _Vectors:
+    """Instructions on vectors of `width` doubles. A frame is a pointer to an array of such vectors."""
+
+    def __init__(self, builder: ir.IRBuilder, width: int) -> None:
+        self.builder, self.width = builder, width
+        self.type = ir.VectorType(F64, width)
+
+    def place(self, frame: Value, index: int | Value) -> Value:
+        index = integer(index) if isinstance(index, int) else index
+        return self.builder.gep(frame, [index], source_etype=self.type)
+
+    def load(self, frame: Value, places: Iterable[int | Value]) -> list[Value]:
+        return [self.builder.load(self.place(frame, i), typ=self.type, align=8 * self.width) for i in places]
+
+    def store(self, values: Sequence[Value], frame: Value, places: Iterable[int]) -> None:
+        for value, i in zip(values, places, strict=True):
+            self.builder.store(value, self.place(frame, i), align=8 * self.width)
+
+    def constant(self, value: float) -> Value:
+        return ir.Constant(self.type, [value] * self.width)
+
+    def spread(self, number: Value) -> Value:
+        """A vector of equal numbers."""
+        nothing = ir.Constant(self.type, ir.Undefined)
+        single = self.builder.insert_element(nothing, number, ir.Constant(I32, 0))
+        return self.builder.shuffle_vector(single, nothing, ir.Constant(ir.VectorType(I32, self.width), None))
+
+    def run(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
+        values = list(inputs)
+        assert len(values) == program.inputs
+        for name, *numbers in program.operations:
+            constant = name == "constant"
+            values.append(self.constant(*numbers) if constant else self.apply(name, *[values[i] for i in numbers]))
+        return [values[i] for i in program.outputs]
+
+    def combine(
+        self, start: Sequence[Value], weights: Sequence[Value], slopes: Sequence[Sequence[Value]]
+    ) -> list[Value]:
+        """start + sum of weight times slope."""
+        result = list(start)
+        for weight, slope in zip(weights, slopes, strict=True):
+            result = [self.call("fma", weight, k, y) for k, y in zip(slope, result, strict=True)]
+        return result
+
+    def apply(self, name: str, *args: Value) -> Value:
+        """One operation of a recorded program."""
+        builder = self.builder
+        if name in _ARITHMETIC:
+            return getattr(builder, _ARITHMETIC[name])(*args)
+        match name, args:
+            case "neg", [a]:
+                return builder.fneg(a)
+            case "fms", [a, b, c]:
+                return self.call("fma", a, b, builder.fneg(c))
+            case "fnma", [a, b, c]:
+                return self.call("fma", builder.fneg(a), b, c)
+            case (("fma" | "sqrt"), _):
+                return self.call(name, *args)
+            case (("less" | "less_equal"), [a, b]):
+                holds = builder.fcmp_ordered("<" if name == "less" else "<=", a, b)
+                return builder.select(holds, self.constant(1.0), self.constant(0.0))
+            case "where", [condition, a, b]:
+                return builder.select(builder.fcmp_unordered("!=", condition, self.constant(0.0)), a, b)
+        return self._each("atan" if name == "arctan" else name, *args)
+
+    def call(self, name: str, *args: Value) -> Value:
+        """An instruction of the processor: fma (rounded once) or sqrt."""
+        return self.builder.call(self._declared(f"llvm.{name}.v{self.width}f64", self.type, len(args)), args)
+
+    def _each(self, name: str, *args: Value) -> Value:
+        """A function of the C library, lane by lane."""
+        function = self._declared(name, F64, len(args))
+        result = ir.Constant(self.type, ir.Undefined)
+        for lane in (ir.Constant(I32, i) for i in range(self.width)):
+            number = self.builder.call(function, [self.builder.extract_element(a, lane) for a in args])
+            result = self.builder.insert_element(result, number, lane)
+        return result
+
+    def _declared(self, name: str, kind: ir.Type, count: int) -> ir.Function:
+        module = self.builder.module
+        return module.globals.get(name) or ir.Function(module, ir.FunctionType(kind, [kind] * count), name)
 
 
-def _side_by_side(move: Moving) -> list[tuple[int, int, int]]:
-    """Tangents from, to, and how many advance side by side."""
-    n = len(move.lie)
-    paired = n - n % 2 if len(move.lie[0]) < _FILLED else 0
-    return [(begin, end, by) for begin, end, by in ((0, paired, 2), (paired, n, 1)) if begin < end]
+@contextmanager
+def loop(b: ir.IRBuilder, first: Value, last: Value, by: int = 1) -> Iterator[Value]:
+    """for i in range(first, last, by)"""
+    test, body, after = (b.append_basic_block(name) for name in ("test", "body", "after"))
+    before = b.block
+    b.branch(test)
+    b.position_at_end(test)
+    i = b.phi(I64)
+    i.add_incoming(first, before)
+    b.cbranch(b.icmp_signed("<", i, last), body, after)
+    b.position_at_end(body)
+    yield i
+    i.add_incoming(b.add(i, integer(by)), b.block)
+    b.branch(test)
+    b.position_at_end(after)
+
+
+def integer(value: int) -> Value:
+    return ir.Constant(I64, value)
+
+
+def number_at(b: ir.IRBuilder, array: Value, index: Value, kind: ir.Type = F64) -> Value:
+    return b.load(b.gep(array, [index], source_etype=kind), typ=kind)
+
+
+def put(b: ir.IRBuilder, value: Value, array: Value, index: Value) -> None:
+    b.store(value, b.gep(array, [index], source_etype=value.type))
+
+
+def room(b: ir.IRBuilder, kind: ir.Type, count: int = 1, align: int = 8) -> Value:
+    """Memory of the function's own."""
+    made: Any = b.alloca(kind, size=count)
+    made.align, made.type = align, PTR  # llvmlite gives it a typed pointer, which stores refuse
+    return made

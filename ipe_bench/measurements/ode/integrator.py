@@ -23,7 +23,7 @@ from ipe_bench.basics import compiled
 from ipe_bench.basics.compiled import INTEGER, POINTER, WHOLE, aligned, at
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import cores
-from ipe_bench.measurements.ode.plan import Equations, Plan
+from ipe_bench.measurements.ode.plan import Equations, Plan, Recording, planned
 from ipe_bench.measurements.ode.tableau import Tableau
 from ipe_bench.measurements.ode.trace import Program
 
@@ -63,23 +63,18 @@ def _compiled(name: str, source: Plan | Program, width: int, arguments: tuple[An
 
 @dataclass(frozen=True)
 class Kernel:
-    """One kind of integration of some equations by one formula."""
+    """The integration of some equations by one formula, for readings or, where `sensitive`, for Jacobians."""
 
-    kind: Callable[[Equations, Tableau], Plan]
     equations: Equations
     tableau: Tableau
+    sensitive: bool = False
 
     @functools.cached_property
     def plan(self) -> Plan:
-        return self.kind(self.equations, self.tableau)
+        return planned(self.equations, self.tableau, sensitive=self.sensitive)
 
-    @functools.cached_property
-    def _narrow(self) -> tuple[Callable[..., None], int]:
-        return self._machine_code(_NARROW)
-
-    @functools.cached_property
-    def _wide(self) -> tuple[Callable[..., None], int]:
-        return self._machine_code(compiled.width())
+    _narrow = functools.cached_property(lambda self: self._machine_code(_NARROW))
+    _wide = functools.cached_property(lambda self: self._machine_code(compiled.width()))
 
     def _machine_code(self, width: int) -> tuple[Callable[..., None], int]:
         """The function for groups of so many lanes, and the numbers that it needs room for."""
@@ -103,12 +98,10 @@ class Kernel:
         count = cases.shape[-2]
         lanes = len(rows) * count
         *offset, out = more
-        if bool(offset) != (self.plan.moving is None):
-            raise TypeError("simulations take an offset, Jacobians take none")
         if not lanes:
             return
         if not compiled.available():
-            interpret(self.plan, x, si, cases, rows, times, steps, *more)
+            self._interpret(x, si, cases, rows, times, steps, *more)
             return
         function, size = self._narrow if lanes <= _NARROW else self._wide
         given = (at(x), at(si), at(cases), count, at(rows, WHOLE))
@@ -136,82 +129,52 @@ class Kernel:
         for other in others:
             other.result()
 
+    @functools.cached_property
+    def _programs(self) -> tuple[Program, Program, Program]:
+        """From the time, the state with its tangents, and what stays: where these begin, their slopes, and readings."""
+        tape = Recording(self.equations)
+        d, dp, slopes, shown, starts = tape.tangents if self.sensitive else ([], [], [], tape.shown, [])
+        stays = [*tape.p, *tape.c, *dp]
+        at = [tape.t, *tape.y, *d, *stays]
+        return (
+            Program.of([*tape.start, *starts], stays),
+            Program.of([*tape.slope, *slopes], at),
+            Program.of(shown, at),
+        )
 
-def interpret(
-    plan: Plan,
-    x: Array,
-    si: Array,
-    cases: Array,
-    rows: NDArray[np.int64],
-    times: Array,
-    steps: NDArray[np.int64],
-    *more: Array,
-) -> None:
-    """`Kernel.run` operation by operation in NumPy, all lanes at once; products are rounded before they are added."""
-    intervals = cases.reshape(-1, *cases.shape[-2:])
-    count = intervals.shape[1]
-    trial, case = np.repeat(rows, count), np.tile(np.arange(count), len(rows))
-    lanes, no, move = len(trial), len(plan.shown), plan.moving
-    frame: list[Any] = [np.zeros(lanes)] * plan.size
-    out = more[-1].reshape(len(x), count, len(times), no, -1)
+    def _interpret(self, x: Array, si: Array, cases: Array, rows: Any, times: Array, steps: Any, *more: Array) -> None:
+        """`run` in NumPy, all lanes at once; products are rounded before they are added."""
+        begin, slope, read = self._programs
+        intervals = cases if cases.ndim == 3 else cases[None]
+        count, n = intervals.shape[1], x.shape[1]
+        trial, case = np.repeat(rows, count), np.tile(np.arange(count), len(rows))
+        out = more[-1].reshape(len(x), count, len(times), self.equations.outputs, -1)
+        directions = list(np.eye(n)[:, :, None]) if self.sensitive else []
+        p = list((x[trial] * si).T)
 
-    def load(places: Any, beyond: int = 0) -> list[Any]:
-        return [frame[i + beyond] for i in places]
+        def stays(k: int) -> list[Any]:
+            return [*p, *intervals[min(k, len(intervals) - 1), case].T, *directions]
 
-    def store(values: Sequence[Any], places: Any) -> None:
-        for value, i in zip(values, places, strict=True):
-            frame[i] = value
-
-    def advance(y: Sequence[Any], h: float, slope: Callable[[int, list[Any]], list[Any]]) -> list[Any]:
-        slopes: list[list[Any]] = []
-        end = list(y)
-        for s, row in enumerate(plan.tableau.weights):
-            end = list(y)
-            for j, weight in row:
-                end = [e + h * weight * k for e, k in zip(end, slopes[j], strict=True)]
-            if s < plan.tableau.stages:
-                slopes.append(slope(s, end))
-        return end
-
-    with np.errstate(all="ignore"):
-        store([x[trial, j] * si[j] for j in range(len(plan.x))], plan.x)
-        store(list(intervals[0, case].T), plan.constants)
-        store(plan.begin(load([*plan.x, *plan.constants])), plan.begun)
-        t = 0.0
-        for k, to in enumerate(times.tolist()):
-            for s in range(int(steps[k]) if to != t else 0):
-                h = (to - t) / int(steps[k])
-                since, ny = t + s * h, len(plan.y)
-
-                def slope(stage: int, y: list[Any], since: float = since, h: float = h, ny: int = ny) -> list[Any]:
-                    time = [since + plan.tableau.C[stage] * h] if plan.step_timed else []
-                    result = plan.step([*time, *y, *load(plan.driven), *load(plan.fixed)])
-                    store(result[ny:], plan.kept[stage])
-                    return result[:ny]
-
-                store(advance(load(plan.y), h, slope), plan.y)
-                for lie, sources in zip(move.lie, move.sources, strict=True) if move else ():
-
-                    def moving(stage: int, d: list[Any], sources: Any = sources, move: Any = move) -> list[Any]:
-                        beyond = stage * move.stage_size
-                        given = [*d, *load(sources, beyond), *load(move.saved, beyond), *load(plan.fixed)]
-                        return move.slope(given)
-
-                    store(advance(load(lie), h, moving), lie)
-            t = to
-            if plan.driven:
-                store(list(intervals[k + 1, case, -len(plan.driven) :].T), plan.driven)
-            store(
-                plan.read([*([t] if plan.read_timed else []), *load([*plan.y, *plan.driven, *plan.fixed])]), plan.noted
-            )
-            if move is None:
-                less = more[0].reshape(count, -1, no)[case, k]
-                for i, value in enumerate(load(plan.shown)):
-                    out[trial, case, k, i, 0] = value - less[:, i]
-            for j, (lie, sources) in enumerate(zip(move.lie, move.show_sources, strict=True) if move else ()):
-                given = [*load(lie), *load(sources), *load(move.show_saved), *load(plan.fixed)] if move else []
-                for i, value in enumerate(move.show(given) if move else ()):
-                    out[trial, case, k, i, j] = value * si[j]
+        with np.errstate(all="ignore"):
+            y, t = begin(stays(0)), 0.0
+            for k, to in enumerate(times.tolist()):
+                h = (to - t) / max(int(steps[k]), 1)
+                for s in range(int(steps[k]) if to != t else 0):
+                    slopes: list[list[Any]] = []
+                    at = y
+                    for node, row in zip((*self.tableau.C, 1.0), self.tableau.weights, strict=True):
+                        at = y
+                        for j, weight in row:
+                            at = [a + h * weight * k for a, k in zip(at, slopes[j], strict=True)]
+                        if len(slopes) < self.tableau.stages:
+                            slopes.append(slope([t + s * h + node * h, *at, *stays(k)]))
+                    y = at
+                t = to
+                for i, value in enumerate(read([t, *y, *stays(k + 1)])):
+                    if self.sensitive:
+                        out[trial, case, k, i] = np.broadcast_to(value, (n, len(trial))).T * si
+                    else:
+                        out[trial, case, k, i, 0] = value - more[0].reshape(count, -1, out.shape[3])[case, k, i]
 
 
 @dataclass(frozen=True)

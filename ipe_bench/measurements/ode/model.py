@@ -18,7 +18,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, own
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.ode.integrator import Kernel, Rates
-from ipe_bench.measurements.ode.plan import Equations, Variation, jacobian, jumps, simulation
+from ipe_bench.measurements.ode.plan import Equations, Variation, jumps
 from ipe_bench.measurements.ode.steps import (
     CONTRACTION,
     MOST_RK4,
@@ -407,9 +407,9 @@ class OdeMeasurement(Measurement):
         """Without what is compiled and remembered, which stays with a process."""
         return {k: v for k, v in self.__dict__.items() if k not in _STAYS}
 
-    _readings_kernel = cached_property(lambda self: Kernel(simulation, self.equations, DOP853))
-    _jacobian_kernel = cached_property(lambda self: Kernel(jacobian, self.equations, DOP853))
-    _rk4_kernel = cached_property(lambda self: Kernel(jacobian, self.equations, RK4))
+    _readings_kernel = cached_property(lambda self: Kernel(self.equations, DOP853))
+    _jacobian_kernel = cached_property(lambda self: Kernel(self.equations, DOP853, sensitive=True))
+    _rk4_kernel = cached_property(lambda self: Kernel(self.equations, RK4, sensitive=True))
 
     @cached_property
     def equations(self) -> Equations:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -57,8 +58,8 @@ class Equations:
     """How many of the constants, the last ones, change from one interval between readings to the next."""
 
 
-class _Tape:
-    """The equations as expressions."""
+class Recording:
+    """Equations as expressions of the time t, states y, parameters p and constants c, of which u, the last, change."""
 
     def __init__(self, equations: Equations) -> None:
         self.equations = equations
@@ -77,6 +78,31 @@ class _Tape:
             raise ValueError(f"{name} returns {len(values)} values where {count} are declared")
         return values
 
+    @cached_property
+    def tangents(self) -> tuple[Any, Any, list[Expression], list[Expression], list[Expression]]:
+        """A deviation d, a direction dp of the parameters, and how slope, readings and start move along them."""
+        graph, variation = self.graph, self.equations.variation
+        dp = graph.inputs("dp", self.equations.parameters)
+        starts = tangent(self.start, dict(zip(self.p, dp, strict=True)))
+        if variation is None:
+            dy = d = graph.inputs("d", self.equations.states)
+            slopes = tangent(self.slope, dict(zip(self.y + self.p, (*dy, *dp), strict=True)))
+        else:
+            d = graph.inputs("d", variation.freedoms)
+            if any(e.value != 0.0 for e in starts):
+                raise ValueError("equations of small deviations need a start that does not depend on the parameters")
+            dy = variation.moved(self.y, d)
+            slopes = self._values(variation.slope(self.t, self.y, self.p, self.c, d, dp), variation.freedoms, "slope")
+            starts = [graph.constant(0.0)] * variation.freedoms
+        along = dict(zip(self.y + self.p, (*(graph.apply("add", v, 0.0) for v in dy), *dp), strict=True))
+        return d, dp, slopes, tangent(self.shown, along), starts
+
+    def along_each(self, directions: Sequence[Expression], tangents: Sequence[Expression]) -> list[list[Expression]]:
+        """The tangents along each direction alone."""
+        one, zero = self.graph.constant(1.0), self.graph.constant(0.0)
+        units = [{other: one if other is along else zero for other in directions} for along in directions]
+        return [[substitute(e, unit) for e in tangents] for unit in units]
+
     def fixed(self, *outputs: Expression) -> list[Expression]:
         """What is computed once for each lane: it depends on the parameters and the case alone."""
         return border(outputs, dependent(outputs, (self.t, *self.y, *self.u)))
@@ -86,21 +112,16 @@ class _Tape:
         timed = self.t in in_order(outputs, fixed)
         return Program.of(outputs, [*([self.t] if timed else []), *self.y, *self.u, *fixed]), timed
 
-    def beginning(self, outputs: Sequence[Expression]) -> Program:
-        return Program.of(outputs, [*self.p, *self.c])
-
 
 class _Linear:
     """Tangents of some outputs: their program, what it needs of the state, and the sources of each direction."""
 
-    def __init__(self, tape: _Tape, tangents: Sequence[Expression], d: Sequence[Expression], dp: Sequence[Expression]):
+    def __init__(
+        self, tape: Recording, d: Sequence[Expression], dp: Sequence[Expression], tangents: Sequence[Expression]
+    ) -> None:
         outputs, sources = separate(tangents, d, dp)
         names = [tape.graph.input(f"source{i}") for i in range(len(sources))]
-        one, zero = tape.graph.constant(1.0), tape.graph.constant(0.0)
-        self.sources = [
-            [substitute(s, {e: one if i == k else zero for i, e in enumerate(dp)}) for s in sources]
-            for k in range(len(dp))
-        ]
+        self.sources = tape.along_each(dp, sources)
         """The value (n, sources) of each source along each parameter."""
         needed = border(outputs, dependent(outputs, (*d, *names)))
         values = [e for row in self.sources for e in row]
@@ -122,17 +143,6 @@ class _Linear:
 
 def _distinct(expressions: Iterable[Expression]) -> list[Expression]:
     return list(dict.fromkeys(expressions))
-
-
-@dataclass
-class _Frame:
-    """The vectors that one group of lanes works on."""
-
-    size: int = 0
-
-    def room(self, count: int) -> range:
-        self.size += count
-        return range(self.size - count, self.size)
 
 
 @dataclass(frozen=True)
@@ -175,14 +185,14 @@ class Plan:
     """Where the results of `read` lie: the readings, or what their tangents need."""
     shown: range
     size: int
-    moving: Moving | None = None
+    sensitive: bool
+    """Whether what is shown are Jacobians, and not readings."""
+    moving: Moving
 
     @property
     def operations(self) -> int:
         """Arithmetic operations of a step of one lane: what it costs, whatever the machine."""
-        moving = 0
-        if self.moving is not None:
-            moving = len(self.moving.lie) * self._operations(self.moving.slope, len(self.moving.lie[0]))
+        moving = sum(self._operations(self.moving.slope, len(lie)) for lie in self.moving.lie)
         return self._operations(self.step, len(self.y)) + moving
 
     def _operations(self, program: Program, numbers: int) -> int:
@@ -197,7 +207,7 @@ def jumps(equations: Equations) -> bool:
 
     Both sides are evaluated at points that are moved to where the operands of the comparison are equal.
     """
-    tape = _Tape(equations)
+    tape = Recording(equations)
     graph, inputs = tape.graph, [tape.t, *tape.y, *tape.p, *tape.c]
     moving = dependent(tape.slope, (tape.t, *tape.y))
     for e in (e for e in in_order(tape.slope) if e.operation in COMPARISONS and e in moving):
@@ -221,70 +231,41 @@ def jumps(equations: Equations) -> bool:
     return False
 
 
-def simulation(equations: Equations, tableau: Tableau) -> Plan:
-    """How readings are computed."""
-    tape, frame = _Tape(equations), _Frame()
-    fixed = tape.fixed(*tape.slope, *tape.shown)
-    (step, step_timed), (read, read_timed) = (tape.along_the_way(e, fixed) for e in (tape.slope, tape.shown))
-    x, constants = frame.room(equations.parameters), frame.room(equations.constants)
-    y, fixed_at, shown = (frame.room(k) for k in (equations.states, len(fixed), equations.outputs))
-    return Plan(
-        tableau, x, constants, tape.beginning([*tape.start, *fixed]), (*y, *fixed_at), y,
-        constants[len(constants) - equations.driven :], fixed_at, step, step_timed,
-        tuple(range(0) for _ in tableau.B), read, read_timed, shown, shown, frame.size,
-    )  # fmt: skip
-
-
-def jacobian(equations: Equations, tableau: Tableau) -> Plan:
-    """How Jacobians are computed: the state once, and beside it one tangent for each parameter.
+def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> Plan:
+    """How readings are computed, or their Jacobians: the state once, and beside it one tangent for each parameter.
 
     The variational equations go through the stages of the state's own steps, so the derivative is that of the
     numerical solution, exact to round-off; or of the model's own equations of small deviations, to the tolerance.
     """
-    tape, frame = _Tape(equations), _Frame()
-    d, dp, slopes, shown, starts = _tangents(tape)
-    motion, reading = _Linear(tape, slopes, d, dp), _Linear(tape, shown, d, dp)
-    saved, noted = [*motion.saved, *motion.driving], [*reading.saved, *reading.driving]
+    tape, size = Recording(equations), 0
+
+    def room(count: int) -> range:
+        nonlocal size
+        size += count
+        return range(size - count, size)
+
+    d, dp, slopes, shown, starts = tape.tangents if sensitive else ([], [], [], [], [])
+    motion, reading = _Linear(tape, d, dp, slopes), _Linear(tape, d, dp, shown)
+    saved = [*motion.saved, *motion.driving]
+    noted = [*reading.saved, *reading.driving] if sensitive else tape.shown
     fixed = _distinct([*tape.fixed(*tape.slope, *saved, *noted), *motion.fixed, *reading.fixed])
     step, step_timed = tape.along_the_way([*tape.slope, *saved], fixed)
-    note, note_timed = tape.along_the_way(noted, fixed)
-    x, constants = frame.room(equations.parameters), frame.room(equations.constants)
-    y, fixed_at = frame.room(equations.states), frame.room(len(fixed))
-    lie = tuple(frame.room(len(d)) for _ in dp)
-    stages = [frame.room(len(saved) + len(motion.constant)) for _ in tableau.B]
-    at_reading, out = frame.room(len(noted) + len(reading.constant)), frame.room(equations.outputs)
+    read, read_timed = tape.along_the_way(noted, fixed)
     k, r = len(saved), len(noted)
-    begun = [*y, *fixed_at, *(i for place in lie for i in place)]
-    begun += [*(i for stage in stages for i in stage[k:]), *at_reading[r:]]
-    started = [*tape.start, *fixed, *(e for row in starts for e in row)]
+    x, constants, y, fixed_at = map(room, (equations.parameters, equations.constants, equations.states, len(fixed)))
+    lie = tuple(room(len(d)) for _ in dp)
+    stages = [room(k + len(motion.constant)) for _ in tableau.B]
+    noted_at = room(r + len(reading.constant))
+    shown_at = room(equations.outputs) if sensitive else noted_at
+    begun = [i for place in (y, fixed_at, *lie, *(stage[k:] for stage in stages), noted_at[r:]) for i in place]
+    started = [*tape.start, *fixed, *(e for row in tape.along_each(dp, starts) for e in row)]
     started += [*motion.constant * tableau.stages, *reading.constant]
     moving = Moving(
         lie, motion.program(fixed), motion.places(stages[0].start), stages[0][: len(motion.saved)], len(stages[0]),
-        reading.program(fixed), reading.places(at_reading.start), at_reading[: len(reading.saved)],
+        reading.program(fixed), reading.places(noted_at.start), noted_at[: len(reading.saved)],
     )  # fmt: skip
     return Plan(
-        tableau, x, constants, tape.beginning(started), tuple(begun), y,
+        tableau, x, constants, Program.of(started, [*tape.p, *tape.c]), tuple(begun), y,
         constants[len(constants) - equations.driven :], fixed_at, step, step_timed,
-        tuple(stage[:k] for stage in stages), note, note_timed, at_reading[:r], out, frame.size, moving,
+        tuple(stage[:k] for stage in stages), read, read_timed, noted_at[:r], shown_at, size, sensitive, moving,
     )  # fmt: skip
-
-
-def _tangents(tape: _Tape) -> tuple[Any, Any, list[Expression], list[Expression], list[list[Expression]]]:
-    """Deviations, direction, the tangents of slope and readings in them, and where those of each parameter start."""
-    graph, variation = tape.graph, tape.equations.variation
-    dp = graph.inputs("dp", tape.equations.parameters)
-    begins = tangent(tape.start, dict(zip(tape.p, dp, strict=True)))
-    one, zero = graph.constant(1.0), graph.constant(0.0)
-    starts = [[substitute(e, {b: one if b is a else zero for b in dp}) for e in begins] for a in dp]
-    if variation is None:
-        dy = d = graph.inputs("d", tape.equations.states)
-        slopes = tangent(tape.slope, dict(zip(tape.y + tape.p, (*dy, *dp), strict=True)))
-    else:
-        d = graph.inputs("d", variation.freedoms)
-        if any(e is not zero for row in starts for e in row):
-            raise ValueError("equations of small deviations need a start that does not depend on the parameters")
-        dy = variation.moved(tape.y, d)
-        slopes = [graph.apply("add", v, 0.0) for v in variation.slope(tape.t, tape.y, tape.p, tape.c, d, dp)]
-        starts = [[zero] * variation.freedoms for _ in dp]
-    along = dict(zip(tape.y + tape.p, (*(graph.apply("add", v, 0.0) for v in dy), *dp), strict=True))
-    return d, dp, slopes, tangent(tape.shown, along), starts

@@ -22,7 +22,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.ode.trace import Expression, Graph, Program, tangent
+from ipe_bench.measurements.ode.plan import Recording
+from ipe_bench.measurements.ode.trace import Program, tangent
 
 if TYPE_CHECKING:
     from ipe_bench.measurements.ode.model import OdeMeasurement
@@ -98,16 +99,10 @@ class Rodas5P:
     @cached_property
     def _programs(self) -> dict[str, Program]:
         """The equations and the derivatives that the method needs, on arrays over lanes."""
-        model, g = self.model, Graph()
-        n, q, constants, do = model.states, model.n, model.tables.shape[2], model.equations
-        t, y, p, c = g.input("t"), g.inputs("y", n), g.inputs("p", q), g.inputs("c", constants)
-        k, s, d = g.inputs("k", n), g.inputs("s", n), g.inputs("d", q)
+        tape = Recording(self.model.equations)
+        g, n, t, y, p, c, f = tape.graph, self.model.states, tape.t, tape.y, tape.p, tape.c, tape.slope
+        k, s, d = g.inputs("k", n), g.inputs("s", n), g.inputs("d", self.model.n)
         one, point, ways = g.constant(1.0), [t, *y, *p, *c], [*s, *d]
-
-        def lift(values: Sequence[Any]) -> list[Expression]:
-            return [v if isinstance(v, Expression) else g.constant(float(v)) for v in values]
-
-        f, h, start = lift(do.rhs(t, y, p, c)), lift(do.read(t, y, p, c)), lift(do.start(p, c))
         along = dict(zip([*y, *p], ways, strict=True))
         in_time, turned = tangent(f, {t: one}), tangent(f, dict(zip(y, k, strict=True)))
         columns = [tangent(f, {a: one}) for a in y]
@@ -118,10 +113,10 @@ class Rodas5P:
             "df": (tangent(f, along), point + ways),
             "dft": (tangent(in_time, along), point + ways),
             "dJk": (tangent(turned, along), [*point, *k, *ways]),
-            "start": (start, [*p, *c]),
-            "dstart": (tangent(start, along), [*p, *c, *d]),
-            "read": (h, point),
-            "dread": (tangent(h, along), point + ways),
+            "start": (tape.start, [*p, *c]),
+            "dstart": (tangent(tape.start, along), [*p, *c, *d]),
+            "read": (tape.shown, point),
+            "dread": (tangent(tape.shown, along), point + ways),
         }
         return {name: Program.of(outputs, inputs) for name, (outputs, inputs) in recorded.items()}
 
