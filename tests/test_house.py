@@ -38,7 +38,7 @@ BUDGETS = {
     "statistics": 4198,
     "real": 2233,
     "plugins": 1185,
-    "report": 4147,
+    "report": 4133,
     "cli": 2552,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""

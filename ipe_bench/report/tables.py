@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Any
 
@@ -25,11 +25,29 @@ from ipe_bench.statistics.records import SCORES, Where, all_statistics, frame_co
 from ipe_bench.statistics.summary import ALL
 
 _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
+    "tracks": (
+        "States over all epochs",
+        f"{TRACKED} all: over the bound at the truth, root mean square over the states.",
+        lambda rows: rows["path_rmse"].notna(),
+    ),
     "costs": (
         "Costs",
         "Medians over all trials; a Jacobian counts as many simulations as its model states. The cost to 0.05 σ of the"
         " limit and the order are over the converged trials with a stored history.",
         lambda rows: rows["trials"] > 0,
+    ),
+    "parameters": (
+        "Parameters",
+        "In each parameter's own unit. Bias, std, rmse, bounds and NEES are over solved trials; median and 95 % of the"
+        " absolute error, and coverage, over all trials.",
+        lambda rows: rows["parameter"] != ALL,
+    ),
+    "calibration": (
+        "Calibration of the reported covariance",
+        "This table tests whether the truth is distributed as the Gaussian that an estimator reports, over converged"
+        " trials with a covariance, for NEES and every parameter together, at 5 % for each row. The median NEES with"
+        " its limits is over all trials.",
+        lambda rows: rows["claims"] > 0,
     ),
     "all_trials": (
         "All trials",
@@ -51,6 +69,14 @@ _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
         " not.",
         lambda rows: rows["eq_14"].notna(),
     ),
+    "theory": (
+        "Theory beside experiment",
+        "Estimators that minimise the sum of squares, over solved trials, in the parameters' own units; all: over the"
+        " linear bound, root mean square over parameters. The theory uses the Jacobians of the models and no draw of"
+        " noise; if readings come from another model than the assumed one, it uses those of both. Linear theory holds"
+        " if the relative curvatures are below 0.3.",
+        lambda rows: rows["predicted_rmse"].notna(),
+    ),
     "iterations": (
         "Bounds on the iterations",
         "Over the first trials, whose iterates are stored. Eq. (18) bounds fixed-point iteration if K of eq. (15) is"
@@ -59,22 +85,25 @@ _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
         lambda rows: (rows["eq_18_trials"] > 0) | rows["eq_23_observed"].notna(),
     ),
 }
-"""Title, caption and rows of the tables of scenarios and estimators that are made of recorded statistics alone."""
+"""Title, caption and rows of the tables that are made of recorded statistics alone."""
+_OF_PARAMETERS = ("tracks", "parameters", "theory")
+"""Those of them that have a row per parameter."""
+_MAIN = ("overview", "tracks", "costs", "comparisons", "parameters", "calibration", "endings")
+_APPENDIX = ("all_trials", "solved_trials", "contraction", "covariances", "theory", "iterations")
 
 
 def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]:
     """Every table that the data allow, in the order of the report; `whole` is the analysis whose endings are listed
     if this one leaves some trials out."""
-    found = [endings(whole or analysis)]
+    found = {"endings": endings(whole or analysis)}
     if not analysis.summary.empty:
         rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
         totals = pd.concat([rows, analysis.scores[list(frame_columns(SCORES))]], axis=1)
-        made = {w: _recorded(analysis, w, t, c, totals[chosen(totals)]) for w, (t, c, chosen) in _RECORDED.items()}
-        main = (tracks(analysis), made["costs"], comparisons(analysis), parameters(analysis), calibration(analysis))
-        late = (made["all_trials"], made["solved_trials"], contraction(analysis), made["covariances"])
-        late = [*late, theory(analysis), made["iterations"]]
-        found = [overview(analysis), *main, *found, *(table and replace(table, appendix=True) for table in late)]
-    return [table for table in found if table is not None]
+        found |= {where: _recorded(analysis, where, totals) for where in _RECORDED}
+        found |= {"overview": overview(analysis), "comparisons": comparisons(analysis)}
+        found["contraction"] = contraction(analysis)
+    listed = [(found.get(name), name in _APPENDIX) for name in (*_MAIN, *_APPENDIX)]
+    return [replace(table, appendix=late) for table, late in listed if table is not None]
 
 
 def head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
@@ -86,10 +115,11 @@ def head(analysis: Analysis, rows: pd.DataFrame) -> list[Column]:
     ]
 
 
-def _recorded(
-    analysis: Analysis, where: Where, title: str, caption: str, rows: pd.DataFrame, names: Sequence[str] = ()
-) -> Table | None:
+def _recorded(analysis: Analysis, where: Where, totals: pd.DataFrame) -> Table | None:
     """The table of the statistics whose records name it, behind the estimators and other columns of names."""
+    (title, caption, chosen), names = _RECORDED[where], ("parameter", "unit") if where in _OF_PARAMETERS else ()
+    rows = analysis.summary if names else totals
+    rows = rows[chosen(rows)]
     if rows.empty:
         return None
     columns = [*head(analysis, rows), *(words(name, rows[name]) for name in ("estimator", *names))]
@@ -109,50 +139,6 @@ def overview(analysis: Analysis) -> Table:
     columns = [*first, *overview_columns(told, leading(told, [*analysis.setting_columns, "error_scale"]))]
     columns += statistics("overview", told)
     return Table("overview", "Overview", "", columns, rows, notes=legend(rows["noise"].tolist()), grouped=len(first))
-
-
-def theory(analysis: Analysis) -> Table | None:
-    """What theory expects of least squares, parameter by parameter, beside what happened."""
-    caption = (
-        "Estimators that minimise the sum of squares, over solved trials, in the parameters' own units; all: over the"
-        " linear bound, root mean square over parameters. The theory uses the Jacobians of the models and no draw of"
-        " noise; if readings come from another model than the assumed one, it uses those of both. Linear theory holds"
-        " if the relative curvatures are below 0.3."
-    )
-    rows = analysis.summary[analysis.summary["predicted_rmse"].notna()]
-    return _recorded(analysis, "theory", "Theory beside experiment", caption, rows, ("parameter", "unit"))
-
-
-def parameters(analysis: Analysis) -> Table | None:
-    """Every parameter in its own unit."""
-    caption = (
-        "In each parameter's own unit. Bias, std, rmse, bounds and NEES are over solved trials; median and 95 % of the"
-        " absolute error, and coverage, over all trials."
-    )
-    rows = analysis.summary[analysis.summary["parameter"] != ALL]
-    table = _recorded(analysis, "parameters", "Parameters", caption, rows, ("parameter", "unit"))
-    return table and replace(table, data=rows)
-
-
-def tracks(analysis: Analysis) -> Table | None:
-    """Every state over the whole path, in its own unit."""
-    rows = analysis.summary[analysis.summary["path_rmse"].notna()]
-    caption = f"{TRACKED} all: over the bound at the truth, root mean square over the states."
-    return _recorded(analysis, "tracks", "States over all epochs", caption, rows, ("parameter", "unit"))
-
-
-def calibration(analysis: Analysis) -> Table | None:
-    """How each reported covariance lies, in words; the file says so of each parameter, too."""
-    caption = (
-        "This table tests whether the truth is distributed as the Gaussian that an estimator reports, over converged"
-        " trials with a covariance, for NEES and every parameter together, at 5 % for each row. The median NEES with"
-        " its limits is over all trials."
-    )
-    rows = analysis.summary[analysis.summary["claims"] > 0]
-    title = "Calibration of the reported covariance"
-    table = _recorded(analysis, "calibration", title, caption, rows[rows["parameter"] == ALL])
-    each = _recorded(analysis, "calibration", title, caption, rows, ("parameter",))
-    return table and each and replace(table, data=each.data)
 
 
 def contraction(analysis: Analysis) -> Table | None:
