@@ -16,8 +16,9 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.basics.streams import normals, own_generators
 from ipe_bench.estimators.base import Equation, Estimates, Estimator, Need
 from ipe_bench.estimators.driver import Limits, continued
-from ipe_bench.estimators.gauss_newton import GaussNewtonMethod
-from ipe_bench.estimators.least_squares import Objective, minimize
+from ipe_bench.estimators.least_squares import Objective
+from ipe_bench.estimators.levenberg_marquardt import GaussNewtonMethod
+from ipe_bench.estimators.minima import minimize
 from ipe_bench.measurements.problem import Problem
 
 

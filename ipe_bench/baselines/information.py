@@ -246,7 +246,7 @@ class _Standardized:
     def cost(self, y: Array, r: Array) -> Array:
         return squared(r)
 
-    def slopes(self, y: Array, *, coarse: bool) -> tuple[Array, None]:
+    def slopes(self, y: Array, *, coarse: Mask | bool) -> tuple[Array, None]:
         J = np.matmul(self.readings.slope(self._x(y)), self.root)
         return np.concatenate([J, np.broadcast_to(np.eye(self.n), self.root.shape)], axis=1), None
 

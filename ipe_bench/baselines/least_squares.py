@@ -14,10 +14,10 @@ from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import Limits, Solver
-from ipe_bench.estimators.gauss_newton import GaussNewtonMethod
 from ipe_bench.estimators.ipe import Start, begin, starting_points
-from ipe_bench.estimators.least_squares import LeastSquaresSystem, Objective, minimize
-from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
+from ipe_bench.estimators.least_squares import LeastSquaresSystem, Objective
+from ipe_bench.estimators.levenberg_marquardt import GaussNewtonMethod, LevenbergMarquardtMethod
+from ipe_bench.estimators.minima import minimize
 from ipe_bench.measurements.problem import Problem
 
 

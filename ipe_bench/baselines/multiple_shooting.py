@@ -16,7 +16,7 @@ from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
 from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, iterate
-from ipe_bench.estimators.least_squares import Minima
+from ipe_bench.estimators.minima import Minima
 from ipe_bench.measurements.base import SubsetModel
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.ode.described import Ode

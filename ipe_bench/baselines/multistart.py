@@ -13,9 +13,9 @@ from ipe_bench.basics.options import Count, Positive, Whole
 from ipe_bench.basics.streams import normals, own_generators
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import Limits
-from ipe_bench.estimators.fitting import Fitting, passes, spread_of_starts
-from ipe_bench.estimators.least_squares import Minima, Objective, minimize
+from ipe_bench.estimators.least_squares import Objective
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
+from ipe_bench.estimators.minima import Fitting, Minima, minimize, passes, spread_of_starts
 from ipe_bench.measurements.problem import Problem
 
 

@@ -63,31 +63,28 @@ class Estimates:
     @classmethod
     def join(cls, parts: Sequence[Estimates]) -> Estimates:
         """The batches one after another."""
-        n, sizes = parts[0].x.shape[1], [len(p.x) for p in parts]
-        starts = np.cumsum([0, *sizes[:-1]])
+        n, sizes = parts[0].x.shape[1], [len(part.x) for part in parts]
+        starts = np.cumsum([0, *sizes[:-1]]).tolist()
 
         def joined(values: list[Any], *shape: int) -> Any:
             """NaN where a part has none, and None where no part has any."""
-            if all(v is None for v in values):
+            if all(value is None for value in values):
                 return None
-            known = (np.full((size, *shape), np.nan) if v is None else v for v, size in zip(values, sizes, strict=True))
-            return np.concatenate(list(known))
+            blanks = (np.full((size, *shape), np.nan) for size in sizes)
+            return np.concatenate([b if v is None else v for v, b in zip(values, blanks, strict=True)])
 
         whole = ("x", "status", "iterations", "simulations", "jacobians", "seconds")
-        histories, others = [p.history for p in parts], [p.alternatives for p in parts]
-        none = [[np.zeros((0, n))] * size for size in sizes]
-        return cls(
-            **{name: joined([getattr(p, name) for p in parts]) for name in whole},
-            covariance=joined([p.covariance for p in parts], n, n),
-            messages={int(s) + i: m for s, p in zip(starts, parts, strict=True) for i, m in p.messages.items()},
-            history=None if any(h is None for h in histories) else [x for h in histories if h for x in h],
-            alternatives=None
-            if all(o is None for o in others)
-            else [x for o, empty in zip(others, none, strict=True) for x in (o or empty)],
-            extras={
-                k: joined([p.extras.get(k) for p in parts]) for k in dict.fromkeys(k for p in parts for k in p.extras)
-            },
-        )
+        found: dict[str, Any] = {name: joined([getattr(part, name) for part in parts]) for name in whole}
+        found["covariance"] = joined([part.covariance for part in parts], n, n)
+        found["messages"] = {s + i: m for s, part in zip(starts, parts, strict=True) for i, m in part.messages.items()}
+        names = dict.fromkeys(name for part in parts for name in part.extras)
+        found["extras"] = {name: joined([part.extras.get(name) for part in parts]) for name in names}
+        if all(part.history is not None for part in parts):
+            found["history"] = [x for part in parts for x in part.history or ()]
+        if any(part.alternatives is not None for part in parts):
+            blank = np.zeros((0, n))
+            found["alternatives"] = [x for part in parts for x in part.alternatives or [blank] * len(part.x)]
+        return cls(**found)
 
     @classmethod
     def failed(cls, trials: int, n: int, message: str) -> Estimates:
@@ -136,11 +133,7 @@ def estimate_safely(estimator: Estimator, problem: Problem, z: Array, *, history
 
     A batch that raises is estimated again trial by trial. Readings and problem are read-only.
     """
-    return _estimate(estimator, problem, read_only(z), history)
-
-
-def _estimate(estimator: Estimator, problem: Problem, z: Array, history: bool) -> Estimates:
-    began = time.perf_counter()
+    began, z = time.perf_counter(), read_only(z)
     try:
         with np.errstate(all="ignore"):
             estimates = estimator.estimate(problem, z, history=history)
@@ -149,7 +142,7 @@ def _estimate(estimator: Estimator, problem: Problem, z: Array, history: bool) -
     except Exception as error:
         if len(z) == 1:
             return Estimates.failed(1, problem.measurement.n, describe_exception(error))
-        return Estimates.join([_estimate(estimator, problem, row[None], history) for row in z])
+        return Estimates.join([estimate_safely(estimator, problem, row[None], history=history) for row in z])
     _require_shapes(estimator, estimates, len(z), problem.measurement.n)
     if not estimates.seconds.any():
         estimates.seconds = np.full(len(z), (time.perf_counter() - began) / max(1, len(z)))

@@ -32,6 +32,7 @@ class HasX(Protocol):
 
 
 S = TypeVar("S", bound=HasX)
+R = TypeVar("R")
 
 
 class Equations(Protocol):
@@ -128,10 +129,20 @@ def iterate(equations: Equations, solver: Solver[S], start: Array | S, limits: L
                 for row, x in zip(active, state.x, strict=True):
                     iterates[row].append(x)
         rows = equations.rows
-        spent = limits.budget is not None and tally.cost(n)[rows] >= limits.budget
-        last = Status.MAX_ITERATIONS if iteration == limits.max_iterations else Status.RUNNING
-        now = _endings(check, tally.failed(rows), tally.singular[rows], begun, spent, limits.tolerance, last)
-        status[active] = now
+        # The first of these that holds is the end of a trial.
+        endings: tuple[tuple[Any, Any], ...] = (
+            (tally.failed(rows), Status.ERROR),
+            (tally.singular[rows], Status.SINGULAR),
+            (~np.isfinite(check.level), Status.NONFINITE),
+            (check.size <= limits.tolerance, Status.CONVERGED),
+            (check.stuck, check.ending),
+            (check.level > FAR * begun, Status.DIVERGED),
+            (check.moved < TINY_STEP * limits.tolerance, check.ending),
+            (limits.budget is not None and tally.cost(n)[rows] >= limits.budget, Status.BUDGET),
+            (iteration == limits.max_iterations, Status.MAX_ITERATIONS),
+        )
+        holds, ending = zip(*endings, strict=True)
+        now = status[active] = np.select(holds, ending, Status.RUNNING)
         going = now == Status.RUNNING
         if not going.all():
             ended.append((active[~going], take(state, ~going) if going.any() else state))
@@ -143,9 +154,6 @@ def iterate(equations: Equations, solver: Solver[S], start: Array | S, limits: L
     return SolveResult(gather(ended) if ended else state, status, iterations, paths)
 
 
-R = TypeVar("R")
-
-
 def continued(first: Any, second: R) -> R:
     """The second of two iterations, results with `iterations` and `history`, with the iterates of both."""
     history = second.history  # type: ignore[attr-defined]
@@ -153,29 +161,3 @@ def continued(first: Any, second: R) -> R:
         history = [np.concatenate([a, b[1:]]) for a, b in zip(first.history, history, strict=True)]
     iterations = first.iterations + second.iterations  # type: ignore[attr-defined]
     return replace(second, iterations=iterations, history=history)  # type: ignore[type-var]
-
-
-def _endings(
-    check: ConvergenceCheck,
-    failed: Mask,
-    singular: Mask,
-    begun: Array,
-    spent: Mask | bool,
-    tolerance: float,
-    last: Status,
-) -> NDArray[np.int8]:
-    """The status of each trial: the first line that holds, else `last`."""
-    lines = (
-        (failed, Status.ERROR),
-        (singular, Status.SINGULAR),
-        (~np.isfinite(check.level), Status.NONFINITE),
-        (check.size <= tolerance, Status.CONVERGED),
-        (check.stuck, check.ending),
-        (check.level > FAR * begun, Status.DIVERGED),
-        (check.moved < TINY_STEP * tolerance, check.ending),
-        (spent, Status.BUDGET),
-    )
-    status = np.full(begun.shape, last, np.int8)
-    for holds, ending in reversed(lines):
-        np.copyto(status, ending, where=holds, casting="unsafe")
-    return status

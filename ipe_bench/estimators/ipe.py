@@ -124,10 +124,6 @@ class FrozenSystem:
         self.model.tally.singular[self.rows[singular & finite(A) & finite(b)]] = True
         return x
 
-    def with_slope(self, H_plus: Array, deviation: Array) -> FrozenSystem:
-        """The same readings with an H+ (trials, n, m) of each trial's own, and its deviations (trials, n)."""
-        return dataclasses.replace(self, H_plus=H_plus, deviation=deviation)
-
     def subset(self, kept: Mask) -> FrozenSystem:
         slopes = {} if len(self.H_plus) == 1 else {"H_plus": self.H_plus[kept], "deviation": self.deviation[kept]}
         return dataclasses.replace(self, z=self.z[kept], rows=self.rows[kept], **slopes)
@@ -137,7 +133,7 @@ class FrozenSystem:
         J = self.model.jacobian(x, self.rows)
         H_plus, deficient = pseudo_inverse(J, self.R)
         self.model.tally.singular[self.rows[deficient & finite(J)]] = True
-        return self.with_slope(H_plus, deviations(frozen_covariance(H_plus, self.R)))
+        return dataclasses.replace(self, H_plus=H_plus, deviation=deviations(frozen_covariance(H_plus, self.R)))
 
     def covariance(self) -> Array:
         """H+ R H+' (1, n, n) or (trials, n, n), eq. (5): of the linear LSE."""
@@ -171,9 +167,15 @@ def begin(problem: Problem, z: Array, start: Start) -> tuple[Array, FrozenSystem
     """
     system = FrozenSystem.at_nominal(problem, z)
     x0 = np.repeat(problem.x0[None], len(z), axis=0)
-    if start == "best":
-        return _better_fitting(system, x0), system
-    return (x0 - system.F(x0) if start == "linear_lse" else x0), system
+    if start == "nominal":
+        return x0, system
+    r0 = system.model.simulate(x0, system.rows) - system.z
+    lse = x0 - multiply(system.H_plus, r0)
+    if start == "linear_lse":
+        return lse, system
+    r = system.model.simulate(lse, system.rows) - system.z
+    better = squared(system.R.whiten(r)) < squared(system.R.whiten(r0))
+    return np.where(better[:, None], lse, x0), system
 
 
 def starting_points(problem: Problem, z: Array, start: Start, tally: EvaluationCount) -> Array:
@@ -188,15 +190,6 @@ def starting_points(problem: Problem, z: Array, start: Start, tally: EvaluationC
     tally.simulations += system.model.tally.simulations
     tally.messages.update(system.model.tally.messages)
     return x
-
-
-def _better_fitting(system: FrozenSystem, x0: Array) -> Array:
-    """x0 or the linear LSE (trials, n), whichever has the smaller |R^-1/2 (h - z)|; x0 where the other has none."""
-    r0 = system.model.simulate(x0, system.rows) - system.z
-    lse = x0 - multiply(system.H_plus, r0)
-    r = system.model.simulate(lse, system.rows) - system.z
-    better = squared(system.R.whiten(r)) < squared(system.R.whiten(r0))
-    return np.where(better[:, None], lse, x0)
 
 
 @dataclass(frozen=True, kw_only=True)

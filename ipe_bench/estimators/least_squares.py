@@ -1,18 +1,15 @@
-"""Least squares for a batch of trials: the objective, what a Jacobian says of it, and where a minimisation ended.
-
-The methods have pages of their own, `gauss_newton` and `levenberg_marquardt`.
-"""
+"""Least squares for a batch of trials: the objective, its normal equations, and the state of an iteration."""
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.batches import put, take
+from ipe_bench.basics.batches import put
 from ipe_bench.basics.linalg import (
     Array,
     Covariance,
@@ -26,8 +23,7 @@ from ipe_bench.basics.linalg import (
     squared,
 )
 from ipe_bench.basics.statuses import Status
-from ipe_bench.estimators.base import Estimates
-from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, SolveResult, iterate
+from ipe_bench.estimators.driver import ConvergenceCheck
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
@@ -38,36 +34,16 @@ _FLAT = 30
 _STATIONARY = 1e-3
 """The part of a deviation, along every column of J, within which a point is nearly stationary."""
 
-_NEAR = 0.03
-"""Steps still to go of fewer deviations are computed from exact Jacobians: a coarse one leaves the gradient about a
-hundredth of a deviation from zero."""
-
 
 class Residuals(Protocol):
-    """What the methods of this room minimise the squares of, for the trials of a batch."""
-
-    def residual(self, x: Array, /) -> Array:
-        """The residuals (trials, m) at x (trials, n), of unit variance."""
-        ...
-
-    def slopes(self, x: Array, /, *, coarse: bool) -> tuple[Array, Array | None]:
-        """Their derivative (trials, m, n), or one near enough for steps; and what is left to divide its rows by (m,),
-        None where nothing is."""
-        ...
-
-    def cost(self, x: Array, r: Array, /) -> Array:
-        """What is minimised (trials,) at x, where the residuals are r: half its gradient is J' r."""
-        ...
+    """What is minimised, for the trials of a batch; `Objective` says what each of these is."""
 
     @property
-    def exact_within(self) -> float:
-        """Where the Gauss-Newton step still to go is shorter than so many deviations, Jacobians are exact, elsewhere
-        coarse; infinite: they are exact everywhere; 0: coarse, and good enough to end with."""
-        ...
-
-    def subset(self, kept: Mask, /) -> Residuals:
-        """The same for some of the trials."""
-        ...
+    def exact_within(self) -> float: ...
+    def residual(self, x: Array, /) -> Array: ...
+    def slopes(self, x: Array, /, *, coarse: Mask | bool) -> tuple[Array, Array | None]: ...
+    def cost(self, x: Array, r: Array, /) -> Array: ...
+    def subset(self, kept: Mask, /) -> Residuals: ...
 
 
 @dataclass(frozen=True)
@@ -83,6 +59,8 @@ class Objective:
     prior: Covariance | None = None
     """P0, where it counts."""
     exact_within: float = np.inf
+    """Where the Gauss-Newton step still to go is shorter than so many deviations, Jacobians are exact, elsewhere
+    coarse; infinite: they are exact everywhere; 0: coarse, and good enough to end with."""
 
     @classmethod
     def of(cls, problem: Problem, z: Array, *, prior: bool, inflation: float = 1.0) -> Objective:
@@ -103,6 +81,7 @@ class Objective:
         return np.concatenate([r, self.prior.whiten(x - self.x0)], axis=1)
 
     def cost(self, x: Array, r: Array) -> Array:
+        """What is minimised (trials,) at x, where the residuals are r: half its gradient is J' r."""
         return squared(r)
 
     def jacobian(self, x: Array) -> Array:
@@ -110,9 +89,9 @@ class Objective:
         J, deviation = self.slopes(x, coarse=False)
         return J if deviation is None else J / deviation[:, None]
 
-    def slopes(self, x: Array, *, coarse: bool) -> tuple[Array, Array | None]:
-        """The same, or from `Measurement.coarse_jacobian`, before its rows (m,) or (m + n,) are divided by those
-        deviations, if there are any."""
+    def slopes(self, x: Array, *, coarse: Mask | bool) -> tuple[Array, Array | None]:
+        """The same, or where `coarse` (trials,) says so a derivative that is near enough for steps, before its rows are
+        divided by deviations (m,) or (m + n,), if there are any."""
         J, deviation = self.model.jacobian(x, self.rows, coarse=coarse), self.R.factor
         if deviation.ndim == 2:
             J, deviation = self.R.whiten_jacobian(J), np.ones(J.shape[1])
@@ -173,20 +152,14 @@ class NormalEquations:
             if Q is not None:
                 Q[~well] = QU
         columns = np.sqrt(np.sum(U**2, axis=1))
-        newton = -multiply(inverse_U, gradient)
-        deviation = np.sqrt(np.sum(inverse_U**2, axis=2))
-        size = np.abs(newton / deviation).max(axis=1)
-        size = np.where(np.isfinite(size), size, np.inf)
         along = np.abs(multiply(U.swapaxes(1, 2), gradient)) / np.where(columns > 0, columns, 1.0)
-        return cls(U, inverse_U, gradient, columns, newton, size, along.max(axis=1), Q)
+        return cls(U, inverse_U, gradient, columns, *_newton_step(inverse_U, gradient), along.max(axis=1), Q)
 
     def towards(self, r: Array) -> NormalEquations:
         """The same Jacobian with another residual r (trials, m): a chord. It needs Q."""
         assert self.Q is not None
         gradient = multiply(self.Q.swapaxes(1, 2), r)
-        newton = -multiply(self.inverse_U, gradient)
-        size = np.abs(newton / np.sqrt(np.sum(self.inverse_U**2, axis=2))).max(axis=1)
-        size = np.where(np.isfinite(size), size, np.inf)
+        newton, size = _newton_step(self.inverse_U, gradient)
         return dataclasses.replace(self, gradient=gradient, newton=newton, size=size)
 
     def damped(self, weights: Array) -> tuple[Array, Array]:
@@ -199,6 +172,13 @@ class NormalEquations:
             step[~well] = _damped_step(self.U[~well], weights[~well], self.gradient[~well])
         change = multiply(self.U, step)
         return step, -np.einsum("ti,ti->t", change, 2.0 * self.gradient + change)
+
+
+def _newton_step(inverse_U: Array, gradient: Array) -> tuple[Array, Array]:
+    """The Gauss-Newton step (trials, n), and its largest entry (trials,) in deviations."""
+    newton = -multiply(inverse_U, gradient)
+    size = np.abs(newton / np.sqrt(np.sum(inverse_U**2, axis=2))).max(axis=1)
+    return newton, np.where(np.isfinite(size), size, np.inf)
 
 
 def _damped_step(U: Array, weights: Array, gradient: Array) -> Array:
@@ -234,24 +214,13 @@ def slope_at(
 ) -> tuple[NormalEquations, Mask]:
     """The slope at x, where the residuals are r, and where it is that of an exact Jacobian: where `exact` (trials,)
     says so, and where a coarse one has not full rank."""
-    if exact.all():
-        return _slope_of(objective, x, r, coarse=False, keep_Q=keep_Q), exact
-    if exact.any():
-        coarse, believed = slope_at(objective.subset(~exact), x[~exact], r[~exact], exact[~exact], keep_Q=keep_Q)
-        near = _slope_of(objective.subset(exact), x[exact], r[exact], coarse=False, keep_Q=keep_Q)
-        both = take(near, np.zeros(len(x), np.intp))
-        return put(put(both, exact, near), ~exact, coarse), put(exact, ~exact, believed)
-    slope = _slope_of(objective, x, r, coarse=True, keep_Q=keep_Q)
-    lost = ~np.isfinite(slope.size)
+    J, deviation = objective.slopes(x, coarse=~exact)
+    slope = NormalEquations.of(J, r, deviation, keep_Q=keep_Q)
+    lost = ~exact & ~np.isfinite(slope.size)
     if lost.any():
-        again = _slope_of(objective.subset(lost), x[lost], r[lost], coarse=False, keep_Q=keep_Q)
+        again, _ = slope_at(objective.subset(lost), x[lost], r[lost], np.ones(lost.sum(), dtype=bool), keep_Q=keep_Q)
         slope = put(slope, lost, again)
-    return slope, lost
-
-
-def _slope_of(objective: Residuals, x: Array, r: Array, *, coarse: bool, keep_Q: bool) -> NormalEquations:
-    J, deviation = objective.slopes(x, coarse=coarse)
-    return NormalEquations.of(J, r, deviation, keep_Q=keep_Q)
+    return slope, exact | lost
 
 
 @dataclass(frozen=True)
@@ -328,96 +297,3 @@ class LeastSquaresSystem:
         if objective.exact_within > 0:
             size = np.where(self.exact, size, np.inf)
         return ConvergenceCheck(size, level, self.moved, stuck, ending)
-
-
-@dataclass(frozen=True)
-class Minima:
-    """Where the minimisation of each trial ended, with what is known of the objective there."""
-
-    x: Array
-    status: NDArray[np.int8]
-    iterations: NDArray[np.int64]
-    history: list[Array] | None
-    covariance: Array
-    """(J' R^-1 J)^-1 (trials, n, n), with P0^-1 inside where the prior counts; NaN where it does not exist."""
-    chi_square: Array
-    """|R^-1/2 (h(x) - z)|^2 (trials,), of the readings alone."""
-    bulk: Array
-    """The median magnitude (trials,) of the readings' residuals in deviations: .67 where R is right, and little more
-    where it is wrong for some of them only."""
-
-    @classmethod
-    def of(cls, ended: SolveResult[Any], covariance: Array, r: Array) -> Minima:
-        """Where an iteration ended, with whitened residuals r (trials, m) there."""
-        bulk = np.median(np.abs(r), axis=1)
-        return cls(ended.x, ended.status, ended.iterations, ended.history, covariance, squared(r), bulk)
-
-    @classmethod
-    def nowhere(cls, x: Array, history: bool) -> Minima:
-        """No minimum for any trial, at its start x (trials, n)."""
-        trials, n = x.shape
-        far = np.full(trials, np.inf)
-        status, none = np.full(trials, Status.MAX_ITERATIONS, np.int8), np.zeros(trials, np.int64)
-        return cls(
-            x, status, none, [row[None] for row in x] if history else None, np.full((trials, n, n), np.nan), far, far
-        )
-
-    @property
-    def converged(self) -> Mask:
-        return self.status == Status.CONVERGED
-
-    def better_than(self, old: Minima) -> Mask:
-        """Which of these count rather than the old ones: they converged and are lower, or the old one had no end."""
-        return self.converged & (~(self.chi_square >= old.chi_square) | ~old.converged)
-
-    def replaced(self, rows: NDArray[np.intp], again: Minima, better: Mask) -> Minima:
-        """The minima after further ones `again` of the trials `rows`, where these are `better`; iterations add up."""
-        spent = self.iterations.copy()
-        spent[rows] += again.iterations
-        return dataclasses.replace(put(self, rows[better], take(again, better)), iterations=spent)
-
-    def fit_probability(self, readings: int) -> Array:
-        """The chi-square test of the fit (trials,): how probable residuals at least this large are if the model holds,
-        R is right and the minimum is the global one."""
-        from scipy.special import chdtrc
-
-        return chdtrc(max(readings - self.x.shape[1], 1), self.chi_square)
-
-    def estimates(self, tally: EvaluationCount, readings: int) -> Estimates:
-        """What an estimator hands back."""
-        extras = {"fit_p": self.fit_probability(readings)}
-        return Estimates.of(self, tally, covariance=self.covariance, extras=extras)
-
-
-def minimize(objective: Objective, method: Solver[LeastSquaresSystem], x: Array, limits: Limits) -> Minima:
-    """Minimises the objective from x (trials, n) by Gauss-Newton or Levenberg-Marquardt.
-
-    Converged is where the Gauss-Newton step, which is the gradient in whitened units, is at most `limits.tolerance`
-    standard deviations of the local bound in every parameter. An iteration is a step tried, taken or not. Jacobians are
-    coarse on the way, if the model has cheaper ones, and exact at the end.
-    """
-    if np.isinf(objective.exact_within):
-        objective = objective.coarsened(_NEAR)
-    ended = iterate(objective, method, x, limits)
-    return minima_of(ended, _exact_slope(objective, ended.state), objective.readings)
-
-
-def minima_of(ended: SolveResult[Any], slope: NormalEquations, readings: int) -> Minima:
-    """What is known of the objective where an iteration of it ended with that slope."""
-    # U^-1 U^-T: inverting U'U would lose twice the digits, and with them the sign of a variance.
-    inverse_U, lost = slope.inverse_U, ~finite(slope.inverse_U)
-    if lost.any():
-        inverse_U = put(inverse_U, lost, inverse(slope.U[lost])[0])
-    return Minima.of(ended, np.matmul(inverse_U, inverse_U.swapaxes(1, 2)), ended.state.r[:, :readings])
-
-
-def _exact_slope(objective: Objective, state: LeastSquaresSystem) -> NormalEquations:
-    """The slope where an iteration has ended; for the report alone where it ended on a coarse one, so not counted."""
-    coarse = ~state.exact & finite(state.x)
-    if objective.exact_within == 0 or not coarse.any():
-        return state.slope
-    tally = EvaluationCount.zeros(len(objective.model.tally.simulations))
-    report = dataclasses.replace(objective, model=dataclasses.replace(objective.model, tally=tally)).subset(coarse)
-    keep_Q = state.slope.Q is not None
-    exact = _slope_of(report, state.x[coarse], state.r[coarse], coarse=False, keep_Q=keep_Q)
-    return put(state.slope, coarse, exact)

@@ -1,4 +1,4 @@
-"""The Levenberg-Marquardt method, plain or with geodesic acceleration."""
+"""The Gauss-Newton method, and that of Levenberg and Marquardt, plain or with geodesic acceleration."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from ipe_bench.basics.linalg import Array, finite, multiply
 from ipe_bench.estimators.driver import ConvergenceCheck, Solver
 from ipe_bench.estimators.least_squares import LeastSquaresSystem, Residuals, slope_at
 
+_SMALL = 1e-10
+"""Singular values of J below this share of the largest are taken for zero where J lacks rank."""
 _LARGEST_DAMPING = 1e30
 _ROUND_OFF = 1e-8
 """A predicted decrease below this share of the objective cannot be seen in the objective any more."""
@@ -18,6 +20,34 @@ _PROBE = 0.1
 """The share of a step over which its curvature is measured."""
 _MOST_BENT = 0.75
 """A correction for curvature is believed where twice its length is at most this share of the step's."""
+
+
+@dataclass(frozen=True)
+class GaussNewtonMethod(Solver[LeastSquaresSystem]):
+    """x <- x - (J' R^-1 J)^-1 J' R^-1 (h(x) - z), undamped; where J lacks rank, the shortest of all such steps."""
+
+    def begin(self, objective: Residuals, x: Array) -> LeastSquaresSystem:
+        return LeastSquaresSystem.at(objective, x)
+
+    def step(self, objective: Residuals, state: LeastSquaresSystem) -> LeastSquaresSystem:
+        slope, lost = state.slope, state.rankless & finite(state.slope.U) & finite(state.slope.gradient)
+        step = slope.newton.copy()
+        if lost.any():
+            step[lost] = -multiply(np.linalg.pinv(slope.U[lost], rcond=_SMALL), slope.gradient[lost])
+        x = state.x + step
+        r = objective.residual(x)
+        near = state.nearly(objective)
+        slope, exact = slope_at(objective, x, r, near)
+        moved = state.reach(step)
+        regular = state.regular | np.isfinite(slope.size)
+        cost = objective.cost(x, r)
+        return replace(state, x=x, r=r, cost=cost, slope=slope, moved=moved, regular=regular, exact=exact, near=near)
+
+    def check(
+        self, objective: Residuals, before: LeastSquaresSystem | None, state: LeastSquaresSystem
+    ) -> ConvergenceCheck:
+        """Where J lacks rank and no step leads on, the trial ends as singular."""
+        return state.check(objective, stuck=state.rankless & (state.moved == 0))
 
 
 @dataclass(frozen=True)

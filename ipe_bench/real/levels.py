@@ -17,10 +17,11 @@ from functools import cached_property
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, Covariance
+from ipe_bench.basics.linalg import Array, Covariance, Mask
 from ipe_bench.estimators.driver import Limits
-from ipe_bench.estimators.least_squares import Minima, Objective, inverse_factor, minimize
+from ipe_bench.estimators.least_squares import Objective, inverse_factor
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
+from ipe_bench.estimators.minima import Minima, minimize
 from ipe_bench.measurements.base import Measurement, Parameter, WrappedModel
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
@@ -141,7 +142,7 @@ class Likelihood(Objective):
         f = self.levelled.spare
         return np.concatenate([w, (f - w**2) / np.sqrt(f + w**2), _HOLD * moved], axis=1)
 
-    def slopes(self, x: Array, *, coarse: bool) -> tuple[Array, None]:
+    def slopes(self, x: Array, *, coarse: Mask | bool) -> tuple[Array, None]:
         """The second residuals' information is f + w^2, whose mean is Fisher's 2 f: steps of log sigma are below 1."""
         w, log, moved = self._split(x)
         weights = [np.exp(-log), np.sqrt(self.levelled.spare + w**2), np.full(moved.shape, _HOLD)]

@@ -17,8 +17,8 @@ from scipy.special import chdtri, fdtri, stdtrit
 
 from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.estimators.driver import Limits
-from ipe_bench.estimators.least_squares import minimize
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
+from ipe_bench.estimators.minima import minimize
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem

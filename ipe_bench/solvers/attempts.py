@@ -7,6 +7,7 @@ from __future__ import annotations
 import itertools
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +16,10 @@ from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array, Covariance, squared
 from ipe_bench.estimators.driver import Limits, continued
 from ipe_bench.estimators.ipe import starting_points
-from ipe_bench.estimators.least_squares import Minima, Objective, minimize
+from ipe_bench.estimators.least_squares import Objective
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
-from ipe_bench.measurements.base import SubsetModel
+from ipe_bench.estimators.minima import Minima, minimize
+from ipe_bench.measurements.base import Measurement, SubsetModel
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
 
@@ -44,9 +46,9 @@ class Attempts(ABC):
     restarts: int | None
     """See the options of `Progressive` of the same names."""
 
-    planned: int = 0
+    planned: ClassVar[int]
     """The number of attempts."""
-    repeats: int = 1
+    repeats: ClassVar[int] = 1
     """How many attempts from independent draws must lead to a minimum again for it to be believed."""
 
     @property
@@ -89,22 +91,23 @@ class Attempts(ABC):
 
     def whole(self, owner: Rows) -> Objective:
         """The objective on all data for candidates of the trials `owner`."""
-        model = CountingModel(self.problem.measurement, self.spent(owner))
+        model = self.counted(self.problem.measurement, owner)
         return Objective(model, self.problem.R, self.z[owner], np.arange(len(owner)), self.problem.x0)
 
-    def spent(self, owner: Rows) -> EvaluationCount:
-        """A tally for candidates of the trials `owner`, which begins at what each trial has cost so far."""
-        singular = np.zeros(len(owner), dtype=bool)
-        return EvaluationCount(self.tally.simulations[owner], self.tally.jacobians[owner], singular)
+    def counted(self, measurement: Measurement, owner: Rows, share: float = 1.0) -> CountingModel:
+        """A model for candidates of the trials `owner`, whose tally begins at what each trial has cost so far."""
+        spent = self.tally.simulations[owner], self.tally.jacobians[owner], np.zeros(len(owner), dtype=bool)
+        return CountingModel(measurement, EvaluationCount(*spent), share)
 
     def charge(self, owner: Rows, tally: EvaluationCount) -> None:
-        """Adds to each trial what its candidates have cost since `spent`."""
+        """Adds to each trial what its candidates have cost since they were `counted`."""
         for total, now in ((self.tally.simulations, tally.simulations), (self.tally.jacobians, tally.jacobians)):
             np.add.at(total, owner, now - total[owner])
         for candidate, message in tally.messages.items():
             self.tally.messages.setdefault(int(owner[candidate]), message)
 
 
+_FROM_AFAR = LevenbergMarquardtMethod(1e-2, sizes=1e-3)
 _SHORT = 60
 _RAYS = np.array([sign * 10.0**exponent for exponent in np.arange(-3, 1.01, 0.25) for sign in (1, -1)])
 """Multiples of the nominal point that are looked at as starts."""
@@ -126,8 +129,8 @@ class Stages(Attempts):
     """From the nominal point under two metrics; from the two best points on the ray through the nominal point; then
     from the best of 20 random points, again and again."""
 
-    planned: int = 16
-    repeats: int = 3
+    planned = 16
+    repeats = 3
 
     def draws(self, k: int) -> int:
         return _LOOKS if k >= _RANDOM else 0
@@ -138,13 +141,12 @@ class Stages(Attempts):
         if k in _HALVING:
             return self._halved(k, rows)
         assert before is not None
-        method = LevenbergMarquardtMethod(1e-2, sizes=1e-3)
         x = self._on_a_ray(k, rows) if k < _RANDOM else self._at_random(k, rows)
-        found = self.minimize(rows, method, x, max(_SHORT, self.limits.max_iterations))
+        found = self.minimize(rows, _FROM_AFAR, x, max(_SHORT, self.limits.max_iterations))
         promising = ~found.converged & (found.chi_square < before.chi_square * (1 - _PROMISING))
         if promising.any():
             first = take(found, promising)
-            on = self.minimize(rows[promising], method, first.x, max(_LONG, self.limits.max_iterations))
+            on = self.minimize(rows[promising], _FROM_AFAR, first.x, max(_LONG, self.limits.max_iterations))
             found = put(found, promising, continued(first, on))
         return found
 
@@ -184,7 +186,7 @@ class Stages(Attempts):
         owner, x = np.repeat(rows, _LOOKS), np.tile(self._points(k, wide=True), (len(rows), 1))
         found = Minima.nowhere(x, False)
         for steps, kept in _HALVINGS:
-            found = self.minimize(owner, LevenbergMarquardtMethod(1e-2, sizes=1e-3), found.x, steps)
+            found = self.minimize(owner, _FROM_AFAR, found.x, steps)
             order = np.lexsort((_finite(found.chi_square), owner))
             rank = np.arange(len(owner)) - np.searchsorted(owner[order], owner[order])
             chosen = np.sort(order[rank < kept])
@@ -239,26 +241,25 @@ class Windows(Attempts):
     apart for one window more.
     """
 
-    planned: int = 9
+    planned = 9
 
-    @property
-    def _plain(self) -> int:
-        """The first of the two attempts on all data."""
-        return 2 if self.prior is None else 3
-
-    def _rank(self, k: int) -> int:
-        """The place of an attempt among those by windows: 0 and 1 from the nominal point, later ones from draws."""
-        return k if k < self._plain else k - 2
+    def _place(self, k: int) -> tuple[int | None, int]:
+        """Which of the two attempts on all data the k-th one is, if any, and its place among those by windows: 0 and 1
+        are from the nominal point, later ones from draws."""
+        plain = 2 if self.prior is None else 3
+        return (k - plain if plain <= k < plain + 2 else None), (k if k < plain else k - 2)
 
     def draws(self, k: int) -> int:
-        return 0 if 0 <= k - self._plain < 2 or k < 2 else _draws(self._rank(k))
+        plain, k = self._place(k)
+        return 0 if plain is not None or k < 2 else _draws(k)
 
     def attempt(self, k: int, rows: Rows, before: Minima | None) -> Minima:
         """A careful attempt without a prior takes one in its windows that reaches as far as the linear estimate
         says."""
-        if 0 <= k - self._plain < 2:
-            return self.plain(k - self._plain, rows)
-        last, k = k == self.last, self._rank(k)
+        last = k == self.last
+        plain, k = self._place(k)
+        if plain is not None:
+            return self.plain(plain, rows)
         if before is None or self.prior is not None or self.problem.rankless:
             return self._grown(k, rows, before, last)
         result, reach = before, self._reach(rows)
@@ -282,8 +283,10 @@ class Windows(Attempts):
         """Window after window, then all data without the prior. If none is known, draws reach as far as `before`."""
         problem, prior, epochs = self.problem, self.prior, self.problem.measurement.epochs
         assert epochs is not None
-        metric = np.ones(len(problem.x0)) if prior is None else prior
-        spread = metric if prior is not None or before is None else _distance(before, problem.x0)
+        metric = spread = np.ones(len(problem.x0)) if prior is None else prior
+        if prior is None and before is not None:
+            distance = np.abs(before.x - problem.x0)
+            spread = np.maximum(1.0, np.where(np.isfinite(distance), distance, 1.0))
         start, owner = self._starts(k, rows, spread), np.repeat(rows, _draws(k))
         found = Minima.nowhere(start, self.limits.history)
         method = LevenbergMarquardtMethod(_DAMPING, metric, by_residual=k > 0, geodesic=k > 0)
@@ -322,7 +325,7 @@ class Windows(Attempts):
         problem, model = self.problem, self.problem.measurement
         assert model.epochs is not None
         arrived, share = model.rows(stop), stop / len(model.epochs)
-        window = CountingModel(SubsetModel.until(model, stop, coarse=True), self.spent(owner), share)
+        window = self.counted(SubsetModel.until(model, stop, coarse=True), owner, share)
         R, z = problem.R.restricted(arrived), self.z[np.ix_(owner, arrived)]
         prior = None if self.prior is None else Covariance(self.prior)
         return Objective(window, R, z, np.arange(len(owner)), centre, prior).coarsened(0.0)
@@ -363,9 +366,3 @@ def window_stops(epochs: int, growth: float) -> list[int]:
     """The number of epochs of each window, the last one short of all: 1, 2, 4, 8, 16 of 30 for growth 2."""
     lengths = itertools.takewhile(lambda length: length < epochs, (growth**i for i in itertools.count()))
     return sorted({round(length) for length in lengths} - {epochs})
-
-
-def _distance(before: Minima, x0: Array) -> Array:
-    """How far draws reach without a prior (trials, n): as far as the attempts before have led."""
-    distance = np.abs(before.x - x0)
-    return np.maximum(1.0, np.where(np.isfinite(distance), distance, 1.0))

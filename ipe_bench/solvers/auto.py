@@ -12,9 +12,9 @@ from ipe_bench.basics.options import Positive, Whole
 from ipe_bench.basics.streams import normals, own_generators
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import Limits
-from ipe_bench.estimators.fitting import WRONG_MINIMUM, Fitting, spread_of_starts
-from ipe_bench.estimators.least_squares import Minima, Objective, minimize
+from ipe_bench.estimators.least_squares import Objective
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
+from ipe_bench.estimators.minima import WRONG_MINIMUM, Fitting, Minima, minimize, spread_of_starts
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers.chords import by_chords

@@ -11,7 +11,8 @@ from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array, Mask, finite, multiply, squared
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, SolveResult, continued, iterate
-from ipe_bench.estimators.least_squares import Minima, NormalEquations, Objective, minima_of
+from ipe_bench.estimators.least_squares import NormalEquations, Objective
+from ipe_bench.estimators.minima import Minima, minima_of
 from ipe_bench.solvers.anderson import accelerated, push
 
 _ITERATIONS = 25

@@ -17,11 +17,10 @@ from ipe_bench.basics.options import Count, Positive, Whole
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import Limits
-from ipe_bench.estimators.fitting import WRONG_MINIMUM, passes
-from ipe_bench.estimators.least_squares import Minima
+from ipe_bench.estimators.minima import WRONG_MINIMUM, Minima, passes
 from ipe_bench.measurements.counted import EvaluationCount
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.solvers.attempts import Rows, Stages, Windows
+from ipe_bench.solvers.attempts import Stages, Windows
 
 _SAME_FIT = 1e-6
 """Two minima whose chi-squares differ by less than this share are one."""
@@ -48,16 +47,12 @@ class Progressive(Estimator):
     residuals is large too, is tried again: carefully from the nominal point (windows that grow slowly, damping by the
     residual, steps bent along the curvature), by Levenberg-Marquardt on all data, and from 16, 32, ... draws of the
     prior, which the first windows keep apart and the later ones thin out to those that fit best. The best fit counts.
-    A minimum that independent draws lead to again ends the search, for nothing says of readings that do not fit
-    whether a better fit exists; so does 20 times the cost of the first fit, once draws were tried. The message of such
-    a trial says how far the search went.
+    A minimum that independent draws lead to again ends the search; so does 20 times the cost of the first fit, once
+    draws were tried. The message of such a trial says how far the search went.
 
-    Growing windows that start one another are the incremental single shooting of Michalik, Hannemann and Marquardt
-    (Comput. Chem. Eng. 33, 2009) and, with a prior, the recursive iterative batch smoother of Stepanov et al. (Sensors
-    25, 2025). Many draws carried through growing data and thinned out on the way are data-tempered Monte Carlo (Chopin,
-    Biometrika 89, 2002), with minimisations for its moves; draws whose priors are centred at themselves are the
-    randomised maximum likelihood of Oliver, He and Reynolds (1996). The damping in the prior's metric, the calibrated
-    test of the fit as the judge, and the order of cheap and dear attempts are ours.
+    Sources: the incremental single shooting of Michalik, Hannemann and Marquardt (Comput. Chem. Eng. 33, 2009); with a
+    prior, the recursive iterative batch smoother of Stepanov et al. (Sensors 25, 2025); data-tempered Monte Carlo
+    (Chopin, Biometrika 89, 2002), with minimisations for its moves.
     """
 
     growth: Annotated[float, Gt(1)] = 2.0
@@ -104,49 +99,45 @@ class Progressive(Estimator):
         if before is not None:
             worse = before.converged & ~best.better_than(before)
             best = put(best, worse, take(before, worse))
-        account, first = _Account(np.zeros((3, len(z)), np.int64)), np.full(len(z), np.inf)
+        # Of each trial: attempts after the first one, independent draws among their starts, attempts from draws that
+        # have led to the best minimum again, and the cost of the first fit.
+        tried, drawn, repeats = np.zeros((3, len(z)), np.int64)
+        first = np.full(len(z), np.inf)
         for k in range(1, attempts.last + 1):
-            cost = tally.cost(n)
+            cost, draws = tally.cost(n), attempts.draws(k)
             first = np.where(best.converged, np.minimum(first, cost), np.inf)
             going = ~accepted(best, m, level) & finite(z) & ~tally.failed(everyone)
-            going &= (cost < _WORTH * first) | (account.draws == 0)
-            going &= (cost < (np.inf if self.budget is None else self.budget)) & (account.repeats < attempts.repeats)
+            going &= (cost < _WORTH * first) | (drawn == 0)
+            going &= (cost < (np.inf if self.budget is None else self.budget)) & (repeats < attempts.repeats)
             rows = np.flatnonzero(going)
             if not len(rows):
                 break
             known = take(best, rows)
             again = attempts.attempt(k, rows, known)
-            better = again.better_than(known)
-            account.note(rows, again, known, better, attempts.draws(k))
+            better, same = again.better_than(known), _same(again, known)
+            tried[rows] += 1
+            drawn[rows] += draws
+            repeats[rows] = np.where(better & ~same, 0, repeats[rows] + (same & (draws > 0)))
             best = put(best, rows[better], take(again, better))
         raised = tally.failed(everyone) & ~best.converged
-        for i in np.flatnonzero(best.converged & ~accepted(best, m, level) & (account.attempts > 0)):
-            tally.messages[int(i)] = account.words(int(i))
+        for i in np.flatnonzero(best.converged & ~accepted(best, m, level) & (tried > 0)).tolist():
+            tally.messages[i] = _words(tried[i], drawn[i], repeats[i])
         return replace(best, status=np.where(raised, Status.ERROR, best.status).astype(np.int8)), tally
 
 
-class _Account:
-    """What the search for a better fit has tried in each trial (trials,): attempts after the first one, independent
-    draws among their starts, and attempts from draws that have led to the best minimum again."""
+def _same(one: Minima, other: Minima) -> Mask:
+    """Where two minima (trials,) are one."""
+    with np.errstate(invalid="ignore"):  # two infinite fits are not one minimum
+        near = _SAME_FIT * np.maximum(one.chi_square, other.chi_square)
+        return one.converged & other.converged & (np.abs(one.chi_square - other.chi_square) <= near)
 
-    def __init__(self, nothing: Rows) -> None:
-        self.attempts, self.draws, self.repeats = nothing
 
-    def note(self, rows: Rows, again: Minima, known: Minima, better: Mask, draws: int) -> None:
-        """Books an attempt from `draws` draws at the trials `rows`, whose best minima were `known`."""
-        with np.errstate(invalid="ignore"):  # two infinite fits are not one minimum
-            near = _SAME_FIT * np.maximum(again.chi_square, known.chi_square)
-            same = again.converged & known.converged & (np.abs(again.chi_square - known.chi_square) <= near)
-        self.attempts[rows] += 1
-        self.draws[rows] += draws
-        self.repeats[rows] = np.where(better & ~same, 0, self.repeats[rows] + (same & (draws > 0)))
-
-    def words(self, i: int) -> str:
-        """What was tried in trial i."""
-        count = f"{self.attempts[i]} more attempt{'' if self.attempts[i] == 1 else 's'}"
-        drawn = f", from {self.draws[i]} independent draws in all" if self.draws[i] else ""
-        led = f"{self.repeats[i]} of them led to this minimum again" if self.repeats[i] else "none found one"
-        return f"a better fit was looked for by {count}{drawn}: {led}"
+def _words(tried: int, drawn: int, repeats: int) -> str:
+    """How far the search went in a trial."""
+    count = f"{tried} more attempt{'' if tried == 1 else 's'}"
+    draws = f", from {drawn} independent draws in all" if drawn else ""
+    led = f"{repeats} of them led to this minimum again" if repeats else "none found one"
+    return f"a better fit was looked for by {count}{draws}: {led}"
 
 
 def accepted(minima: Minima, readings: int, level: float) -> Mask:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -78,7 +78,7 @@ class Relinearized(Solver[Round], Estimator):
 
     def step(self, system: FrozenSystem, state: Round) -> Round:
         """One round: inner steps from the last linearisation, then a new one where they end."""
-        linearized = system.with_slope(state.H_plus, state.deviation)
+        linearized = replace(system, H_plus=state.H_plus, deviation=state.deviation)
         limits = Limits(self.tolerance, self.inner_iterations, self.budget, history=True)
         ended = iterate(linearized, self.solver, self.solver.init(linearized, state.x, state.F), limits)
         assert ended.history is not None

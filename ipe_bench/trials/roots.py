@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from ipe_bench.basics.batches import put, take
 from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.estimators.driver import Limits, Solver, iterate
-from ipe_bench.estimators.gauss_newton import GaussNewtonMethod
 from ipe_bench.estimators.ipe import IPE, FrozenSystem, State, System
 from ipe_bench.estimators.least_squares import Objective
-from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
+from ipe_bench.estimators.levenberg_marquardt import GaussNewtonMethod, LevenbergMarquardtMethod
 from ipe_bench.measurements.counted import CountingModel
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers.newton import Newton

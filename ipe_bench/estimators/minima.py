@@ -1,0 +1,170 @@
+"""Where a minimisation of least squares ended: its minima, whether they fit, and which of them are the same."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipe_bench.basics.batches import put, take
+from ipe_bench.basics.linalg import Array, Mask, deviations, finite, inverse, squared
+from ipe_bench.basics.statuses import Status
+from ipe_bench.estimators.base import Estimates
+from ipe_bench.estimators.driver import Limits, Solver, SolveResult, iterate
+from ipe_bench.estimators.least_squares import LeastSquaresSystem, NormalEquations, Objective, slope_at
+from ipe_bench.measurements.counted import EvaluationCount
+from ipe_bench.measurements.problem import Problem
+
+_NEAR = 0.03
+"""Steps still to go of fewer deviations are computed from exact Jacobians: a coarse one leaves the gradient about a
+hundredth of a deviation from zero."""
+WRONG_MINIMUM = 1e-6
+"""Residuals less probable than this are taken for those of a wrong minimum: far less than those of a misfit."""
+_APART = 0.1
+"""Two minima further apart than this, in standard deviations of the local bound, are two."""
+
+
+@dataclass(frozen=True)
+class Minima:
+    """Where the minimisation of each trial ended, with what is known of the objective there."""
+
+    x: Array
+    status: NDArray[np.int8]
+    iterations: NDArray[np.int64]
+    history: list[Array] | None
+    covariance: Array
+    """(J' R^-1 J)^-1 (trials, n, n), with P0^-1 inside where the prior counts; NaN where it does not exist."""
+    chi_square: Array
+    """|R^-1/2 (h(x) - z)|^2 (trials,), of the readings alone."""
+    bulk: Array
+    """The median magnitude (trials,) of the readings' residuals in deviations: .67 where R is right, and little more
+    where it is wrong for some of them only."""
+
+    @classmethod
+    def of(cls, ended: SolveResult[Any], covariance: Array, r: Array) -> Minima:
+        """Where an iteration ended, with whitened residuals r (trials, m) there."""
+        bulk = np.median(np.abs(r), axis=1)
+        return cls(ended.x, ended.status, ended.iterations, ended.history, covariance, squared(r), bulk)
+
+    @classmethod
+    def nowhere(cls, x: Array, history: bool) -> Minima:
+        """No minimum for any trial, at its start x (trials, n)."""
+        trials, n = x.shape
+        status, none = np.full(trials, Status.MAX_ITERATIONS, np.int8), np.zeros(trials, np.int64)
+        unknown, far = np.full((trials, n, n), np.nan), np.full(trials, np.inf)
+        return cls(x, status, none, [row[None] for row in x] if history else None, unknown, far, far)
+
+    @property
+    def converged(self) -> Mask:
+        return self.status == Status.CONVERGED
+
+    def better_than(self, old: Minima) -> Mask:
+        """Which of these count rather than the old ones: they converged and are lower, or the old one had no end."""
+        return self.converged & (~(self.chi_square >= old.chi_square) | ~old.converged)
+
+    def replaced(self, rows: NDArray[np.intp], again: Minima, better: Mask) -> Minima:
+        """The minima after further ones `again` of the trials `rows`, where these are `better`; iterations add up."""
+        spent = self.iterations.copy()
+        spent[rows] += again.iterations
+        return replace(put(self, rows[better], take(again, better)), iterations=spent)
+
+    def fit_probability(self, readings: int) -> Array:
+        """The chi-square test of the fit (trials,): how probable residuals at least this large are if the model holds,
+        R is right and the minimum is the global one."""
+        from scipy.special import chdtrc
+
+        return chdtrc(max(readings - self.x.shape[1], 1), self.chi_square)
+
+    def estimates(self, tally: EvaluationCount, readings: int) -> Estimates:
+        """What an estimator hands back."""
+        extras = {"fit_p": self.fit_probability(readings)}
+        return Estimates.of(self, tally, covariance=self.covariance, extras=extras)
+
+
+def minimize(objective: Objective, method: Solver[LeastSquaresSystem], x: Array, limits: Limits) -> Minima:
+    """Minimises the objective from x (trials, n) by Gauss-Newton or Levenberg-Marquardt.
+
+    Converged is where the Gauss-Newton step, which is the gradient in whitened units, is at most `limits.tolerance`
+    standard deviations of the local bound in every parameter. An iteration is a step tried, taken or not. Jacobians are
+    coarse on the way, if the model has cheaper ones, and exact at the end.
+    """
+    if np.isinf(objective.exact_within):
+        objective = objective.coarsened(_NEAR)
+    ended = iterate(objective, method, x, limits)
+    return minima_of(ended, _exact_slope(objective, ended.state), objective.readings)
+
+
+def minima_of(ended: SolveResult[Any], slope: NormalEquations, readings: int) -> Minima:
+    """What is known of the objective where an iteration of it ended with that slope."""
+    # U^-1 U^-T: inverting U'U would lose twice the digits, and with them the sign of a variance.
+    inverse_U, lost = slope.inverse_U, ~finite(slope.inverse_U)
+    if lost.any():
+        inverse_U = put(inverse_U, lost, inverse(slope.U[lost])[0])
+    return Minima.of(ended, np.matmul(inverse_U, inverse_U.swapaxes(1, 2)), ended.state.r[:, :readings])
+
+
+def _exact_slope(objective: Objective, state: LeastSquaresSystem) -> NormalEquations:
+    """The slope where an iteration has ended; for the report alone where it ended on a coarse one, so not counted."""
+    coarse = ~state.exact & finite(state.x)
+    if objective.exact_within == 0 or not coarse.any():
+        return state.slope
+    tally = EvaluationCount.zeros(len(objective.model.tally.simulations))
+    report = replace(objective, model=replace(objective.model, tally=tally)).subset(coarse)
+    x, r, keep_Q = state.x[coarse], state.r[coarse], state.slope.Q is not None
+    return put(state.slope, coarse, slope_at(report, x, r, np.ones(len(x), dtype=bool), keep_Q=keep_Q)[0])
+
+
+@dataclass(frozen=True)
+class Fitting:
+    """The distinct minima that pass the test of the fit, for the trials of a batch."""
+
+    readings: int
+    known: list[list[Array]]
+    """Of each trial, in the order in which they were found."""
+
+    @classmethod
+    def none(cls, trials: int, readings: int) -> Fitting:
+        return cls(readings, [[] for _ in range(trials)])
+
+    def note(self, found: Minima, rows: NDArray[np.intp]) -> Mask:
+        """Adds the minima of the trials `rows` that fit and are not known yet, and says which of them fit."""
+        fits: Mask = found.converged & passes(found, self.readings, WRONG_MINIMUM)
+        deviation = deviations(found.covariance)
+        for i in np.flatnonzero(fits):
+            known = self.known[rows[i]]
+            if all(_apart(x, found.x[i], deviation[i]) for x in known):
+                known.append(found.x[i])
+        return fits
+
+    def report(self, estimates: Estimates) -> Estimates:
+        """The estimates with the extras `minima`, the number of distinct ones that fit, and `ambiguous`, 1 where there
+        are several; the others are their `alternatives`."""
+        minima = np.array([len(known) for known in self.known], dtype=float)
+        estimates.extras |= {"minima": minima, "ambiguous": (minima > 1).astype(float)}
+        assert estimates.covariance is not None
+        deviation = deviations(estimates.covariance)
+        estimates.alternatives = [
+            np.array([other for other in known if _apart(other, x, d)]).reshape(-1, len(x))
+            for known, x, d in zip(self.known, estimates.x, deviation, strict=True)
+        ]
+        return estimates
+
+
+def passes(found: Minima, readings: int, level: float) -> Mask:
+    """Which minima (trials,) pass the test of the fit at a level; none at 1, where their residuals say nothing."""
+    return (found.fit_probability(readings) >= level) & (level < 1)
+
+
+def spread_of_starts(problem: Problem) -> Array:
+    """Standard deviations (n,) of random starts about the nominal point: those of the prior where one is known, else
+    the size of the nominal point, or 1 where that is zero."""
+    if problem.prior_deviation is not None:
+        return problem.prior_deviation
+    return np.where(problem.x0 == 0, 1.0, np.abs(problem.x0))
+
+
+def _apart(a: Array, b: Array, deviation: Array) -> bool:
+    """Whether two minima (n,) are two."""
+    return bool((np.abs(a - b) / deviation).max() > _APART)
