@@ -10,7 +10,9 @@
 Importing it costs nothing: each name is loaded when it is first used.
 """
 
+# ruff: noqa: F401
 import importlib
+import itertools
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.2.0"
@@ -46,43 +48,7 @@ _HOMES = {
 }
 """Public names, by the module that they are in."""
 _ROOMS = ("baselines", "measurements", "noise", "priors", "solvers", "states")
-
-__all__ = [
-    "IPE",
-    "Estimates",
-    "Estimator",
-    "Measurement",
-    "Noise",
-    "OdeMeasurement",
-    "Parameter",
-    "Problem",
-    "Scenario",
-    "Sequential",
-    "State",
-    "Status",
-    "System",
-    "Track",
-    "Tracking",
-    "UserError",
-    "__version__",
-    "audit",
-    "baselines",
-    "check",
-    "compare",
-    "design",
-    "estimate",
-    "load",
-    "measurements",
-    "noise",
-    "posterior",
-    "priors",
-    "report",
-    "run",
-    "solvers",
-    "states",
-    "status",
-]
-
+__all__ = sorted(["__version__", *_ROOMS, *itertools.chain(*_HOMES.values())])  # pyright: ignore[reportUnsupportedDunderAll]
 
 # The room of the report is imported first, so that its name stands for the function `report` from then on.
 importlib.import_module(f"{__name__}.report")
@@ -90,7 +56,6 @@ del globals()["report"]
 
 
 def __getattr__(name: str) -> Any:
-
     if name in _ROOMS:
         return importlib.import_module(f"{__name__}.{name}")
     for module, names in _HOMES.items():

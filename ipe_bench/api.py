@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import tempfile
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,19 +60,16 @@ def run(
 ) -> Summary:
     """Runs every estimator on the same trials of every scenario and summarises what is known of them.
 
-    What `output` holds already is not computed again; without `output` nothing is kept. A model with its `noise`,
-    `prior` and `error_scale` stands for a scenario of its own; a state model stands for its `Tracking`, whose
-    estimators are trackers. Returns a frame with a row per scenario, estimator and
-    parameter, plus the parameter `all`, the root mean square over parameters of error over bound; `rmse` and its kin
-    are in the parameter's own unit. It shows the table of the terminal, `.trials` has a row per trial, `.figures` has
-    Matplotlib's figures by name, and `.report(output)` writes the report. What could not be computed is left out, with
-    a warning that says why.
+    A model with its `noise`, `prior` and `error_scale` stands for a scenario, a state model for its `Tracking`, whose
+    estimators are trackers. What `output` holds already is not computed again; without `output` nothing is kept. The
+    result is a frame with a row per scenario, estimator and parameter, in the parameter's own unit, and one of the
+    parameter `all`, the root mean square over parameters of error over bound. It shows the table of the terminal,
+    `.trials` has a row per trial, `.figures` has Matplotlib's figures by name, and `.report(output)` writes the report.
+    What could not be computed is left out, with a warning that says why.
 
-    There are 1000 `trials` unless another number is given. With `precision` there are just enough, and `trials` is the
-    most there may be (100,000 unless given): blocks are added until every success share is known to within that number,
-    or what is named, as in {"success": 0.01, "rmse": 0.05}, to within its own (rmse: relative), or `time_limit` seconds
-    are over. `success_anytime` and `rmse_anytime` have intervals that stay valid under such looking; `attrs["stops"]`
-    says how many trials each scenario took, and why no more.
+    There are 1000 `trials` unless another number is given. With `precision` (0.01, or {"success": 0.01, "rmse": 0.05},
+    rmse relative) blocks are added until the intervals are that narrow, there are `trials` (100,000 unless given), or
+    `time_limit` seconds are over; `attrs["stops"]` says how many trials each scenario took, and why no more.
 
     >>> import ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -85,12 +82,11 @@ def run(
 
     Raises:
         UserError: what was asked for cannot be computed; nothing has been computed then.
-        StorageError: nothing can be stored any more.
     """
     from ipe_bench.plugins.extensions import use_statistics
     from ipe_bench.report.summary import Stored, Summary
     from ipe_bench.statistics import summarize
-    from ipe_bench.statistics.stopping import Stop, check_time_limit, compute_until
+    from ipe_bench.statistics.stopping import check_time_limit, compute_until
 
     stated = {"noise": noise, "prior": prior, "error_scale": error_scale}
     if isinstance(scenarios, Sequence):
@@ -99,17 +95,14 @@ def run(
         scenarios = [_tracking(scenarios) or _scenario(scenarios, **stated)]
     estimators, stored = _labelled(estimators), Stored(output)
     options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
-    stops: tuple[Stop, ...] = ()
+    stops: Sequence[Any] = ()
     if precision is None:
         check_time_limit(time_limit)
         failures = compute(scenarios, estimators, TRIALS if trials is None else trials, stored.folder, **options)
     else:
         options |= {"precision": precision, "time_limit": time_limit}
         failures, stops = compute_until(scenarios, estimators, trials, stored.folder, **options)
-    for failure in failures:
-        warnings.warn(f"failed: {failure}", stacklevel=2)
-    for problem in use_statistics():
-        warnings.warn(problem, stacklevel=2)
+    _warn([*(f"failed: {failure}" for failure in failures), *use_statistics()])
     table = Summary.of(summarize([stored.folder]), stored)
     if precision is not None:
         table.attrs["stops"] = [stop.row for stop in stops]
@@ -119,12 +112,11 @@ def run(
 def load(directories: Directories) -> pd.DataFrame:
     """Every stored trial of one directory or bundle, or of several: a row per trial and estimator.
 
-    A row belongs to a measurement, noise, prior, error_scale, seed and estimator, and to every key of the config that
-    differs (`estimator.KEY` for options under one label). It has `error_NAME` and `deviation_NAME` (as the estimator
-    reports it) per parameter, status, message, iterations, simulations, jacobians, time_s, crlb_distance, nees, fit_p,
-    solved, success, and the truth `x_NAME` with its bounds `crlb_NAME` and `bayes_NAME`, all in multiples of the
-    parameters' sizes; `crlb_distance` is the squared Mahalanobis distance by the bound at the truth, n on average where
-    it is attained. What is missing or damaged is a warning, and stale results are left out.
+    A row has the measurement, noise, prior, error_scale, seed and estimator, and every key of the config that differs;
+    `error_NAME` and `deviation_NAME` (as the estimator reports it) per parameter, status, message, iterations,
+    simulations, jacobians, time_s, nees, fit_p, solved, success, `crlb_distance` (the squared Mahalanobis distance by
+    the bound at the truth); and the truth `x_NAME` with its bounds `crlb_NAME` and `bayes_NAME`, all in multiples of
+    the parameters' sizes. What is missing or damaged is a warning, and stale results are left out.
 
     >>> import tempfile, ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -135,9 +127,6 @@ def load(directories: Directories) -> pd.DataFrame:
     {'newton': 20, 'linear': 20}
     >>> rows["measurement"].unique().tolist(), bool((rows["x_c0"] + rows["error_c0"]).notna().all())
     (['polynomial'], True)
-
-    Raises:
-        UserError: no run ever wrote to a directory.
     """
     from ipe_bench.statistics.collect import collect, trials_frame
 
@@ -145,8 +134,7 @@ def load(directories: Directories) -> pd.DataFrame:
         require_results(paths)
         collection = collect(paths)
         frame = trials_frame(collection)
-    for problem in collection.problems:
-        warnings.warn(problem, stacklevel=2)
+    _warn(collection.problems)
     return frame
 
 
@@ -166,10 +154,6 @@ def report(
     >>> ib.report("outputs/nowhere")
     Traceback (most recent call last):
     ipe_bench.basics.errors.UserError: outputs/nowhere: there is no such directory; give one that a run wrote to
-
-    Raises:
-        UserError: no run ever wrote to a directory, or there is no such choice of figures or formats.
-        StorageError: the files cannot be written.
     """
     from ipe_bench.report.run import begin_report
 
@@ -196,20 +180,17 @@ def compare(
 ) -> pd.DataFrame:
     """Whether a second version, setting or estimator is better or worse than a first, trial by trial.
 
-    Compares every estimator that both directories have, on every scenario that both have, or `first` of the first with
-    `second` of the second; without a second directory both are in the first one. Where no scenario is in both, those
-    are compared that differ in one setting alone. Trials are matched by seed and number, else in their order.
+    Compares every estimator and scenario that both directories have, or `first` of the first with `second` of the
+    second; without a second directory both are in the first one. Scenarios that differ in one setting are compared
+    where none is in both. Trials are matched by seed and number, else in their order.
 
-    Returns a row per comparison and quantity: success (share; `change` is a difference), error (mean Mahalanobis error,
-    each trial's at most the radius of the gate; a ratio), cost in simulations (a ratio), and time, which is not tested.
-    `low` and `high` are the ends of the row's own interval, `p` is corrected over all rows (Holm), and `e` is evidence
-    that may be looked at after any number of trials; `finding` says what the second is, by p below `alpha`, or by e
-    where `anytime`. `attrs` has lines on what of `fail_on` is `worse`, and on `problems`, `stale` results and `notes`.
-    With `output`, comparison.csv and a page are written there.
-
-    With `power` and `difference`, rows on success have the column `trials_needed`: how many trials find such a
-    difference of success with that probability, by the upper limit (80 %) of the share of trials in which one alone
-    succeeds.
+    The result has a row per comparison and quantity: success (a difference of shares), error (a ratio of mean
+    Mahalanobis errors, each at most the radius of the gate), cost in simulations (a ratio), and time, which is not
+    tested. `low` and `high` are the ends of the row's own interval, `p` is corrected over all rows (Holm), and `e` is
+    evidence that may be looked at after any number of trials; `finding` says what the second is, by p below `alpha`, or
+    by e where `anytime`. `attrs` has lines on what of `fail_on` is `worse`, and on `problems`, `stale` results and
+    `notes`. With `power` and `difference`, `trials_needed` of a row on success is how many trials find such a
+    difference with that probability. With `output`, comparison.csv and a page are written there.
 
     >>> import tempfile, ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -218,9 +199,6 @@ def compare(
     ...     rows = ib.compare(folder, first="linear", second="newton")
     >>> rows.set_index("quantity")["finding"].to_dict()
     {'success': 'better', 'error': 'better', 'cost': 'worse', 'time': ''}
-
-    Raises:
-        UserError: there is nothing to compare.
     """
     import pandas as pd
 
@@ -238,9 +216,7 @@ def compare(
         raise UserError("compare: one folder is given; name another, or first=LABEL and second=LABEL")
     if first == second and {path.resolve() for path in paths[0]} == {path.resolve() for path in paths[1]}:
         label = "one folder" if first is None else f"{first} of one folder"
-        raise UserError(
-            f"compare: {label} is compared with itself; name another folder, or first=LABEL and second=LABEL"
-        )
+        raise UserError(f"compare: {label} is compared with itself; name another, or first=LABEL and second=LABEL")
     with opened(paths[0]) as one, opened(paths[1]) as other:
         for part in (one, other):
             require_results(part)
@@ -277,9 +253,6 @@ def audit(table: Path | str | pd.DataFrame, *, output: Path | str | None = None)
     >>> found = ib.audit(pd.DataFrame({"x_error": error, "x_std": 0.1}))
     >>> found.verdict, round(found.scale.value, 1)
     ('too small', 2.9)
-
-    Raises:
-        UserError: a column is missing, a covariance is none, or there are too few runs.
     """
     from ipe_bench.statistics.audit import audit as examined
     from ipe_bench.statistics.audit import read_claims
@@ -305,9 +278,6 @@ def status(directories: Directories) -> pd.DataFrame:
     ...     table = ib.status(folder)
     >>> table[["estimator", "expected", "done"]].values.tolist(), table.attrs["problems"]
     ([['truth', 20, 20], ['newton', 20, 20]], [])
-
-    Raises:
-        UserError: no run ever wrote to a directory.
     """
     import pandas as pd
 
@@ -315,11 +285,8 @@ def status(directories: Directories) -> pd.DataFrame:
         require_results(paths)
         results = Results.read(paths)
     counts = ("expected", "done", "missing", "failed", "stale")
-    rows = [
-        {**cell.names, **{name: getattr(cell, name) for name in counts}, "messages": "; ".join(cell.messages)}
-        for cell in results.cells
-    ]
-    frame = pd.DataFrame(rows)
+    rows = [{**cell.names, **{name: getattr(cell, name) for name in counts}} for cell in results.cells]
+    frame = pd.DataFrame(rows).assign(messages=["; ".join(cell.messages) for cell in results.cells])
     frame.attrs["problems"] = results.problems
     return frame
 
@@ -338,17 +305,15 @@ def estimate(
 ) -> Answer:
     """Parameters from real readings, by every estimator: estimates, standard errors, residuals and a test of the fit.
 
-    A scenario stands for its model with its noise, prior and error scale. `readings` is a CSV file (see
-    `ipe_bench.real.readings`), several that share parameters, or an array z (m,) in the model's order and unit, NaN
-    where missing; None: those that come with the model. `noise` states R; without it R is what the file says in its
-    column sigma, or the model of its own noise, or else one level for all is estimated from the residuals (`Unknown`,
-    which can also have a level for each instrument, or a formula of levels), whose size then cannot test the fit.
-    Filters and `map_lm` need a prior: `error_scale` is the standard deviation of each parameter in multiples of its
-    size, and `prior` widens or narrows some, or makes them depend on each other (`ipe_bench.priors.prior_of` makes one
-    of a covariance). `parameters` says what is known of each, as in {"k": {"fixed": 2.0}, "c": {"positive": True,
-    "nominal": 3.0}}; also `lower`, `upper` and `deviation`. `ignore_rows` and `ignore_columns` of the files are left
-    out. A fit has its estimates by name in `values`, and `x` and `covariance` in the parameters' own units. The answer
-    is the sequence of the fits; it shows itself in a notebook, and `table()` is a frame.
+    A scenario stands for its model with its noise, prior and error scale. `readings` is a CSV or Parquet file, several
+    that share parameters, or an array z (m,) in the model's order and unit, NaN where missing; None: those that come
+    with the model. `noise` states R; without it R is what the file's column sigma says, or the model's own noise, or
+    else one level that is estimated from the residuals (`Unknown`), whose size then cannot test the fit. Filters and
+    `map_lm` need a prior: `error_scale` is the standard deviation of each parameter in multiples of its size, which
+    `prior` widens or narrows. `parameters` says what is known of each, as in {"k": {"fixed": 2.0}, "c": {"positive":
+    True, "nominal": 3.0}}; also `lower`, `upper` and `deviation`. `ignore_rows` and `ignore_columns` of the files are
+    left out. A fit has its estimates by name in `values`, and `x` and `covariance` in the parameters' own units. The
+    answer is the sequence of the fits; it shows itself in a notebook, and `table()` is a frame.
 
     >>> import ipe_bench as ib
     >>> model = ib.measurements.Polynomial()
@@ -360,8 +325,7 @@ def estimate(
     auto converged True
 
     Raises:
-        UserError: a file does not hold this model's readings, the array has another shape, or an estimator needs
-            what is not given.
+        UserError: the readings are not this model's, or an estimator needs what is not given.
     """
     from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
     from ipe_bench.plugins.construct import known_parameters
@@ -399,14 +363,14 @@ def design(
 ) -> Design:
     """What a scenario's readings say about each parameter, and which readings would say more; nothing is simulated.
 
-    The result has `observability` (singular values, bounds, correlations, the least observable direction),
-    `suspects` (what each error of the richer models `errors` does to the estimates, and whether a test of residuals
-    will notice) and `ways`. The richer models are the scenario's truth, or every option of `measurement`
-    that is the same model with more errors, unless others are given. A way chooses by one column of the model's index
-    or reading by reading; `by` names the columns of one way instead. Its `saving` has the fewest readings whose
-    mean bound is not above today's, its `sharpest` the smallest mean bound with `readings` readings (today's number
-    where it is None), of which `measurement(choice)` is the model. Bounds are averaged over truths from the prior: as
-    squares over parameters in units of today's bound (`criterion` A), or as the volume of the ellipsoid (D).
+    The result has `observability` (singular values, bounds, correlations, the least observable direction), `suspects`
+    (what each error of the richer models `errors` does to the estimates, and whether a test of residuals will notice)
+    and `ways`. The richer models are the scenario's truth, or every option of `measurement` that is the same model with
+    more errors, unless others are given. A way chooses by one column of the model's index or reading by reading; `by`
+    names the columns of one way instead. Its `saving` has the fewest readings whose mean bound is not above today's,
+    its `sharpest` the smallest mean bound with `readings` readings (as many as today unless given), of which
+    `measurement(choice)` is the model. Bounds are averaged over truths from the prior: as squares over parameters in
+    units of today's bound (`criterion` A), or as the volume of the ellipsoid (D).
 
     >>> import ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
@@ -455,9 +419,6 @@ def posterior(
     (True, 1)
     >>> found.divergences["newton"].kl < 1 < found.divergences["linear"].kl
     True
-
-    Raises:
-        UserError: the scenario has no prior, an estimator needs what is not there, or there are too few particles.
     """
     from ipe_bench.trials.posterior import reference, require_particles
 
@@ -484,9 +445,6 @@ def check(component: Any) -> list[Finding]:
     >>> findings = ib.check(ib.noise.Gaussian(0.1))
     >>> [f.check for f in findings if f.complaint]
     []
-
-    Raises:
-        UserError: there is no plugin in the folder.
     """
     from ipe_bench.plugins.conformance import check_component, check_option
     from ipe_bench.plugins.discovery import RECORD_GROUPS, options_in
@@ -534,11 +492,7 @@ def _check_records(options: Sequence[Option]) -> list[Finding]:
 
 
 def _scenario(given: Any, **stated: Any) -> Scenario:
-    """The scenario that is given, or that of a model under what is stated of it.
-
-    Raises:
-        UserError: it is neither, or something is stated of a scenario.
-    """
+    """The scenario that is given, or that of a model under what is stated of it."""
     stated = {name: value for name, value in stated.items() if value is not None}
     if isinstance(given, Scenario):
         if stated:
@@ -555,11 +509,7 @@ def _tracking(given: Any) -> Tracking | None:
 
 
 def _labelled(estimators: Any) -> Mapping[str, Any]:
-    """The estimators by their labels.
-
-    Raises:
-        UserError: they have no labels, or one is no estimator.
-    """
+    """The estimators, if each has a label and is one."""
     if not isinstance(estimators, Mapping):
         raise UserError('estimators: give each a label, as in {"newton": ib.solvers.Newton()}')
     for label, one in estimators.items():
@@ -579,10 +529,6 @@ def _paths(directories: Directories) -> list[Path]:
     return [Path(d) for d in ([directories] if isinstance(directories, Path | str) else directories)]
 
 
-def objective_columns() -> list[str]:
-    """The columns whose value over all parameters is a number: those of the summary, and those of the scores."""
-    from ipe_bench.plugins.extensions import use_statistics
-    from ipe_bench.statistics.records import SCORES, all_statistics, frame_columns
-
-    use_statistics()
-    return list(frame_columns([s for s in (*all_statistics(), *SCORES) if s.kind != "word"]))
+def _warn(problems: Iterable[str]) -> None:
+    for problem in problems:
+        warnings.warn(problem, stacklevel=3)

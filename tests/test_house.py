@@ -39,7 +39,7 @@ BUDGETS = {
     "real": 2234,
     "plugins": 1185,
     "report": 4133,
-    "cli": 2552,
+    "cli": 2534,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""
 PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}

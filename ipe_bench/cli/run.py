@@ -243,7 +243,7 @@ def _best(outcomes: Sequence[Outcome], maximises: bool) -> list[str]:
     return [f"Objective {float(best):.6g}{of}" + (own and f": {own}")]
 
 
-_NOT_TELLING = {*w.NO_PART_OF_A_NAME, "solver", "baseline", "tracker"} - {"seed"}
+_NOT_TELLING = {*w.NO_PART_OF_A_NAME, "default_name", "experiment", "solver", "baseline", "tracker"} - {"seed"}
 """Keys that tell no job of a sweep from another."""
 
 

@@ -96,9 +96,11 @@ class Spec(Component):
             self._check_objective(*self.aim)
 
     def _check_objective(self, label: str, column: str) -> None:
-        from ipe_bench.api import objective_columns
+        from ipe_bench.plugins.extensions import use_statistics
+        from ipe_bench.statistics.records import SCORES, all_statistics, frame_columns
 
-        columns = objective_columns()
+        use_statistics()
+        columns = frame_columns([s for s in (*all_statistics(), *SCORES) if s.kind != "word"])
         if not label:
             raise UserError(f"objective={self.objective}: write LABEL.COLUMN, such as newton.capped_error")
         for name, known, noun in ((label, self.estimators, "estimator"), (column, columns, "column")):

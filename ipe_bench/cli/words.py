@@ -191,10 +191,8 @@ def _literal(value: Any, where: str) -> str:
         return "[" + ",".join(_literal(v, where) for v in value) + "]"
     if isinstance(value, str):
         return _quoted(value)
-    if value is None or isinstance(value, bool):
+    if value is None or isinstance(value, int | float):
         return json.dumps(value)
-    if isinstance(value, int | float):
-        return repr(value)
     raise UserError(f"{where}: {value!r} is neither text nor number")
 
 
@@ -234,43 +232,33 @@ def _parse(command: str, word: str, groups: Groups) -> Override:
 
 
 def _check(override: Override, groups: Groups) -> None:
-    group = override.key_or_group
+    group, word = override.key_or_group, said(override)
     if re.split("[./]", group)[0] == "hydra":
         return
-    if override.is_delete():
-        _check_deletion(override)
-    elif group in groups:
+    if group in groups and not override.is_delete():
         _check_place(override)
         _check_choice(override, groups)
-    else:
-        _check_key(override, groups)
-
-
-def _check_deletion(override: Override) -> None:
-    group = override.key_or_group
-    if group in plugins.PACKAGES:
-        raise UserError(f"{said(override)}: cannot be left out; {group}=[] chooses none")
-    if not group.startswith(("estimators.", "trackers.")):
-        raise UserError(f"{said(override)}: only estimators.LABEL can be left out; give the key another value")
-
-
-def _check_key(override: Override, groups: Groups) -> None:
-    key, word = override.key_or_group, said(override)
-    first = key.split(".")[0]
-    if override.package is not None or ("/" in key and first.split("/")[0] in groups):
-        raise UserError(f"{word}: {unknown(key, groups, 'group')}")
-    if first in plugins.PACKAGES and "." in key:
-        raise UserError(
-            f"{word}: options are set by label; write {plugins.PACKAGES[first]}.{word.lstrip('+').partition('.')[2]}"
-        )
+        return
+    first = group.split(".")[0]
+    if override.is_delete():
+        if group in plugins.PACKAGES:
+            raise UserError(f"{word}: cannot be left out; {group}=[] chooses none")
+        if not group.startswith(("estimators.", "trackers.")):
+            raise UserError(f"{word}: only estimators.LABEL can be left out; give the key another value")
+        return
+    if override.package is not None or ("/" in group and first.split("/")[0] in groups):
+        raise UserError(f"{word}: {unknown(group, groups, 'group')}")
+    if first in plugins.PACKAGES:
+        remedy = f"{plugins.PACKAGES[first]}.{word.lstrip('+').partition('.')[2]}"
+        raise UserError(f"{word}: options are set by label; write {remedy}")
     if first not in KEYS:
         raise UserError(f"{word}: {unknown(first, {*KEYS, *groups, 'experiment'}, 'key')}")
-    if key == "estimators":
+    if group == "estimators":
         raise UserError(f"{word}: choose with solver= and baseline=, and set options by estimators.LABEL.KEY=VALUE")
     for value in values(override):
-        if key in _WHOLE and isinstance(value, float) and value.is_integer():
-            raise UserError(f"{word}: is not written as a whole number; write {key}={value:.0f}")
-        if key in ("trials", "block_size") and value is None:
+        if group in _WHOLE and isinstance(value, float) and value.is_integer():
+            raise UserError(f"{word}: is not written as a whole number; write {group}={value:.0f}")
+        if group in ("trials", "block_size") and value is None:
             raise UserError(f"{word}: cannot be null; give a whole number, or leave it out")
 
 
@@ -374,12 +362,11 @@ def settled(overrides: Sequence[Override]) -> list[Override]:
 # The name of the folder
 
 
-NO_PART_OF_A_NAME = ("name", "output", "trials", "block_size", "seed", "execution", "experiment", "hydra", "readings")
-NO_PART_OF_A_NAME += ("precision", "time_limit", "write_readings", "write_readings_trial", "default_name", "objective")
-NO_PART_OF_A_NAME += ("figures", "formats")
+NO_PART_OF_A_NAME = ("name", "output", "trials", "block_size", "seed", "execution", "hydra", "readings", "figures")
+NO_PART_OF_A_NAME += ("precision", "time_limit", "write_readings", "write_readings_trial", "objective", "formats")
 """Keys that change no setting, or add trials to it."""
-_BARE = ("measurement", "measurement.dataset", "model", "noise", *plugins.PACKAGES)
-"""Keys whose values speak for themselves."""
+_BARE = ("measurement.dataset", "truth", "model", "noise", *plugins.PACKAGES)
+"""Keys that come first in a name; the values of most speak for themselves."""
 _LONGEST_NAME = 80
 
 
@@ -388,8 +375,8 @@ def default_name(words: Words) -> str:
 
     The same for the same settings in any order. What changes no setting, or adds trials to it, is no part of it.
     """
-    parts: dict[str, str] = {"measurement": "gins"}
-    experiment = held = ""
+    parts: dict[str, str] = {}
+    held = ""
     for override in words.overrides:
         line = override.input_line or ""
         if file := words.files.get(forced(override)):
@@ -397,21 +384,14 @@ def default_name(words: Words) -> str:
         key, _, value = line.partition("=")
         key = key.lstrip("+~").replace(HYDRAS_TRUTH, "truth").rpartition("@estimators.")[2].rpartition("@trackers.")[2]
         text = re.sub(r"[\[\]'\" ]", "", value.replace("],[", ";").replace(",", "+") if "[" in value else value)
-        if override.key_or_group == "experiment":
-            experiment = text
-        elif _first(override) not in NO_PART_OF_A_NAME:
-            parts[key] = f"no_{key}" if override.is_delete() or text == "" else text
-    if "model" in parts and parts["measurement"] == "gins":
-        parts["measurement"] = parts.pop("model")
-    if experiment and parts["measurement"] == "gins":
-        parts["measurement"] = experiment
-    order = [*_BARE[:2], "truth", *_BARE[2:]]
-    keys = sorted(parts, key=lambda k: (order.index(k) if k in order else len(order), k))
-    full = "-".join(
-        parts[k] if k in _BARE else f"{k.removeprefix('estimators.').removeprefix('trackers.')}={parts[k]}"
-        for k in keys
-    )
-    full = full.replace("/", "-")
+        if _first(override) not in NO_PART_OF_A_NAME:
+            parts[key] = text or f"no_{key}"
+    experiment = parts.pop("experiment", None)
+    names = [parts.pop("measurement", None) or parts.pop("model", None) or experiment or "gins"]
+    for key in (*(key for key in _BARE if key in parts), *sorted(parts.keys() - set(_BARE))):
+        bare = key in _BARE and key != "truth"
+        names.append(parts[key] if bare else f"{re.sub('^(estimators|trackers)[.]', '', key)}={parts[key]}")
+    full = "-".join(names).replace("/", "-")
     short = re.sub(r"[^\w.,=+-]", "_", full, flags=re.ASCII)
     if short == full and len(full) <= _LONGEST_NAME and not held:
         return full
