@@ -7,7 +7,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -36,11 +36,13 @@ if TYPE_CHECKING:
     from ipe_bench.report.run import ReportResult
     from ipe_bench.report.style import Which
     from ipe_bench.report.summary import Summary
+    from ipe_bench.report.tracked import TrackAnswer
     from ipe_bench.statistics.audit import Audit
     from ipe_bench.trials.design import Criterion, Design
     from ipe_bench.trials.posterior import Reference
 
 Directories = Path | str | Sequence[Path | str]
+RealReadings = Path | str | Sequence[Path | str] | Array | None
 
 
 def run(
@@ -291,9 +293,20 @@ def status(directories: Directories) -> pd.DataFrame:
     return frame
 
 
+@overload
+def estimate(
+    model: StateModel,
+    readings: RealReadings = None,
+    estimators: Mapping[str, Tracker] | None = None,
+    *,
+    ignore_columns: Sequence[str] = (),
+) -> TrackAnswer: ...
+
+
+@overload
 def estimate(
     model: Measurement | Scenario,
-    readings: Path | str | Sequence[Path | str] | Array | None = None,
+    readings: RealReadings = None,
     estimators: Mapping[str, Estimator] | None = None,
     *,
     noise: Noise | None = None,
@@ -302,7 +315,21 @@ def estimate(
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
     ignore_rows: Sequence[int | str] = (),
     ignore_columns: Sequence[str] = (),
-) -> Answer:
+) -> Answer: ...
+
+
+def estimate(
+    model: Measurement | Scenario | StateModel,
+    readings: RealReadings = None,
+    estimators: Mapping[str, Any] | None = None,
+    *,
+    noise: Noise | None = None,
+    prior: Prior | None = None,
+    error_scale: float | None = None,
+    parameters: Mapping[str, Mapping[str, Any]] | None = None,
+    ignore_rows: Sequence[int | str] = (),
+    ignore_columns: Sequence[str] = (),
+) -> Answer | TrackAnswer:
     """Parameters from real readings, by every estimator: estimates, standard errors, residuals and a test of the fit.
 
     A scenario stands for its model with its noise, prior and error scale. `readings` is a CSV or Parquet file, several
@@ -314,6 +341,9 @@ def estimate(
     True, "nominal": 3.0}}; also `lower`, `upper` and `deviation`. `ignore_rows` and `ignore_columns` of the files are
     left out. A fit has its estimates by name in `values`, and `x` and `covariance` in the parameters' own units. The
     answer is the sequence of the fits; it shows itself in a notebook, and `table()` is a frame.
+
+    Of a state model the `estimators` are trackers, `readings` is one log with a row per epoch or an array (K, m), and
+    the answer has a track of each (see `ipe_bench.real.tracks`); only `ignore_columns` goes with it.
 
     >>> import ipe_bench as ib
     >>> model = ib.measurements.Polynomial()
@@ -334,13 +364,20 @@ def estimate(
     from ipe_bench.report.answer import Answer
     from ipe_bench.solvers import Auto
 
+    if isinstance(model, StateModel):
+        stated = {"noise": noise, "prior": prior, "error_scale": error_scale, "parameters": parameters}
+        if other := [
+            name for name, value in (stated | {"ignore_rows": ignore_rows or None}).items() if value is not None
+        ]:
+            raise UserError(f"{other[0]}=: is of a measurement, and this is a model of states that move; leave it out")
+        return _tracked(model, readings, estimators, ignore_columns)
     if not isinstance(model, Measurement):
         scenario = _scenario(model, noise=noise, prior=prior, error_scale=error_scale)
         model, noise = scenario.measurement, None if scenario.noise.real else scenario.noise
         prior, error_scale = scenario.prior, scenario.error_scale
     if estimators is None:
         estimators = {"linear_lse": LinearLSE(), "levenberg_marquardt": LevenbergMarquardt(), "auto": Auto()}
-    estimators = _labelled(estimators)
+    estimators = _labelled(estimators, Estimator)
     if isinstance(readings, str | Path):
         readings = [readings]
     given = readings if readings is None or isinstance(readings, np.ndarray) else tuple(map(Path, readings))
@@ -348,6 +385,23 @@ def estimate(
     stated: dict[str, Any] = {"noise": noise, "prior": prior, "error_scale": error_scale, "left_out": left_out}
     stated["known"] = known_parameters(parameters or {})
     return Answer.to(Question(model=model, readings=given, estimators=estimators, **stated).opened())
+
+
+def _tracked(
+    model: StateModel, readings: Any, trackers: Mapping[str, Any] | None, ignored: Sequence[str]
+) -> TrackAnswer:
+    from ipe_bench.real.tracks import Log, Tracked
+    from ipe_bench.report.tracked import TrackAnswer
+    from ipe_bench.states.trackers import ckf, ekf, ukf
+
+    if isinstance(readings, Sequence) and not isinstance(readings, str):
+        if len(readings) != 1:
+            raise UserError(f"readings=[{','.join(map(str, readings))}]: a track has one log; name one file")
+        (readings,) = readings
+    trackers = {"ekf": ekf(), "ukf": ukf(), "ckf": ckf()} if trackers is None else _labelled(trackers)
+    log = Log.of(model, Path(readings) if isinstance(readings, str) else readings, ignored)
+    validate([Tracking(log.model)], trackers, 1)
+    return TrackAnswer(log, [Tracked.of(log, label, tracker) for label, tracker in trackers.items()])
 
 
 def design(
@@ -508,12 +562,12 @@ def _tracking(given: Any) -> Tracking | None:
     return given if isinstance(given, Tracking) else Tracking(given) if isinstance(given, StateModel) else None
 
 
-def _labelled(estimators: Any) -> Mapping[str, Any]:
+def _labelled(estimators: Any, kind: Any = Estimator | Tracker) -> Mapping[str, Any]:
     """The estimators, if each has a label and is one."""
     if not isinstance(estimators, Mapping):
         raise UserError('estimators: give each a label, as in {"newton": ib.solvers.Newton()}')
     for label, one in estimators.items():
-        if not isinstance(one, Estimator | Tracker):
+        if not isinstance(one, kind):
             raise UserError(f"estimators: {label}: {_described(one)}; give an estimator such as ib.solvers.Newton()")
     return estimators
 

@@ -25,13 +25,16 @@ from ipe_bench.report.table import Part
 from ipe_bench.report.writer import reserve_output_folder
 from ipe_bench.runs.provenance import describe, fingerprint
 from ipe_bench.runs.run import validate
+from ipe_bench.states.base import StateModel
 from ipe_bench.trials.design import Criterion
 
 STANDARD_ESTIMATORS = ("solver=[auto]", "baseline=[linear_lse,levenberg_marquardt]")
 """Of `estimate`: the one that chooses its way by itself, and two that it can be held against."""
 OF_MANY_TRIALS = ("precision", "time_limit", "block_size", "formats", "execution", "write_readings")
-OF_MANY_TRIALS += ("write_readings_trial", "objective", "model", "tracker", "trackers")
+OF_MANY_TRIALS += ("write_readings_trial", "objective")
 """Keys of runs."""
+OF_STATES = ("model", "tracker", "trackers")
+"""Keys of states that move."""
 OF_CONSTANTS = ("measurement", "truth_measurement", "noise", "prior", "error_scale", "solver", "baseline")
 OF_CONSTANTS += ("estimators", "parameters", "prior_covariance", "write_readings")
 """Keys of parameters that stand still."""
@@ -54,10 +57,10 @@ class Single:
     @property
     def measurement(self) -> str:
         """The model, as it was asked for."""
-        model = self.spec.measurement
+        group, model = ("measurement", self.spec.measurement) if self.spec.model is None else ("model", self.spec.model)
         if isinstance(model, Nist):
             return f"nist/{model.dataset.lower()}"
-        return self.words.chosen("measurement") or model.name
+        return self.words.chosen(group) or model.name
 
     def folder(self, name: str, identity: Any, files: Sequence[str] = ()) -> Path:
         """Reserves the folder that was named, or one that is named after the command and the model.
@@ -78,6 +81,7 @@ def single(command: str, arguments: Sequence[str], standard: Sequence[str] = (),
             words.refuse(keys, f"is for `ipe-bench {whose}`, and nothing in `ipe-bench {command}`")
         given = w.read(command, [one for one in standard if one.partition("=")[0] not in words.keys])
         jobs = jobs_of(Words(given.overrides + words.overrides), multirun=False)
+        require_one_kind(words, jobs.specs[0])
         return Single(command, words, jobs.specs[0], composed(jobs.words))
 
 
@@ -85,7 +89,7 @@ def require_one_kind(words: Words, spec: Spec) -> None:
     """Refuses a tracker without a state model, and a state model together with a key of measurements, typed or from an
     experiment."""
     if spec.model is None:
-        words.refuse(("tracker", "trackers"), "goes with model=NAME")
+        words.refuse(OF_STATES[1:], "goes with model=NAME")
         return
     words.refuse(OF_CONSTANTS, "is of a measurement, and model= chooses states that move")
     for experiment, changed in changed_by_experiment(words).items():
@@ -112,21 +116,42 @@ def estimate_command(arguments: Sequence[str]) -> int:
     from ipe_bench.report.answer import FILES, NAME, Answer, contents, write_answer
 
     asked = single("estimate", arguments, STANDARD_ESTIMATORS, run=(*OF_MANY_TRIALS, "trials", "seed", w.TRUTH))
+    if asked.spec.model is not None:
+        return _track(asked, asked.spec.model)
     opened = asked.spec.question(asked.words.keys).opened()
     command = _command(opened)
     folder = asked.folder(NAME, command, FILES)
     answer = Answer.to(opened, asked.measurement)
-    provenance = {
-        "measurement": asked.measurement,
-        "config": asked.config,
-        "written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "readings": [{"file": file, "sha256": digest} for file, digest in opened.readings.files] or None,
-        "libraries": library_versions(),
-        **fingerprint([opened.scenario, *opened.question.estimators.values()]),
-    }
+    parts = [opened.scenario, *opened.question.estimators.values()]
+    provenance = _provenance(asked, opened.readings.files, parts)
     files = write_answer(folder, answer, command, provenance, figures=asked.spec.figures != "none")
     _show(contents(answer), files)
     return 0 if answer.passes else 1
+
+
+def _track(asked: Single, model: StateModel) -> int:
+    """Tracks the states by every chosen tracker, prints tables and writes files; exit code 1 where no track passes."""
+    from ipe_bench.report.tracked import NAME, TABLE, contents, write_tracks
+
+    asked.words.refuse(("ignore_rows",), "is for estimates of constants; empty the cells of the row")
+    given, trackers = asked.spec.readings, asked.spec.estimators
+    answer = api.estimate(model, given, trackers, ignore_columns=asked.spec.names("ignore_columns", str))
+    command = {"readings": given, "model": describe(model), "trackers": _described(trackers)}
+    files, parts = [answer.log.file] if answer.log.file else [], [answer.log.model, *trackers.values()]
+    folder = asked.folder(NAME, command, [TABLE])
+    _show(contents(answer), write_tracks(folder, answer, command, _provenance(asked, files, parts)))
+    return 0 if answer.passes else 1
+
+
+def _provenance(asked: Single, files: Sequence[tuple[str, str]], parts: Sequence[Any]) -> dict[str, Any]:
+    return {
+        "measurement": asked.measurement,
+        "config": asked.config,
+        "written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "readings": [{"file": file, "sha256": digest} for file, digest in files] or None,
+        "libraries": library_versions(),
+        **fingerprint(parts),
+    }
 
 
 def _command(opened: Opened) -> dict[str, Any]:
@@ -150,7 +175,7 @@ def design_command(
 
     if any(word.lstrip("+").startswith("readings=") for word in arguments):
         raise UserError("readings: is for `ipe-bench estimate`; the number to choose is --readings NUMBER")
-    of_runs = (*OF_MANY_TRIALS, "figures", "trials", "solver", "baseline", "estimators")
+    of_runs = (*OF_MANY_TRIALS, *OF_STATES, "figures", "trials", "solver", "baseline", "estimators")
     asked = single("design", arguments, run=of_runs, estimate=OF_FILES)
     scenario = asked.spec.scenario
     if scenario.noise.real:
@@ -173,7 +198,7 @@ def posterior_command(arguments: Sequence[str], particles: int) -> int:
     """Samples, prints a table and writes files; exit code 1 where the populations of a trial do not agree."""
     from ipe_bench.report.questions import posterior_parts, write_posteriors
 
-    asked = single("posterior", arguments, run=(*OF_MANY_TRIALS, "figures"), estimate=OF_FILES)
+    asked = single("posterior", arguments, run=(*OF_MANY_TRIALS, *OF_STATES, "figures"), estimate=OF_FILES)
     job, name, scenario = asked.spec, asked.measurement, asked.spec.scenario
     trials = job.count if "trials" in asked.words.keys else _TRIALS
     if trials > _MOST_TRIALS:

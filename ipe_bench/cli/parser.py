@@ -94,7 +94,7 @@ readings=FILE          is for `ipe-bench estimate`, as are ignore_rows= and igno
         ),
     ),
     "estimate": (
-        "parameters from real readings, and whether the model fits them",
+        "parameters or states from real readings, and whether the model fits them",
         "0 some estimator has an answer; 1 none has, or the model fits none",
         """
   ipe-bench estimate readings=FILE.csv                          the default model, gins
@@ -102,6 +102,7 @@ readings=FILE          is for `ipe-bench estimate`, as are ignore_rows= and igno
   ipe-bench estimate measurement=nist/misra1a                   readings that come with the model
   ipe-bench estimate measurement=formula "measurement.expression=a*(1-exp(-b*t))" measurement.start.a=5 \\
       measurement.start.b=0.3 readings=FILE.csv                 your own formula of parameters and columns
+  ipe-bench estimate model=pendulum readings=LOG.csv "tracker=[ekf,ukf_rts]"    states that move, epoch by epoch
 
 readings=FILE       CSV or Parquet; `ipe-bench list measurement -v` says which rows and columns a model wants.
                     A missing reading keeps its row, with an empty cell. A column sigma has standard deviations.

@@ -165,10 +165,10 @@ class Spec(Component):
             error_scale=self.error_scale if "error_scale" in stated else None,
             known=self.known,
             covariance=self.prior_covariance,
-            left_out=LeftOut(self._names("ignore_columns", str), self._names("ignore_rows", int, str)),
+            left_out=LeftOut(self.names("ignore_columns", str), self.names("ignore_rows", int, str)),
         )
 
-    def _names(self, key: str, *kinds: type) -> tuple[Any, ...]:
+    def names(self, key: str, *kinds: type) -> tuple[Any, ...]:
         given = getattr(self, key)
         names = given if isinstance(given, tuple) else () if given is None else (given,)
         for name in names:

@@ -92,6 +92,12 @@ class StateModel(Component, Named, ABC):
         return ()
 
     @property
+    def reading_names(self) -> tuple[str, ...]:
+        """Names of the readings of an epoch: the columns of a log."""
+        m = len(self.R(0))
+        return ("reading",) if m == 1 else tuple(f"reading{i + 1}" for i in range(m))
+
+    @property
     def n(self) -> int:
         return len(self.states)
 

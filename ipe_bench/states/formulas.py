@@ -43,6 +43,8 @@ class Formulas(StateModel):
     """Standard deviation of each state in the prior."""
     constants: Mapping[str, Finite] = field(default_factory=dict)
     """Numbers that the formulas name."""
+    inputs: Mapping[str, Finite | tuple[Finite, ...]] = field(default_factory=dict)
+    """Known inputs that the formulas name, such as a control: one number, or one for each epoch."""
     units: Mapping[str, str] = field(default_factory=dict)
     """Units of states."""
     period: Mapping[str, NonNegative] = field(default_factory=dict)
@@ -58,10 +60,12 @@ class Formulas(StateModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        names = [*self.next, *self.noise, *self.constants, "k", "t"]
+        names = [*self.next, *self.noise, *self.constants, *self.inputs, "k", "t"]
         if twice := next((name for name in names if names.count(name) > 1), None):
-            raise UserError(f"next.{twice}: two of states, noise, constants, k and t have this name; choose another")
-        known = {*self.next, *self.constants, "k", "t"}
+            raise UserError(
+                f"next.{twice}: two of states, noise, constants, inputs, k and t have this name; rename one"
+            )
+        known = {*self.next, *self.constants, *self.inputs, "k", "t"}
         for key, formulas, names in (
             ("next", self._transitions, {*known, *self.noise}),
             ("readings", self._readings, known),
@@ -81,6 +85,11 @@ class Formulas(StateModel):
                     raise UserError(f"{key}.{label}: {unknown(label, labels, 'name')}")
             if key in ("deviation", "spread") and (absent := set(labels) - set(given)):
                 raise UserError(f"{key}.{min(absent)}: is not given; give it a value")
+        for label, given in self.inputs.items():
+            if (number := np.size(given)) not in (1, self.count):
+                raise UserError(
+                    f"inputs.{label}: has {number} numbers; give one, or one for each of {self.count} epochs"
+                )
         gains = [self._gain_at(multiple) for multiple in _OTHER_PLACES]
         if not all(np.allclose(gain, gains[0], rtol=1e-9, atol=0) for gain in gains):
             raise UserError("next: the factor of a process noise depends on a state; give it a constant one")
@@ -92,6 +101,15 @@ class Formulas(StateModel):
     @cached_property
     def _readings(self) -> dict[str, Arithmetic]:
         return {name: read(text, f"readings.{name}") for name, text in self.readings.items()}
+
+    @cached_property
+    def _inputs(self) -> dict[str, Array]:
+        """Each input (K,)."""
+        return {name: np.broadcast_to(np.array(given, dtype=float), self.count) for name, given in self.inputs.items()}
+
+    @property
+    def reading_names(self) -> tuple[str, ...]:
+        return tuple(self.readings)
 
     @property
     def times(self) -> Array:
@@ -118,7 +136,7 @@ class Formulas(StateModel):
 
     def gain(self, k: int) -> Array:
         named = {name for formula in self._transitions.values() for name in formula.names}
-        return self._gain_at(0.0, k) if named & {"k", "t"} else self._steady_gain
+        return self._gain_at(0.0, k) if named & {"k", "t", *self.inputs} else self._steady_gain
 
     @cached_property
     def _steady_gain(self) -> Array:
@@ -139,6 +157,7 @@ class Formulas(StateModel):
     def _values(self, formulas: Mapping[str, Arithmetic], x: Array, k: int, noise: Mapping[str, Any]) -> Array:
         """Those formulas (..., number) at states x (..., n) at epoch k."""
         known = dict(zip(self.next, np.moveaxis(x, -1, 0), strict=True)) | dict(noise)
+        known |= {name: float(values[k]) for name, values in self._inputs.items()}
         known |= {**self.constants, "k": k + 1.0, "t": float(self.times[k])}
         with np.errstate(all="ignore"):
             values = np.broadcast_arrays(x[..., 0], *(formula(known) for formula in formulas.values()))[1:]

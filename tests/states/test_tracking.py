@@ -260,7 +260,7 @@ WALK = {
         ({"next": {"x": "x +", "v": "v"}}, r"next\.x: 'x \+' is not a formula"),
         ({"next": {"x": "x", "v": "v + x*w"}}, "the factor of a process noise depends on a state"),
         ({"readings": {}}, "readings: is empty"),
-        ({"constants": {"h": 1.0, "x": 2.0}}, r"next\.x: two of states, noise, constants, k and t have this name"),
+        ({"constants": {"h": 1.0, "x": 2.0}}, r"next\.x: two of states, noise, constants, inputs, k and t have"),
         ({"readings": {"z": "x + w"}}, r"readings\.z: there is no such name"),
         ({"spread": {"x": 1.0}}, r"spread\.v: is not given"),
         ({"deviation": {"z": -1.0}}, r"deviation\.z=-1\.0: give 0 or a number above"),

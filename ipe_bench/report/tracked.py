@@ -1,0 +1,98 @@
+"""Tracks of real readings: tables and files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ipe_bench.basics.files import write_text
+from ipe_bench.real.tracks import Log, Tracked
+from ipe_bench.report.answer import as_json, with_error
+from ipe_bench.report.table import Part, Strong, Table, html, interval, plain_text, texts, words
+from ipe_bench.report.words import p_value, short
+from ipe_bench.report.writer import write
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+NAME, TABLE, SCHEMA = "track", "track.csv", 1
+
+
+@dataclass(frozen=True)
+class TrackAnswer:
+    """The tracks of one log, one for each tracker."""
+
+    log: Log
+    tracks: Sequence[Tracked]
+
+    @property
+    def passes(self) -> bool:
+        """Whether any tracker has a track that nothing speaks against."""
+        return any(one.passes for one in self.tracks)
+
+    def __iter__(self) -> Iterator[Tracked]:
+        return iter(self.tracks)
+
+    def __getitem__(self, label: str) -> Tracked:
+        return next(one for one in self.tracks if one.label == label)
+
+    def table(self) -> pd.DataFrame:
+        """A row per tracker and epoch: each state with its standard deviation, and NIS."""
+        import pandas as pd
+
+        model, frames = self.log.model, []
+        for one in self.tracks:
+            columns = {"tracker": one.label, "epoch": range(1, model.epochs + 1), "time [s]": model.times}
+            for i, state in enumerate(model.states):
+                unit = f" [{state.unit}]" if state.unit else ""
+                columns |= {f"{state.name}{unit}": one.mean[:, i], f"{state.name}_deviation{unit}": one.deviation[:, i]}
+            frames.append(pd.DataFrame(columns | {"nis": one.nis}))
+        return pd.concat(frames, ignore_index=True)
+
+    def __str__(self) -> str:
+        return plain_text(contents(self))
+
+    def _repr_html_(self) -> str:
+        return html(contents(self))
+
+
+def contents(answer: TrackAnswer) -> list[Part]:
+    """What the innovations say of each tracker, and the states at the last epoch."""
+    found, states = answer.tracks, answer.log.model.states
+    limits = [one.limits[0] for one in found], [one.limits[1] for one in found]
+    columns = [
+        words("tracker", [one.label for one in found]),
+        texts("rms of innovations", [short(np.sqrt(one.mean_nis)) for one in found]),
+        texts("NIS / m", [short(one.mean_nis) for one in found]),
+        interval("95 % if right", *limits, short),
+        words("verdict", [one.verdict for one in found]),
+        texts("white p", [p_value(one.white_p) for one in found]),
+        texts("log likelihood", [short(one.log_likelihood) for one in found]),
+    ]
+    note = (
+        "Innovations are readings less their predictions, in predicted standard deviations; NIS / m is their mean"
+        " square. They are white if the filter is right (Ljung and Box). Smoothers have none."
+    )
+    ends = [words("state", [state.name for state in states]), words("unit", [state.unit for state in states])]
+    ends += [texts(one.label, map(with_error, one.mean[-1], one.deviation[-1])) for one in found]
+    return [
+        *(Strong(f"{one.label}: {one.message}") for one in found if one.message),
+        Table("innovations", f"{answer.log.model.name}: is the filter right?", "", columns, notes=[note]),
+        Table("last", "States at the last epoch ± standard deviation", "", ends),
+    ]
+
+
+def write_tracks(folder: Path, answer: TrackAnswer, command: Any, provenance: Mapping[str, Any]) -> list[Path]:
+    """Writes track.json, track.csv and track.html, and returns them."""
+    log, rows = answer.log, ("message", "mean_nis", "limits", "verdict", "white_p", "log_likelihood", "passes")
+    trackers = {one.label: {name: as_json(getattr(one, name)) for name in rows} for one in answer}
+    content = {"schema": SCHEMA, "command": command, "trackers": trackers, **provenance}
+    write_text(folder / f"{NAME}.json", json.dumps(content, indent=1) + "\n")
+    lead = f"{int(np.isfinite(log.z).sum())} readings at {log.model.epochs} epochs"
+    title = f"{log.model.name}: tracks"
+    return [folder / f"{NAME}.json", *write(folder, NAME, title, contents(answer), (TABLE, answer.table()), lead=lead)]

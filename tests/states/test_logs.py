@@ -1,0 +1,167 @@
+"""Tracks of readings from a file: the same numbers as in a run, the closed form with known inputs, and refusals."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import chi2
+from state_models import ConstantVelocity, CoordinatedTurn
+
+import ipe_bench as ib
+from ipe_bench.cli.main import main
+from ipe_bench.plugins.construct import construct
+from ipe_bench.plugins.discovery import options
+from ipe_bench.states import Bootstrap, Formulas, Smoother, ckf, ekf, ukf
+
+DRIVEN = Formulas(
+    next={"x": "x + h*u + sqrt(h)*w"},
+    readings={"z": "x"},
+    noise={"w": 0.5},
+    deviation={"z": 0.2},
+    spread={"x": 1.0},
+    inputs={"u": 0.0, "h": 1.0},
+    units={"x": "m"},
+)
+
+
+@pytest.fixture
+def estimate(tmp_path, monkeypatch, capsys):
+    """Runs `estimate` in an empty folder: the exit code, and what it printed."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["ipe-bench"])
+
+    def run(*words):
+        code = main(["estimate", *words])
+        printed = capsys.readouterr()
+        return code, printed.out, printed.err
+
+    return run
+
+
+def written(path, model, z, **columns):
+    pd.DataFrame({**columns, **dict(zip(model.reading_names, z.T, strict=True))}).to_csv(path, index=False)
+
+
+def test_a_log_is_tracked_with_the_bits_of_a_run(tmp_path):
+    model = CoordinatedTurn(count=25)
+    trackers = {"ekf": ekf(), "ukf": ukf(), "rts": Smoother(ckf()), "particles": Bootstrap(100)}
+    ib.run(model, trackers, 9, output=tmp_path / "run")
+    z = model.draw(0, 9).z
+    written(tmp_path / "log.csv", model, z[4], time=model.times)
+    stored = ib.load(tmp_path / "run").set_index(["estimator", "trial"])
+    answer = ib.estimate(model, tmp_path / "log.csv", trackers)
+    assert [one.label for one in answer] == list(trackers)
+    for label, tracker in trackers.items():
+        whole, one = tracker.track(model, z), answer[label]
+        np.testing.assert_array_equal(one.mean, whole.mean[4])
+        np.testing.assert_array_equal(one.deviation, np.sqrt(np.einsum("kii->ki", whole.covariance[4])))
+        assert one.log_likelihood == stored.loc[(label, 4), "log_likelihood"] or label == "rts"
+        assert one.white_p == stored.loc[(label, 4), "white_p"] or label in ("rts", "particles")
+        assert one.mean_nis == pytest.approx(stored.loc[(label, 4), "extra_nis"], rel=1e-12, nan_ok=True)
+    one = answer["ekf"]
+    assert one.limits == pytest.approx(chi2.ppf([0.025, 0.975], 50) / 50, rel=1e-9)
+    assert np.isnan(answer["rts"].mean_nis)
+    assert answer["rts"].verdict == answer["particles"].verdict == "-"
+
+
+def test_known_inputs_and_unequal_steps_of_a_log_give_the_closed_form(tmp_path):
+    rng = np.random.default_rng(5)
+    h, u = rng.uniform(0.1, 3.0, 40), rng.normal(size=40)
+    x = rng.normal() + np.cumsum(h * u + 0.5 * np.sqrt(h) * rng.normal(size=40))
+    z = x + 0.2 * rng.normal(size=40)
+    z[[7, 8]] = np.nan
+    written(tmp_path / "log.csv", DRIVEN, z[:, None], h=h, u=u, epoch=np.arange(1, 41), note=np.ones(40))
+    (one,) = ib.estimate(DRIVEN, tmp_path / "log.csv", {"ekf": ekf()}, ignore_columns=["note"])
+    m, P, log_likelihood = 0.0, 1.0, 0.0
+    for k in range(40):
+        m, P = m + h[k] * u[k], P + 0.25 * h[k]
+        if np.isfinite(z[k]):
+            S = P + 0.04
+            log_likelihood -= 0.5 * ((z[k] - m) ** 2 / S + np.log(2 * np.pi * S))
+            m, P = m + P / S * (z[k] - m), P * 0.04 / S
+        assert one.mean[k, 0] == pytest.approx(m, abs=1e-12)
+        assert one.deviation[k, 0] == pytest.approx(np.sqrt(P), rel=1e-12)
+    assert one.log_likelihood == pytest.approx(log_likelihood, rel=1e-12)
+    assert np.flatnonzero(np.isnan(one.nis)).tolist() == [7, 8]
+    assert one.mean_nis == pytest.approx(np.nansum(one.nis) / 38, rel=1e-12)
+
+
+def test_the_command_leaves_the_track_and_says_whether_the_filter_is_right(tmp_path, estimate):
+    model = construct(next(o for o in options("model") if o.name == "constant_velocity").config, "model")
+    z = model.draw(3, 4).z[0]
+    z[11] = np.nan
+    written(tmp_path / "log.csv", model, z, epoch=range(1, 101))
+    code, out, err = estimate("model=constant_velocity", "readings=log.csv", "tracker=[ekf,ekf_rts]")
+    assert (code, err) == (0, "")
+    assert all(words in out for words in ("consistent", "NIS / m", "white p", "position"))
+    folder = tmp_path / "outputs" / "estimate-constant_velocity"
+    table = pd.read_csv(folder / "track.csv").query("tracker == 'ekf'")
+    track = ekf().track(model, z[None])
+    np.testing.assert_array_equal(table["velocity [m/s]"], track.mean[0, :, 1])
+    np.testing.assert_array_equal(table["nis"].dropna(), np.delete(track.nis[0], 11))
+    assert json.loads((folder / "track.json").read_text())["trackers"]["ekf"]["verdict"] == "consistent"
+    code, out, _ = estimate("model=constant_velocity", "readings=log.csv", "model.deviation.seen=0.3", "output=two")
+    assert code == 1
+    assert "optimistic" in out
+    assert estimate("model=pendulum_book", "tracker=[ukf]", "output=book")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["readings=absent.csv"], "readings=absent.csv: there is no such file"),
+        ([], "readings: is not given; write readings=FILE, with the columns u,h,z"),
+        (["readings=short.csv"], "readings=short.csv: column h is missing (the header must be u,h,z)"),
+        (["readings=more.csv"], "readings=more.csv: column note is not understood; remove it, or set ignore_columns"),
+        (["readings=order.csv"], "readings=order.csv: row 4, column epoch: 3 belongs here; give a row for each epoch"),
+        (["readings=time.csv"], "readings=time.csv: row 3, column time [s]: 2 belongs here; give a row for"),
+        (["readings=hole.csv"], "readings=hole.csv: row 3, column u: is empty; a known input has a value at each"),
+        (["readings=blank.csv"], "readings=blank.csv: has no reading"),
+        (["readings=gap.csv"], "readings=gap.csv: row 3: is empty; if a reading is missing there, number the rows in"),
+        (["readings=[good.csv,more.csv]"], "readings=[good.csv,more.csv]: a track has one log; name one file"),
+        (["readings=good.csv", "tracker=[nothing]"], "tracker=nothing: there is no such option"),
+        (["readings=good.csv", "tracker=[newton]"], "tracker=newton: newton is no tracker but a solver"),
+        (["readings=good.csv", "baseline=[ekf]"], "baseline: is of a measurement, and model= chooses states that move"),
+        (["readings=good.csv", "measurement=gins"], "measurement: is of a measurement, and model= chooses states that"),
+        (["readings=good.csv", "ignore_rows=[2]"], "ignore_rows: is for estimates of constants; empty the cells"),
+        (["readings=good.csv", "ignore_columns=[v]"], "ignore_columns=v: there is no such column"),
+        (["readings=good.csv", "model.inputs.u=[1,2]"], "model.inputs.u: has 2 numbers; give one, or one for each of"),
+    ],
+)
+def test_what_is_no_log_of_the_model_is_refused(words, complaint, tmp_path, estimate):
+    good = {"u": [1.0, 2.0, 3.0], "h": [1.0] * 3, "z": [0.1, 0.2, 0.3]}
+    changes = {"short": {"h": None}, "more": {"note": [1, 2, 3]}, "order": {"epoch": [1, 2, 4]}, "good": {}}
+    changes |= {"time": {"time [s]": [1, 1.5, 3]}, "hole": {"u": [1.0, None, 3.0]}, "blank": {"z": [None] * 3}}
+    changes["gap"] = {name: [values[0], None, values[2]] for name, values in good.items()}
+    for name, change in changes.items():
+        columns = {key: value for key, value in {**good, **change}.items() if value is not None}
+        pd.DataFrame(columns).to_csv(tmp_path / f"{name}.csv", index=False)
+    model = ["model=formulas", "model.next.x=x+h*u+w", "model.noise.w=1", "model.readings.z=x", "model.deviation.z=1"]
+    code, _, err = estimate(*model, "model.spread.x=1", "model.inputs={u:0,h:1}", *words)
+    assert code == 2
+    assert err.splitlines()[-1].startswith(f"ipe-bench: {complaint}")
+    assert not list(tmp_path.rglob("track.csv"))
+
+
+def test_a_model_in_python_has_the_epochs_that_it_says(tmp_path):
+    model = ConstantVelocity(count=12)
+    written(tmp_path / "log.csv", model, model.draw(0, 1).z[0, :11])
+    with pytest.raises(ib.UserError, match="has 11 rows, and constant_velocity 12 epochs"):
+        ib.estimate(model, tmp_path / "log.csv")
+    with pytest.raises(ib.UserError, match=r"readings: has shape \(3, 1\), where \(12, 1\) belongs"):
+        ib.estimate(model, np.zeros((3, 1)))
+
+
+def test_estimates_of_constants_and_of_states_are_told_apart():
+    model, z = ConstantVelocity(count=12), np.zeros((12, 1))
+    with pytest.raises(ib.UserError, match=r"estimators\.ekf: estimates constants; a state model takes trackers"):
+        ib.estimate(model, z, {"ekf": ib.baselines.EKF()})  # pyright: ignore
+    with pytest.raises(ib.UserError, match="noise=: is of a measurement"):
+        ib.estimate(model, z, noise=ib.noise.Gaussian(1.0))  # pyright: ignore
+    constant = ib.measurements.Polynomial()
+    with pytest.raises(ib.UserError, match=r"estimators: ekf: .* is a Filter; give an estimator"):
+        ib.estimate(constant, np.zeros(constant.m), {"ekf": ekf()})  # pyright: ignore
