@@ -26,7 +26,7 @@ LINE = (
 )
 BUDGETS = {
     "basics": 997,
-    "measurements": 7001,
+    "measurements": 6934,
     "noise": 634,
     "priors": 147,
     "states": 1081,

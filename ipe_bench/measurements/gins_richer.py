@@ -142,9 +142,6 @@ class RicherGins(Gins):
         equations = Equations(self.states, given + self.states, 0, self.states, start, moving.rhs, read)
         return Kernel(equations, DOP853)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in super().__getstate__().items() if k != "_motion"}
-
 
 class _Motion(Gins):
     """The equations of motion with the errors of the accelerometers behind the parameters."""

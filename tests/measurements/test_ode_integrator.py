@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import DOP853
 
+from ipe_bench.basics import compiled
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import OdeMeasurement, Parameter, ode
 from ipe_bench.measurements.base import differentiate
@@ -100,6 +101,15 @@ def test_readings_and_jacobian_are_those_of_a_plain_loop_with_the_same_coefficie
         for j, direction in enumerate(np.eye(2)):
             exact = np.imag(rk8(model, row + 1e-100j * direction, model.step)) / 1e-100
             np.testing.assert_allclose(slope[:, j], exact, rtol=1e-11, atol=1e-13)
+
+
+@pytest.mark.parametrize("model", [Pulse(0.5), Cases(0.5)], ids=str)
+def test_numpy_computes_what_machine_code_does(model, monkeypatch):
+    x = np.random.default_rng(1).normal(size=(3, 2))
+    z, J = model.simulate(x), model.jacobian(x)
+    monkeypatch.setattr(compiled, "available", lambda: False)
+    np.testing.assert_allclose(model.simulate(x), z, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(model.jacobian(x), J, rtol=1e-12, atol=1e-13)
 
 
 @pytest.mark.parametrize("cases", [1, 4, 5, 9])

@@ -19,30 +19,31 @@ from ipe_bench.basics.linalg import Array, own
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.ode.integrator import Kernel, Rates
 from ipe_bench.measurements.ode.plan import Equations, Variation, jumps
+from ipe_bench.measurements.ode.rodas import diagnose
 from ipe_bench.measurements.ode.steps import (
     CONTRACTION,
+    LONGEST,
     MOST_RK4,
     ORDER,
     SAFETY,
-    Coarseness,
     Found,
     Indices,
-    Remembered,
-    Search,
     coarser,
     contraction,
     grouped,
     ladder,
+    search,
 )
-from ipe_bench.measurements.ode.stiffness import diagnose
 from ipe_bench.measurements.ode.tableau import DOP853, RK4
 from ipe_bench.measurements.ode.trace import Graph, Program
 
-_STAYS = ("_readings_kernel", "_rk4_kernel", "_rate_function", "_jacobian_kernel", "equations", "_remembered")
 _FAR = 1e3
 """Tolerances by which readings with the shortest steps are off where the integrator cannot follow the equations."""
 _ANGLE_AT_START = 0.7
 """Radians over which the first step that is tried lets the solution turn."""
+_REMEMBERED = 100_000
+"""Trials whose levels are remembered: a simulation and a Jacobian share one search, and what is forgotten is found
+again, the same."""
 
 
 class OdeMeasurement(Measurement):
@@ -174,7 +175,9 @@ class OdeMeasurement(Measurement):
             groups = self._groups(self._guess(x), everyone)
         else:
             found = self._search(x, offset)
-            z[found.computed] = self._prefix(found.z, stop)
+            cases, outputs = len(self._cases), len(self.outputs)
+            whole = found.z.reshape(len(found.z), cases, len(self.times), outputs)
+            z.reshape(len(x), cases, stop, outputs)[found.computed] = whole[:, :, :stop]
             others = np.delete(everyone, found.computed)
             groups = self._groups(found.places[others], others)
         for rows, steps in groups:
@@ -224,25 +227,23 @@ class OdeMeasurement(Measurement):
     _si_sizes = cached_property(lambda self: own(self.si_sizes))
     _cases = cached_property(lambda self: own(self.cases))
     _times = cached_property(lambda self: own(self.times))
-    _remembered = cached_property(lambda self: Remembered())
+    _remembered = cached_property(lambda self: dict[bytes, int]())
     _fixed_steps = cached_property(lambda self: steps_between(self.times, self.step))
-
-    def _prefix(self, z: Array, stop: int) -> Array:
-        if stop == len(self.times):
-            return z
-        shape = (len(z), len(self.cases), len(self.times), len(self.outputs))
-        return z.reshape(shape)[:, :, :stop].reshape(len(z), len(self.cases) * stop * len(self.outputs))
 
     def _search(self, x: Array, offset: Array) -> Found:
         """The level of each trial, and the readings of those whose level had to be looked for."""
-        places = self._trusted(x)
+        places, remembered = self._trusted(x), self._remembered
         unknown = np.flatnonzero(places < 0)
-        places[unknown] = self._remembered.look_up(x[unknown])
-        unknown = unknown[places[unknown] < 0]
+        bits = np.ascontiguousarray(x[unknown]).view(f"V{8 * x.shape[1]}").ravel().tolist() if len(unknown) else []
+        places[unknown] = [remembered.get(key, -1) for key in bits]
+        new = np.flatnonzero(places[unknown] < 0)
+        unknown = unknown[new]
         if not len(unknown):
             return Found(places, unknown, np.empty((0, self.m)))
         found = self._find(x[unknown], self._first_guess(x[unknown]), offset)
-        self._remembered.keep(x[unknown], found.places)
+        if len(remembered) + len(unknown) > _REMEMBERED:
+            remembered.clear()
+        remembered.update(zip([bits[i] for i in new], found.places.tolist(), strict=True))
         places[unknown] = found.places
         return Found(places, unknown[found.computed], found.z)
 
@@ -250,7 +251,7 @@ class OdeMeasurement(Measurement):
         def simulate(rows: Indices, level: int, z: Array) -> None:
             self._simulate(x, rows, level * self._parts, offset, z)
 
-        return Search(self._ladder, self._tolerances, simulate).run(start)
+        return search(self._ladder, self._tolerances, simulate, start)
 
     def _trusted(self, x: Array) -> Indices:
         """The coarsest level for trials of which it is known to do, -1 for the others."""
@@ -348,15 +349,17 @@ class OdeMeasurement(Measurement):
 
     def _coarsened(self, place: int) -> tuple[Kernel, int]:
         """The formula and the level for the tangents of trials at this place; -1 for those that are trusted."""
-        level = 1 if place < 0 else int(self._ladder[place])
-        if level > 2 or self._coarseness.rk4 is None:
-            return self._jacobian_kernel, self._coarseness.level(level)
+        level, (rk4, longer) = 1 if place < 0 else int(self._ladder[place]), self._coarseness
+        if level > 2 or rk4 is None:
+            return self._jacobian_kernel, max(1, int(np.ceil(level / longer)))
         # The formula of fourth order loses more by what a trial turns faster than the nominal one: 2^4 and 3^4 in hand.
-        return self._rk4_kernel, self._coarseness.rk4 * (1 if place < 0 else level + 1)
+        return self._rk4_kernel, rk4 * (1 if place < 0 else level + 1)
 
     @cached_property
-    def _coarseness(self) -> Coarseness:
-        """Measured at the nominal parameters."""
+    def _coarseness(self) -> tuple[int | None, float]:
+        """How coarse tangents may be, as measured at the nominal parameters: steps of the formula of fourth order that
+        contract enough at the coarsest level, None if none do; and how many times longer steps of that of eighth order
+        may be where readings are within a sixteenth of the tolerance."""
         x, everything = own(self.nominal[None]), len(self.times)
         level, J = int(self._ladder[self._search(x, self._zeros).places[0]]), self.jacobian(x)
         rk4, tangents = None, np.empty_like(J)
@@ -367,7 +370,7 @@ class OdeMeasurement(Measurement):
                 break
         # Half the level; where that is half a step, every second reading.
         if level == 1 and (len(self._times) == 1 or self.driven is not None):
-            return Coarseness(rk4, np.inf)
+            return rk4, 1.0
         every = slice(None) if level > 1 else slice(1, None, 2)
         rows = np.arange(self.m).reshape(len(self._cases), everything, -1)[:, every].ravel()
         times, steps = self._times[every], max(1, level // 2) * self._parts[every]
@@ -378,7 +381,10 @@ class OdeMeasurement(Measurement):
         with np.errstate(all="ignore"):
             off = np.abs(z - self._shown(x, everything, self._zeros)[:, rows]) / self._tolerances[rows]
             sensitivity = contraction(coarse[0], J[0, rows]) / off.max()
-        return Coarseness(rk4, float(sensitivity) if np.isfinite(sensitivity) else np.inf)
+        if not np.isfinite(sensitivity):
+            return rk4, 1.0
+        longer = (16 * CONTRACTION / sensitivity) ** (1 / ORDER) if sensitivity > 0 else np.inf
+        return rk4, float(np.clip(longer, 1.0, LONGEST))
 
     def _empty_jacobian(self, x: Array, stop: int) -> Array:
         return np.empty((len(x), len(self._cases) * stop * len(self.outputs), self.n))
@@ -405,7 +411,7 @@ class OdeMeasurement(Measurement):
 
     def __getstate__(self) -> dict[str, Any]:
         """Without what is compiled and remembered, which stays with a process."""
-        return {k: v for k, v in self.__dict__.items() if k not in _STAYS}
+        return {k: v for k, v in self.__dict__.items() if not k.startswith("_") and k != "equations"}
 
     _readings_kernel = cached_property(lambda self: Kernel(self.equations, DOP853))
     _jacobian_kernel = cached_property(lambda self: Kernel(self.equations, DOP853, sensitive=True))

@@ -65,6 +65,8 @@ TIME_WEIGHTS = (
 )
 _REACH = 6.0
 """About where the stability region of DOP853 ends on the negative real axis."""
+_STABLE = 5.0
+"""The formula of eighth order is stable to a step of about this over the fastest rate."""
 MOST_STEPS = 4000
 SHAPE = 1e-4
 """A relative tolerance that shows the shape of a solution."""
@@ -301,3 +303,18 @@ def _solve(W: Array, exchanged: Sequence[Array], b: Array) -> Array:
         b[k] /= W[k, k]
         b[:k] -= W[:k, k, None] * b[k]
     return b
+
+
+def diagnose(model: OdeMeasurement, x: Array, shortest: float) -> str:
+    """What hinders the integrator from following the solution at x (n,), whose shortest step that is."""
+    unit = f" {model.time_unit}".rstrip()
+    z, work = Rodas5P(model, SHAPE).measured(x[None])
+    if not np.isfinite(z).all():
+        if work.steps >= MOST_STEPS:
+            return f"the solution takes more than {MOST_STEPS} steps, by the implicit method, too"
+        return f"the solution itself leaves all numbers near t = {work.reached:.4g}{unit}"
+    needed, t = _STABLE / max(work.fastest, 1e-300), work.met
+    if needed >= shortest:
+        return f"steps of {shortest:.2g}{unit}, the shortest, are too long for these equations"
+    looks = f"; they look stiff: {model.stiff_remedy}" if work.explicit > work.steps else ""
+    return f"the equations need steps of {needed:.2g}{unit} at t = {t:.4g}, and the shortest is {shortest:.2g}{looks}"

@@ -10,7 +10,6 @@ class Tableau:
     """An explicit formula: stage s starts from y + h sum_j A[s][j] k_j at t + C[s] h, the step ends at
     y + h sum_s B[s] k_s."""
 
-    name: str
     A: tuple[tuple[float, ...], ...]
     B: tuple[float, ...]
     C: tuple[float, ...]
@@ -27,7 +26,6 @@ class Tableau:
 
 # fmt: off
 DOP853 = Tableau(
-    name="DOP853",
     A=(
         (),
         (0.05260015195876773,),
@@ -71,7 +69,6 @@ DOP853 = Tableau(
 I, 2nd ed. 1993, II.5, table 5.4 and the code DOP853)."""
 
 RK4 = Tableau(
-    name="RK4",
     A=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
     B=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
     C=(0.0, 0.5, 0.5, 1.0),
