@@ -38,8 +38,8 @@ BUDGETS = {
     "statistics": 4198,
     "real": 2385,
     "plugins": 1185,
-    "report": 4231,
-    "cli": 2560,
+    "report": 4197,
+    "cli": 2561,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""
 PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}

@@ -50,7 +50,7 @@ def audit_command(arguments: Sequence[str]) -> int:
 
 def bundle_command(arguments: Sequence[str]) -> int:
     """Writes the archive, or checks one; exit code 1 where the folders lack something that was asked for."""
-    from ipe_bench.report.definitions import CITATION
+    from ipe_bench.report.words import CITATION
 
     places, keys = places_and_keys("bundle", arguments, {"output": str})
     paths = [Path(place) for place in places]
@@ -178,7 +178,8 @@ def show_report(
 
 
 def _print_table(rows: Sequence[Mapping[str, Any]], collection: Any) -> None:
-    from ipe_bench.report.terminal import render
+    from ipe_bench.report.table import terminal
+    from ipe_bench.report.terminal import summary_tables
 
     totals = []
     if any(row["noise"] == "certified" for row in rows):
@@ -186,7 +187,7 @@ def _print_table(rows: Sequence[Mapping[str, Any]], collection: Any) -> None:
 
         totals = [table for table in certified_tables(collection) if table.whole]
     out = console()
-    out.print(render(rows, totals, out.width))
+    out.print(terminal(summary_tables(rows, totals, out.width), out.width))
     sys.stdout.flush()
 
 

@@ -11,7 +11,6 @@ from importlib import resources
 from typing import Any
 
 from ipe_bench import __version__
-from ipe_bench.report.definitions import CITATION, definitions
 from ipe_bench.report.figures import Drawn
 from ipe_bench.report.figures.views import View, views
 from ipe_bench.report.headline import about, headline
@@ -19,8 +18,11 @@ from ipe_bench.report.sections import Written
 from ipe_bench.report.style import ON_DARK
 from ipe_bench.report.table import Table, environment
 from ipe_bench.report.tables import without_certified
+from ipe_bench.report.words import CITATION
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.collect import Run
+from ipe_bench.statistics.comparisons import TIE
+from ipe_bench.statistics.records import SCORES, STATISTICS, all_statistics
 from ipe_bench.trials.thresholds import FEW
 
 MOST_RUNS = 20
@@ -64,7 +66,7 @@ def render_page(
             runs=runs[:MOST_RUNS],
             older_runs=max(0, len(runs) - MOST_RUNS),
             citation=CITATION,
-            definitions=definitions(),
+            definitions=[*DEFINITIONS, *((one.title, one.definition) for one in all_statistics()[len(STATISTICS) :])],
         )
     )
 
@@ -165,3 +167,46 @@ def _short(value: float) -> float | int | None:
     if not math.isfinite(value):
         return None
     return int(value) if value == int(value) and abs(value) < 1e15 else float(f"{value:.{FIGURES}g}")
+
+
+# Definitions ---------------------------------------------------------------------------------------------------------
+
+DEFINITIONS: tuple[tuple[str, str], ...] = (
+    ("trial", "One draw of true parameters and of noise. Trial t is the same for every estimator."),
+    (
+        "error scale",
+        "Standard deviation of the true parameters about the nominal point, in multiples of the parameters' unit"
+        " inputs.",
+    ),
+    *((record.title, record.definition) for record in STATISTICS),
+    (
+        "parameter 'all'",
+        "Root mean square over parameters of the statistic over the linear bound, unless the statistic says otherwise.",
+    ),
+    *((record.title, record.definition) for record in SCORES),
+    (
+        "win, tie, loss",
+        f"Errors are paired by trial. Mahalanobis errors that differ by less than {TIE:g} are a tie, because"
+        " estimators that share a root differ by round-off alone.",
+    ),
+    (
+        "p of error",
+        "Wilcoxon's two-sided signed-rank test without ties (Biometrics Bulletin 1, 1945), with Holm's correction over"
+        " the pairs of a scenario (Scandinavian Journal of Statistics 6, 1979).",
+    ),
+    (
+        "p of success",
+        "McNemar's exact test on the trials in which only one of the two succeeds (Psychometrika 12, 1947), with"
+        " Holm's correction.",
+    ),
+    (
+        "may be the best (bold)",
+        "No rival succeeds significantly more often in the same trials, by the gate of the Cramér-Rao bound for all:"
+        " McNemar's exact one-sided test against every rival at 5 % over their number, which leaves a true best out in"
+        " at most 5 % of scenarios (Hsu, Annals of Statistics 9, 1981). Nothing is bold if no estimator is beaten.",
+    ),
+    (
+        "data profile",
+        "Share of trials in which it succeeds within a budget (Moré and Wild, SIAM Journal on Optimization 20, 2009).",
+    ),
+)

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ipe_bench.report.table import Cell, Column, Part, Table, column, interval, sort_key, terminal, words
-from ipe_bench.report.words import brief, duration, limits, percent, plain, reported, shower, shown
+from ipe_bench.report.table import Cell, Column, Part, Table, column, interval, sort_key, words
+from ipe_bench.report.words import brief, duration, p_value, percent, plain, short
 from ipe_bench.statistics.formulas import CAP
-from ipe_bench.statistics.records import SCORES, Where, all_statistics
+from ipe_bench.statistics.records import SCORES, Kind, Statistic, Where, all_statistics
 from ipe_bench.statistics.summary import ALL, BEST
 from ipe_bench.statistics.summary import columns as summary_columns
-
-if TYPE_CHECKING:
-    import pandas as pd
-    from rich.console import Group
 
 _WIDE_ENOUGH = 100
 """Letters of a screen that has room for failures, and for verdicts in words."""
@@ -34,8 +31,6 @@ _TOLD = (
     "With noise=unknown every estimator here is given R, that of the true levels at the nominal readings; bounds and"
     " success are those of parameters that are estimated together with the levels."
 )
-
-
 TRACKED = (
     "For states that move, success is the share of trials that keep the track, and the error is a root mean square"
     " over all epochs. Both are in units of the filter that is linearised at the true path, because the posterior"
@@ -54,20 +49,9 @@ _VERDICTS = {"consistent": ("", ""), "optimistic": ("optimistic", "+"), "pessimi
 _VERDICTS |= {"diverged but confident": ("diverged", "!"), "-": ("", "")}
 
 
-def render(
-    summary: pd.DataFrame | Sequence[Mapping[str, Any]], totals: Iterable[Table] = (), width: int = 120
-) -> Group:
-    """The summary on a terminal: a table per setting, a section per error scale.
-
-    `summary` is the frame or its rows. Runs on certified readings and on problems of known minimum are shown by their
-    `totals` instead.
-    """
-    rows: list[Any] = list(summary) if isinstance(summary, Sequence) else [*summary.to_dict("records")]
-    return terminal(summary_tables(rows, list(totals), width), width)
-
-
 def summary_tables(listed: Sequence[Mapping[str, Any]], totals: Sequence[Table], width: int) -> list[Part]:
-    """A table per setting (measurement, noise, and every option that differs) behind the totals."""
+    """A table per setting (measurement, noise, and every option that differs) behind the totals of runs on certified
+    readings and on problems of known minimum, which are not shown otherwise."""
     # Models whose own readings are certified, without being of a collection, have no totals.
     rows = [row for row in listed if row["parameter"] == ALL and not (totals and row["noise"] == "certified")]
     known = {*summary_columns(), "parameter", "unit", "estimator", "error_scale"}
@@ -96,22 +80,6 @@ def _setting(title: str, rows: Sequence[Mapping[str, Any]], width: int) -> Table
         title = f"{title}: {counts[0]} trial{'s' * (counts[0] != 1)} per row"
     columns += statistics("terminal", rows)
     return Table("summary", title, "", columns, grouped=1, whole="summary.csv")
-
-
-def statistics(where: Where, rows: Sequence[Mapping[str, Any]]) -> list[Column]:
-    """The columns of the statistics that are shown in that table."""
-    columns: list[Column] = []
-    for record in (*all_statistics(), *SCORES):
-        if where not in record.where or not reported(record, rows):
-            continue
-        numeric = record.kind != "word"
-        cells = [Cell(shown(record, where, row), sort_key(row[record.name]) if numeric else None) for row in rows]
-        columns.append(Column(record.titles.get(where, record.title), cells, numeric))
-        if where in record.limits_titles:
-            ends = [limits(record, where, row) for row in rows]
-            low, high = zip(*ends, strict=True) if ends else ((), ())
-            columns.append(interval(record.limits_titles[where], low, high, shower(record.kind, where)))
-    return columns
 
 
 def leading(rows: Sequence[Mapping[str, Any]], scenario: Sequence[str]) -> list[bool]:
@@ -155,3 +123,60 @@ def overview_columns(rows: Sequence[Mapping[str, Any]], best: Sequence[bool], *,
         cells("cost", "simulations_median", lambda r: brief(r["simulations_median"])),
         cells("time", "time_median_s", lambda r: duration(r["time_median_s"], 2)),
     ]
+
+
+# Statistics ----------------------------------------------------------------------------------------------------------
+
+
+def statistics(where: Where, rows: Sequence[Mapping[str, Any]]) -> list[Column]:
+    """The columns of the statistics that are shown in that table."""
+    columns: list[Column] = []
+    for record in (*all_statistics(), *SCORES):
+        if where not in record.where or not reported(record, rows):
+            continue
+        numeric, show = record.kind != "word", _shower(record.kind, where)
+        cells = [Cell(_shown(record, where, row), sort_key(row[record.name]) if numeric else None) for row in rows]
+        columns.append(Column(record.titles.get(where, record.title), cells, numeric))
+        if where in record.limits_titles:
+            low, high = (
+                [row[name] if _applies(record, where, row) else math.nan for row in rows] for name in record.columns[1:]
+            )
+            columns.append(interval(record.limits_titles[where], low, high, show))
+    return columns
+
+
+def reported(record: Statistic, rows: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether a table has the column of a statistic; a rare one needs a finite value in some row, a rare count one
+    above 0."""
+    values = [row[record.name] for row in rows]
+    return not record.rare or any(math.isfinite(v) and (v > 0 or record.kind != "count") for v in values)
+
+
+def _shown(record: Statistic, where: Where, row: Mapping[str, Any]) -> str:
+    """A value as it stands in a table, with the number of trials that it is conditional on unless that is all."""
+    if not _applies(record, where, row):
+        return "-"
+    text = _shower(record.kind, where)(row[record.name])
+    if record.given and text != "-" and row[record.count] < row["trials"]:
+        text += f" ({int(row[record.count])})"
+    return text
+
+
+def _applies(record: Statistic, where: Where, row: Mapping[str, Any]) -> bool:
+    """Whether a row can have the statistic: what solves no equation has nothing to say of solved trials. In the
+    tables of parameters and of states its finished trials stand in for them."""
+    return record.given != "solved" or where in ("parameters", "tracks") or row["equation"] != "-"
+
+
+def _shower(kind: Kind, where: Where) -> Callable[[Any], str]:
+    """How values of that kind are written in that table."""
+    return {
+        "count": lambda v: f"{int(v):d}" if math.isfinite(v) else "-",
+        "share": percent,
+        "number": short,
+        # Physical units are of any size.
+        "physical": (lambda v: f"{v:.4g}" if math.isfinite(v) else short(v)) if where == "parameters" else short,
+        "seconds": (lambda v: duration(v, 2)) if where == "terminal" else duration,
+        "probability": p_value,
+        "word": str,
+    }[kind]

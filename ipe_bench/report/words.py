@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from ipe_bench.statistics.records import Kind, Statistic, Where
+from ipe_bench import __version__
+
+CITATION = (
+    f"The ipe-bench developers (2026). ipe-bench, version {__version__} [computer program]. Beside it, state the"
+    " command, the git commit and the source's digest that stand with the provenance, and the digest of the bundle"
+    " where results are shared as one (`ipe-bench bundle`)."
+)
+"""How results of the bench are cited."""
 
 
 def plain(value: Any) -> str:
@@ -91,49 +98,3 @@ def p_value(p: float, least: float = 0.0) -> str:
     if p <= least and least > 0:
         return f"≤{p_value(least)}"
     return f"{p:.3f}" if p >= 1e-3 else f"{p:.0e}" if p > 1e-300 else "<1e-300"
-
-
-# Statistics ----------------------------------------------------------------------------------------------------------
-
-
-def shower(kind: Kind, where: Where) -> Callable[[Any], str]:
-    """How values of that kind are written in that table."""
-    return {
-        "count": lambda v: f"{int(v):d}" if math.isfinite(v) else "-",
-        "share": percent,
-        "number": short,
-        # Physical units are of any size.
-        "physical": (lambda v: f"{v:.4g}" if math.isfinite(v) else short(v)) if where == "parameters" else short,
-        "seconds": (lambda v: duration(v, 2)) if where == "terminal" else duration,
-        "probability": p_value,
-        "word": str,
-    }[kind]
-
-
-def _applies(record: Statistic, where: Where, row: Mapping[str, Any]) -> bool:
-    """Whether a row can have the statistic: what solves no equation has nothing to say of solved trials. In the
-    tables of parameters and of states its finished trials stand in for them."""
-    return record.given != "solved" or where in ("parameters", "tracks") or row["equation"] != "-"
-
-
-def reported(record: Statistic, rows: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether a table has the column of a statistic; a rare one needs a finite value in some row, a rare count one
-    above 0."""
-    values = [row[record.name] for row in rows]
-    return not record.rare or any(math.isfinite(v) and (v > 0 or record.kind != "count") for v in values)
-
-
-def shown(record: Statistic, where: Where, row: Mapping[str, Any]) -> str:
-    """A value as it stands in a table, with the number of trials that it is conditional on unless that is all."""
-    if not _applies(record, where, row):
-        return "-"
-    text = shower(record.kind, where)(row[record.name])
-    if record.given and text != "-" and row[record.count] < row["trials"]:
-        text += f" ({int(row[record.count])})"
-    return text
-
-
-def limits(record: Statistic, where: Where, row: Mapping[str, Any]) -> tuple[float, float]:
-    """The ends of a statistic's interval; NaN if it has none."""
-    low, high = (float(row[name]) for name in record.columns[1:])
-    return (low, high) if math.isfinite(low) and _applies(record, where, row) else (math.nan, math.nan)

@@ -7,7 +7,8 @@ from rich.console import Console
 import ipe_bench as ib
 from ipe_bench.measurements import Formula
 from ipe_bench.noise import Gaussian, Unknown
-from ipe_bench.report.terminal import render
+from ipe_bench.report.table import terminal
+from ipe_bench.report.terminal import summary_tables
 from ipe_bench.trials.scoring import Block
 
 TIMES = tuple(np.linspace(0.2, 8.0, 12))
@@ -44,7 +45,7 @@ def test_estimators_are_told_the_nominal_level_and_marked_so(tmp_path):
     total = frame[frame["parameter"] == "all"].iloc[0]
     assert total["success"] > 0.95
     with (shown := Console(width=200)).capture() as printed:
-        shown.print(render(frame))
+        shown.print(terminal(summary_tables(frame.to_dict("records"), [], 120), 120))
     assert "every estimator here is given R, that of the true levels" in printed.get()
 
 

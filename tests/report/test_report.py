@@ -20,12 +20,12 @@ from synthetic_store import Filter, Seeker, Synthetic
 from ipe_bench.api import report as write_report
 from ipe_bench.noise import Quantization
 from ipe_bench.report import figures
-from ipe_bench.report.definitions import DEFINITIONS
 from ipe_bench.report.headline import about, headline
+from ipe_bench.report.html import DEFINITIONS
 from ipe_bench.report.table import Strong, Table, column, comma_separated, html, latex, markdown, terminal, texts, words
 from ipe_bench.report.tables import all_tables
-from ipe_bench.report.terminal import LEGEND, render
-from ipe_bench.report.words import compact, duration, percent, reported, short
+from ipe_bench.report.terminal import LEGEND, reported, summary_tables
+from ipe_bench.report.words import compact, duration, percent, short
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.records import SCORES, STATISTICS, frame_columns
 
@@ -170,7 +170,7 @@ def test_a_record_is_all_that_a_statistic_needs(result):
     page = result.report.read_text(encoding="utf-8")
     tables = {t.name: t for t in all_tables(analyse([result.report.parent]))}
     out = io.StringIO()
-    Console(file=out, width=300).print(render(result.summary))
+    Console(file=out, width=300).print(terminal(summary_tables(result.summary.to_dict("records"), [], 300), 300))
     rows = result.summary.to_dict("records")
     for record in (*STATISTICS, *SCORES):
         assert (record.title, record.definition) in DEFINITIONS

@@ -8,8 +8,8 @@ from ipe_bench.baselines import LeastSquares, LevenbergMarquardt
 from ipe_bench.measurements import Mgh
 from ipe_bench.measurements.mgh import functions
 from ipe_bench.noise import Certified
+from ipe_bench.report.table import terminal
 from ipe_bench.report.tables import certified_tables
-from ipe_bench.report.terminal import render
 from ipe_bench.runs.run import compute
 from ipe_bench.solvers import Auto, Progressive
 from ipe_bench.statistics.certified import attained_table, attained_totals, data_profile
@@ -75,7 +75,7 @@ def test_the_terminal_and_the_report_show_them(folder):
     collection = collect([folder])
     console = Console(width=140, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     with console.file:
-        console.print(render([], certified_tables(collection), 140))
+        console.print(terminal(certified_tables(collection), 140))
         shown = console.export_text()
     assert "Known minima" in shown
     assert "nothing is stored" not in shown

@@ -15,8 +15,9 @@ from synthetic_store import Pretender, Repeated
 import ipe_bench as ib
 from ipe_bench.cli.main import main
 from ipe_bench.noise import Correlated, Gaussian
+from ipe_bench.report.table import terminal
 from ipe_bench.report.tables import overview
-from ipe_bench.report.terminal import render
+from ipe_bench.report.terminal import summary_tables
 from ipe_bench.runs.key import ResultKey
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.collect import collect
@@ -43,7 +44,7 @@ def headings(directory) -> tuple[list[str], list[tuple[str, ...]]]:
     """The titles in the terminal, and what tells the rows of the overview apart."""
     analysis = analyse([directory])
     out = io.StringIO()
-    Console(file=out, width=250).print(render(analysis.summary))
+    Console(file=out, width=250).print(terminal(summary_tables(analysis.summary.to_dict("records"), [], 250), 250))
     titles = titles_in(out.getvalue())
     table = overview(analysis)
     named = [column.title for column in table.columns].index("estimator") + 1

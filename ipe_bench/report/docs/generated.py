@@ -23,8 +23,8 @@ from ipe_bench.basics.files import make_folder, write_text
 from ipe_bench.basics.statuses import Status
 from ipe_bench.plugins.construct import described
 from ipe_bench.plugins.discovery import PACKAGES, Option, options
-from ipe_bench.report.definitions import DEFINITIONS
 from ipe_bench.report.figures import INDEX
+from ipe_bench.report.html import DEFINITIONS
 from ipe_bench.report.table import environment
 from ipe_bench.report.words import brief, duration, enumerate_few, percent
 from ipe_bench.statistics.records import STATISTICS
