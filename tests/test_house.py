@@ -35,7 +35,7 @@ BUDGETS = {
     "baselines": 2081,
     "trials": 2373,
     "runs": 2230,
-    "statistics": 4198,
+    "statistics": 4111,
     "real": 2385,
     "plugins": 1185,
     "report": 4197,

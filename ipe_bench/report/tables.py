@@ -51,7 +51,7 @@ _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     ),
     "all_trials": (
         "All trials",
-        "Over all trials. Root mean squares and efficiency are not capped here, so a single trial may decide them.",
+        "Over all trials, the same for every estimator.",
         lambda rows: rows["trials"] > 0,
     ),
     "solved_trials": (

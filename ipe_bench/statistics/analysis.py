@@ -171,7 +171,7 @@ def _joined(parts: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> pd.Da
 
 def _contraction_rows(collection: Collection, group: Group) -> list[dict[str, Any]]:
     """Median and largest contraction constants over the scenario's trials, and how often they promise convergence."""
-    parts = [collection.load(truth, (), CONTRACTION) for _, truth in group.cells if truth is not None]
+    parts = [collection.load(truth, (), CONTRACTION) for truth in group.truths if truth is not None]
     if not parts or any(name not in part for part in parts for name in CONTRACTION):
         return []
     row = dict(group.columns)

@@ -177,7 +177,7 @@ def left_out(first: Collection, second: Collection) -> list[str]:
 def _by_scenario(collection: Collection) -> dict[_Leaves, list[Group]]:
     found: dict[_Leaves, list[Group]] = {}
     for group in collection.groups:
-        leaves = config_leaves(scenario_of(group.cells[0][0])).items()
+        leaves = config_leaves(scenario_of(group.cells[0])).items()
         scenario = tuple(sorted((k, canonical_json(v)) for k, (_, v) in leaves))
         found.setdefault(scenario, []).append(group)
     return found

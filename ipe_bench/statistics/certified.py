@@ -102,7 +102,7 @@ def data_profile(table: pd.DataFrame) -> pd.DataFrame:
 def _certified(collection: Collection, measurement: str) -> Iterator[tuple[Group, StoredCell, dict[str, Any]]]:
     """The results on a measurement's certified readings, with what the measurement was described by."""
     for group in collection.groups:
-        for cell, _ in group.cells:
+        for cell in group.cells:
             names = cell.footer["names"]
             if names["noise"] == "certified" and names["measurement"] == measurement:
                 yield group, cell, cell.footer["identity"]["scenario"]["measurement"]
@@ -123,6 +123,6 @@ def published_table(collection: Collection) -> pd.DataFrame:
         model = group.footer["identity"]["scenario"].get("model", {})
         for state, published in model.get("published", {}).items():
             if (known := published.get(group.label)) is not None:
-                (found,) = collection.load(group.cells[0][0], [f"path_{state}"])[f"path_{state}"]
+                (found,) = collection.load(group.cells[0], [f"path_{state}"])[f"path_{state}"]
                 rows.append((group.columns["measurement"], state, group.estimator, known, found, found - known))
     return pd.DataFrame(rows, columns=["model", "state", "estimator", "published", "found", "difference"])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection as Keys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,16 +34,18 @@ class Group:
     """The estimator's label, with the options that differ where one label stands for several configs."""
     options: Mapping[str, Any]
     """Those options, as columns."""
-    cells: tuple[tuple[StoredCell, StoredCell | None], ...]
-    """Each seed's estimates with the truth that belongs to them."""
+    cells: tuple[StoredCell, ...]
+    """Each seed's estimates."""
+    truths: tuple[StoredCell | None, ...]
+    """The truth that belongs to each of them."""
 
     @property
     def footer(self) -> Mapping[str, Any]:
-        return self.cells[0][0].footer
+        return self.cells[0].footer
 
     @property
     def label(self) -> str:
-        return self.cells[0][0].label
+        return self.cells[0].label
 
 
 @dataclass
@@ -83,7 +85,7 @@ def trials_frame(collection: Collection) -> pd.DataFrame:
 
     parts = []
     for group in collection.groups:
-        for cell, truth in group.cells:
+        for cell, truth in zip(group.cells, group.truths, strict=True):
             rows = pd.DataFrame(collection.load(cell, None))
             known = {} if truth is None else collection.load(truth, None)
             rows = rows.merge(pd.DataFrame(known), on="trial", how="left") if known else rows
@@ -100,14 +102,15 @@ def trials_frame(collection: Collection) -> pd.DataFrame:
 
 
 def config_leaves(description: Any, prefix: str = "") -> dict[str, tuple[str, Any]]:
-    """Dotted keys with (class that holds the leaf, plain value); a component's own class stands under its own key."""
+    """Dotted keys with (class that holds the leaf, plain value); a component's own class stands under its own key, that
+    of the whole under `TARGET`."""
     if isinstance(description, list) and any(isinstance(v, Mapping) for v in description):
         description = {str(i): v for i, v in enumerate(description)}
     if not isinstance(description, Mapping):
         # A list is one value, however long: two of different lengths differ.
         return {prefix: ("", canonical_json(description) if isinstance(description, list) else description)}
     holder = str(description.get(TARGET, ""))
-    result: dict[str, tuple[str, Any]] = {prefix: ("", holder)} if TARGET in description and prefix else {}
+    result: dict[str, tuple[str, Any]] = {prefix or TARGET: ("", holder)} if TARGET in description else {}
     for key, value in description.items():
         if key != TARGET:
             inner = config_leaves(value, f"{prefix}.{key}" if prefix else str(key))
@@ -131,30 +134,34 @@ def _groups(cells: Sequence[StoredCell], runs: Sequence[Run]) -> tuple[Group, ..
     """One group per scenario and estimator: what was constructed decides which those are, and names only show it."""
     truths = {cell.scenario_id: cell for cell in cells if cell.label == TRUTH}
     found: dict[tuple[str, str, str], list[StoredCell]] = {}
+    configs: dict[str, dict[str, Any]] = {}
     for cell in cells:
         if cell.label != TRUTH:
-            what = canonical_json(scenario_of(cell)), cell.label, canonical_json(cell.footer["identity"]["estimator"])
+            config = cell.footer["identity"]["estimator"]
+            what = canonical_json(scenario_of(cell)), cell.label, canonical_json(config)
             found.setdefault(what, []).append(cell)
+            configs.setdefault(cell.label, {})[what[2]] = config
     firsts = [members[0] for members in found.values()]
     extra = [k for k in differing([scenario_of(cell) for cell in firsts]) if k != "error_scale"]
     extra = [k for k in extra if not _stands_in_a_name(k, firsts)]
-    options = _options(firsts)
+    options = {label: differing(list(several.values())) for label, several in configs.items()}
+    labels = dict.fromkeys(str(cell["names"].get("estimator")) for run in runs for cell in run.record["cells"])
+    order = {label: i for i, label in enumerate(labels)}
     groups = []
     for members in found.values():
         first = members[0]
-        chosen = _shown(first.footer["identity"]["estimator"], options.get(first.label, ()))
+        chosen = _shown(first.footer["identity"]["estimator"], options[first.label])
         columns = {k: first.names[k] for k in ("measurement", "noise")} | _shown(scenario_of(first), extra)
-        label = first.label + (f" ({', '.join(f'{k}={v}' for k, v in chosen.items())})" if chosen else "")
-        pairs = tuple((m, truths.get(m.scenario_id)) for m in sorted(members, key=lambda m: (m.seed, m.key)))
         columns["error_scale"] = first.names["error_scale"]
-        groups.append(Group(columns, label, {f"estimator.{k}": v for k, v in chosen.items()}, pairs))
-    labels = dict.fromkeys(str(cell["names"].get("estimator")) for run in runs for cell in run.record["cells"])
-    order = {label: i for i, label in enumerate(labels)}
+        label = first.label + (f" ({', '.join(f'{k}={v}' for k, v in chosen.items())})" if chosen else "")
+        members.sort(key=lambda cell: (cell.seed, cell.key))
+        known = tuple(truths.get(cell.scenario_id) for cell in members)
+        groups.append(Group(columns, label, {f"estimator.{k}": v for k, v in chosen.items()}, tuple(members), known))
 
     def place(group: Group) -> tuple[Any, ...]:
         return (*map(_sortable, group.columns.values()), order.get(group.label, len(order)), group.estimator)
 
-    return tuple(sorted(_told_apart(list(found), groups), key=place))
+    return tuple(sorted(groups, key=place))
 
 
 def scenario_of(cell: StoredCell) -> dict[str, Any]:
@@ -168,27 +175,6 @@ def _shown(description: Any, keys: Iterable[str]) -> dict[str, Any]:
     return {k: shown_leaf(leaves[k][1]) if k in leaves else None for k in keys}
 
 
-def _told_apart(identities: Sequence[tuple[str, str, str]], groups: Sequence[Group]) -> list[Group]:
-    """The groups; those that no column tells apart get one that does, a digest of their config."""
-    scenarios: dict[str, set[str]] = {}
-    estimators: dict[tuple[str, str], set[str]] = {}
-    for (scenario, _, estimator), group in zip(identities, groups, strict=True):
-        scenarios.setdefault(canonical_json(group.columns), set()).add(scenario)
-        estimators.setdefault((scenario, group.estimator), set()).add(estimator)
-    alike = any(len(different) > 1 for different in scenarios.values())
-    result = []
-    for (scenario, _, estimator), group in zip(identities, groups, strict=True):
-        if alike:
-            # The error scale stays last.
-            columns = {k: v for k, v in group.columns.items() if k != "error_scale"}
-            columns |= {"config": digest(scenario)[:6], "error_scale": group.columns["error_scale"]}
-            group = replace(group, columns=columns)
-        if len(estimators[scenario, group.estimator]) > 1:
-            group = replace(group, estimator=f"{group.estimator} (#{digest(estimator)[:6]})")
-        result.append(group)
-    return result
-
-
 def _stands_in_a_name(key: str, cells: Sequence[StoredCell]) -> bool:
     """Whether the name of the component says already what this leaf says."""
     component = key.split(".")[0]
@@ -199,19 +185,9 @@ def _stands_in_a_name(key: str, cells: Sequence[StoredCell]) -> bool:
     return len(said) == len({name for name, _ in said})
 
 
-def _options(cells: Sequence[StoredCell]) -> dict[str, list[str]]:
-    """By label, the options that differ if one label stands for several configs."""
-    by_label: dict[str, dict[str, Any]] = {}
-    for cell in cells:
-        config = cell.footer["identity"]["estimator"]
-        by_label.setdefault(cell.label, {})[canonical_json(config)] = config
-    several = {label: list(configs.values()) for label, configs in by_label.items() if len(configs) > 1}
-    return {label: differing(configs) or [TARGET] for label, configs in several.items()}
-
-
 def shown_leaf(value: Any) -> Any:
-    """A leaf as it stands in a table: a class by its own name, a long list by its beginning and a digest of it all."""
-    if isinstance(value, str) and value.count(".") >= 2 and value.replace(".", "_").isidentifier():
+    """A leaf as it stands in a table: a class of ours by its own name, a long text by its beginning and a digest."""
+    if isinstance(value, str) and value.startswith("ipe_bench."):
         return value.rpartition(".")[2]
     if isinstance(value, str) and len(value) > _LONGEST:
         return f"{value[: _LONGEST - 10]}… #{digest(value)[:6]}"

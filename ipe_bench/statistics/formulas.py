@@ -112,11 +112,6 @@ def rmse_common(s: Sample) -> Array:
 
 
 @once
-def rmse_all(s: Sample) -> Array:
-    return np.sqrt(mean(np.where(np.isfinite(s.error), s.error**2, np.inf)))
-
-
-@once
 def products(s: Sample) -> Array:
     """Sums (n, n) over solved trials of products of the deviations of errors from their mean, in multiples of the
     linear bound: parameters may differ by many orders of magnitude."""
@@ -268,12 +263,6 @@ def applying_bound(s: Sample) -> Array:
     return bayes(s) if s.bound_kind == "bayes" else crlb(s)
 
 
-@once
-def bound_all(s: Sample) -> Array:
-    """The same over all trials."""
-    return np.sqrt(mean(s.of_truth(s.bound_kind) ** 2))
-
-
 def efficiency(s: Sample) -> Array:
     return ratio(in_units(applying_bound(s), s), in_units(rmse(s), s))
 
@@ -283,13 +272,8 @@ def efficiency_limits(s: Sample) -> Limits:
     return ratio(bound, high), ratio(bound, low)
 
 
-def efficiency_all(s: Sample) -> Array:
-    whole = ratio(rms(bound_all(s) / s.linear_bound), rms(rmse_all(s) / s.linear_bound))
-    return np.append(ratio(bound_all(s), rmse_all(s)), whole)
-
-
 @once
-def _van_trees(s: Sample) -> tuple[Array, Array]:
+def van_trees(s: Sample) -> tuple[Array, Array]:
     """The bound (n,) over the first trials of the seeds, and its standard error: of the mean of squared bounds, whose
     errors are twice the bound times its own."""
     bound, error = s.of_truth("van_trees"), s.of_truth("van_trees_error")
@@ -298,13 +282,9 @@ def _van_trees(s: Sample) -> tuple[Array, Array]:
     return middle, np.sqrt(mean((2 * bound * error) ** 2, drawn) / max(1, int(drawn.sum()))) / (2 * middle)
 
 
-def van_trees(s: Sample) -> Array:
-    return _van_trees(s)[0]
-
-
 def van_trees_limits(s: Sample) -> Limits:
     """Where the bound lies for truths without end, by the scatter of the information among those it is from."""
-    bound, error = _van_trees(s)
+    bound, error = van_trees(s)
     return in_units(np.maximum(bound - NORMAL_95 * error, 0.0), s), in_units(bound + NORMAL_95 * error, s)
 
 
@@ -321,7 +301,7 @@ def _compensation(s: Sample) -> Array:
 
 
 @once
-def _predicted(s: Sample) -> tuple[Array, Array]:
+def predicted(s: Sample) -> tuple[Array, Array]:
     """Bias (n,) and root mean square error (n,) that theory expects of least squares; NaN of other estimators.
 
     Where readings come from another model, from each trial's pseudo-true parameters and the scatter about them; where
@@ -337,14 +317,6 @@ def _predicted(s: Sample) -> tuple[Array, Array]:
     known: Array = np.asarray(np.isfinite(box).all(axis=1))
     square = mean(box**2, known)
     return mean(box, known), np.sqrt(mean(s.crlb**2, s.solved) + np.where(np.isnan(square), 0.0, square))
-
-
-def predicted_bias(s: Sample) -> Array:
-    return _predicted(s)[0]
-
-
-def predicted_rmse(s: Sample) -> Array:
-    return _predicted(s)[1]
 
 
 def median_of_truth(s: Sample, name: str) -> float:
@@ -433,7 +405,7 @@ def fixed_point_bounds(s: Sample) -> list[FixedPointBound]:
     """Eq. (18) for each stored history of fixed-point iteration whose K at the truth is below 1."""
     if not _uses(s, "FixedPoint"):
         return []
-    return [fixed_point_bound(h.iterates, K) for h in s.histories if (K := h.truth["contraction_K"]) < 1]
+    return [fixed_point_bound(h.iterates, h.K) for h in s.histories if h.K < 1]
 
 
 @once
@@ -442,5 +414,5 @@ def constants(s: Sample) -> Array:
     without those that are over too soon to tell."""
     if not _uses(s, "Newton"):
         return np.empty((0, 2))
-    pairs = [(observed_constant(h.iterates), h.truth["curvature_M"]) for h in s.histories]
+    pairs = [(observed_constant(h.iterates), h.M) for h in s.histories]
     return np.array([pair for pair in pairs if np.isfinite(pair).all()]).reshape(-1, 2)

@@ -5,7 +5,6 @@ Iterates are (iterates, n), in multiples of the parameters' units; the last one 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,8 +28,10 @@ class History:
     """(iterates,) from the last iterate, in deviations of the bound."""
     cost: float
     """Of the whole trial."""
-    truth: Mapping[str, float]
-    """What the paper's theorems ask of the model at the truth, by its column; NaN where it is not stored."""
+    K: float
+    """Of eq. (15) at the truth; NaN where it is not stored, as is M."""
+    M: float
+    """Of eq. (23) at the truth."""
 
     @property
     def cost_to_limit(self) -> float:

@@ -366,7 +366,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " Detection, Estimation, and Modulation Theory I, 1968, sec. 2.4): standard deviation. The mean E is over"
         f" {EXPECTED} truths of each seed; its interval, 95 %, is that of this mean. Of states that move: the posterior"
         " Cramér-Rao bound (Tichavský, Muravchik and Nehorai, IEEE TSP 46, 1998).",
-        f.of_each(f.van_trees),
+        f.of_each(lambda s: f.van_trees(s)[0]),
         limits=f.van_trees_limits,
         kind="physical",
         where=("parameters",),
@@ -378,7 +378,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "Mean error of least squares by theory. Under a wrong model it is the distance to the parameters that come"
         " closest to the error-free readings (Vuong, Caltech working paper 652, 1986); under the right one it is the"
         " bias of second order (Box, J. R. Stat. Soc. B 33, 1971).",
-        f.of_each(f.predicted_bias),
+        f.of_each(lambda s: f.predicted(s)[0]),
         given="solved",
         kind="physical",
         where=("theory",),
@@ -391,7 +391,7 @@ STATISTICS: tuple[Statistic, ...] = (
         " that distance with the asymptotic covariance A⁻¹ B A⁻¹ of least squares about it (Vuong, 1986; Richmond and"
         " Horowitz, IEEE Trans. Signal Processing 63, 2015), which is not a bound, since another estimator may have a"
         " smaller error; under the right one it combines the Cramér-Rao bound with the bias of second order.",
-        f.of_each(f.predicted_rmse),
+        f.of_each(lambda s: f.predicted(s)[1]),
         given="solved",
         kind="physical",
         where=("theory",),
@@ -457,26 +457,6 @@ STATISTICS: tuple[Statistic, ...] = (
         where=("solved_trials", "parameters"),
         titles={"solved_trials": "efficiency"},
         limits_titles={"solved_trials": "95 % of efficiency"},
-    ),
-    Statistic(
-        "rmse_all",
-        "rmse, all",
-        "all trials",
-        "Root mean square error over all trials; infinite if one of them has no finite estimate.",
-        f.of_each(f.rmse_all),
-        kind="physical",
-        where=("all_trials", "parameters"),
-        titles={"all_trials": "rmse / linear bound"},
-    ),
-    Statistic(
-        "efficiency_all",
-        "efficiency, all",
-        "all trials",
-        "The same bound over the root mean square error of all trials. Because no trial is left out, it compares"
-        " estimators that solve an equation with those that do not.",
-        f.efficiency_all,
-        where=("all_trials", "parameters"),
-        titles={"all_trials": "efficiency, uncapped"},
     ),
     Statistic(
         "median_abs_error",

@@ -66,32 +66,28 @@ class Sample:
         solved."""
         names = [str(p["name"]) for p in group.footer["parameters"]]
         kinds = {kind: [f"{kind}_{name}" for name in names] for kind in ("error", "deviation")}
-        wanted = [*SCALARS, *kinds["error"], *kinds["deviation"]]
-        parts = [collection.load(cell, wanted, OPTIONAL) for cell, _ in group.cells]
-        number = np.concatenate(
-            [_numbers(cell, part["trial"]) for (cell, _), part in zip(group.cells, parts, strict=True)]
-        )
+        parts = [
+            collection.load(cell, [*SCALARS, *kinds["error"], *kinds["deviation"]], OPTIONAL) for cell in group.cells
+        ]
+        every = np.concatenate([_numbers(cell, part["trial"]) for cell, part in zip(group.cells, parts, strict=True)])
         status = np.concatenate([part["status"] for part in parts])
-        unread: Array = np.asarray(status == Status.NO_READINGS.label)
-        used = ~unread if unread.any() else slice(None)
+        used: Array = np.asarray(status != Status.NO_READINGS.label)
 
         def joined(name: str) -> Array:
             """The column, which is forgotten in its parts."""
             return np.concatenate([part.pop(name) for part in parts])[used]
 
         there = [name for name in (*SCALARS, *OPTIONAL) if all(name in part for part in parts)]
-        scalars = {name: _read_only(joined(name)) for name in there}
+        number, scalars = every[used], {name: joined(name) for name in there}
         for name in ("solved", "success"):
-            scalars[name] = _read_only(scalars[name].astype(bool))
-        matrices = {}
-        for kind, columns in kinds.items():
-            values = np.empty((len(columns), len(scalars["status"])))
-            for row, name in zip(values, columns, strict=True):
-                row[:] = joined(name)
-            matrices[kind] = _read_only(values.T)
-        number, unread = _read_only(number[used]), number[unread]
+            scalars[name] = scalars[name].astype(bool)
+        matrices = {kind: np.array([joined(name) for name in columns]).T for kind, columns in kinds.items()}
+        for array in (number, *scalars.values(), *matrices.values()):
+            array.flags.writeable = False
         present, solved = np.isin(number, present), np.isin(number, solved)
-        return cls(collection, group, number, scalars, **matrices, present=present, solved_by_all=solved, unread=unread)
+        return cls(
+            collection, group, number, scalars, **matrices, present=present, solved_by_all=solved, unread=every[~used]
+        )
 
     def __len__(self) -> int:
         return len(self.number)
@@ -169,26 +165,22 @@ class Sample:
     def of_truth(self, kind: str) -> Array:
         """What is stored of the truth for each parameter (trials, n), or (trials,) by a name in `TRUTH`, read anew; NaN
         where it is not stored."""
-        return self._beside(kind)
+        return self._stored(kind, self.group.truths)
 
     def of_estimate(self, kind: str) -> Array:
         """What is stored of the estimates for each parameter (trials, n) besides errors and deviations, read anew."""
-        return self._beside(kind, own=True)
+        return self._stored(kind, self.group.cells)
 
-    def _beside(self, kind: str, *, own: bool = False) -> Array:
+    def _stored(self, kind: str, cells: Sequence[StoredCell | None]) -> Array:
         names = [kind] if kind in TRUTH else [f"{kind}_{name}" for name in self.names]
         values = np.full((len(names), len(self)), np.nan)
-        for cell, truth in self.group.cells:
-            truth = cell if own else truth
-            stored = {} if truth is None else self.collection.load(truth, (), names)
-            if truth is None or not len(stored["trial"]):
-                continue
-            numbers = _numbers(truth, stored["trial"])
-            at = np.minimum(np.searchsorted(numbers, self.number), len(numbers) - 1)
-            there = numbers[at] == self.number
+        for cell in filter(None, cells):
+            stored = self.collection.load(cell, (), names)
+            numbers = _numbers(cell, stored["trial"])
+            _, mine, theirs = np.intersect1d(self.number, numbers, assume_unique=True, return_indices=True)
             for row, name in zip(values, names, strict=True):
                 if name in stored:
-                    row[there] = stored[name][at[there]]
+                    row[mine] = stored[name][theirs]
         return values[0] if kind in TRUTH else values.T
 
     @cached_property
@@ -201,27 +193,24 @@ class Sample:
         """Those of the converged trials whose iterates are stored; none of a filter, which has epochs instead."""
         if not self.iterates:
             return []
-        columns = [f"x_{name}" for name in self.names]
-        stored = [(cell, self.collection.load_history(cell)) for cell, _ in self.group.cells]
-        found = [
-            (row, np.stack([history[c][history["trial"] == trial] for c in columns], axis=1))
-            for cell, history in stored
-            if history is not None
-            for trial in np.unique(history["trial"])
-            for row in np.flatnonzero(self.converged & (self.number == cell.seed * _SEED + trial)).tolist()
-        ]
-        found = [(row, iterates) for row, iterates in found if len(iterates) > 1]
+        found = []
+        for cell in self.group.cells:
+            history = self.collection.load_history(cell) or {"trial": np.empty(0)}
+            for trial in np.unique(history["trial"]):
+                iterates = np.stack([history[f"x_{name}"][history["trial"] == trial] for name in self.names], axis=1)
+                rows = np.flatnonzero(self.converged & (self.number == cell.seed * _SEED + trial))
+                found += [(row, iterates) for row in rows.tolist() if len(iterates) > 1]
         if not found:
             return []
-        crlb = self.crlb
-        truth = {name: self.of_truth(name) for name in TRUTH}
+        crlb, K, M = self.crlb, self.of_truth("contraction_K"), self.of_truth("curvature_M")
         return [
             History(
                 label_of(self.number[row]),
                 iterates,
                 distances_to_limit(iterates, crlb[row]),
                 float(self.cost[row]),
-                {name: float(values[row]) for name, values in truth.items()},
+                float(K[row]),
+                float(M[row]),
             )
             for row, iterates in found
         ]
@@ -235,10 +224,9 @@ def label_of(number: Any) -> str:
 
 def samples(collection: Collection, groups: Sequence[Group]) -> Iterator[Sample]:
     """The samples of one scenario that have trials, one after another."""
-    present: list[Array] = []
-    solved: list[Array] = []
+    present, solved = [], []
     for group in groups:
-        parts = [(cell, collection.load(cell, ["solved"])) for cell, _ in group.cells]
+        parts = [(cell, collection.load(cell, ["solved"])) for cell in group.cells]
         numbers = np.concatenate([_numbers(cell, rows["trial"]) for cell, rows in parts])
         right = np.concatenate([rows["solved"] for _, rows in parts]).astype(bool)
         present += [numbers] if len(numbers) else []
@@ -256,8 +244,3 @@ def _in_all(several: Sequence[Array]) -> Array:
 
 def _numbers(cell: StoredCell, trial: Array) -> Array:
     return cell.seed * _SEED + trial.astype(np.int64)
-
-
-def _read_only(array: Array) -> Array:
-    array.flags.writeable = False
-    return array.view()

@@ -199,7 +199,7 @@ def objective(
             value = float((summary_columns_of(sample)[-1] | rows_of(SCORES, sample)[-1])[column])
             if np.isnan(value):
                 raise UserError(
-                    f"objective={label}.{column}: is not known of {describe_names(sample.group.cells[0][0].names)}"
+                    f"objective={label}.{column}: is not known of {describe_names(sample.group.cells[0].names)}"
                 )
             return value
     raise UserError(f"objective={label}.{column}: no trials of {label} are stored")

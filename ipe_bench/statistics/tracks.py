@@ -5,7 +5,7 @@ Epochs are dependent, so intervals and verdicts are those over trials.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ipe_bench.basics.linalg import Array
+from ipe_bench.runs.results import StoredCell
 from ipe_bench.statistics import formulas as f
 from ipe_bench.statistics.consistency import clopper_pearson, mean_limits, verdict
 from ipe_bench.statistics.sample import NIS, Sample
@@ -86,8 +87,8 @@ def curves(s: Sample) -> Iterator[dict[str, Any]]:
     if not len(times):
         return
     K, n = len(times), s.n
-    own = sum(_sums(s, [cell for cell, _ in s.group.cells], K), np.zeros((K, n + 4)))
-    truths = _sums(s, [truth for _, truth in s.group.cells if truth is not None], K)
+    own = sum(_sums(s, s.group.cells, K), np.zeros((K, n + 4)))
+    truths = _sums(s, [truth for truth in s.group.truths if truth is not None], K)
     errors, nees, count = own[:, :n], own[:, n], own[:, -1]
     total = sum((block[:, : n + 1] for block in truths), np.zeros((K, n + 1)))
     posterior = next((block[:, n + 1 :] for block in truths if np.isfinite(block).all()), np.full((K, 2 * n), np.nan))
@@ -109,7 +110,7 @@ def curves(s: Sample) -> Iterator[dict[str, Any]]:
             }
 
 
-def _sums(s: Sample, cells: list[Any], epochs: int) -> list[Array]:
+def _sums(s: Sample, cells: Sequence[StoredCell], epochs: int) -> list[Array]:
     """The sums (K, columns) of each stored block."""
     stored = (s.collection.load(cell, (), ("curves",)).get("curves", np.empty(0)) for cell in cells)
     return [block for texts in stored for block in unpacked(texts, epochs)]
