@@ -26,7 +26,7 @@ LINE = (
 )
 BUDGETS = {
     "basics": 997,
-    "measurements": 6934,
+    "measurements": 6878,
     "noise": 634,
     "priors": 147,
     "states": 1081,
@@ -36,7 +36,7 @@ BUDGETS = {
     "trials": 2373,
     "runs": 2230,
     "statistics": 4111,
-    "real": 2385,
+    "real": 2384,
     "plugins": 1185,
     "report": 4197,
     "cli": 2561,

@@ -5,8 +5,7 @@ from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded,
 from ipe_bench.measurements.bearings import Bearings
 from ipe_bench.measurements.formula import Formula
 from ipe_bench.measurements.function import Function, function
-from ipe_bench.measurements.gins import Gins
-from ipe_bench.measurements.gins_richer import RicherGins
+from ipe_bench.measurements.gins import Gins, RicherGins
 from ipe_bench.measurements.gnss import Gnss
 from ipe_bench.measurements.mgh import Mgh
 from ipe_bench.measurements.nist import Nist

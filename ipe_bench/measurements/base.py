@@ -6,7 +6,7 @@ A new model is a frozen dataclass that derives from `Measurement` and writes `si
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import attrgetter
@@ -37,6 +37,11 @@ class Parameter:
     size: float = 1.0
     group: str = ""
     """Parameters of one group share a panel in figures; empty: the name is the group."""
+
+
+def parameter_table(*groups: tuple[Iterable[str], str, float, str]) -> tuple[Parameter, ...]:
+    """The parameters of several groups, each of which is names, unit, size and the group's name."""
+    return tuple(Parameter(name, unit, size, group) for names, unit, size, group in groups for name in names)
 
 
 @dataclass(frozen=True)

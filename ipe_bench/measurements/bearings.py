@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Positive
-from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise
+from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise, parameter_table
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class Bearings(Measurement):
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        place = (Parameter(name, "m", self.position_size, "position") for name in ("east", "north"))
-        return (*place, *(Parameter(f"v_{a}", "m/s", self.velocity_size, "velocity") for a in ("east", "north")))
+        place = ("east", "north"), "m", self.position_size, "position"
+        return parameter_table(place, (("v_east", "v_north"), "m/s", self.velocity_size, "velocity"))
 
     @cached_property
     def nominal(self) -> Array:

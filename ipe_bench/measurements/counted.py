@@ -46,14 +46,12 @@ class EvaluationCount:
 
 @dataclass(frozen=True)
 class CountingModel:
-    """A model that counts its evaluations per trial, and in which a trial that raises spoils only itself.
-
-    `share` is the cost of one evaluation: below 1 for a model restricted to the first epochs.
-    """
+    """A model that counts its evaluations per trial, and in which a trial that raises spoils only itself."""
 
     measurement: Measurement
     tally: EvaluationCount
     share: float = 1.0
+    """The cost of one evaluation: below 1 for a model restricted to the first epochs."""
 
     @classmethod
     def uncounted(cls, measurement: Measurement, trials: int) -> CountingModel:
@@ -66,9 +64,9 @@ class CountingModel:
         return self._each_if_raising(self.measurement.simulate, x, rows, (self.measurement.m,))
 
     def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: Mask | bool = False) -> Array:
-        """dh/dx (trials, m, n) for the trials `rows` of the tally. Where it is only for steps `coarse` will do, which
-        counts as what it costs beside an exact one."""
-        # What calls itself here is this method, whatever parameters a subclass leaves out of x.
+        """dh/dx (trials, m, n) for the trials `rows` of the tally; of the trials `coarse` by `coarse_jacobian`,
+        counted as what it costs beside an exact one."""
+        # A subclass may leave parameters out of x, so what is called here is this method and not its own.
         if self.coarse_share == 1.0 or not np.any(coarse):
             return self._jacobian(self.measurement.jacobian, 1.0, x, rows)
         if not np.all(coarse):

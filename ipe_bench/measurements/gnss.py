@@ -14,7 +14,7 @@ import numpy as np
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Positive
-from ipe_bench.measurements.base import Epochs, Input, Measurement, Parameter, UsualNoise
+from ipe_bench.measurements.base import Epochs, Input, Measurement, Parameter, UsualNoise, parameter_table
 
 LIGHT = 299792458.0
 """Speed of light in m/s."""
@@ -133,10 +133,10 @@ class Gnss(Measurement):
     def parameters(self) -> tuple[Parameter, ...]:
         axes = ("east", "north", "up") if self.frame == "enu" else ("x", "y", "z")
         clocks = [f"clock_{k}" for k in self._times] if len(self._times) > 1 else ["clock"]
-        return (
-            *(Parameter(name, "m", self.position_size, "position") for name in axes),
-            *(Parameter(name, "m", self.clock_size, "clock") for name in clocks),
-            *(Parameter(f"offset_{name}", "m", self.offset_size, "offset") for name in self._systems[1:]),
+        return parameter_table(
+            (axes, "m", self.position_size, "position"),
+            (clocks, "m", self.clock_size, "clock"),
+            ([f"offset_{name}" for name in self._systems[1:]], "m", self.offset_size, "offset"),
         )
 
     @cached_property

@@ -179,8 +179,10 @@ class ConstrainedModel(WrappedModel):
         }
 
     def stating(self, key: str, values: Mapping[int, float]) -> Measurement:
-        stated = [ParameterInfo(self.physical_parameters[k].name, **{key: value}) for k, value in values.items()]
-        given = {one.name: one for one in (*self.known, *stated)}
+        given = {one.name: one for one in self.known}
+        for k, value in values.items():
+            name = self.physical_parameters[k].name
+            given[name] = replace(ParameterInfo(name), **{key: value})
         return replace(self, known=tuple(given.values()))
 
     def whole_x(self, x: Array) -> Array:

@@ -1,18 +1,23 @@
-"""What an estimator is told besides the readings: the model, R, and the prior. The truth is not in it."""
+"""What an estimator is told besides the readings: the model, R and the prior, but not the truth."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+import copy
+import time
+from dataclasses import dataclass, is_dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance, pseudo_inverse, read_only
+from ipe_bench.basics.options import component_classes
 from ipe_bench.measurements.base import Measurement
 
 _FIXED = 1e-9
 """A prior deviation of zero is taken for this share of the largest."""
+_PATIENCE_S = 1.0
+"""A model that takes longer for one call is not tried."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +62,7 @@ class Problem:
     def prior_used(self, inflation: float = 1.0) -> Array | None:
         """The prior's standard deviations (n,) times `inflation`; a parameter that the prior fixes is nearly fixed."""
         deviation = self.prior_deviation
-        if deviation is None:
-            return None
-        return inflation * np.maximum(deviation, _FIXED * deviation.max())
+        return None if deviation is None else inflation * np.maximum(deviation, _FIXED * deviation.max())
 
     def prior_covariance(self, inflation: float = 1.0) -> Covariance | None:
         """P0 with its deviations times `inflation`, as `prior_used` has them."""
@@ -77,6 +80,12 @@ class Problem:
         return replace(self, prior_deviation=None, prior_correlation=None)
 
 
+def recorded_problem(measurement: Measurement) -> Problem:
+    """What estimators are told of the readings that come with a model: no prior, since nothing was drawn from one."""
+    assert measurement.recorded is not None
+    return Problem(measurement, measurement.recorded.R)
+
+
 def require_nominal(model: Measurement) -> None:
     """Refuses a model whose nominal point is not (n,)."""
     if np.shape(model.nominal) != (model.n,):
@@ -87,7 +96,42 @@ def require_nominal(model: Measurement) -> None:
         )
 
 
-def recorded_problem(measurement: Measurement) -> Problem:
-    """What estimators are told of the readings that come with a model: no prior, since nothing was drawn from one."""
-    assert measurement.recorded is not None
-    return Problem(measurement, measurement.recorded.R)
+def require_repeatable(model: Measurement) -> None:
+    """Refuses a model from outside of this package that gives one x other readings or other slopes after another x, in
+    another batch, or on a fresh object: they are to be a function of x alone."""
+    if all(cls.__module__.startswith("ipe_bench.") for cls in component_classes(model)):
+        return
+    try:
+        complaint = _irregularity(model)
+    except TypeError:  # options that cannot be hashed
+        complaint = _irregularity.__wrapped__(model)
+    if complaint:
+        raise UserError(f"measurement={model.name}: {complaint}; let h(x) depend on x and the options alone")
+
+
+@lru_cache(maxsize=256)
+def _irregularity(model: Measurement) -> str:
+    """What differs; empty where nothing does, and where a call raises, which is told of by the trials that it ends."""
+    rng = np.random.default_rng(11)
+    x, other = (model.nominal + 0.1 * rng.standard_normal((trials, model.n)) for trials in (4, 7))
+    fresh = replace(model) if is_dataclass(model) else copy.copy(model)  # type: ignore[type-var]
+    for method in ("simulate", "jacobian"):
+        call = getattr(model, method)
+        try:
+            call(x)  # the first call may compile
+            began = time.perf_counter()
+            first = call(x)
+            if time.perf_counter() - began > _PATIENCE_S:
+                continue
+            call(other)
+            ways = {
+                "after another x": call(x),
+                "in another batch": np.concatenate([call(x[:1]), call(x[1:])]),
+                "on a fresh object": getattr(fresh, method)(x),
+            }
+        except Exception:
+            return ""
+        differing = [way for way, z in ways.items() if not np.array_equal(z, first, equal_nan=True)]
+        if differing:
+            return f"{method}(x) has other bits {' and '.join(differing)}"
+    return ""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Positive
-from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise
+from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise, parameter_table
 
 _BEACONS = (
     (1000.0, 0.0, 300.0),
@@ -59,8 +59,8 @@ class Ranging(Measurement):
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        place = (Parameter(name, "m", self.position_size, "position") for name in ("east", "north", "up"))
-        return (*place, Parameter("clock", "m", self.clock_size, "clock bias"))
+        place = ("east", "north", "up"), "m", self.position_size, "position"
+        return parameter_table(place, (("clock",), "m", self.clock_size, "clock bias"))
 
     @cached_property
     def nominal(self) -> Array:

@@ -17,7 +17,7 @@ from annotated_types import MinLen
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Positive
-from ipe_bench.measurements.base import Epochs, Input, Measurement, Parameter, UsualNoise
+from ipe_bench.measurements.base import Epochs, Input, Measurement, Parameter, UsualNoise, parameter_table
 
 Vector = tuple[float, float, float]
 
@@ -58,10 +58,10 @@ class Magnitudes(Measurement):
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         bias, scale, angle = self.error_sizes
-        return (
-            *(Parameter(f"b{a}", self.output_unit, bias, "bias") for a in "xyz"),
-            *(Parameter(f"k{a}", "ppm", 1e6 * scale, "scale factor") for a in "xyz"),
-            *(Parameter(name, "mrad", 1e3 * angle, "misalignment") for name in self.angles),
+        return parameter_table(
+            (("bx", "by", "bz"), self.output_unit, bias, "bias"),
+            (("kx", "ky", "kz"), "ppm", 1e6 * scale, "scale factor"),
+            (self.angles, "mrad", 1e3 * angle, "misalignment"),
         )
 
     @property
@@ -119,9 +119,9 @@ class Triad(Magnitudes):
 
     outputs_option = "outputs"
     angles = ("mxy", "mxz", "myz")
-    reading_unit = output_unit = property(lambda triad: triad.unit)
-    usual_noise = property(lambda triad: UsualNoise(1e-5 * triad.field))
-    error_sizes = property(lambda triad: (2e-3 * triad.field, 2e-3, 2e-3))
+    reading_unit = output_unit = property(lambda triad: triad.unit)  # type: ignore[assignment]
+    usual_noise = property(lambda triad: UsualNoise(1e-5 * triad.field))  # type: ignore[assignment]
+    error_sizes = property(lambda triad: (2e-3 * triad.field, 2e-3, 2e-3))  # type: ignore[assignment]
 
     @cached_property
     def _plain_sizes(self) -> Array:

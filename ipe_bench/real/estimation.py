@@ -18,8 +18,7 @@ from ipe_bench.basics.linalg import Array
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo, informed
-from ipe_bench.measurements.problem import Problem
-from ipe_bench.measurements.repeatable import require_repeatable
+from ipe_bench.measurements.problem import Problem, require_repeatable
 from ipe_bench.noise import Certified, Gaussian, ModelNoise, Noise, Unknown
 from ipe_bench.priors import GaussianPrior, Prior, prior_of
 from ipe_bench.real.examination import Examination, examine

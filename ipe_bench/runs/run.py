@@ -21,7 +21,7 @@ import numpy as np
 from ipe_bench.basics.errors import StorageError, UserError
 from ipe_bench.basics.machine import cores, library_versions
 from ipe_bench.estimators.base import Estimator
-from ipe_bench.measurements.repeatable import require_repeatable
+from ipe_bench.measurements.problem import require_repeatable
 from ipe_bench.noise.unknown import NO_LEVEL
 from ipe_bench.runs.execution import Execution, Serial
 from ipe_bench.runs.key import ResultKey
