@@ -313,7 +313,6 @@ def estimate(
     prior: Prior | None = None,
     error_scale: float | None = None,
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
-    ignore_rows: Sequence[int | str] = (),
     ignore_columns: Sequence[str] = (),
 ) -> Answer: ...
 
@@ -327,7 +326,6 @@ def estimate(
     prior: Prior | None = None,
     error_scale: float | None = None,
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
-    ignore_rows: Sequence[int | str] = (),
     ignore_columns: Sequence[str] = (),
 ) -> Answer | TrackAnswer:
     """Parameters from real readings, by every estimator: estimates, standard errors, residuals and a test of the fit.
@@ -338,9 +336,9 @@ def estimate(
     else one level that is estimated from the residuals (`Unknown`), whose size then cannot test the fit. Filters and
     `map_lm` need a prior: `error_scale` is the standard deviation of each parameter in multiples of its size, which
     `prior` widens or narrows. `parameters` says what is known of each, as in {"k": {"fixed": 2.0}, "c": {"positive":
-    True, "nominal": 3.0}}; also `lower`, `upper` and `deviation`. `ignore_rows` and `ignore_columns` of the files are
-    left out. A fit has its estimates by name in `values`, and `x` and `covariance` in the parameters' own units. The
-    answer is the sequence of the fits; it shows itself in a notebook, and `table()` is a frame.
+    True, "nominal": 3.0}}; also `lower`, `upper` and `deviation`. `ignore_columns` of the files are left out. A
+    fit has its estimates by name in `values`, and `x` and `covariance` in the parameters' own units. The answer is the
+    sequence of the fits; it shows itself in a notebook, and `table()` is a frame.
 
     Of a state model the `estimators` are trackers, `readings` is one log with a row per epoch or an array (K, m), and
     the answer has a track of each (see `ipe_bench.real.tracks`); only `ignore_columns` goes with it.
@@ -360,15 +358,12 @@ def estimate(
     from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
     from ipe_bench.plugins.construct import known_parameters
     from ipe_bench.real.estimation import Question
-    from ipe_bench.real.readings import LeftOut
     from ipe_bench.report.answer import Answer
     from ipe_bench.solvers import Auto
 
     if isinstance(model, StateModel):
         stated = {"noise": noise, "prior": prior, "error_scale": error_scale, "parameters": parameters}
-        if other := [
-            name for name, value in (stated | {"ignore_rows": ignore_rows or None}).items() if value is not None
-        ]:
+        if other := [name for name, value in stated.items() if value is not None]:
             raise UserError(f"{other[0]}=: is of a measurement, and this is a model of states that move; leave it out")
         return _tracked(model, readings, estimators, ignore_columns)
     if not isinstance(model, Measurement):
@@ -381,9 +376,8 @@ def estimate(
     if isinstance(readings, str | Path):
         readings = [readings]
     given = readings if readings is None or isinstance(readings, np.ndarray) else tuple(map(Path, readings))
-    left_out = LeftOut(tuple(ignore_columns), tuple(ignore_rows))
-    stated: dict[str, Any] = {"noise": noise, "prior": prior, "error_scale": error_scale, "left_out": left_out}
-    stated["known"] = known_parameters(parameters or {})
+    stated: dict[str, Any] = {"noise": noise, "prior": prior, "error_scale": error_scale}
+    stated |= {"known": known_parameters(parameters or {}), "ignored": tuple(ignore_columns)}
     return Answer.to(Question(model=model, readings=given, estimators=estimators, **stated).opened())
 
 

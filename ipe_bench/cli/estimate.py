@@ -36,9 +36,9 @@ OF_MANY_TRIALS += ("write_readings_trial", "objective")
 OF_STATES = ("model", "tracker", "trackers")
 """Keys of states that move."""
 OF_CONSTANTS = ("measurement", "truth_measurement", "noise", "prior", "error_scale", "solver", "baseline")
-OF_CONSTANTS += ("estimators", "parameters", "prior_covariance", "write_readings")
+OF_CONSTANTS += ("estimators", "parameters", "write_readings")
 """Keys of parameters that stand still."""
-OF_FILES = ("readings", "ignore_rows", "ignore_columns")
+OF_FILES = ("readings", "ignore_columns")
 """Keys of estimates from real readings."""
 _TRIALS, _MOST_TRIALS = 3, 100
 """Of `posterior`."""
@@ -133,9 +133,8 @@ def _track(asked: Single, model: StateModel) -> int:
     """Tracks the states by every chosen tracker, prints tables and writes files; exit code 1 where no track passes."""
     from ipe_bench.report.tracked import NAME, TABLE, contents, write_tracks
 
-    asked.words.refuse(("ignore_rows",), "is for estimates of constants; empty the cells of the row")
     given, trackers = asked.spec.readings, asked.spec.estimators
-    answer = api.estimate(model, given, trackers, ignore_columns=asked.spec.names("ignore_columns", str))
+    answer = api.estimate(model, given, trackers, ignore_columns=asked.spec.ignored)
     command = {"readings": given, "model": describe(model), "trackers": _described(trackers)}
     files, parts = [answer.log.file] if answer.log.file else [], [answer.log.model, *trackers.values()]
     folder = asked.folder(NAME, command, [TABLE])
@@ -163,7 +162,7 @@ def _command(opened: Opened) -> dict[str, Any]:
         "scenario": describe(opened.scenario),
         "prior": question.has_prior,
         "estimators": _described(question.estimators),
-        **({"left_out": describe(question.left_out)} if question.left_out else {}),
+        **({"left_out": list(question.ignored)} if question.ignored else {}),
     }
 
 

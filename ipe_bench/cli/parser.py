@@ -69,14 +69,13 @@ precision=X            adds trials until the success shares are known to within 
 time_limit=SECONDS     ends this earlier
 objective=NAME.COLUMN  the statistic that a sweeper minimises, as in newton.capped_error
 parameters.NAME.KEY=X  knowledge of a parameter: fixed, nominal, deviation, lower, upper, positive
-prior_covariance=FILE  prior covariance of the parameters in their own units
 output=DIR             folder of the results; the same command in the same folder resumes
 name=NAME              name of the folder under outputs/, in place of the one made of the other keys (default_name)
 figures=main           figures to draw: main, all or none
 formats=pdf,svg        file formats of the figures besides PNG
 block_size=N           trials that are computed at once; it changes no number
 write_readings=FILE    writes the simulated readings of trial write_readings_trial=N, and computes nothing
-readings=FILE          is for `ipe-bench estimate`, as are ignore_rows= and ignore_columns=
+readings=FILE          is for `ipe-bench estimate`, as is ignore_columns=
 +experiment=NAME       an experiment of `ipe-bench list experiment`, which sets some of these keys
 """,
         (
@@ -110,10 +109,9 @@ readings=[A,B]      several files, which share all parameters but those in measu
 noise.deviation=X   the standard deviation of a reading; standard errors and tests rest on it.
 noise=unknown       it is estimated, so the size of residuals tests nothing; noise.by=COLUMN: a level for each entry;
                     "noise.sigma=a + b*h": a formula of the reading's magnitude h and of levels a and b.
-ignore_rows=[3,7]   rows to leave out, by their numbers; ignore_columns=[NAME] leaves out columns.
+ignore_columns=[A]  columns to leave out.
 parameters.NAME.fixed=X, .lower=X, .upper=X   what is known of a parameter; parameters=FILE.yaml has that of many.
 error_scale=X       how far the parameters may lie from the nominal point: the prior of filters and map_lm.
-prior_covariance=F  the same in the parameters' own units: a CSV file of the covariance, headed by their names.
 figures=none        draws nothing.
 output=DIR          where the files go, which are named at the end: outputs/estimate-MODEL unless given, or
                     outputs/estimate-MODEL-2 and so on. Nothing of another command is overwritten.

@@ -71,12 +71,10 @@ class Spec(Component):
     formats: Any = PAGE
     block_size: Count | None = None
     readings: str | tuple[str, ...] | None = None
-    ignore_rows: Any = None
-    ignore_columns: Any = None
+    ignore_columns: str | tuple[str, ...] | None = None
     write_readings: str | None = None
     write_readings_trial: Whole = 0
     parameters: Mapping[str, Any] | None = None
-    prior_covariance: Any = None
     objective: str | None = None
 
     def __post_init__(self) -> None:
@@ -132,10 +130,10 @@ class Spec(Component):
         measurement, truth = (m and informed(m, self.known) for m in (self.measurement, self.truth_measurement))
         assert measurement is not None
         prior = self.prior
-        if self.known or self.prior_covariance is not None:
+        if self.known:
             from ipe_bench.real.estimation import prior_stated
 
-            prior = prior_stated(prior, measurement, self.prior_covariance)
+            prior = prior_stated(prior, measurement)
         return Scenario(measurement, self.noise, prior, self.error_scale, self.seed, truth)
 
     def suited(self) -> Spec:
@@ -151,7 +149,6 @@ class Spec(Component):
         """What is asked of real readings; `stated` are the keys that a user has given, and a part that stands there by
         default is stated by nobody."""
         from ipe_bench.real.estimation import Question
-        from ipe_bench.real.readings import LeftOut
 
         given = (self.readings,) if isinstance(self.readings, str) else self.readings
         if given == ():
@@ -164,17 +161,14 @@ class Spec(Component):
             prior=None if self.prior == GaussianPrior() and "prior" not in stated else self.prior,
             error_scale=self.error_scale if "error_scale" in stated else None,
             known=self.known,
-            covariance=self.prior_covariance,
-            left_out=LeftOut(self.names("ignore_columns", str), self.names("ignore_rows", int, str)),
+            ignored=self.ignored,
         )
 
-    def names(self, key: str, *kinds: type) -> tuple[Any, ...]:
-        given = getattr(self, key)
-        names = given if isinstance(given, tuple) else () if given is None else (given,)
-        for name in names:
-            if not isinstance(name, kinds) or isinstance(name, bool):
-                raise UserError(f"{key}={name}: give names of columns, or numbers of rows, as in {key}=[3,4]")
-        return names
+    @property
+    def ignored(self) -> tuple[str, ...]:
+        """The columns of the files that are left out."""
+        given = self.ignore_columns
+        return (given,) if isinstance(given, str) else given or ()
 
 
 KEYS = tuple(field.name for field in fields(Spec))

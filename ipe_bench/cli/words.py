@@ -38,6 +38,10 @@ _FORMULA = re.compile(
 """Texts that the shell has taken the quotes from; a list of units is none."""
 _FILE = re.compile(rf"\+*(?:(measurement|{TRUTH})\.file|(parameters))=(?![{{$]|null$)(.*)", re.DOTALL)
 
+_GONE = {
+    "ignore_rows": "empty the cells of these readings in the file",
+    "prior_covariance": "give parameters.NAME.deviation and prior.correlations",
+}
 _WHOLE = ("trials", "block_size", "seed", "write_readings_trial")
 """Keys that take a whole number."""
 
@@ -251,6 +255,8 @@ def _check(override: Override, groups: Groups) -> None:
     if first in plugins.PACKAGES:
         remedy = f"{plugins.PACKAGES[first]}.{word.lstrip('+').partition('.')[2]}"
         raise UserError(f"{word}: options are set by label; write {remedy}")
+    if first in _GONE:
+        raise UserError(f"{word}: is no key any more; {_GONE[first]}")
     if first not in KEYS:
         raise UserError(f"{word}: {unknown(first, {*KEYS, *groups, 'experiment'}, 'key')}")
     if group == "estimators":

@@ -12,9 +12,8 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.naming import Named
 from ipe_bench.basics.options import Component, Finite, NonNegative
-from ipe_bench.measurements.base import Measurement
 
-__all__ = ["GaussianPrior", "Prior", "prior_of"]
+__all__ = ["GaussianPrior", "Prior"]
 
 _SYMMETRIC = 1e-6
 """Entries that should be equal may differ by this share of the deviations: files are printed with few digits."""
@@ -72,7 +71,17 @@ class GaussianPrior(Prior):
             C = np.array(self.correlations)
             if not np.allclose(np.diag(C), 1.0, atol=_SYMMETRIC):
                 raise UserError("correlations: has a diagonal that is not 1; give correlations, deviations aside")
-            _require_covariance("correlations", C)
+            if (np.abs(C - C.T) > _SYMMETRIC).any():
+                i, j = np.unravel_index(np.abs(C - C.T).argmax(), C.shape)
+                raise UserError(
+                    f"correlations: is not symmetric; row {i + 1}, column {j + 1} is {C[i, j]:g}, and row {j + 1}, "
+                    f"column {i + 1} is {C[j, i]:g}"
+                )
+            if (least := float(np.linalg.eigvalsh((C + C.T) / 2)[0])) <= _DEFINITE:
+                raise UserError(
+                    f"correlations: is not positive definite; the least eigenvalue is {least:.2g}, so that some "
+                    "combination of the parameters would have no variance"
+                )
 
     def deviation(self, n: int, error_scale: float) -> Array:
         if self.deviations is not None and len(self.deviations) != n:
@@ -95,53 +104,3 @@ class GaussianPrior(Prior):
         n = len(x0)
         white, C = rng.standard_normal(n), self.correlation(n)
         return x0 + self.deviation(n, error_scale) * (white if C is None else np.linalg.cholesky(C) @ white)
-
-
-def prior_of(model: Measurement, P: Array) -> GaussianPrior:
-    """The prior of a covariance P (n, n) in the parameters' own units, at error scale 1.
-
-    Of parameters with bounds it is that of their logarithms or logits, which has this P where it is narrow.
-
-    Raises:
-        UserError: P is not a covariance of n parameters.
-    """
-    P = np.asarray(P, dtype=float)
-    if P.shape != (model.n, model.n):
-        size = " x ".join(map(str, P.shape))
-        names = ", ".join(p.name for p in model.physical_parameters)
-        raise UserError(f"prior_covariance: is {size}; give a row and a column for each of {model.n} ({names})")
-    _require_covariance("prior_covariance", P)
-    deviation = np.sqrt(np.diag(P))
-    slope = model.physical_slope(model.nominal[None])[0]
-    C = P / np.outer(deviation, deviation) * np.outer(np.sign(slope), np.sign(slope))
-    C = (C + C.T) / 2
-    np.fill_diagonal(C, 1.0)
-    return GaussianPrior(tuple((deviation / np.abs(slope)).tolist()), tuple(map(tuple, C.tolist())))
-
-
-def _require_covariance(key: str, P: Array) -> None:
-    """Refuses a square matrix that is not the covariance of anything.
-
-    Raises:
-        UserError: by `key`, and by row and column where one is to blame.
-    """
-    if len(odd := np.argwhere(~np.isfinite(P))):
-        raise UserError(f"{key}: row {odd[0][0] + 1}, column {odd[0][1] + 1} is not a finite number")
-    variances = np.diag(P)
-    if (variances <= 0).any():
-        i = int(np.flatnonzero(variances <= 0)[0])
-        raise UserError(f"{key}: row {i + 1}, column {i + 1} is {variances[i]:g}; a variance is above 0")
-    deviation = np.sqrt(variances)
-    C = P / np.outer(deviation, deviation)
-    if (np.abs(C - C.T) > _SYMMETRIC).any():
-        i, j = np.unravel_index(np.abs(C - C.T).argmax(), C.shape)
-        raise UserError(
-            f"{key}: is not symmetric; row {i + 1}, column {j + 1} is {P[i, j]:g}, and row {j + 1}, column {i + 1} is "
-            f"{P[j, i]:g}"
-        )
-    least = float(np.linalg.eigvalsh((C + C.T) / 2)[0])
-    if least <= _DEFINITE:
-        raise UserError(
-            f"{key}: is not positive definite; the least eigenvalue of its correlations is {least:.2g}, so that some "
-            "combination of the parameters would have no variance"
-        )

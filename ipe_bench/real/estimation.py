@@ -7,9 +7,8 @@ noise and prior make the problem, and only the problem tells whether an estimato
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,16 +19,16 @@ from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo, informed
 from ipe_bench.measurements.problem import Problem, require_repeatable
 from ipe_bench.noise import Certified, Gaussian, ModelNoise, Noise, Unknown
-from ipe_bench.priors import GaussianPrior, Prior, prior_of
+from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.real.examination import Examination, examine
 from ipe_bench.real.fits import Fit, fit
-from ipe_bench.real.readings import SIGMA, LeftOut, Readings, open_together, read_covariance, require_enough
+from ipe_bench.real.readings import SIGMA, Readings, open_together
 from ipe_bench.trials.scenario import Scenario
 
 
 @dataclass(frozen=True, kw_only=True)
 class Question:
-    """All that is stated about an estimate from real readings; None where nothing is."""
+    """All that is stated about an estimate from real readings; None if nothing is."""
 
     model: Measurement
     readings: tuple[Path, ...] | Array | None
@@ -39,9 +38,8 @@ class Question:
     prior: Prior | None = None
     error_scale: float | None = None
     known: tuple[ParameterInfo, ...] = ()
-    covariance: Any = None
-    """P0 in the parameters' own units: rows of numbers, or the name of a CSV file."""
-    left_out: LeftOut = field(default_factory=LeftOut)
+    ignored: tuple[str, ...] = ()
+    """Columns of the files that are left out on purpose."""
 
     def opened(self) -> Opened:
         """The readings, with the scenario and the problem that estimators are told.
@@ -50,11 +48,8 @@ class Question:
             UserError: a file does not hold the model's readings, or an estimator needs what is not stated.
         """
         found = self._readings()
-        model = informed(found.model, self.known)
-        found = replace(found, model=model)
-        if isinstance(self.readings, tuple):
-            require_enough(self.readings, found)
-        prior = prior_stated(self.prior or GaussianPrior(), model, self.covariance)
+        model = found.model
+        prior = prior_stated(self.prior or GaussianPrior(), model)
         scale = 1.0 if self.error_scale is None else self.error_scale
         require_repeatable(model)
         if hindrance := model.hindrance(model.nominal):
@@ -67,27 +62,26 @@ class Question:
     def has_prior(self) -> bool:
         """Whether anything says how far the parameters may lie from the nominal point."""
         deviating = any(one.deviation is not None for one in self.known)
-        return deviating or any(x is not None for x in (self.prior, self.error_scale, self.covariance))
+        return deviating or self.prior is not None or self.error_scale is not None
 
     def _readings(self) -> Readings:
         model, given = self.model, self.readings
-        if self.left_out and not isinstance(given, tuple):
-            remedy = "give readings=FILE, or leave them out" if given is None else "set readings to NaN in an array"
-            raise UserError(f"ignore_rows, ignore_columns: are of files; {remedy}")
-        if given is None:
-            if model.recorded is None:
-                raise UserError("readings: is not given; write readings=FILE (see `ipe-bench list measurement -v`)")
-            return Readings(model, model.recorded.z)
         if isinstance(given, tuple):
             names = [str(path) for path in given]
             if len(set(names)) < len(names):
                 raise UserError(f"readings=[{','.join(names)}]: names a file twice, and would count its readings twice")
-            return open_together(given, model, self.left_out, enough=False)
+            return open_together(given, model, self.known, self.ignored)
+        if self.ignored:
+            raise UserError("ignore_columns: are columns of a file; give readings=FILE, or leave them out")
+        if given is None:
+            if model.recorded is None:
+                raise UserError("readings: is not given; write readings=FILE (see `ipe-bench list measurement -v`)")
+            return Readings(informed(model, self.known), model.recorded.z)
         if given.shape != (model.m,):
             raise UserError(
                 f"readings: has shape {given.shape}; give the {model.m} readings of {model.name}, NaN where missing"
             )
-        return Readings(model, np.array(given, dtype=float))
+        return Readings(informed(model, self.known), np.array(given, dtype=float))
 
     def _noise(self, found: Readings) -> Noise:
         """What is stated, or a file's column of standard deviations, or the model's own; else its level is unknown."""
@@ -146,20 +140,12 @@ class Opened:
         return fits, examine(self.problem, z, fits)
 
 
-def prior_stated(prior: Prior, model: Measurement, covariance: Any = None) -> Prior:
-    """The prior with the standard deviations that are known of single parameters, or with all of a covariance.
+def prior_stated(prior: Prior, model: Measurement) -> Prior:
+    """The prior with the standard deviations that are known of single parameters.
 
     Raises:
-        UserError: it cannot be told of single parameters, or two of these say the same.
+        UserError: it cannot be told of single parameters, or has another number of them.
     """
-    deviating = isinstance(model, ConstrainedModel) and any(one.deviation is not None for one in model.known)
-    if covariance is not None:
-        if not isinstance(prior, GaussianPrior):
-            raise UserError(f"prior_covariance: is for prior=gaussian; with prior={prior.name}, leave it out")
-        if deviating or prior != GaussianPrior():
-            other = "parameters.NAME.deviation" if deviating else "prior.deviations or prior.correlations"
-            raise UserError(f"prior_covariance: says all of the prior; leave out {other}")
-        return prior_of(model, read_covariance(covariance, [p.name for p in model.physical_parameters]))
     if not isinstance(model, ConstrainedModel):
         return prior
     if not isinstance(prior, GaussianPrior):

@@ -25,11 +25,12 @@ from ipe_bench.basics.files import write_atomically
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Input, Measurement
 from ipe_bench.measurements.joint import Joint
-from ipe_bench.measurements.known import ConstrainedModel, informed
+from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo, informed
 
 SIGMA = "sigma"
 """The column of standard deviations of the readings."""
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_MISSING = "a missing reading is an empty cell"
 _WITH_COMMA = re.compile(r"[+-]?\d*,\d*([eE][+-]?\d+)?", re.ASCII)
 
 
@@ -49,48 +50,6 @@ class Readings:
     """Each file with the SHA-256 of the bytes that were read."""
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """What of the files is left out on purpose.
-
-    A row that is left out is a missing reading: it is predicted with its band, where its other cells can be read.
-    """
-
-    columns: tuple[str, ...] = ()
-    """Headings, with their units or without; in all files that have them."""
-    rows: tuple[int | str, ...] = ()
-    """Numbers of rows, as messages and spreadsheets count them; of several files FILE:NUMBER."""
-
-    def __bool__(self) -> bool:
-        return bool(self.columns or self.rows)
-
-    @property
-    def said(self) -> str:
-        """In words; empty where nothing is left out."""
-        parts = [("rows", self.rows), ("columns", self.columns)]
-        return "; ".join(f"{what} {', '.join(map(str, names))}" for what, names in parts if names)
-
-    def rows_of(self, path: Path, paths: Sequence[Path]) -> frozenset[int]:
-        """The rows of one of the files.
-
-        Raises:
-            UserError: a row names no file of those, or is no number.
-        """
-        found = set()
-        for row in self.rows:
-            name, _, number = str(row).rpartition(":")
-            if not (number.strip().isascii() and number.strip().isdigit()):
-                raise UserError(f"ignore_rows={row}: is not the number of a row; messages name rows by their number")
-            if not name and len(paths) > 1:
-                raise UserError(f"ignore_rows={row}: says not of which file; write {paths[0]}:{row}")
-            known = [one for one in paths if name in ("", str(one), one.name)]
-            if len(known) != 1:
-                raise UserError(f"ignore_rows={row}: {unknown(name, [str(one) for one in paths], 'file')}")
-            if known[0] == path:
-                found.add(int(number))
-        return frozenset(found)
-
-
 # Tables of text -------------------------------------------------------------------------------------------------------
 
 
@@ -103,21 +62,19 @@ class Table:
     heading: Sequence[str] = ()
     rows: Sequence[tuple[int, list[str]]] = ()
     decimal: str = "."
-    key: str = "readings"
-    """The key of the config that names the file."""
     digest: str = ""
     """SHA-256 of the bytes that were read."""
 
     def error(self, text: str) -> UserError:
-        return UserError(f"{self.key}={self.path}: {text}")
+        return UserError(f"readings={self.path}: {text}")
 
     def number(self, text: str) -> float | None:
-        """What a cell says in digits that everybody reads alike; None where it says something else."""
+        """The number that a cell says in digits that everybody reads alike; None if it says something else."""
         # A point among decimal commas would be one between thousands, or one of another country: nobody can tell.
         return _number(text.replace(".", "?").replace(",", ".") if self.decimal == "," else text)
 
     def value(self, text: str, where: str) -> float:
-        """The finite number in a cell, NaN where it is empty; `where` names the row and the column.
+        """The finite number in a cell, NaN if it is empty; `where` names the row and the column.
 
         Raises:
             UserError: the cell says something else.
@@ -153,6 +110,12 @@ class Table:
                 hint = f"{meant} Otherwise" if meant else ";"
                 raise self.error(f"{what} is not understood{hint} {remedy} (the header must be {','.join(wanted)})")
 
+    def refuse_other_unit(self, name: str) -> None:
+        """Refuses a column that is there with another unit."""
+        for other in self.heading:
+            if _quantity(other) == _quantity(name):
+                raise self.error(f"column {other}: the unit must be that of {name}; convert the values")
+
 
 def _number(text: str) -> float | None:
     text = text.strip()  # of separators too, which float() does not take
@@ -167,14 +130,29 @@ def _unit(heading: str) -> str:
     return heading.partition("[")[2].rstrip("] ")
 
 
-def read_table(path: Path, *, key: str = "readings", without: Collection[int] = ()) -> Table:
-    """The header and the rows of a CSV or Parquet file, which `key` names in the config. Rows `without` need not be
-    such rows: those with too few or too many cells are left out.
+def read_tables(paths: Sequence[Path], without: Sequence[str] = ()) -> list[Table]:
+    """The tables of files, without the columns of these headings; a file need not have all of them.
 
     Raises:
-        UserError: the file is absent, or not such a table.
+        UserError: a file is absent or not a table, or none has such a column.
     """
-    table = Table(path, key=key)
+    tables = [_read_table(path) for path in paths]
+    for name in without:
+        if not any(table.find(name.strip()) for table in tables):
+            headings = dict.fromkeys(heading for table in tables for heading in table.heading)
+            raise UserError(f"ignore_columns={name}: {unknown(name, list(headings), 'column')}")
+    reduced = []
+    for table in tables:
+        gone = {table.find(name.strip()) for name in without}
+        kept = [k for k, name in enumerate(table.heading) if name not in gone]
+        rows = [(number, [row[k] for k in kept]) for number, row in table.rows]
+        reduced.append(replace(table, heading=[table.heading[k] for k in kept], rows=rows))
+    return reduced
+
+
+def _read_table(path: Path) -> Table:
+    """The header and the rows of a CSV or Parquet file."""
+    table = Table(path)
     if not path.is_file():
         raise table.error("there is no such file")
     data = path.read_bytes()
@@ -187,8 +165,15 @@ def read_table(path: Path, *, key: str = "readings", without: Collection[int] = 
             what = f"column {name} stands there" if name else "columns without a name stand there"
             raise table.error(f"{what} twice; keep one")
     for number, row in table.rows:
-        if len(row) != len(table.heading) and number not in without:
-            raise table.error(_miscounted(table, number, row))
+        if len(row) == len(table.heading):
+            continue
+        if number == table.rows[0][0] and all(cell.strip() and table.number(cell) is None for cell in row):
+            text = "looks like the header, which must be the first row; remove what stands above it"
+        else:
+            decimal = len(row) > len(table.heading) and table.decimal == "."
+            remedy = "with decimal commas, separate the cells by semicolons" if decimal else _MISSING
+            text = f"has {len(row)} cells and the header {len(table.heading)}; {remedy}"
+        raise table.error(f"row {number}: {text}")
     return table
 
 
@@ -223,16 +208,6 @@ def _with_text(table: Table, data: bytes) -> Table:
     (_, heading), *rows = lines
     comma = separator == ";" and any(_WITH_COMMA.fullmatch(cell.strip()) for _, row in rows for cell in row)
     return replace(table, heading=[name.strip() for name in heading], rows=rows, decimal="," if comma else ".")
-
-
-def _miscounted(table: Table, number: int, row: Sequence[str]) -> str:
-    """What is wrong with a row that has more or fewer cells than the header."""
-    if number == table.rows[0][0] and all(cell.strip() and table.number(cell) is None for cell in row):
-        return f"row {number}: looks like the header, which must be the first row; remove what stands above it"
-    text = f"row {number}: has {len(row)} cells and the header {len(table.heading)}"
-    if len(row) > len(table.heading) and table.decimal == ".":
-        return f"{text}; with decimal commas, separate the cells by semicolons"
-    return f"{text}; a missing reading is an empty cell"
 
 
 # Files of a model -----------------------------------------------------------------------------------------------------
@@ -277,78 +252,26 @@ def _write(path: Path, rows: Sequence[Sequence[Any]]) -> None:
 
 
 def open_together(
-    paths: Sequence[Path], model: Measurement, left_out: LeftOut | None = None, *, enough: bool = True
+    paths: Sequence[Path], model: Measurement, known: Sequence[ParameterInfo] = (), without: Sequence[str] = ()
 ) -> Readings:
     """The readings of one file or of several; the latter share the parameters that are not a file's own.
 
-    What is known of parameters (`ConstrainedModel`) is known of all files, where each has its own of each one's.
-    `enough`: refuses fewer readings than parameters.
+    `known` is what is known of the parameters of all files together, which have names of their own if each file has
+    one. `without` are columns that are left out on purpose, by their headings with their units or without.
 
     Raises:
-        UserError: a file is absent or does not hold readings of this model, or files differ in what they know.
+        UserError: a file is absent or does not hold readings of this model, files differ in what they know, or there
+            are fewer readings than parameters.
     """
-    left_out = left_out or LeftOut()
     if isinstance(model, ConstrainedModel):
-        found = open_together(paths, model.whole, left_out, enough=False)
-        found = replace(found, model=informed(found.model, model.known))
-    else:
-        rows = [left_out.rows_of(path, paths) for path in paths]
-        tables = [read_table(path, without=gone) for path, gone in zip(paths, rows, strict=True)]
-        for name in left_out.columns:
-            if all(table.find(name.strip()) is None for table in tables):
-                known = dict.fromkeys(heading for table in tables for heading in table.heading)
-                raise UserError(f"ignore_columns={name}: {unknown(name, list(known), 'column')}")
-        reduced = [_reduced(table, model, left_out.columns, gone) for table, gone in zip(tables, rows, strict=True)]
-        found = _together(paths, [_readings_in(table, model) for table in reduced])
-        found = replace(found, files=tuple((str(table.path), table.digest) for table in tables))
-    if enough:
-        require_enough(paths, found)
-    return found
-
-
-def require_enough(paths: Sequence[Path], found: Readings) -> None:
-    """Refuses fewer readings than parameters."""
-    there = int(np.isfinite(found.z).sum())
-    if there < found.model.n:
+        return open_together(paths, model.whole, (*model.known, *known), without)
+    tables = read_tables(paths, without)
+    found = _together(paths, [_readings_in(table, model) for table in tables])
+    model, files = informed(found.model, known), tuple((str(table.path), table.digest) for table in tables)
+    if (there := int(np.isfinite(found.z).sum())) < model.n:
         shown = str(paths[0]) if len(paths) == 1 else f"[{','.join(map(str, paths))}]"
-        raise UserError(f"readings={shown}: {there} readings are too few for {found.model.n} parameters")
-
-
-def _reduced(table: Table, model: Measurement, columns: Sequence[str], rows: Collection[int]) -> Table:
-    """The table without these columns, and with the readings missing in these rows."""
-    numbers = [number for number, _ in table.rows]
-    for number in sorted(rows):
-        if number not in numbers:
-            there = f"{table.path} has no such row; its rows are {numbers[0]} to {numbers[-1]}" if numbers else ""
-            raise UserError(f"ignore_rows={number}: {there or f'{table.path} has no rows'}")
-    gone = {table.find(name.strip()) for name in columns}
-    kept = [k for k, name in enumerate(table.heading) if name not in gone]
-    heading = [table.heading[k] for k in kept]
-    # Of other lengths are only rows that are left out.
-    same = [(number, [row[k] for k in kept]) for number, row in table.rows if len(row) == len(table.heading)]
-    table = replace(table, heading=heading, rows=same)
-    if not rows:
-        return table
-    emptied = [heading.index(name) for name in (_reading_column(table, model), SIGMA) if name in heading]
-    found = []
-    for number, row in table.rows:
-        if number in rows:
-            row = ["" if k in emptied else cell for k, cell in enumerate(row)]
-            if not _is_known(replace(table, rows=[(number, row)]), model):
-                continue
-        found.append((number, row))
-    return replace(table, rows=found)
-
-
-def _is_known(row: Table, model: Measurement) -> bool:
-    """Whether what a model wants to know of a reading can be read in the one row of a table."""
-    try:
-        for wanted in model.inputs:
-            if column := row.find(wanted.heading):
-                _input(row, wanted, *row.column(column)[0])
-    except UserError:
-        return False
-    return True
+        raise UserError(f"readings={shown}: {there} readings are too few for {model.n} parameters")
+    return replace(found, model=model, files=files)
 
 
 def _together(paths: Sequence[Path], found: Sequence[Readings]) -> Readings:
@@ -415,7 +338,7 @@ def _rows_of(table: Table, model: Measurement, also: Sequence[str]) -> list[int]
     wanted = header(model)
     for name in (*model.index, wanted[-1]):
         if name not in table.heading:
-            _refuse_other_unit(table, name)
+            table.refuse_other_unit(name)
             raise table.error(f"column {name} is missing; the header must be {','.join(wanted)}")
     table.require_known((*wanted, *also), wanted)
     every = list(zip(*model.index.values(), strict=True))
@@ -461,20 +384,13 @@ def _reading_column(table: Table, model: Measurement) -> str:
     if found := next(filter(None, map(table.find, names)), None):
         return found
     for name in names:
-        _refuse_other_unit(table, name)
+        table.refuse_other_unit(name)
     known = [_quantity(wanted.heading) for wanted in model.inputs] + [SIGMA]
     free = [_quantity(name) for name in table.heading if _quantity(name) not in known]
     other = free[0] if len(free) == 1 else "COLUMN"
     remedy = f"set measurement.reading={other}" if hasattr(model, "reading") else f"rename {other}"
     there = ", ".join(table.heading)
     raise table.error(f"column {names[0]} is missing, which holds the readings; there are {there}; {remedy}")
-
-
-def _refuse_other_unit(table: Table, name: str) -> None:
-    """Refuses a column that is there with another unit."""
-    for other in table.heading:
-        if _quantity(other) == _quantity(name):
-            raise table.error(f"column {other}: the unit must be that of {name}; convert the values")
 
 
 def _input(table: Table, wanted: Input, text: str, where: str) -> Any:
@@ -503,57 +419,3 @@ def _sigmas(table: Table, column: str | None, rows: Sequence[int], z: Array, sho
         if (not math.isnan(values[i]) and values[i] <= 0) or (math.isnan(values[i]) and not math.isnan(z[i])):
             raise table.error(f"{where}: '{text}' is not a standard deviation; give a number above 0")
     return values
-
-
-# A covariance ---------------------------------------------------------------------------------------------------------
-
-PRIOR_COVARIANCE = "prior_covariance"
-_NAMED = "parameter"
-"""The column of names, where the rows of a file have names too."""
-
-
-def read_covariance(given: Any, names: Sequence[str]) -> Array:
-    """The matrix (n, n) of the parameters `names`, in their order: rows of numbers, or the name of a CSV file.
-
-    A file has a column for every parameter, headed by its name, in any order; its rows are in the order of the columns,
-    or have names in a column `parameter`.
-
-    Raises:
-        UserError: it is not a matrix of numbers, or of other parameters.
-    """
-    if isinstance(given, str):
-        return _in_file(read_table(Path(given), key=PRIOR_COVARIANCE), names)
-    if not isinstance(given, list | tuple) or not given or not all(isinstance(row, list | tuple) for row in given):
-        raise UserError(f"{PRIOR_COVARIANCE}={given}: give a matrix, [[1,0.5],[0.5,1]], or a CSV file")
-    for i, row in enumerate(given):
-        if len(row) != len(given):
-            raise UserError(f"{PRIOR_COVARIANCE}: row {i + 1} has {len(row)} numbers and there are {len(given)} rows")
-        for value in row:
-            if isinstance(value, bool) or not isinstance(value, int | float):
-                raise UserError(f"{PRIOR_COVARIANCE}: row {i + 1} has '{value}', which is not a number")
-    return np.array(given, dtype=float)
-
-
-def _in_file(table: Table, names: Sequence[str]) -> Array:
-    headings = [name for name in table.heading if name != _NAMED]
-    for name in headings:
-        if name not in names:
-            raise table.error(f"column {name}: {unknown(name, names, 'parameter that is estimated')}")
-    for name in names:
-        if name not in headings:
-            raise table.error(f"has no column {name}; every parameter that is estimated has one")
-    rows = headings
-    if _NAMED in table.heading:
-        rows = [text.strip() for text, _ in table.column(_NAMED)]
-        for name, (_, where) in zip(rows, table.column(_NAMED), strict=True):
-            if name not in names or rows.count(name) > 1:
-                raise table.error(f"{where}: '{name}' is not the name of one parameter, once")
-    if len(table.rows) != len(names):
-        raise table.error(f"has {len(table.rows)} rows and {len(headings)} parameters; give a row for each")
-    found = np.empty((len(names), len(names)))
-    for name in headings:
-        for row, (text, where) in zip(rows, table.column(name), strict=True):
-            if not text.strip():
-                raise table.error(f"{where}: is empty; give 0 where two do not depend on each other")
-            found[names.index(row), names.index(name)] = table.value(text, where)
-    return found

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from scipy.special import chdtrc
 
-from ipe_bench.basics.errors import UserError, unknown
+from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, deviations
-from ipe_bench.real.readings import Table, read_table
+from ipe_bench.real.readings import Table, read_tables
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.formulas import Formulas, Recorded
 from ipe_bench.states.trackers import Tracker
@@ -45,7 +45,7 @@ class Log:
             UserError: they are not readings of this model.
         """
         if isinstance(readings, Path):
-            return _read(read_table(readings), model, ignored)
+            return _read(read_tables([readings], ignored)[0], model)
         if readings is None and not isinstance(model, Recorded):
             raise UserError(f"readings: is not given; write readings=FILE, with the columns {','.join(_wanted(model))}")
         z = model.draw(0, 1).z[0] if readings is None else np.array(readings, dtype=float)
@@ -60,17 +60,13 @@ def _wanted(model: StateModel) -> list[str]:
     return [*(model.inputs if isinstance(model, Formulas) else ()), *model.reading_names]
 
 
-def _read(table: Table, model: StateModel, ignored: Sequence[str]) -> Log:
-    left_out, wanted = {name: table.find(name) for name in ignored}, _wanted(model)
-    for name, heading in left_out.items():
-        if heading is None:
-            raise UserError(f"ignore_columns={name}: {unknown(name, list(table.heading), 'column')}")
-    found = {name: table.find(name) for name in ("epoch", "time", *wanted)}
-    columns = {name: heading for name, heading in found.items() if heading and heading not in left_out.values()}
+def _read(table: Table, model: StateModel) -> Log:
+    wanted = _wanted(model)
+    columns = {name: heading for name in ("epoch", "time", *wanted) if (heading := table.find(name))}
     for name in wanted:
         if name not in columns:
             raise table.error(f"column {name} is missing (the header must be {','.join(wanted)})")
-    table.require_known([*columns.values(), *map(str, left_out.values())], wanted)
+    table.require_known(list(columns.values()), wanted)
     if not table.rows:
         raise table.error("has a header and no rows")
     if gap := next((a + 1 for (a, _), (b, _) in pairwise(table.rows) if b > a + 1), None):

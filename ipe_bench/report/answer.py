@@ -59,13 +59,15 @@ class Answer:
     examination: Examination | None
     """That of the least minimum that was found; None if no estimator without a prior found any."""
     left_out: str = ""
-    """What of the files was left out on purpose."""
+    """The columns of the files that were left out on purpose."""
 
     @classmethod
     def to(cls, opened: Opened, name: str = "") -> Answer:
         """The answer to a question; `name` is what the model is called if that is not its own name."""
         model, fits_and_examination = opened.scenario.measurement, opened.fitted()
-        return cls(name or model.name, model, opened.readings.z, *fits_and_examination, opened.question.left_out.said)
+        return cls(
+            name or model.name, model, opened.readings.z, *fits_and_examination, ", ".join(opened.question.ignored)
+        )
 
     @property
     def passes(self) -> bool:
@@ -236,7 +238,7 @@ def _notes(answer: Answer) -> Iterator[str]:
     if answer.model.fixed:
         yield f"Fixed: {_values(answer.model.fixed)}"
     if answer.left_out:
-        yield f"Left out on purpose: {answer.left_out}."
+        yield f"Left out on purpose: columns {answer.left_out}."
     if failing := [one.label for one in fits if not one.passes]:
         yield f"In brackets: {', '.join(failing)}. Not an answer: errors are not given, for they would be wrong."
 

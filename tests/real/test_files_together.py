@@ -1,7 +1,6 @@
 """Several files of a model whose parameters are fixed, bounded or one file's own, against SciPy; and what is left out
 of a file on purpose, against a file without it."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +9,12 @@ from scipy.optimize import least_squares
 from test_instruments import SATURATION, START, estimate, simulated, solution
 
 import ipe_bench as ib
-from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
+from ipe_bench.baselines import LevenbergMarquardt
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import Formula, Sir
-from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo, informed
+from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.noise import Gaussian, ModelNoise
-from ipe_bench.real.readings import LeftOut, Readings, open_together
+from ipe_bench.real.readings import Readings, open_together
 
 OWN = Formula(SATURATION, START, own=("b1",))
 LM = {"lm": LevenbergMarquardt(tolerance=1e-10, max_iterations=300)}
@@ -30,8 +29,7 @@ def files(tmp_path) -> tuple[list[Path], list[np.ndarray]]:
 
 def together(paths: list[Path], *known: ParameterInfo) -> Readings:
     """The files with what is known of the parameters that they have together."""
-    found = open_together(paths, OWN)
-    return replace(found, model=informed(found.model, known))
+    return open_together(paths, OWN, known)
 
 
 def residuals(data, p, q, rate):
@@ -120,78 +118,43 @@ def test_mistakes_name_the_file_s_own_parameter(files, case):
 # What is left out on purpose
 
 
-def test_rows_that_are_left_out_are_those_that_are_not_there_and_are_predicted(tmp_path):
-    path, columns = simulated(tmp_path / "a.csv", 240.0, 6)
-    lines = path.read_text().splitlines()
-    (tmp_path / "b.csv").write_text("\n".join([*lines[:3], *lines[4:7], *lines[8:]]))
-    model, line = Formula(SATURATION, START), LinearLSE()
-    left, short = (
-        ib.estimate(model, path, {**LM, "line": line}, ignore_rows=[4, 8]),
-        ib.estimate(model, tmp_path / "b.csv", {**LM, "line": line}),
-    )
-    for label in ("lm", "line"):
-        assert left[label].x.tolist() == short[label].x.tolist()
-        assert left[label].p_value == pytest.approx(short[label].p_value, rel=1e-12)
-    assert np.flatnonzero(np.isnan(left.z)).tolist() == [2, 6]
-    x, t = left["lm"].x, columns[:, 0]
-    assert left.examination is not None
-    assert left.examination.fitted == pytest.approx(x[0] * -np.expm1(-x[1] * t), rel=1e-6)
-    assert left.left_out == "rows 4, 8"
-    assert "Left out on purpose: rows 4, 8." in str(left)
-    assert "Left out on purpose: rows 4, 8." in left._repr_html_()
-
-
-def test_a_row_that_nobody_can_read_may_be_left_out(tmp_path):
-    """A word for a reading, a word for a time, and a row of totals with a cell too few."""
-    line = Formula("a+b*t", {"a": 1.0, "b": 1.0})
-    (tmp_path / "a.csv").write_text("t,y,sigma\n0,1,1\n1,saturated,?\n2,3.2,1\nlunch,,\n3,4,1\nsum,8.2\n")
-    with pytest.raises(UserError, match="row 7: has 2 cells"):
-        open_together([tmp_path / "a.csv"], line)
-    found = open_together([tmp_path / "a.csv"], line, LeftOut(rows=(3, 5, 7)))
-    assert found.model.index["t"] == [0.0, 1.0, 2.0, 3.0]
-    assert found.z == pytest.approx([1.0, np.nan, 3.2, 4.0], nan_ok=True)
-    assert found.deviations == pytest.approx([1.0, np.nan, 1.0, 1.0], nan_ok=True)
+def test_columns_that_are_left_out_are_said(tmp_path):
+    path, _ = simulated(tmp_path / "a.csv", 240.0, 6)
+    left = ib.estimate(Formula(SATURATION, START), path, LM, ignore_columns=["sigma"])
+    assert left.left_out == "sigma"
+    for shown in (str(left), left._repr_html_()):
+        assert "Left out on purpose: columns sigma." in shown
 
 
 def test_columns_are_left_out_with_their_units_or_without(tmp_path):
     line = Formula("a+b*t", {"a": 1.0, "b": 1.0})
     (tmp_path / "a.csv").write_text("t,remark,T [C],y,sigma\n0,x,20,1,1\n1,,21,2,9\n2,y,22,4,1\n")
-    found = open_together([tmp_path / "a.csv"], line, LeftOut(columns=("remark", "T", "sigma")))
+    found = open_together([tmp_path / "a.csv"], line, without=("remark", "T", "sigma"))
     assert found.z.tolist() == [1.0, 2.0, 4.0]
     assert found.deviations is None
-    assert open_together([tmp_path / "a.csv"], line, LeftOut(("remark", "T [C]"))).deviations is not None
-
-
-def test_of_several_files_a_row_is_of_one(files):
-    paths, data = files
-    found = open_together(paths, OWN, LeftOut(rows=(f"{paths[1].name}:2", f"{paths[0]}:3")))
-    assert np.flatnonzero(np.isnan(found.z)).tolist() == [1, len(data[0])]
+    assert open_together([tmp_path / "a.csv"], line, without=("remark", "T [C]")).deviations is not None
 
 
 NOT_THERE = {
-    "a column": (LeftOut(("u",)), r"ignore_columns=u: there is no such column \(there are: sigma, t, y\)"),
-    "a row": (LeftOut(rows=(14,)), r"ignore_rows=14: .*240.csv has no such row; its rows are 2 to 13"),
-    "the header": (LeftOut(rows=(1,)), r"ignore_rows=1: .* has no such row"),
-    "no number": (LeftOut(rows=("three",)), r"ignore_rows=three: is not the number of a row"),
-    "no such file": (LeftOut(rows=("c.csv:3",)), r"ignore_rows=c.csv:3: there is no such file"),
-    "what is needed": (LeftOut(("t",)), r"column t is missing"),
-    "the readings": (LeftOut(("y",)), r"column y is missing, which holds the readings"),
-    "nearly all": (LeftOut(rows=tuple(range(3, 14))), r"1 readings are too few for 2 parameters"),
+    "a column": ("u", r"ignore_columns=u: there is no such column \(there are: sigma, t, y\)"),
+    "what is needed": ("t", r"column t is missing"),
+    "the readings": ("y", r"column y is missing, which holds the readings"),
 }
 
 
 @pytest.mark.parametrize("case", NOT_THERE)
 def test_what_is_not_there_cannot_be_left_out(files, case):
-    left_out, expected = NOT_THERE[case]
+    column, expected = NOT_THERE[case]
     with pytest.raises(UserError, match=expected):
-        open_together(files[0][:1], OWN, left_out)
+        open_together(files[0][:1], OWN, without=(column,))
 
 
-def test_a_row_of_several_files_without_its_file_is_refused(files):
-    with pytest.raises(UserError, match=r"ignore_rows=3: says not of which file; write .*240.csv:3"):
-        open_together(files[0], OWN, LeftOut(rows=(3,)))
+def test_fewer_readings_than_parameters_are_refused(tmp_path):
+    (tmp_path / "a.csv").write_text("t,y\n1,2\n2,\n3,\n")
+    with pytest.raises(UserError, match=r"readings=.*a.csv: 1 readings are too few for 2 parameters"):
+        open_together([tmp_path / "a.csv"], OWN)
 
 
-def test_an_array_has_neither_rows_nor_columns():
-    with pytest.raises(UserError, match="set readings to NaN in an array"):
-        ib.estimate(ib.measurements.Polynomial(), np.zeros(40), LM, ignore_rows=[3])
+def test_an_array_has_no_columns():
+    with pytest.raises(UserError, match="ignore_columns: are columns of a file"):
+        ib.estimate(ib.measurements.Polynomial(), np.zeros(40), LM, ignore_columns=["u"])

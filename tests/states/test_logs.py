@@ -127,7 +127,7 @@ def test_the_command_leaves_the_track_and_says_whether_the_filter_is_right(tmp_p
         (["readings=good.csv", "tracker=[newton]"], "tracker=newton: newton is no tracker but a solver"),
         (["readings=good.csv", "baseline=[ekf]"], "baseline: is of a measurement, and model= chooses states that move"),
         (["readings=good.csv", "measurement=gins"], "measurement: is of a measurement, and model= chooses states that"),
-        (["readings=good.csv", "ignore_rows=[2]"], "ignore_rows: is for estimates of constants; empty the cells"),
+        (["readings=good.csv", "ignore_rows=[2]"], "ignore_rows=[2]: is no key any more; empty the cells"),
         (["readings=good.csv", "ignore_columns=[v]"], "ignore_columns=v: there is no such column"),
         (["readings=good.csv", "model.inputs.u=[1,2]"], "model.inputs.u: has 2 numbers; give one, or one for each of"),
     ],

@@ -6,12 +6,9 @@ from small_models import Bent
 
 from ipe_bench.baselines import CKF, EKF, IPLF, LMIEKF, UKF, EnKF, EsMda, IteratedEKF, MapLM
 from ipe_bench.basics.errors import UserError
-from ipe_bench.measurements import Formula
-from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins.conformance import check_component
-from ipe_bench.priors import GaussianPrior, prior_of
-from ipe_bench.real.readings import read_covariance
+from ipe_bench.priors import GaussianPrior
 from ipe_bench.trials.fit_test import spread_of
 from ipe_bench.trials.posterior import sample_posterior
 from ipe_bench.trials.scenario import Scenario
@@ -87,58 +84,22 @@ def test_residuals_of_the_maximum_a_posteriori_scatter_as_is_said(bench):
     assert np.mean(np.sum(r**2, axis=1)) == pytest.approx(spread.mean[0], rel=0.03)
 
 
-def test_a_covariance_is_of_the_parameters_in_their_own_units_and_logarithms():
-    model = informed(
-        Formula("a*exp(-b*t)", {"a": 8.0, "b": 0.2}, {"t": (0.0, 1.0, 2.0)}), (ParameterInfo("b", positive=True),)
-    )
-    P = np.array([[0.25, 0.006], [0.006, 0.0004]])
-    problem = Scenario(model, Gaussian(1.0), prior_of(model, P)).problem
-    inner = problem.prior_covariance().matrix()  # type: ignore[union-attr]
-    # x is a / 8, and (ln b - ln 0.2) / (0.2 / 0.2): db = 0.2 dx.
-    assert inner == pytest.approx(P / np.outer([8.0, 0.2], [8.0, 0.2]), rel=1e-12)
-
-
 REFUSED = {
-    "not symmetric": ([[1, 0.5], [0.4, 1]], r"is not symmetric; row 1, column 2 is 0.5, and row 2, column 1 is 0.4"),
-    "not definite": ([[1, 1.1], [1.1, 1]], r"is not positive definite; the least eigenvalue of its correlations"),
-    "singular": ([[1, 1], [1, 1]], r"is not positive definite"),
-    "a variance of nothing": ([[1, 0], [0, 0]], r"row 2, column 2 is 0; a variance is above 0"),
-    "a variance below nothing": ([[-1, 0], [0, 1]], r"row 1, column 1 is -1"),
-    "too small": ([[1]], r"is 1 x 1; give a row and a column for each of 2 \(a, b\)"),
-    "too large": (np.eye(3).tolist(), r"is 3 x 3; give a row and a column for each of 2"),
-    "not square": ([[1, 0, 0], [0, 1, 0]], r"row 1 has 3 numbers and there are 2 rows"),
-    "not numbers": ([[1, "x"], [0, 1]], r"row 1 has 'x', which is not a number"),
-    "no matrix": (3, r"prior_covariance=3: give a matrix"),
+    "not symmetric": (((1, 0.5), (0.4, 1)), r"is not symmetric; row 1, column 2 is 0.5, and row 2, column 1 is 0.4"),
+    "not definite": (((1, 1.1), (1.1, 1)), r"is not positive definite; the least eigenvalue"),
+    "singular": (((1, 1), (1, 1)), r"is not positive definite"),
+    "not square": (((1, 0, 0), (0, 1, 0)), r"row 1 has 3 numbers; give a square matrix"),
+    "no correlations": (((4, 0), (0, 1)), r"has a diagonal that is not 1"),
 }
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_is_no_covariance_is_refused_in_a_line(case):
+def test_what_is_no_correlation_is_refused_in_a_line(case):
     given, expected = REFUSED[case]
-    model = Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": (0.0, 1.0)})
-    with pytest.raises(UserError, match=expected):
-        prior_of(model, read_covariance(given, ["a", "b"]))
+    with pytest.raises(UserError, match=f"correlations: {expected}"):
+        GaussianPrior(correlations=given)
 
 
-FILES = {
-    "names in another order": ("b,a\n0.25,-0.9\n-0.9,4\n", None),
-    "names of rows": ("parameter,a,b\nb,-0.9,0.25\na,4,-0.9\n", None),
-    "decimal commas": ("a;b\n4;-0,9\n-0,9;0,25\n", None),
-    "another parameter": ("a,c\n1,0\n0,1\n", r"column c: .*parameter that is estimated"),
-    "a parameter less": ("a\n1\n", r"has no column b"),
-    "a row less": ("a,b\n1,0\n", r"has 1 rows and 2 parameters"),
-    "an empty cell": ("a,b\n1,\n0,1\n", r"row 2, column b: is empty"),
-    "no number": ("a,b\n1,x\n0,1\n", r"row 2, column b: 'x' is not a number"),
-    "a name twice": ("parameter,a,b\na,1,0\na,0,1\n", r"row 2, column parameter: 'a' is not the name of one"),
-}
-
-
-@pytest.mark.parametrize("case", FILES)
-def test_a_small_file_holds_it_by_name(tmp_path, case):
-    text, refused = FILES[case]
-    (tmp_path / "p.csv").write_text(text)
-    if refused:
-        with pytest.raises(UserError, match=rf"prior_covariance=.*p.csv: {refused}"):
-            read_covariance(str(tmp_path / "p.csv"), ["a", "b"])
-    else:
-        assert read_covariance(str(tmp_path / "p.csv"), ["a", "b"]).tolist() == [[4.0, -0.9], [-0.9, 0.25]]
+def test_correlations_of_another_number_of_parameters_are_refused():
+    with pytest.raises(UserError, match=r"prior.correlations: has 2 rows; give one for each of 3 parameters"):
+        _ = Scenario(Bent(), Gaussian(1.0), GaussianPrior(correlations=((1.0, 0.0), (0.0, 1.0)))).problem
