@@ -26,7 +26,7 @@ LINE = (
 )
 BUDGETS = {
     "basics": 997,
-    "measurements": 6878,
+    "measurements": 6851,
     "noise": 634,
     "priors": 106,
     "states": 1081,

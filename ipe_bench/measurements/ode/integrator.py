@@ -156,8 +156,8 @@ class Kernel:
             return [*p, *intervals[min(k, len(intervals) - 1), case].T, *directions]
 
         with np.errstate(all="ignore"):
-            y, t = begin(stays(0)), 0.0
-            for k, to in enumerate(times.tolist()):
+            y, t = begin(stays(0)), np.float64(0.0)
+            for k, to in enumerate(times):
                 h = (to - t) / max(int(steps[k]), 1)
                 for s in range(int(steps[k]) if to != t else 0):
                     slopes: list[list[Any]] = []

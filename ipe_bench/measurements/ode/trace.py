@@ -178,32 +178,30 @@ def special(name: str) -> Callable[[Any], Any]:
     return lambda a: getattr(importlib.import_module("scipy.special"), name)(a)
 
 
-_NUMBERS: dict[str, Callable[..., Any]] = {
+_SIGNS: dict[str, Callable[..., Any]] = {
     "add": operator.add,
     "sub": operator.sub,
     "mul": operator.mul,
     "div": operator.truediv,
     "pow": operator.pow,
     "neg": operator.neg,
+}
+_NUMBERS: dict[str, Callable[..., Any]] = _SIGNS | {
     "arctan": math.atan,
     "less": operator.lt,
     "less_equal": operator.le,
     "where": lambda condition, a, b: a if condition else b,
-} | {name: getattr(math, name) for name in _FUNCTIONS if name != "arctan"}
-_ARRAYS: dict[str, Callable[..., Any]] = {
-    "add": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "div": np.divide,
-    "pow": np.power,
-    "neg": np.negative,
+    **{name: getattr(math, name) for name in _FUNCTIONS if name != "arctan"},
+}
+_ARRAYS: dict[str, Callable[..., Any]] = _SIGNS | {
     "less": lambda a, b: np.less(a, b) * 1.0,
     "less_equal": lambda a, b: np.less_equal(a, b) * 1.0,
     "where": lambda condition, a, b: np.where(condition, a, b)[()],
     "fma": lambda a, b, c: a * b + c,
     "fms": lambda a, b, c: a * b - c,
     "fnma": lambda a, b, c: c - a * b,
-} | {name: getattr(np, name, None) or special(name) for name in _FUNCTIONS}
+    **{name: getattr(np, name, None) or special(name) for name in _FUNCTIONS},
+}
 """The operations of a program, on arrays; products are rounded before they are added."""
 _DERIVATIVES: dict[str, Callable[[Any, Any, Any], Any]] = {
     "tan": lambda e, a, one: one + e * e,
@@ -321,78 +319,56 @@ def tangent(outputs: Sequence[Expression], direction: Mapping[Expression, Expres
 def separate(
     tangents: Sequence[Expression], moving: Sequence[Expression], direction: Sequence[Expression]
 ) -> tuple[list[Expression], list[Expression]]:
-    """Tangents, linear in the tangents of the state (`moving`) and in a `direction` of the parameters, with whatever
-    depends on the direction alone replaced by inputs source0, source1, ...; and what these stand for.
+    """Tangents, linear in the tangents of the state (`moving`) and in a `direction` of the parameters, with inputs
+    source0, source1, ... in place of what depends on the direction alone; and what these stand for.
 
     The sources are gathered before they are multiplied, so a direction along one parameter has few that are not zero.
     """
-    parts: dict[int, _Parts] = {e.order: _Parts(e, None) for e in moving}
-    parts |= {e.order: _Parts(None, e) for e in direction}
+    # What depends on the tangents of the state, and what depends on the direction alone.
+    parts: dict[int, _Parts] = {e.order: (e, None) for e in moving}
+    parts |= {e.order: (None, e) for e in direction}
     sources: dict[Expression, Expression] = {}
 
     def joined(part: _Parts) -> Expression:
-        if part.source is None:
-            assert part.homogeneous is not None
-            return part.homogeneous
-        name = sources.setdefault(part.source, part.source.graph.input(f"source{len(sources)}"))
-        return name if part.homogeneous is None else part.homogeneous + name
+        moved, source = part
+        if source is not None:
+            name = sources.setdefault(source, source.graph.input(f"source{len(sources)}"))
+            moved = name if moved is None else moved + name
+        assert moved is not None
+        return moved
 
     for e in in_order(tangents):
-        own = [parts.get(a.order) for a in operands(e)]
-        if e.order in parts or not any(own):
-            continue
-        parts[e.order] = _linear(e, own, joined)
-    outputs = [joined(parts[e.order]) if e.order in parts else e for e in tangents]
-    return outputs, list(sources)
+        own = [parts.get(a.order, _NOTHING) for a in operands(e)]
+        if e.order not in parts and any(part != _NOTHING for part in own):
+            parts[e.order] = _linear(e, own, joined)
+    return [joined(parts[e.order]) if e.order in parts else e for e in tangents], list(sources)
 
 
-@dataclass(frozen=True)
-class _Parts:
-    """A linear expression: what depends on the state's tangents, plus what depends on the direction alone."""
-
-    homogeneous: Expression | None
-    source: Expression | None
+_Parts: TypeAlias = "tuple[Expression | None, Expression | None]"
+_NOTHING: _Parts = (None, None)
 
 
-def _linear(e: Expression, own: list[_Parts | None], joined: Any) -> _Parts:
-    apply = e.graph.apply
-    if e.operation == "neg":
-        (part,) = own
-        assert part is not None
-        return _Parts(*(None if v is None else apply("neg", v) for v in (part.homogeneous, part.source)))
-    if e.operation in ("add", "sub"):
-        first, second = (part or _Parts(None, None) for part in own)
-        pairs = ((first.homogeneous, second.homogeneous), (first.source, second.source))
-        return _Parts(*(_sum(e.operation, a, b) for a, b in pairs))
-    if e.operation == "where":
-        first, second = (part or _Parts(None, None) for part in own[1:])
-        pairs = ((first.homogeneous, second.homogeneous), (first.source, second.source))
-        return _Parts(*(_chosen(operands(e)[0], a, b) for a, b in pairs))
-    place = next(i for i, part in enumerate(own) if part is not None)
-    part = own[place]
-    assert part is not None
-    if e.operation not in ("mul", "div") or (e.operation == "div" and place == 1) or all(own):
+def _linear(e: Expression, own: Sequence[_Parts], joined: Callable[[_Parts], Expression]) -> _Parts:
+    """The parts of an operation that is linear in the parts of its operands."""
+    apply, given = e.graph.apply, operands(e)
+    if e.operation in ("neg", "add", "sub", "where"):
+        held, terms = (given[:1], own[1:]) if e.operation == "where" else ([], own)
+
+        def applied(*values: Expression | None) -> Expression | None:
+            given = [0.0 if v is None else v for v in values]
+            return apply(e.operation, *held, *given) if any(v is not None for v in values) else None
+
+        moved, source = (applied(*values) for values in zip(*terms, strict=True))
+        return moved, source
+    (place, part), *others = [(i, part) for i, part in enumerate(own) if part != _NOTHING]
+    if e.operation not in ("mul", "div") or (e.operation == "div" and place == 1) or others:
         raise TypeError(f"a tangent is not linear: {e.operation}")
 
     def scaled(value: Expression) -> Expression:
-        return apply(e.operation, *(value if i == place else a for i, a in enumerate(operands(e))))
+        return apply(e.operation, *(value if i == place else a for i, a in enumerate(given)))
 
-    if part.homogeneous is None:
-        assert part.source is not None
-        return _Parts(None, scaled(part.source))
-    return _Parts(scaled(joined(part)), None)
-
-
-def _sum(operation: str, a: Expression | None, b: Expression | None) -> Expression | None:
-    if a is None or b is None:
-        return (-b if operation == "sub" else b) if b is not None else a
-    return a.graph.apply(operation, a, b)
-
-
-def _chosen(condition: Expression, a: Expression | None, b: Expression | None) -> Expression | None:
-    if a is None and b is None:
-        return None
-    return condition.graph.apply("where", condition, 0.0 if a is None else a, 0.0 if b is None else b)
+    moved, source = part
+    return (None, scaled(source)) if moved is None and source is not None else (scaled(joined(part)), None)
 
 
 @dataclass(frozen=True)
@@ -421,9 +397,17 @@ class Program:
         number = {e.order: i for i, e in enumerate(inputs)}
         operations: list[tuple[Any, ...]] = []
         for e in needed:
-            if e.order not in inside:
-                operations.append(_operation(e, fused.get(e.order), number))
-                number[e.order] = len(inputs) + len(operations) - 1
+            if e.order in inside:
+                continue
+            if e.operation == "input":
+                raise ValueError(f"the program has no input {e.operands[0]}")
+            if e.operation == "constant":
+                operations.append(("constant", e.value))
+            else:
+                name, product, other = fused.get(e.order, (e.operation, e, None))
+                taken = [*operands(product), *([] if other is None else [other])]
+                operations.append((name, *(number[a.order] for a in taken)))
+            number[e.order] = len(inputs) + len(operations) - 1
         return cls(len(inputs), tuple(operations), tuple(number[e.order] for e in outputs))
 
     @cached_property
@@ -463,14 +447,3 @@ def _fusion(e: Expression, uses: Mapping[int, int], inputs: Collection[Expressio
     if is_product(b):
         return ("fma" if e.operation == "add" else "fnma"), b, a
     return None
-
-
-def _operation(e: Expression, fusion: _Fusion | None, number: Mapping[int, int]) -> tuple[Any, ...]:
-    if fusion is not None:
-        name, product, other = fusion
-        return (name, *(number[a.order] for a in (*operands(product), other)))
-    if e.operation == "constant":
-        return ("constant", e.value)
-    if e.operation == "input":
-        raise ValueError(f"the program has no input {e.operands[0]}")
-    return (e.operation, *(number[a.order] for a in operands(e)))
