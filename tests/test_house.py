@@ -35,7 +35,7 @@ BUDGETS = {
     "baselines": 2081,
     "trials": 2373,
     "runs": 2230,
-    "statistics": 4111,
+    "statistics": 4076,
     "real": 2228,
     "plugins": 1185,
     "report": 4199,

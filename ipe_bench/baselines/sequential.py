@@ -68,7 +68,7 @@ class Sequential(Estimator):
     which `rule` readings are linearised.
 
     Reports the filter's P, and as `extras["nis"]` the trial's squared innovations over their number: 1 on average where
-    the filter is consistent (`ipe_bench.statistics.consistency.mean_limits` has the limits).
+    the filter is consistent (`ipe_bench.statistics.intervals.mean_limits` has the limits).
     """
 
     prior_inflation: Positive = 1.0

@@ -16,7 +16,7 @@ from ipe_bench.real.readings import Table, read_tables
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.formulas import Formulas, Recorded
 from ipe_bench.states.trackers import Tracker
-from ipe_bench.statistics.consistency import mean_limits
+from ipe_bench.statistics.intervals import mean_limits
 from ipe_bench.trials.thresholds import FIT_LEVEL
 from ipe_bench.trials.tracking import track_safely
 from ipe_bench.trials.whiteness import lags_of, ljung_box

@@ -20,8 +20,7 @@ from scipy.special import ndtr, ndtri, stdtr, stdtrit
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.comparisons import holm
-from ipe_bench.statistics.consistency import mean_limits
-from ipe_bench.statistics.intervals import rms_interval
+from ipe_bench.statistics.intervals import mean_limits, rms_interval
 from ipe_bench.trials.observability import in_words
 
 if TYPE_CHECKING:

@@ -14,15 +14,8 @@ from scipy.special import betaincinv, gammaincinv, ndtri
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.calibration import overall_p, overall_words
-from ipe_bench.statistics.consistency import mean_limits
-from ipe_bench.statistics.histories import FixedPointBound, fixed_point_bound, observed_constant
-from ipe_bench.statistics.intervals import (
-    Squares,
-    few_carry,
-    quantile,
-    rms_interval,
-    rms_sequence,
-)
+from ipe_bench.statistics.histories import fixed_point_bound, observed_constant
+from ipe_bench.statistics.intervals import Squares, few_carry, mean_limits, quantile, rms_interval, rms_sequence
 from ipe_bench.statistics.sample import AMBIGUOUS, FIT, NIS, Sample
 from ipe_bench.trials.thresholds import FIT_LEVEL, gate
 
@@ -401,11 +394,11 @@ def _uses(s: Sample, method: str) -> bool:
 
 
 @once
-def fixed_point_bounds(s: Sample) -> list[FixedPointBound]:
-    """Eq. (18) for each stored history of fixed-point iteration whose K at the truth is below 1."""
-    if not _uses(s, "FixedPoint"):
-        return []
-    return [fixed_point_bound(h.iterates, h.K) for h in s.histories if h.K < 1]
+def fixed_point_bounds(s: Sample) -> Array:
+    """(histories, 2): whether eq. (18) holds, and the largest error over its bound, of each stored history of
+    fixed-point iteration whose K at the truth is below 1."""
+    histories = s.histories if _uses(s, "FixedPoint") else ()
+    return np.array([fixed_point_bound(h.iterates, h.K) for h in histories if h.K < 1]).reshape(-1, 2)
 
 
 @once

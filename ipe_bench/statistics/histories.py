@@ -61,36 +61,20 @@ def orders_of(errors: Array, floor: float = FLOOR) -> Array:
     return orders[decreasing]
 
 
-@dataclass(frozen=True)
-class FixedPointBound:
-    """Eq. (18) against what happened, for one trial. Each is (iterates,), in the largest parameter error."""
+def fixed_point_bound(iterates: Array, K: float, limit: Array | None = None) -> tuple[bool, float]:
+    """Whether each iterate's largest error |x_k - limit| is at most K^k / (1 - K) |x_1 - x_0|, eq. (18) with the k that
+    the print lost (Burden and Faires have it), and the largest such ratio among the iterates between the ends.
 
-    bound: Array
-    """K^k / (1 - K) |x_1 - x_0|, infinite where K >= 1. The paper's print lost the k (Burden and Faires have it)."""
-    error: Array
-    """|x_k - limit|."""
-
-    @property
-    def holds(self) -> bool:
-        """Whether no iterate is farther from the limit than the bound (and round-off) allows."""
-        return bool(np.all(self.error <= self.bound + 1e-12 * (1.0 + self.error.max())))
-
-    @property
-    def ratio(self) -> float:
-        """The largest error over its bound among the iterates between the first and the last."""
-        error = self.error[1:-1]
-        with np.errstate(all="ignore"):
-            return float((error / self.bound[1:-1])[error > FLOOR].max(initial=0.0))
-
-
-def fixed_point_bound(iterates: Array, K: float, limit: Array | None = None) -> FixedPointBound:
-    """Eq. (18) with a constant K that holds along the iterates; at a single point K is not a proven bound. `limit` (n,)
-    is the last iterate unless it is given."""
-    limit = iterates[-1] if limit is None else limit
+    The bound holds for a K that holds along the iterates; at a single point K is not a proven one. `limit` (n,) is the
+    last iterate unless it is given.
+    """
+    error = np.abs(iterates - (iterates[-1] if limit is None else limit)).max(axis=1)
     step = np.abs(iterates[1] - iterates[0]).max()
-    powers = K ** np.arange(len(iterates))
-    bound = powers / (1 - K) * step if K < 1 else np.full(len(iterates), np.inf)
-    return FixedPointBound(bound, np.abs(iterates - limit).max(axis=1))
+    bound = K ** np.arange(len(iterates)) / (1 - K) * step if K < 1 else np.full(len(iterates), np.inf)
+    inner = slice(1, -1)
+    with np.errstate(all="ignore"):
+        ratio = (error / bound)[inner][error[inner] > FLOOR].max(initial=0.0)
+    return bool(np.all(error <= bound + 1e-12 * (1.0 + error.max()))), float(ratio)
 
 
 def observed_constant(iterates: Array, limit: Array | None = None, floor: float = FLOOR) -> float:

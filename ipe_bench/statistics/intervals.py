@@ -1,6 +1,6 @@
-"""Intervals: how far a share or a root mean square error may lie from its true value by chance.
+"""How far a share, a root mean square error or a mean NEES may lie from its true value by chance.
 
-Those of a fixed number of trials, and confidence sequences, which hold the true value at all numbers of trials at once
+Intervals are of a fixed number of trials; confidence sequences hold the true value at all numbers of trials at once
 with the stated probability, so that one may look as often as one likes.
 """
 
@@ -11,12 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
-from scipy.special import betaln, ndtri
+from scipy.special import betaincinv, betaln, chdtri, ndtri
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.trials.thresholds import FEW
+from ipe_bench.trials.thresholds import FEW, gate
 
 LEVEL = 0.95
 RESAMPLES = 2000
@@ -33,6 +34,28 @@ _WEIGHT = TIGHTEST / (2 * math.log(20) + math.log(2 * math.log(20)) + 1)
 _HALVINGS = 50
 FIRST = 100
 """Trials from which an asymptotic sequence begins; one that begins earlier misses errors with rare large ones."""
+TOLERATED = 0.01
+"""Share of trials outside their own gate above which an estimator is named diverged but confident."""
+SEEN = 60
+"""Trials from which an estimator is called pessimistic: with 95 % an error that one trial in twenty has is among so
+many, and may be in none of fewer."""
+_BETS = 0.99 * 2.0 ** -np.arange(9)
+"""Shares of the stake."""
+
+Verdict = Literal["consistent", "pessimistic", "optimistic", "undecided", "diverged but confident", "-"]
+
+
+# Shares --------------------------------------------------------------------------------------------------------------
+
+
+def clopper_pearson(count: int, trials: int, level: float = LEVEL) -> tuple[float, float]:
+    """The exact confidence interval of a share of which `count` in `trials` was seen (Clopper and Pearson, Biometrika
+    26, 1934)."""
+    if trials < 1:
+        return np.nan, np.nan
+    tail = (1 - level) / 2
+    low = float(betaincinv(count, trials - count + 1, tail)) if count else 0.0
+    return low, float(betaincinv(count + 1, trials - count, 1 - tail)) if count < trials else 1.0
 
 
 # Root mean squares of a fixed number of trials -----------------------------------------------------------------------
@@ -168,6 +191,56 @@ def _heaviest(trials: int, degrees: int) -> float:
     w = root + 1 / root - 1
     beyond = np.exp(-ndtri(HEAVY) * np.log(w) ** 0.5) - w**0.5
     return float(mean) + deviation * float(beyond) / (w * (w - 1)) ** 0.5
+
+
+# NEES ----------------------------------------------------------------------------------------------------------------
+
+
+def mean_limits(degrees: float, trials: int, level: float = LEVEL) -> tuple[float, float]:
+    """Where the mean over `trials` of chi-square / degrees lies with probability `level`, if all is consistent.
+
+    NEES has n degrees per trial, NIS as many as the trial has readings (Bar-Shalom, Li and Kirubarajan, Estimation with
+    Applications to Tracking and Navigation, 2001, sec. 5.4.2).
+    """
+    if trials < 1 or degrees < 1:
+        return np.nan, np.nan
+    tail = (1 - level) / 2
+    low, high = chdtri(degrees * trials, np.array([1 - tail, tail])) / (degrees * trials)
+    return float(low), float(high)
+
+
+def verdict(nees: Array, n: int, level: float = LEVEL) -> Verdict:
+    """In one word, what an estimator's own covariance is worth: by the NEES (trials,) of the trials that it calls
+    converged, as `scoring.nees` returns them, for n parameters; none of fewer than `FEW`.
+
+    Diverged but confident: surely more than `TOLERATED` of the trials lie where the estimator says that a share of
+    `GATE` should, and the mean of NEES / n surely lies above 1, as it does not for a right covariance of errors with
+    heavy tails. Optimistic, pessimistic: the mean of NEES / n surely lies above or below 1, by the interval that
+    root mean squares have, whatever the law of the errors. Where few trials carry that mean there is no such interval:
+    it may still surely lie above 1, and is undecided otherwise; so is one of fewer than `SEEN` trials that seems to lie
+    below 1. A trial whose NEES is NaN made no claim and is left out.
+    """
+    claims = nees[~np.isnan(nees)]
+    if len(claims) < FEW:
+        return "-"
+    x = np.minimum(claims / n, 1e150)
+    above = _evidence_above_1(x) >= 2 / (1 - level)
+    outside = int(np.sum(claims > gate(n)))
+    if above and clopper_pearson(outside, len(claims), level)[0] > TOLERATED:
+        return "diverged but confident"
+    if few_carry(Squares.of(x[None]), np.array([n]))[0]:
+        return "optimistic" if above else "undecided"
+    low, high = rms_interval(x[:, None], level=level)
+    if high[0] < 1:
+        return "pessimistic" if len(claims) >= SEEN else "undecided"
+    return "optimistic" if low[0] > 1 else "consistent"
+
+
+def _evidence_above_1(x: Array) -> float:
+    """Evidence that the mean of numbers (trials,) that are not negative is above 1, whatever their law: the mean
+    fortune of those who bet fixed shares on it, which exceeds c with a probability of at most 1 / c otherwise."""
+    fortunes = np.log1p(_BETS[:, None] * (x - 1)[None, :]).sum(axis=1)
+    return float(np.mean(np.exp(np.minimum(fortunes, 600.0))))
 
 
 # However often one looks ---------------------------------------------------------------------------------------------

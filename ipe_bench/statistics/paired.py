@@ -15,8 +15,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.calibration import least_count
 from ipe_bench.statistics.comparisons import ALPHA, mcnemar
-from ipe_bench.statistics.consistency import clopper_pearson
-from ipe_bench.statistics.intervals import first_that, grouped
+from ipe_bench.statistics.intervals import clopper_pearson, first_that, grouped
 from ipe_bench.trials.thresholds import FEW
 
 FLIPS = 4999

@@ -15,9 +15,18 @@ import numpy as np
 import ipe_bench.statistics.formulas as f
 import ipe_bench.statistics.tracks as t
 from ipe_bench.basics.errors import UserError, place_of
-from ipe_bench.statistics.consistency import SEEN, clopper_pearson, verdict
 from ipe_bench.statistics.histories import CLOSE, orders_of
-from ipe_bench.statistics.intervals import FIRST, HEAVY, LARGEST_SAMPLE, RESAMPLES, quantile, share_sequence
+from ipe_bench.statistics.intervals import (
+    FIRST,
+    HEAVY,
+    LARGEST_SAMPLE,
+    RESAMPLES,
+    SEEN,
+    clopper_pearson,
+    quantile,
+    share_sequence,
+    verdict,
+)
 from ipe_bench.statistics.sample import NIS, Sample
 from ipe_bench.trials.thresholds import EXPECTED, FEW, GATE, SAME_ROOT
 
@@ -757,7 +766,7 @@ SCORES: tuple[Statistic, ...] = (
         "Share in which no iterate is farther from the limit than K^k / (1 - K) times the first step, eq. (18) with the"
         " k that the print lost (Burden and Faires, Numerical Analysis, have it). K is that at the truth: the theorem"
         " wants the largest on the way, so this is an observation and no proof.",
-        lambda s: f.share(np.array([b.holds for b in bounds])) if (bounds := f.fixed_point_bounds(s)) else np.nan,
+        lambda s: float(f.mean(f.fixed_point_bounds(s))[0]),
         kind="share",
         where=("iterations",),
     ),
@@ -766,7 +775,7 @@ SCORES: tuple[Statistic, ...] = (
         "error / bound of eq. (18)",
         "those trials in which K is below 1",
         "Median of the largest distance of an iterate after the first from the limit, over its bound.",
-        lambda s: quantile(np.array([b.ratio for b in f.fixed_point_bounds(s)]), 0.5),
+        lambda s: quantile(f.fixed_point_bounds(s)[:, 1], 0.5),
         where=("iterations",),
     ),
     Statistic(

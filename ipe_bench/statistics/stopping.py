@@ -27,8 +27,6 @@ from ipe_bench.trials.tracking import AnyScenario
 
 NARROW = "every interval is narrow enough"
 """Why a scenario stops that has come to the precision that was asked for."""
-
-
 STATISTICS = ("success", "rmse")
 """What a precision can be asked for: success as a difference of shares, of every estimator; rmse as a ratio less 1, of
 the root mean square over parameters of error over bound, of the trials that an estimator solved."""
@@ -53,10 +51,9 @@ def precision_of(given: float | Mapping[str, float]) -> Mapping[str, float]:
     return named
 
 
-def reached(sample: Sample, wanted: Mapping[str, float]) -> list[tuple[float, str]]:
+def _distances(sample: Sample, wanted: Mapping[str, float]) -> Iterator[tuple[float, str]]:
     """How far each statistic is from the precision that is wanted, as a ratio that is above 1 where it is not near
     enough yet, and in words."""
-    found = []
     for statistic, precision in wanted.items():
         if statistic == "success":
             share = float(sample.scalars["success"].mean())
@@ -67,8 +64,7 @@ def reached(sample: Sample, wanted: Mapping[str, float]) -> list[tuple[float, st
             width = float(np.sqrt(high / low)) - 1 if low > 0 else np.inf
         known = math.isfinite(width)
         shown = f"{100 * width:.2g} %" if known else "anything, since a few trials carry it or there are too few"
-        found.append((width / precision if known else np.inf, f"{sample.group.estimator}: {statistic} ± {shown}"))
-    return found
+        yield width / precision if known else np.inf, f"{sample.group.estimator}: {statistic} ± {shown}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,26 +123,20 @@ def compute_until(
     names, failures = [new_name() for _ in scenarios], []
     stops: dict[int, Stop] = {}
     while len(stops) < len(scenarios):
-        for i, scenario in enumerate(scenarios):
-            if i in stops:
-                continue
-            failed = compute([scenario], estimators, at[i], output, record_as=names[i], **options)
-            ratios = [one for sample in _stored(scenario, estimators, output) for one in reached(sample, wanted)]
+        for i in [i for i in range(len(scenarios)) if i not in stops]:
+            failed = compute([scenarios[i]], estimators, at[i], output, record_as=names[i], **options)
+            ratios = [one for sample in _stored(scenarios[i], estimators, output) for one in _distances(sample, wanted)]
             ratio, widest = max(ratios, key=lambda one: one[0], default=(np.inf, ""))
-            reason = ""
-            if failed:
-                reason = "some blocks failed"
-            elif not ratios:
-                reason = "no trial has readings"
-            elif ratio <= 1:
-                reason = NARROW
-            elif at[i] >= budget:
-                reason = "there are as many trials as there may be"
-            elif time_limit is not None and time.monotonic() - began >= time_limit:
-                reason = "the time is over"
-            if reason:
+            reasons = {
+                "some blocks failed": failed,
+                "no trial has readings": not ratios,
+                NARROW: ratio <= 1,
+                "there are as many trials as there may be": at[i] >= budget,
+                "the time is over": time_limit is not None and time.monotonic() - began >= time_limit,
+            }
+            if reason := next((words for words, applies in reasons.items() if applies), ""):
                 failures += failed
-                stops[i] = Stop(scenario, at[i], reason, widest)
+                stops[i] = Stop(scenarios[i], at[i], reason, widest)
             else:
                 at[i] = next_trials(at[i], ratio, block_size, budget)
     return tuple(failures), tuple(stops[i] for i in range(len(scenarios)))
@@ -165,8 +155,7 @@ def _first_trials(
     """Where to begin: with what is stored of every estimator, or one block."""
     cells = result_keys(scenario, estimators)
     results = Results.read([output] if output.is_dir() else [], keys={cell.key for cell in cells})
-    whole = [results.missing(cell.key, most) for cell in cells]
-    stored = min(gaps[0][0] if gaps else most for gaps in whole)
+    stored = min(gaps[0][0] if (gaps := results.missing(cell.key, most)) else most for cell in cells)
     return min(most, max(stored, block_size))
 
 

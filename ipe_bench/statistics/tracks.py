@@ -15,7 +15,7 @@ import numpy as np
 from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.results import StoredCell
 from ipe_bench.statistics import formulas as f
-from ipe_bench.statistics.consistency import clopper_pearson, mean_limits, verdict
+from ipe_bench.statistics.intervals import clopper_pearson, mean_limits, verdict
 from ipe_bench.statistics.sample import NIS, Sample
 from ipe_bench.trials.tracking import unpacked
 

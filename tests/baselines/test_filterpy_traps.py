@@ -12,7 +12,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
-from ipe_bench.statistics.consistency import mean_limits
+from ipe_bench.statistics.intervals import mean_limits
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import nees
 

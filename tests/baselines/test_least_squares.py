@@ -14,7 +14,7 @@ from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.priors import GaussianPrior
-from ipe_bench.statistics.consistency import mean_limits
+from ipe_bench.statistics.intervals import mean_limits
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import nees
 

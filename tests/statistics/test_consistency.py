@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ipe_bench.statistics.consistency import mean_limits, verdict
+from ipe_bench.statistics.intervals import mean_limits, verdict
 from ipe_bench.trials.scoring import nees
 
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2
 
-from ipe_bench.statistics.consistency import clopper_pearson
-from ipe_bench.statistics.intervals import Squares, few_carry, quantile, quantiles, rms_interval
+from ipe_bench.statistics.intervals import Squares, clopper_pearson, few_carry, quantile, quantiles, rms_interval
 
 
 @pytest.mark.parametrize("p", [0.01, 0.3, 0.5, 0.97])

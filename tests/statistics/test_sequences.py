@@ -6,8 +6,7 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import binom
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.statistics.consistency import clopper_pearson
-from ipe_bench.statistics.intervals import Squares, mean_sequence, rms_sequence, share_sequence
+from ipe_bench.statistics.intervals import Squares, clopper_pearson, mean_sequence, rms_sequence, share_sequence
 from ipe_bench.statistics.stopping import next_trials, precision_of
 
 

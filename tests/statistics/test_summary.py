@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from synthetic_store import Filter, Pretender, Repeated, Synthetic, forge
 
 from ipe_bench.statistics import analyse, summarize
-from ipe_bench.statistics.consistency import clopper_pearson
+from ipe_bench.statistics.intervals import clopper_pearson
 from ipe_bench.statistics.summary import COLUMNS
 
 
