@@ -12,13 +12,14 @@ import functools
 import inspect
 import math
 import numbers
+import operator
 import types
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Self
 
 import numpy as np
-from annotated_types import BaseMetadata, DocInfo, Ge, GroupedMetadata, Gt, Le, Lt, MaxLen, MinLen, Predicate
+from annotated_types import BaseMetadata, Ge, Gt, Le, Lt, MinLen, Predicate
 
 from ipe_bench.basics.errors import UserError, describe_exception, unknown
 
@@ -32,13 +33,25 @@ Count = Annotated[int, Gt(0)]
 Whole = Annotated[int, Ge(0)]
 
 _COMPARISONS = {
-    Gt: lambda value, bound: value > bound.gt,
-    Ge: lambda value, bound: value >= bound.ge,
-    Lt: lambda value, bound: value < bound.lt,
-    Le: lambda value, bound: value <= bound.le,
-    MinLen: lambda value, bound: len(value) >= bound.min_length,
-    MaxLen: lambda value, bound: len(value) <= bound.max_length,
-    Predicate: lambda value, bound: bound.func(value),
+    Gt: operator.gt,
+    Ge: operator.ge,
+    Lt: operator.lt,
+    Le: operator.le,
+    MinLen: lambda value, length: len(value) >= length,
+    Predicate: lambda value, holds: holds(value),
+}
+"""What each constraint asks of a value, given the constraint's own number or function."""
+_BOUNDED = {
+    (): "{}",
+    (Gt,): "{} above {}",
+    (Ge,): "{} from {} up",
+    (Lt,): "{} below {}",
+    (Le,): "{} up to {}",
+    (Gt, Lt): "{} between {} and {}",
+    (Gt, Le): "{} above {} and up to {}",
+    (Ge, Lt): "{} from {} to below {}",
+    (Ge, Le): "{} from {} to {}",
+    (MinLen,): "{} of at least {}",
 }
 _NOUNS = {int: "a whole number", float: "a number", bool: "true or false", str: "a text", type(None): "null"}
 
@@ -151,22 +164,18 @@ def _constrained(value: Any, kind: Any, metadata: Sequence[Any], key: str) -> An
         if typing.get_origin(kind) is tuple:
             raise  # it says which entry is wrong
         raise _refusal(value, describe_type(Annotated[kind, *metadata]), key) from None
-    if not all(_COMPARISONS[type(bound)](value, bound) for bound in bounds_of(metadata)):
+    if not all(_COMPARISONS[type(bound)](value, dataclasses.astuple(bound)[0]) for bound in _bounds(metadata)):
         raise _refusal(value, describe_type(Annotated[kind, *metadata]), key)
     return value
 
 
-def bounds_of(metadata: Iterable[Any]) -> list[Any]:
-    """The constraints among an annotation's metadata; an `Interval` is taken apart."""
-    flat: list[Any] = []
-    for item in metadata:
-        if type(item) in _COMPARISONS:
-            flat.append(item)
-        elif isinstance(item, GroupedMetadata):
-            flat += bounds_of(item)
-        elif isinstance(item, BaseMetadata):
-            raise TypeError(f"{item}: is a constraint that options cannot have; write a Predicate")
-    return flat
+def _bounds(metadata: Sequence[Any]) -> list[Any]:
+    """The constraints among an annotation's metadata."""
+    bounds = [item for item in metadata if isinstance(item, BaseMetadata)]
+    for bound in bounds:
+        if type(bound) not in _COMPARISONS:
+            raise TypeError(f"{bound}: is a constraint that options cannot have; write a Predicate")
+    return bounds
 
 
 def _one_of(value: Any, alternatives: Sequence[Any], key: str) -> Any:
@@ -210,8 +219,10 @@ def describe_type(hint: Any) -> str:
     """What a user is to give: 'a number above 0 or null'."""
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        words = [c.documentation for c in arguments[1:] if isinstance(c, DocInfo)]
-        return words[0] if words else _with_bounds(describe_type(arguments[0]), bounds_of(arguments[1:]))
+        bounds = [bound for bound in _bounds(arguments[1:]) if not isinstance(bound, Predicate)]
+        noun = "a finite number" if FINITE in arguments and not bounds else describe_type(arguments[0])
+        limits = [dataclasses.astuple(bound)[0] for bound in bounds]
+        return _BOUNDED[tuple(map(type, bounds))].format(noun, *limits)
     if origin in (typing.Union, types.UnionType):
         return " or ".join(map(describe_type, arguments))
     if origin is typing.Literal:
@@ -229,20 +240,3 @@ def _list_of(arguments: Sequence[Any]) -> str:
         return "a list"
     nouns = {describe_type(a).removeprefix("a ") for a in arguments}
     return f"a list of {len(arguments)}" + (f" {nouns.pop()}s" if len(nouns) == 1 else "")
-
-
-def _with_bounds(noun: str, bounds: Sequence[Any]) -> str:
-    """The noun with its constraints in words."""
-    limits = {type(b): b for b in bounds}
-    lower, upper = limits.get(Gt) or limits.get(Ge), limits.get(Lt) or limits.get(Le)
-    if MinLen in limits:
-        return f"{noun} of at least {limits[MinLen].min_length}"
-    if isinstance(lower, Gt) and isinstance(upper, Lt):
-        return f"{noun} between {lower.gt} and {upper.lt}"
-    if isinstance(lower, Gt):
-        return f"{noun} above {lower.gt}" + (f" and up to {upper.le}" if isinstance(upper, Le) else "")
-    if isinstance(lower, Ge) and upper is not None:
-        return f"{noun} from {lower.ge} to " + (f"below {upper.lt}" if isinstance(upper, Lt) else f"{upper.le}")
-    if isinstance(lower, Ge):
-        return f"{noun} from {lower.ge} up" if noun == _NOUNS[int] else f"{lower.ge} or {noun} above"
-    return "a finite number" if FINITE in bounds else noun

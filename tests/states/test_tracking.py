@@ -263,7 +263,7 @@ WALK = {
         ({"constants": {"h": 1.0, "x": 2.0}}, r"next\.x: two of states, noise, constants, inputs, k and t have"),
         ({"readings": {"z": "x + w"}}, r"readings\.z: there is no such name"),
         ({"spread": {"x": 1.0}}, r"spread\.v: is not given"),
-        ({"deviation": {"z": -1.0}}, r"deviation\.z=-1\.0: give 0 or a number above"),
+        ({"deviation": {"z": -1.0}}, r"deviation\.z=-1\.0: give a number from 0 up"),
     ],
 )
 def test_formulas_that_make_no_model_are_refused(changes, complaint):
