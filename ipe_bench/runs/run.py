@@ -135,6 +135,9 @@ def validate(
             kind, what = Estimator, "tracks states that move; a measurement model takes estimators"
         other = [f"estimators.{label}: {what}" for label, one in estimators.items() if not isinstance(one, kind)]
         mistakes += other
+        if isinstance(scenario, Tracking) and not other:
+            found = {label: tracker.hindrance(scenario.model) for label, tracker in estimators.items()}
+            mistakes += [f"trackers.{label}: {why}" for label, why in found.items() if why]
         if isinstance(scenario, Tracking) or other:
             continue
         if scenario.noise.estimated and scenario.noise.true_levels(scenario.measurement.m) is None:

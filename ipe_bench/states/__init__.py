@@ -3,6 +3,7 @@
 from ipe_bench.states.base import Gaussian, Paths, StateModel
 from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
 from ipe_bench.states.formulas import Formulas, Recorded
+from ipe_bench.states.grid import Grid
 from ipe_bench.states.linearisation import Cubature, GaussHermite, SigmaPoints, Taylor, Unscented
 from ipe_bench.states.trackers import (
     Bootstrap,
@@ -23,6 +24,7 @@ __all__ = [
     "Formulas",
     "GaussHermite",
     "Gaussian",
+    "Grid",
     "IteratedSmoother",
     "Paths",
     "Recorded",

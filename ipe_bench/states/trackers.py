@@ -84,6 +84,10 @@ class Tracker(Component, Named, ABC):
     equation: ClassVar[None] = None
     family: ClassVar[str] = "filters"
 
+    def hindrance(self, model: StateModel) -> str:
+        """Why the tracker does not suit the model; empty if it does."""
+        return ""
+
     @abstractmethod
     def track(self, model: StateModel, z: Array) -> Tracks:
         """The states that readings z (trials, K, m) tell of."""
@@ -333,30 +337,32 @@ class Bootstrap(Tracker):
             if model.moves(k):
                 G = model.gain(k)
                 x = model.transition(x, k) + np.matmul(normals(G.shape[1]), G.T)
-            w = self._weights(model, x, k, z[:, k], out)
+            w = weighed(model, x, k, z[:, k], 1.0, out)
             mean = np.sum(w[..., None] * x, axis=1)
             d = x - mean[:, None]
             out.mean[:, k], out.covariance[:, k] = mean, np.matmul(transposed(d * w[..., None]), d)
             x = _resampled(x, w, np.array([g.random() for g in generators]))
+        out.log_likelihood -= model.epochs * np.log(N)
         out.calls = float(N * 2 * model.epochs)
         return out
 
-    def _weights(self, model: StateModel, x: Array, k: int, z: Array, out: Tracks) -> Array:
-        """The normalised likelihood (trials, N) of the particles; adds to the log likelihood of the readings."""
-        near = np.where(np.isfinite(z), z, 0.0)
-        r = z[:, None] - model.observe_near(x, k, near)
-        seen = np.isfinite(z)
-        both = seen[:, :, None] & seen[:, None, :]
-        L = factor(np.where(both, model.R(k), np.eye(z.shape[1])))
-        white = lower_solve(L, transposed(np.where(seen[:, None], r, 0.0)))
-        log = -0.5 * np.sum(white**2, axis=1)
-        top = log.max(axis=1, keepdims=True)
-        w = np.exp(log - top)
-        total = w.sum(axis=1, keepdims=True)
-        constant = np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1) + 0.5 * np.log(2 * np.pi) * seen.sum(axis=1)
-        out.log_likelihood += top[:, 0] + np.log(total[:, 0] / self.particles) - constant
-        out.degrees[:, k] = seen.sum(axis=1)
-        return w / total
+
+def weighed(model: StateModel, x: Array, k: int, z: Array, before: Array | float, out: Tracks) -> Array:
+    """The weights `before` (trials, N) of states x (trials, N, n) times the likelihood of readings z (trials, m), with
+    sum 1; the logarithm of their sum is added to the log likelihood of the track."""
+    r = z[:, None] - model.observe_near(x, k, np.where(np.isfinite(z), z, 0.0))
+    seen = np.isfinite(z)
+    both = seen[:, :, None] & seen[:, None, :]
+    L = factor(np.where(both, model.R(k), np.eye(z.shape[1])))
+    white = lower_solve(L, transposed(np.where(seen[:, None], r, 0.0)))
+    log = -0.5 * np.sum(white**2, axis=1)
+    top = log.max(axis=1, keepdims=True)
+    w = before * np.exp(log - top)
+    total = w.sum(axis=1, keepdims=True)
+    constant = np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1) + 0.5 * np.log(2 * np.pi) * seen.sum(axis=1)
+    out.log_likelihood += top[:, 0] + np.log(total[:, 0]) - constant
+    out.degrees[:, k] = seen.sum(axis=1)
+    return w / total
 
 
 def _resampled(x: Array, w: Array, offset: Array) -> Array:

@@ -68,6 +68,10 @@ def test_what_is_right_is_taken(words, ipe_bench):
         (["model=pendulum", "tracker=[newton]"], "tracker=newton: newton is no tracker but a solver"),
         (["model=pendulum", "trackers.ukf.iterations=0"], "trackers.ukf.iterations=0: give a whole number above 0"),
         (["model=pendulum", "trackers.bootstrap.particles=5"], "trackers.bootstrap.particles: is set, but bootstrap"),
+        (
+            ["model=pendulum", "tracker=[grid]"],
+            "trackers.grid: is exact for one state, and pendulum has 2; leave it out",
+        ),
         (["model=growth", "model.next.state=x"], "model.next.state: there is no such name"),
         (["+experiment=polynomial", "model=growth"], "+experiment=polynomial: sets measurement, which is of a measur"),
         (["+experiment=headline", "model=growth"], "+experiment=headline: sets noise, which is of a measurement"),

@@ -28,12 +28,11 @@ from ipe_bench.states import (
     Filter,
     GaussHermite,
     Gaussian,
+    Grid,
     IteratedSmoother,
     Smoother,
     StateModel,
     Taylor,
-    Tracker,
-    Tracks,
     Unscented,
     bound_at_truth,
     ckf,
@@ -257,22 +256,75 @@ def test_bearings_come_round():
 
 
 @dataclass(frozen=True)
-class Grid(Tracker):
-    """The exact filter of a scalar state on a grid (Kitagawa, JASA 82, 1987)."""
+class Scalar(StateModel):
+    """A scalar state that forgets, with some readings missing: linear, so that the Kalman filter is exact."""
 
-    def track(self, model, z):
-        g = np.linspace(-45.0, 45.0, 901)
-        mean, P = model.prior
-        p = np.repeat(np.exp(-0.5 * (g - mean) ** 2 / P[0, 0])[None], len(z), 0)
-        out = Tracks.empty(model, len(z))
-        for k in range(model.epochs):
-            gap = (g[:, None] - model.transition(g[:, None], k)[:, 0]) / model.gain(k)[0, 0]
-            kernel = np.exp(-0.5 * gap**2)
-            p = (p / p.sum(axis=1, keepdims=True)) @ (kernel / kernel.sum(axis=0)).T
-            p = p * np.exp(-0.5 * (z[:, k] - model.observe(g[:, None], k)[:, 0]) ** 2)
-            p /= p.sum(axis=1, keepdims=True)
-            out.mean[:, k, 0] = p @ g
-        return out
+    moved_first: bool = True
+
+    @property
+    def states(self):
+        return (Parameter("x"),)
+
+    @property
+    def times(self):
+        return np.arange(1.0, 31.0)
+
+    @property
+    def prior(self):
+        return Gaussian(np.array([2.0]), np.array([[9.0]]))
+
+    def transition(self, x, k):
+        return 0.9 * x + 0.5 * np.cos(k)
+
+    def observe(self, x, k):
+        return np.concatenate([x, -0.5 * x], axis=-1)
+
+    def gain(self, k):
+        return np.array([[0.6, 0.3]])
+
+    def R(self, k):
+        return np.array([[0.5, 0.1], [0.1, 0.3]])
+
+
+@dataclass(frozen=True)
+class Sharp(Scalar):
+    """The same with readings whose errors are far smaller than a step of the grid."""
+
+    def R(self, k):
+        return 1e-8 * np.eye(2)
+
+
+@pytest.mark.parametrize("moved_first", [True, False])
+def test_a_grid_gives_the_kalman_filter_and_its_smoother_of_a_linear_model(moved_first):
+    model = Scalar(moved_first)
+    z = model.draw(0, 3).z
+    z[0, 4:7], z[1, 3, 1] = np.nan, np.nan
+    filtered, smoothed = ekf().track(model, z), Smoother(ekf()).track(model, z)
+    for grid, exact in ((Grid(400), filtered), (Grid(400, smooths=True), smoothed)):
+        found = grid.track(model, z)
+        np.testing.assert_allclose(found.mean, exact.mean, atol=1e-6)
+        np.testing.assert_allclose(found.covariance, exact.covariance, atol=1e-6)
+        np.testing.assert_allclose(found.log_likelihood, filtered.log_likelihood, atol=1e-6)
+        np.testing.assert_array_equal(found.mean[1:2], grid.track(model, z[1:2]).mean)
+
+
+def test_a_grid_refuses_what_it_cannot_be_exact_for():
+    growth = Growth(count=20)
+    assert "is exact for one state, and pendulum has 2" in Grid().hindrance(NEAR)
+    with pytest.raises(
+        ib.UserError, match=r"trackers\.grid: its points are farther apart than process noise reaches"
+    ) as refused:
+        ib.run(growth, {"grid": Grid(300)}, 3)
+    needed = int(str(refused.value).rpartition("=")[2])
+    assert Grid(needed).hindrance(growth) == ""
+    z = growth.draw(0, 3).z
+    z[1, 7] = 400.0  # a state of 90, as none is
+    table = ib.run(growth, {"grid": Grid(needed)}, 3)
+    assert (table["converged"] == 1).all()
+    with pytest.raises(ArithmeticError, match="runs over an end of the grid"):
+        Grid(needed).track(growth, z)
+    with pytest.raises(ArithmeticError, match="falls between the points of the grid"):
+        Grid(400).track(Sharp(), Sharp().draw(0, 3).z)
 
 
 def test_the_growth_model_separates_the_filters_from_the_exact_answer():

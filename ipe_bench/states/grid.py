@@ -1,0 +1,101 @@
+"""The exact answer for a scalar state: its density at the points of a grid (Kitagawa, JASA 82, 1987)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ipe_bench.basics.linalg import Array, multiply
+from ipe_bench.basics.options import Count
+from ipe_bench.states.base import StateModel
+from ipe_bench.states.trackers import Tracker, Tracks, weighed
+
+_PATHS = 1000
+"""Drawn paths by which the grid of an epoch is as wide as the states are."""
+_BEYOND = 3.0
+"""Their standard deviations by which it is wider on either side."""
+_COARSE = 1.6
+"""Largest squared step of the points in standard deviations of process noise, and of the density about its peak: an
+integral is then wrong by a share of exp(-2 pi^2 / 1.6) = 4e-6."""
+_CUT = 1e-6
+"""Largest density at an end of the grid, in parts of the peak."""
+
+
+@dataclass(frozen=True)
+class Grid(Tracker):
+    """The exact mean and variance of a scalar state, which no tracker beats in mean square."""
+
+    points: Count = 1000
+    """Points of the grid of an epoch."""
+    smooths: bool = False
+    """Whether each epoch is told all readings instead of those up to it."""
+
+    def hindrance(self, model: StateModel) -> str:
+        if model.n > 1:
+            return f"is exact for one state, and {model.name} has {model.n}; leave it out"
+        grids, epochs = self._grids(model), [k for k in range(model.epochs) if model.moves(k)]
+        noise = np.sqrt([_COARSE * model.Q(k)[0, 0] for k in epochs])
+        if not (noise > 0).all():
+            return f"needs process noise at every step of {model.name}; leave it out"
+        steps = [max(np.diff(grids[k + 1]).max(), np.abs(np.diff(_moved(model, grids, k))).max()) for k in epochs]
+        if (excess := np.max(steps / noise)) > 1:
+            needed = np.ceil(1.1 * self.points * excess)
+            return f"its points are farther apart than process noise reaches; set points={needed:.0f}"
+        return ""
+
+    def track(self, model: StateModel, z: Array) -> Tracks:
+        out, grids = Tracks.empty(model, len(z)), self._grids(model)
+        out.nis[:] = np.nan  # a density has no innovation
+        m, P = model.prior.mean[0], model.prior.covariance[0, 0]
+        p = np.exp(-0.5 * (grids[0] - m) ** 2 / (P or 1.0))
+        p = np.repeat(p[None] / p.sum(), len(z), axis=0)
+        predicted, filtered = [], []
+        for k in range(model.epochs):
+            if model.moves(k):
+                p = multiply(_kernel(model, grids, k), p)
+                p /= p.sum(axis=1, keepdims=True)
+            predicted.append(p)
+            p = weighed(model, np.repeat(grids[k + 1][None, :, None], len(z), 0), k, z[:, k], p, out)
+            _require_resolved(p, k)
+            filtered.append(p)
+        for k in range(model.epochs - 1, -1, -1):
+            if self.smooths and k < model.epochs - 1:
+                ratio = np.where(predicted[k + 1] > 0, p / np.maximum(predicted[k + 1], 1e-300), 0.0)
+                p = filtered[k] * multiply(_kernel(model, grids, k + 1).T, ratio)
+                p /= p.sum(axis=1, keepdims=True)
+            density, g = p if self.smooths else filtered[k], grids[k + 1]
+            out.mean[:, k, 0] = mean = np.sum(density * g, axis=1)
+            out.covariance[:, k, 0, 0] = np.sum(density * (g - mean[:, None]) ** 2, axis=1)
+        out.calls = 2.0 * self.points * model.epochs
+        return out
+
+    def _grids(self, model: StateModel) -> Array:
+        """The points (K + 1, points) before the first transition, and at each epoch."""
+        paths = StateModel.draw(model, 0, _PATHS)
+        x = np.concatenate([paths.start, paths.x[..., 0]], axis=1)
+        margin = _BEYOND * x.std(axis=0)
+        return np.linspace(x.min(axis=0) - margin, x.max(axis=0) + margin, self.points, axis=1)
+
+
+def _kernel(model: StateModel, grids: Array, k: int) -> Array:
+    """The probability (points, points) of each point of epoch k, up to a factor, from each of the epoch before."""
+    return np.exp(-0.5 * (grids[k + 1][:, None] - _moved(model, grids, k)) ** 2 / model.Q(k)[0, 0])
+
+
+def _moved(model: StateModel, grids: Array, k: int) -> Array:
+    """Where the points before epoch k are moved to without process noise (points,)."""
+    return model.transition(grids[k][:, None], k)[:, 0]
+
+
+def _require_resolved(p: Array, k: int) -> None:
+    """Refuses densities p (trials, points) that fall between points, or run over an end."""
+    rows, peak = np.arange(len(p)), p.argmax(axis=1).clip(1, p.shape[1] - 2)
+    bend = np.log(p[rows, peak] ** 2 / np.maximum(p[rows, peak - 1] * p[rows, peak + 1], 1e-300))
+    ends = np.maximum(p[:, 0], p[:, -1]) / p[rows, peak]
+    if not (bend < _COARSE).all():
+        raise ArithmeticError(f"the density of epoch {k + 1} falls between the points of the grid; set more points")
+    if not (ends < _CUT).all():
+        raise ArithmeticError(
+            f"the density of epoch {k + 1} runs over an end of the grid: the model draws no such path"
+        )
