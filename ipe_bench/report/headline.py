@@ -29,10 +29,10 @@ def headline(analysis: Analysis) -> list[str]:
 
 
 def _certified(analysis: Analysis) -> Iterator[str]:
-    averages = certified_averages(certified_table(analysis.collection))
-    if averages.empty:
+    each = certified_averages(certified_table(analysis.collection))
+    if each.empty:
         return
-    each = averages.assign(digits=averages["mean_lre_parameters"] * averages["datasets"])
+    each["digits"] = each["mean_lre_parameters"] * each["datasets"]
     totals = each.groupby("estimator", sort=False)[["solved", "datasets", "digits"]].sum()
     best = totals[totals["solved"] == totals["solved"].max()].sort_values("digits", ascending=False, kind="stable")
     first = best.iloc[0]
@@ -63,9 +63,7 @@ def _simulated(analysis: Analysis) -> Iterator[str]:
     if several or len(scales) < 2 or rows["estimator"].nunique() < 2:
         yield _ranked(analysis, rows, scales)
         return
-    yield from _agreement(
-        rows, scales, {group.estimator: family_of(group.footer) for group in analysis.collection.groups}
-    )
+    yield from _agreement(rows, scales, {one.estimator: family_of(one.footer) for one in analysis.collection.groups})
     yield from _honesty(rows)
     yield from _reach(rows, scales)
     yield _costs(rows, scales)
@@ -96,7 +94,6 @@ def _agreement(rows: pd.DataFrame, scales: Sequence[float], kinds: Mapping[str, 
 
 
 def _listed(rows: pd.DataFrame, value: Callable[[Any], str]) -> str:
-    """The estimators of the rows, each with a value in brackets."""
     return enumerate_few([f"{row['estimator']} ({value(row)})" for _, row in rows.iterrows()])
 
 
@@ -119,14 +116,12 @@ def _honesty(rows: pd.DataFrame) -> Iterator[str]:
 
 def _reach(rows: pd.DataFrame, scales: Sequence[float]) -> Iterator[str]:
     """From which scale on who surely fails in more than a tenth of the trials, and who never does."""
-
-    def success(row: Any) -> str:
-        return percent(row["success"])
-
     broken = rows[rows["success_high"] < BROKEN]
-    parts = _from_scale(broken, success)
+    parts = _from_scale(broken, lambda row: percent(row["success"]))
     top = rows[(rows["error_scale"] == scales[-1]) & ~rows["estimator"].isin(broken["estimator"])]
-    parts += [f"{_listed(top, success)} hold{'s' * (len(top) == 1)} to {plain(scales[-1])}"] if len(top) else []
+    if len(top):
+        who = _listed(top, lambda row: percent(row["success"]))
+        parts.append(f"{who} hold{'s' * (len(top) == 1)} to {plain(scales[-1])}")
     yield f"Success falls surely below {100 * BROKEN:.0f} %: {'; '.join(parts)}."
     silent = rows.sort_values("failed_silent", kind="stable").iloc[-1]
     if silent["failed_silent"] > 0:
@@ -142,11 +137,10 @@ def _costs(rows: pd.DataFrame, scales: Sequence[float]) -> str:
     parts = []
     for scale in dict.fromkeys([*most[-1:], number.index.max() if len(number) else scales[-1]]):
         part = (holding if len(number) else rows).query("error_scale == @scale")
-        listed = [
-            f"{row['estimator']} {brief(row['simulations_median'])} ({duration(row['time_median_s'], 2)})"
-            for _, row in part.sort_values("simulations_median", kind="stable").iterrows()
-        ]
-        parts.append(f"at scale {plain(scale)} {enumerate_few(listed)}")
+        part = part.sort_values("simulations_median", kind="stable")
+        costs = zip(part["estimator"], part["simulations_median"], part["time_median_s"], strict=True)
+        listed = enumerate_few([f"{e} {brief(cost)} ({duration(time, 2)})" for e, cost, time in costs])
+        parts.append(f"at scale {plain(scale)} {listed}")
     return f"A trial costs, in simulations: {'; '.join(parts)}."
 
 

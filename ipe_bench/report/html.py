@@ -207,6 +207,7 @@ DEFINITIONS: tuple[tuple[str, str], ...] = (
     ),
     (
         "data profile",
-        "Share of trials in which it succeeds within a budget (Moré and Wild, SIAM Journal on Optimization 20, 2009).",
+        "Share of problems that an estimator solves within a budget (Moré and Wild, SIAM Journal on Optimization 20,"
+        " 2009).",
     ),
 )

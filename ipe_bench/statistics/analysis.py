@@ -14,8 +14,8 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.statistics.calibration import POINTS, band
 from ipe_bench.statistics.certified import attained_table
 from ipe_bench.statistics.collect import Collection, Group, collect
-from ipe_bench.statistics.comparisons import Outcomes, common, compare_pairs, corrected, may_be_best, profiles
-from ipe_bench.statistics.intervals import quantile, quantiles
+from ipe_bench.statistics.comparisons import Outcomes, common, compare_pairs, corrected, may_be_best
+from ipe_bench.statistics.intervals import quantile
 from ipe_bench.statistics.records import SCORES, rows_of
 from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of, samples
 from ipe_bench.statistics.summary import BEST, summary_rows, to_frame
@@ -24,8 +24,6 @@ from ipe_bench.statistics.tracks import curves
 if TYPE_CHECKING:
     import pandas as pd
 
-PROBABILITIES = np.unique(np.concatenate([np.linspace(0, 1, 101), [0.001, 0.005, 0.025, 0.975, 0.995, 0.999]]))
-"""Where the distribution of errors is tabulated."""
 MESSAGES = 20
 """Different messages of one estimator on one scenario that are listed one by one."""
 
@@ -43,14 +41,6 @@ class Analysis:
     """Every pair of estimators on every scenario; see `comparisons.compare_pairs`."""
     scores: pd.DataFrame
     """Per scenario and estimator: capped mean error, and median costs."""
-    profiles: pd.DataFrame
-    """Estimator, profile (performance or data), `at` (cost ratio or budget) and share, over all scenarios."""
-    distributions: pd.DataFrame
-    """Quantiles of the Mahalanobis error: probability (of `PROBABILITIES`) and distance."""
-    convergence: pd.DataFrame
-    """Of each converged trial with a stored history: trial, iteration, and the iterate's distance from the last one in
-    deviations of the bound; none of filters, whose epochs are not iterations. The last distance is zero by definition,
-    which says nothing of convergence."""
     calibration: pd.DataFrame
     """Of NEES: the probability `at`, the `difference` of the empirical distribution function from the uniform one
     there, and the ends `low` and `high` of the band; NEES and all parameters of an honest estimator keep within theirs
@@ -118,17 +108,11 @@ class Begun:
             outcomes[sample.group.estimator] = Outcomes(sample.number, sample.distance, sample.inside_gate, sample.cost)
             found["endings"] += [dict(sample.group.columns) | label | row for row in _ending_rows(sample)]
             found["scores"].append(numbered | rows_of(SCORES, sample)[-1])
-            distances = quantiles(sample.distance, PROBABILITIES)
-            found["distributions"].append(numbered | {"probability": PROBABILITIES, "distance": distances})
             for whole in sample.calibrations[-1:]:
                 low, high = band(len(whole.z), whole.level)
                 curve = {"at": POINTS, "difference": whole.size.difference, "low": low, "high": high}
                 found["calibration"].append(numbered | curve)
             found["tracks"] += [numbered | row for row in curves(sample)]
-            found["convergence"] += [
-                numbered | {"trial": h.trial, "iteration": np.arange(len(h.distances)), "distance": h.distances}
-                for h in sample.histories
-            ]
         if outcomes:
             paired = common(outcomes)
             best = may_be_best(np.column_stack([outcome.success for outcome in paired.values()]))
@@ -149,9 +133,6 @@ class Begun:
             endings=pd.DataFrame(rows["endings"]),
             pairs=pd.DataFrame(corrected(pairs)),
             scores=pd.DataFrame(rows["scores"]),
-            profiles=profiles([outcomes for _, outcomes in self._compared]),
-            distributions=_joined(rows["distributions"], ("probability", "distance")),
-            convergence=_joined(rows["convergence"], ("trial", "iteration", "distance")),
             calibration=_joined(rows["calibration"], ("at", "difference", "low", "high")),
             contraction=pd.DataFrame(rows["contraction"]),
             tracks=_joined(rows["tracks"], ("parameter", "at", "rmse")),

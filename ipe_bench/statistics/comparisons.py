@@ -18,14 +18,11 @@ from scipy.special import bdtr
 from ipe_bench.basics.linalg import Array
 
 if TYPE_CHECKING:
-    import pandas as pd
+    pass
 
 TIE = 1e-3
 """Errors closer than this, in standard deviations, are equal: round-off is never a difference."""
 ALPHA = 0.05
-RATIOS = np.unique(np.round(np.geomspace(1, 1000, 181), 6))
-BUDGETS = np.unique(np.round(np.geomspace(1, 100_000, 301)))
-"""Costs at which performance and data profiles are tabulated: over the cheapest success, and in simulations."""
 
 
 @dataclass(frozen=True)
@@ -131,31 +128,3 @@ def may_be_best(success: Array, level: float = ALPHA) -> Array:
     discordant = (won + won.T).astype(int)
     p = np.where(discordant > 0, bdtr(won, np.maximum(discordant, 1), 0.5), 1.0)
     return p.min(axis=1, initial=1.0) > level / max(k - 1, 1)
-
-
-def profiles(scenarios: Sequence[Mapping[str, Outcomes]]) -> pd.DataFrame:
-    """Which share of all trials the estimators of every scenario solve at what cost: columns estimator, profile, `at`
-    and share.
-
-    `performance`: at a cost of at most `RATIOS` times the cheapest estimator's (Dolan and Moré, Math. Program. 91,
-    2002). `data`: within `BUDGETS` simulations (Moré and Wild, SIAM J. Optim. 20, 2009). A trial without success costs
-    infinitely much.
-    """
-    import pandas as pd
-
-    everywhere = [label for label in (scenarios[0] if scenarios else ()) if all(label in one for one in scenarios)]
-    shared = [common({label: outcomes[label] for label in everywhere}) for outcomes in scenarios]
-    spent = {
-        label: np.concatenate([np.where(one[label].success, one[label].cost, np.inf) for one in shared])
-        for label in everywhere
-    }
-    best = np.min(list(spent.values()), axis=0, initial=np.inf)
-    parts = [pd.DataFrame(columns=["estimator", "profile", "at", "share"])] if not spent else []
-    for label, cost in spent.items():
-        solved = np.isfinite(cost)
-        # A cost of nothing, without any simulation, is the best there is.
-        ratio = np.divide(cost, best, out=np.where(solved, 1.0, np.inf), where=solved & (best > 0))
-        for profile, at, values, slack in (("performance", RATIOS, ratio, 1e-9), ("data", BUDGETS, cost, 0.0)):
-            share = np.searchsorted(np.sort(values), at * (1 + slack), side="right") / max(1, len(values))
-            parts.append(pd.DataFrame({"estimator": label, "profile": profile, "at": at, "share": share}))
-    return pd.concat(parts, ignore_index=True)

@@ -9,7 +9,6 @@ from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PathCollection
@@ -24,7 +23,6 @@ from ipe_bench.report.figures import (
     draw_all,
     errors,
     parameters,
-    paths,
 )
 from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.figures.views import View, views
@@ -211,35 +209,7 @@ def test_an_estimator_is_in_the_colours_of_its_family_and_of_many_the_best_are_i
     assert [t.get_text() for t in legend.get_texts()][:5] == [*(e for e in view.look if e in colored), "8 others"]
 
 
-# Convergence and parameters ------------------------------------------------------------------------------------------
-
-
-def histories(**trials: list[list[float]]) -> pd.DataFrame:
-    return pd.DataFrame(
-        [
-            {"error_scale": 1.0, "estimator": label, "trial": str(t), "iteration": k, "distance": d}
-            for label, several in trials.items()
-            for t, distances in enumerate(several)
-            for k, d in enumerate(distances)
-        ]
-    )
-
-
-def test_neither_the_last_iterate_nor_the_epochs_of_filters_are_drawn_as_convergence():
-    """An iterate's distance from itself is zero; trials that have come to it count as nearer than those under way."""
-    found = paths.median_distances(
-        histories(a=[[8.0, 4.0, 0.0], [6.0, 3.0, 2.0, 1.0, 0.0], [9.0, 0.0]], b=[[3.0, 0.0]])
-    )
-    assert list(found["iteration"]) == [0, 1, 0]
-    assert list(found["distance"]) == [8.0, 3.0, 3.0]
-    filters = [[9.0, 5.0, 2.0, 0.0]]
-    frame = histories(ekf=filters, newton=[[9.0, 0.1, 0.001, 0.0]])
-    look = looks(["ekf", "newton"])
-    view = View("", "model", {"convergence": frame, "tracks": pd.DataFrame()}, look, {"ekf": None, "newton": "frozen"})
-    (drawing,) = drawn(paths, view).values()
-    assert [ax.get_title() for ax in drawing.figure.axes if ax.axison] == ["newton"]
-    assert "newton 2" in drawing.caption
-    assert not drawn(paths, replace(view, frames={"convergence": histories(ekf=filters), "tracks": pd.DataFrame()}))
+# Parameters ----------------------------------------------------------------------------------------------------------
 
 
 def test_only_the_papers_setting_has_the_papers_figures(synthetic):

@@ -10,8 +10,6 @@ from synthetic_store import Pretender
 from ipe_bench.report.tables import all_tables
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.comparisons import (
-    BUDGETS,
-    RATIOS,
     Outcomes,
     compare_pairs,
     corrected,
@@ -19,7 +17,6 @@ from ipe_bench.statistics.comparisons import (
     holm,
     may_be_best,
     mcnemar,
-    profiles,
 )
 from ipe_bench.statistics.histories import distances_to_limit, iterations_to_limit
 
@@ -124,22 +121,6 @@ def test_many_small_losses_do_not_outweigh_in_number_what_they_lose_in_rank():
     assert pair["favours"] == "B"
 
 
-def test_profiles_of_two_estimators_by_hand():
-    # Costs: a 1, 4, fails, fails; b 2, 2, 8, fails.
-    a = outcomes(np.ones(4), [1, 1, 0, 0], [1, 4, 1, 1])
-    b = outcomes(np.ones(4), [1, 1, 1, 0], [2, 2, 8, 1])
-    tables = profiles([{"a": a, "b": b}]).set_index(["profile", "estimator"])["share"]
-
-    def share(profile, label, at):
-        grid = {"performance": RATIOS, "data": BUDGETS}[profile]
-        return tables.loc[profile, label].to_numpy()[np.searchsorted(grid, at, side="right") - 1]
-
-    assert [share("performance", "a", r) for r in (1, 2.5)] == [0.25, 0.5]
-    assert [share("performance", "b", r) for r in (1, 2.5)] == [0.5, 0.75]
-    assert [share("data", "a", c) for c in (1, 3, 4, 100)] == [0.25, 0.25, 0.5, 0.5]
-    assert [share("data", "b", c) for c in (1, 2, 8, 100)] == [0, 0.5, 0.75, 0.75]
-
-
 def test_iterations_to_the_limit_of_a_halving_sequence():
     history = np.array([[2.0**-k] for k in range(12)] + [[0.0]])
     distances = distances_to_limit(history, np.array([1.0]))
@@ -180,8 +161,6 @@ def test_the_error_that_is_compared_is_a_distance_and_not_its_square(synthetic):
     assert scores.loc["one", "capped_error"] == pytest.approx(3 * np.sqrt(3))
     assert scores.loc["two", "capped_error"] == pytest.approx(np.sqrt(3))
     assert analysis.pairs.loc[0, "median_difference"] == pytest.approx(2 * np.sqrt(3))
-    middle = analysis.distributions.query("estimator == 'one' and probability == 0.5")["distance"]
-    assert middle.item() == pytest.approx(3 * np.sqrt(3))
 
 
 def test_closer_is_said_of_errors_and_bold_of_success(synthetic):
@@ -198,9 +177,8 @@ def test_closer_is_said_of_errors_and_bold_of_success(synthetic):
     assert (finding, bold) == ("B is closer", {"A"})
 
 
-def test_profiles_compare_on_the_same_scenarios_and_by_the_same_gate(synthetic):
-    """An estimator that was spared the hard scenario has no part in the profile; users of a prior have no easier or
-    harder gate than the others."""
+def test_pairs_are_compared_by_the_same_gate(synthetic):
+    """Users of a prior have no easier or harder gate than the others."""
     easy, hard = (synthetic.scenario(error_scale=s) for s in (1.0, 2.0))
     e = 0.1 * np.random.default_rng(9).normal(size=(50, 3))
     bayes = Pretender(knows_prior=True)
@@ -208,10 +186,7 @@ def test_profiles_compare_on_the_same_scenarios_and_by_the_same_gate(synthetic):
     synthetic.add(hard, "both", np.full((50, 3), 9.0))
     synthetic.add(easy, "map", e, estimator=bayes, success=False)
     synthetic.add(hard, "map", e, estimator=bayes, success=False)
-    synthetic.add(easy, "spared", e)
     analysis = analyse([synthetic.directory])
-    last = analysis.profiles[analysis.profiles["profile"] == "data"].groupby("estimator")["share"].last()
-    assert last.to_dict() == {"both": 0.5, "map": 1.0}
     pairs = analysis.pairs.set_index(["first", "second", "error_scale"])
     assert pairs.loc[("both", "map", 1.0), "only_first"] == 0
     assert pairs.loc[("both", "map", 2.0), "only_second"] == 50

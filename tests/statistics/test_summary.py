@@ -256,4 +256,3 @@ def test_epochs_of_a_filter_are_not_iterations(synthetic):
     assert np.isnan(scores.loc["ekf", "order_median"])
     assert scores.loc["ekf", "histories"] == 0
     assert scores.loc["newton", "histories"] == 1
-    assert set(analysis.convergence["estimator"]) == {"newton"}

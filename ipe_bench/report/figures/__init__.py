@@ -17,7 +17,7 @@ from ipe_bench.report.figures.views import View, views
 from ipe_bench.report.style import FORMATS, PAGE, Which, house_style
 from ipe_bench.statistics.analysis import Analysis
 
-FIGURES = ("errors", "costs", "parameters", "paths")
+FIGURES = ("errors", "costs", "parameters")
 """The modules in the order of the report; each holds its kinds of figures in FIGURES."""
 INDEX = "index.json"
 

@@ -90,23 +90,19 @@ def number(value: float) -> str:
 
 
 def scale_axis(ax: Axes, scales: Sequence[float], labels: Sequence[str]) -> None:
-    """A logarithmic axis that shows the error scales themselves; if there is one alone, the labels side by side."""
+    """A logarithmic axis that shows ascending error scales; if there is one alone, the labels side by side."""
     if len(scales) == 1:
         ax.set_xticks(range(len(labels)), [text(label) for label in labels], rotation=90)
         ax.set_xlim(-0.6, len(labels) - 0.4)
         ax.set_xlabel("")
         return
-    positive = sorted(s for s in scales if s > 0)
-    zero = len(positive) < len(scales)
-    # A scale of zero has no place on a logarithmic axis: a decade below the smallest is as near as it gets.
-    least = positive[0] / 10 if zero else positive[0]
-    ax.set_xscale("symlog", linthresh=positive[0], linscale=0.5) if zero else ax.set_xscale("log")
-    span = np.log10(positive[-1] / least)
-    kept = [0.0] * zero + labelled(positive, span / _letters(_width(ax), "xtick.labelsize"))
+    span = np.log10(scales[-1] / scales[0])
+    kept = labelled(scales, span / _letters(_width(ax), "xtick.labelsize"))
+    ax.set_xscale("log")
     ax.set_xticks(kept, [plain(s) for s in kept])
     ax.set_xticks([], minor=True)
     margin = 10 ** max(0.06 * span, 0.15)
-    ax.set_xlim(-0.3 * positive[0] if zero else least / margin, positive[-1] * margin)
+    ax.set_xlim(scales[0] / margin, scales[-1] * margin)
     ax.set_xlabel("error scale")
 
 
@@ -149,11 +145,10 @@ def log_ticks(axis: Axis, low: float, high: float) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def shares(ax: Axes, label: str) -> None:
+def shares(ax: Axes) -> None:
     """A vertical axis from none to all."""
     ax.set_ylim(-0.03, 1.03)
     ax.yaxis.set_major_formatter(lambda v, _: f"{100 * v:.0f} %")
-    ax.set_ylabel(label)
 
 
 def bound_line(ax: Axes, at: float, label: str) -> None:
@@ -200,7 +195,7 @@ def curves(
     interval if they are fewer than `FEW`.
     """
     scale_axis(ax, scales, list(look))
-    gap = float(np.diff(np.log10([s for s in sorted(scales) if s > 0])).min(initial=1.0))
+    gap = float(np.diff(np.log10(scales)).min(initial=1.0))
     most, emptied = rows["trials"].max(), {"linestyle": "none", "markerfacecolor": "white", "markeredgewidth": 1.1}
     hollow = False
     for i, (name, one) in enumerate(look.items()):
@@ -212,16 +207,14 @@ def curves(
         if interval and one.color != GREY:
             sizes = np.array([values - part[interval[0]], part[interval[1]] - values]).clip(min=0)
             ends = np.where(np.isfinite(sizes).all(axis=0) & ~few.to_numpy(), sizes, np.nan)
-        line: dict[str, Any] = (
-            one.line | ({"linestyle": "none"} if len(scales) == 1 else {}) | {"zorder": 2 - (one.color == GREY)}
-        )
+        line: dict[str, Any] = {**one.line, "zorder": 2 - (one.color == GREY)}
+        line |= {"linestyle": "none"} if len(scales) == 1 else {}
         ax.errorbar(x, values.where(np.isfinite(values)), ends, elinewidth=0.8, **line)
         empty = few | (part[trials] < most)
         hollow |= bool(empty.any())
         ax.plot(x[empty], values[empty], marker=one.marker, markeredgecolor=one.color, zorder=3, **emptied)
     if hollow:
-        words = "hollow: trials missing, or few"
-        ax.plot([], [], marker="o", markeredgecolor=BOUND_COLOR, label=words, **emptied)
+        ax.plot([], [], marker="o", markeredgecolor=BOUND_COLOR, label="hollow: trials missing, or few", **emptied)
     ax.set_ylabel(label)
     if heading:
         title(ax, heading)

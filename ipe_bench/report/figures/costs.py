@@ -74,7 +74,7 @@ def draw_known_minima(view: View) -> Iterator[Drawing]:
     ax.set_xscale("log")
     ax.set_xlim(low, end)
     common.log_ticks(ax.xaxis, low, end)
-    common.shares(ax, "")
+    common.shares(ax)
     common.legend(fig, [ax], look)
     ax.set(xlabel="simplex gradients, n + 1 simulations each", ylabel="share of problems solved")
     yield view.drawing(

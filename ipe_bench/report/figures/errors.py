@@ -43,7 +43,7 @@ def draw(view: View) -> Iterator[Drawing]:
     fig, axes = common.panels(3 if len(claims) else 2, view.look, height=3.3)
     shown = view.look, view.scales
     words: dict[str, Any] = {"heading": "success", "label": "share of all trials"}
-    common.shares(axes[0], "")
+    common.shares(axes[0])
     common.curves(axes[0], totals, "success", *shown, interval=("success_low", "success_high"), **words)
     words = {"heading": "error over the bound", "label": "median, bar to 95 %"}
     common.decades(axes[1], totals[["error_median", "error_q95"]].clip(lower=0.5), least=4.0)
