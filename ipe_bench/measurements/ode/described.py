@@ -374,6 +374,7 @@ class _Engine(OdeMeasurement):
     cases = property(lambda engine: engine.described.cases)  # type: ignore[assignment]
     parameters = property(lambda engine: engine.described.parameters)  # type: ignore[assignment]
     nominal = property(lambda engine: engine.described.nominal)  # type: ignore[assignment]
+    _coarsens = property(lambda engine: engine.step is None and not engine.stiff)  # type: ignore[assignment]
 
     @cached_property
     def times(self) -> Array:
@@ -458,16 +459,9 @@ class _Engine(OdeMeasurement):
     def jacobian_until(self, x: Array, stop: int) -> Array:
         return self._implicit.jacobian(x, stop) if self.stiff else super().jacobian_until(x, stop)
 
-    def coarse_jacobian_until(self, x: Array, stop: int) -> Array:
-        return self._implicit.jacobian(x, stop) if self.stiff else super().coarse_jacobian_until(x, stop)
-
     @cached_property
     def jacobian_cost(self) -> float:  # type: ignore[override]
         return float(1 + self.n) if self.stiff else super().jacobian_cost
-
-    @cached_property
-    def coarse_jacobian_cost(self) -> float:  # type: ignore[override]
-        return self.jacobian_cost if self.stiff else super().coarse_jacobian_cost
 
     def hindrance(self, x: Array) -> str:
         x = own(x[None, : self.n])
@@ -507,17 +501,18 @@ class _Engine(OdeMeasurement):
             values[name] = u if kind == "hold" else u + next(constants) * (t - next(constants))
         return values
 
+    def _computed(self, formulas: Mapping[str, Arithmetic], t: Any, y: Any, p: Any, c: Any) -> list[Any]:
+        values = self._values(t, y, p, c)
+        return [formula(values) for formula in formulas.values()]
+
     def start(self, p, c):
-        values = self._values(0.0, [0.0] * self.states, p, c)
-        return [formula(values) for formula in self.described.initial_formulas.values()]
+        return self._computed(self.described.initial_formulas, 0.0, [0.0] * self.states, p, c)
 
     def rhs(self, t, y, p, c):
-        values = self._values(t, y, p, c)
-        return [formula(values) for formula in self.described.piecewise_rates[0].values()]
+        return self._computed(self.described.piecewise_rates[0], t, y, p, c)
 
     def read(self, t, y, p, c):
-        values = self._values(t, y, p, c)
-        return [formula(values) for formula in self.described.output_formulas.values()]
+        return self._computed(self.described.output_formulas, t, y, p, c)
 
 
 def packaged(name: str) -> Callable[..., Ode]:

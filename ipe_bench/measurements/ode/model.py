@@ -7,7 +7,7 @@ come from it. Recording is in `trace` and `plan`, integration in `integrator`, t
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -187,7 +187,7 @@ class OdeMeasurement(Measurement):
     @property
     def _guessed(self) -> bool:
         """Whether the rate says with which steps to integrate."""
-        return self.step is None and self.trusted_angle > 0 and self._rate_function is not None
+        return self.trusted_angle > 0 and self._rate_function is not None
 
     def _guess(self, x: Array) -> Indices:
         """The level of each trial by its rate alone."""
@@ -214,9 +214,8 @@ class OdeMeasurement(Measurement):
 
     def _common_steps(self, x: Array) -> NDArray[np.int64] | None:
         """The steps to each time that are the same for all trials, fixed or known to do; None where trials differ."""
-        if self.step is not None:
-            return self._fixed_steps
-        return self._parts if self.trusted_angle and self._rates(x)[1] * self._longest <= self.trusted_angle else None
+        trusted = self.trusted_angle and self._rates(x)[1] * self._longest <= self.trusted_angle
+        return self._parts if self.step is not None or trusted else None
 
     def _simulate(self, x: Array, rows: Indices, steps: NDArray[np.int64], offset: Array, z: Array) -> None:
         """Fills these rows of z (trials, readings), as many times as it has room for, with so many steps to each."""
@@ -228,7 +227,6 @@ class OdeMeasurement(Measurement):
     _cases = cached_property(lambda self: own(self.cases))
     _times = cached_property(lambda self: own(self.times))
     _remembered = cached_property(lambda self: dict[bytes, int]())
-    _fixed_steps = cached_property(lambda self: steps_between(self.times, self.step))
 
     def _search(self, x: Array, offset: Array) -> Found:
         """The level of each trial, and the readings of those whose level had to be looked for."""
@@ -293,8 +291,9 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def _parts(self) -> NDArray[np.int64]:
-        """Steps to each time at level 1: one, more over an interval longer than usual, none over none."""
-        return steps_between(self.times, self._usual_interval)
+        """Steps to each time at level 1: equal ones, none longer than `step` or the usual interval, none over none."""
+        intervals, longest = np.diff(self.times, prepend=0.0), self.step or self._usual_interval
+        return np.where(intervals > 0.0, np.maximum(np.ceil(intervals / longest - 1e-9), 1), 0).astype(np.int64)
 
     @cached_property
     def _usual_interval(self) -> float:
@@ -325,26 +324,36 @@ class OdeMeasurement(Measurement):
     def jacobian_until(self, x: Array, stop: int) -> Array:
         """dh/dx by the variational equations, integrated by the same formula and steps as the readings of that x."""
         x = own(x)
-        everyone, common, J = np.arange(len(x)), self._common_steps(x), self._empty_jacobian(x, stop)
+        everyone, common = np.arange(len(x)), self._common_steps(x)
         if common is not None:
             groups = [(everyone, common)]
         else:
             groups = self._groups(self._search(x, self._zeros).places, everyone)
-        for rows, steps in groups:
-            self._differentiate(self._jacobian_kernel, x, rows, steps, J)
-        return J
+        return self._tangents(x, stop, [(self._jacobian_kernel, rows, steps) for rows, steps in groups])
 
     def coarse_jacobian_until(self, x: Array, stop: int) -> Array:
         """dh/dx with longer steps, or by a cheaper formula, where that was measured to contract; see `coarse`."""
-        if self.step is not None:
+        if not self._coarsens:
             return self.jacobian_until(x, stop)
         x = own(x)
-        partial = self._guessed and stop < len(self.times)
-        places = self._guess(x) if partial else self._search(x, self._zeros).places
-        J, trusted = self._empty_jacobian(x, stop), self._trusted(x) == 0
-        for place, rows in grouped(np.where(trusted, -1, places), np.arange(len(x))):
+        guessed = self._guessed and stop < len(self.times)
+        places = self._guess(x) if guessed else self._search(x, self._zeros).places
+        groups = []
+        for place, rows in grouped(np.where(self._trusted(x) == 0, -1, places), np.arange(len(x))):
             kernel, level = self._coarsened(place)
-            self._differentiate(kernel, x, rows, level * self._parts, J)
+            groups.append((kernel, rows, level * self._parts))
+        return self._tangents(x, stop, groups)
+
+    @property
+    def _coarsens(self) -> bool:
+        """Whether there are longer steps for tangents."""
+        return self.step is None
+
+    def _tangents(self, x: Array, stop: int, groups: Iterable[tuple[Kernel, Indices, NDArray[np.int64]]]) -> Array:
+        """J (trials, readings, n) at the first times, each group of trials by its kernel and its steps."""
+        J = np.empty((len(x), len(self._cases) * stop * len(self.outputs), self.n))
+        for kernel, rows, steps in groups:
+            kernel.run(x, self._si_sizes, self.tables, rows, self._times[:stop], steps, J.reshape(-1))
         return J
 
     def _coarsened(self, place: int) -> tuple[Kernel, int]:
@@ -362,9 +371,9 @@ class OdeMeasurement(Measurement):
         may be where readings are within a sixteenth of the tolerance."""
         x, everything = own(self.nominal[None]), len(self.times)
         level, J = int(self._ladder[self._search(x, self._zeros).places[0]]), self.jacobian(x)
-        rk4, tangents = None, np.empty_like(J)
+        rk4 = None
         for k in range(1, MOST_RK4 + 1) if level <= 2 else ():
-            self._differentiate(self._rk4_kernel, x, np.arange(1), k * self._parts, tangents)
+            tangents = self._tangents(x, everything, [(self._rk4_kernel, np.arange(1), k * self._parts)])
             if contraction(tangents[0], J[0]) <= CONTRACTION:
                 rk4 = k
                 break
@@ -386,14 +395,6 @@ class OdeMeasurement(Measurement):
         longer = (16 * CONTRACTION / sensitivity) ** (1 / ORDER) if sensitivity > 0 else np.inf
         return rk4, float(np.clip(longer, 1.0, LONGEST))
 
-    def _empty_jacobian(self, x: Array, stop: int) -> Array:
-        return np.empty((len(x), len(self._cases) * stop * len(self.outputs), self.n))
-
-    def _differentiate(self, kernel: Kernel, x: Array, rows: Indices, steps: NDArray[np.int64], J: Array) -> None:
-        """Fills these rows of J (trials, readings, n), as many times as it has room for."""
-        times = self._times[: J.shape[1] // (len(self._cases) * len(self.outputs))]
-        kernel.run(x, self._si_sizes, self.tables, rows, times, steps, J.reshape(-1))
-
     @cached_property
     def jacobian_cost(self) -> float:  # type: ignore[override]
         """Arithmetic operations of a step with all tangents, over those of a simulation's step."""
@@ -402,11 +403,11 @@ class OdeMeasurement(Measurement):
     @cached_property
     def coarse_jacobian_cost(self) -> float:  # type: ignore[override]
         """At the nominal parameters, or where they are at a level above 2; in simulations at the trial's level."""
-        if self.step is not None:
+        if not self._coarsens:
             return self.jacobian_cost
-        place = int(self._search(own(self.nominal[None]), self._zeros).places[0])
-        trusted = self._trusted(own(self.nominal[None]))[0] == 0
-        kernel, level = self._coarsened(-1 if trusted else place)
+        x = own(self.nominal[None])
+        place = int(self._search(x, self._zeros).places[0])
+        kernel, level = self._coarsened(-1 if self._trusted(x)[0] == 0 else place)
         return kernel.plan.operations * level / (self._readings_kernel.plan.operations * int(self._ladder[place]))
 
     def __getstate__(self) -> dict[str, Any]:
@@ -439,9 +440,3 @@ class OdeMeasurement(Measurement):
 def time_heading(unit: str) -> str:
     """The column of the times in a file."""
     return f"time [{unit}]" if unit else "time"
-
-
-def steps_between(times: Array, longest: float) -> NDArray[np.int64]:
-    """The equal steps (times,) from each time to the next, none longer than that."""
-    intervals = np.diff(times, prepend=0.0)
-    return np.where(intervals > 0.0, np.maximum(np.ceil(intervals / longest - 1e-9), 1), 0).astype(np.int64)

@@ -124,58 +124,62 @@ class Rodas5P:
 
     def measured(self, x: Array) -> tuple[Array, Work]:
         """The readings (1, m) at x (1, n), and what they take; a tolerance that shows the shape will do."""
-        run = self._run(x, len(self.model.times), stretch=True)
+        run = _Run(self, x, len(self.model.times), stretched=True)
         k = int(np.argmax(run.stretch))
         explicit, fastest, met = (float(a[k]) for a in (run.stretch, run.fastest, run.met))
-        return self._readings(run), Work(int(run.steps.max()), explicit, fastest, met, float(run.t.min()))
+        return run.readings, Work(int(run.steps.max()), explicit, fastest, met, float(run.t.min()))
 
     def simulate(self, x: Array, stop: int) -> Array:
         """Readings (trials, cases x stop x outputs) at the first `stop` times; NaN from where a trial breaks down."""
-        return self._readings(self._run(x, stop))
+        return _Run(self, x, stop).readings
 
     def jacobian(self, x: Array, stop: int) -> Array:
         """Their derivatives by x (trials, cases x stop x outputs, n)."""
-        J = self._run(x, stop, sensitive=True).J
+        J = _Run(self, x, stop, sensitive=True).J
         readings = len(self.model.cases) * stop * len(self.model.outputs)
         return J.transpose(3, 1, 0, 2).reshape(len(x), readings, self.model.n) * self.model.si_sizes
 
-    def _run(self, x: Array, stop: int, *, sensitive: bool = False, stretch: bool = False) -> _Run:
-        run = _Run(self, x, stop, sensitive=sensitive, stretch=stretch)
-        with np.errstate(all="ignore"):
-            run.all_steps()
-        return run
-
-    def _readings(self, run: _Run) -> Array:
-        outputs, stop, lanes = run.z.shape
-        cases = len(self.model.cases)
-        return run.z.transpose(2, 1, 0).reshape(lanes // cases, cases * stop * outputs)
-
 
 class _Run:
-    """The lanes of one integration; arrays are (..., lanes)."""
+    """The lanes of one integration to the last time; arrays are (..., lanes)."""
 
-    def __init__(self, method: Rodas5P, x: Array, stop: int, *, sensitive: bool, stretch: bool) -> None:
-        model, self.do, self.rtol = method.model, method._programs, method.rtol
-        self.atol = _SMALLEST * method.rtol
-        self.times, self.end = np.asarray(model.times, dtype=float)[:stop], float(model.times[-1])
-        cases, self.q = model.cases, model.n if sensitive else 0
-        lanes, n = len(x) * len(cases), model.states
-        self.p = np.repeat(x * model.si_sizes, len(cases), axis=0).T.copy()
-        self.tables, self.case = model.tables, np.tile(np.arange(len(cases)), len(x))
-        self.directions = np.eye(model.n)[:, :, None]
+    def __init__(
+        self, method: Rodas5P, x: Array, stop: int, *, sensitive: bool = False, stretched: bool = False
+    ) -> None:
+        model = self.model = method.model
+        self.do, self.rtol, self.atol = method._programs, method.rtol, _SMALLEST * method.rtol
+        self.times, self.stretched = np.asarray(model.times, dtype=float)[:stop], stretched
+        cases, self.q = len(model.cases), model.n if sensitive else 0
+        lanes = len(x) * cases
+        self.p = np.repeat(x * model.si_sizes, cases, axis=0).T.copy()
+        self.case, self.directions = np.tile(np.arange(cases), len(x)), np.eye(model.n)[:, :, None]
         self.t, self.place, self.steps = np.zeros(lanes), np.zeros(lanes, int), np.zeros(lanes, int)
-        c = self._constants(np.arange(lanes))
-        self.y = _stacked(self.do["start"], [*self.p, *c], (lanes,))
-        self.S = np.zeros((n, 0, lanes))
-        if sensitive:
-            self.S = _stacked(self.do["dstart"], [*self.p, *c, *self.directions], (self.q, lanes))
+        self.stretch, self.fastest, self.met = np.zeros((3, lanes))
         self.z = np.full((len(model.outputs), stop, lanes), np.nan)
         self.J = np.full((len(model.outputs), stop, self.q, lanes), np.nan)
-        self.stretch, self.fastest, self.met = np.zeros(lanes), np.zeros(lanes), np.zeros(lanes)
-        self.stretched = stretch
+        self.S = np.zeros((model.states, 0, lanes))
+        c = self._constants(np.arange(lanes))
+        with np.errstate(all="ignore"):
+            self.y = self._values("start", [*self.p, *c], lanes)
+            if sensitive:
+                self.S = self._values("dstart", [*self.p, *c, *self.directions], self.q, lanes)
+            self._integrate()
 
-    def all_steps(self) -> None:
-        """Integrates every lane to the last time, reading on the way."""
+    @property
+    def readings(self) -> Array:
+        outputs, stop, lanes = self.z.shape
+        cases = len(self.model.cases)
+        return self.z.transpose(2, 1, 0).reshape(lanes // cases, cases * stop * outputs)
+
+    def _values(self, name: str, inputs: Sequence[Any], *shape: int) -> Array:
+        """The outputs of a program, of which some may be numbers, as one array."""
+        program = self.do[name]
+        out = np.empty((len(program.outputs), *shape))
+        for row, value in zip(out, program(inputs), strict=True):
+            row[...] = value
+        return out
+
+    def _integrate(self) -> None:
         h = self._first_step()
         live = np.arange(len(self.t))
         while True:
@@ -199,34 +203,31 @@ class _Run:
             self.t[done] = np.where(now[good] == left[good], self.times[self.place[done]], self.t[done] + now[good])
             self.y[:, done], self.S[:, :, done] = y[:, good], S[:, :, good]
 
-    def _read(self, live: Array) -> None:
-        """Takes the readings whose time has come, at t = 0 too, in all lanes `live`."""
-        here = live
+    def _read(self, here: Array) -> None:
+        """Takes the readings whose time has come, at t = 0 too, in these lanes."""
         while True:
             here = here[self.place[here] < len(self.times)]
             here = here[self.t[here] == self.times[self.place[here]]]
             if not len(here):
                 return
-            at = self._at(here)
-            self.z[:, self.place[here], here] = _stacked(self.do["read"], at, (len(here),))
+            at = (self.t[here], *self.y[:, here], *self.p[:, here], *self._constants(here, 1))
+            self.z[:, self.place[here], here] = self._values("read", at, len(here))
             if self.q:
-                slopes = _stacked(self.do["dread"], [*at, *self.S[:, :, here], *self.directions], (self.q, len(here)))
+                slopes = self._values("dread", [*at, *self.S[:, :, here], *self.directions], self.q, len(here))
                 self.J[:, self.place[here], :, here] = slopes.transpose(2, 0, 1)
             self.place[here] += 1
 
-    def _at(self, lanes: Array) -> tuple[Any, ...]:
-        return (self.t[lanes], *self.y[:, lanes], *self.p[:, lanes], *self._constants(lanes, 1))
-
     def _constants(self, lanes: Array, later: int = 0) -> Array:
         """Of the interval to the next time of each lane, or those that hold from that time on."""
-        return self.tables[np.minimum(self.place[lanes] + later, len(self.tables) - 1), self.case[lanes]].T
+        tables = self.model.tables
+        return tables[np.minimum(self.place[lanes] + later, len(tables) - 1), self.case[lanes]].T
 
     def _step(self, live: Array, h: Array) -> tuple[Array, Array, Array]:
         """States, sensitivities and the error in units of the tolerance after a step h of the lanes `live`."""
-        do, q, lanes = self.do, self.q, len(live)
+        q, lanes = self.q, len(live)
         t, y, p, c, S = self.t[live], self.y[:, live], self.p[:, live], self._constants(live), self.S[:, :, live]
         n, at = len(y), (t, *y, *p, *c)
-        J = _stacked(do["J"], at, (lanes,)).reshape(n, n, lanes)
+        J = self._values("J", at, lanes).reshape(n, n, lanes)
         if self.stretched:
             finite = np.nan_to_num(np.moveaxis(J, 2, 0), posinf=0.0, neginf=0.0)
             radius = np.abs(np.linalg.eigvals(finite)).max(axis=1)
@@ -237,43 +238,34 @@ class _Run:
         W = -J
         W[range(n), range(n)] += 1 / (h * GAMMA)
         exchanged = _factor(W)
-        ft = _stacked(do["ft"], at, (lanes,))
+        ft = self._values("ft", at, lanes)
         ways = (*S, *self.directions)
-        dft = _stacked(do["dft"], [*at, *ways], (q, lanes)) if q else 0.0
+        dft = self._values("dft", [*at, *ways], q, lanes) if q else 0.0
         K: list[Array] = []
         D: list[Array] = []
         u, V = y, S
         for a, b, node, weight in zip(A, C, NODES, TIME_WEIGHTS, strict=True):
             u = y + sum(w * k for w, k in zip(a, K, strict=True))
             inside = (t + node * h, *u, *p, *c)
-            rest = _stacked(do["f"], inside, (lanes,)) + h * weight * ft
+            rest = self._values("f", inside, lanes) + h * weight * ft
             rest = rest + sum(w * k for w, k in zip(b, K, strict=True)) / h
             K.append(_solve(W, exchanged, rest[:, None])[:, 0])
             if q:
                 V = S + sum(w * k for w, k in zip(a, D, strict=True))
-                rest = _stacked(do["df"], [*inside, *V, *self.directions], (q, lanes)) + h * weight * dft
+                rest = self._values("df", [*inside, *V, *self.directions], q, lanes) + h * weight * dft
                 rest = rest + sum(w * k for w, k in zip(b, D, strict=True)) / h
-                rest = rest + _stacked(do["dJk"], [*at, *K[-1], *ways], (q, lanes))
+                rest = rest + self._values("dJk", [*at, *K[-1], *ways], q, lanes)
                 D.append(_solve(W, exchanged, rest))
         y1 = u + K[-1]  # stiffly accurate: the last stage is the error of the embedded solution
         size = self.atol + self.rtol * np.maximum(np.abs(y), np.abs(y1))
         return y1, V + D[-1] if q else S, (np.abs(K[-1]) / size).max(axis=0)
 
     def _first_step(self) -> Array:
-        end = self.end or 1.0
+        end, lanes = float(self.model.times[-1]) or 1.0, len(self.t)
         scale = self.atol + self.rtol * np.abs(self.y)
-        c = self._constants(np.arange(len(self.t)))
-        f = _stacked(self.do["f"], [np.zeros(len(self.t)), *self.y, *self.p, *c], self.t.shape)
+        f = self._values("f", [self.t, *self.y, *self.p, *self._constants(np.arange(lanes))], lanes)
         speed, size = (np.abs(f) / scale).max(axis=0), (np.abs(self.y) / scale).max(axis=0)
         return np.where((speed > 1e-5) & (size > 1e-5), np.minimum(1e-3 * size / speed, end), 1e-6 * end)
-
-
-def _stacked(program: Program, inputs: Sequence[Any], shape: tuple[int, ...]) -> Array:
-    """The outputs of a program, of which some may be numbers, as one array."""
-    out = np.empty((len(program.outputs), *shape))
-    for row, value in zip(out, program(inputs), strict=True):
-        row[...] = value
-    return out
 
 
 def _factor(W: Array) -> list[Array]:
