@@ -18,8 +18,7 @@ from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
 from ipe_bench.runs import parts
-from ipe_bench.runs.key import ResultKey
-from ipe_bench.runs.store import Store
+from ipe_bench.runs.store import ResultKey, Store
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.thresholds import GATE
 

@@ -22,8 +22,7 @@ from ipe_bench.cli.progress import shown_progress
 from ipe_bench.cli.results import show_report
 from ipe_bench.cli.session import Jobs, complete, jobs_of, session, show, spec_of
 from ipe_bench.cli.spec import STANDARD_FILTERS, Spec
-from ipe_bench.runs.execution import Serial
-from ipe_bench.runs.execution.processes import end_idle
+from ipe_bench.runs.execution import Serial, end_idle
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import accept, compute, record_refusal, result_keys, validate
 from ipe_bench.runs.store import describe_names

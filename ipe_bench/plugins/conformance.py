@@ -581,7 +581,7 @@ def ends_with_the_run(execution: Execution) -> None:
     except UserError:
         pass
     else:
-        raise AssertionError("a UserError does not end the run; raise what is in ipe_bench.runs.execution.base.FATAL")
+        raise AssertionError("a UserError does not end the run; raise what is in ipe_bench.runs.execution.FATAL")
     events = execution.run(_work, (range(3), range(3)))
     next(iter(events))
     assert isinstance(events, Generator), "run returns no generator, which could be closed"

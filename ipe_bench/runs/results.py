@@ -1,8 +1,7 @@
 """What is stored under output folders: what is there, done, missing, failed, refused, stale and damaged.
 
 `run` asks it what to compute, `status` and `report` what to show, `load` for the rows, so they cannot disagree. A file
-is used, or named with what is wrong with it; nothing is guessed, mixed or deleted. `statistics` says what the numbers
-mean.
+is used, or named with what is wrong with it; nothing is guessed, mixed or deleted.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from collections.abc import Collection as Keys
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -25,10 +24,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.runs.parts import TRUTH, Outdated, Part, Unusable, as_array, read_record
 from ipe_bench.runs.provenance import canonical_json
-from ipe_bench.runs.store import Store, describe_names, gaps, title
-
-if TYPE_CHECKING:
-    from ipe_bench.runs.key import ResultKey
+from ipe_bench.runs.store import ResultKey, Store, describe_names, gaps, title
 
 T = TypeVar("T")
 _AGAIN = "run the same command again, which computes it anew"
@@ -77,11 +73,8 @@ class StoredCell:
     @property
     def written(self) -> float:
         """When the youngest of its files was written; 0 if they went away meanwhile."""
-        times = [0.0]
-        for part in self.parts:
-            with contextlib.suppress(OSError):
-                times.append(part.path.stat().st_mtime)
-        return max(times)
+        times = [os.path.getmtime(part.path) for part in self.parts if part.path.is_file()]
+        return max(times, default=0.0)
 
 
 @dataclass(frozen=True)
@@ -178,7 +171,6 @@ class Results:
         for path in results.directories:
             if not path.is_dir():
                 raise UserError(f"{path}: there is no such directory; give one that a run wrote to")
-        for path in results.directories:
             results._read_directory(Store(path), keys)
         results.runs = tuple(sorted(results.runs, key=lambda run: (run.started, run.path.name)))
         return results
@@ -193,20 +185,16 @@ class Results:
         while fresh := [part for part in store.parts(keys) if part.path not in listed]:
             for part in fresh:
                 listed.add(part.path)
-                self._add(part)
+                with self._naming(part.path), contextlib.suppress(FileNotFoundError):
+                    footer, _ = part.read()
+                    known = self.stored[part.key].parts if part.key in self.stored else ()
+                    self.stored[part.key] = StoredCell(footer, tuple(sorted([*known, part], key=lambda p: p.order)))
         self.runs += tuple(Run(path, record) for path, record in self._records(store.runs))
         self.attempts += [record for _, record in self._records(store.failed)]
         if keys is None and not listed and not self.runs:
             self.extra_problems.append(f"{store.directory}: holds no results of ipe-bench")
         if self.outdated and not self.stored and keys is None:
             self.extra_problems.append(f"{store.directory}: was written by an older version of ipe-bench; {_AGAIN}")
-
-    def _add(self, part: Part) -> None:
-        """Adds a part to what is stored, if it is there and every byte of it is whole."""
-        with self._naming(part.path), contextlib.suppress(FileNotFoundError):
-            footer, _ = part.read()
-            known = self.stored[part.key].parts if part.key in self.stored else ()
-            self.stored[part.key] = StoredCell(footer, tuple(sorted([*known, part], key=lambda p: p.order)))
 
     def _records(self, folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
         for path in sorted(folder.glob("[!.]*.json")):
@@ -240,17 +228,17 @@ class Results:
     @property
     def stale(self) -> list[str]:
         """A line for what older code computed: left out, and no problem if the present code has computed it."""
-        return [
-            f"stale: {describe_names(cell.names)}: {cell.trials} trials were computed by other code"
-            f" ({', '.join(f'{p} {v}' for p, v in cell.footer.get('versions', {}).items())},"
-            f" source {cell.footer.get('source')}, key {cell.key}); left out"
-            for _, stale in self._rivals.values()
-            for cell in stale
-        ] + [
-            f"stale: {folder}: {sum(path.is_relative_to(folder) for path in self.outdated)} files were written by an"
-            f" older version of ipe-bench; left out: {_AGAIN}"
-            for folder in dict.fromkeys(path.parents[1] for path in self.outdated)
-        ]
+        lines = []
+        for cell in (cell for _, stale in self._rivals.values() for cell in stale):
+            versions = ", ".join(f"{package} {version}" for package, version in cell.footer["versions"].items())
+            made_by = f"({versions}, source {cell.footer['source']}, key {cell.key})"
+            what = f"{describe_names(cell.names)}: {cell.trials} trials were computed by other code"
+            lines.append(f"stale: {what} {made_by}; left out")
+        for folder, count in Counter(path.parents[1] for path in self.outdated).items():
+            lines.append(
+                f"stale: {folder}: {count} files were written by an older version of ipe-bench; left out: {_AGAIN}"
+            )
+        return lines
 
     @property
     def expected(self) -> int:
@@ -290,9 +278,8 @@ class Results:
             rivals.setdefault(cell.footer["identity_key"], []).append(cell)
         result: dict[str, tuple[StoredCell | None, list[StoredCell]]] = {}
         for identity, cells in rivals.items():
-            asked = self._asked_for.get(identity)
-            key = max(cells, key=lambda cell: cell.written).key if asked is None else asked.key
-            result[identity] = self.stored.get(key), [c for c in cells if c.key != key]
+            asked = self._asked_for.get(identity) or max(cells, key=lambda cell: cell.written)
+            result[identity] = self.stored.get(asked.key), [cell for cell in cells if cell.key != asked.key]
         return result
 
     @property
@@ -334,11 +321,8 @@ class Results:
         for path, reason in self.damaged.items():
             aside = path.with_name(f"{path.stem}.damaged-{uuid.uuid4().hex[:8]}")
             with contextlib.suppress(FileNotFoundError):  # another run may have done so at this moment
-                try:
-                    path.rename(aside)
-                    lines.append(f"{path}: {reason}; set aside as {aside.name} and computed again")
-                except OSError as error:
-                    lines.append(f"{path}: {reason}; cannot be set aside ({error.strerror or error})")
+                path.rename(aside)
+                lines.append(f"{path}: {reason}; set aside as {aside.name} and computed again")
         return lines
 
     def _covered(self, key: str) -> Sequence[tuple[int, int]]:
@@ -370,7 +354,6 @@ class Results:
             for part in parts[:1]:
                 with self._naming(part.path):
                     return part.history() if part.start == 0 else None
-            return None
 
         return self._of_parts(cell, first)
 

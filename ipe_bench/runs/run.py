@@ -24,12 +24,11 @@ from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.problem import require_repeatable
 from ipe_bench.noise.unknown import NO_LEVEL
 from ipe_bench.runs.execution import Execution, Serial
-from ipe_bench.runs.key import ResultKey
 from ipe_bench.runs.parts import TRUTH, Unusable
 from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.schedule import Watcher, block_size_for, plan, run_tasks
-from ipe_bench.runs.store import Store
+from ipe_bench.runs.store import ResultKey, Store
 from ipe_bench.states.trackers import Tracker
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.tracking import AnyScenario, Tracking

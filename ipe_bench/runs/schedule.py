@@ -22,11 +22,10 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from ipe_bench.basics.errors import StorageError
-from ipe_bench.runs.execution.base import FATAL, Execution, Failure
-from ipe_bench.runs.key import ResultKey
+from ipe_bench.runs.execution import FATAL, Execution, Failure
 from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.runs.results import Results
-from ipe_bench.runs.store import Store, describe_names
+from ipe_bench.runs.store import ResultKey, Store, describe_names
 from ipe_bench.trials.scoring import HISTORIES
 from ipe_bench.trials.tracking import AnyScenario, block_of
 
@@ -53,40 +52,59 @@ class Task:
     stop: int
 
 
-@dataclass(frozen=True)
-class Done:
-    """One cell of a task is finished: stored, or failed."""
-
-    cell: int
-    failure: Failure | None = None
-
-
-@dataclass(frozen=True)
 class Progress:
-    """What a watcher of a run is told after each cell."""
+    """How far a run is: what its watcher is told after each cell."""
 
-    done: int
-    """Tasks that have ended."""
-    tasks: int
-    trials: int
-    """Trials times estimators that are done."""
-    total: int
-    """Trials times estimators that were missing when the run began."""
-    failures: tuple[str, ...]
-    preparing: bool = False
-    """Whether nothing has been estimated yet, as code is imported and compiled first."""
-    seconds: float = 0.0
-    """Time since the first estimator began, after imports and compilation."""
+    def __init__(self, tasks: Sequence[Task]) -> None:
+        cells = [(task, cell) for task in tasks for cell in task.cells]
+        self.total = sum(_weight(*one) for one in cells)
+        """Trials times estimators that were missing when the run began."""
+        self.trials = 0
+        """Trials times estimators that are done."""
+        self.failures: list[str] = []
+        self._left = Counter((id(cell.scenario), task.start, task.stop) for task, cell in cells)
+        """Cells of each task that are not done."""
+        self._began: float | None = None
+
+    def begin(self) -> bool:
+        """Notes that an estimator begins; returns whether it is the first, after imports and compilation."""
+        first, self._began = self._began is None, self._began or time.monotonic()
+        return first
+
+    def close(self, task: Task, cell: ResultKey, failure: Failure | None) -> None:
+        """Notes that a cell of a task is stored, or has failed for good."""
+        self._left[id(cell.scenario), task.start, task.stop] -= 1
+        self.trials += _weight(task, cell)
+        if failure is not None:
+            self.failures.append(f"{_described(task, cell)}: {failure.message}")
+
+    @property
+    def tasks(self) -> int:
+        return len(self._left)
+
+    @property
+    def done(self) -> int:
+        """Tasks that have ended."""
+        return sum(left == 0 for left in self._left.values())
+
+    @property
+    def preparing(self) -> bool:
+        """Whether nothing has been estimated yet, as code is imported and compiled first."""
+        return self._began is None and bool(self._left)
 
     @property
     def rate(self) -> float:
         """Estimates per second since the first estimator began."""
-        return self.trials / self.seconds if self.seconds else 0.0
+        return self.trials / seconds if (seconds := self._seconds) else 0.0
 
     @property
     def seconds_left(self) -> float | None:
         """Forecast from what the tasks that have ended took; None before one has."""
-        return self.seconds * (self.tasks - self.done) / self.done if self.done else None
+        return self._seconds * (self.tasks - self.done) / self.done if self.done else None
+
+    @property
+    def _seconds(self) -> float:
+        return 0.0 if self._began is None else time.monotonic() - self._began
 
 
 Watcher = Callable[[Progress], None]
@@ -111,8 +129,9 @@ def plan(
     return [Task(directory, tuple(cells), *edge) for edge, cells in sorted(lacking.items())]
 
 
-def run_task(task: Task) -> Iterator[Done | str]:
-    """Computes one task and stores each cell's rows as soon as they are there. Runs wherever the execution has it run.
+def run_task(task: Task) -> Iterator[str | tuple[int, Failure | None]]:
+    """Computes one task and stores each cell's rows as soon as they are there; then yields the cell's place in the
+    task, and its failure if there was one. Runs wherever the execution has it run.
 
     An exception in one cell fails that cell alone. What an estimator does for the first time in a process, such as to
     import a library or to compile a model, it does before its time is taken.
@@ -141,7 +160,7 @@ def run_task(task: Task) -> Iterator[Done | str]:
             if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
                 raise  # a user's Ctrl-C; where it is ignored, in worker processes, there can be none
             failure = Failure.of(error)
-        yield Done(index, failure)
+        yield index, failure
 
 
 _recent: dict[str, ResultKey] = {}
@@ -216,71 +235,43 @@ def _history_columns(scenario: AnyScenario, history: Sequence[np.ndarray]) -> di
     }
 
 
-class RunProgress:
-    """What has become of the cells of a run's tasks."""
-
-    def __init__(self, store: Store, tasks: Sequence[Task], watch: Watcher) -> None:
-        self.store, self.watch = store, watch
-        self.total = sum(_weight(task, cell) for task in tasks for cell in task.cells)
-        self.left = Counter((id(cell.scenario), task.start, task.stop) for task in tasks for cell in task.cells)
-        """Cells of each task that are not done."""
-        self.trials = 0
-        self.failures: list[str] = []
-        self.began: float | None = None
-        """When the first estimator did."""
-        self.tell()
-
-    def begin(self) -> None:
-        """Notes that an estimator begins."""
-        if self.began is None:
-            self.began = time.monotonic()
-            self.tell()
-
-    def close(self, task: Task, cell: ResultKey, failure: Failure | None) -> None:
-        """Notes that a cell of a task is stored, or has failed for good."""
-        self.left[id(cell.scenario), task.start, task.stop] -= 1
-        self.trials += _weight(task, cell)
-        if failure is not None:
-            self.failures.append(f"{_described(task, cell)}: {failure.message}")
-            self.store.write_failure(cell, task.start, task.stop, failure)
-        self.tell()
-
-    def tell(self) -> None:
-        done = sum(left == 0 for left in self.left.values())
-        seconds = 0.0 if self.began is None else time.monotonic() - self.began
-        preparing = self.began is None and bool(self.left)
-        counts = done, len(self.left), self.trials, self.total
-        self.watch(Progress(*counts, tuple(self.failures), preparing, seconds))
-
-
 def run_tasks(tasks: Sequence[Task], execution: Execution, store: Store, watch: Watcher) -> tuple[str, ...]:
     """Runs tasks until each of their cells is stored or has failed; returns the messages of those that failed.
 
     Raises:
         StorageError: nothing can be stored any more.
     """
-    progress = RunProgress(store, tasks, watch)
-    tries: Counter[tuple[str, int]] = Counter()
+    progress, tries = Progress(tasks), Counter[tuple[str, int]]()
+    watch(progress)
+
+    def close(task: Task, cell: ResultKey, failure: Failure | None) -> None:
+        progress.close(task, cell, failure)
+        if failure is not None:
+            store.write_failure(cell, task.start, task.stop, failure)
+        watch(progress)
+
     while tasks:
         closed: list[set[int]] = [set() for _ in tasks]
         again: list[Task] = []
         for event in execution.run(run_task, tasks):
             task = tasks[event.index]
-            if isinstance(event.step, Done):
-                closed[event.index].add(event.step.cell)
-                cell, failure = task.cells[event.step.cell], event.step.failure
-                if failure is None and not store.has(cell, task.start, task.stop):
+            if event.step == PREPARED:
+                if progress.begin():
+                    watch(progress)
+            elif event.step is not None:
+                index, failure = event.step
+                closed[event.index].add(index)
+                if failure is None and not store.has(task.cells[index], task.start, task.stop):
                     failure = Failure("died", "was said to be stored and is not; run the same command again")
-                progress.close(task, cell, failure)
-            elif event.step == PREPARED:
-                progress.begin()
+                close(task, task.cells[index], failure)
             if event.failure is None:
                 continue
-            left = [cell for i, cell in enumerate(task.cells) if i not in closed[event.index]]
-            for cell in left:
+            left = []
+            for cell in (cell for i, cell in enumerate(task.cells) if i not in closed[event.index]):
                 if store.has(cell, task.start, task.stop):  # stored, and the news of it was lost
-                    progress.close(task, cell, None)
-            left = [cell for cell in left if not store.has(cell, task.start, task.stop)]
+                    close(task, cell, None)
+                else:
+                    left.append(cell)
             # Cells are computed in order, so the first one that is not there is the one that it happened in; an error
             # outside of cells is of what all of them need.
             culprits, rest = (left, []) if event.failure.status == "error" else (left[:1], left[1:])
@@ -290,7 +281,7 @@ def run_tasks(tasks: Sequence[Task], execution: Execution, store: Store, watch: 
                     log.warning(f"{_described(task, cell)}: {event.failure.message}; trying it again")
                     again.append(replace(task, cells=(cell,)))
                 else:
-                    progress.close(task, cell, event.failure)
+                    close(task, cell, event.failure)
             if rest:
                 again.append(replace(task, cells=tuple(rest)))
         tasks = again

@@ -1,11 +1,11 @@
-"""Results are written here: blocks of trials as they come, and one file per result made of them at the end of a run.
+"""What a stored file belongs to, and where it lies: blocks of trials as they come, and one file per result at the end.
 
     OUTPUT/trials/KEY-START-STOP.parquet   rows of trials START to STOP of a scenario under an estimator, or its truth
     OUTPUT/runs/RUN.json                   what a run was asked for
     OUTPUT/failed/KEY-START-STOP.json      trials that could not be computed, and why
 
-KEY stands for what was computed (see `runs.key`); the rows of one key are a union of ranges. Every file appears
-complete or not at all, and no locks are needed. What is there is said by `runs.results`.
+The rows of one key are a union of ranges. Every file appears complete or not at all, and no locks are needed. What is
+there is said by `runs.results`.
 """
 
 from __future__ import annotations
@@ -17,24 +17,112 @@ import tempfile
 import time
 from collections.abc import Collection as Keys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.machine import library_versions
+from ipe_bench.estimators.base import Estimator
 from ipe_bench.runs import parts
-from ipe_bench.runs.parts import TRUTH, Part
-
-if TYPE_CHECKING:
-    from ipe_bench.runs.execution.base import Failure
-    from ipe_bench.runs.key import ResultKey
+from ipe_bench.runs.execution import Failure
+from ipe_bench.runs.parts import SCHEMA, TRUTH, Part
+from ipe_bench.runs.provenance import describe, digest, fingerprint
+from ipe_bench.states.trackers import Tracker
+from ipe_bench.trials.bounds import linear_correlation
+from ipe_bench.trials.tracking import AnyScenario, Tracking
 
 _ABANDONED_S = 3600.0
 """Age in s from which a temporary file counts as abandoned."""
+
+
+@dataclass(frozen=True)
+class ResultKey:
+    """One scenario under one estimator, or its truth: what a stored file belongs to."""
+
+    scenario: AnyScenario
+    label: str = TRUTH
+    estimator: Estimator | Tracker | None = None
+
+    @property
+    def components(self) -> list[Any]:
+        """The scenario, and the estimator if there is one."""
+        return [self.scenario] if self.estimator is None else [self.scenario, self.estimator]
+
+    @cached_property
+    def identity(self) -> dict[str, Any]:
+        """What was computed, without the version of the program."""
+        return {"scenario": describe(self.scenario), "label": self.label, "estimator": describe(self.estimator)}
+
+    @cached_property
+    def key(self) -> str:
+        """Sixteen hexadecimal digits that stand for the identity, the schema and the numerical source, but not for the
+        version: a release that changes no number leaves what is stored valid."""
+        return digest({"schema": SCHEMA, "identity": self.identity, "source": self.made_by["source"]})
+
+    @cached_property
+    def identity_key(self) -> str:
+        """Sixteen hexadecimal digits that stand for the identity alone."""
+        return digest(self.identity)
+
+    @cached_property
+    def made_by(self) -> dict[str, Any]:
+        """The versions of the packages and the digest of the numerical source."""
+        return fingerprint(self.components)
+
+    @property
+    def names(self) -> dict[str, Any]:
+        """What people call it by."""
+        scenario, truth = self.scenario, self.scenario.truth
+        return {
+            "measurement": scenario.measurement.name,
+            **({} if truth is None else {"truth_measurement": truth.name}),
+            "noise": scenario.noise.name,
+            "prior": scenario.prior.name,
+            "error_scale": scenario.error_scale,
+            "seed": scenario.seed,
+            "estimator": self.label,
+        }
+
+    @cached_property
+    def footer(self) -> dict[str, Any]:
+        """All that a reader of the file needs to know."""
+        scenario, model = self.scenario, self.scenario.measurement
+        return {
+            "schema": SCHEMA,
+            "key": self.key,
+            "identity": self.identity,
+            "identity_key": self.identity_key,
+            **self.made_by,
+            "libraries": library_versions(),
+            "names": self.names,
+            "bound": "bayes" if self.estimator is not None and "prior" in self.estimator.needs else "crlb",
+            "equation": None if self.estimator is None else self.estimator.equation,
+            "family": None if self.estimator is None else self.estimator.family,
+            "sequential": self.estimator is not None and "epochs" in self.estimator.needs,
+            "jacobian_cost": float(getattr(model, "jacobian_cost", model.n)),
+            "parameters": [describe(p) for p in model.parameters],
+            "readings": model.m,
+            "about": _first_sentence(model),
+            "linear_bound": scenario.linear_bound.tolist(),
+            **(
+                {"times": scenario.model.times.tolist()}
+                if isinstance(scenario, Tracking)
+                else {"linear_correlation": linear_correlation(scenario.problem).round(4).tolist()}
+            ),
+        }
+
+
+def _first_sentence(component: Any) -> str:
+    """The first sentence of the docstring of a component's class; empty where it has none of its own."""
+    kind = type(component)
+    words = " ".join((kind.__doc__ or "").split())
+    return "" if words.startswith(f"{kind.__name__}(") else words.partition(". ")[0].rstrip(".")
 
 
 class Store:
@@ -94,18 +182,9 @@ class Store:
 
     def write_failure(self, result: ResultKey, start: int, stop: int, failure: Failure) -> None:
         """States that these trials could not be computed, and why; the next run tries them again."""
-        record = {
-            "key": result.key,
-            "identity_key": result.identity_key,
-            "names": result.names,
-            "start": start,
-            "stop": stop,
-            "status": failure.status,
-            "message": failure.message,
-            "detail": failure.detail,
-            "when": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-            "host": socket.gethostname(),
-        }
+        record = {"key": result.key, "identity_key": result.identity_key, "names": result.names}
+        record |= {"start": start, "stop": stop, **asdict(failure), "host": socket.gethostname()}
+        record["when"] = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
         parts.write_record(self._failure(result, start, stop), record)
 
     def _failure(self, result: ResultKey, start: int, stop: int) -> Path:

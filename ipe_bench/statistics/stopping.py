@@ -13,11 +13,10 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.runs.execution import Execution
-from ipe_bench.runs.key import ResultKey
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import MOST_TRIALS, compute, new_name, result_keys, validate
 from ipe_bench.runs.schedule import BLOCK_SIZE, Watcher
-from ipe_bench.runs.store import describe_names
+from ipe_bench.runs.store import ResultKey, describe_names
 from ipe_bench.statistics.collect import collect
 from ipe_bench.statistics.formulas import rmse_ends_anytime
 from ipe_bench.statistics.intervals import share_sequence

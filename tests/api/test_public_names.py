@@ -12,7 +12,7 @@ import pytest
 
 import ipe_bench as ib
 from ipe_bench import api
-from ipe_bench.runs.key import ResultKey
+from ipe_bench.runs.store import ResultKey
 
 HEAVY = ("pandas", "matplotlib", "seaborn", "hydra", "omegaconf", "filterpy", "llvmlite", "rich")
 FUNCTIONS = ("audit", "check", "compare", "design", "estimate", "load", "posterior", "report", "run", "status")

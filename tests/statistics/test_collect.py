@@ -9,7 +9,7 @@ import pytest
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.runs import parts
-from ipe_bench.runs.execution.base import Failure
+from ipe_bench.runs.execution import Failure
 from ipe_bench.runs.provenance import digest
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.collect import collect

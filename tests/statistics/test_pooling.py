@@ -18,7 +18,7 @@ from ipe_bench.noise import Correlated, Gaussian
 from ipe_bench.report.table import terminal
 from ipe_bench.report.tables import overview
 from ipe_bench.report.terminal import summary_tables
-from ipe_bench.runs.key import ResultKey
+from ipe_bench.runs.store import ResultKey
 from ipe_bench.statistics import analyse
 from ipe_bench.statistics.collect import collect
 

@@ -10,7 +10,7 @@ from scipy.stats import norm
 from synthetic_store import Pretender, Seeker, Synthetic
 
 import ipe_bench as ib
-from ipe_bench.runs.key import ResultKey
+from ipe_bench.runs.store import ResultKey
 from ipe_bench.statistics import analyse, formulas, summarize
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.collect import collect

@@ -15,7 +15,7 @@ from ipe_bench.runs.provenance import numerical_code
 
 KEYS = """
 import ipe_bench as ib
-from ipe_bench.runs.key import ResultKey
+from ipe_bench.runs.store import ResultKey
 bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01))
 for name, estimator in {"ukf": ib.baselines.UKF(), "newton": ib.solvers.Newton(), "truth": None}.items():
     print(name, ResultKey(bench, name, estimator).key)

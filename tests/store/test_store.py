@@ -14,11 +14,10 @@ from ipe_bench.baselines import LinearLSE
 from ipe_bench.cli.main import main
 from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
-from ipe_bench.runs.key import ResultKey
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import compute
 from ipe_bench.runs.schedule import block_size_for
-from ipe_bench.runs.store import Store, gaps
+from ipe_bench.runs.store import ResultKey, Store, gaps
 from ipe_bench.solvers import Newton
 
 

@@ -22,8 +22,7 @@ import cloudpickle
 from ipe_bench.basics.errors import StorageError, UserError, describe_exception
 from ipe_bench.basics.machine import cores
 from ipe_bench.basics.options import Count
-from ipe_bench.runs.execution.base import FATAL, Event, Failure, LimitedExecution, ResourceLimits, Work
-from ipe_bench.runs.execution.processes import supervise
+from ipe_bench.runs.execution import FATAL, Event, Failure, Processes, Work, supervise
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +34,7 @@ _CANCELLED = asyncio.CancelledError, concurrent.futures.CancelledError
 
 
 @dataclass(frozen=True)
-class Dask(LimitedExecution):
+class Dask(Processes):
     """Runs tasks on the workers of a Dask cluster, which write to the output directory themselves: all machines need it
     under the same path, and the same installation of ipe-bench and its plugins.
 
@@ -66,7 +65,8 @@ class Dask(LimitedExecution):
 
         # As bytes: what a Dask worker cannot unpickle, such as a plugin that it lacks, is then ours to name.
         payloads = [cloudpickle.dumps((work, task)) for task in tasks]
-        futures = {client.submit(_run_one, payload, self.limits, pure=False): i for i, payload in enumerate(payloads)}
+        limits = self.block_timeout_s, self.memory_limit_gb
+        futures = {client.submit(_run_one, payload, *limits, pure=False): i for i, payload in enumerate(payloads)}
         heard = threading.Event()
         threading.Thread(target=_say_when_nobody_works, args=(client, heard), daemon=True).start()
         try:
@@ -110,13 +110,13 @@ def _say_when_nobody_works(client: Any, heard: threading.Event) -> None:
                 log.warning(f"execution=dask: the scheduler at {address} has no workers yet; waiting for one")
 
 
-def _run_one(payload: bytes, limits: ResourceLimits) -> Any:
+def _run_one(payload: bytes, timeout_s: float | None, memory_gb: float | None) -> Any:
     """On a Dask worker: the steps and the failure of one task, done in a process beside it."""
     try:
         work, task = pickle.loads(payload)
     except Exception as error:
         return [], Failure("died", f"{describe_exception(error)}, on {platform.node()}: install the same there")
-    events = list(supervise(work, [task], 1, 1, limits))
+    events = list(supervise(work, [task], 1, 1, timeout_s, memory_gb))
     return [event.step for event in events if not event.ended], events[-1].failure
 
 

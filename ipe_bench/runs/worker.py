@@ -1,7 +1,7 @@
-"""The process that a task runs in: `python -m ipe_bench.runs.execution.worker FD`.
+"""The process that a task runs in: `python -m ipe_bench.runs.worker FD`.
 
-It imports next to nothing before it listens, computes with one thread in BLAS, holds itself to the limits of a task,
-and ends when its parent ends.
+It imports next to nothing before it listens, computes with one thread in BLAS, holds itself to the memory limit of a
+task, and ends when its parent ends.
 """
 
 from __future__ import annotations
@@ -14,10 +14,7 @@ import sys
 import threading
 import warnings
 from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from ipe_bench.runs.execution.base import ResourceLimits
+from typing import Any
 
 
 def main(handle: int) -> None:
@@ -30,10 +27,10 @@ def main(handle: int) -> None:
     # Reading in a thread, so that the end of the parent is noticed in the middle of a task.
     threading.Thread(target=_listen, args=(connection, messages), daemon=True).start()
     while True:
-        path, threads, limits, payload = messages.get()
+        path, threads, memory_gb, payload = messages.get()
         sys.path[:] = path
         os.environ["IPE_BENCH_THREADS"] = str(threads)
-        connection.send(_perform(connection, limits, payload))
+        connection.send(_perform(connection, memory_gb, payload))
 
 
 def _listen(connection: Connection, messages: queue.SimpleQueue[Any]) -> None:
@@ -47,12 +44,12 @@ def _listen(connection: Connection, messages: queue.SimpleQueue[Any]) -> None:
             os._exit(0)
 
 
-def _perform(connection: Connection, limits: ResourceLimits, payload: bytes) -> tuple[str, Any]:
+def _perform(connection: Connection, memory_gb: float | None, payload: bytes) -> tuple[str, Any]:
     """Does one task; the last message about it."""
-    from ipe_bench.runs.execution.base import FATAL, Failure
+    from ipe_bench.runs.execution import FATAL, Failure
 
     try:
-        limits.enforce()
+        _limit_memory(memory_gb)
         work, task = pickle.loads(payload)
         connection.send(("started", None))
         for step in work(task):
@@ -62,6 +59,17 @@ def _perform(connection: Connection, limits: ResourceLimits, payload: bytes) -> 
     except BaseException as error:  # sys.exit() in an estimator, too, fails that task only
         return "ended", Failure.of(error)
     return "ended", None
+
+
+def _limit_memory(memory_gb: float | None) -> None:
+    """Has every allocation of this process beyond the limit, in 1e9 bytes, end in a MemoryError."""
+    if sys.platform.startswith("linux"):
+        import resource
+
+        # Data, not address space: compiled code and thread pools reserve far more addresses than they use.
+        _, most = resource.getrlimit(resource.RLIMIT_DATA)
+        limit = most if memory_gb is None else int(memory_gb * 1e9)
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, most))
 
 
 def _connection(handle: int) -> Connection:

@@ -1,9 +1,8 @@
-"""Tasks in worker processes of this machine, each watched on its own.
+"""Where tasks run: one after another in this process, or in worker processes. Config group `execution`.
 
 A pool of joblib or concurrent.futures breaks as a whole when one worker dies, does not say which task it died of, and
-cannot stop one task; Pebble's workers share one pipe and its locks, and need a `__main__` guard. Here each worker has a
-pipe of its own: the task of a dead worker is known, a task that exceeds its time is ended with its worker and the
-processes that it started, and the others never notice.
+cannot stop one task. Here each worker has a pipe of its own: the task of a dead worker is known, a task that exceeds
+its time is ended with its worker and the processes that it started, and the others never notice.
 """
 
 from __future__ import annotations
@@ -17,33 +16,116 @@ import signal
 import subprocess
 import sys
 import time
+import traceback
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, Pipe, wait
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import cloudpickle
+from annotated_types import Gt, Lt, doc
 
+from ipe_bench.basics.errors import StorageError, UserError, describe_exception
 from ipe_bench.basics.machine import cores
-from ipe_bench.runs.execution.base import Event, Failure, LimitedExecution, ResourceLimits, Serial, Work
+from ipe_bench.basics.naming import Named
+from ipe_bench.basics.options import Component, Count
 
+Work = Callable[[Any], Iterable[Any]]
+"""Does a task, which is anything that can be pickled, in steps: what it yields after each step is handed on."""
+
+_LONGEST = 1e9
+"""Seconds, and 1e9 bytes, beyond which no limit is meant: thirty years, and more memory than there is."""
+Limit = Annotated[float, Gt(0), Lt(_LONGEST), doc(f"a number above 0 and below {_LONGEST:g}")]
+"""Of time or memory."""
+FATAL = (UserError, StorageError)
+"""Exceptions that concern the whole run: they end it, where any other is a failure of one task."""
 _THREADED = ("OMP", "OPENBLAS", "MKL", "BLIS", "VECLIB", "NUMEXPR")
 _PREPARATION_S = 60.0
 
 
 @dataclass(frozen=True)
-class Processes(LimitedExecution):
+class Failure:
+    """Why a task did not end well."""
+
+    status: Literal["error", "timeout", "died"]
+    """It raised; it exceeded a time limit; or it never began, or the process that it ran in ended."""
+    message: str
+    detail: str = ""
+    """The traceback, where there is one."""
+
+    @classmethod
+    def of(cls, error: BaseException) -> Failure:
+        return cls("error", describe_exception(error), "".join(traceback.format_exception(error)))
+
+
+@dataclass(frozen=True)
+class Event:
+    """News of one task: a step was done, or it ended."""
+
+    index: int
+    """The task's place in the sequence that was given."""
+    step: Any = None
+    ended: bool = False
+    failure: Failure | None = None
+
+
+class Execution(Component, Named, ABC):
+    """Where tasks run. A new execution is a frozen dataclass that writes `run`."""
+
+    @abstractmethod
+    def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
+        """Yields an event per step, and one with `ended` per task; an exception in `work` fails its task alone.
+
+        Closing the iterator, or an exception of `FATAL`, stops what is under way.
+        """
+
+
+@dataclass(frozen=True)
+class Serial(Execution):
+    """Runs tasks in this process; compiled models still use every core.
+
+    Nothing stands between an estimator and this process: one that never returns, or ends the process, ends the run.
+    """
+
+    def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
+        for index, task in enumerate(tasks):
+            failure = None
+            try:
+                for step in work(task):
+                    yield Event(index, step)
+            except FATAL:
+                raise
+            except (Exception, SystemExit) as error:
+                failure = Failure.of(error)
+            yield Event(index, ended=True, failure=failure)
+
+
+@dataclass(frozen=True)
+class Processes(Execution):
     """Runs tasks in processes of this machine, with one thread in BLAS and one in compiled models each.
 
     Workers outlive a run and serve the next one in this process. Fewer tasks than workers leave cores idle, so then the
     compiled models get several threads.
     """
 
+    workers: Count | None = None
+    """How many processes; None: one per core."""
+    block_timeout_s: Limit | None = None
+    """Seconds that one estimator may take for one block; None: no limit."""
+    memory_limit_gb: Limit | None = None
+    """Memory that one worker may use, in 1e9 bytes; None: no limit. Linux only."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.memory_limit_gb is not None and not sys.platform.startswith("linux"):
+            raise UserError(f"memory_limit_gb={self.memory_limit_gb}: can be enforced on Linux only; give null")
+
     def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
         workers = min(self.workers or cores(), len(tasks))
         threads = 1 if self.workers else max(1, cores() // max(workers, 1))
-        return supervise(work, tasks, workers, threads, self.limits)
+        return supervise(work, tasks, workers, threads, self.block_timeout_s, self.memory_limit_gb)
 
 
 @dataclass(frozen=True)
@@ -54,16 +136,23 @@ class Auto(Processes):
     """
 
     def run(self, work: Work, tasks: Sequence[Any]) -> Iterator[Event]:
-        if len(tasks) == 1 and self.limits == ResourceLimits():
+        if len(tasks) == 1 and self.block_timeout_s is None and self.memory_limit_gb is None:
             return Serial().run(work, tasks)
         return super().run(work, tasks)
 
 
-def supervise(work: Work, tasks: Sequence[Any], workers: int, threads: int, limits: ResourceLimits) -> Iterator[Event]:
+def supervise(
+    work: Work,
+    tasks: Sequence[Any],
+    workers: int,
+    threads: int,
+    timeout_s: float | None = None,
+    memory_gb: float | None = None,
+) -> Iterator[Event]:
     """Runs tasks in at most `workers` processes with `threads` threads each; see `Execution.run`.
 
-    A worker whose task exceeds its time is ended. The first step has a minute in any case: a new worker has to load
-    compiled code.
+    A worker whose task takes longer than `timeout_s` between two steps is ended. The first step has a minute in any
+    case: a new worker has to load compiled code.
     """
     waiting = deque(range(len(tasks)))
     busy: dict[Connection, _Worker] = {}
@@ -71,7 +160,7 @@ def supervise(work: Work, tasks: Sequence[Any], workers: int, threads: int, limi
         while waiting or busy:
             while waiting and len(busy) < workers:
                 index = waiting.popleft()
-                worker = _begun(index, (sys.path, threads, limits, cloudpickle.dumps((work, tasks[index]))))
+                worker = _begun(index, (sys.path, threads, memory_gb, cloudpickle.dumps((work, tasks[index]))))
                 busy[worker.connection] = worker
             deadline = min(worker.deadline for worker in busy.values())
             patience = None if deadline == math.inf else max(0.0, deadline - time.monotonic())
@@ -79,9 +168,9 @@ def supervise(work: Work, tasks: Sequence[Any], workers: int, threads: int, limi
                 worker = busy[connection]  # pyright: ignore[reportArgumentType]
                 kind, value = worker.receive()
                 if kind == "started":
-                    worker.extend(None if limits.seconds is None else max(limits.seconds, _PREPARATION_S))
+                    worker.extend(None if timeout_s is None else max(timeout_s, _PREPARATION_S))
                 elif kind == "step":
-                    worker.extend(limits.seconds)
+                    worker.extend(timeout_s)
                     yield Event(worker.index, value)
                 else:
                     del busy[worker.connection]
@@ -94,7 +183,7 @@ def supervise(work: Work, tasks: Sequence[Any], workers: int, threads: int, limi
             for worker in [w for w in busy.values() if w.deadline <= now and not w.connection.poll()]:
                 del busy[worker.connection]
                 worker.end()
-                failure = Failure("timeout", f"exceeded block_timeout_s={limits.seconds:g}")
+                failure = Failure("timeout", f"exceeded block_timeout_s={timeout_s:g}")
                 yield Event(worker.index, ended=True, failure=failure)
     finally:
         for worker in busy.values():
@@ -107,7 +196,7 @@ class _Worker:
     def __init__(self) -> None:
         self.connection, there = Pipe()
         handle = there.fileno()
-        command = [sys.executable, "-P", "-m", "ipe_bench.runs.execution.worker", str(handle)]
+        command = [sys.executable, "-P", "-m", "ipe_bench.runs.worker", str(handle)]
         path = os.pathsep.join(p or os.getcwd() for p in sys.path)
         options: dict[str, Any] = {"pass_fds": (handle,)}
         if sys.platform == "win32":
@@ -122,8 +211,7 @@ class _Worker:
             **options,
         )
         there.close()
-        self.index = -1
-        self.deadline = math.inf
+        self.index, self.deadline = -1, math.inf
 
     def extend(self, seconds: float | None) -> None:
         """Gives it that long for its next step."""
