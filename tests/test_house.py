@@ -37,9 +37,9 @@ BUDGETS = {
     "runs": 2142,
     "statistics": 4025,
     "real": 2228,
-    "plugins": 1185,
+    "plugins": 1133,
     "report": 4096,
-    "cli": 2557,
+    "cli": 2519,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""
 PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}

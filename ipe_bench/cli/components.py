@@ -258,11 +258,6 @@ def _check_name(group: str, name: str) -> None:
         if option.group in rivals and option.name == name:
             origin = option.source.origin
             raise UserError(f"{name}: {option.group}={name} is there already ({origin}); choose another name")
-    if group == "statistic":  # a column of the summary
-        from ipe_bench.statistics.records import SCORES, STATISTICS, frame_columns
-
-        if name in frame_columns([*STATISTICS, *SCORES]):
-            raise UserError(f"{name}: is a statistic of ours; choose another name")
 
 
 def _write_skill(folder: Path) -> list[Path]:

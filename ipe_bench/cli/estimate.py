@@ -15,7 +15,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.machine import library_versions
 from ipe_bench.cli import console, say, show
 from ipe_bench.cli import words as w
-from ipe_bench.cli.session import changed_by_experiment, composed, jobs_of, session
+from ipe_bench.cli.session import composed, jobs_of, session
 from ipe_bench.cli.spec import Spec
 from ipe_bench.cli.words import Words
 from ipe_bench.measurements import Nist
@@ -91,13 +91,12 @@ def require_one_kind(words: Words, spec: Spec) -> None:
     if spec.model is None:
         words.refuse(OF_STATES[1:], "goes with model=NAME")
         return
-    words.refuse(OF_CONSTANTS, "is of a measurement, and model= chooses states that move")
-    for experiment, changed in changed_by_experiment(words).items():
-        if key := next((key for key in OF_CONSTANTS if key in changed), None):
-            raise UserError(
-                f"{experiment}: sets {key}, which is of a measurement, and model= chooses states that move; leave out"
-                " one of them"
-            )
+    why = "is of a measurement, and model= chooses states that move"
+    words.refuse(OF_CONSTANTS, why)
+    for one in (one for one in words.overrides if one.key_or_group == "experiment"):
+        config, without = composed(Words((one,))), composed(Words(()))
+        if changed := [key for key in OF_CONSTANTS if config.get(key) != without.get(key)]:
+            raise UserError(f"{w.said(one)}: sets {changed[0]}, which {why}; leave out one of them")
 
 
 def _show(parts: Iterable[Part], files: Sequence[Path]) -> None:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
-
-from annotated_types import Gt, Lt
+from typing import Any
 
 from ipe_bench import api
 from ipe_bench.basics.errors import UserError
@@ -25,7 +23,7 @@ _PAPER = {"output": str, "paper": NAMES, "columns": NAMES, "width": float}
 _COMPARE = {
     "first": str,
     "second": str,
-    "alpha": Annotated[float, Gt(0), Lt(1)],
+    "alpha": float,
     "anytime": bool,
     "fail_on": NAMES,
     "power": float,

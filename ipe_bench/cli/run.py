@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from argparse import Namespace
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from ipe_bench.basics.errors import UserError, shortened
+from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import say
 from ipe_bench.cli import words as w
 from ipe_bench.cli.estimate import OF_FILES, require_one_kind
@@ -26,6 +27,9 @@ from ipe_bench.runs.execution import Serial, end_idle
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import accept, compute, record_refusal, result_keys, validate
 from ipe_bench.runs.store import describe_names
+
+_NOT_TELLING = {*w.NO_PART_OF_A_NAME, "default_name", "experiment", "solver", "baseline", "tracker"} - {"seed"}
+"""Keys that tell no job of a sweep from another."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +53,11 @@ class Outcome:
 
     @property
     def job(self) -> str:
-        """What tells the job from the others of a sweep."""
-        return " ".join(_telling(self.words)) or "the job"
+        """The words that may tell the job from the others of a sweep, or the name of its folder."""
+        words = [word.lstrip("+~").replace(w.HYDRAS_TRUTH, w.TRUTH) for word in self.words]
+        return (
+            ", ".join(word for word in words if re.split("[.=]", word)[0] not in _NOT_TELLING) or Path(self.output).name
+        )
 
     def __float__(self) -> float:
         """What sweepers that optimise make small; they cannot go on from a job that was refused."""
@@ -104,7 +111,7 @@ def _missing(jobs: Jobs) -> list[str]:
         asked = job.count * len(cells)
         most = "" if job.precision is None else "at most "
         more = f", {most}{lacking} are missing" if lacking else ""
-        name = title(job, w.as_typed(told, jobs.words.files))
+        name = Outcome(job.output, w.as_typed(told, jobs.words.files)).job
         lines.append(f"{name}: {asked - lacking} of {asked} estimates are stored{more}")
         stored, missing = stored + asked - lacking, missing + lacking
     return [*lines, f"{stored} estimates are stored, {missing} would be computed; nothing was computed now"]
@@ -173,10 +180,9 @@ def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
     if job.write_readings is not None:
         write_trial(job, Path(job.write_readings), job.write_readings_trial)
         return begun
-    name = title(job, begun.words)
     asked: Any = ([job.scenario], job.estimators, job.count, job.output)
     options: dict[str, Any] = {"execution": job.execution, "block_size": job.block_size, "command": command}
-    with shown_progress(name) as watch:
+    with shown_progress(begun.job) as watch:
         if job.precision is None:
             done = replace(begun, failures=compute(*asked, **options, watch=watch))
         else:
@@ -185,7 +191,7 @@ def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
             options |= {"precision": job.precision, "time_limit": job.time_limit}
             failures, (stop,) = compute_until(*asked, **options, watch=watch)
             verdict = "" if stop.reached else "the precision is not reached: "
-            said = f"{name}: {stop.trials} trials; {verdict}{stop.reason} ({stop.widest})"
+            said = f"{begun.job}: {stop.trials} trials; {verdict}{stop.reason} ({stop.widest})"
             done = replace(begun, failures=failures, stop=said, precision_missed=not stop.reached)
     value = None
     if job.objective is not None:
@@ -242,30 +248,11 @@ def _best(outcomes: Sequence[Outcome], maximises: bool) -> list[str]:
     return [f"Objective {float(best):.6g}{of}" + (own and f": {own}")]
 
 
-_NOT_TELLING = {*w.NO_PART_OF_A_NAME, "default_name", "experiment", "solver", "baseline", "tracker"} - {"seed"}
-"""Keys that tell no job of a sweep from another."""
-
-
-def title(job: Spec, words: Sequence[str]) -> str:
-    """What a job is about, for its progress bar: its model, and everything that may tell it from others of a sweep."""
-    told = _telling(words)
-    model = [] if any(word.startswith(("measurement", "model")) for word in told) else [job.scenario.measurement.name]
-    return ", ".join(shortened(word, 60) for word in (*model, *told))
-
-
-def _telling(words: Sequence[str]) -> list[str]:
-    """Those words of a job that may tell it from the others of a sweep."""
-    keys = {word.lstrip("+~").replace(w.HYDRAS_TRUTH, w.TRUTH): word.lstrip("+~").partition("=")[0] for word in words}
-    return [word for word, key in keys.items() if key not in _NOT_TELLING and not key.startswith("execution")]
-
-
 def write_trial(job: Spec, path: Path, trial: int) -> None:
     """Writes the simulated readings of one trial, and its true parameters beside them."""
     from ipe_bench.real.readings import write_readings, write_truth
 
     drawn, model = job.scenario.draw(trial, trial + 1), job.scenario.measurement
-    if not path.name:
-        raise UserError(f"write_readings={path}: name a file")
     truth = path.with_name(f"{path.stem}.truth.csv")
     if truth.exists():
         raise UserError(f"{truth}: is there already and is not overwritten; name another file or remove it")

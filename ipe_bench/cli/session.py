@@ -162,16 +162,6 @@ def composed(words: Words) -> dict[str, Any]:
     return _plain(_composed(tuple(map(w.forced, words.overrides)), whole=True))
 
 
-def changed_by_experiment(words: Words) -> dict[str, list[str]]:
-    """The keys that the experiment of a command gives other values, by the word that names it."""
-    without = _composed(())
-    found = {}
-    for word in [one for one in words.overrides if one.key_or_group == "experiment"]:
-        config = _composed((w.forced(word),))
-        found[w.said(word)] = [str(key) for key in config if config._get_node(key) != without._get_node(key)]
-    return found
-
-
 def _plain(config: DictConfig) -> dict[str, Any]:
     try:
         own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
@@ -190,19 +180,15 @@ def show(words: Words, flags: Any) -> None:
 
 
 def complete(words: Sequence[str]) -> None:
-    """Installs Hydra's completion, or answers a shell."""
-    if not re.fullmatch("(install|uninstall|query)=(bash|fish|zsh)", " ".join(words)):
+    """Installs Hydra's completion, or answers a shell, which sets COMP_LINE."""
+    asked = re.fullmatch("(install|uninstall|query)=(bash|fish|zsh)", " ".join(words))
+    line = os.environ.get("COMP_LINE")
+    if asked is None or (asked[1] == "query" and line is None):
         shown = " ".join(words) or "nothing"
         raise UserError(f"-sc {shown}: write -sc install=SHELL or -sc uninstall=SHELL, SHELL being bash, fish, zsh")
-    if words[0].startswith("query"):
-        line = os.environ.get("COMP_LINE")
-        if line is None:
-            raise UserError(f"-sc {words[0]}: is what a shell asks while completing, with COMP_LINE set")
-        # Hydra completes the words after the program's name; ours has the command in between.
-        program, command, rest = line.partition(" run ")
-        if command:
-            os.environ["COMP_LINE"] = f"{program} {rest}"
-            os.environ["COMP_POINT"] = str(len(os.environ["COMP_LINE"]))
+    if line is not None:  # Hydra completes the words after the program's name; ours has the command in between
+        os.environ["COMP_LINE"] = line.replace(" run ", " ", 1)
+        os.environ["COMP_POINT"] = str(len(os.environ["COMP_LINE"]))
     _hydra().shell_completion("config", list(words))
 
 
@@ -212,8 +198,6 @@ def explain(error: BaseException) -> UserError:
         return error
     if isinstance(error, yaml.YAMLError):
         return UserError(plugins.explain_yaml(error))
-    if isinstance(error, UnicodeDecodeError):
-        return UserError(f"a config file is not UTF-8 ({error.reason}); `ipe-bench list` names it")
     text = "\n".join(str(e) for e in (error, error.__cause__) if e is not None)
     for pattern, explained in _EXPLAINED:
         if found := re.search(pattern, text):
@@ -239,11 +223,7 @@ def _no_such_key(name: str) -> str:
     return f"{name}: {unknown(key, known, 'key')}"
 
 
-def _missing_value(key: str) -> str:
-    forms = {"measurement.of": "=MODULE:FUNCTION", "measurement.rates": ".STATE=FORMULA"}
-    return f"{key}: is not given; write {key}{forms.get(key, '=VALUE')}"
-
-
+_FORMS = {"measurement.of": "=MODULE:FUNCTION", "measurement.rates": ".STATE=FORMULA"}
 _EXPLAINED: tuple[tuple[str, Callable[..., str]], ...] = (
     (r"Could not (?:find|load) '([^']+)'", _no_such_option),
     (r"Could not override '([^']+)'", _no_such_key),
@@ -256,6 +236,9 @@ _EXPLAINED: tuple[tuple[str, Callable[..., str]], ...] = (
         r"Interpolation key '([^']+)' not found\s+full_key: (\S+)",
         lambda k, key: f"{key}: ${{{k}}} is no key of the config",
     ),
-    (r"Missing mandatory value: \S+[\s\S]*full_key: (\S+)", _missing_value),
+    (
+        r"Missing mandatory value: \S+[\s\S]*full_key: (\S+)",
+        lambda key: f"{key}: is not given; write {key}{_FORMS.get(key, '=VALUE')}",
+    ),
 )
 """What Hydra says, and the line for it."""

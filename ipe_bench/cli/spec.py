@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -192,14 +192,14 @@ def spec(plain: Mapping[Any, Any]) -> Spec:
             made[key] = _of_kind(construct(config, key), key, kind)
     made["trackers"] = {}
     chosen = "estimators" if made["model"] is None else "trackers"
-    made["estimators"] = {str(k): _labelled(chosen, str(k), one) for k, one in (plain[chosen] or {}).items()}
+    known = [option for option in plugins.options() if plugins.PACKAGES.get(option.group) == chosen]
+    made["estimators"] = {str(k): _labelled(chosen, str(k), one, known) for k, one in (plain[chosen] or {}).items()}
     return instantiate(Spec, made, "")
 
 
-def _labelled(key: str, label: str, options: Any) -> Any:
+def _labelled(key: str, label: str, options: Any, known: Sequence[plugins.Option]) -> Any:
     """The estimator or tracker of a label."""
     where = f"{key}.{label}"
-    known = [one for group, holder in plugins.PACKAGES.items() if holder == key for one in plugins.options(group)]
     if not isinstance(options, Mapping):
         raise UserError(f"{where}={options}: set its options, such as {where}.KEY=VALUE")
     if TARGET not in options:

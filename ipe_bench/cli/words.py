@@ -305,8 +305,8 @@ def _check_choice(override: Override, groups: Groups) -> None:
             if not isinstance(name, str) or name not in groups[group]:
                 shown = "null" if name is None else str(name)
                 raise UserError(f"{key}={shown}: {no_option(group, shown, groups)}")
-            if (fault := plugins.fault(group, name)) is not None:
-                raise UserError(f"{key}={name}: {fault}")
+            if faults := [o.fault for o in plugins.options(group) if o.name == name and o.fault is not None]:
+                raise UserError(f"{key}={name}: {faults[0]}")
             if names.count(name) > 1:
                 remedy = f"+{group}@{plugins.PACKAGES[group]}.{name}_2={name} runs it again under a label of its own"
                 raise UserError(f"{word}: {name} stands there twice and would run once; {remedy}")

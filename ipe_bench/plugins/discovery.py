@@ -192,10 +192,9 @@ def sources() -> tuple[Source, ...]:
     of_folders = [source for folder in dict.fromkeys([*folders, *_added]) for source in _in_folder(folder)]
     for source in [*installed_sources(), *of_folders]:
         known = found.setdefault(source.name, source)
-        # A plugin that is installed from its folder is found twice.
-        if known.conf.resolve() != source.conf.resolve():
-            line = f"plugin {source.conf.parent}: {known.conf.parent} is called {source.name} too; it is left out"
-            _problems[line] = None
+        if known.conf.resolve() != source.conf.resolve():  # one that is installed from its folder is found twice
+            home, other = source.conf.parent, known.conf.parent
+            _problems[f"plugin {home}: {other} is called {source.name} too; it is left out"] = None
     return tuple(found.values())
 
 
@@ -215,13 +214,6 @@ def installed_sources() -> list[Source]:
         origin = f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.name
         found.append(Source(entry.value, Path(spec.submodule_search_locations[0]) / "conf", origin))
     return found
-
-
-def add_folder(folder: Path) -> bool:
-    """Makes the plugin in a folder known, wherever it is; False where there is none."""
-    _added[folder.resolve()] = None
-    sources.cache_clear()
-    return bool(list(_in_folder(folder.resolve())))
 
 
 def _in_folder(folder: Path) -> Iterator[Source]:
@@ -283,23 +275,16 @@ def options_in(folder: Path) -> list[Option]:
         beside = Path("plugins") / folder.name.rpartition("=")[2]
         meant = beside if beside.is_dir() else "a plugin's folder, such as plugins/my_plugin"
         raise UserError(f"{folder}: there is no such folder; give {meant}")
-    if not add_folder(folder):
-        raise UserError(f"{folder}: holds no package with a folder conf in it; see `ipe-bench new`")
     home = folder.resolve()
-    found = [
-        option
-        for option in options()
-        if option.group in CHECKED_GROUPS
-        and any(path is not None and path.is_relative_to(home) for path in (option.path, option.rival))
-    ]
+    _added[home] = None
+    sources.cache_clear()
+    if not list(_in_folder(home)):
+        raise UserError(f"{folder}: holds no package with a folder conf in it; see `ipe-bench new`")
+    own = [o for o in options() if home in (*o.path.parents, *(o.rival.parents if o.rival else ()))]
+    found = [option for option in own if option.group in CHECKED_GROUPS]
     if not found:
         raise UserError(f"{folder}: holds nothing to check; its conf has no option of {', '.join(CHECKED_GROUPS)}")
     return found
-
-
-def fault(group: str, name: str) -> str | None:
-    """Why that option cannot be used, in a line; None where it can."""
-    return next((option.fault for option in options(group) if option.name == name), None)
 
 
 def groups() -> list[str]:

@@ -173,7 +173,7 @@ def test_costs_are_judged_by_their_means_alone(tmp_path):
         (["{a}", "first=it", "second=it"], "it of one folder is compared with itself"),
         (["{a}", "nowhere"], "holds no results"),
         (["{a}", "{b}", "alpha=2"], "between 0 and 1"),
-        (["{a}", "{b}", "alpha=x"], "between 0 and 1"),
+        (["{a}", "{b}", "alpha=x"], "alpha=x: give a number"),
         (["{a}", "{b}", "alfa=0.1"], "did you mean alpha"),
         (["{a}", "{b}", "alpha="], "give it a value"),
         (["{a}", "{b}", "first=it", "first=it"], "stands there twice"),

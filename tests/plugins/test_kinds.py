@@ -255,9 +255,9 @@ class Hasty(Execution):
     ("faulty", "complaint"),
     [
         (Faulty(), "the draws are not normal"),
-        (Faulty("wide"), "1.1 times the stated deviation"),
-        (Faulty("shifted"), "the mean is off x0"),
-        (Faulty("common"), "two parameters have the correlation"),
+        (Faulty("wide"), "have 1.1 times the stated deviation"),
+        (Faulty("shifted"), "the mean of the draws is off by up to 0.09"),
+        (Faulty("common"), "have the correlation 0.99, and 0.00 is stated"),
         (Faulty(power=0.0), "at ten times the error scale"),
         (Swallowing(), "of task 1 it tells step 0, step 1, end; right is step 0, step 1, a Failure ValueError: wrong"),
         (Hasty(), "of task 0 it tells end; right is step 0, step 1, step 2, end"),
