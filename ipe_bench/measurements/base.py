@@ -25,7 +25,6 @@ _SMALL = 16384
 _CENTRAL_STEP = float(np.finfo(float).eps ** (1 / 3))
 
 Epochs = tuple[NDArray[np.intp], ...]
-"""The rows of z that arrive at each epoch, in order of arrival."""
 
 
 @dataclass(frozen=True)
@@ -69,11 +68,7 @@ class UsualNoise:
 
 @dataclass(frozen=True)
 class Recorded:
-    """Real readings that come with a model, and what is known of their answer.
-
-    A model whose `recorded` is this needs no file: `ipe-bench estimate measurement=NAME` estimates from z, and
-    `ipe-bench run measurement=NAME noise=certified trials=1` scores estimators by x.
-    """
+    """Real readings that come with a model, which need no file, and what is known of their answer."""
 
     z: Array
     """The readings (m,)."""
@@ -86,9 +81,9 @@ class Recorded:
 class Measurement(Component, Named, ABC):
     """A model z = h(x) + v, without the noise v.
 
-    x is (trials, n) in multiples of the parameters' sizes, h(x) is (trials, m) in `reading_unit`, and a trial's
-    readings depend on that trial's x alone, bit for bit. n parameters, m readings, m >= n; where
-    m = n the readings can be met exactly, and no fit can be tested.
+    x is (trials, n) in multiples of the parameters' sizes, h(x) is (trials, m) in `reading_unit`, m >= n, and a trial's
+    readings depend on that trial's x alone, bit for bit. Where m = n the readings can be met exactly, and no fit can be
+    tested.
     """
 
     analytic: ClassVar[bool] = False
@@ -99,7 +94,7 @@ class Measurement(Component, Named, ABC):
     usual_noise: UsualNoise | None = None
     """The noise of the readings unless told otherwise; None: the model does not know any."""
     epochs: Epochs | None = None
-    """The rows of z that arrive at each epoch; None where readings have no order."""
+    """The rows of z by epoch, in order of arrival; None where readings have no order."""
     levels: Mapping[str, Mapping[Any, str]] = {}
     """Words for entries of `index` that do not speak for themselves, by column: the numbers of cases, say."""
     own_parameters: Sequence[str] = ()
@@ -138,11 +133,8 @@ class Measurement(Component, Named, ABC):
 
     @property
     def nuisance_deviation(self) -> Array:
-        """Standard deviations (k,) of the further errors of a truth that is richer than what estimators assume.
-
-        A scenario draws k such numbers from N(0, deviation^2) in each trial, whatever the error scale, and hands them
-        to `simulate` as further columns of x behind the n parameters.
-        """
+        """Standard deviations (k,) of the further errors of a truth that is richer than what estimators assume: drawn
+        in each trial, whatever the error scale, and handed to `simulate` as columns of x behind the n parameters."""
         return np.zeros(0)
 
     @property
@@ -152,10 +144,7 @@ class Measurement(Component, Named, ABC):
 
     @property
     def candidates(self) -> Measurement:
-        """The model with every reading that could be taken, for a design to choose among: by default those it has.
-
-        Its columns of `index` are this model's, and equal entries mean the same reading.
-        """
+        """The model with every reading that a design may choose among, with the columns and entries of this `index`."""
         return self
 
     def taking(self, rows: Sequence[int]) -> Measurement:
@@ -228,7 +217,7 @@ class Measurement(Component, Named, ABC):
 
     def coarse_jacobian(self, x: Array) -> Array:
         """dh/dx near enough for the steps of an iteration, `|I - J~+ J|` below 0.01, where that is cheaper; else exact.
-        A trial's bits depend on that trial's x alone. Covariances and tests of convergence want `jacobian`."""
+        Covariances and convergence checks want `jacobian`."""
         return self.jacobian(x)
 
     @property
@@ -256,7 +245,7 @@ class Measurement(Component, Named, ABC):
 
     def coarse_simulate_until(self, x: Array, stop: int) -> Array:
         """`simulate_until` near enough for fits that only start another, to a small part of a reading's usual noise,
-        where that is cheaper; else the same. A trial's bits depend on that trial's x alone."""
+        where that is cheaper; else the same."""
         return self.simulate_until(x, stop)
 
     def jacobian_until(self, x: Array, stop: int) -> Array:
@@ -418,11 +407,9 @@ class SubsetModel(WrappedModel):
 
 
 def _complex_step(h: Any, x: Array) -> Array:
-    """dh/dx (trials, m, n) by directions into the complex plane, a few trials in a call.
-
-    NumPy multiplies complex numbers with other rounding where it reuses a large temporary array for the product: in one
-    call of all trials, the bits of each would depend on how many there are.
-    """
+    """dh/dx (trials, m, n) by directions into the complex plane."""
+    # A few trials in a call: NumPy multiplies complex numbers with other rounding where it reuses a large temporary
+    # array for the product, so in one call of all trials the bits of each would depend on how many there are.
     trials, n = x.shape
     steps = np.eye(n) * _COMPLEX_STEP * 1j
     parts, begun = [], 0

@@ -36,10 +36,6 @@ class Bearings(Measurement):
     """Time between bearings in s; the first is taken at time 0."""
     target: tuple[float, float, float, float] = (3000.0, 5000.0, -3.0, 1.0)
     """The presumed target (east and north in m, in m/s): the nominal point."""
-    position_size: Positive = 250.0
-    """What one unit of error of a coordinate is, in m."""
-    velocity_size: Positive = 0.25
-    """What one unit of error of a velocity is, in m/s."""
 
     reading_unit = "deg"
     usual_noise = UsualNoise(0.5)
@@ -47,8 +43,8 @@ class Bearings(Measurement):
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        place = ("east", "north"), "m", self.position_size, "position"
-        return parameter_table(place, (("v_east", "v_north"), "m/s", self.velocity_size, "velocity"))
+        place = ("east", "north"), "m", 250.0, "position"
+        return parameter_table(place, (("v_east", "v_north"), "m/s", 0.25, "velocity"))
 
     @cached_property
     def nominal(self) -> Array:

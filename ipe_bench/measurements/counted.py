@@ -9,7 +9,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.batches import put
 from ipe_bench.basics.errors import describe_exception
 from ipe_bench.basics.linalg import Array, Mask, finite
 from ipe_bench.measurements.base import Measurement
@@ -66,18 +65,16 @@ class CountingModel:
     def jacobian(self, x: Array, rows: NDArray[np.intp], *, coarse: Mask | bool = False) -> Array:
         """dh/dx (trials, m, n) for the trials `rows` of the tally; of the trials `coarse` by `coarse_jacobian`,
         counted as what it costs beside an exact one."""
-        # A subclass may leave parameters out of x, so what is called here is this method and not its own.
-        if self.coarse_share == 1.0 or not np.any(coarse):
+        exact: Mask = ~np.broadcast_to(coarse, len(x)) | (self.coarse_share == 1.0)
+        if exact.all():
             return self._jacobian(self.measurement.jacobian, 1.0, x, rows)
-        if not np.all(coarse):
-            J = np.empty((len(x), self.measurement.m, self.measurement.n))
-            J[coarse] = CountingModel.jacobian(self, x[coarse], rows[coarse], coarse=True)
-            J[~coarse] = CountingModel.jacobian(self, x[~coarse], rows[~coarse])
-            return J
-        J = self._jacobian(self.measurement.coarse_jacobian, self.coarse_share, x, rows)
+        J = np.empty((len(x), self.measurement.m, self.measurement.n))
+        J[~exact] = self._jacobian(self.measurement.coarse_jacobian, self.coarse_share, x[~exact], rows[~exact])
         # Far away the longer steps of a coarse one may overflow where those of the readings do not.
-        lost = ~finite(J)
-        return put(J, lost, CountingModel.jacobian(self, x[lost], rows[lost])) if lost.any() else J
+        exact[~exact] = ~finite(J[~exact])
+        if exact.any():
+            J[exact] = self._jacobian(self.measurement.jacobian, 1.0, x[exact], rows[exact])
+        return J
 
     def _jacobian(self, method: Callable[[Array], Array], cost: float, x: Array, rows: NDArray[np.intp]) -> Array:
         self.tally.jacobians[rows] += self.share * cost

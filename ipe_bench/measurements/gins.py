@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from itertools import product
-from typing import Any
+from itertools import compress, product
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import MinLen
 from numpy.typing import NDArray
 
-from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite, NonNegative, Positive
 from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise, parameter_table
@@ -60,12 +60,14 @@ class Gins(OdeMeasurement):
     earth_radius: float = 6378137.0
     gravity: float = 9.80665
     earth_rate: float = 7.292115e-5
-    injected_ft_per_s: float = 1500.0
+    injected: Annotated[tuple[tuple[Finite, Finite], ...], MinLen(1)] = (
+        *((1500.0, 0.0), (0.0, 1500.0)),
+        *((-1500.0, 0.0), (0.0, -1500.0)),
+    )
+    """Velocities (x, y) in ft/s to inject, a case each."""
     interval_min: Positive = 3.0
     readings_per_case: Count = 30
     step: Positive | None = None
-    injected: tuple[tuple[Finite, Finite], ...] | None = None
-    """Velocities (x, y) in ft/s to inject, a case each; None: the paper's four cases of `injected_ft_per_s`."""
 
     reading_unit = "m/s"
     usual_noise = UsualNoise(step=0.02286)
@@ -74,11 +76,6 @@ class Gins(OdeMeasurement):
 
     tolerance = 1e-6
     shortest_step = 180.0 / 64
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.injected is not None and not self.injected:
-            raise UserError("injected=[]: give at least one velocity, such as [[1500, 0]], or null")
 
     @cached_property
     def trusted_angle(self) -> float:
@@ -114,10 +111,8 @@ class Gins(OdeMeasurement):
 
     @cached_property
     def cases(self) -> Array:
-        """Injected velocity (x, y) in m/s: along x, along y, against x, against y, unless `injected` says otherwise."""
-        if self.injected is not None:
-            return FOOT * np.array(self.injected)
-        return self.injected_ft_per_s * FOOT * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+        """Injected velocity (x, y) in m/s."""
+        return FOOT * np.array(self.injected)
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
@@ -132,9 +127,9 @@ class Gins(OdeMeasurement):
         top = self._fastest / FOOT
         turns = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
         rays = [(size * np.cos(turn), size * np.sin(turn)) for size in (top, top / 2) for turn in turns]
-        here = [(float(x), float(y)) for x, y in self.cases / FOOT]
-        new = [v for v in [*rays, (0.0, 0.0)] if not np.isclose(v, here, atol=1e-6 * max(top, 1.0)).all(axis=1).any()]
-        injected = (*here, *((round(float(x), 3) + 0.0, round(float(y), 3) + 0.0) for x, y in new))
+        here = np.isclose([*rays, (0.0, 0.0)], np.array(self.injected)[:, None], atol=1e-6 * max(top, 1.0)).all(axis=2)
+        new = np.array([*rays, (0.0, 0.0)])[~here.any(axis=0)]
+        injected = (*self.injected, *((round(x, 3) + 0.0, round(y, 3) + 0.0) for x, y in new.tolist()))
         return replace(
             self, injected=injected, interval_min=self.interval_min / 2, readings_per_case=2 * self.readings_per_case
         )
@@ -142,14 +137,14 @@ class Gins(OdeMeasurement):
     @property
     def levels(self) -> Mapping[str, Mapping[Any, str]]:
         """The injected velocity of each case."""
-        return {"case": {k: f"{x:.0f}, {y:.0f} ft/s" for k, (x, y) in enumerate(self.cases / FOOT, start=1)}}
+        return {"case": {k: f"{x:.0f}, {y:.0f} ft/s" for k, (x, y) in enumerate(self.injected, start=1)}}
 
     def taking(self, rows: Sequence[int]) -> Measurement:
         """Only the cases that are needed are computed."""
         taken = np.zeros((len(self.cases), 2 * self.readings_per_case), dtype=bool)
         taken.flat[list(rows)] = True
         needed = taken.any(axis=1)
-        fewer = replace(self, injected=tuple((float(x), float(y)) for x, y in self.cases[needed] / FOOT))
+        fewer = replace(self, injected=tuple(compress(self.injected, needed)))
         return super(Gins, fewer).taking(np.flatnonzero(taken[needed]).tolist())
 
     def start(self, p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:

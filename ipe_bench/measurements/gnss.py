@@ -13,7 +13,7 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.basics.options import Count, Positive
+from ipe_bench.basics.options import Count
 from ipe_bench.measurements.base import Epochs, Input, Measurement, Parameter, UsualNoise, parameter_table
 
 LIGHT = 299792458.0
@@ -80,12 +80,6 @@ class Gnss(Measurement):
     frame: Literal["enu", "ecef"] = "enu"
     """In which axes the position is estimated: east, north, up, or x, y, z."""
     rounds: Count = 1
-    position_size: Positive = 1000.0
-    """What one unit of error of a coordinate is, in m."""
-    clock_size: Positive = 1000.0
-    """What one unit of error of a clock is, in m."""
-    offset_size: Positive = 10.0
-    """What one unit of error of the offset of a further constellation is, in m."""
     earth_rate: float = EARTH_RATE
     """In rad/s; 0 for beacons and readings whose rotation is taken off already."""
 
@@ -134,9 +128,9 @@ class Gnss(Measurement):
         axes = ("east", "north", "up") if self.frame == "enu" else ("x", "y", "z")
         clocks = [f"clock_{k}" for k in self._times] if len(self._times) > 1 else ["clock"]
         return parameter_table(
-            (axes, "m", self.position_size, "position"),
-            (clocks, "m", self.clock_size, "clock"),
-            ([f"offset_{name}" for name in self._systems[1:]], "m", self.offset_size, "offset"),
+            (axes, "m", 1000.0, "position"),
+            (clocks, "m", 1000.0, "clock"),
+            ([f"offset_{name}" for name in self._systems[1:]], "m", 10.0, "offset"),
         )
 
     @cached_property

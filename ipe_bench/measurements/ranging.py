@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.basics.options import Count, Positive
+from ipe_bench.basics.options import Count
 from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise, parameter_table
 
 _BEACONS = (
@@ -43,10 +43,6 @@ class Ranging(Measurement):
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The presumed position of the receiver in m: the nominal point."""
     rounds: Count = 3
-    position_size: Positive = 10.0
-    """What one unit of error of a coordinate is, in m."""
-    clock_size: Positive = 10.0
-    """What one unit of error of the clock bias is, in m."""
 
     reading_unit = "m"
     usual_noise = UsualNoise(0.1)
@@ -59,8 +55,8 @@ class Ranging(Measurement):
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        place = ("east", "north", "up"), "m", self.position_size, "position"
-        return parameter_table(place, (("clock",), "m", self.clock_size, "clock bias"))
+        place = ("east", "north", "up"), "m", 10.0, "position"
+        return parameter_table(place, (("clock",), "m", 10.0, "clock bias"))
 
     @cached_property
     def nominal(self) -> Array:

@@ -27,7 +27,7 @@ def draw(scale, trials=2, seed=0):
 
 def test_an_accelerometer_bias_swings_at_the_schuler_period():
     # Without Earth rate the platform is a pendulum: v = b / w sin(w t), w^2 = g / R.
-    model = Gins(earth_rate=0.0, injected_ft_per_s=0.0, step=60.0)
+    model = Gins(earth_rate=0.0, injected=((0.0, 0.0),) * 4, step=60.0)
     frequency = np.sqrt(model.gravity / model.earth_radius)
     assert 2 * np.pi / frequency / 60 == pytest.approx(84.45, abs=0.005)
     x = np.zeros((2, 11))

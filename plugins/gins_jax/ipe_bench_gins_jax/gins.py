@@ -37,7 +37,6 @@ class GinsJax(Measurement):
     earth_radius: float = 6378137.0
     gravity: float = 9.80665
     earth_rate: float = 7.292115e-5
-    injected_ft_per_s: float = 1500.0
     interval_min: Positive = 3.0
     readings_per_case: Count = 30
     steps_per_interval: Count = 90
@@ -50,9 +49,8 @@ class GinsJax(Measurement):
     @cached_property
     def twin(self) -> Gins:
         """The model of which this is a second implementation."""
-        shared = ("latitude_deg", "earth_radius", "gravity", "earth_rate", "injected_ft_per_s", "interval_min")
-        options = {name: getattr(self, name) for name in shared}
-        return Gins(**options, readings_per_case=self.readings_per_case)
+        shared = ("latitude_deg", "earth_radius", "gravity", "earth_rate", "interval_min", "readings_per_case")
+        return Gins(**{name: getattr(self, name) for name in shared})
 
     @property
     def usual_noise(self) -> Any:
