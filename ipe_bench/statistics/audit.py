@@ -320,7 +320,7 @@ def read_claims(table: Path | str | pd.DataFrame) -> Claims:
     frame, error, deviation = frame.iloc[rows], error[rows], deviation[rows]
     correlation = _correlation(frame, names, deviation)
     if correlation is not None:
-        good = np.isfinite(correlation).all(axis=(1, 2))
+        good = np.array(np.isfinite(correlation).all(axis=(1, 2)))
         good[good] = np.linalg.eigvalsh(correlation[good])[:, 0] > 1e-12
         if not good.all():
             raise UserError(f"{name}: row {rows[np.argmin(good)] + 2}: the covariance is not positive definite")

@@ -14,7 +14,6 @@ from scipy.special import betaincinv, gammaincinv, ndtri
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.calibration import overall_p, overall_words
-from ipe_bench.statistics.histories import fixed_point_bound, observed_constant
 from ipe_bench.statistics.intervals import Squares, few_carry, mean_limits, quantile, rms_interval, rms_sequence
 from ipe_bench.statistics.sample import AMBIGUOUS, FIT, NIS, Sample
 from ipe_bench.trials.thresholds import FIT_LEVEL, gate
@@ -382,30 +381,3 @@ def calibration(s: Sample) -> Any:
 def mean_nis(s: Sample) -> float:
     values = s.scalars[NIS] if NIS in s.scalars else np.empty(0)
     return float(np.mean(values[np.isfinite(values)])) if np.isfinite(values).any() else np.nan
-
-
-# Iterations ----------------------------------------------------------------------------------------------------------
-
-
-def _uses(s: Sample, method: str) -> bool:
-    """Whether the estimator iterates by that method on the frozen equation; told by its description alone."""
-    target = str((s.group.footer["identity"]["estimator"] or {}).get("_target_", ""))
-    return s.group.footer.get("equation") == "frozen" and target.rpartition(".")[2] == method
-
-
-@once
-def fixed_point_bounds(s: Sample) -> Array:
-    """(histories, 2): whether eq. (18) holds, and the largest error over its bound, of each stored history of
-    fixed-point iteration whose K at the truth is below 1."""
-    histories = s.histories if _uses(s, "FixedPoint") else ()
-    return np.array([fixed_point_bound(h.iterates, h.K) for h in histories if h.K < 1]).reshape(-1, 2)
-
-
-@once
-def constants(s: Sample) -> Array:
-    """(histories, 2): the least M of eq. (23) that explains each stored history of Newton's method, and M at the truth;
-    without those that are over too soon to tell."""
-    if not _uses(s, "Newton"):
-        return np.empty((0, 2))
-    pairs = [(observed_constant(h.iterates), h.M) for h in s.histories]
-    return np.array([pair for pair in pairs if np.isfinite(pair).all()]).reshape(-1, 2)

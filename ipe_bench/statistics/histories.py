@@ -1,4 +1,4 @@
-"""What iterations did on their way to the limit: cost of coming close, orders of convergence, and the paper's bounds.
+"""What iterations did on their way to the limit: the cost of coming close, and the orders of convergence.
 
 Iterates are (iterates, n), in multiples of the parameters' units; the last one stands for the limit.
 """
@@ -23,20 +23,15 @@ class History:
 
     trial: str
     """The trial as readers name it."""
-    iterates: Array
     distances: Array
     """(iterates,) from the last iterate, in deviations of the bound."""
     cost: float
     """Of the whole trial."""
-    K: float
-    """Of eq. (15) at the truth; NaN where it is not stored, as is M."""
-    M: float
-    """Of eq. (23) at the truth."""
 
     @property
     def cost_to_limit(self) -> float:
         """The cost of coming close; that of iterate k is its share (k + 1) / (iterates) of the trial's whole cost."""
-        return self.cost * (iterations_to_limit(self.distances) + 1) / len(self.iterates)
+        return self.cost * (iterations_to_limit(self.distances) + 1) / len(self.distances)
 
 
 def distances_to_limit(iterates: Array, deviation: Array) -> Array:
@@ -59,29 +54,3 @@ def orders_of(errors: Array, floor: float = FLOOR) -> Array:
         orders = np.log(e[2:] / e[1:-1]) / np.log(e[1:-1] / e[:-2])
     decreasing = (e[2:] < e[1:-1]) & (e[1:-1] < e[:-2])
     return orders[decreasing]
-
-
-def fixed_point_bound(iterates: Array, K: float, limit: Array | None = None) -> tuple[bool, float]:
-    """Whether each iterate's largest error |x_k - limit| is at most K^k / (1 - K) |x_1 - x_0|, eq. (18) with the k that
-    the print lost (Burden and Faires have it), and the largest such ratio among the iterates between the ends.
-
-    The bound holds for a K that holds along the iterates; at a single point K is not a proven one. `limit` (n,) is the
-    last iterate unless it is given.
-    """
-    error = np.abs(iterates - (iterates[-1] if limit is None else limit)).max(axis=1)
-    step = np.abs(iterates[1] - iterates[0]).max()
-    bound = K ** np.arange(len(iterates)) / (1 - K) * step if K < 1 else np.full(len(iterates), np.inf)
-    inner = slice(1, -1)
-    with np.errstate(all="ignore"):
-        ratio = (error / bound)[inner][error[inner] > FLOOR].max(initial=0.0)
-    return bool(np.all(error <= bound + 1e-12 * (1.0 + error.max()))), float(ratio)
-
-
-def observed_constant(iterates: Array, limit: Array | None = None, floor: float = FLOOR) -> float:
-    """The largest 2 e_(k+1) / (n^2 e_k^2) above the floor: the least M with which eq. (23),
-    e_(k+1) <= n^2 M / 2 e_k^2, explains the iterates; NaN where they are over too soon."""
-    limit = iterates[-1] if limit is None else limit
-    errors = np.abs(iterates - limit).max(axis=1)
-    usable = (errors[:-1] > floor) & (errors[1:] > floor)
-    ratios = 2 * errors[1:][usable] / (iterates.shape[1] ** 2 * errors[:-1][usable] ** 2)
-    return float(ratios.max()) if len(ratios) else np.nan

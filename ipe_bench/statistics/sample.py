@@ -29,7 +29,7 @@ PATH = ("path_nees", "white_p", "log_likelihood", "first_bad_epoch")
 OPTIONAL = ("message", FIT, NIS, AMBIGUOUS, "root_distance", *PATH)
 """Columns that not every version or estimator stores."""
 CONTRACTION = ("contraction_K", "contraction_norm", "contraction_radius")
-TRUTH = (*CONTRACTION, "curvature_M", "curvature_intrinsic", "curvature_parameter")
+TRUTH = ("curvature_intrinsic", "curvature_parameter")
 """Numbers of the truth."""
 _SEED = 1 << 40
 
@@ -64,11 +64,9 @@ class Sample:
     def load(cls, collection: Collection, group: Group, present: Array, solved: Array) -> Sample:
         """The stored trials of a group; `present` and `solved` are the numbers of those that all rivals have, and all
         solved."""
-        names = [str(p["name"]) for p in group.footer["parameters"]]
-        kinds = {kind: [f"{kind}_{name}" for name in names] for kind in ("error", "deviation")}
-        parts = [
-            collection.load(cell, [*SCALARS, *kinds["error"], *kinds["deviation"]], OPTIONAL) for cell in group.cells
-        ]
+        names = [p["name"] for p in group.footer["parameters"]]
+        errors, deviations = ([f"{kind}_{name}" for name in names] for kind in ("error", "deviation"))
+        parts = [collection.load(cell, [*SCALARS, *errors, *deviations], OPTIONAL) for cell in group.cells]
         every = np.concatenate([_numbers(cell, part["trial"]) for cell, part in zip(group.cells, parts, strict=True)])
         status = np.concatenate([part["status"] for part in parts])
         used: Array = np.asarray(status != Status.NO_READINGS.label)
@@ -81,13 +79,11 @@ class Sample:
         number, scalars = every[used], {name: joined(name) for name in there}
         for name in ("solved", "success"):
             scalars[name] = scalars[name].astype(bool)
-        matrices = {kind: np.array([joined(name) for name in columns]).T for kind, columns in kinds.items()}
-        for array in (number, *scalars.values(), *matrices.values()):
+        error, deviation = (np.array([joined(name) for name in columns]).T for columns in (errors, deviations))
+        for array in (number, error, deviation, *scalars.values()):
             array.flags.writeable = False
-        present, solved = np.isin(number, present), np.isin(number, solved)
-        return cls(
-            collection, group, number, scalars, **matrices, present=present, solved_by_all=solved, unread=every[~used]
-        )
+        common = np.isin(number, present), np.isin(number, solved)
+        return cls(collection, group, number, scalars, error, deviation, *common, every[~used])
 
     def __len__(self) -> int:
         return len(self.number)
@@ -202,16 +198,9 @@ class Sample:
                 found += [(row, iterates) for row in rows.tolist() if len(iterates) > 1]
         if not found:
             return []
-        crlb, K, M = self.crlb, self.of_truth("contraction_K"), self.of_truth("curvature_M")
+        crlb, cost = self.crlb, self.cost.tolist()
         return [
-            History(
-                label_of(self.number[row]),
-                iterates,
-                distances_to_limit(iterates, crlb[row]),
-                float(self.cost[row]),
-                float(K[row]),
-                float(M[row]),
-            )
+            History(label_of(self.number[row]), distances_to_limit(iterates, crlb[row]), cost[row])
             for row, iterates in found
         ]
 

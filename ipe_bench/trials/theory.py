@@ -44,17 +44,6 @@ def contraction_of(J_F: Array) -> Contraction:
     )
 
 
-def curvature(J: Array, second: Array, H_plus: Array) -> Array:
-    """M of eq. (23): the largest abs(d2 g_i / dx_j dx_k) of Newton's g, where at a root d2g = J_F^-1 d2F, from the
-    slopes J (trials, m, n) and second derivatives (trials, m, n, n) of the readings, for H+ (1, n, m). (trials,), NaN
-    where J_F is singular.
-    """
-    trials, m, n = J.shape
-    d2F = np.matmul(H_plus, second.reshape(trials, m, n * n))
-    bent, _ = solve(np.matmul(H_plus, J), d2F)
-    return np.asarray(np.abs(bent).max(axis=(1, 2)))
-
-
 def second_derivatives(model: Measurement, x: Array) -> Array:
     """d2h/dx_j dx_k at x (trials, n): (trials, m, n, n), by central differences of the Jacobian, symmetrised."""
     step = _STEP * np.maximum(1.0, np.abs(x))
