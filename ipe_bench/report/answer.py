@@ -106,26 +106,21 @@ class Answer:
 
 def contents(answer: Answer) -> Iterator[Part]:
     """The tables and sentences of an answer, in order."""
-    found = structure(answer.model)
+    found, one = structure(answer.model), answer.examination
     yield from (Strong(f"No data can tell: {sentence}.") for sentence in (found.sentences if found else ()))
-    yield from _remarks(answer)
+    x = answer[one.label].inner if one else answer.model.nominal
+    remarked = answer.model.remarks(x if np.isfinite(x).all() else answer.model.nominal)
+    yield from (f"Note: {sentence}." for sentence in remarked)
     yield _estimates(answer)
     yield _verdicts(answer)
     yield from _outliers(answer)
-    if (one := answer.examination) is not None:
+    if one is not None:
         passes = answer[one.label].passes
         if passes:
             yield _intervals(one)
         if passes or not one.least:
             for remark in remarks(one, _reading_labels(answer.model)):
                 yield Strong(remark) if remark.split(":")[0].isupper() else remark
-
-
-def _remarks(answer: Answer) -> Iterator[str]:
-    """What the model says of itself, at the least minimum if there is one."""
-    inner = answer[answer.examination.label].inner if answer.examination else answer.model.nominal
-    x = inner if np.isfinite(inner).all() else answer.model.nominal
-    yield from (f"Note: {sentence}." for sentence in answer.model.remarks(x))
 
 
 def _estimates(answer: Answer) -> Table:

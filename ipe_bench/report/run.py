@@ -12,7 +12,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ipe_bench.basics.errors import StorageError
 from ipe_bench.basics.files import write_text
 from ipe_bench.plugins.extensions import files_of_records, use_statistics
 from ipe_bench.report.style import PAGE, Which, file_formats, which_figures
@@ -40,9 +39,6 @@ class ReportResult:
     """One line per piece that is missing, failed, foreign or damaged; the exit code is 1 if there is any."""
     stale: tuple[str, ...]
     """One line per piece that older code computed, which is left out."""
-    certified: pd.DataFrame
-    """Mean correct digits per estimator and start on certified readings; empty without such runs."""
-
     headline: tuple[str, ...]
     """What the page opens with: a few sentences on what the data say."""
 
@@ -86,17 +82,15 @@ class Pending:
         from ipe_bench.report.sections import report_tables, written
         from ipe_bench.report.table import write_table
         from ipe_bench.report.tables import without_certified
-        from ipe_bench.statistics.certified import certified_averages, certified_table
 
         analysis, output = self.begun.finish(), self.output
-        simulated, problems = without_certified(analysis), analysis.collection.extra_problems
-        known = len(problems)
-        tables = report_tables(analysis)
+        problems = analysis.collection.extra_problems
+        known, tables = len(problems), report_tables(analysis)
         sections = written("section", analysis, tables)
         added = [table for section in sections for table in section.tables]
         write_text(output / "summary.csv", analysis.summary.to_csv(index=False))
         files = [path for table in (*tables, *added) for path in write_table(table, output / "tables")]
-        drawn = draw_all(simulated, output / "figures", which=self.figures, formats=self.formats)
+        drawn = draw_all(without_certified(analysis), output / "figures", which=self.figures, formats=self.formats)
         write_text(output / "report.html", render_page(analysis, tables, drawn, sections))
         result = ReportResult(
             summary=analysis.summary,
@@ -106,11 +100,11 @@ class Pending:
             report=output / "report.html",
             problems=analysis.problems,
             stale=analysis.stale,
-            certified=certified_averages(certified_table(analysis.collection)),
             headline=tuple(headline(analysis)),
         )
         if len(problems) == known:  # what plugins cannot make is said each time
-            _leave(output, self.made, result.files)
+            stamp = {"from": self.made, "files": _digests(result.files)}
+            write_text(output / STAMP, json.dumps(stamp, indent=1) + "\n")
         return result
 
 
@@ -153,12 +147,6 @@ def _is_current(output: Path, made: str) -> bool:
         known = json.loads((output / STAMP).read_text(encoding="utf-8"))
         return known == {"from": made, "files": _digests(map(Path, known["files"]))}
     return False
-
-
-def _leave(output: Path, made: str, files: Iterable[Path]) -> None:
-    """States what the report under `output` was made from, and which files belong to it."""
-    with contextlib.suppress(StorageError):
-        write_text(output / STAMP, json.dumps({"from": made, "files": _digests(files)}, indent=1) + "\n")
 
 
 def _digests(paths: Iterable[Path]) -> dict[str, str]:

@@ -20,7 +20,7 @@ from ipe_bench.measurements import Polynomial
 from ipe_bench.noise import Gaussian
 from ipe_bench.plugins import discovery
 from ipe_bench.plugins.construct import described
-from ipe_bench.report.docs import generated as pages
+from ipe_bench.report.docs import __main__ as pages
 from ipe_bench.report.docs import show_type, type_of
 
 PAGES = Path(str(files("ipe_bench.report.docs"))) / "pages"

@@ -1,15 +1,38 @@
-"""`python -m ipe_bench.report.docs [OUTPUT] [--trials N]`: builds the site of written and generated pages by Sphinx."""
+"""`python -m ipe_bench.report.docs [OUTPUT] [--trials N]`: builds the site by Sphinx, of written pages, of what the
+program says of itself, and of what its experiments print and draw."""
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
+import re
+import shlex
 import shutil
+import subprocess
 import sys
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from importlib.metadata import version
 from importlib.resources import as_file, files
 from pathlib import Path
+from typing import Any
 
-from ipe_bench.report.docs.generated import write_gallery, write_reference
+import pandas as pd
+
+import ipe_bench
+from ipe_bench.basics.errors import UserError
+from ipe_bench.basics.files import make_folder, write_text
+from ipe_bench.basics.statuses import Status
+from ipe_bench.plugins.construct import described
+from ipe_bench.plugins.discovery import PACKAGES, Option, options
+from ipe_bench.report.figures import INDEX
+from ipe_bench.report.html import DEFINITIONS
+from ipe_bench.report.table import environment
+from ipe_bench.report.words import brief, duration, enumerate_few, percent
+from ipe_bench.statistics.records import STATISTICS
+from ipe_bench.statistics.summary import ALL
 
 SETTINGS = {
     "project": "ipe-bench",
@@ -36,6 +59,27 @@ SETTINGS = {
     "autodoc_member_order": "bysource",
 }
 """Sphinx's; nothing that a page needs is fetched when it is opened."""
+GROUPS = {
+    "measurement": "Measurement models",
+    "noise": "Noises",
+    "prior": "Priors",
+    "solver": "Solvers",
+    "baseline": "Baseline estimators",
+    "model": "State models",
+    "tracker": "Filters and smoothers of states",
+    "execution": "Executions",
+}
+FIGURES = 5
+"""Pictures of an experiment that its page shows."""
+ORDINARY, LEAST = 1000, 3
+"""Trials of an ordinary experiment, and the least number that a costly one is cut to."""
+_PARTS = {
+    "beyond": ["error_scale=300,1000,3000"],
+    "headline": ["trials=40"],
+    "mgh": ["measurement.start=1"],
+    "nist": ["measurement.start=2"],
+}
+"""The part that is computed of experiments that take minutes, and the trials of the picture on the first page."""
 
 
 def build(output: Path, trials: int) -> int:
@@ -56,6 +100,103 @@ def build(output: Path, trials: int) -> int:
     site = Sphinx(source, None, *places, "html", SETTINGS, warningiserror=True, freshenv=True)
     site.build()
     return site.statuscode
+
+
+def printed_by(command: Sequence[str], columns: int = 80) -> str:
+    """What `ipe-bench COMMAND` prints, without blanks at the ends of lines.
+
+    Raises:
+        UserError: it failed.
+    """
+    program = [sys.executable, "-m", "ipe_bench", *command]
+    environment = os.environ | {"COLUMNS": str(columns), "NO_COLOR": "1"}
+    done = subprocess.run(program, capture_output=True, text=True, env=environment, check=False)
+    if done.returncode != 0:
+        raise UserError(f"{shlex.join(command)}: ended with exit code {done.returncode}: {done.stderr[-2000:]}")
+    return "\n".join(line.rstrip() for line in done.stdout.splitlines())
+
+
+def write_page(path: Path, template: str, **content: Any) -> None:
+    """Writes a page from its template, in which the filter `cell` makes any text a cell of a Markdown table."""
+    made = environment().overlay(autoescape=False)
+    made.filters["cell"] = lambda text: " ".join(str(text).replace("|", "\\|").replace("<", "&lt;").split())
+    write_text(path, made.get_template(f"docs/{template}.md.j2").render(content))
+
+
+def _ours(group: str) -> list[Option]:
+    return [option for option in options(group) if option.source.name == "ipe-bench"]
+
+
+def write_reference(folder: Path) -> None:
+    """Adds pages of options, commands, statuses, statistics and Python names to a folder."""
+    for group, title in GROUPS.items():
+        rows = [(option, described(option)) for option in _ours(group)]
+        key = f"{PACKAGES[group]}.NAME" if group in PACKAGES else group
+        write_page(folder / f"{group}.md", "options", group=group, title=title, key=key, options=rows)
+    statuses = [status for status in Status if status is not Status.RUNNING]
+    write_page(folder / "statuses.md", "statuses", statuses=statuses)
+    write_page(folder / "statistics.md", "statistics", records=STATISTICS, definitions=DEFINITIONS)
+    summary = printed_by(["--help"], columns=100).rstrip()
+    names = re.findall(r"^    (\w+)(?:  |$)", summary, re.MULTILINE)
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        said = pool.map(lambda name: printed_by([name, "--help"], columns=100).rstrip(), names)
+        write_page(folder / "commands.md", "commands", commands={"": summary, **dict(zip(names, said, strict=True))})
+    things = [(name, getattr(ipe_bench, name)) for name in ipe_bench.__all__]
+    shown = [(name, thing) for name, thing in things if hasattr(thing, "__qualname__")]
+    kinds = [("autoclass" if isinstance(t, type) else "autofunction", f"ipe_bench.{name}") for name, t in shown]
+    write_page(folder / "python.md", "python", names=kinds)
+
+
+def write_gallery(folder: Path, results: Path, trials: int) -> None:
+    """A page for each experiment, one that lists them, and a table of the best estimators by model; `trials` is for an
+    experiment that has 1000 by itself, and others have as large a part of theirs."""
+    chosen, found, began = _ours("experiment"), {}, time.perf_counter()
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        running = {pool.submit(_executed, option, folder, results / option.name, trials): option for option in chosen}
+        for number, done in enumerate(as_completed(running), 1):
+            name, at = running[done].name, duration(time.perf_counter() - began, 2)
+            found[name] = done.result()
+            print(f"experiment {number} of {len(chosen)}: {name}, at {at}", flush=True)
+    write_page(folder / "index.md", "gallery", experiments=[(option, found[option.name]) for option in chosen])
+    summaries = {option.name: results / option.name / "summary.csv" for option in chosen}
+    rows = [row for name, path in summaries.items() if path.exists() for row in _best(name, pd.read_csv(path))]
+    write_page(folder / "best.inc", "best", rows=rows)
+
+
+def _executed(option: Option, folder: Path, results: Path, trials: int) -> list[dict[str, str]]:
+    """Runs one experiment, writes its page, and returns the figures that the page shows."""
+    command = ["run", f"+experiment={option.name}", *_PARTS.get(option.name, ())]
+    own = (option.config or {}).get("trials", ORDINARY)
+    number = min(own, max(round(own * trials / ORDINARY), min(trials, LEAST)))
+    if number != own and not any(word.startswith("trials=") for word in command):
+        command.append(f"trials={number}")
+    whole = printed_by([*command, "execution=serial", f"output={results.resolve()}"])
+    printed = whole.partition("\nSummary ")[0].strip()  # the paths at its end are of no use to a reader
+    index = results / "figures" / INDEX  # there is none without figures
+    figures = json.loads(index.read_text(encoding="utf-8"))[:FIGURES] if index.exists() else []
+    make_folder(folder / "pictures")
+    for figure in figures:
+        picture = results / "figures" / f"{figure['name']}.png"
+        shutil.copyfile(picture, folder / "pictures" / f"{option.name}_{figure['name']}.png")
+    text = {"command": shlex.join(command), "printed": printed, "figures": figures}
+    write_page(folder / f"{option.name}.md", "experiment", option=option, **text)
+    return figures
+
+
+def _best(experiment: str, summary: pd.DataFrame) -> Iterator[tuple[str, ...]]:
+    """For the least and the largest error scale of an experiment on simulated readings of the assumed model: who
+    succeeds most often, and at what cost."""
+    if "truth" in summary or not {"measurement", "noise", "success"} <= set(summary):
+        return
+    totals = summary[(summary["parameter"] == ALL) & (summary["noise"] != "certified")]
+    for scale in sorted({totals["error_scale"].min(), totals["error_scale"].max()} if len(totals) else ()):
+        here = totals[totals["error_scale"] == scale].sort_values("simulations_median", kind="stable")
+        best = here[here["success"] == here["success"].max()]
+        names = dict.fromkeys((str(best["measurement"].iloc[0]), experiment))
+        link = f"[{', '.join(names)}](gallery/{experiment}.md)"
+        share = f"{percent(best['success'].iloc[0])} of {best['trials'].iloc[0]}"
+        cost = brief(best["simulations_median"].iloc[0])
+        yield link, f"{scale:g}", enumerate_few(list(best["estimator"]), 5), share, cost
 
 
 if __name__ == "__main__":
