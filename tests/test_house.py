@@ -26,7 +26,7 @@ LINE = (
 )
 BUDGETS = {
     "basics": 991,
-    "measurements": 6798,
+    "measurements": 6807,
     "noise": 634,
     "priors": 106,
     "states": 1190,

@@ -72,10 +72,12 @@ class Arithmetic:
     text: str
     tree: Tree
     names: tuple[str, ...]
+    where: str = ""
+    """Its config key."""
 
     def __call__(self, values: Mapping[str, Any]) -> Any:
         """Its value, where `values` gives that of every name: numbers, arrays, or expressions to be recorded."""
-        return _evaluate(self.tree, values)
+        return evaluate(self.tree, values)
 
 
 def read(text: str, where: str) -> Arithmetic:
@@ -110,7 +112,7 @@ def read(text: str, where: str) -> Arithmetic:
     except NameError as error:
         raise UserError(f"{where}: {error.name}(...): {unknown(str(error.name), _CALLED, 'function')}") from None
     names = dict.fromkeys(names_in(tree))
-    return Arithmetic(text, tree, tuple(name for name in names if name not in CONSTANTS))
+    return Arithmetic(text, tree, tuple(name for name in names if name not in CONSTANTS), where)
 
 
 def _tree(node: ast.expr, source: str) -> Tree:
@@ -176,20 +178,16 @@ def names_in(tree: Tree) -> list[str]:
     return [part[1] for part in parts(tree) if part[0] == "name"]
 
 
-def never_switching(formulas: Mapping[str, Arithmetic], values: Mapping[str, Any]) -> list[str]:
+def never_switching(formulas: Iterable[Arithmetic], values: Mapping[str, Any]) -> list[str]:
     """A sentence for each comparison in some formulas that holds for all readings, or for none, at these values."""
-    found: dict[Tree, str] = {}
-    for where, formula in formulas.items():
-        for part in parts(formula.tree):
-            if part[0] in COMPARISONS:
-                found.setdefault(part, where)
-    said = []
-    for tree, where in found.items():
-        met = _evaluate(tree, values)
-        if np.all(met) or not np.any(met):
-            held = "holds at every reading" if np.all(met) else "holds at no reading"
-            said.append(f"measurement.{where}: {tree[3]} {held}, so these readings say nothing of the other branch")
-    return said
+    where = {part: one.where for one in formulas for part in parts(one.tree) if part[0] in COMPARISONS}
+    met = {one: np.asarray(evaluate(one, values), dtype=bool) for one in where}
+    silent = "so these readings say nothing of the other branch"
+    return [
+        f"measurement.{where[one]}: {one[3]} holds at {'every' if held.all() else 'no'} reading, {silent}"
+        for one, held in met.items()
+        if held.all() or not held.any()
+    ]
 
 
 def rewritten(tree: Tree, new: Callable[[Tree], Tree | None]) -> Tree:
@@ -221,17 +219,18 @@ _BINARY: dict[str, Callable[[Any, Any], Any]] = {
 }
 
 
-def _evaluate(tree: Tree, values: Mapping[str, Any]) -> Any:
+def evaluate(tree: Tree, values: Mapping[str, Any]) -> Any:
+    """The value of a tree where `values` gives that of every name."""
     operation, first, *others = tree
     if operation == "number":
         return first
     if operation == "name":
         return values[first] if first in values else CONSTANTS[first]
-    value = _evaluate(first, values)
+    value = evaluate(first, values)
     if operation == "if":
         if isinstance(value, float):  # the other branch may have no value
-            return _evaluate(others[0] if value else others[1], values)
-        return np.where(value, _evaluate(others[0], values), _evaluate(others[1], values))
+            return evaluate(others[0] if value else others[1], values)
+        return np.where(value, evaluate(others[0], values), evaluate(others[1], values))
     if operation in _BINARY:
-        return _BINARY[operation](value, _evaluate(others[0], values))
+        return _BINARY[operation](value, evaluate(others[0], values))
     return -value if operation == "negative" else FUNCTIONS[operation](value)

@@ -181,7 +181,7 @@ class Formula(WrittenModel):
         """Which conditionals never switch at x."""
         values = dict(zip(self.arithmetic.names, (value[0] for value in self._values(x[None, : self.n])), strict=True))
         with np.errstate(all="ignore"):
-            return tuple(never_switching({"expression": self.arithmetic}, values))
+            return tuple(never_switching([self.arithmetic], values))
 
     def simulate(self, x: Array) -> Array:
         value, _ = self._recorded

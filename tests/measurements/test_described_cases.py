@@ -140,31 +140,6 @@ def test_a_file_that_does_not_say_which_state_was_read_is_refused(tmp_path):
         open_together([tmp_path / "a.csv"], model)
 
 
-MISTAKES = {
-    "a name of nothing": ({"constants": {"fed": 1.0}}, "constants.fed: appears in no formula"),
-    "a state": ({"constants": {"y": 1.0}}, "constants.y: is a state, a parameter or the time"),
-    "of two lengths": (
-        {"constants": {"feed": (1.0, 2.0), "begin": (1.0, 2.0, 3.0)}},
-        "constants: have different lengths",
-    ),
-    "no number": ({"constants": {"feed": "much"}}, "constants.feed=much: give a finite number"),
-    "the time by another name": ({"outputs": {"s": "gain*time*y"}}, "time: is a column .* the time is t"),
-}
-
-
-@pytest.mark.parametrize("case", MISTAKES)
-def test_constants_that_cannot_be_are_refused(case):
-    options, expected = MISTAKES[case]
-    given = {
-        "rates": {"y": "feed - k*y"},
-        "start": {"k": 0.5, "gain": 1.0},
-        "initial": {"y": "begin"},
-        "outputs": {"s": "gain*y"},
-    }
-    with pytest.raises(UserError, match=expected):
-        Ode(**(given | options))
-
-
 def test_a_misspelt_parameter_is_told_of_with_both_remedies():
     model = Ode({"y": "-kk*y"}, {"y0": 1.0}, {"y": "y0"}, times=(1.0, 2.0))
     with pytest.raises(UserError, match=r"kk is not known; give it a start, measurement.start.kk=1, .*constants.kk"):

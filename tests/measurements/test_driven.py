@@ -194,7 +194,7 @@ def test_a_row_without_a_reading_only_changes_the_input(tmp_path):
 )
 def test_an_input_that_is_missing_or_has_gaps_is_refused(tmp_path, rows, header, message):
     with pytest.raises(UserError, match=message):
-        open_together([file(tmp_path / "a.csv", rows, header)], replace(BATTERY, times=(), columns={}), enough=False)
+        open_together([file(tmp_path / "a.csv", rows, header)], replace(BATTERY, times=(), columns={}))
 
 
 def test_two_readings_of_one_thing_at_one_time_both_count(tmp_path):

@@ -57,26 +57,6 @@ class Cases(Pulse):
         return y[0], self.rhs(t, y, p, c)[0]
 
 
-def rk8(model, x, step):
-    """The model's readings by a plain loop over steps and stages, for one x that may be complex."""
-    p = list(x * model.si_sizes)
-    z = []
-    for c in model.cases:
-        t, y = 0.0, np.array(model.start(p, c)) + 0 * p[0]
-        for end in model.times:
-            count = max(1, int(np.ceil((end - t) / step - 1e-9)))
-            h, began = (end - t) / count, t
-            for s in range(count):
-                k = []
-                for i in range(12):
-                    slope = sum((DOP853.A[i, j] * k[j] for j in range(i)), np.zeros_like(y))
-                    k.append(np.array(model.rhs(began + s * h + DOP853.C[i] * h, y + h * slope, p, c)))
-                y = y + h * sum(DOP853.B[i] * k[i] for i in range(12))
-            t = end
-            z.extend(model.read(t, y, p, c))
-    return np.array(z).reshape(len(model.cases), len(model.times), -1).ravel()
-
-
 def test_the_coefficients_are_those_of_scipy():
     for mine, theirs in ((tableau.DOP853.B, DOP853.B[:12]), (tableau.DOP853.C, DOP853.C[:12])):
         assert mine == tuple(theirs)
@@ -89,18 +69,6 @@ def test_the_solution_is_of_eighth_order():
     errors = [np.abs(Pulse(step).simulate(x) - Pulse().solution(x)).max() for step in (0.5, 0.25, 0.125)]
     orders = np.log2(np.divide(errors[:-1], errors[1:]))
     assert ((orders > 7.5) & (orders < 9.5)).all()
-
-
-@pytest.mark.parametrize("model", [Pulse(0.5), Cases(0.5), Cases(0.7)], ids=str)
-def test_readings_and_jacobian_are_those_of_a_plain_loop_with_the_same_coefficients(model):
-    rng = np.random.default_rng(1)
-    x = rng.normal(size=(3, 2))
-    J = model.jacobian(x)
-    for row, z, slope in zip(x, model.simulate(x), J, strict=True):
-        np.testing.assert_allclose(z, rk8(model, row, model.step), rtol=1e-13, atol=1e-14)
-        for j, direction in enumerate(np.eye(2)):
-            exact = np.imag(rk8(model, row + 1e-100j * direction, model.step)) / 1e-100
-            np.testing.assert_allclose(slope[:, j], exact, rtol=1e-11, atol=1e-13)
 
 
 @pytest.mark.parametrize("model", [Pulse(0.5), Cases(0.5)], ids=str)

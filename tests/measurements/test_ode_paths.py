@@ -68,9 +68,6 @@ LAWS = {
     "power": scalar(
         lambda t, y, p, c: -p[0] * y**1.5, "-p0*a**1.5", lambda t, k, b, c: (b**-0.5 + 0.5 * k * t) ** -2.0
     ),
-    "saturation": scalar(
-        lambda t, y, p, c: p[0] * np.exp(-y), "p0*exp(-a)", lambda t, k, b, c: np.log(np.exp(b) + k * t)
-    ),
     "quadrature": scalar(
         lambda t, y, p, c: p[0] / (1.0 + t) + c, "p0/(1+t)+c", lambda t, k, b, c: b + k * np.log(1.0 + t) + c * t
     ),

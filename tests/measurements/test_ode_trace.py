@@ -29,33 +29,6 @@ FUNCTIONS = {
 }
 
 
-OPERATIONS = {
-    "add": lambda a, b: a + b,
-    "sub": lambda a, b: a - b,
-    "mul": lambda a, b: a * b,
-    "div": lambda a, b: a / b,
-    "pow": lambda a, b: a**b,
-    "neg": lambda a: -a,
-    "fma": lambda a, b, c: a * b + c,
-    "fms": lambda a, b, c: a * b - c,
-    "fnma": lambda a, b, c: c - a * b,
-}
-
-
-def run(outputs, **values):
-    """What the program of these outputs computes, operation by operation."""
-    graph = outputs[0].graph
-    program = Program.of(outputs, [graph.input(name) for name in values])
-    numbers = list(values.values())
-    for name, *operands in program.operations:
-        if name == "constant":
-            numbers.append(operands[0])
-        else:
-            function = OPERATIONS.get(name) or getattr(np, name)
-            numbers.append(function(*(numbers[i] for i in operands)))
-    return [numbers[i] for i in program.outputs]
-
-
 @pytest.mark.parametrize("name", FUNCTIONS)
 @pytest.mark.parametrize("point", [(0.7, 1.3), (2.2, 0.4), (1.0, 1.0)])
 def test_values_and_derivatives_agree_with_a_complex_step(name, point):
@@ -65,7 +38,7 @@ def test_values_and_derivatives_agree_with_a_complex_step(name, point):
     value = function(a, b)
     derivative = tangent([value], {a: da, b: db})
     direction = (0.3, -1.1)
-    results = run([value, *derivative], a=point[0], b=point[1], da=direction[0], db=direction[1])
+    results = Program.of([value, *derivative], [a, b, da, db])([*point, *direction])
     stepped = function(*(p + 1e-100j * d for p, d in zip(point, direction, strict=True)))
     assert results[0] == pytest.approx(np.real(stepped), rel=1e-14)
     assert results[1] == pytest.approx(np.imag(stepped) / 1e-100, rel=1e-13, abs=1e-15)

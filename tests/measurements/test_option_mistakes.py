@@ -9,6 +9,7 @@ from ipe_bench.measurements import (
     Bearings,
     Bock,
     Gnss,
+    Ode,
     Polynomial,
     Ranging,
     Sir,
@@ -18,6 +19,12 @@ from ipe_bench.noise import Colored, Correlated
 
 FEW = ((1.0, 0.0, 0.0),) * 9
 HIGH = ((1, "gps", 2e7, 0.0, 0.0),) * 9
+
+
+def _fed(**options):
+    return Ode(**({"rates": {"y": "feed - k*y"}, "start": {"k": 0.5}, "initial": {"y": "begin"}} | options))
+
+
 MISTAKES = [
     (lambda: Bearings(legs=((1.0, 2.0),)), "legs"),
     (lambda: Bearings(target=(1.0, 2.0)), "target"),
@@ -33,6 +40,14 @@ MISTAKES = [
     (lambda: Sir(constants={"population": 763.0}).simulate(np.ones((1, 3))), "measurement: infection is not known"),
     (lambda: Bock(tolerance="1e-13*cosh(nu*t)"), "tolerance: nu is neither a constant nor t"),
     (lambda: Bock(answer={"q": 3.0}), "answer: q is not a parameter"),
+    (lambda: _fed(constants={"fed": 1.0}), "constants.fed: appears in no formula"),
+    (lambda: _fed(constants={"y": 1.0}), "constants.y: is a state, a parameter or the time"),
+    (lambda: _fed(constants={"feed": (1.0, 2.0), "begin": (1.0, 2.0, 3.0)}), "constants: have different lengths"),
+    (lambda: _fed(constants={"feed": "much"}), "constants.feed=much: give a finite number"),
+    (lambda: _fed(outputs={"s": "k*time*y"}), "time: is a column .* the time is t"),
+    (lambda: _fed(initial={"y": "y"}), "initial.y: y changes with time"),
+    (lambda: _fed(start={"k": 1.0, "y": 1.0}), "start.y: the state, parameter, column or time has this name"),
+    (lambda: _fed(driven_by={"feed": "hold"}, columns={"fed": [1.0]}), "columns.fed: there is no such input"),
     (lambda: Bock(start={"p": np.inf}), "start.p=inf: give a finite number"),
     (lambda: Bock(size={"p": 0.0}), "size.p=0.0: give a number above 0"),
     (lambda: Bock(driven_by={"u": "steps"}), "driven_by.u=steps: choose one of hold, linear"),

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_bvp, solve_ivp
+from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, curve_fit
 from scipy.special import expi
 from small_models import bock
@@ -113,22 +113,6 @@ def closed_form(x, mu, t):
     first = np.sin(p * t) + x1 * grow + (x2 - p) * fall / mu
     second = p * np.cos(p * t) + x1 * mu * fall + (x2 - p) * grow
     return np.stack([first, second], axis=2).reshape(len(x), -1)
-
-
-def test_bocks_closed_form_solves_the_equation_as_a_boundary_value_problem():
-    """From the ends, where nothing grows, another solver finds between them what the closed form says."""
-    p, x1, x2, t = 2.5, 0.1, 2.4, np.arange(1, 21) / 20
-    z = closed_form(np.array([[p, x1, x2]]), 10.0, t).reshape(-1, 2)
-    solution = solve_bvp(
-        lambda t, y: np.vstack([y[1], 100.0 * y[0] - (100.0 + p**2) * np.sin(p * t)]),
-        lambda a, b: np.array([a[0] - x1, b[0] - z[-1, 0]]),
-        np.linspace(0, 1, 50),
-        np.zeros((2, 50)),
-        tol=1e-9,
-        max_nodes=100_000,
-    )
-    assert solution.sol(0.0)[1] == pytest.approx(x2, rel=1e-5)
-    np.testing.assert_allclose(solution.sol(t), z.T, rtol=1e-5)
 
 
 @pytest.mark.parametrize("mu", [10.0, 30.0, 60.0])

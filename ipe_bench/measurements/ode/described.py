@@ -15,7 +15,7 @@ from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.basics.files import own_conf
 from ipe_bench.basics.linalg import Array, Covariance, own
 from ipe_bench.basics.options import Count, Finite, Positive
-from ipe_bench.measurements.arithmetic import COMPARISONS, Arithmetic, Tree, never_switching, parts, read
+from ipe_bench.measurements.arithmetic import COMPARISONS, Arithmetic, Tree, evaluate, never_switching, parts, read
 from ipe_bench.measurements.base import Input, Measurement, Recorded, SubsetModel, UsualNoise, WrappedModel
 from ipe_bench.measurements.formula import WrittenModel
 from ipe_bench.measurements.ode.driven import (
@@ -194,16 +194,15 @@ class Ode(WrittenModel, WrappedModel):
 
     @cached_property
     def rate_formulas(self) -> dict[str, Arithmetic]:
-        return {name: read(str(text), f"rates.{name}") for name, text in self.rates.items()}
+        return _read_all("rates", self.rates)
 
     @cached_property
     def initial_formulas(self) -> dict[str, Arithmetic]:
-        return {name: read(str(self.initial.get(name, 0.0)), f"initial.{name}") for name in self.rates}
+        return _read_all("initial", {name: self.initial.get(name, 0.0) for name in self.rates})
 
     @cached_property
     def output_formulas(self) -> dict[str, Arithmetic]:
-        shown = self.outputs or {name: name for name in self.rates}
-        return {name: read(str(text), f"outputs.{name}") for name, text in shown.items()}
+        return _read_all("outputs", self.outputs or {name: name for name in self.rates})
 
     @cached_property
     def courses(self) -> list[dict[str, Array]]:
@@ -280,19 +279,17 @@ class Ode(WrittenModel, WrappedModel):
         """That the implicit method is chosen, or is nearer, and which conditionals never switch along the solution at
         x."""
         found, engine = [], self.engine
+        rates, outputs = self.rate_formulas.values(), self.output_formulas.values()
         if self.method == "auto" and engine.stiff:
             found.append(engine.said_stiff)
-        rates = self.piecewise_rates[0].values()
-        kinked = any(part[0] in PIECEWISE for formula in rates for part in parts(formula.tree))
+        kinked = any(part[0] in PIECEWISE for one in self.piecewise_rates[0].values() for part in parts(one.tree))
         if kinked and (off := engine.off(x)) > _KINKED:
             found.append(
                 f"the explicit method leaves readings off by about {off:.0f} times the tolerance, as it does where "
                 "rates have kinks, and slopes right to two or three digits; measurement.method=implicit brings the "
                 "readings nearer, but not always the slopes"
             )
-        rates = {f"rates.{name}": formula for name, formula in self.rate_formulas.items()}
-        outputs = {f"outputs.{name}": formula for name, formula in self.output_formulas.items()}
-        if any(part[0] in COMPARISONS for one in (rates | outputs).values() for part in parts(one.tree)):
+        if any(part[0] in COMPARISONS for one in (*rates, *outputs) for part in parts(one.tree)):
             known = engine.along(x)
             found += never_switching(rates, known | {"t": middles(engine.times)[None, :-1]})
             found += never_switching(outputs, known)
@@ -343,7 +340,7 @@ class Ode(WrittenModel, WrappedModel):
         whole = set(self.answer) == set(self.start) and set(self.exact) == set(self.output_formulas)
         if not whole or self.deviation is None:
             return None
-        formulas = [read(str(self.exact[name]), f"exact.{name}") for name in self.output_formulas]
+        formulas = _read_all("exact", {name: self.exact[name] for name in self.output_formulas}).values()
         known = self.known(self.reading_times)
         z = np.concatenate([[formula({**self.answer, **one}) for formula in formulas] for one in known])
         x = np.array([self.answer[name] for name in self.start]) / self.sizes
@@ -357,6 +354,10 @@ class Ode(WrittenModel, WrappedModel):
     def known(self, times: Array) -> list[dict[str, float]]:
         """The constants and t at each of these times of each case."""
         return [{**case, "t": t} for case in self.known_of_cases for t in times.tolist()]
+
+
+def _read_all(key: str, texts: Mapping[str, str | float]) -> dict[str, Arithmetic]:
+    return {name: read(str(text), f"{key}.{name}") for name, text in texts.items()}
 
 
 @dataclass(frozen=True)
@@ -393,7 +394,7 @@ class _Engine(OdeMeasurement):
             return None
         tables = []
         for k, case in enumerate(described.known_of_cases):
-            columns = [Arithmetic("", tree, ())({**case, "t": at}) for tree in switches.values()]
+            columns = [evaluate(tree, {**case, "t": at}) for tree in switches.values()]
             for name, kind in described.driven_by.items():
                 one = described.courses[min(k, len(described.courses) - 1)]
                 columns += course(kind, one["time"], one[name], at)

@@ -13,7 +13,16 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.measurements.arithmetic import COMPARISONS, CONSTANTS, Arithmetic, Tree, names_in, parts, rewritten
+from ipe_bench.measurements.arithmetic import (
+    COMPARISONS,
+    CONSTANTS,
+    Arithmetic,
+    Tree,
+    evaluate,
+    names_in,
+    parts,
+    rewritten,
+)
 from ipe_bench.measurements.ode.trace import COMPARISONS as OF_COMPARISON
 from ipe_bench.measurements.ode.trace import Graph, Program, in_order, tangent
 
@@ -57,7 +66,7 @@ def switching_times(comparison: Tree, cases: Sequence[Mapping[str, float]]) -> l
     found = []
     for case in cases:
         t = Graph().input("t")
-        gap = t.graph.apply("add", Arithmetic(text, ("-", left, right), ())({**case, "t": t}), 0.0)
+        gap = t.graph.apply("add", evaluate(("-", left, right), {**case, "t": t}), 0.0)
         slope = tangent([gap], {t: t.graph.constant(1.0)})[0].value
         if slope is None or any(e.operation in OF_COMPARISON for e in in_order([gap])):
             remedy = "compare t itself with a constant, so that the moment of the switch is known"
