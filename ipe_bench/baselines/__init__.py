@@ -8,7 +8,7 @@ from ipe_bench.baselines.least_squares import GaussNewton, LevenbergMarquardt, L
 from ipe_bench.baselines.multiple_shooting import MultipleShooting
 from ipe_bench.baselines.multistart import Multistart
 from ipe_bench.baselines.scipy_least_squares import LeastSquares
-from ipe_bench.basics.naming import without_modules
+from ipe_bench.basics.errors import without_modules
 
 __all__ = [
     "CKF",

@@ -2,8 +2,11 @@
 
 import difflib
 import os
+import sys
 import traceback
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from types import ModuleType
+from typing import Any
 
 
 class UserError(Exception):
@@ -51,3 +54,15 @@ def unknown(name: str, known: Iterable[str], noun: str) -> str:
     """'there is no such option; did you mean ...', with everything there is."""
     known = sorted(known)
     return f"there is no such {noun}{did_you_mean(name, known)} (there are: {', '.join(known) or 'none'})"
+
+
+def without_modules(room: str, names: Sequence[str]) -> None:
+    """Takes a package's modules off its attributes, so that `measurements.gins` is answered with the class `Gins`."""
+    content = vars(sys.modules[room])
+    for name in [name for name, thing in content.items() if isinstance(thing, ModuleType)]:
+        del content[name]
+
+    def missing(name: str) -> Any:
+        raise AttributeError(f"{room}.{name}: {unknown(name, names, 'name')}")
+
+    content["__getattr__"] = missing

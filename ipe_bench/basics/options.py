@@ -13,15 +13,16 @@ import inspect
 import math
 import numbers
 import operator
+import re
 import types
 import typing
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from annotated_types import BaseMetadata, Ge, Gt, Le, Lt, MinLen, Predicate
 
-from ipe_bench.basics.errors import UserError, describe_exception, unknown
+from ipe_bench.basics.errors import UserError, describe_exception, shortened, unknown
 
 FINITE = Predicate(math.isfinite)
 
@@ -62,13 +63,20 @@ class Component:
     A class whose options must suit one another writes `__post_init__` and calls this one first.
     """
 
+    name: ClassVar[str] = ""
+    """Its name in tables: that of the class in small letters with underscores, unless the class states one."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "name" not in {*cls.__dict__, *cls.__annotations__} and not isinstance(cls.name, property):
+            cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
+
     def __new__(cls, *_: Any, **options: Any) -> Self:
         """Refuses an option that the class does not have, with those that it has."""
-        takes = inspect.signature(cls.__init__).parameters.values()
-        known = [one.name for one in takes if one.kind is one.POSITIONAL_OR_KEYWORD or one.kind is one.KEYWORD_ONLY][1:]
-        if not any(one.kind is one.VAR_KEYWORD for one in takes):
-            for name in options.keys() - set(known):
-                raise UserError(f"{cls.__name__}: {name}=: {unknown(name, known, 'option')}")
+        takes = inspect.signature(cls.__init__).parameters
+        if not any(one.kind is one.VAR_KEYWORD for one in takes.values()):
+            for name in options.keys() - takes.keys():
+                raise UserError(f"{cls.__name__}: {name}=: {unknown(name, takes.keys() - {'self'}, 'option')}")
         return super().__new__(cls)
 
     def __post_init__(self) -> None:
@@ -144,7 +152,7 @@ def checked(value: Any, hint: Any, key: str) -> Any:
 
 def _refusal(value: Any, wanted: str, key: str) -> UserError:
     text = " ".join(str(list(value) if isinstance(value, tuple) else value).split())
-    return UserError(f"{key}={text if len(text) <= 60 else text[:57] + '...'}: give {wanted}")
+    return UserError(f"{key}={shortened(text, 60)}: give {wanted}")
 
 
 def _number(value: Any, kind: Any, key: str) -> Any:

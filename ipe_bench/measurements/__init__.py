@@ -1,6 +1,6 @@
 """Measurement models: what a parameter vector makes the instruments read. Config group `measurement`."""
 
-from ipe_bench.basics.naming import without_modules
+from ipe_bench.basics.errors import without_modules
 from ipe_bench.measurements.base import Input, Measurement, Parameter, Recorded, SubsetModel, UsualNoise
 from ipe_bench.measurements.bearings import Bearings
 from ipe_bench.measurements.formula import Formula

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array, Covariance
-from ipe_bench.basics.naming import Named
 from ipe_bench.basics.options import Component
 
 _COMPLEX_STEP = 1e-100
@@ -78,7 +77,7 @@ class Recorded:
     """The certified answer (n,), in multiples of the parameters' sizes."""
 
 
-class Measurement(Component, Named, ABC):
+class Measurement(Component, ABC):
     """A model z = h(x) + v, without the noise v.
 
     x is (trials, n) in multiples of the parameters' sizes, h(x) is (trials, m) in `reading_unit`, m >= n, and a trial's

@@ -1,6 +1,6 @@
 """Noise: adds errors to readings, and knows the covariance that estimators assume. Config group `noise`."""
 
-from ipe_bench.basics.naming import without_modules
+from ipe_bench.basics.errors import without_modules
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.kinds import (
     Certified,

@@ -10,7 +10,6 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance
-from ipe_bench.basics.naming import Named
 from ipe_bench.basics.options import Component, Positive
 from ipe_bench.measurements.base import Measurement, UsualNoise
 
@@ -21,7 +20,7 @@ UNIFORM_DEVIATION = 1 / np.sqrt(12)
 """The standard deviation of a uniform number between 0 and 1."""
 
 
-class Noise(Component, Named, ABC):
+class Noise(Component, ABC):
     """Errors of readings. A new noise is a frozen dataclass that writes `corrupt` and `covariance`."""
 
     real: ClassVar[bool] = False

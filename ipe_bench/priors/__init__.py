@@ -10,7 +10,6 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.basics.naming import Named
 from ipe_bench.basics.options import Component, Finite, NonNegative
 
 __all__ = ["GaussianPrior", "Prior"]
@@ -21,7 +20,7 @@ _DEFINITE = 1e-12
 """The least eigenvalue of a correlation: below it P0 has no inverse to working precision."""
 
 
-class Prior(Component, Named, ABC):
+class Prior(Component, ABC):
     """A prior. A new one is a frozen dataclass that writes `deviation` and `draw`.
 
     Estimators that use a prior are told N(nominal, P0), P0 being of these deviations and of `correlation`, and the

@@ -29,7 +29,6 @@ from annotated_types import Gt, Lt, doc
 
 from ipe_bench.basics.errors import StorageError, UserError, describe_exception
 from ipe_bench.basics.machine import cores
-from ipe_bench.basics.naming import Named
 from ipe_bench.basics.options import Component, Count
 
 Work = Callable[[Any], Iterable[Any]]
@@ -71,7 +70,7 @@ class Event:
     failure: Failure | None = None
 
 
-class Execution(Component, Named, ABC):
+class Execution(Component, ABC):
     """Where tasks run. A new execution is a frozen dataclass that writes `run`."""
 
     @abstractmethod

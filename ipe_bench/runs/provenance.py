@@ -24,7 +24,7 @@ TARGET = "_target_"
 WITHOUT_NUMBERS = tuple(
     f"ipe_bench.{name}"
     for name in (
-        *("basics.errors", "basics.files", "basics.machine", "basics.naming", "basics.statuses"),
+        *("basics.errors", "basics.files", "basics.machine", "basics.statuses"),
         *("runs", "statistics", "real", "plugins", "report", "api", "cli"),
     )
 )

@@ -1,6 +1,6 @@
 """Solvers: IPE by different iterations. Config group `solver`."""
 
-from ipe_bench.basics.naming import without_modules
+from ipe_bench.basics.errors import without_modules
 from ipe_bench.estimators.ipe import IPE, State, System
 from ipe_bench.solvers.anderson import Anderson
 from ipe_bench.solvers.auto import Auto

@@ -11,7 +11,6 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, multiply
-from ipe_bench.basics.naming import Named
 from ipe_bench.basics.options import Component
 from ipe_bench.basics.streams import numbered
 from ipe_bench.measurements.base import Parameter, differentiate
@@ -42,7 +41,7 @@ class Paths:
     """The readings (trials, K, m)."""
 
 
-class StateModel(Component, Named, ABC):
+class StateModel(Component, ABC):
     """States that move, and what is read of them at K epochs k = 0 ... K-1.
 
     A model writes `states`, `times`, `prior`, `transition`, `observe`, `gain` and `R`. `transition` and `observe` take

@@ -14,7 +14,6 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from ipe_bench.basics.linalg import Array, multiply
-from ipe_bench.basics.naming import Named
 from ipe_bench.basics.options import Component, Count, NonNegative
 from ipe_bench.basics.streams import own_generators
 from ipe_bench.states.algebra import divide, factor, lower_solve, mahalanobis, root, symmetric, transposed, upper_solve
@@ -77,7 +76,7 @@ class Tracks:
         return cls(**arrays, calls=max(part.calls for part in parts), start=start)
 
 
-class Tracker(Component, Named, ABC):
+class Tracker(Component, ABC):
     """Estimates the states of every trial from its readings."""
 
     needs: ClassVar[frozenset[str]] = frozenset({"epochs", "prior"})
