@@ -14,41 +14,16 @@ import yaml
 import ipe_bench as ib
 from ipe_bench.cli.main import COMMANDS, main
 from ipe_bench.cli.spec import KEYS
-from ipe_bench.plugins import discovery as plugins
 from ipe_bench.report import figures
 
 ROOT = Path(__file__).parents[2]
 
 
-def ipe_bench(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+def alone(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     """Runs a command as users do, in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "ipe_bench", *arguments],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-
-
-@pytest.fixture
-def here(monkeypatch, capsys):
-    """Runs a command in this process, and answers as one in a process of its own does."""
-    for variable in ("HYDRA_FULL_ERROR", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        monkeypatch.setenv(variable, "1")
-
-    def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
-        monkeypatch.chdir(folder)
-        monkeypatch.setattr(sys, "argv", ["ipe-bench"])
-        plugins.sources.cache_clear()
-        capsys.readouterr()
-        code = main(list(arguments))
-        written = capsys.readouterr()
-        return subprocess.CompletedProcess(arguments, code, written.out, written.err)
-
-    return run
+    command = [sys.executable, "-m", "ipe_bench", *arguments]
+    variables = {**os.environ, "PYTHONPATH": str(ROOT), **environment}
+    return subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True, timeout=300, check=False)
 
 
 @pytest.fixture(scope="module")
@@ -62,19 +37,20 @@ def readings(tmp_path_factory) -> Path:
     return folder / "trial.csv"
 
 
-def test_a_sweep_leaves_tables_figures_and_a_report(tmp_path, here, monkeypatch):
+def test_a_sweep_leaves_tables_figures_and_a_report(tmp_path, ipe_bench, monkeypatch):
     monkeypatch.setattr(figures, "FIGURES", ("costs", "parameters"))
-    result = here("run", "-m", "error_scale=1,10", "trials=20", "figures=main", folder=tmp_path)
-    assert result.returncode == 0, result.stderr
+    words = ("run", "-m", "error_scale=1,10", "trials=20", "figures=main")
+    code, out, error = ipe_bench(*words)
+    assert code == 0, error
     folder = tmp_path / "outputs/gins-error_scale=1,10"
     assert {path.name for path in folder.iterdir()} >= {"summary.csv", "report.html", "tables"}
     drawn = {path.name for path in (folder / "figures").iterdir()}
     assert drawn == {"index.json", "cost_against_accuracy.png"}
-    assert "fixed_point" in result.stdout
-    again = here("run", "-m", "error_scale=1,10", "trials=20", "figures=main", folder=tmp_path)
-    assert again.stderr.count("nothing left to compute") == 2
+    assert "fixed_point" in out
+    assert ipe_bench(*words)[2].count("nothing left to compute") == 2
 
 
+SMALL = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01")
 MISTAKES = {
     "unknown estimator": (["run", "solver=[newtn]"], "solver=newtn: there is no such option; did you mean newton?"),
     "unknown key": (["run", "eror_scale=1"], "did you mean error_scale?"),
@@ -114,30 +90,51 @@ MISTAKES = {
     "a flag that is gone": (["run", "--config-path", "x"], "name it with --config-dir"),
     "no function": (["run", "measurement=function"], "measurement.of: is not given; write measurement.of=MODULE:FUNC"),
     "no readings": (["estimate"], "readings: is not given"),
+    "design of trials": (["design", *SMALL, "trials=5"], "trials: is for `ipe-bench run`"),
+    "design of a solver": (["design", *SMALL, "solver=[newton]"], "solver: is for `ipe-bench run`"),
+    "design of a file": (["design", *SMALL, "readings=a.csv"], "--readings NUMBER"),
+    "no such column": (["design", *SMALL, "--by", "colour"], "by=colour: there is no such column"),
+    "no such criterion": (["design", *SMALL, "--criterion", "E"], "--criterion: invalid choice"),
+    "too few readings": (["design", *SMALL, "--readings", "3"], "readings=3: 4 parameters want"),
+    "too many readings": (
+        ["design", *SMALL, "--readings", "500"],
+        "readings=500: polynomial has 40 readings to choose",
+    ),
+    "design to a precision": (["design", *SMALL, "precision=0.1"], "precision: is for `ipe-bench run`"),
+    "no richer truth": (["design", *SMALL, "truth_measurement=polynomial"], "has no errors besides the parameters"),
+    "posterior of a file": (
+        ["posterior", *SMALL, "readings=a.csv"],
+        "readings: is for `ipe-bench estimate`, and nothing in `ipe-bench posterior`",
+    ),
+    "posterior to a precision": (
+        ["posterior", *SMALL, "precision=0.1"],
+        "precision: is for `ipe-bench run`, and nothing",
+    ),
+    "a thousand posteriors": (["posterior", *SMALL, "trials=1000"], "trials=1000: each takes up to a minute"),
+    "few particles": (["posterior", *SMALL, "baseline=[]", "--particles", "20"], "particles=20: give at least 80"),
+    "particles in words": (["posterior", *SMALL, "--particles", "many"], "--particles: invalid int value"),
+    "no posterior": (["posterior", *SMALL, "trials=0"], "trials=0: give a whole number above 0"),
 }
 
 
-def is_refused(result: subprocess.CompletedProcess[str], expected: str) -> None:
-    assert result.returncode == 2
-    assert expected in result.stderr
-    assert len(result.stderr.strip().splitlines()) == 1
-
-
-QUICK = ("measurement=polynomial", "noise=gaussian", "noise.deviation=0.01", "trials=4", "execution=serial")
+QUICK = (*SMALL, "trials=4", "execution=serial")
 
 
 @pytest.mark.parametrize("case", MISTAKES)
-def test_a_mistake_is_one_line_with_exit_code_2(tmp_path, here, case):
+def test_a_mistake_is_one_line_with_exit_code_2(tmp_path, ipe_bench, case):
     arguments, expected = MISTAKES[case]
-    is_refused(here(*arguments, folder=tmp_path), expected)
-    assert not (tmp_path / "outputs").exists() or not list((tmp_path / "outputs").rglob("*.parquet"))
+    code, _, error = ipe_bench(*arguments)
+    assert code == 2
+    assert expected in error
+    assert len(error.strip().splitlines()) == 1
+    assert not list(tmp_path.rglob("*.parquet"))
 
 
-def test_nothing_is_overwritten(readings, here):
+def test_nothing_is_overwritten(readings, ipe_bench):
     before = readings.read_text()
-    result = here("run", f"write_readings={readings}", folder=readings.parent)
-    assert result.returncode == 2
-    assert "is not overwritten" in result.stderr
+    code, _, error = ipe_bench("run", f"write_readings={readings}")
+    assert code == 2
+    assert "is not overwritten" in error
     assert readings.read_text() == before
 
 
@@ -159,13 +156,13 @@ def test_a_data_set_may_be_written_as_an_option_of_its_own(words, expected, tmp_
     assert all(line.startswith(f"measurement{name}, noise") for line, name in zip(lines, expected, strict=True))
 
 
-def test_hydras_own_flags_work_after_run(tmp_path, here, monkeypatch):
-    assert "error_scale: 5\n" in here("run", "error_scale=5", "--cfg", "job", folder=tmp_path).stdout
+def test_hydras_own_flags_work_after_run(tmp_path, ipe_bench, monkeypatch):
+    assert "error_scale: 5\n" in ipe_bench("run", "error_scale=5", "--cfg", "job")[1]
     # Which sets up logging for the whole of its process.
-    assert ipe_bench("run", "--info", "searchpath", folder=tmp_path).returncode == 0
+    assert alone("run", "--info", "searchpath", folder=tmp_path).returncode == 0
     monkeypatch.setenv("COMP_LINE", "ipe-bench run measurement=gi")
     monkeypatch.setenv("COMP_POINT", "28")
-    assert "measurement=gins" in here("-sc", "query=bash", folder=tmp_path).stdout
+    assert "measurement=gins" in ipe_bench("-sc", "query=bash")[1]
 
 
 LOADED = """
@@ -178,8 +175,7 @@ print(sorted(m for m in ("pandas", "seaborn", "filterpy", "llvmlite", "hydra", "
 
 
 def test_help_is_quick_to_load_and_names_the_commands():
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    result = subprocess.run([sys.executable, "-c", LOADED], env=environment, capture_output=True, text=True, check=True)
+    result = subprocess.run([sys.executable, "-c", LOADED], capture_output=True, text=True, check=True)
     assert "ipe-bench estimate" in result.stdout
     assert result.stdout.strip().endswith("[]")
 
@@ -189,19 +185,19 @@ def test_a_plugin_without_its_header_or_with_a_taken_name_is_refused(tmp_path):
     conf.mkdir(parents=True)
     (tmp_path / "plugins/mine/mine/__init__.py").touch()
     (conf / "lost.yaml").write_text("_target_: mine.Lost\n")
-    assert "first line must be" in ipe_bench("list", folder=tmp_path).stderr
+    assert "first line must be" in alone("list", folder=tmp_path).stderr
     (conf / "lost.yaml").unlink()
     (conf / "newton.yaml").write_text("# @package estimators.newton\n_target_: mine.Newton\n")
-    assert "rename one of the two" in ipe_bench("list", folder=tmp_path).stderr
+    assert "rename one of the two" in alone("list", folder=tmp_path).stderr
 
 
-def test_estimate_leaves_numbers_residuals_and_figures_from_csv_and_parquet_alike(readings, tmp_path, here):
+def test_estimate_leaves_numbers_residuals_and_figures_from_csv_and_parquet_alike(readings, tmp_path, ipe_bench):
     pd.read_csv(readings).to_parquet(tmp_path / "trial.parquet")
     results = []
     for file, drawn in ((readings, "none"), (tmp_path / "trial.parquet", "none"), (readings, "all")):
-        ran = here("estimate", f"readings={file}", "error_scale=10", f"figures={drawn}", folder=tmp_path)
-        assert ran.returncode == 0, ran.stderr
-        assert all(len(line) <= 120 for line in ran.stdout.splitlines())
+        code, out, error = ipe_bench("estimate", f"readings={file}", "error_scale=10", f"figures={drawn}")
+        assert code == 0, error
+        assert all(len(line) <= 120 for line in out.splitlines())
     # The second file is another command, and the third run is the first command again.
     folders = sorted(path.name for path in (tmp_path / "outputs").iterdir())
     assert folders == ["estimate-gins", "estimate-gins-2"]
@@ -220,23 +216,19 @@ def test_estimate_leaves_numbers_residuals_and_figures_from_csv_and_parquet_alik
     assert {"numpy", "scipy"} <= set(results[0]["libraries"])
 
 
-def test_an_estimate_draws_nothing_where_no_figures_are_asked_for(tmp_path, here):
-    words = ("estimate", "measurement=nist/misra1a", "solver=[]", "baseline=[levenberg_marquardt]", "output=out")
-    assert here(*words, folder=tmp_path).returncode == 0
+def test_an_estimate_draws_nothing_where_no_figures_are_asked_for_and_overwrites_no_other_command(tmp_path, ipe_bench):
+    words = ("estimate", "measurement=nist/misra1a", "solver=[]", "output=out")
+    assert ipe_bench(*words, "baseline=[levenberg_marquardt]")[0] == 0
     drawn = {path.name for path in (tmp_path / "out").iterdir() if path.suffix in (".png", ".pdf")}
     assert {"residuals.png", "residuals.pdf"} <= drawn
-    assert here(*words, "figures=none", folder=tmp_path).returncode == 0
+    assert ipe_bench(*words, "baseline=[levenberg_marquardt]", "figures=none")[0] == 0
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"estimate.json", "residuals.csv", "estimate.html"}
     assert "<img" not in (tmp_path / "out" / "estimate.html").read_text(encoding="utf-8")
-
-
-def test_estimate_overwrites_no_other_command(readings, tmp_path, here):
-    folder = tmp_path / "mine"
-    folder.mkdir()
-    (folder / "residuals.csv").write_text("mine")
-    result = here("estimate", f"readings={readings}", "output=mine", folder=tmp_path)
-    is_refused(result, "output=mine: holds results of another command")
-    assert (folder / "residuals.csv").read_text() == "mine"
+    (tmp_path / "out" / "residuals.csv").write_text("mine")
+    code, _, error = ipe_bench(*words, "baseline=[gauss_newton]")
+    assert code == 2
+    assert "output=out: holds results of another command" in error
+    assert (tmp_path / "out" / "residuals.csv").read_text() == "mine"
 
 
 def test_the_bare_program_and_every_command_have_help(capsys):
@@ -262,12 +254,9 @@ def test_the_help_of_run_explains_every_key_of_the_config_in_a_line(capsys):
 
 
 def test_a_reader_that_closes_the_pipe_is_no_mistake(tmp_path):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     for words in (["list", "measurement", "-v"], ["run", *QUICK, "figures=none", f"output={tmp_path / 'out'}"]):
         command = [sys.executable, "-m", "ipe_bench", *words]
-        with subprocess.Popen(
-            command, env=environment, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-        ) as process:
+        with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
             assert process.stdout is not None
             assert process.stderr is not None
             process.stdout.close()
@@ -277,21 +266,20 @@ def test_a_reader_that_closes_the_pipe_is_no_mistake(tmp_path):
 
 
 def test_a_stream_that_knows_no_greek_letters_shows_question_marks(tmp_path):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "ascii"}
-    words = ["run", *QUICK, "figures=none", f"output={tmp_path / 'out'}"]
-    result = subprocess.run([sys.executable, "-m", "ipe_bench", *words], env=environment, capture_output=True)
+    result = alone("run", *QUICK, "figures=none", "output=out", folder=tmp_path, PYTHONIOENCODING="ascii")
     assert result.returncode == 0, result.stderr
     assert result.stdout.isascii()
 
 
-def test_filters_that_nobody_chose_are_left_out_where_the_model_has_no_use_for_them(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_filters_that_nobody_chose_are_left_out_where_the_model_has_no_use_for_them(ipe_bench):
     words = ["run", "measurement=nist/boxbod", "noise=certified", "trials=1", "figures=none", "output=out"]
-    assert main(words) in (0, 1)
-    assert "ekf and ukf are left out for nist" in " ".join(capsys.readouterr().out.split())
+    code, out, _ = ipe_bench(*words)
+    assert code in (0, 1)
+    assert "ekf and ukf are left out for nist" in " ".join(out.split())
     assert set(ib.load("out")["estimator"]) == {"fixed_point", "linear_lse"}
-    assert main([*words, "baseline=[ekf]"]) == 2
-    assert "estimators.ekf: needs epochs" in capsys.readouterr().err
+    code, _, error = ipe_bench(*words, "baseline=[ekf]")
+    assert code == 2
+    assert "estimators.ekf: needs epochs" in error
 
 
 CASES = {
@@ -305,17 +293,16 @@ CASES = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
-def test_a_model_of_one_case_or_one_reading_warns_of_nothing(tmp_path, here, case):
+def test_a_model_of_one_case_or_one_reading_warns_of_nothing(ipe_bench, case):
     """Tables and figures included: warnings are errors."""
-    result = here("run", *CASES[case], "trials=3", "execution=serial", folder=tmp_path)
-    assert result.returncode == 0, result.stderr
-    assert "Warning" not in result.stdout + result.stderr
+    code, out, error = ipe_bench("run", *CASES[case], "trials=3", "execution=serial")
+    assert code == 0, error
+    assert "Warning" not in out + error
 
 
-def test_a_model_that_brings_its_own_certified_readings_has_a_table(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    words = ["measurement=bock", "noise=certified", "trials=1", "figures=none", "output=out", "solver=[]"]
-    assert main(["run", *words, "baseline=[gauss_newton]"]) == 0
-    said = capsys.readouterr().out
-    assert "gauss_newton" in said
-    assert "nothing is stored" not in said
+def test_a_model_that_brings_its_own_certified_readings_has_a_table(ipe_bench):
+    words = ("measurement=bock", "noise=certified", "trials=1", "figures=none", "output=out", "solver=[]")
+    code, out, _ = ipe_bench("run", *words, "baseline=[gauss_newton]")
+    assert code == 0
+    assert "gauss_newton" in out
+    assert "nothing is stored" not in out

@@ -1,7 +1,7 @@
 """Our own components pass the checks that plugins are given, and the checks catch what they are for."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,11 @@ from ipe_bench.measurements import Formula, Gnss, Nist, Ode, Polynomial, Ranging
 from ipe_bench.measurements.joint import Joint
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.measurements.nist import datasets
-from ipe_bench.noise import Colored, Gaussian, Noise, Quantization
+from ipe_bench.noise import Colored, Gaussian, Quantization
 from ipe_bench.plugins import discovery as plugins
 from ipe_bench.plugins.conformance import check_component
 from ipe_bench.plugins.construct import construct
-from ipe_bench.solvers import IPE, Newton, State
+from ipe_bench.solvers import Newton, State
 from ipe_bench.states import Filter
 
 GROUPS = ("measurement", "noise", "prior", "solver", "baseline", "model", "tracker")
@@ -85,197 +85,118 @@ class Faulty(Estimator):
         return estimates
 
 
-@dataclass(frozen=True)
-class Linearizing(Newton):
-    def estimate(self, problem, z, *, history=False):
-        problem.H[0] = 0.0
-        return super().estimate(problem, z, history=history)
-
-
-@dataclass(frozen=True)
-class Bare(IPE):
-    def step(self, system, state):
-        return state.x - state.F
-
-
-@dataclass(frozen=True)
-class Misshapen(IPE):
-    def step(self, system, state):
-        return State(state.x - state.F, state.F[:, :1])
-
-
 @dataclass
 class Thawed(Estimator):
     def estimate(self, problem, z, *, history=False):
         return Newton().estimate(problem, z, history=history)
 
 
-@dataclass(frozen=True)
-class Mislabelled(Polynomial):
-    @property
-    def index(self):
-        return {"time": [0.0] * self.count}
+def altered(made, **attributes):
+    """A component as that one, of a class with other attributes."""
+    cls = dataclass(frozen=True)(type("Altered", (type(made),), {**attributes, "__module__": __name__}))
+    return cls(**{f.name: getattr(made, f.name) for f in fields(made) if f.init and f.name not in attributes})
 
 
-@dataclass(frozen=True)
-class Short(Polynomial):
-    nominal = np.array([5.0])  # type: ignore[assignment]
+def into_H(self, problem, z, *, history=False):
+    problem.H[0] = 0.0
+    return Newton.estimate(self, problem, z, history=history)
 
 
-@dataclass(frozen=True)
-class Slanted(Polynomial):
-    def jacobian(self, x):
-        return super().jacobian(x) * 1.01
+def into_x(self, x):
+    x += 1.0
+    return Polynomial.simulate(self, x)
 
 
-@dataclass(frozen=True)
-class Tilted(Polynomial):
-    """Wrong in one entry."""
-
-    def jacobian(self, x):
-        J = super().jacobian(x)
-        J[:, 6, 2] += 0.5
-        return J
+def one_entry(self, x):
+    J = Polynomial.jacobian(self, x)
+    J[:, 6, 2] += 0.5
+    return J
 
 
-@dataclass(frozen=True)
-class Broken(Polynomial):
-    """As analytic as np.abs is."""
-
-    def simulate(self, x):
-        return super().simulate(x) + np.abs(x[:, :1])
-
-
-@dataclass(frozen=True)
-class Shifting(Polynomial):
-    def simulate(self, x):
-        x += 1.0
-        return super().simulate(x)
-
-
-@dataclass(frozen=True)
-class Confused(Gaussian):
-    """Takes the variance for the deviation."""
-
-    def corrupt(self, h, offset, rng):
-        return h + self.deviation * rng.standard_normal(h.shape)
-
-    def covariance(self, m):
-        return Covariance(np.full(m, self.deviation**2))
-
-
-@dataclass(frozen=True)
-class Biased(Gaussian):
-    def corrupt(self, h, offset, rng):
-        return super().corrupt(h, offset, rng) + 0.1 * self.deviation
-
-
-@dataclass(frozen=True)
-class Whitened(Colored):
-    """Says that it states the whole truth, and does not."""
-
-    true_covariance = True
-
-
-@dataclass(frozen=True)
-class Silent(Quantization):
-    """Does not say that its errors are uniform."""
-
-    def whitened(self, shape, rng):
-        return None
-
-
-@dataclass(frozen=True)
-class Kinked(CoordinatedTurn):
-    """As analytic as np.abs is."""
-
-    def observe(self, x, k):
-        return super().observe(x, k) + np.abs(x[..., :1])
-
-
-@dataclass(frozen=True)
-class Unwrapped(CoordinatedTurn):
-    """Its bearing jumps."""
-
-    periods = ()
-
-
-@dataclass(frozen=True)
-class Crowded(CoordinatedTurn):
-    """A state depends on the others of the stack."""
-
-    def transition(self, x, k):
-        return super().transition(x, k) + 1e-9 * len(x)
-
-
-@dataclass(frozen=True)
-class Shapeless(CoordinatedTurn):
-    def R(self, k):
-        return np.eye(3)
-
-
-@dataclass(frozen=True)
-class Proud(Filter):
-    """Claims a quarter of its covariance, or looks at the other trials."""
-
-    share: float = 0.25
-    leaning: float = 0.0
-
+def changed_tracks(share: float, leaning: float):
     def track(self, model, z):
-        tracks = super().track(model, z)
-        tracks.covariance *= self.share
-        tracks.mean += self.leaning * len(z)
+        tracks = Filter.track(self, model, z)
+        tracks.covariance *= share
+        tracks.mean += leaning * len(z)
         return tracks
 
-
-@dataclass(frozen=True)
-class Forgetful(Noise):
-    def corrupt(self, h, offset, rng):
-        return h + np.random.default_rng().standard_normal(h.shape)
-
-    def covariance(self, m):
-        return Covariance(np.ones(m))
+    return track
 
 
-@pytest.mark.parametrize(
-    ("faulty", "complaint"),
-    [
-        (Silent(1.0), "is not distributed as normal, since there is no `whitened`"),
-        (Faulty("leaning"), "trial 0 differs"),
-        (Faulty("rounding"), "trial 0 differs, by rounding alone: use stacked matmul"),
-        (Faulty("averaging"), "trial 0 differs, by more than rounding"),
-        (Faulty("dicing"), "draws random numbers"),
-        (Linearizing(), "test_conformance.py, line"),
-        (Faulty("timid"), "variances are 1"),
-        (Faulty("bold"), "times too small"),
-        (Faulty("diagonal"), "covariance has shape (60, 4), and not (trials, n, n), which is (60, 4, 4) here"),
-        (Bare(), "step returns ndarray, and not a State: return State(x, system.F(x))"),
-        (Misshapen(), "step returns a State whose F has shape (8, 1), and not (8, 4)"),
-        (Tilted(), "most for parameter c2 in reading time=-0.6"),
-        (Broken(), "write np.where(u.real < 0, -u, u) for np.abs(u)"),
-        (Shifting(), "test_conformance.py, line"),
-        (Confused(0.01), "times the stated deviation"),
-        (Biased(0.01), "mean of the draws is off by up to 0.1"),
-        (Whitened(0.01, 0.5), "have the correlation 0.50, and 0.00 is stated"),
-        (Faulty("boasting"), "NaN readings counts as converged"),
-        (Faulty("wrong"), "standard deviations of the bound"),
-        (Faulty("free"), "not counted"),
-        (Faulty("scribbling"), "it writes into what it is given"),
-        (Thawed(), "frozen=True"),
-        (Mislabelled(), "two readings have one label"),
-        (Short(), "nominal has shape (1,), and not one number for each parameter, which is (4,) here"),
-        (Slanted(), "off by"),
-        (Forgetful(), "besides the stream"),
-        (Kinked(), "observe is not analytic"),
-        (Crowded(), "transition gives a state alone other bits"),
-        (Unwrapped(), "reading 2 jumps by 6.28: it is an angle; state its period"),
-        (Shapeless(), "h has shape (1, 2), where (1, 3) belongs"),
-        (Proud(), "the reported variances of the last epoch are"),
-        (Proud(share=1.0, leaning=1e-9), "trial 0 alone has other bits"),
-        (42, "neither"),
-    ],
-    ids=lambda value: getattr(value, "fault", type(value).__name__) if not isinstance(value, str) else "",
-)
+def errors_of_a_hundredth(self, h, offset, rng):
+    return h + 0.01 * rng.standard_normal(h.shape)
+
+
+TURN = CoordinatedTurn()
+FOUND = [
+    (Faulty("leaning"), "trial 0 differs"),
+    (Faulty("rounding"), "trial 0 differs, by rounding alone: use stacked matmul"),
+    (Faulty("averaging"), "trial 0 differs, by more than rounding"),
+    (Faulty("dicing"), "draws random numbers"),
+    (Faulty("timid"), "variances are 1"),
+    (Faulty("bold"), "times too small"),
+    (Faulty("diagonal"), "covariance has shape (60, 4), and not (trials, n, n), which is (60, 4, 4) here"),
+    (Faulty("boasting"), "NaN readings counts as converged"),
+    (Faulty("wrong"), "standard deviations of the bound"),
+    (Faulty("free"), "not counted"),
+    (Faulty("scribbling"), "it writes into what it is given"),
+    (Thawed(), "frozen=True"),
+    (altered(Newton(), estimate=into_H), "test_conformance.py, line"),
+    (
+        altered(Newton(), step=lambda self, system, state: state.x - state.F),
+        "step returns ndarray, and not a State: return State(x, system.F(x))",
+    ),
+    (
+        altered(Newton(), step=lambda self, system, state: State(state.x - state.F, state.F[:, :1])),
+        "step returns a State whose F has shape (8, 1), and not (8, 4)",
+    ),
+    (altered(Polynomial(), jacobian=one_entry), "most for parameter c2 in reading time=-0.6"),
+    (altered(Polynomial(), jacobian=lambda self, x: 1.01 * Polynomial.jacobian(self, x)), "off by"),
+    (  # as analytic as np.abs is
+        altered(Polynomial(), simulate=lambda self, x: Polynomial.simulate(self, x) + np.abs(x[:, :1])),
+        "write np.where(u.real < 0, -u, u) for np.abs(u)",
+    ),
+    (altered(Polynomial(), simulate=into_x), "test_conformance.py, line"),
+    (altered(Polynomial(), index=property(lambda self: {"time": [0.0] * self.count})), "two readings have one label"),
+    (
+        altered(Polynomial(), nominal=np.array([5.0])),
+        "nominal has shape (1,), and not one number for each parameter, which is (4,) here",
+    ),
+    (
+        altered(Quantization(1.0), whitened=lambda *_: None),
+        "is not distributed as normal, since there is no `whitened`",
+    ),
+    (
+        # the variance for the deviation
+        altered(Gaussian(0.01), corrupt=errors_of_a_hundredth, covariance=lambda _, m: Covariance(np.full(m, 1e-4))),
+        "times the stated deviation",
+    ),
+    (
+        altered(Gaussian(0.01), corrupt=lambda self, h, o, rng: Gaussian.corrupt(self, h, o, rng) + 0.001),
+        "mean of the draws is off by up to 0.1",
+    ),
+    (altered(Colored(0.01, 0.5), true_covariance=True), "have the correlation 0.50, and 0.00 is stated"),
+    (
+        altered(Gaussian(1.0), corrupt=lambda self, h, *_: h + np.random.default_rng().standard_normal(h.shape)),
+        "besides the stream",
+    ),
+    (
+        altered(TURN, observe=lambda self, x, k: TURN.observe(x, k) + np.abs(x[..., :1])),
+        "observe is not analytic",
+    ),
+    (
+        altered(TURN, transition=lambda self, x, k: TURN.transition(x, k) + 1e-9 * len(x)),
+        "transition gives a state alone other bits",
+    ),
+    (altered(TURN, periods=()), "reading 2 jumps by 6.28: it is an angle; state its period"),
+    (altered(TURN, R=lambda self, k: np.eye(3)), "h has shape (1, 2), where (1, 3) belongs"),
+    (altered(Filter(), track=changed_tracks(0.25, 0.0)), "the reported variances of the last epoch are"),
+    (altered(Filter(), track=changed_tracks(1.0, 1e-9)), "trial 0 alone has other bits"),
+    (42, "neither"),
+]
+
+
+@pytest.mark.parametrize(("faulty", "complaint"), FOUND, ids=[complaint for _, complaint in FOUND])
 def test_a_fault_is_found(faulty, complaint):
     assert complaint in complaints(faulty)
 
