@@ -423,7 +423,7 @@ def design(
     >>> import ipe_bench as ib
     >>> bench = ib.Scenario(ib.measurements.Polynomial(), ib.noise.Gaussian(0.01), error_scale=3.0)
     >>> found = ib.design(bench, readings=20)
-    >>> half = found.best.sharpest
+    >>> half = found.ways[-1].sharpest
     >>> half.readings, bench.measurement.m, half.mean_bound < 2**0.5
     (20, 40, True)
     >>> ib.Scenario(found.measurement(half), bench.noise, error_scale=3.0).draw(0, 5).z.shape

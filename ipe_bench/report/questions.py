@@ -35,8 +35,6 @@ half a deviation off, are about a tenth."""
 ALIKE = 0.05
 """Energy distance up to which draws may come from one law: of Gaussians in few dimensions, some tenths of a nat."""
 _MOST_SUSPECTS = 12
-_MUST_BREAK = 1.02
-"""Multiple of Van Trees's bound above which false roots are felt by any estimator."""
 _UNSEEN = 0.05
 """Share of trials below which an error goes unnoticed by any test of residuals."""
 
@@ -54,8 +52,6 @@ def design_parts(name: str, design: Design) -> Iterator[Part]:
     if told is not None and not told.lost:
         yield f"Exact readings would tell all {len(told.unknowns)} parameters from their neighbours."
     yield from (Strong(f"No data can tell: {sentence}.") for sentence in (told.sentences if told else ()))
-    if design.threshold:
-        yield _threshold(design)
     yield from _suspects(design)
     yield from _ways(design)
 
@@ -80,26 +76,6 @@ def _parameters(name: str, design: Design) -> Table:
     ]
     title = f"{name}, {scenario.noise.name}, error scale {scenario.error_scale:g}: what {scenario.measurement.m}"
     return Table("parameters", f"{title} readings say", "", columns, notes=notes)
-
-
-def _threshold(design: Design) -> str:
-    """Whether false roots are the estimator's own fault, or anyone's."""
-    limit = design.threshold
-    assert limit is not None
-    if not limit.false_roots:
-        return f"False roots: none in {limit.runs} runs of least squares from other truths."
-    loss = float(np.max(limit.weiss_weinstein / limit.van_trees))
-    if loss > _MUST_BREAK:
-        blame = f"so no estimator can do better than {loss:.2f} times Van Trees's bound"
-    elif limit.confusion < _UNSEEN:
-        blame = "so ending there is the estimator's fault and not that of noise"
-    else:
-        blame = "which the Weiss-Weinstein bound, averaged over the prior, does not feel"
-    return (
-        f"False roots: {limit.false_roots} of {limit.runs} runs of least squares from other truths; readings of the"
-        f" nearest are {limit.nearest:.3g} deviations off, and noise makes it fit better in {percent(limit.confusion)},"
-        f" {blame}."
-    )
 
 
 def _suspects(design: Design) -> Iterator[Part]:

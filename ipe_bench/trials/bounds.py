@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from ipe_bench.basics.batches import put
-from ipe_bench.basics.linalg import Array, Covariance, Mask, definite_factor, deviations, solve
+from ipe_bench.basics.linalg import Array, Covariance, definite_factor, deviations, solve
 from ipe_bench.estimators.ipe import frozen_covariance
 from ipe_bench.estimators.least_squares import inverse_factor
 from ipe_bench.measurements.problem import Problem
@@ -42,14 +40,14 @@ def informative_rows(noise: Noise, R: Covariance, J: Array, h: Array) -> Array:
     )
 
 
-def bound_deviations(information: Array, rows: Callable[[Mask], Array]) -> Array:
-    """Standard deviations (trials, n) of the bound whose inverse is `information` (trials, n, n); NaN where it is
-    singular.
+def bound_deviations(information: Array, rows: Array) -> Array:
+    """Standard deviations (trials, n) of the bound whose inverse is `information` A' A (trials, n, n), for rows A
+    (trials, k, n); NaN where it is singular.
 
-    `rows` gives A (some, k, n) with A' A = information of some trials: where that is ill-conditioned the bound is had
-    from A by QR, since an inverse of A' A loses twice the digits, and with them the sign of a variance.
+    An ill-conditioned bound is had from A by QR, since an inverse of A' A loses twice the digits, and with them the
+    sign of a variance.
     """
     _, inverse_U, well = definite_factor(information)
     if not well.all():
-        inverse_U = put(inverse_U, ~well, inverse_factor(rows(~well)))
+        inverse_U = put(inverse_U, ~well, inverse_factor(rows[~well]))
     return np.sqrt(np.sum(inverse_U**2, axis=2))

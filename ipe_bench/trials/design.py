@@ -6,7 +6,7 @@ take, one after another, the readings that gain most. What readings say about ea
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -15,27 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.trials.observability import TRUTHS, Observability, Suspect, suspects, truths_of
+from ipe_bench.trials.observability import TRUTHS, Observability, Suspect, suspects
 from ipe_bench.trials.scenario import Scenario
-from ipe_bench.trials.weiss_weinstein import Threshold, threshold
 
 Criterion = Literal["A", "D"]
 """A: the mean over parameters and truths of the squared bound. D: the volume of its ellipsoid."""
 SUSPECTED = 5
 """Truths at which unmodelled errors are tried: each takes two simulations of each of them."""
-_POINTS = 16
-"""Numbers of readings on a curve."""
 _WEAK = 1e-8
 """What every choice is taken to know beforehand, as a share of what all candidates together say: the first readings
 chosen do not determine the parameters by themselves."""
 _FEW = 3
 """With fewer units there is nothing to choose."""
-_REACH = 1.25
-"""How far a curve goes on beyond today's number of readings."""
-
-Rows = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -45,9 +38,9 @@ class Units:
     by: tuple[str, ...]
     entries: tuple[tuple[Any, ...], ...]
     """What a unit's readings have in those columns."""
-    rows: tuple[Rows, ...]
+    rows: tuple[NDArray[np.intp], ...]
     """The rows of the candidates' z."""
-    today: NDArray[np.bool_]
+    today: Mask
     """Which units today's set-up has (units,)."""
     slopes: Array
     """(truths, units, r, n): whitened, in units of today's bounds; r rows say what all readings of the unit say."""
@@ -56,11 +49,10 @@ class Units:
     def sizes(self) -> Array:
         return np.array([float(len(rows)) for rows in self.rows])
 
-    def information(self, weights: Array) -> Array:
-        """(truths, n, n) of units taken with these weights (units,)."""
-        taken = np.flatnonzero(weights)
+    def information(self, taken: Mask) -> Array:
+        """(truths, n, n) of the units that are taken (units,)."""
         A = self.slopes[:, taken]
-        return np.einsum("turi,turj,u->tij", A, A, weights[taken], optimize=True)
+        return np.einsum("turi,turj->tij", A, A, optimize=True)
 
 
 @dataclass(frozen=True)
@@ -85,10 +77,8 @@ class Way:
     """One way to choose: by case, by time, or reading by reading; all else as today."""
 
     units: Units
-    curve: tuple[Choice, ...]
-    """The choice at each of some numbers of readings, ascending."""
     saving: Choice | None
-    """The smallest choice whose mean bound is not above today's; None where that takes as many readings as today."""
+    """The smallest choice whose mean bound is not above today's; None if that takes as many readings as today."""
     sharpest: Choice
     """The smallest mean bound with no more readings than today."""
 
@@ -106,17 +96,7 @@ class Design:
     candidates: Measurement
     observability: Observability
     suspects: tuple[Suspect, ...]
-    threshold: Threshold | None
-    """What no estimator can beat, false roots counted in; None without a prior."""
     ways: tuple[Way, ...]
-
-    @property
-    def best(self) -> Way | None:
-        """The way that saves most readings, or else reaches the smallest bound."""
-        if not self.ways:
-            return None
-        most = float("inf")
-        return min(self.ways, key=lambda w: (w.saving.readings if w.saving else most, w.sharpest.mean_bound))
 
     def measurement(self, choice: Choice) -> Measurement:
         """The model that takes these readings and no others."""
@@ -147,10 +127,13 @@ def design(
             f"noise={scenario.noise.name}: without the level of the noise there are no bounds; give the deviation that"
             " you expect, as in noise=gaussian noise.deviation=0.1"
         )
-    model, R, x = scenario.measurement, scenario.problem.R, truths_of(scenario, truths)
+    model, R, x = scenario.measurement, scenario.problem.R, scenario.truths(0, truths)
     today = Observability.at(model, R, x)
-    found = [one for error in errors for one in suspects(model, R, error, x[:SUSPECTED])]
-    limit = threshold(scenario)
+    worst: dict[str, Suspect] = {}
+    for one in sorted(
+        (s for error in errors for s in suspects(model, R, error, x[:SUSPECTED])), key=lambda s: -s.bounds
+    ):
+        worst.setdefault(one.name, one)
     candidates = model.candidates
     columns = _columns(model, by)
     if R.factor.ndim != 1:
@@ -161,7 +144,7 @@ def design(
     R_all = scenario.noise.covariance(candidates.m)
     whole = Observability.at(candidates, R_all, x)
     if not whole.observable:
-        return Design(scenario, criterion, candidates, today, _largest(found), limit, ())
+        return Design(scenario, criterion, candidates, today, tuple(worst.values()), ())
     reference = today if today.observable else whole
     bounds = np.sqrt(np.diagonal(reference.covariance, axis1=1, axis2=2))[:, None, :]
     slopes = R_all.whiten_jacobian(candidates.jacobian(x)) * bounds
@@ -174,24 +157,18 @@ def design(
             f"readings={readings}: {model.name} has {candidates.m} readings to choose among; give at most as many, or"
             " make room for more with its options (`ipe-bench list measurement -v`)"
         )
-    judge = _Judge.against(np.matmul(own.swapaxes(1, 2), own), slopes, criterion)
-    ways = [_way(judge, _units(model, candidates, chosen, slopes), model.m, most) for chosen in columns]
-    chosen_ways = tuple(way for way in ways if way is not None)
-    if readings is not None and not chosen_ways:
+    judge = _Judge(criterion, np.matmul(slopes.swapaxes(1, 2), slopes))
+    if np.isfinite(value := judge.value(np.matmul(own.swapaxes(1, 2), own))):
+        judge = replace(judge, today=value)
+    tried = [_way(judge, _units(model, candidates, chosen, slopes), model.m, most) for chosen in columns]
+    ways = tuple(way for way in tried if way is not None)
+    if readings is not None and not ways:
         titles = " or ".join("by " + " and ".join(chosen) for chosen in columns)
         raise UserError(
             f"readings={readings}: no choice {titles} of so few determines all parameters, or there are fewer than"
             f" {_FEW} to choose among; give more readings, or choose by other columns"
         )
-    return Design(scenario, criterion, candidates, today, _largest(found), limit, chosen_ways)
-
-
-def _largest(found: Sequence[Suspect]) -> tuple[Suspect, ...]:
-    """Each suspect once, as the richest model has it, the largest shift first."""
-    worst: dict[str, Suspect] = {}
-    for one in sorted(found, key=lambda s: -s.bounds):
-        worst.setdefault(one.name, one)
-    return tuple(worst.values())
+    return Design(scenario, criterion, candidates, today, tuple(worst.values()), ways)
 
 
 def _columns(model: Measurement, by: Sequence[str] | None) -> list[tuple[str, ...]]:
@@ -222,20 +199,15 @@ def _units(model: Measurement, candidates: Measurement, by: tuple[str, ...], slo
     for row, (entry, other) in enumerate(zip(_entries(candidates, by), rest, strict=True)):
         if other in as_today:
             groups.setdefault(entry, []).append(row)
-    had = set(_entries(model, by))
-    rows = tuple(np.array(r, dtype=np.intp) for r in groups.values())
-    return Units(by, tuple(groups), rows, np.array([entry in had for entry in groups]), _compressed(slopes, rows))
-
-
-def _compressed(slopes: Array, rows: Sequence[Rows]) -> Array:
-    """(truths, units, r, n) with the information of each unit in at most n rows, by QR; shorter units end in zeros."""
+    had, rows = set(_entries(model, by)), tuple(np.array(one, dtype=np.intp) for one in groups.values())
+    # The information of each unit in at most n rows, by QR; shorter units end in zeros.
     truths, _, n = slopes.shape
-    r = min(n, max(len(one) for one in rows))
+    r = min(n, max(map(len, rows)))
     units = np.zeros((truths, len(rows), r, n))
     for u, one in enumerate(rows):
         A = slopes[:, one]
         units[:, u, : min(len(one), r)] = A if len(one) <= r else np.linalg.qr(A, mode="r")
-    return units
+    return Units(by, tuple(groups), rows, np.array([entry in had for entry in groups]), units)
 
 
 @dataclass(frozen=True)
@@ -247,30 +219,20 @@ class _Judge:
     everything: Array
     """What all candidates together say (truths, n, n)."""
     today: float = 1.0
-    """The mean bound of today's set-up, which others are shares of; 1 where it is infinite."""
-
-    @classmethod
-    def against(cls, today: Array, slopes: Array, criterion: Criterion) -> _Judge:
-        """With what today's readings say (truths, n, n) and the slopes of all candidates (truths, m, n)."""
-        judge = cls(criterion, np.matmul(slopes.swapaxes(1, 2), slopes))
-        value = judge.value(today)
-        return replace(judge, today=value) if np.isfinite(value) else judge
-
-    def covariance(self, M: Array) -> Array:
-        return np.linalg.inv(M + _WEAK * self.everything)
+    """The mean bound of today's set-up, which others are shares of; 1 if it is infinite."""
 
     def value(self, M: Array) -> float:
-        """The mean bound in units of today's, without what is known beforehand; infinite where M is singular."""
+        """The mean bound in units of today's, without what is known beforehand; infinite if M is singular."""
         s = np.linalg.eigvalsh(M)
         if (s[:, 0] <= 1e-12 * s[:, -1]).any():
             return float("inf")
-        if self.criterion == "D":
-            return float(np.exp(-0.5 * np.log(s).mean())) / self.today
-        return float(np.sqrt((1 / s).mean())) / self.today
+        mean = np.exp(-0.5 * np.log(s).mean()) if self.criterion == "D" else np.sqrt((1 / s).mean())
+        return float(mean) / self.today
 
-    def gains(self, P: Array, slopes: Array) -> Array:
-        """By how much the loss falls with each further unit (units,), where P is the covariance without it."""
+    def gains(self, M: Array, slopes: Array) -> Array:
+        """The fall of the loss with each further unit (units,), where M is the information without it."""
         truths, units, r, n = slopes.shape
+        P = np.linalg.inv(M + _WEAK * self.everything)
         B = np.matmul(slopes.reshape(truths, units * r, n), P).reshape(slopes.shape)
         K = np.eye(r) + np.matmul(B, slopes.swapaxes(-1, -2))
         if self.criterion == "D":
@@ -279,43 +241,34 @@ class _Judge:
 
 
 def _way(judge: _Judge, units: Units, today: int, most: int) -> Way | None:
-    """The curve of the greedy choice, which adds the unit that gains most per reading, and the two choices on it; None
-    where there is nothing to choose."""
+    """The two choices of those to which the unit is added that gains most per reading; None if there is nothing to
+    choose."""
     if len(units.rows) < _FEW:
         return None
-    reach = min(max(int(_REACH * today), most), int(units.sizes.sum()))
-    curve = [choice for choice in _grown(judge, units, reach) if np.isfinite(choice.mean_bound)]
-    within = [c for c in curve if c.readings <= most]
+    sizes, taken, found = units.sizes, np.zeros(len(units.rows), dtype=bool), []
+    while (free := ~taken & (sizes <= max(today, most) - sizes[taken].sum())).any():
+        gains = judge.gains(units.information(taken), units.slopes) / sizes
+        taken[int(np.argmax(np.where(free, gains, -np.inf)))] = True
+        found.append(_choice(judge, units, taken))
+    found = [choice for choice in found if np.isfinite(choice.mean_bound)]
+    within = [choice for choice in found if choice.readings <= most]
     if not within:
         return None
-    if units.sizes[units.today].sum() <= most:
+    if sizes[units.today].sum() <= most:
         within.append(_choice(judge, units, units.today))
-    saving = next((c for c in curve if c.mean_bound <= 1 and c.readings < today), None)
-    wanted = np.unique(np.round(np.geomspace(units.sizes.min(), reach, _POINTS)))
-    shown = dict.fromkeys(next((c for c in reversed(curve) if c.readings <= w), curve[0]) for w in wanted)
-    return Way(units, tuple(shown), saving, min(within, key=lambda c: c.mean_bound))
+    saving = next((choice for choice in found if choice.mean_bound <= 1 and choice.readings < today), None)
+    return Way(units, saving, min(within, key=lambda choice: choice.mean_bound))
 
 
-def _choice(judge: _Judge, units: Units, taken: NDArray[np.bool_]) -> Choice:
+def _choice(judge: _Judge, units: Units, taken: Mask) -> Choice:
     """The choice of these units (units,)."""
-    places = np.flatnonzero(taken)
+    places = np.flatnonzero(taken).tolist()
     rows = np.sort(np.concatenate([units.rows[u] for u in places], dtype=np.intp))
-    value = judge.value(units.information(taken.astype(float)))
-    return Choice(tuple(map(int, places)), tuple(map(int, rows)), value)
-
-
-def _grown(judge: _Judge, units: Units, most: int) -> Iterator[Choice]:
-    """Choices one after another, each with the further unit that gains most per reading, up to a number of readings."""
-    sizes, taken = units.sizes, np.zeros(len(units.rows), dtype=bool)
-    while (free := ~taken & (sizes <= most - sizes[taken].sum())).any():
-        P = judge.covariance(units.information(taken.astype(float)))
-        gains = judge.gains(P, units.slopes) / sizes
-        taken[int(np.argmax(np.where(free, gains, -np.inf)))] = True
-        yield _choice(judge, units, taken)
+    return Choice(tuple(places), tuple(rows.tolist()), judge.value(units.information(taken)))
 
 
 def levels_of(model: Measurement, column: str, entry: Any) -> str:
-    """An entry of the index with what it stands for, where the model has words for it."""
+    """An entry of the index with what it stands for, if the model has words for it."""
     words: Mapping[Any, str] = model.levels.get(column, {})
     shown = f"{entry:g}" if isinstance(entry, float) else str(entry)
     return f"{shown} ({words[entry]})" if entry in words else shown

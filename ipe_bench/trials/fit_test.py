@@ -19,7 +19,7 @@ from typing import cast
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array, Covariance, definite_factor, finite, information, inverse
+from ipe_bench.basics.linalg import Array, Covariance, finite, information
 from ipe_bench.estimators.base import Estimator
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise.base import Noise
@@ -27,7 +27,6 @@ from ipe_bench.noise.base import Noise
 DRAWS = 10_000
 """Simulated fits behind the law where whitened noise is not normal: the smallest p is 1 / (DRAWS + 1)."""
 _AT_ONCE = 2_000
-_ILL_CONDITIONED = 1e-10
 
 
 @dataclass(frozen=True)
@@ -49,22 +48,20 @@ class Spread:
         return self.ones + (self.others**2).sum(axis=1)
 
 
-def spread_of(estimator: Estimator, problem: Problem, J: Array, inner: Array | None = None) -> Spread:
-    """How the residuals scatter that an estimator leaves, with dh/dx = J (trials, m, n) near its estimates; `inner` is
-    J' R^-1 J where it is known."""
+def spread_of(estimator: Estimator, problem: Problem, J: Array) -> Spread:
+    """How the residuals scatter that an estimator leaves, with dh/dx = J (trials, m, n) near its estimates."""
     m, n = J.shape[1:]
     prior = problem.prior_covariance()
     with np.errstate(all="ignore"):
         if "prior" in estimator.needs and prior is not None:
-            inner = information(J, problem.R) if inner is None else inner
-            return prior_spread(inner, m, prior.factor, inflation_of(estimator))
+            return prior_spread(information(J, problem.R), m, prior.factor, inflation_of(estimator))
         if estimator.equation == "frozen" and np.isfinite(problem.H).all():
-            return frozen_spread(J, problem.H, problem.R, inner)
+            return frozen_spread(J, problem.H, problem.R)
     return least_squares_spread(m, n, len(J))
 
 
 def inflation_of(estimator: Estimator) -> float:
-    """By how much an estimator widens the prior: one that does solves an equation of its own."""
+    """The factor by which an estimator widens the prior: one that does solves an equation of its own."""
     return float(getattr(estimator, "prior_inflation", 1.0)) if "prior" in estimator.needs else 1.0
 
 
@@ -72,40 +69,17 @@ def least_squares_spread(m: int, n: int, trials: int) -> Spread:
     return Spread(m - n, np.empty((trials, 0)))
 
 
-def frozen_spread(J: Array, H: Array, R: Covariance, inner: Array | None = None) -> Spread:
-    """For the root of eq. (11), with dh/dx = J (trials, m, n) and H (m, n); `inner` is J' R^-1 J where it is known.
-
-    I - B is 1 outside the ranges of H and J, and 1 / cos of the principal angles between them on n directions. These
-    are found from products of the slopes, which is ten times faster than from bases of their ranges, where those
-    products are well conditioned.
-    """
+def frozen_spread(J: Array, H: Array, R: Covariance) -> Spread:
+    """For the root of eq. (11), with dh/dx = J (trials, m, n) and H (m, n): I - B is 1 outside the ranges of H and J,
+    and 1 / cos of the principal angles between them on n directions."""
     m, n = H.shape
-    inner = information(J, R) if inner is None else inner
-    size = np.sqrt(np.diagonal(inner, axis1=1, axis2=2))
-    products = np.matmul(_basis(H[None], R).swapaxes(1, 2), R.whiten_jacobian(J)) / size[:, None, :]
-    scaled = inner / (size[:, :, None] * size[:, None, :])
-    usable = finite(scaled) & finite(products)
-    scaled = np.where(usable[:, None, None], scaled, np.eye(n))
-    inverted, singular = inverse(np.where(usable[:, None, None], products, np.eye(n)))
-    others = np.linalg.eigvalsh(
-        np.where(singular[:, None, None], np.eye(n), inverted.swapaxes(1, 2) @ scaled @ inverted)
-    )
-    others = np.where((usable & ~singular)[:, None], np.maximum(others, 1.0), np.inf)
-    bent = usable & ~definite_factor(scaled)[2]
-    bent[bent] = np.linalg.eigvalsh(scaled[bent])[:, 0] < _ILL_CONDITIONED
-    if bent.any():
-        others[bent] = _by_bases(J[bent], H, R)
-    # With fewer than n readings to spare the largest angles are those that are left.
-    kept = min(n, m - n)
-    return Spread(max(m - 2 * n, 0), others[:, n - kept :])
-
-
-def _by_bases(J: Array, H: Array, R: Covariance) -> Array:
-    """1 / cos^2 (trials, n) of the principal angles, ascending."""
-    slopes, frozen = (_basis(slope, R) for slope in (J, H[None]))
-    cosines = np.linalg.svd(np.matmul(frozen.swapaxes(1, 2), slopes), compute_uv=False)
+    products = np.matmul(_basis(H[None], R).swapaxes(1, 2), _basis(J, R))
+    usable = finite(products)
+    cosines = np.linalg.svd(np.where(usable[:, None, None], products, 0.0), compute_uv=False)
     with np.errstate(divide="ignore"):
-        return 1 / np.minimum(cosines, 1.0) ** 2
+        others = 1 / np.minimum(cosines, 1.0) ** 2
+    # With fewer than n readings to spare the largest angles are those that are left.
+    return Spread(max(m - 2 * n, 0), others[:, n - min(n, m - n) :])
 
 
 def prior_spread(inner: Array, m: int, factor: Array, inflation: float = 1.0) -> Spread:
@@ -123,9 +97,8 @@ def prior_spread(inner: Array, m: int, factor: Array, inflation: float = 1.0) ->
 def _basis(J: Array, R: Covariance) -> Array:
     """An orthonormal basis (trials, m, n) of the range of R^-1/2 J; NaN where J is not finite."""
     white = R.whiten_jacobian(J)
-    usable = finite(white)
-    Q = np.linalg.qr(np.where(usable[:, None, None], white, 0.0))[0]
-    return np.where(usable[:, None, None], Q, np.nan)
+    usable = finite(white)[:, None, None]
+    return np.where(usable, np.linalg.qr(np.where(usable, white, 0.0))[0], np.nan)
 
 
 def fit_probability(squares: Array, spread: Spread, noise: Noise, H: Array, R: Covariance) -> Array:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from ipe_bench.basics.linalg import Array, Covariance, multiply
 from ipe_bench.measurements.base import Measurement, Parameter
-from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
 TRUTHS = 30
@@ -220,8 +219,3 @@ def _noticed(left: Array, degrees: int) -> float:
     inner = np.matmul(left.swapaxes(1, 2), left)
     squares = np.stack([np.einsum("dk,dk->d", drawn, multiply(one, drawn)) for one in inner])
     return float(np.mean(1 - chndtr(chdtri(degrees, FIT_LEVEL), degrees, squares)))
-
-
-def truths_of(scenario: Scenario, count: int = TRUTHS) -> Array:
-    """The truths (count, n) that the averages are over: those of the scenario's first trials."""
-    return scenario.truths(0, count)

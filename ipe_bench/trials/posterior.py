@@ -22,8 +22,7 @@ from ipe_bench.trials.roots import least_squares_root
 from ipe_bench.trials.scenario import Scenario
 
 PARTICLES = 1000
-POPULATIONS = 2
-"""Populations that know nothing of each other: where they disagree, neither is to be believed."""
+"""Of two populations together that know nothing of each other: if they disagree, neither is to be believed."""
 AGREED = 0.35
 """Means of populations farther apart than this, in deviations of the posterior, have not settled; half of it and the
 deviations differ by more."""
@@ -57,13 +56,11 @@ class Posterior:
     shares: Array
     """(modes,) of the draws that lead there."""
     apart: float
-    """How far the means of the populations differ, in standard deviations; not a number where there is one."""
+    """How far the means of the populations differ, in standard deviations, or half their widths in their logarithms."""
     noise: float
     """The divergence (see `Divergence.kl`) of the populations' own moments: what is not above it is chance."""
     evidence: Array
     """(populations,): the logarithm of the probability density of the readings."""
-    stages: int
-    simulations: int
 
     @cached_property
     def mean(self) -> Array:
@@ -129,59 +126,39 @@ def reference(
     )
 
 
-def require_particles(problem: Problem, particles: int, populations: int = POPULATIONS) -> None:
+def require_particles(problem: Problem, particles: int) -> None:
     """Refuses a problem without a prior, and fewer than ten particles per parameter and population."""
     if problem.prior_deviation is None:
         raise UserError("posterior: needs a prior; choose a noise and an error_scale that parameters are drawn with")
-    least = 10 * problem.measurement.n * populations
-    if particles < least:
+    if particles < (least := 20 * problem.measurement.n):
         raise UserError(f"particles={particles}: give at least {least}, 10 per parameter and population")
 
 
-def sample_posterior(
-    problem: Problem, z: Array, *, particles: int = PARTICLES, populations: int = POPULATIONS, seed: int = 0
-) -> Posterior:
-    """Draws of the posterior of one trial's readings z (m,).
-
-    Each of the populations has its share of the particles. They are put together by their evidence.
+def sample_posterior(problem: Problem, z: Array, *, particles: int = PARTICLES, seed: int = 0) -> Posterior:
+    """Draws of the posterior of one trial's readings z (m,), by two populations that are put together by their
+    evidence.
 
     Raises:
         UserError: no prior is known, or there are too few particles.
     """
-    require_particles(problem, particles, populations)
-    each = particles // populations
-    sequences = np.random.SeedSequence(seed).spawn(populations)
-    runs = [_Population.run(problem, z, each, np.random.Generator(np.random.Philox(s))) for s in sequences]
-    evidence = np.array([run.evidence for run in runs])
-    x = _together([run.x for run in runs], evidence)
-    modes, shares = _modes(problem, z, x)
-    return Posterior(
-        x=x,
-        modes=modes,
-        shares=shares,
-        apart=_apart([run.x for run in runs]),
-        noise=_between([run.x for run in runs]),
-        evidence=evidence,
-        stages=max(run.stages for run in runs),
-        simulations=sum(run.simulations for run in runs),
-    )
-
-
-def _apart(parts: list[Array]) -> float:
-    """The largest distance of the means of populations, or of half their logarithmic deviations' twofold, in standard
-    deviations of the widest."""
-    if len(parts) < 2:
-        return float("nan")
+    require_particles(problem, particles)
+    generators = [np.random.Generator(np.random.Philox(s)) for s in np.random.SeedSequence(seed).spawn(2)]
+    runs = [_Population.run(problem, z, particles // 2, rng) for rng in generators]
+    parts, evidence = [run.x for run in runs], np.array([run.evidence for run in runs])
+    # As many draws of each population as its evidence deserves, the best one's all.
+    counts = np.round(np.exp(evidence - evidence.max()) * [len(p) for p in parts]).astype(int)
+    spaced = [p[np.linspace(0, len(p) - 1, count).round().astype(int)] for p, count in zip(parts, counts, strict=True)]
+    x = np.concatenate(spaced)
     means, widths = np.stack([p.mean(axis=0) for p in parts]), np.stack([p.std(axis=0) for p in parts])
     moved = np.ptp(means, axis=0) / widths.max(axis=0)
-    return float(max(moved.max(), 0.5 * np.ptp(np.log(widths), axis=0).max()))
-
-
-def _between(parts: list[Array]) -> float:
-    """The largest divergence of one population's moments from another's."""
-    moments = [(p.mean(axis=0), np.atleast_2d(np.cov(p.T))) for p in parts]
-    found = [_kl(a[0] - b[0], a[1], b[1]) for i, a in enumerate(moments) for b in moments[:i]]
-    return max(found, default=float("nan"))
+    one, other = (np.atleast_2d(np.cov(p.T)) for p in parts)
+    return Posterior(
+        x,
+        *_modes(problem, z, x),
+        apart=float(max(moved.max(), 0.5 * np.ptp(np.log(widths), axis=0).max())),
+        noise=_kl(means[1] - means[0], other, one),
+        evidence=evidence,
+    )
 
 
 def _kl(d: Array, S: Array, P: Array) -> float:
@@ -189,14 +166,6 @@ def _kl(d: Array, S: Array, P: Array) -> float:
     inner = np.linalg.inv(P)
     log_ratio = np.linalg.slogdet(P)[1] - np.linalg.slogdet(S)[1]
     return float(0.5 * (np.trace(inner @ S) + d @ inner @ d - len(d) + log_ratio))
-
-
-def _together(parts: list[Array], evidence: Array) -> Array:
-    """As many draws of each population as its evidence deserves, the best one's all."""
-    shares = np.exp(evidence - evidence.max())
-    counts = np.round(shares * [len(p) for p in parts]).astype(int)
-    spaced = [p[np.linspace(0, len(p) - 1, count).round().astype(int)] for p, count in zip(parts, counts, strict=True)]
-    return np.concatenate(spaced)
 
 
 def _modes(problem: Problem, z: Array, x: Array) -> tuple[Array, Array]:
@@ -207,17 +176,12 @@ def _modes(problem: Problem, z: Array, x: Array) -> tuple[Array, Array]:
     if not len(ends):
         return np.empty((0, x.shape[1])), np.empty(0)
     width = deviations(inverse(_tempered(problem, ends, 1.0))[0])
-    kept: list[int] = []
-    counts: list[int] = []
+    counts: dict[int, int] = {}
     for i, end in enumerate(ends):
-        near = [j for j, k in enumerate(kept) if (np.abs(end - ends[k]) / width[k]).max() < _SAME_MODE]
-        if near:
-            counts[near[0]] += 1
-        else:
-            kept.append(i)
-            counts.append(1)
-    order = np.argsort(-np.array(counts), kind="stable")
-    return ends[kept][order], np.array(counts)[order] / len(ends)
+        mode = next((k for k in counts if (np.abs(end - ends[k]) / width[k]).max() < _SAME_MODE), i)
+        counts[mode] = counts.get(mode, 0) + 1
+    order = sorted(counts, key=lambda k: -counts[k])
+    return ends[order], np.array([counts[k] for k in order]) / len(ends)
 
 
 def _tempered(problem: Problem, x: Array, beta: float) -> Array:
@@ -239,37 +203,34 @@ class _Population:
     z: Array
     rng: np.random.Generator
     x: Array
-    log: Array
-    """The logarithm of the likelihood of each, less its constant."""
     beta: float = 0.0
     """The power of the likelihood that the particles are draws with."""
     reach: float = 1.0
     """The length of moves, times 2.38 / sqrt(n)."""
     evidence: float = 0.0
-    stages: int = 0
-    simulations: int = 0
+
+    def __post_init__(self) -> None:
+        self.log = self._log_likelihood(self.x)
 
     @classmethod
     def run(cls, problem: Problem, z: Array, count: int, rng: np.random.Generator) -> _Population:
         x = problem.x0 + _prior(problem).coloured(rng.standard_normal((count, problem.measurement.n)))
-        self = cls(problem, z, rng, x, np.empty(count))
-        self.log = self._log_likelihood(x)
-        while self.beta < 1 and self.stages < _MOST_STAGES:
+        self = cls(problem, z, rng, x)
+        for _ in range(_MOST_STAGES):
             self._stage()
-        if self.beta < 1:
+            if self.beta == 1:
+                break
+        else:
             raise UserError(f"particles={count}: do not reach the posterior in {_MOST_STAGES} stages; give more")
         self.x = self._final()
         return self
 
     def _log_likelihood(self, x: Array) -> Array:
-        self.simulations += len(x)
+        """The logarithm of the likelihood of each, less its constant."""
         with np.errstate(all="ignore"):
             r = self.problem.R.whiten(self.z - self.problem.measurement.simulate(x))
             squares = np.sum(r**2, axis=1)
         return np.where(np.isfinite(squares), -0.5 * squares, -np.inf)
-
-    def _log_prior(self, x: Array) -> Array:
-        return -0.5 * np.sum(_prior(self.problem).whiten(x - self.problem.x0) ** 2, axis=1)
 
     def _stage(self) -> None:
         """A step of temperature, resampling, and moves."""
@@ -277,17 +238,18 @@ class _Population:
         w = np.exp(rise * (self.log - self.log.max()))
         self.evidence += float(np.log(w.mean()) + rise * self.log.max())
         self.beta = 1.0 if self.beta + rise >= 1 - 1e-12 else self.beta + rise
-        chosen = _resampled(w, self.rng)
+        # Each as often as its weight says, by one draw for all (Kitagawa, J. Comput. Graph. Stat. 5, 1996).
+        at = (self.rng.random() + np.arange(len(w))) / len(w)
+        chosen = np.minimum(np.searchsorted(np.cumsum(w / w.sum()), at), len(w) - 1)
         self.x, self.log = self.x[chosen], self.log[chosen]
-        self.stages += 1
         shapes, accepted, tried = self._shapes(), 0.0, 0
         while tried < _MOST and (tried < _FEWEST or accepted < _MOVES):
             accepted += self._move(shapes)
             tried += 1
 
     def _rise(self) -> float:
-        """By how much the power may grow so that half of the particles still count, found by bisection of its
-        logarithm: it begins at billionths."""
+        """The growth of the power at which half of the particles still count, by bisection of its logarithm: it begins
+        at billionths."""
 
         def effective(rise: float) -> float:
             w = np.exp(rise * (self.log - self.log.max()))
@@ -311,20 +273,21 @@ class _Population:
         P = P[np.isfinite(P).all(axis=(1, 2))]
         if not len(P):
             return np.diag(_prior(self.problem).deviations)[None]
-        D = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+        D = deviations(P)
         # By eigenvalues, since round-off may leave a correlation a shade beyond 1.
         values, axes = np.linalg.eigh(P / (D[:, :, None] * D[:, None, :]))
         return D[:, :, None] * axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]
 
     def _move(self, shapes: Array) -> float:
         """A Metropolis step of every particle; returns the share that is accepted."""
-        count, n = self.x.shape
+        (count, n), prior, x0 = self.x.shape, _prior(self.problem), self.problem.x0
         chosen = self.rng.integers(0, len(shapes), count)
         step = multiply(shapes[chosen], self.rng.standard_normal((count, n)))
         proposed = self.x + self.reach * 2.38 / np.sqrt(n) * step
         log = self._log_likelihood(proposed)
+        before, after = (-0.5 * np.sum(prior.whiten(x - x0) ** 2, axis=1) for x in (self.x, proposed))
         with np.errstate(invalid="ignore"):
-            gain = self.beta * (log - self.log) + self._log_prior(proposed) - self._log_prior(self.x)
+            gain = self.beta * (log - self.log) + after - before
         taken = np.log(self.rng.random(count)) < gain
         self.x, self.log = np.where(taken[:, None], proposed, self.x), np.where(taken, log, self.log)
         share = float(taken.mean())
@@ -344,13 +307,6 @@ class _Population:
                 self.reach = reach
             kept.append(self.x)
         return np.concatenate(kept)
-
-
-def _resampled(w: Array, rng: np.random.Generator) -> Array:
-    """Places (particles,), each as often as its weight says, by one draw for all (Kitagawa, J. Comput. Graph. Stat. 5,
-    1996)."""
-    at = (rng.random() + np.arange(len(w))) / len(w)
-    return np.minimum(np.searchsorted(np.cumsum(w / w.sum()), at), len(w) - 1)
 
 
 def divergence(posterior: Posterior, estimates: Estimates, seed: int = 0) -> Divergence:

@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from ipe_bench.basics.linalg import (
     Array,
+    Covariance,
     Mask,
     definite_factor,
     deviations,
     finite,
-    information,
     inverse,
     multiply,
     quadratic_form,
@@ -29,9 +30,9 @@ from ipe_bench.measurements.counted import CountingModel
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.trials.bounds import bound_deviations, informative_rows
 from ipe_bench.trials.fit_test import Spread, fit_probability, inflation_of, spread_of
-from ipe_bench.trials.roots import Known, frozen_root, least_squares_root
+from ipe_bench.trials.roots import frozen_root, least_squares_root
 from ipe_bench.trials.scenario import Scenario, Trials
-from ipe_bench.trials.theory import box_bias, contraction_of, misspecified, relative_curvatures, second_derivatives
+from ipe_bench.trials.theory import box_bias, contraction, misspecified, relative_curvatures, second_derivatives
 from ipe_bench.trials.thresholds import EXPECTED, SAME_ROOT, gate
 
 HISTORIES = 20
@@ -50,7 +51,7 @@ class Block:
     scenario: Scenario
     trials: Trials
     _roots: dict[tuple[Equation, float], Array] = field(default_factory=dict, repr=False, compare=False)
-    _spreads: dict[tuple[Equation | None, bool, float], Spread] = field(default_factory=dict, repr=False, compare=False)
+    _spreads: dict[tuple[Any, ...], Spread] = field(default_factory=dict, repr=False, compare=False)
 
     @classmethod
     def draw(cls, scenario: Scenario, start: int, stop: int) -> Block:
@@ -72,18 +73,19 @@ class Block:
         """h (trials, m) at the truth, of the model that estimators are told; NaN where it fails."""
         return self.readings_at(self.trials.x) if self.trials.h is None else self.trials.h
 
+    def _rows(self, J: Array, h: Array) -> Array:
+        """R^-1/2 J (trials, m, n), or what else makes the information in readings h (trials, m) of slopes J."""
+        with np.errstate(all="ignore"):
+            return informative_rows(self.scenario.noise, self.problem.R, J, h)
+
+    @cached_property
+    def _white(self) -> Array:
+        return self._rows(self.jacobian, self.readings)
+
     @cached_property
     def crlb_information(self) -> Array:
         """J' R^-1 J at the truth (trials, n, n), the inverse of the Cramér-Rao bound; see `informative_rows`."""
-        with np.errstate(all="ignore"):
-            return self._information(self.jacobian, self.readings)
-
-    def _information(self, J: Array, h: Array) -> Array:
-        """Of readings h (trials, m) of slopes J (trials, m, n)."""
-        if self.scenario.noise.true_levels(h.shape[1]) is None:
-            return information(J, self.problem.R)
-        A = informative_rows(self.scenario.noise, self.problem.R, J, h)
-        return np.matmul(A.swapaxes(1, 2), A)
+        return _squared(self._white)
 
     @cached_property
     def bayes_information(self) -> Array:
@@ -103,20 +105,15 @@ class Block:
         prior = self.problem.prior_covariance()
         if prior is None:
             return self.crlb_deviation
-        root = prior.whiten_jacobian(np.eye(self.trials.x.shape[1]))
         with np.errstate(all="ignore"):
-            return bound_deviations(self.bayes_information, lambda ill: _below(self._white(ill), root))
-
-    def _white(self, kept: Mask) -> Array:
-        """R^-1/2 J of some of the trials, or what else makes their information."""
-        return informative_rows(self.scenario.noise, self.problem.R, self.jacobian[kept], self.readings[kept])
+            return bound_deviations(self.bayes_information, _below(self._white, prior))
 
     def truth_columns(self) -> Columns:
         """The truth and its bounds, in multiples of the parameters' units, what the noise alone makes of the linear
         estimate, and what the paper's theorems ask of the model there."""
         names = [p.name for p in self.problem.measurement.parameters]
         H_plus = self.problem.H_plus[None]
-        contracts = contraction_of(np.matmul(H_plus, self.jacobian))
+        K, norm, radius = contraction(np.matmul(H_plus, self.jacobian))
         van_trees, van_trees_error = self._van_trees()
         return {
             "trial": np.arange(self.trials.start, self.trials.stop),
@@ -126,9 +123,9 @@ class Block:
             **by_parameter("van_trees", names, van_trees),
             **by_parameter("van_trees_error", names, van_trees_error),
             **by_parameter("linear_error", names, multiply(H_plus, self.trials.z - self.readings)),
-            "contraction_K": contracts.K,
-            "contraction_norm": contracts.infinity_norm,
-            "contraction_radius": contracts.spectral_radius,
+            "contraction_K": K,
+            "contraction_norm": norm,
+            "contraction_radius": radius,
             **self._curvature_columns(names),
             **self._misspecification_columns(names),
         }
@@ -143,14 +140,12 @@ class Block:
         if self.trials.start == 0 and len(bound) and prior is not None and not self.scenario.noise.real:
             x = self.scenario.truths(0, EXPECTED)
             with np.errstate(all="ignore"):
-                J, R = self.problem.measurement.jacobian(x), self.problem.R
-                h = self.readings_at(x)
-                each = self._information(J, h)
+                rows = self._rows(self.problem.measurement.jacobian(x), self.readings_at(x))
+                each = _squared(rows)
                 mean = each.mean(axis=0)
                 expected = (mean + prior.inverse())[None]
-                rows = informative_rows(self.scenario.noise, R, J, h).reshape(1, -1, x.shape[1]) / np.sqrt(len(x))
-                root = prior.whiten_jacobian(np.eye(x.shape[1]))
-                bound[0] = bound_deviations(expected, lambda ill: _below(rows[ill], root))[0]
+                together = rows.reshape(1, -1, x.shape[1]) / np.sqrt(len(x))
+                bound[0] = bound_deviations(expected, _below(together, prior))[0]
                 P = inverse(expected)[0][0]
                 variances = np.einsum("ij,tjk,ki->ti", P, each - mean, P)
                 error[0] = variances.std(axis=0, ddof=1) / np.sqrt(EXPECTED) / (2 * bound[0])
@@ -187,31 +182,25 @@ class Block:
             return {}
         h = self.scenario.error_free(self.trials.start, self.trials.stop)
         with np.errstate(all="ignore"):
-            found = misspecified(self.problem, h, self.trials.x, self.jacobian)
-        return {
-            **by_parameter("pseudo_bias", names, found.bias),
-            **by_parameter("misspecified", names, found.deviation),
-        }
+            bias, deviation = misspecified(self.problem, h, self.trials.x)
+        return by_parameter("pseudo_bias", names, bias) | by_parameter("misspecified", names, deviation)
 
     def reference_root(self, equation: Equation, inflation: float = 1.0) -> Array:
         """The root (trials, n) that an estimating equation reaches from the truth; NaN where it reaches none.
 
         `inflation` widens the prior of the equation `map`.
         """
-        key = (equation, inflation)
-        if key not in self._roots:
+        if (key := (equation, inflation)) not in self._roots:
+            problem, z, x = self.problem, self.trials.z, self.trials.x
             with np.errstate(all="ignore"):
-                self._roots[key] = self._root(equation, inflation)
+                if equation != "frozen":
+                    root = least_squares_root(problem, z, x, prior=inflation if equation == "map" else None)
+                elif problem.rankless:  # there is no such equation; the estimators that solve it say so
+                    root = np.full(x.shape, np.nan)
+                else:
+                    root = frozen_root(problem, z, x)
+            self._roots[key] = root
         return self._roots[key]
-
-    def _root(self, equation: Equation, inflation: float) -> Array:
-        trials, known = self.trials, Known(self.jacobian, self.readings)
-        if equation != "frozen":
-            prior = inflation if equation == "map" else None
-            return least_squares_root(self.problem, trials.z, trials.x, known, prior=prior)
-        if self.problem.rankless:  # there is no such equation; the estimators that solve it say so
-            return np.full(trials.x.shape, np.nan)
-        return frozen_root(self.problem, trials.z, trials.x, known)
 
     def warm(self, estimator: Estimator) -> None:
         """Has an estimator do what it does once in a process."""
@@ -247,9 +236,7 @@ class Block:
         """How the residuals that an estimator leaves scatter, with the slopes at the truth."""
         key = (estimator.equation, "prior" in estimator.needs, inflation_of(estimator))
         if key not in self._spreads:
-            same = self.scenario.noise.true_levels(self.problem.R.m) is None
-            inner = self.crlb_information if same else None
-            self._spreads[key] = spread_of(estimator, self.problem, self.jacobian, inner)
+            self._spreads[key] = spread_of(estimator, self.problem, self.jacobian)
         return self._spreads[key]
 
     def score(self, estimator: Estimator, estimates: Estimates) -> Columns:
@@ -295,8 +282,15 @@ class Block:
         }
 
 
-def _below(rows: Array, more: Array) -> Array:
-    """The rows (trials, k, n) of each trial, and below them those (n, n) of all."""
+def _squared(rows: Array) -> Array:
+    """A' A (trials, n, n) of rows A (trials, k, n)."""
+    with np.errstate(all="ignore"):
+        return np.matmul(rows.swapaxes(1, 2), rows)
+
+
+def _below(rows: Array, prior: Covariance) -> Array:
+    """The rows (trials, k, n) of each trial, and below them those of the prior."""
+    more = prior.whiten_jacobian(np.eye(prior.m))
     return np.concatenate([rows, np.broadcast_to(more, (len(rows), *more.shape))], axis=1)
 
 
@@ -319,15 +313,11 @@ def nees(error: Array, P: Array) -> Array:
     with np.errstate(all="ignore"):
         squared = np.sum(multiply(inverse_U.swapaxes(1, 2), e) ** 2, axis=1)
     if not definite.all():
-        squared[~definite] = _nees_of_any(e[~definite], C[~definite])
+        ill, e = C[~definite], e[~definite]
+        x, singular = solve(ill, e)
+        covariance = ~singular & (np.linalg.eigvalsh(ill)[:, 0] > 0)
+        squared[~definite] = np.where(covariance, np.einsum("ti,ti->t", e, x), np.inf)
     return np.where(reported, np.where(usable, squared, np.inf), np.nan)
-
-
-def _nees_of_any(e: Array, C: Array) -> Array:
-    """e' C^-1 e; infinite where C is not positive definite."""
-    x, singular = solve(C, e)
-    definite = ~singular & (np.linalg.eigvalsh(C)[:, 0] > 0)
-    return np.where(definite, np.einsum("ti,ti->t", e, x), np.inf)
 
 
 def by_parameter(prefix: str, names: list[str], values: Array) -> Columns:

@@ -1,60 +1,49 @@
-"""What theory says of a model and its estimates at a point: how fixed-point iteration contracts, eq. (15), how the
-model bends, how least squares is biased to second order, and what it makes of readings from another model."""
+"""What theory says of a model and its estimates at a point: the contraction of fixed-point iteration, eq. (15), the
+curvature of the model, the second-order bias of least squares, and its error under a wrong model."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import numpy as np
 
 from ipe_bench.basics.linalg import Array, Covariance, deviations, finite, inverse, multiply, solve
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.trials.roots import Known, least_squares_root
+from ipe_bench.trials.roots import least_squares_root
 
 _STEP = 1e-4
 """Of central differences of the Jacobian, in parameters' sizes or as a share of their values."""
 
 
-@dataclass(frozen=True)
-class Contraction:
-    """How much g(x) = x - F(x) contracts at a point, from g' = I - H+ J. Each is (trials,).
+def contraction(J_F: Array) -> tuple[Array, Array, Array]:
+    """Three measures (trials,) of how much g(x) = x - F(x) contracts, from g' = I - J_F, where J_F = H+ J (trials, n,
+    n) and lengths are in multiples of the parameters' units.
 
-    Lengths are in multiples of the parameters' units; K and the infinity norm depend on the units, the radius does not.
+    K = n max abs(dg_i/dx_j) of eq. (15): below 1 it is sufficient for the fixed-point theorem, and far from necessary.
+    The infinity norm: below 1 in a neighbourhood it is sufficient as well, and it is never above K. The spectral
+    radius: below 1 it is necessary and sufficient for local convergence, and it is the asymptotic rate.
     """
-
-    K: Array
-    """n max abs(dg_i/dx_j), eq. (15). Below 1 is sufficient for the fixed-point theorem, and far from necessary."""
-    infinity_norm: Array
-    """Below 1 in a neighbourhood is sufficient as well, and is never above K."""
-    spectral_radius: Array
-    """Below 1 is necessary and sufficient for local convergence, and is the asymptotic rate."""
-
-
-def contraction_of(J_F: Array) -> Contraction:
-    """The contraction where dF/dx = H+ J is J_F (trials, n, n)."""
     slope = np.eye(J_F.shape[1]) - J_F
-    bad = ~finite(slope)
+    bad, size = ~finite(slope), np.abs(slope)
     radius = np.abs(np.linalg.eigvals(np.where(bad[:, None, None], 0.0, slope))).max(axis=1)
-    size = np.abs(slope)
-    return Contraction(
-        K=slope.shape[1] * size.max(axis=(1, 2)),
-        infinity_norm=size.sum(axis=2).max(axis=1),
-        spectral_radius=np.where(bad, np.nan, radius),
-    )
+    K, norm = slope.shape[1] * size.max(axis=(1, 2)), size.sum(axis=2).max(axis=1)
+    return K, norm, np.where(bad, np.nan, radius)
 
 
 def second_derivatives(model: Measurement, x: Array) -> Array:
     """d2h/dx_j dx_k at x (trials, n): (trials, m, n, n), by central differences of the Jacobian, symmetrised."""
+    second = np.stack(list(_bends(model, x)), axis=3)
+    return (second + second.swapaxes(2, 3)) / 2
+
+
+def _bends(model: Measurement, x: Array) -> Iterator[Array]:
+    """The derivative (trials, m, n) of the Jacobian by each parameter."""
     step = _STEP * np.maximum(1.0, np.abs(x))
-    columns = []
     for k in range(x.shape[1]):
         shift = np.zeros_like(x)
         shift[:, k] = step[:, k]
-        rise = model.jacobian(x + shift) - model.jacobian(x - shift)
-        columns.append(rise / (2 * step[:, k])[:, None, None])
-    second = np.stack(columns, axis=3)
-    return (second + second.swapaxes(2, 3)) / 2
+        yield (model.jacobian(x + shift) - model.jacobian(x - shift)) / (2 * step[:, k])[:, None, None]
 
 
 def box_bias(J: Array, second: Array, R: Covariance) -> Array:
@@ -99,47 +88,24 @@ def _mean_square(a: Array) -> Array:
     return np.asarray(np.sqrt(squares / (n * (n + 2))))
 
 
-@dataclass(frozen=True)
-class Misspecified:
-    """The asymptotic error of least squares under a wrong model, for normal noise, in each trial; NaN where it has no
-    minimum (Vuong, Caltech working paper 652, 1986; Richmond and Horowitz, IEEE Trans. Signal Processing 63, 2015).
+def misspecified(problem: Problem, h: Array, x: Array) -> tuple[Array, Array]:
+    """The asymptotic error of least squares under a wrong model, for normal noise and error-free readings h (trials, m)
+    of truths x (trials, n): the bias (trials, n), which is that of the parameters that come closest to h, and the
+    standard deviation (trials, n) of estimates about these; NaN where there is no minimum (Vuong, Caltech working paper
+    652, 1986; Richmond and Horowitz, IEEE Trans. Signal Processing 63, 2015).
 
     It is known as the misspecified Cramér-Rao bound, but bounds nothing: other estimators may err less (Khatib et al.,
-    arXiv 2605.20739).
+    arXiv 2605.20739). Estimates scatter with A^-1 B A^-1, B = J' R^-1 J and A = B - sum_i (R^-1 r)_i d2h_i with the
+    residuals r that remain at the minimum.
     """
-
-    bias: Array
-    """(trials, n): the parameters that come closest to the error-free readings, less the true ones."""
-    deviation: Array
-    """(trials, n): the standard deviation of estimates about those parameters."""
-
-
-def misspecified(problem: Problem, h: Array, x: Array, J: Array) -> Misspecified:
-    """For the error-free readings h (trials, m) of truths x (trials, n), where the assumed model's slopes are J.
-
-    The pseudo-true parameters minimise |h - h(x)| in the metric of R. About them estimates scatter with A^-1 B A^-1,
-    B = J' R^-1 J and A = B - sum_i (R^-1 r)_i d2h_i with the residuals r that remain there.
-    """
-    root = least_squares_root(problem, h, x, Known(J), prior=None)
+    root = least_squares_root(problem, h, x, prior=None)
     found = np.isfinite(root).all(axis=1)
-    bias, deviation = np.full(x.shape, np.nan), np.full(x.shape, np.nan)
+    bias, deviation = root - x, np.full(x.shape, np.nan)
     if found.any():
-        bias[found] = root[found] - x[found]
-        deviation[found] = deviations(_sandwich(problem, h[found], root[found]))
-    return Misspecified(bias, deviation)
-
-
-def _sandwich(problem: Problem, h: Array, x: Array) -> Array:
-    model, R = problem.measurement, problem.R
-    Jw = R.whiten_jacobian(model.jacobian(x))
-    B = np.matmul(Jw.swapaxes(1, 2), Jw)
-    r = R.whiten(h - model.simulate(x))
-    step = _STEP * np.maximum(1.0, np.abs(x))
-    bent = np.empty_like(B)
-    for k in range(x.shape[1]):
-        shift = np.zeros_like(x)
-        shift[:, k] = step[:, k]
-        rise = R.whiten_jacobian(model.jacobian(x + shift) - model.jacobian(x - shift))
-        bent[:, :, k] = np.einsum("tmi,tm->ti", rise, r) / (2 * step[:, k])[:, None]
-    inverted = inverse(B - (bent + bent.swapaxes(1, 2)) / 2)[0]
-    return np.matmul(np.matmul(inverted, B), inverted)
+        model, R, at = problem.measurement, problem.R, root[found]
+        Jw, r = R.whiten_jacobian(model.jacobian(at)), R.whiten(h[found] - model.simulate(at))
+        B = np.matmul(Jw.swapaxes(1, 2), Jw)
+        bent = np.stack([np.einsum("tmi,tm->ti", R.whiten_jacobian(one), r) for one in _bends(model, at)], axis=2)
+        inverted = inverse(B - (bent + bent.swapaxes(1, 2)) / 2)[0]
+        deviation[found] = deviations(np.matmul(np.matmul(inverted, B), inverted))
+    return bias, deviation
