@@ -38,7 +38,7 @@ BUDGETS = {
     "statistics": 3899,
     "real": 2228,
     "plugins": 1133,
-    "report": 4031,
+    "report": 4017,
     "cli": 2519,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""

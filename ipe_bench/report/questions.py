@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -134,11 +133,6 @@ def _ways(design: Design) -> Iterator[Part]:
 
 def write_design(folder: Path, name: str, design: Design) -> list[Path]:
     """Writes the page of a design, and readings.csv with what each choice takes; returns the files."""
-    return write(folder, "design", f"{name}: design", design_parts(name, design), (READINGS, _readings(design)))
-
-
-def _readings(design: Design) -> pd.DataFrame:
-    """What each choice takes, a row per reading."""
     import pandas as pd
 
     index = pd.DataFrame(dict(design.candidates.index))
@@ -149,7 +143,8 @@ def _readings(design: Design) -> pd.DataFrame:
         if choice
     ]
     columns = ["by", "choice", *index]
-    return pd.concat(chosen)[columns] if chosen else pd.DataFrame(columns=columns)
+    table = pd.concat(chosen)[columns] if chosen else pd.DataFrame(columns=columns)
+    return write(folder, "design", f"{name}: design", design_parts(name, design), (READINGS, table))
 
 
 # Posterior -----------------------------------------------------------------------------------------------------------
@@ -163,7 +158,7 @@ def posterior_parts(name: str, found: Sequence[Reference]) -> list[Table]:
         texts("modes", [str(len(one.posterior.modes)) for one, *_ in rows]),
         texts("noise", [compact(one.posterior.noise) for one, *_ in rows]),
         words("estimator", [label for _, label, _ in rows]),
-        words("status", [_status(one, label) for one, label, _ in rows]),
+        words("status", [Status(int(one.estimates[label].status[0])).label for one, label, _ in rows]),
         words("honest", [honesty(d, one.posterior) for one, _, d in rows]),
     ]
     numbers = {"kl": "diverg.", "shift": "shift", "width": "width", "energy": "energy"}
@@ -172,18 +167,14 @@ def posterior_parts(name: str, found: Sequence[Reference]) -> list[Table]:
     return [Table("posterior", title, "", columns, notes=list(_notes(found)), grouped=3)]
 
 
-def _status(one: Reference, label: str) -> str:
-    return Status(int(one.estimates[label].status[0])).label
-
-
 def _notes(found: Sequence[Reference]) -> Iterator[str]:
     yield (
         "diverg. is the divergence of the estimator's Gaussian from the moments of the posterior, in nats; noise is"
         " the same between two populations of particles, so a divergence below it is chance. shift is that of the"
         " mean, in standard deviations of the posterior per root of the number of parameters. width is the geometric"
-        " mean of the standard deviations over those of the posterior."
-        " energy is the distance between draws. An estimate is honest if there is a single mode, the divergence is at"
-        f" most {HONEST:g} or twice the noise, and the energy is at most {ALIKE:g}."
+        " mean of the standard deviations over those of the posterior. energy is the distance between draws. An"
+        f" estimate is honest if there is a single mode, the divergence is at most {HONEST:g} or twice the noise, and"
+        f" the energy is at most {ALIKE:g}."
     )
     for one in found:
         if not one.posterior.settled:
@@ -211,38 +202,40 @@ def write_posteriors(
     `scenario` says what was sampled."""
     import pandas as pd
 
-    frames = []
-    for one in found:
-        own: dict[str, Any] = {"trial": one.trial, "parameter": [p.name for p in model.parameters]}
-        own |= {"unit": [p.unit for p in model.parameters], "truth": one.truth * model.sizes}
-        own |= {key: getattr(one.posterior, key) * model.sizes for key in ("mean", "deviation")}
-        frames.append(pd.DataFrame(own))
-    table = "posterior.csv", pd.concat(frames)
-    return write(folder, "posterior", f"{name}: posteriors", posterior_parts(scenario, found), table)
+    rows = [
+        (
+            one.trial,
+            p.name,
+            p.unit,
+            *(p.size * np.array([one.truth[k], one.posterior.mean[k], one.posterior.deviation[k]])),
+        )
+        for one in found
+        for k, p in enumerate(model.parameters)
+    ]
+    table = pd.DataFrame(rows, columns=["trial", "parameter", "unit", "truth", "mean", "deviation"])
+    parts = posterior_parts(scenario, found)
+    return write(folder, "posterior", f"{name}: posteriors", parts, ("posterior.csv", table))
 
 
 # Comparison ----------------------------------------------------------------------------------------------------------
 
 
-def comparison_parts(frame: pd.DataFrame, alpha: float) -> list[Table]:
-    """A table per comparison, within 80 columns; what the columns mean stands below the last."""
+def comparison_parts(frame: pd.DataFrame, alpha: float) -> Iterator[Part]:
+    """A table per comparison, within 80 columns, and what the columns mean."""
     titles = ("", "first", "second", "change", f"{100 * (1 - alpha):g} %", "p", "e", "second is")
-    tables = []
     for title, rows in _comparisons(frame):
-        cells = list(zip(*map(_cells, rows), strict=True))
-        last = len(titles) - 1
-        columns = [(words if i in (0, last) else texts)(t, cells[i]) for i, t in enumerate(titles)]
+        cells = zip(titles, zip(*map(_cells, rows), strict=True), strict=True)
+        columns = [(words if title in ("", "second is") else texts)(title, column) for title, column in cells]
         needed = [_needed(row) for row in rows if row.get("power", math.nan) > 0]
-        tables.append(Table("comparison", title, "", columns, notes=needed))
-    note = (
+        yield Table("comparison", title, "", columns, notes=needed)
+    yield (
         "error is the mean Mahalanobis error, where a trial counts as at most the radius of the gate of success; cost"
         " counts simulations. p comes from McNemar's exact test for success and from random signs for ratios, with"
         " Holm's correction over all rows. e is evidence that may be looked at repeatedly; e = 20 is as rare as p ="
         " 0.05. Each interval is that of its row alone. Times are not tested."
     )
     if (frame["matched_by"] == "order").any():
-        note += " Without common trials nothing is gained from pairing: the intervals are wider."
-    return [*tables[:-1], *(replace(last, notes=[*last.notes, note]) for last in tables[-1:])]
+        yield "Without common trials nothing is gained from pairing: the intervals are wider."
 
 
 def _needed(row: dict[str, Any]) -> str:
@@ -308,8 +301,7 @@ def audit_parts(found: Audit) -> list[Part]:
     runs, left_out = found.claims.runs, found.claims.left_out
     notes = [
         "true over reported is the root mean square of errors in reported standard deviations, 1 if the report is"
-        " right;  "
-        "bias is their mean. Intervals hold for all parameters together, and for heavy tails."
+        " right; bias is their mean. Intervals hold for all parameters together, and for heavy tails."
     ]
     low, high = found.nees_limits
     if math.isfinite(low):

@@ -171,14 +171,9 @@ def _needed(column: Column, table: Table) -> tuple[int, int]:
     longest = max([1, *(cell_len(cell.text) for cell in column.cells)])
     if not column.numeric:
         longest = min(longest, _WHOLE_NAME if column is table.columns[table.naming] else _WHOLE_WORD)
-    title = _unbroken(column.title)
+    title = column.title.replace(" %", "\u00a0%")  # a number and its per cent are one word
     word = max(map(cell_len, title.split(" ")))
     return max(longest, cell_len(title)), max(longest, min(word, _WHOLE_NAME))
-
-
-def _unbroken(title: str) -> str:
-    """A title in which a number and its per cent are one word."""
-    return title.replace(" %", "\u00a0%")
 
 
 def _taken(columns: Iterable[Column], table: Table) -> tuple[int, int]:
@@ -198,7 +193,7 @@ def _rich(columns: Sequence[Column], table: Table, width: int) -> Any:
     folded = _taken(columns, table)[0] > width
     for each in columns:
         letters = _needed(each, table)[folded]
-        title = Text(textwrap.fill(_unbroken(each.title), letters).replace("\u00a0", " "))
+        title = Text(textwrap.fill(each.title.replace(" %", "\u00a0%"), letters).replace("\u00a0", " "))
         if each.numeric:
             shown.add_column(title, justify="right", no_wrap=True)
         else:
@@ -296,8 +291,11 @@ def latex(table: Table, width: float | None = None) -> str:
     """To be read into a document with `\\input`, with booktabs and siunitx: the bare table, or one that floats with its
     caption in a column of that many inches; a longtable if it has more than `LONG` rows."""
     shape = "@{}" + "".join("r" if c.numeric else "l" for c in table.columns) + "@{}"
-    head = [r"\toprule", _latex_row(map(_latex_title, table.columns)), r"\midrule"]
-    rows = [_latex_row(map(_latex_cell, row, table.columns)) for row in table.rows]
+    titles, *rows = [
+        f"{' & '.join(cells)} \\\\"
+        for cells in (map(_latex_title, table.columns), *(map(_latex_cell, row, table.columns) for row in table.rows))
+    ]
+    head = [r"\toprule", titles, r"\midrule"]
     kind, repeated = ("longtable", [r"\endhead"]) if len(table) > LONG else ("tabular", [])
     lines = [rf"\begin{{{kind}}}{{{shape}}}", *head, *repeated, *rows, r"\bottomrule", rf"\end{{{kind}}}"]
     if width is not None:
@@ -311,10 +309,6 @@ def latex(table: Table, width: float | None = None) -> str:
             lines = [rf"\begin{{{kind}}}[tb]", r"\centering", caption, size, *lines, rf"\end{{{kind}}}"]
     needed = r"\usepackage{booktabs, longtable, siunitx, amsmath} and \usepackage[T1]{fontenc}."
     return "\n".join([f"% {' '.join(table.title.split())}. Needs {needed}", *lines, ""])
-
-
-def _latex_row(cells: Iterable[str]) -> str:
-    return f"{' & '.join(cells)} \\\\"
 
 
 def _latex_title(column: Column) -> str:
