@@ -12,7 +12,7 @@ from ipe_bench.report.tables import without_certified
 from ipe_bench.report.words import brief, duration, enumerate_few, percent, plain, short
 from ipe_bench.statistics.analysis import Analysis
 from ipe_bench.statistics.certified import attained_totals, certified_averages, certified_table
-from ipe_bench.statistics.summary import ALL, BEST
+from ipe_bench.statistics.records import ALL, BEST
 
 ALIKE = 0.05
 """Efficiencies within this part of each other count as equal."""

@@ -21,8 +21,7 @@ from ipe_bench.statistics.certified import (
     published_table,
 )
 from ipe_bench.statistics.collect import Collection
-from ipe_bench.statistics.records import SCORES, Where, all_statistics, frame_columns
-from ipe_bench.statistics.summary import ALL
+from ipe_bench.statistics.records import ALL, SCORES, Where, all_statistics, frame_columns
 
 _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     "tracks": (

@@ -10,9 +10,7 @@ from typing import Any
 from ipe_bench.report.table import Cell, Column, Part, Table, column, interval, sort_key, words
 from ipe_bench.report.words import brief, duration, p_value, percent, plain, short
 from ipe_bench.statistics.formulas import CAP
-from ipe_bench.statistics.records import SCORES, Kind, Statistic, Where, all_statistics
-from ipe_bench.statistics.summary import ALL, BEST
-from ipe_bench.statistics.summary import columns as summary_columns
+from ipe_bench.statistics.records import ALL, BEST, SCORES, Kind, Statistic, Where, all_statistics, summary_columns
 
 _WIDE_ENOUGH = 100
 """Letters of a screen that has room for failures, and for verdicts in words."""

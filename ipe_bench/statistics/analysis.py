@@ -16,9 +16,8 @@ from ipe_bench.statistics.certified import attained_table
 from ipe_bench.statistics.collect import Collection, Group, collect
 from ipe_bench.statistics.comparisons import Outcomes, common, compare_pairs, corrected, may_be_best
 from ipe_bench.statistics.intervals import quantile
-from ipe_bench.statistics.records import SCORES, rows_of
+from ipe_bench.statistics.records import BEST, SCORES, rows_of, summary_rows, to_frame
 from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of, samples
-from ipe_bench.statistics.summary import BEST, summary_rows, to_frame
 from ipe_bench.statistics.tracks import curves
 
 if TYPE_CHECKING:

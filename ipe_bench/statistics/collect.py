@@ -1,6 +1,6 @@
 """From what is stored to what is compared: which cells are one experiment, and what tells them from the others.
 
-What is there, and what is wrong with it, `runs.results` says; what the numbers mean is left to `statistics.summary`.
+What is there, and what is wrong with it, `runs.results` says; what the numbers mean, `statistics.records`.
 """
 
 from __future__ import annotations

@@ -8,27 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
 import ipe_bench.statistics.formulas as f
+import ipe_bench.statistics.intervals as intervals
 import ipe_bench.statistics.tracks as t
 from ipe_bench.basics.errors import UserError, place_of
-from ipe_bench.statistics.histories import CLOSE, orders_of
-from ipe_bench.statistics.intervals import (
-    FIRST,
-    HEAVY,
-    LARGEST_SAMPLE,
-    RESAMPLES,
-    SEEN,
-    clopper_pearson,
-    quantile,
-    share_sequence,
-    verdict,
-)
-from ipe_bench.statistics.sample import NIS, Sample
+from ipe_bench.statistics.collect import ALWAYS_COLUMNS
+from ipe_bench.statistics.intervals import clopper_pearson, quantile, share_sequence, verdict
+from ipe_bench.statistics.sample import CLOSE, NIS, Sample, orders_of
 from ipe_bench.trials.thresholds import EXPECTED, FEW, GATE, SAME_ROOT
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Kind = Literal["count", "share", "number", "physical", "seconds", "probability", "word"]
 """How a value is written; `report.words` knows each."""
@@ -47,6 +41,10 @@ Where = Literal[
 """A table; its columns are in the order of the records. The overview and the terminal's table show those of plugins
 behind their own."""
 Given = Literal["", "solved", "common"]
+ALL = "all"
+"""The row of the summary over all parameters."""
+BEST = "may_be_best"
+"""Whether no rival surely succeeds more often in the same trials; see `comparisons.may_be_best`."""
 Limits = f.Limits
 
 
@@ -292,10 +290,10 @@ STATISTICS: tuple[Statistic, ...] = (
         "rmse",
         "solved trials",
         "Root mean square error. Interval: 95 %, by the studentised bootstrap of its logarithm over trials (Efron and"
-        f" Tibshirani, An Introduction to the Bootstrap, 1993, ch. 12), {RESAMPLES} resamples, the same for every"
-        f" estimator; above {LARGEST_SAMPLE} trials, groups of consecutive trials are resampled. None for fewer than"
-        f" {FEW} trials, and none where a few trials carry the sum of squares: where its effective number of trials is"
-        f" less than that of normal errors in all but {100 * HEAVY:g} % of cases.",
+        f" Tibshirani, An Introduction to the Bootstrap, 1993, ch. 12), {intervals.RESAMPLES} resamples, the same for"
+        f" every estimator; above {intervals.LARGEST_SAMPLE} trials, groups of consecutive trials are resampled. None"
+        f" for fewer than {FEW} trials, and none where a few trials carry the sum of squares: where its effective"
+        f" number of trials is less than that of normal errors in all but {100 * intervals.HEAVY:g} % of cases.",
         f.of_each(f.rmse),
         limits=f.ends_in_units(f.rmse_ends),
         given="solved",
@@ -308,8 +306,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "rmse, any time",
         "solved trials",
         "The same root mean square error, with an asymptotic interval of 95 % that stays valid however often one looks"
-        f" and whenever one stops (Waudby-Smith et al., Ann. Statist. 52, 2024); none for fewer than {FIRST} trials,"
-        " nor where a few trials carry the sum of squares.",
+        " and whenever one stops (Waudby-Smith et al., Ann. Statist. 52, 2024); none for fewer than"
+        f" {intervals.FIRST} trials, nor where a few trials carry the sum of squares.",
         f.of_each(f.rmse),
         limits=f.ends_in_units(f.rmse_ends_anytime),
         given="solved",
@@ -518,8 +516,8 @@ STATISTICS: tuple[Statistic, ...] = (
         "Whether the reported covariance is honest. Diverged but confident: surely more than 1 % of the trials lie"
         f" where it says that a share of {GATE:g} should, and the mean NEES is surely above n; optimistic, pessimistic:"
         " the mean NEES lies surely (95 %, for errors of any law) above or below n; undecided: a few trials carry that"
-        f" mean, or it seems to lie below n and there are fewer than {SEEN} trials, which rare large errors may be"
-        f" missing from. None for fewer than {FEW} trials.",
+        f" mean, or it seems to lie below n and there are fewer than {intervals.SEEN} trials, which rare large errors"
+        f" may be missing from. None for fewer than {FEW} trials.",
         lambda s: verdict(s.scalars["nees"][s.converged], s.n),
         kind="word",
         where=("calibration",),
@@ -762,7 +760,7 @@ SCORES: tuple[Statistic, ...] = (
 
 # Those of plugins ----------------------------------------------------------------------------------------------------
 
-_RESERVED = ("measurement", "noise", "prior", "error_scale", "seed", "estimator", "parameter", "unit", "scenario")
+_RESERVED = (BEST, "measurement", "noise", "prior", "error_scale", "seed", "estimator", "parameter", "unit", "scenario")
 _added: dict[str, Statistic] = {}
 
 
@@ -791,7 +789,7 @@ def fault_of(record: Any) -> str:
     if not isinstance(record, Statistic):
         return f"is a {type(record).__name__} and not a Statistic"
     others = [other for other in _added.values() if other is not record]
-    taken = {"may_be_best", *_RESERVED, *frame_columns([*STATISTICS, *SCORES, *others])}
+    taken = {*_RESERVED, *frame_columns([*STATISTICS, *SCORES, *others])}
     for column in record.columns:
         if not (column.isidentifier() and column.isascii()):
             return f"{column!r} is not a name for a column; use letters, digits and underscores"
@@ -802,25 +800,6 @@ def fault_of(record: Any) -> str:
         if value not in get_args(choices):
             return f"{name}={value}: choose from {', '.join(get_args(choices))}"
     return ""
-
-
-def summary_columns_of(sample: Sample) -> list[dict[str, Any]]:
-    """A row per parameter and one over all, of every statistic of the summary.
-
-    One that was added and raises, or gives what cannot be shown, is missing in these rows, and named in the
-    collection's problems.
-    """
-    rows = rows_of(STATISTICS, sample)
-    for record in _added.values():
-        try:
-            columns = columns_of_added(record, sample)
-        except UserError as error:
-            line = f"statistic={record.name}: {error}; it is missing where that is so"
-            sample.collection.extra_problems.append(line)
-            columns = {name: ["-" if record.kind == "word" else np.nan] * len(rows) for name in record.columns}
-        for i, row in enumerate(rows):
-            row |= {name: values[i] for name, values in columns.items()}
-    return rows
 
 
 def columns_of_added(record: Statistic, sample: Sample) -> dict[str, list[Any]]:
@@ -843,3 +822,48 @@ def columns_of_added(record: Statistic, sample: Sample) -> dict[str, list[Any]]:
             if not isinstance(value, str if record.kind == "word" else int | float | np.number):
                 raise UserError(f"{name}: a value is a {type(value).__name__}; return a float, or NaN for none")
     return columns
+
+
+# The summary ---------------------------------------------------------------------------------------------------------
+
+
+def summary_columns() -> tuple[str, ...]:
+    """The columns of `summary.csv` behind those that say what a row is of."""
+    return (*frame_columns(all_statistics()), BEST)
+
+
+def summary_rows(sample: Sample) -> list[dict[str, Any]]:
+    """A row per parameter and one over all, without the comparison of the estimator with its rivals.
+
+    A statistic that was added and raises, or gives what cannot be shown, is missing in these rows, and named in the
+    collection's problems.
+    """
+    rows = rows_of(STATISTICS, sample)
+    for record in _added.values():
+        try:
+            columns = columns_of_added(record, sample)
+        except UserError as error:
+            line = f"statistic={record.name}: {error}; it is missing where that is so"
+            sample.collection.extra_problems.append(line)
+            columns = {name: ["-" if record.kind == "word" else np.nan] * len(rows) for name in record.columns}
+        for i, row in enumerate(rows):
+            row |= {name: values[i] for name, values in columns.items()}
+    group = sample.group
+    head = dict(group.columns) | {"estimator": group.estimator} | dict(group.options)
+    labels = [*((p["name"], p["unit"]) for p in sample.parameters), (ALL, "linear bound")]
+    return [head | {"parameter": p, "unit": unit} | row for (p, unit), row in zip(labels, rows, strict=True)]
+
+
+def to_frame(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Rows as a table, columns in the order that readers know."""
+    import pandas as pd
+
+    frame, known = pd.DataFrame(list(rows)), summary_columns()
+    if frame.empty:
+        return pd.DataFrame(columns=[*ALWAYS_COLUMNS, "parameter", "unit", *known])
+    keys = [c for c in frame.columns if c not in (*known, "parameter", "unit")]
+    first = [c for c in ("measurement", "noise") if c in keys]
+    last = ["error_scale", "estimator"]
+    middle = [c for c in keys if c not in (*first, *last) and not c.startswith("estimator.")]
+    options = [c for c in keys if c.startswith("estimator.")]
+    return frame[[*first, *middle, *last, *options, "parameter", "unit", *known]]

@@ -20,7 +20,7 @@ from ipe_bench.runs.store import ResultKey, describe_names
 from ipe_bench.statistics.collect import collect
 from ipe_bench.statistics.formulas import rmse_ends_anytime
 from ipe_bench.statistics.intervals import share_sequence
-from ipe_bench.statistics.records import SCORES, rows_of, summary_columns_of
+from ipe_bench.statistics.records import SCORES, rows_of, summary_rows
 from ipe_bench.statistics.sample import Sample, samples
 from ipe_bench.trials.tracking import AnyScenario
 
@@ -184,7 +184,7 @@ def objective(
     """
     for sample in _stored(scenario, estimators, output):
         if sample.group.label == label:
-            value = float((summary_columns_of(sample)[-1] | rows_of(SCORES, sample)[-1])[column])
+            value = float((summary_rows(sample)[-1] | rows_of(SCORES, sample)[-1])[column])
             if np.isnan(value):
                 raise UserError(
                     f"objective={label}.{column}: is not known of {describe_names(sample.group.cells[0].names)}"

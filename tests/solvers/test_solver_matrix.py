@@ -10,7 +10,7 @@ from ipe_bench.measurements import Gins, Polynomial
 from ipe_bench.noise import Gaussian, Quantization
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.solvers import Anderson, Broyden, DampedNewton, FixedPoint, Newton, SteepestDescent
-from ipe_bench.statistics.histories import orders_of
+from ipe_bench.statistics.sample import orders_of
 from ipe_bench.trials.roots import frozen_root
 from ipe_bench.trials.scenario import Scenario
 

@@ -18,7 +18,7 @@ from ipe_bench.statistics.comparisons import (
     may_be_best,
     mcnemar,
 )
-from ipe_bench.statistics.histories import distances_to_limit, iterations_to_limit
+from ipe_bench.statistics.sample import distances_to_limit, iterations_to_limit
 
 
 def outcomes(distance, success=None, cost=None, ids=None):

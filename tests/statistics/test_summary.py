@@ -10,7 +10,7 @@ from synthetic_store import Filter, Pretender, Repeated, Synthetic, forge
 
 from ipe_bench.statistics import analyse, summarize
 from ipe_bench.statistics.intervals import clopper_pearson
-from ipe_bench.statistics.summary import COLUMNS
+from ipe_bench.statistics.records import summary_columns
 
 
 def row(frame: pd.DataFrame, estimator: str, parameter: str = "all", **where) -> pd.Series:
@@ -51,7 +51,7 @@ def test_moments_are_those_of_the_errors_in_physical_units(synthetic):
     assert total["bias"] == pytest.approx(np.sqrt(0.25 / 3))
     assert total["nees"] == pytest.approx((1 + 1.25 + 1) / 3)
     assert total["linear_bound"] == 1.0
-    assert set(COLUMNS) <= set(frame.columns)
+    assert set(summary_columns()) <= set(frame.columns)
 
 
 def test_shares_are_of_all_trials_and_moments_of_solved_ones(synthetic):

@@ -16,7 +16,7 @@ from ipe_bench.report.tables import all_tables
 from ipe_bench.runs.run import compute
 from ipe_bench.solvers import FixedPoint, Newton
 from ipe_bench.statistics import analyse
-from ipe_bench.statistics.histories import orders_of
+from ipe_bench.statistics.sample import orders_of
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import CURVED, Block
 from ipe_bench.trials.theory import contraction

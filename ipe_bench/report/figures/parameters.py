@@ -13,7 +13,7 @@ from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
 from ipe_bench.report.style import BLACK, BOUND_COLOR, BOUND_DASH, COLORS, GREY, MARKERS, REFERENCE, Look
 from ipe_bench.report.words import enumerate_few, plain
-from ipe_bench.statistics.summary import ALL
+from ipe_bench.statistics.records import ALL
 
 MOST_GROUPS = 8
 """Groups of parameters that have panels."""

@@ -14,7 +14,7 @@ from ipe_bench.report.figures.drawing import Drawing
 from ipe_bench.report.style import MOST_FACES, Look, looks
 from ipe_bench.report.words import plain
 from ipe_bench.statistics.analysis import Analysis
-from ipe_bench.statistics.summary import ALL
+from ipe_bench.statistics.records import ALL
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
