@@ -38,8 +38,8 @@ BUDGETS = {
     "statistics": 3861,
     "real": 2228,
     "plugins": 1133,
-    "report": 4013,
-    "cli": 2519,
+    "report": 4012,
+    "cli": 2520,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""
 PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}

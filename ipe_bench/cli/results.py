@@ -152,13 +152,14 @@ def show_report(
 
     pending = begin_report(folders, output, figures=figures, formats=formats)
     collection, rows = pending.begun.collection, pending.begun.summary
-    shown, told = collection, [*collection.problems, *([] if cells else collection.stale)]
+    shown = collection
     others = sum(cell.key not in cells and cell.label != TRUTH for cell in collection.current) if cells else 0
     if cells and others:
         shown = collect(folders, cells.keys())
         rows = Begun(shown).summary
     _print_table(rows, shown)
     pending.write_unless_current()
+    told = [*collection.problems, *([] if cells else collection.stale)]
     if cells:
         # What is wrong with a file or a folder may concern anybody; what other commands lack does not.
         of_cells = [line for line in told if line.startswith(("missing: ", "failed: "))]

@@ -31,8 +31,7 @@ from ipe_bench.report.figures import INDEX
 from ipe_bench.report.html import DEFINITIONS
 from ipe_bench.report.table import environment
 from ipe_bench.report.words import brief, duration, enumerate_few, percent
-from ipe_bench.statistics.records import STATISTICS
-from ipe_bench.statistics.summary import ALL
+from ipe_bench.statistics.records import ALL, STATISTICS
 
 SETTINGS = {
     "project": "ipe-bench",
