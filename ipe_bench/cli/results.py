@@ -65,7 +65,7 @@ def bundle_command(arguments: Sequence[str]) -> int:
         found = write_bundle(paths, path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX), {"citation": CITATION})
         problems = Results.read(paths).problems
         print_problems(problems)
-    held = f"{len(found.files)} files of {', '.join(found.folders)}; {found.size:,} bytes"
+    held = f"{len(found.files)} files of {', '.join(found.folders)}; {found.path.stat().st_size:,} bytes"
     say(f"{'Whole' if checked else 'Bundle':<8}{found.path} ({held})")
     say(f"Digest  sha256:{found.digest}")
     return 1 if problems else 0

@@ -1,8 +1,7 @@
 """Bundles: results of one or several folders in one archive, with a manifest that has a digest of every file.
 
-A bundle holds what was computed and what was asked for, not what a report makes of it. The same results give the same
-bytes, so that the digest of the manifest stands for all of them and can be printed in a paper. A reader gets nothing
-unless everything is as the manifest says.
+The same results give the same bytes, so that the digest of the manifest stands for all of them and can be printed in a
+paper. A reader gets nothing unless everything is as the manifest says.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import json
 import re
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,9 +29,6 @@ SUFFIX = ".zip"
 BUNDLES = "bundles"
 """Where bundles are unpacked below a report on them."""
 _NAME = re.compile(r"(?!\.\.?/)[^/\\\x00-\x1f]{1,200}/(trials|runs|failed)/[A-Za-z0-9][A-Za-z0-9._-]*")
-_BROKEN = (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, NotImplementedError)
-_BROKEN += (KeyError, ValueError, TypeError, AttributeError)
-"""What reading an archive may raise that is cut short, changed, encrypted or none at all."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +45,6 @@ class Bundle:
     def folders(self) -> tuple[str, ...]:
         """The folders that results came from."""
         return tuple(dict.fromkeys(name.partition("/")[0] for name in self.files))
-
-    @property
-    def size(self) -> int:
-        return self.path.stat().st_size
 
 
 def is_bundle(path: Path | str) -> bool:
@@ -127,10 +118,10 @@ def read_bundle(path: Path) -> Bundle:
                 if not _NAME.fullmatch(name):
                     raise UserError(f"{path}: {name!r} is no name of a result; nothing of it is read")
                 if name not in there or digests.get(name) != _digest(archive.read(name)):
-                    raise UserError(
-                        f"{path}: was damaged or changed: {name} is not what the manifest says; get it anew"
-                    )
-    except _BROKEN as error:
+                    raise UserError(f"{path}: was damaged or changed: {name} is not as its manifest says; get it anew")
+    except UserError:
+        raise
+    except Exception as error:  # whatever an archive raises that is cut short, changed, encrypted or none at all
         raise UserError(f"{path}: is not a whole bundle of ipe-bench ({error or type(error).__name__})") from None
     return Bundle(path, _digest(manifest), digests)
 

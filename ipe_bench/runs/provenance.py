@@ -65,15 +65,13 @@ def digest(value: Any) -> str:
 def fingerprint(components: Iterable[Any]) -> dict[str, Any]:
     """The versions of the packages, and a digest of the numerical source, that components are made of.
 
-    The source of a component is the module of its class with all modules of its package that it imports, so a change in
-    anything that it computes with changes the digest, and a new file elsewhere does not. The scoring of trials counts
-    as part of it. Comments, docstrings, the texts of exceptions and the modules of `WITHOUT_NUMBERS` do not: a change
-    of prose leaves every stored result valid.
+    The source of a component is the module of its class with all modules of its package that it imports, and the
+    scoring of trials, without comments, docstrings, the texts of exceptions and the modules of `WITHOUT_NUMBERS`.
     """
-    modules = set(_import_closure("ipe_bench.trials.scoring"))
-    for component in components:
-        for cls in component_classes(component):
-            modules |= _import_closure(cls.__module__)
+    classes = [cls for component in components for cls in component_classes(component)]
+    modules = set[str]().union(
+        *map(_import_closure, ["ipe_bench.trials.scoring", *(cls.__module__ for cls in classes)])
+    )
     packages = sorted({m.split(".")[0] for m in modules})
     digest = hashlib.sha256("".join(f"{m} {_source_of(m)[0]}\n" for m in sorted(modules)).encode())
     return {"versions": {p: _package_version(p) for p in packages}, "source": digest.hexdigest()[:16]}

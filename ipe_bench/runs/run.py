@@ -1,7 +1,4 @@
-"""The run of a bench: what is asked for is checked, what is missing is computed and stored, and all of it recorded.
-
-`statistics.stopping` decides when a run has enough trials for a precision.
-"""
+"""The run of a bench: what is asked for is checked, what is missing is computed and stored, and all of it recorded."""
 
 from __future__ import annotations
 
@@ -84,9 +81,8 @@ def compute(
     tasks = [task for several in of_scenarios for task in plan(store.directory, several, results, trials, block_size)]
     record = None
     if tasks or aside or not results.announces(cells, trials):
-        facts = _record(scenarios, estimators, trials) | dict(further or {})
-        facts |= {"command": command, "blocks": len(tasks)}
-        record = store.write_run(record_as or new_name(), {"started": _now(), **facts})
+        facts = {**_record(scenarios, estimators, trials), **(further or {}), "command": command, "blocks": len(tasks)}
+        record = store.write_run(record_as or new_name(), facts)
     for line in aside:
         log.warning(line)
     failures = run_tasks(tasks, execution or Serial(), store, watch or (lambda progress: None))
@@ -112,13 +108,13 @@ def validate(
 
     Trials are drawn of the scenarios `untried` (all where it is None), to see whether numbers hold what is asked for.
     """
-    mistakes = []
-    if trials < 1:
-        mistakes.append(f"trials={trials}: give a whole number above 0")
     size = block_size_for(trials) if block_size is None else block_size
-    if size < 1:
-        mistakes.append(f"block_size={size}: give a whole number above 0")
-    elif trials > MOST_BLOCKS * size:
+    mistakes = [
+        f"{name}={value}: give a whole number above 0"
+        for name, value in (("trials", trials), ("block_size", size))
+        if value < 1
+    ]
+    if trials > MOST_BLOCKS * size >= MOST_BLOCKS:
         mistakes.append(f"trials={trials}: are more than {MOST_BLOCKS} blocks of block_size={size}")
     if not scenarios:
         mistakes.append("there is no scenario; give at least one")
@@ -160,28 +156,27 @@ def _beyond_numbers(scenario: Scenario) -> Iterator[str]:
     if scenario.error_scale > LARGEST:
         yield f"error_scale={scenario.error_scale:g}: its square overflows; give a number up to {LARGEST:g}"
         return
-    model = scenario.measurement
+    model, real = scenario.measurement, scenario.noise.real
     with np.errstate(all="ignore"):
         bound = scenario.linear_bound
         try:
-            few = scenario.draw(0, 1 if scenario.noise.real else _FEW)
+            few = scenario.draw(0, 1 if real else _FEW)
         except UserError:
             raise
         except Exception:  # what cannot be drawn is a failure of its blocks, and told of there
             return
-    if not scenario.noise.real and not np.isfinite(few.z).all(axis=1).any():
+    if not real and not np.isfinite(few.z).all(axis=1).any():
         reason = scenario.simulator.hindrance(few.x[0])
         yield f"measurement={model.name}: none of the first {_FEW} trials has readings: {reason}; choose smaller scales"
         return
-    for parameter, deviation in zip(model.parameters, bound, strict=True):
-        if scenario.noise.real and np.isnan(deviation):
-            return  # J lacks rank at the start, or is not finite there: that is a hard start, and no mistake
-        if not 1 / LARGEST <= deviation <= LARGEST and deviation != 0:
-            yield (
-                f"noise={scenario.noise.name}: {parameter.name} has a linear bound of {deviation:g} of its size, "
-                "whose square is beyond numbers; choose another scale of the noise"
-            )
-            return
+    beyond = ~((bound >= 1 / LARGEST) & (bound <= LARGEST) | (bound == 0))
+    if real and np.isnan(bound).any():
+        return  # J lacks rank at the start, or is not finite there: that is a hard start, and no mistake
+    for i in np.flatnonzero(beyond)[:1]:
+        yield (
+            f"noise={scenario.noise.name}: {model.parameters[i].name} has a linear bound of {bound[i]:g} of its size, "
+            "whose square is beyond numbers; choose another scale of the noise"
+        )
 
 
 def result_keys(scenario: AnyScenario, estimators: Mapping[str, Any]) -> list[ResultKey]:
@@ -210,7 +205,7 @@ def record_refusal(
     store = Store(Path(output))
     if store.trials.is_dir():
         store.prepare()
-        record = {"started": _now(), **_record([scenario] if scenario else [], estimators, trials)}
+        record = _record([scenario] if scenario else [], estimators, trials)
         store.write_run(_refusal(job), {**record, "job": job, "refused": reason})
 
 
@@ -223,13 +218,10 @@ def _refusal(job: str) -> str:
     return f"refused-{digest(job)}"
 
 
-def _now() -> str:
-    return datetime.datetime.now(datetime.UTC).isoformat(timespec="microseconds")
-
-
 def _record(scenarios: Sequence[AnyScenario], estimators: Mapping[str, Any], trials: int) -> dict[str, Any]:
     cells = [cell for scenario in scenarios for cell in result_keys(scenario, estimators)]
     return {
+        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="microseconds"),
         "trials": trials,
         "scenarios": [describe(s) for s in scenarios],
         "estimators": {label: describe(e) for label, e in estimators.items()},
