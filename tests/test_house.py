@@ -34,7 +34,7 @@ BUDGETS = {
     "solvers": 1239,
     "baselines": 2081,
     "trials": 1991,
-    "runs": 2141,
+    "runs": 2122,
     "statistics": 3861,
     "real": 2228,
     "plugins": 1133,

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, multiply
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.gins import Gins
 from ipe_bench.measurements.problem import Problem
@@ -41,10 +41,10 @@ class Linear(Measurement):
         return np.random.default_rng(5).standard_normal((self.m, self.unknowns))
 
     def simulate(self, x):
-        return np.matmul(self.matrix, x[..., None])[..., 0]
+        return multiply(self.matrix, x)
 
     def simulate_until(self, x, stop):
-        return np.matmul(self.matrix[self.rows(stop)], x[..., None])[..., 0]
+        return multiply(self.matrix[self.rows(stop)], x)
 
     def jacobian(self, x):
         return np.repeat(self.matrix[None], len(x), axis=0)
@@ -60,7 +60,7 @@ class LinearGins(Gins):
         return Gins(step=180.0).jacobian(np.zeros((1, self.n)))[0]
 
     def simulate_until(self, x, stop):
-        return np.matmul(self.matrix[self.rows(stop)], x[..., None])[..., 0]
+        return multiply(self.matrix[self.rows(stop)], x)
 
     def jacobian_until(self, x, stop):
         return np.repeat(self.matrix[None, self.rows(stop)], len(x), axis=0)

@@ -6,6 +6,7 @@ from linear_models import Linear, linear_map
 
 from ipe_bench.baselines import EsMda, MapLM
 from ipe_bench.baselines.es_mda import assimilated
+from ipe_bench.basics.linalg import deviations
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements import Gins
 from ipe_bench.noise import Gaussian, Quantization
@@ -19,10 +20,6 @@ def linear(trials: int):
     scenario = Scenario(model, Gaussian(0.5), GaussianPrior(), 1.0)
     problem, z = scenario.problem, scenario.draw(0, trials).z
     return (problem, z, *linear_map(problem, model.matrix, z))
-
-
-def deviations(P):
-    return np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
 
 
 @pytest.mark.parametrize("steps", [1, 4])

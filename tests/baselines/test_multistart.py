@@ -20,10 +20,7 @@ class Mirrored(Measurement):
 
     parameters = (Parameter("a"), Parameter("b"))
     index = {"number": list(range(6))}  # noqa: RUF012  as a model states it
-
-    @property
-    def nominal(self):
-        return np.array([1.0, 0.0])
+    nominal = np.array([1.0, 0.0])
 
     def simulate(self, x):
         return np.repeat(np.stack([x[:, 0] ** 2, x[:, 1]], axis=1), 3, axis=1)

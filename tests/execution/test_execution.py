@@ -32,14 +32,10 @@ def scenario(**changes) -> Scenario:
 
 def stored(directory: Path) -> dict[str, np.ndarray]:
     """Every number that a run stored, timings aside, by file and column."""
-    numbers = {}
-    for cell in Results.read([directory]).stored.values():
-        for part in cell.parts:
-            _, table = part.read()
-            for name in table.column_names:
-                if name != "time_s":
-                    numbers[f"{part.path.name}:{name}"] = table[name].to_numpy()
-    return numbers
+    parts = (part for cell in Results.read([directory]).stored.values() for part in cell.parts)
+    tables = {part.path.name: part.read()[1] for part in parts}
+    names = ((file, name) for file, table in tables.items() for name in table.column_names if name != "time_s")
+    return {f"{file}:{name}": tables[file][name].to_numpy() for file, name in names}
 
 
 def assert_same(first: dict, second: dict) -> None:
@@ -115,19 +111,20 @@ def test_one_estimator_that_fails_loses_nothing_but_itself(tmp_path, reference, 
     assert (rogue.done, rogue.failed, rogue.missing) == (0, 10, 0)
 
 
-def test_an_exception_in_an_estimator_is_a_status_and_no_failure(tmp_path):
-    assert compute([scenario()], {"rogue": Rogue("raise")}, 5, tmp_path, execution=Processes(1)) == ()
-    results = Results.read([tmp_path])
-    rows = results.load(next(cell for cell in results.stored.values() if cell.label == "rogue"), None)
-    assert set(rows["status"]) == {"error"}
-    assert set(rows["message"]) == {"ArithmeticError: rogue"}
+def rows_of(directory: Path, label: str) -> dict[str, np.ndarray]:
+    results = Results.read([directory])
+    return results.load(next(cell for cell in results.stored.values() if cell.label == label), None)
 
 
-def test_an_estimate_that_is_not_finite_has_not_converged(tmp_path):
-    assert compute([scenario()], {"rogue": Rogue("boast")}, 5, tmp_path) == ()
-    results = Results.read([tmp_path])
-    rows = results.load(next(cell for cell in results.stored.values() if cell.label == "rogue"), ["status"])
-    assert rows["status"].tolist() == ["nonfinite"] + ["converged"] * 4
+@pytest.mark.parametrize(
+    ("does", "statuses", "message"),
+    [("raise", ["error"] * 5, "ArithmeticError: rogue"), ("boast", ["nonfinite", *["converged"] * 4], "")],
+)
+def test_an_exception_or_an_infinite_estimate_is_a_status_and_no_failure(tmp_path, does, statuses, message):
+    assert compute([scenario()], {"rogue": Rogue(does)}, 5, tmp_path, execution=Processes(1)) == ()
+    rows = rows_of(tmp_path, "rogue")
+    assert rows["status"].tolist() == statuses
+    assert set(rows["message"]) == {message}
 
 
 def test_an_estimator_cannot_change_the_readings_and_the_problem_of_the_others(tmp_path, reference):
@@ -135,12 +132,10 @@ def test_an_estimator_cannot_change_the_readings_and_the_problem_of_the_others(t
     assert compute([scenario()], {**estimators, **GOOD}, 40, tmp_path, block_size=10) == ()
     there = stored(tmp_path)
     assert_same({name: there[name] for name in reference}, reference)
-    results = Results.read([tmp_path])
-    for cell in results.stored.values():
-        if cell.label in estimators:
-            rows = results.load(cell, ["status", "message"])
-            assert set(rows["status"]) == {"error"}
-            assert all("read-only" in message for message in rows["message"])
+    for label in estimators:
+        rows = rows_of(tmp_path, label)
+        assert set(rows["status"]) == {"error"}
+        assert all("read-only" in message for message in rows["message"])
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="sends POSIX signals")
@@ -163,9 +158,7 @@ def test_what_a_process_does_first_is_not_booked_as_time_of_estimation(tmp_path,
     """As an import or a compilation, of half a second here: in 10 trials, 0.05 s for each of them."""
     rogues._begun.clear()
     compute([scenario()], {"once": Rogue("once")}, 20, tmp_path, execution=execution, block_size=10)
-    results = Results.read([tmp_path])
-    rows = results.load(next(cell for cell in results.stored.values() if cell.label == "once"), None)
-    assert rows["time_s"].max() < 0.03
+    assert rows_of(tmp_path, "once")["time_s"].max() < 0.03
 
 
 def test_what_failed_is_tried_again_by_the_next_run(tmp_path):

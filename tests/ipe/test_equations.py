@@ -27,21 +27,13 @@ def problem_of(bend: float = 0.0, seed: int = 7, sigma: float = SIGMA) -> Proble
 
 @given(seeds, vectors)
 @settings(deadline=None, max_examples=30)
-def test_linear_lse_is_the_normal_equation_of_eq_2(seed, x):
+def test_linear_lse_is_the_normal_equation_of_eq_2_and_its_covariance_eq_5(seed, x):
     problem = problem_of(seed=seed)
     A = problem.measurement.A
     z = A @ x + np.random.default_rng(seed).normal(size=len(A))
     estimates = LinearLSE().estimate(problem, z[None])
     np.testing.assert_allclose(estimates.x[0], np.linalg.lstsq(A, z, rcond=None)[0], atol=1e-9)
-
-
-@given(seeds)
-@settings(deadline=None, max_examples=30)
-def test_covariance_of_the_linear_lse_is_eq_5(seed):
-    problem = problem_of(seed=seed)
-    A = problem.measurement.A
-    P = LinearLSE().estimate(problem, np.zeros((1, len(A)))).covariance
-    np.testing.assert_allclose(P[0], SIGMA**2 * np.linalg.inv(A.T @ A), rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(estimates.covariance[0], SIGMA**2 * np.linalg.inv(A.T @ A), rtol=1e-8, atol=1e-12)
 
 
 @given(seeds, vectors, st.floats(-0.1, 0.1))

@@ -111,8 +111,6 @@ def directory(path: Path, rng: random.Random) -> None:
 
 Harm = Callable[[Path, random.Random], None]
 HARMS: tuple[Harm, ...] = (truncate, swap, zeros, other_text, pipe, directory)
-
-
 SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.campaign) for seed in range(1, 8))]
 
 

@@ -30,11 +30,15 @@ def copy(tmp_path) -> Path:
     return tmp_path
 
 
-def keys(copy: Path) -> dict[str, str]:
+def said(code: str, copy: Path) -> str:
+    """What that code prints in a process that has the copy."""
     environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, "-c", KEYS]
-    lines = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=True).stdout
-    return dict(line.split() for line in lines.splitlines())
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=True).stdout
+
+
+def keys(copy: Path) -> dict[str, str]:
+    return dict(line.split() for line in said(KEYS, copy).splitlines())
 
 
 def edit(path: Path, old: str, new: str) -> None:
@@ -138,13 +142,7 @@ def test_a_base_class_in_another_module_is_part_of_the_source(copy):
         "@dataclass(frozen=True)\nclass Mine(ib.baselines.LinearLSE):\n    pass\n",
         encoding="utf-8",
     )
-
-    def source() -> str:
-        code = "from mine import Mine; from ipe_bench.runs.provenance import fingerprint; print(fingerprint([Mine()]))"
-        environment = {**os.environ, "PYTHONPATH": str(copy)}
-        command = [sys.executable, "-c", code]
-        return subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=True).stdout
-
-    before = source()
+    code = "from mine import Mine; from ipe_bench.runs.provenance import fingerprint; print(fingerprint([Mine()]))"
+    before = said(code, copy)
     edit(copy / "ipe_bench/baselines/least_squares.py", "FACTOR = 2", "FACTOR = 3")
-    assert source() != before
+    assert said(code, copy) != before
