@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 from html import unescape
 
@@ -182,22 +180,6 @@ def test_a_record_is_all_that_a_statistic_needs(result):
             elif where in tables:
                 assert {*headings, ""} <= {*(c.title for c in tables[where].columns), ""}
     assert set(frame_columns(STATISTICS)) <= set(result.summary.columns)
-
-
-@pytest.mark.slow
-def test_latex_tables_compile(synthetic, tmp_path):
-    program = shutil.which("pdflatex")
-    if program is None:
-        pytest.skip("there is no pdflatex")
-    fill(synthetic, labels=("linear_lse", HOSTILE, "$x_1$ & \\frac{a}{b} 中 µ"), names=(HOSTILE, "_b%", "c#~^"))
-    body = "\n\n".join(latex(t) for t in all_tables(analyse([synthetic.directory])))
-    packages = r"\usepackage[T1]{fontenc}\usepackage{booktabs,longtable,siunitx,amsmath}"
-    text = rf"\documentclass[landscape]{{article}}{packages}\begin{{document}}\tiny{body}\end{{document}}"
-    (tmp_path / "t.tex").write_text(text, encoding="utf-8")
-    command = [program, "-interaction=nonstopmode", "-halt-on-error", "t.tex"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, errors="replace", timeout=300)
-    assert done.returncode == 0, done.stdout[-2000:]
-    assert (tmp_path / "t.pdf").stat().st_size > 1000
 
 
 def test_numbers_are_written_for_readers():
