@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import sys
@@ -78,9 +79,12 @@ def places_and_keys(command: str, words: Sequence[str], kinds: Mapping[str, Any]
         value: Any = text
         if kinds[key] is NAMES:
             value = [name.strip() for name in text.strip("[]").split(",") if name.strip()]
-        elif kinds[key] is not str:
-            value = {"true": True, "false": False}.get(text) if kinds[key] is bool else _number(text)
-        found[key] = checked(text if value is None else value, kinds[key], key)
+        elif kinds[key] is bool:
+            value = {"true": True, "false": False}.get(text, text)
+        elif kinds[key] is float:
+            with contextlib.suppress(ValueError):
+                value = float(text)
+        found[key] = checked(value, kinds[key], key)
     return places, found
 
 
@@ -90,10 +94,3 @@ def refuse_blanks(words: Sequence[str]) -> None:
         if (second.startswith("=") and "=" not in first) or (first.endswith("=") and "=" not in second):
             parts = words[i : i + 3] if second == "=" else (first, second)
             raise UserError(f"{' '.join(parts)}: has a blank beside the equals sign; write {''.join(parts)}")
-
-
-def _number(text: str) -> float | None:
-    try:
-        return float(text)
-    except ValueError:
-        return None

@@ -69,7 +69,7 @@ class Words:
 
     @property
     def standard_baselines(self) -> bool:
-        """Whether nothing that was typed chooses the baselines."""
+        """Whether no word chooses the baselines."""
         return {"baseline", "experiment"}.isdisjoint(self.keys)
 
     def chosen(self, group: str) -> str | None:

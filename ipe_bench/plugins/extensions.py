@@ -24,10 +24,8 @@ def richer_models(scenario: Scenario) -> list[Measurement]:
     model, truth = scenario.measurement, scenario.truth
     if truth is not None:
         if not truth.nuisance_deviation.any():
-            raise UserError(
-                f"truth_measurement={truth.name}: has no errors besides the parameters; leave it out, or choose a "
-                "richer one"
-            )
+            remedy = "leave it out, or choose a richer one"
+            raise UserError(f"truth_measurement={truth.name}: has no errors besides the parameters; {remedy}")
         return [truth]
     own = {f.name: getattr(model, f.name) for f in dataclasses.fields(model) if f.init}  # type: ignore[arg-type]
     found: list[Any] = []

@@ -1,0 +1,1 @@
+"""Lets Hydra name these configs: pkg://ipe_bench.conf."""
