@@ -26,7 +26,7 @@ LINE = (
 )
 BUDGETS = {
     "basics": 979,
-    "measurements": 6806,
+    "measurements": 6796,
     "noise": 633,
     "priors": 105,
     "states": 1188,

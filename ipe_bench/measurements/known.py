@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.basics.linalg import Array
+from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.basics.options import Component, Finite, Positive
 from ipe_bench.measurements.base import Measurement, Parameter, Recorded, WrappedModel
 from ipe_bench.measurements.joint import Joint
@@ -124,16 +124,18 @@ class ConstrainedModel(WrappedModel):
         return np.array([s if g is None else g for s, g in zip(starts, given, strict=True)], dtype=float)
 
     @cached_property
-    def _transformed(self) -> tuple[_Transformation, ...]:
+    def _coordinates(self) -> _Coordinates:
         """Of the parameters that are left."""
-        sizes = self.whole.sizes.tolist()
-        return tuple(_Transformation(float(self._v0[i]), self._known[i].bounds, sizes[i]) for i in self._free)
+        lower, upper = np.array([self._known[i].bounds for i in self._free]).T
+        return _Coordinates(self._v0[self._free], lower, upper, self.whole.sizes[self._free])
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
+        c = self._coordinates
+        prefixes = c.choose("", "ln_", "ln_", "logit_").tolist()
         return tuple(
-            p if t.plain else Parameter(f"{t.prefix}_{p.name}", size=t.inner_size, group=p.group or p.name)
-            for p, t in zip(self.physical_parameters, self._transformed, strict=True)
+            Parameter(prefix + p.name, size=size, group=p.group or p.name) if prefix else p
+            for p, prefix, size in zip(self.physical_parameters, prefixes, c.inner_size.tolist(), strict=True)
         )
 
     @cached_property
@@ -153,30 +155,25 @@ class ConstrainedModel(WrappedModel):
 
     @cached_property
     def nominal(self) -> Array:
-        return np.array([t.inner(t.v0) for t in self._transformed])
-
-    def _each(self, method: str, values: Array) -> Array:
-        """What that method of each transformation makes of its column of values (trials, n)."""
-        return np.stack([getattr(t, method)(values[:, k]) for k, t in enumerate(self._transformed)], axis=1)
+        return self.inner(self._coordinates.v0)
 
     def physical(self, x: Array) -> Array:
-        return self._each("value", x)
+        return self._coordinates.value(x)
 
     def physical_slope(self, x: Array) -> Array:
-        return self._each("slope", x)
+        return self._coordinates.slope(x)
 
     def inner(self, values: Array) -> Array:
-        """x (trials, n) of values (trials, n) in the parameters' own units."""
-        return self._each("inner", values)
+        """x (..., n) of values (..., n) in the parameters' own units."""
+        return self._coordinates.inner(values)
 
     def near_bounds(self, x: Array) -> dict[int, float]:
-        values = self.physical(x[None])[0]
-        return {
-            k: bound
-            for k, (t, v) in enumerate(zip(self._transformed, values, strict=True))
-            for bound in t.bounds
-            if abs(v - bound) <= _NEAR * abs(t.v0 - bound) < np.inf
-        }
+        c, values = self._coordinates, self.physical(x[None])[0]
+        found: dict[int, float] = {}
+        for bounds in (c.lower, c.upper):
+            near = np.abs(values - bounds) <= np.where(np.isfinite(bounds), _NEAR * np.abs(c.v0 - bounds), -1.0)
+            found |= {k: float(bounds[k]) for k in np.flatnonzero(near).tolist()}
+        return dict(sorted(found.items()))
 
     def stating(self, key: str, values: Mapping[int, float]) -> Measurement:
         given = {one.name: one for one in self.known}
@@ -187,18 +184,14 @@ class ConstrainedModel(WrappedModel):
 
     def whole_x(self, x: Array) -> Array:
         """What comes behind the parameters, a truth's nuisances, stays there."""
-        n, sizes = self.n, self.whole.sizes
-        whole = np.repeat((self._v0 / sizes)[None], len(x), axis=0).astype(x.dtype)
-        for k, (i, t) in enumerate(zip(self._free, self._transformed, strict=True)):
-            whole[:, i] = x[:, k] if t.plain else t.value(x[:, k]) / sizes[i]
-        return np.concatenate([whole, x[:, n:]], axis=1)
+        c, own = self._coordinates, x[:, : self.n]
+        whole = np.repeat((self._v0 / self.whole.sizes)[None], len(x), axis=0).astype(x.dtype)
+        whole[:, self._free] = np.where(c.bounded, c.value(own) / c.size, own)
+        return np.concatenate([whole, x[:, self.n :]], axis=1)
 
     def own_jacobian(self, x: Array, J: Array) -> Array:
-        slopes = [
-            np.ones(len(x)) if t.plain else t.slope(x[:, k]) / self.whole.sizes[i]
-            for k, (i, t) in enumerate(zip(self._free, self._transformed, strict=True))
-        ]
-        return J[:, :, self._free] * np.stack(slopes, axis=1)[:, None]
+        c = self._coordinates
+        return J[:, :, self._free] * np.where(c.bounded, c.slope(x) / c.size, 1.0)[:, None]
 
     def linearization(self) -> Array:
         if np.array_equal(self._v0, self.whole.nominal * self.whole.sizes):
@@ -211,58 +204,56 @@ class ConstrainedModel(WrappedModel):
         found = self.whole.recorded
         if found is None:
             return None
-        with np.errstate(all="ignore"):
-            x = self.inner((found.x * self.whole.sizes)[None, self._free])[0]
-        return Recorded(found.z, found.R, x)
+        return Recorded(found.z, found.R, self.inner((found.x * self.whole.sizes)[self._free]))
 
 
 @dataclass(frozen=True)
-class _Transformation:
-    """From a multiple x of `inner_size` to a value inside of its bounds."""
+class _Coordinates:
+    """Values (..., n) inside of bounds by multiples x (..., n) of `inner_size` of their logarithms or logits."""
 
-    v0: float
-    bounds: tuple[float, float]
-    size: float
+    v0: Array
+    lower: Array
+    upper: Array
+    size: Array
 
-    @property
-    def plain(self) -> bool:
-        return not np.isfinite(self.bounds).any()
+    @cached_property
+    def bounded(self) -> Mask:
+        return np.isfinite(self.lower) | np.isfinite(self.upper)
 
-    @property
-    def prefix(self) -> str:
-        return "logit" if np.isfinite(self.bounds).all() else "ln"
+    def choose(self, free: Any, above: Any, below: Any, between: Any) -> Array:
+        """What holds of each parameter: without bounds, above a lower one, below an upper one, or between two."""
+        within = np.where(self.upper == np.inf, above, np.where(self.lower == -np.inf, below, between))
+        return np.where(self.bounded, within, free)
 
-    @property
-    def inner_size(self) -> float:
+    @cached_property
+    def inner_size(self) -> Array:
         """What one unit of x is, of the logarithm or logit."""
         return self.size / self._slope_at(self.v0)
 
-    def _slope_at(self, v: Any) -> Any:
+    @cached_property
+    def _origin(self) -> Array:
+        return self._coordinate(self.v0)
+
+    def _slope_at(self, v: Array) -> Array:
         """The derivative of the value by its logarithm or logit."""
-        lower, upper = self.bounds
-        if upper == np.inf:
-            return v - lower
-        return upper - v if lower == -np.inf else (v - lower) * (upper - v) / (upper - lower)
+        with np.errstate(all="ignore"):
+            above, below = v - self.lower, self.upper - v
+            return self.choose(1.0, above, below, above * below / (self.upper - self.lower))
 
-    def _coordinate(self, v: Any) -> Any:
-        lower, upper = self.bounds
-        if upper == np.inf:
-            return np.log(v - lower)
-        return -np.log(upper - v) if lower == -np.inf else np.log((v - lower) / (upper - v))
+    def _coordinate(self, v: Array) -> Array:
+        with np.errstate(all="ignore"):
+            above, below = v - self.lower, self.upper - v
+            return self.choose(v, np.log(above), -np.log(below), np.log(above / below))
 
-    def value(self, x: Any) -> Any:
-        if self.plain:
-            return x * self.size
-        lower, upper = self.bounds
-        u = self._coordinate(self.v0) + x * self.inner_size
-        with np.errstate(over="ignore"):
-            if upper == np.inf:
-                return lower + np.exp(u)
-            return upper - np.exp(-u) if lower == -np.inf else lower + (upper - lower) / (1.0 + np.exp(-u))
+    def value(self, x: Array) -> Array:
+        with np.errstate(all="ignore"):
+            u = self._origin + x * self.inner_size
+            within = self.lower + (self.upper - self.lower) / (1.0 + np.exp(-u))
+            return self.choose(x * self.size, self.lower + np.exp(u), self.upper - np.exp(-u), within)
 
-    def slope(self, x: Any) -> Any:
+    def slope(self, x: Array) -> Array:
         """dv/dx."""
-        return np.full(np.shape(x), self.size) if self.plain else self._slope_at(self.value(x)) * self.inner_size
+        return self._slope_at(self.value(x)) * self.inner_size
 
-    def inner(self, v: Any) -> Any:
-        return v / self.size if self.plain else (self._coordinate(v) - self._coordinate(self.v0)) / self.inner_size
+    def inner(self, v: Array) -> Array:
+        return np.where(self.bounded, (self._coordinate(v) - self._origin) / self.inner_size, v / self.size)
