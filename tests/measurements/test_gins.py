@@ -1,15 +1,28 @@
-"""The gimballed INS: closed forms, other integrators, and the reference values of its linear bound."""
+"""The gimballed INS: closed forms, other integrators, the reference values of its linear bound, and richer truths."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from gins_reference import velocities
-from scipy.integrate import DOP853, solve_ivp
+from scipy.integrate import DOP853
+from scipy.stats import chi2
 
-from ipe_bench.measurements import Gins
-from ipe_bench.measurements.base import SubsetModel
-from ipe_bench.noise import Quantization
+from ipe_bench.baselines import GaussNewton
+from ipe_bench.basics.errors import UserError
+from ipe_bench.measurements import Gins, Polynomial, RicherGins, SubsetModel
+from ipe_bench.noise import NoNoise, Quantization
+from ipe_bench.solvers import Progressive
 from ipe_bench.trials.scenario import Scenario
 
+ROOT = Path(__file__).parents[2]
+NOISE = Quantization(0.02286)
 STEP = 0.075 * 0.3048
 LINEAR_BOUND = [
     0.001105, 0.001321, 0.01559, 0.01560, 0.002182, 0.001645, 0.001446, 0.001660, 0.001549, 0.001558, 0.001663
@@ -39,26 +52,6 @@ def test_an_accelerometer_bias_swings_at_the_schuler_period():
         np.testing.assert_allclose(velocity[axis, :, :, 1 - axis], 0.0, atol=1e-7)
 
 
-@pytest.mark.parametrize("scale", [1.0, 33.0, 100.0])
-def test_readings_agree_with_an_adaptive_integrator(scale):
-    model = Gins()
-    x = draw(scale, 1, seed=int(scale))
-    z = model.simulate(x).reshape(4, 30, 2)
-    for p, sign in ((list(x[0] * model.si_sizes), 1.0), ([0.0] * 11, -1.0)):
-        for k, c in enumerate(model.cases[:2]):
-            solution = solve_ivp(
-                lambda t, y, p=p, c=c: model.rhs(t, y, p, c),
-                (0.0, model.times[-1]),
-                model.start(p, c),
-                "DOP853",
-                t_eval=model.times,
-                rtol=1e-12,
-                atol=1e-12,
-            )
-            z[k] -= sign * solution.y[:2].T
-    assert np.abs(z[:2]).max() < 1e-6
-
-
 def errors_beside_scipy(scale, trials):
     x = draw(scale, trials, seed=int(scale))
     reference = np.concatenate([velocities(x[i : i + 10]) for i in range(0, trials, 10)])
@@ -71,7 +64,10 @@ SLOW = [(scale, 60, 2e-6 if scale == 10000.0 else 1e-6) for scale in (300.0, 100
 
 @pytest.mark.parametrize(
     ("scale", "trials", "limit"),
-    [(300.0, 4, 1e-6), (3000.0, 4, 1e-6), *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)],
+    [
+        *((scale, 4, 1e-6) for scale in (1.0, 33.0, 300.0, 3000.0)),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW),
+    ],
 )
 def test_every_step_keeps_its_promise_whatever_the_scale(scale, trials, limit):
     assert errors_beside_scipy(scale, trials).max() < limit
@@ -200,7 +196,7 @@ def test_the_linear_bound_is_the_reference(gins):
 def test_readings_of_a_window_are_near_enough_and_the_same_bits_in_any_batch():
     """Without a search for the step, at error scales where no step is known to do."""
     model = Gins()
-    x = Scenario(model, Quantization(0.02286), error_scale=5000.0).draw(0, 12).x
+    x = Scenario(model, NOISE, error_scale=5000.0).draw(0, 12).x
     for stop in (1, 8, 16):
         near = model.coarse_simulate_until(x, stop)
         exact = model.simulate_until(x, stop)
@@ -208,3 +204,132 @@ def test_readings_of_a_window_are_near_enough_and_the_same_bits_in_any_batch():
         assert off.max() < 0.1 * 0.02286 / np.sqrt(12)
         assert (off > 0).any()
         np.testing.assert_array_equal(model.coarse_simulate_until(x[3:4], stop), near[3:4])
+
+
+# Readings in a file, whose command is not told how far the parameters lie
+
+
+def ipe_bench(*arguments, folder):
+    return subprocess.run(
+        [sys.executable, "-m", "ipe_bench", *arguments],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=True,
+    )
+
+
+@pytest.mark.slow
+def test_an_estimate_that_fits_is_right_at_large_errors(tmp_path):
+    """A step chosen by `error_scale`, which is 1 here, gave p = .5 and errors of ten standard errors."""
+    ipe_bench("run", "error_scale=3000", "seed=3", "write_readings=t.csv", folder=tmp_path)
+    ipe_bench("estimate", "readings=t.csv", "solver=[progressive]", "baseline=[]", folder=tmp_path)
+    truth = {
+        row["parameter"]: float(row["value"])
+        for row in csv.DictReader((tmp_path / "t.truth.csv").read_text().splitlines())
+    }
+    found = json.loads(next(tmp_path.glob("outputs/*/estimate.json")).read_text())["estimators"]["progressive"]
+    assert found["status"] == "converged"
+    assert found["fits"]
+    for name, value in truth.items():
+        assert abs(found["estimates"][name] - value) < 4 * found["standard_errors"][name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [300.0, 1000.0, 3000.0, 10_000.0])
+def test_without_a_prior_estimates_succeed_as_often_as_with_one(scale):
+    """Who has a file alone cannot say how far the parameters may lie: windows then take it from the linear estimate."""
+    scenario = Scenario(Gins(), NOISE, error_scale=scale)
+    trials = scenario.draw(0, 60)
+    problem = replace(scenario.problem, prior_deviation=None)
+    found = Progressive().estimate(problem, trials.z)
+    J = scenario.problem.R.whiten_jacobian(scenario.measurement.jacobian(trials.x))
+    distance = np.sum(np.einsum("tij,tj->ti", J, found.x - trials.x) ** 2, axis=1)
+    success = distance <= chi2.isf(1e-6, problem.measurement.n)
+    assert success.sum() >= 59
+    assert (found.extras["fit_p"][~success] < 1e-6).all()
+
+
+# Truths richer than the model: exact, of their own draws, and seen or not seen by the test of the fit
+
+
+def scenario(scale=33.0, **errors):
+    return Scenario(Gins(), NOISE, error_scale=scale, truth=RicherGins(**errors))
+
+
+def test_without_its_errors_it_is_gins():
+    model, rich = Gins(), RicherGins()
+    x = 33.0 * np.random.default_rng(0).normal(size=(3, 11))
+    z = rich.simulate(np.pad(x, ((0, 0), (0, len(rich.nuisance_deviation)))))
+    np.testing.assert_allclose(z, model.simulate(x), atol=1e-9)
+    assert (rich.simulate(x) == model.simulate(x)).all()
+
+
+def test_a_constant_walk_is_a_drift():
+    """An increment at the start of a case and none after it is that drift in this case."""
+    model, rich = Gins(), RicherGins()
+    extra = np.zeros((1, len(rich.nuisance_deviation)))
+    walk = extra[:, 7:].reshape(4, 30, 3)
+    walk[:, 0, 1] = 5.0 * model.si_sizes[5]
+    z = rich.simulate(np.concatenate([np.zeros((1, 11)), extra], axis=1))
+    drift = np.zeros((1, 11))
+    drift[0, 5] = 5.0
+    np.testing.assert_allclose(z, model.simulate(drift), atol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [33.0, 3000.0])
+def test_a_random_walk_keeps_the_tolerance_of_gins(scale):
+    """Beside SciPy, from reading to reading."""
+    rich = RicherGins(gyro_random_walk=0.05)
+    rng = np.random.default_rng(5)
+    increments = rich.nuisance_deviation * rng.normal(size=367)
+    x = np.concatenate([scale * rng.normal(size=11), increments])[None]
+    walk = np.cumsum(increments[7:].reshape(1, 4, 30, 3), axis=2)
+    reference = velocities(x[:, :11], walk) - velocities(np.zeros((1, 11)))
+    assert np.abs(rich.simulate(x) - reference).max() < 1e-6
+    assert (rich.simulate_until(x, 7) == rich.simulate(x)[:, rich.rows(7)]).all()
+
+
+def test_the_parameters_of_a_trial_are_those_of_the_plain_scenario():
+    plain = Scenario(Gins(), NOISE, error_scale=33.0).draw(0, 5)
+    rich = scenario(gyro_random_walk=0.01).draw(0, 5)
+    assert (rich.x == plain.x).all()
+    assert not (rich.z == plain.z).all()
+
+
+def test_nuisances_do_not_scale_with_the_errors():
+    """Twice the error scale doubles the parameters' readings, not those of the random walk."""
+    noiseless = [
+        Scenario(Gins(), NoNoise(0.0066), error_scale=s, truth=RicherGins(gyro_random_walk=0.01)).draw(0, 20).z
+        for s in (1e-6, 1e-3)
+    ]
+    assert abs(noiseless[0].std() / noiseless[1].std() - 1) < 0.01
+
+
+def test_who_is_noticed():
+    """Drifts that walk leave residuals; an initial tilt looks like a bias and leaves none, however wrong the bias."""
+    found = {}
+    for name, errors in {
+        "none": {},
+        "walk": {"gyro_random_walk": 0.001},
+        "tilt": {"platform_misalignment": 5.0},
+    }.items():
+        given = scenario(**errors)
+        trials = given.draw(0, 60)
+        estimates = GaussNewton().estimate(given.problem, trials.z)
+        deviation = np.sqrt(np.diagonal(estimates.covariance, axis1=1, axis2=2))
+        rms = np.sqrt(np.mean(((estimates.x - trials.x) / deviation) ** 2))
+        found[name] = rms, np.mean(estimates.extras["fit_p"] < 1e-3)
+    assert found["none"][0] < 1.2
+    assert found["none"][1] < 0.05
+    assert found["walk"][0] > 5
+    assert found["walk"][1] > 0.95
+    assert found["tilt"][0] > 30
+    assert found["tilt"][1] < 0.1
+
+
+def test_a_truth_of_another_model_is_refused():
+    with pytest.raises(UserError, match=r"^truth_measurement="):
+        Scenario(Gins(), NOISE, error_scale=1.0, truth=Polynomial())

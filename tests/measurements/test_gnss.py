@@ -1,6 +1,7 @@
-"""Pseudo-ranges against the flight of light in inertial axes, the ellipsoid's formulas, and SciPy's solution."""
+"""Pseudo-ranges against the flight of light in inertial axes, the ellipsoid's formulas, SciPy and Bancroft."""
 
 import numpy as np
+import pytest
 from scipy.optimize import brentq, least_squares
 
 from ipe_bench.baselines import GaussNewton
@@ -8,6 +9,7 @@ from ipe_bench.basics.linalg import Covariance
 from ipe_bench.measurements import Gnss, Ranging
 from ipe_bench.measurements.gnss import east_north_up
 from ipe_bench.measurements.problem import Problem
+from ipe_bench.solvers import Newton
 
 LIGHT, EARTH_RATE = 299792458.0, 7.2921151467e-5
 
@@ -130,3 +132,52 @@ def test_clocks_belong_to_epochs_and_offsets_to_constellations():
     epoch, galileo = np.array(model.index["epoch"]), np.array(model.index["constellation"]) == "galileo"
     np.testing.assert_array_equal(difference, np.array([epoch == 1, epoch == 2, galileo], dtype=float))
     assert [len(rows) for rows in model.epochs] == [10, 10]
+
+
+# Ranging against the closed form of the same problem
+
+
+def bancroft(beacons, pseudoranges):
+    """Position and clock bias (4,) from pseudoranges, algebraically (Bancroft 1985); the root that fits better."""
+    B = np.column_stack([beacons, pseudoranges])
+    lorentz = np.array([1.0, 1.0, 1.0, -1.0])
+    a = (B**2) @ lorentz / 2
+    u, v = np.linalg.lstsq(B, np.column_stack([np.ones(len(B)), a]), rcond=None)[0].T
+    inner = [u @ (lorentz * u), 2 * (u @ (lorentz * v) - 1), v @ (lorentz * v)]
+    solutions = [lorentz * (root * u + v) for root in np.real(np.roots(inner))]
+
+    def misfit(s):
+        return np.abs(np.linalg.norm(beacons - s[:3], axis=1) + s[3] - pseudoranges).max()
+
+    return min(solutions, key=misfit)
+
+
+@pytest.fixture
+def trials():
+    model = Ranging(rounds=1)
+    x = model.nominal + 3.0 * np.random.default_rng(4).normal(size=(20, 4))
+    return model, x, model.simulate(x)
+
+
+def test_bancrofts_closed_form_inverts_the_model(trials):
+    model, x, z = trials
+    for truth, ranges in zip(x, z, strict=True):
+        solution = bancroft(np.array(model.beacons), ranges)
+        np.testing.assert_allclose(solution, truth * model.sizes, atol=1e-6)
+
+
+def test_the_iterated_estimate_is_bancrofts_where_readings_are_exact(trials):
+    model, _, z = trials
+    estimates = Newton(tolerance=1e-9).estimate(Problem(model, Covariance(np.full(model.m, 0.1))), z)
+    assert (estimates.status == 0).all()
+    closed = np.stack([bancroft(np.array(model.beacons), ranges) for ranges in z])
+    np.testing.assert_allclose(estimates.x * model.sizes, closed, atol=1e-6)
+
+
+def test_a_clock_bias_adds_to_every_range_and_rounds_repeat():
+    model = Ranging(rounds=2)
+    z = model.simulate(np.array([[0.0, 0, 0, 0], [0.0, 0, 0, 1.5]]))
+    np.testing.assert_allclose(z[1] - z[0], 15.0, atol=1e-12)
+    assert z[0, 0] == np.hypot(1000.0, 300.0)
+    assert (z[:, :7] == z[:, 7:]).all()
+    assert [len(rows) for rows in model.epochs] == [7, 7]

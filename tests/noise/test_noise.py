@@ -18,16 +18,13 @@ def errors(noise, m=40, h=None, offset=None):
     return np.stack([noise.corrupt(h, offset, rng) for _ in range(TRIALS)]) - h
 
 
+INDEPENDENT = [Gaussian(0.3), StudentT(0.3, 5.0), Outliers(0.3, share=0.1, factor=5.0, assumed="total")]
+COLORED = Colored(0.3, 0.8, channels=2, length=10, assumed="full")
+
+
 @pytest.mark.parametrize(
     "noise",
-    [
-        Gaussian(0.3),
-        StudentT(0.3, 5.0),
-        Outliers(0.3, share=0.1, factor=5.0, assumed="total"),
-        Colored(0.3, 0.8, channels=2, length=10, assumed="full"),
-        Colored(0.3, -0.5),
-        Correlated(0.3, 0.6, block=8),
-    ],
+    [*INDEPENDENT, COLORED, Colored(0.3, -0.5), Correlated(0.3, 0.6, block=8)],
     ids=lambda noise: type(noise).__name__,
 )
 def test_the_sample_variance_is_what_estimators_are_told(noise):
@@ -40,7 +37,7 @@ def test_the_sample_variance_is_what_estimators_are_told(noise):
 @pytest.mark.parametrize(
     "noise",
     [
-        Colored(0.3, 0.8, channels=2, length=10, assumed="full"),
+        COLORED,
         Correlated(0.3, 0.6, block=8),
         Correlated(matrix=((2.0, -0.5, 0.1), (-0.5, 1.0, 0.3), (0.1, 0.3, 0.5))),
     ],
@@ -120,15 +117,7 @@ def test_no_noise_adds_nothing_while_r_stays_nominal():
 
 
 @pytest.mark.parametrize(
-    "noise",
-    [
-        Gaussian(0.3),
-        StudentT(0.3, 5.0),
-        Quantization(0.3, dither=True),
-        Outliers(0.3, share=0.1, factor=5.0, assumed="total"),
-        Colored(0.3, 0.8, channels=2, length=10, assumed="full"),
-    ],
-    ids=lambda noise: type(noise).__name__,
+    "noise", [*INDEPENDENT, Quantization(0.3, dither=True), COLORED], ids=lambda noise: type(noise).__name__
 )
 def test_the_stated_law_is_that_of_whitened_errors(noise):
     """Mean, variance and kurtosis, the last from many draws of what it should be."""
