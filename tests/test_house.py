@@ -35,7 +35,7 @@ BUDGETS = {
     "baselines": 2081,
     "trials": 1991,
     "runs": 2122,
-    "statistics": 3861,
+    "statistics": 3832,
     "real": 2228,
     "plugins": 1131,
     "report": 4012,

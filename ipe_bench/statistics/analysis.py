@@ -14,7 +14,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.statistics.calibration import POINTS, band
 from ipe_bench.statistics.certified import attained_table
 from ipe_bench.statistics.collect import Collection, Group, collect
-from ipe_bench.statistics.comparisons import Outcomes, common, compare_pairs, corrected, may_be_best
+from ipe_bench.statistics.comparisons import Outcomes, compare_pairs, corrected, may_be_best
 from ipe_bench.statistics.intervals import quantile
 from ipe_bench.statistics.records import BEST, SCORES, rows_of, summary_rows, to_frame
 from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of, samples
@@ -101,10 +101,10 @@ class Begun:
         found["contraction"] += _contraction_rows(self.collection, groups[0])
         where = dict(groups[0].columns) | {"scenario": number}
         for sample in samples(self.collection, groups):
-            label = {"estimator": sample.group.estimator}
+            label, present = {"estimator": sample.group.estimator}, sample.present
             numbered = where | label
             summary += summary_rows(sample)
-            outcomes[sample.group.estimator] = Outcomes(sample.number, sample.distance, sample.inside_gate, sample.cost)
+            outcomes[sample.group.estimator] = Outcomes(sample.distance[present], sample.inside_gate[present])
             found["endings"] += [dict(sample.group.columns) | label | row for row in _ending_rows(sample)]
             found["scores"].append(numbered | rows_of(SCORES, sample)[-1])
             for whole in sample.calibrations[-1:]:
@@ -113,9 +113,8 @@ class Begun:
                 found["calibration"].append(numbered | curve)
             found["tracks"] += [numbered | row for row in curves(sample)]
         if outcomes:
-            paired = common(outcomes)
-            best = may_be_best(np.column_stack([outcome.success for outcome in paired.values()]))
-            marks = dict(zip(paired, best.tolist(), strict=True))
+            best = may_be_best(np.column_stack([outcome.success for outcome in outcomes.values()]))
+            marks = dict(zip(outcomes, best.tolist(), strict=True))
             self.summary += [row | {BEST: marks[row["estimator"]]} for row in summary]
             self._compared.append((where, outcomes))
 
@@ -132,19 +131,19 @@ class Begun:
             endings=pd.DataFrame(rows["endings"]),
             pairs=pd.DataFrame(corrected(pairs)),
             scores=pd.DataFrame(rows["scores"]),
-            calibration=_joined(rows["calibration"], ("at", "difference", "low", "high")),
+            calibration=_joined(rows["calibration"]),
             contraction=pd.DataFrame(rows["contraction"]),
-            tracks=_joined(rows["tracks"], ("parameter", "at", "rmse")),
+            tracks=_joined(rows["tracks"]),
             attained=attained_table(self.collection),
         )
 
 
-def _joined(parts: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> pd.DataFrame:
+def _joined(parts: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     """Frames one after another, each given by its columns; what is not an array is the same in all its rows."""
     import pandas as pd
 
     if not parts:
-        return pd.DataFrame(columns=["scenario", "estimator", *columns])
+        return pd.DataFrame()
     arrays = [name for name, value in parts[0].items() if isinstance(value, np.ndarray)]
     return pd.DataFrame(list(parts)).explode(arrays, ignore_index=True).infer_objects()
 

@@ -1,4 +1,4 @@
-"""Comparisons of estimators on the same trials: differences of error and of success, and what success costs.
+"""Comparisons of estimators on the same trials: differences of error and of success.
 
 The error of a trial is its Mahalanobis distance sqrt(e' J' R^-1 J e) from the truth, in standard deviations of the
 Cramér-Rao bound: about sqrt(n) for an efficient estimator. An estimate that is not finite is infinitely wrong.
@@ -9,16 +9,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.special import bdtr
 
 from ipe_bench.basics.linalg import Array
-
-if TYPE_CHECKING:
-    pass
 
 TIE = 1e-3
 """Errors closer than this, in standard deviations, are equal: round-off is never a difference."""
@@ -27,35 +23,16 @@ ALPHA = 0.05
 
 @dataclass(frozen=True)
 class Outcomes:
-    """What comparisons need of an estimator's trials on one scenario."""
+    """What comparisons need of an estimator on one scenario, in the trials that every estimator has."""
 
-    ids: Array
-    """(trials,) ascending: one number per (seed, trial)."""
     distance: Array
     """(trials,) Mahalanobis errors, infinite where the estimate is not finite."""
     success: Array
     """(trials,) whether the error lies inside the gate of the Cramér-Rao bound: one gate for all, prior or not."""
-    cost: Array
-    """(trials,) in simulations."""
-
-    def at(self, ids: Array) -> Outcomes:
-        """The trials with these numbers, all of which are there."""
-        if len(ids) == len(self.ids):
-            return self
-        rows = np.searchsorted(self.ids, ids)
-        return Outcomes(ids, self.distance[rows], self.success[rows], self.cost[rows])
-
-
-def common(outcomes: Mapping[str, Outcomes]) -> dict[str, Outcomes]:
-    """The outcomes on the trials that every estimator has, in the same order."""
-    if not outcomes:
-        return {}
-    shared = reduce(np.intersect1d, [outcome.ids for outcome in outcomes.values()])
-    return {label: outcome.at(shared) for label, outcome in outcomes.items()}
 
 
 def compare_pairs(outcomes: Mapping[str, Outcomes]) -> list[dict[str, Any]]:
-    """A row for every pair of estimators of one scenario on their common trials; see `corrected`.
+    """A row for every pair of estimators of one scenario; see `corrected`.
 
     A win is an error of the first smaller by more than `TIE`; `median_difference` is the median of first's error less
     second's, `p_error` Wilcoxon's signed-rank test of the differences that are not ties, `favours` the one on whose
@@ -65,7 +42,7 @@ def compare_pairs(outcomes: Mapping[str, Outcomes]) -> list[dict[str, Any]]:
     from scipy.stats import rankdata, wilcoxon  # late: takes longer to load than all else here
 
     rows = []
-    for (first, a), (second, b) in itertools.combinations(common(outcomes).items(), 2):
+    for (first, a), (second, b) in itertools.combinations(outcomes.items(), 2):
         d = differences(a.distance, b.distance)
         differing = d[d != 0]
         side = float(np.sign(differing) @ rankdata(np.abs(differing)))

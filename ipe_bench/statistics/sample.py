@@ -41,8 +41,6 @@ _SEED = 1 << 40
 class History:
     """How a converged trial came to its limit."""
 
-    trial: str
-    """The trial as readers name it."""
     distances: Array
     """(iterates,) from the last iterate, in deviations of the bound."""
     cost: float
@@ -219,10 +217,7 @@ class Sample:
         if not found:
             return []
         crlb, cost = self.crlb, self.cost.tolist()
-        return [
-            History(label_of(self.number[row]), distances_to_limit(iterates, crlb[row]), cost[row])
-            for row, iterates in found
-        ]
+        return [History(distances_to_limit(iterates, crlb[row]), cost[row]) for row, iterates in found]
 
 
 def label_of(number: Any) -> str:

@@ -21,15 +21,9 @@ from ipe_bench.statistics.comparisons import (
 from ipe_bench.statistics.sample import distances_to_limit, iterations_to_limit
 
 
-def outcomes(distance, success=None, cost=None, ids=None):
+def outcomes(distance):
     distance = np.asarray(distance, dtype=float)
-    n = len(distance)
-    return Outcomes(
-        np.arange(n) if ids is None else np.asarray(ids),
-        distance,
-        np.ones(n, dtype=bool) if success is None else np.asarray(success, dtype=bool),
-        np.ones(n) if cost is None else np.asarray(cost, dtype=float),
-    )
+    return Outcomes(distance, np.ones(len(distance), dtype=bool))
 
 
 def test_two_failures_are_a_tie_and_one_is_a_loss():
@@ -155,12 +149,13 @@ def test_known_differences_are_found_in_a_store(synthetic):
 def test_the_error_that_is_compared_is_a_distance_and_not_its_square(synthetic):
     """Every error 3 bounds in each of 3 parameters: the distance is 3 sqrt(3), which the gate does not cap."""
     synthetic.add(synthetic.scenario(), "one", np.full((30, 3), 0.3))
-    synthetic.add(synthetic.scenario(), "two", np.full((30, 3), 0.1))
+    synthetic.add(synthetic.scenario(), "two", np.full((30, 3), 0.1), start=10)
     analysis = analyse([synthetic.directory])
     scores = analysis.scores.set_index("estimator")
     assert scores.loc["one", "capped_error"] == pytest.approx(3 * np.sqrt(3))
     assert scores.loc["two", "capped_error"] == pytest.approx(np.sqrt(3))
     assert analysis.pairs.loc[0, "median_difference"] == pytest.approx(2 * np.sqrt(3))
+    assert analysis.pairs.loc[0, "trials"] == 20  # those that both have
 
 
 def test_closer_is_said_of_errors_and_bold_of_success(synthetic):
