@@ -37,9 +37,9 @@ BUDGETS = {
     "runs": 2122,
     "statistics": 3832,
     "real": 2228,
-    "plugins": 1131,
+    "plugins": 1123,
     "report": 4012,
-    "cli": 2497,
+    "cli": 2490,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""
 PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}

@@ -264,14 +264,6 @@ The same results give the same file, so that the digest may stand in a paper. Ot
     ),
 }
 """Each command's line, its exit codes besides 2, what its help says more, and its arguments."""
-_OWN_CONFIGS = "put options and experiments of your own into a folder and name it with --config-dir"
-_GONE = {
-    **dict.fromkeys(("-cp", "--config-path", "-cn", "--config-name"), _OWN_CONFIGS),
-    "--experimental-rerun": "runs/*.json in a folder of results has the command of each run",
-    "--hydra-help": "`ipe-bench run --help` has the flags",
-    **dict.fromkeys(("-r", "--run"), "leave it out"),
-}
-"""Flags of earlier versions, and what to use instead."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -294,8 +286,9 @@ class Parser(argparse.ArgumentParser):
         if not surplus:
             return values
         word, (flag, equals, _) = surplus[0], surplus[0].partition("=")
-        if self.command == "run" and flag in _GONE:
-            raise UserError(f"run: {word}: is no flag any more; {_GONE[flag]}")
+        if self.command == "run" and flag in ("-cp", "--config-path", "-cn", "--config-name"):
+            remedy = "put options and experiments of your own into a folder and name it with --config-dir"
+            raise UserError(f"run: {word}: is no flag any more; {remedy}")
         takes_keys = equals or any(action.metavar == "KEY=VALUE" for action in self._actions)
         if word.startswith("-" if equals else "--") and takes_keys and flag.lstrip("-").isidentifier():
             after = list(words)[list(words).index(word) + 1 :]
