@@ -36,7 +36,7 @@ BUDGETS = {
     "trials": 1991,
     "runs": 2122,
     "statistics": 3832,
-    "real": 2228,
+    "real": 2190,
     "plugins": 1123,
     "report": 4012,
     "cli": 2490,

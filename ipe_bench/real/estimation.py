@@ -6,7 +6,7 @@ noise and prior make the problem, and only the problem tells whether an estimato
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -55,7 +55,10 @@ class Question:
         if hindrance := model.hindrance(model.nominal):
             raise UserError(f"measurement={model.name}: cannot be computed where estimation starts: {hindrance}")
         opened = Opened(self, found, Scenario(model, self._noise(found), prior, scale))
-        opened.require(self.estimators)
+        if not self.estimators:
+            raise UserError("there is no estimator; choose with solver= and baseline=")
+        if lacking := list(opened.lacking()):
+            raise UserError("; ".join(lacking))
         return opened
 
     @property
@@ -115,23 +118,17 @@ class Opened:
         """What estimators are told: a prior only where one is stated."""
         return self.scenario.problem if self.question.has_prior else self.scenario.problem.without_prior()
 
-    def require(self, estimators: Mapping[str, Estimator]) -> None:
-        """Refuses estimators that need what the problem lacks, each with its remedy."""
-        if not estimators:
-            raise UserError("there is no estimator; choose with solver= and baseline=")
-        name = self.scenario.measurement.name
-        unstated = (
-            "is not stated; give error_scale=X, the standard deviation of the parameters in multiples of their sizes"
-        )
-        lacking = [
-            f"estimators.{label}: needs {need}, which {unstated}"
-            if need == "prior" and not self.scenario.noise.real
-            else f"estimators.{label}: needs {need}, which measurement={name} does not have; leave it out"
-            for label, estimator in estimators.items()
-            for need in estimator.missing(self.problem)
-        ]
-        if lacking:
-            raise UserError("; ".join(lacking))
+    def lacking(self) -> Iterator[str]:
+        """What estimators need and the problem lacks, each with its remedy."""
+        for label, estimator in self.question.estimators.items():
+            for need in estimator.missing(self.problem):
+                why = f"measurement={self.scenario.measurement.name} does not have; leave it out"
+                if need == "prior" and not self.scenario.noise.real:
+                    why = (
+                        "is not stated; give error_scale=X, the standard deviation of the parameters in multiples of"
+                        " their sizes"
+                    )
+                yield f"estimators.{label}: needs {need}, which {why}"
 
     def fitted(self) -> tuple[list[Fit], Examination | None]:
         """A fit by every estimator, and what is to be said of the least minimum."""

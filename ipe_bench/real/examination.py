@@ -51,8 +51,6 @@ class Minimum:
     x: Array
     """(n,) in the parameters' own units."""
     chi_square: float
-    found: int
-    """The number of starts that lead to it."""
     as_good: bool
     """Whether the readings do not tell it from the least one: their joint confidence region holds it."""
 
@@ -242,15 +240,13 @@ class Examination:
         places: list[tuple[Array, Array]] = []
         for i in np.flatnonzero(usable)[np.argsort(minima.chi_square[usable], kind="stable")]:
             x, deviation = minima.x[i], deviations(minima.covariance[i])
-            near = [k for k, (y, d) in enumerate(places) if (np.abs(x - y) <= _SAME * np.maximum(d, deviation)).all()]
-            if near:
-                found[near[0]] = replace(found[near[0]], found=found[near[0]].found + 1)
+            if any((np.abs(x - y) <= _SAME * np.maximum(d, deviation)).all() for y, d in places):
                 continue
             chi_square = float(minima.chi_square[i])
             least = found[0].chi_square if found else chi_square
             places.append((x, deviation))
-            found.append(Minimum(self.model.physical(x[None])[0], chi_square, 1, chi_square - least <= limit))
-        return found or [Minimum(self.x, self.chi_square, 1, True)]
+            found.append(Minimum(self.model.physical(x[None])[0], chi_square, chi_square - least <= limit))
+        return found or [Minimum(self.x, self.chi_square, True)]
 
     @property
     def least(self) -> bool:

@@ -15,14 +15,14 @@ from ipe_bench.basics.linalg import Array, Covariance, Mask
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimator, estimate_safely
 from ipe_bench.measurements.base import Measurement, SubsetModel
-from ipe_bench.measurements.counted import cost
+from ipe_bench.measurements.counted import CountingModel, EvaluationCount
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.unknown import Levels
-from ipe_bench.real.levels import Estimated, first_levels, levels_at, maximum, objective_of, unknown_levels
+from ipe_bench.real.levels import Estimated, first_levels, levels_at, maximum, objective_of
 from ipe_bench.real.profiles import Released, half_width, wald_interval
-from ipe_bench.real.residuals import Whiteness, explained, normalised, outlier_limit, whiteness
+from ipe_bench.real.residuals import explained, normalised, outlier_limit, whiteness
 from ipe_bench.trials.fit_test import fit_probability, spread_of
 from ipe_bench.trials.observability import in_words
 from ipe_bench.trials.thresholds import FIT_LEVEL
@@ -199,10 +199,10 @@ class Fit:
         return at_rows(self.given.rows, values, self.given.model.m)
 
     @cached_property
-    def whiteness(self) -> Whiteness:
-        """The test that successive residuals do not resemble each other."""
+    def white_p(self) -> float:
+        """The p of the test that successive residuals do not resemble each other; NaN if that cannot be tested."""
         if self._explained is None:
-            return Whiteness(np.nan, 0, np.nan)
+            return np.nan
         return whiteness(self._whitened, self._explained, self.given.series)
 
     @cached_property
@@ -370,13 +370,9 @@ def _fit_with_levels(given: Given, label: str, estimator: Estimator, levels: Lev
         again = _fit_one(given, label, estimator, replace(given.problem, R=levels.covariance(h, theta)))
         if found is not None and again.status is not Status.CONVERGED:
             break
-        h, last = z - again.residual, theta
-        if not np.isfinite(h).all():
-            found = again, unknown_levels(again.assumed, levels, again.inner)
-            break
         found = again, levels_at(again.assumed, levels, theta, z, again.inner)
-        theta = found[1].x[len(again.inner) :]
-        if np.abs(theta - last).max() < _SAME_LEVEL:
+        h, last, theta = z - again.residual, theta, found[1].x[len(again.inner) :]
+        if not np.abs(theta - last).max() >= _SAME_LEVEL:
             break
     assert found is not None
     again, known = found
@@ -446,27 +442,25 @@ def falls_beyond(
 def _fit_inside(given: Given, label: str, estimator: Estimator, problem: Problem) -> Fit:
     """The fit, wherever it is."""
     estimates, model, n = estimate_safely(estimator, problem, given.z[None]), problem.measurement, problem.measurement.n
-    message, residual = estimates.messages.get(0, ""), np.full(len(given.z), np.nan)
+    tally, residual = EvaluationCount.zeros(1), np.full(len(given.z), np.nan)
     if np.isfinite(estimates.x).all():
         # Far from the truth a model may overflow or refuse: then nothing is known of the residuals.
         with np.errstate(all="ignore"):
-            try:
-                residual = given.z - model.simulate(estimates.x)[0]
-            except Exception as error:
-                message = message or f"the residuals are unknown: {error}"
+            residual = given.z - CountingModel(model, tally).simulate(estimates.x, np.arange(1))[0]
+    refused = f"the residuals are unknown: {tally.messages[0]}" if tally.messages else ""
     return Fit(
         label=label,
         estimator=estimator,
         given=given,
         status=Status(int(estimates.status[0])),
-        message=message,
+        message=estimates.messages.get(0, refused),
         model=model,
         assumed=problem,
         inner=estimates.x[0],
         inner_covariance=np.full((n, n), np.nan) if estimates.covariance is None else estimates.covariance[0],
         residual=residual,
         iterations=int(estimates.iterations[0]),
-        simulations=float(cost(estimates.simulations, estimates.jacobians, n)[0]),
+        simulations=float(estimates.simulations[0] + n * estimates.jacobians[0]),
     )
 
 

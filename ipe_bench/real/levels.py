@@ -83,9 +83,6 @@ class Levelled(WrappedModel):
     def physical_slope(self, x: Array) -> Array:
         return np.concatenate([self.whole.physical_slope(self.whole_x(x)), np.exp(self._logarithms(x))], axis=1)
 
-    def near_bounds(self, x: Array) -> dict[int, float]:
-        return dict(self.whole.near_bounds(x[: self.whole.n]))
-
     def whole_x(self, x: Array) -> Array:
         return x[:, : self.whole.n]
 
@@ -111,12 +108,11 @@ class _Known(Measurement):
     """Readings without a parameter."""
 
     h: Array
-    parameters = property(lambda model: ())  # type: ignore[assignment]
+    parameters = ()  # type: ignore[assignment]
+    index = property(lambda model: {"row": range(len(model.h))})  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         """Made of numbers."""
-
-    index = property(lambda model: {"row": range(len(model.h))})  # type: ignore[assignment]
 
     def simulate(self, x: Array) -> Array:
         return np.repeat(self.h[None], len(x), axis=0)
@@ -213,12 +209,19 @@ class Estimated:
 
 
 def levels_at(problem: Problem, levels: Levels, theta: Array, z: Array, x: Array) -> Estimated:
-    """The levels of maximum restricted likelihood at x (n,), from theta (k,); R is taken for the leverages.
+    """The levels of maximum restricted likelihood at x (n,), from theta (k,), NaN if the readings there are not known;
+    R is taken for the leverages.
 
     Raises:
         UserError: a group has too few readings for its levels, or residuals of zero.
     """
-    h, J = problem.measurement.simulate(x[None])[0], problem.measurement.jacobian(x[None])[0]
+    h = CountingModel.uncounted(problem.measurement, 1).simulate(x[None], np.arange(1))[0]
+    if not np.isfinite(h).all():
+        none = np.full_like(theta, np.nan)
+        joint = replace(problem, measurement=Levelled(problem.measurement, levels, none, np.ones(len(z))))
+        unknown = np.full((len(x) + len(none),) * 2, np.nan)
+        return Estimated(joint, np.concatenate([x, none]), False, unknown, unknown[0], np.inf)
+    J = problem.measurement.jacobian(x[None])[0]
     _require_residuals(levels, z, z - h, J)
     spare = _spare(J, problem.R)
     w = levels.covariance(h, theta).whiten(z - h)
@@ -226,14 +229,6 @@ def levels_at(problem: Problem, levels: Levels, theta: Array, z: Array, x: Array
     known = Levelled(_Known(h), levels, theta, spare)
     found = minimise(Problem(known, _covariance(levels, known.whole, theta)), z[None], theta[None])
     return _estimated(problem, levels, spare, z, np.concatenate([x, found.x[0]]), bool(found.converged[0]))
-
-
-def unknown_levels(problem: Problem, levels: Levels, x: Array) -> Estimated:
-    """No levels, where the readings at x (n,) are not known."""
-    theta = np.full(len(levels.parameters), np.nan)
-    joint = replace(problem, measurement=Levelled(problem.measurement, levels, theta, np.ones(problem.R.m)))
-    unknown = np.full((len(x) + len(theta),) * 2, np.nan)
-    return Estimated(joint, np.concatenate([x, theta]), False, unknown, unknown[0], np.inf)
 
 
 def maximum(start: Estimated, z: Array) -> Estimated:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from ipe_bench.basics.errors import UserError, did_you_mean, unknown
-from ipe_bench.basics.files import write_atomically
+from ipe_bench.basics.files import write_text
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Input, Measurement
 from ipe_bench.measurements.joint import Joint
@@ -243,12 +243,9 @@ def write_truth(path: Path, model: Measurement, x: Array) -> None:
 def _write(path: Path, rows: Sequence[Sequence[Any]]) -> None:
     if path.exists():
         raise UserError(f"{path}: is there already and is not overwritten; name another file or remove it")
-
-    def write(temporary: Path) -> None:
-        with temporary.open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows(rows)
-
-    write_atomically(path, write)
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    write_text(path, text.getvalue())
 
 
 def open_together(
@@ -405,14 +402,12 @@ def _input(table: Table, wanted: Input, text: str, where: str) -> Any:
 
 
 def _sigmas(table: Table, column: str | None, rows: Sequence[int], z: Array, shown: str) -> Array | None:
-    """The standard deviations (m,) that stand in `rows` of that column, `shown` being that of the readings; None where
-    there is no such column."""
+    """The standard deviations (m,) in `rows` of that column, `shown` being that of the readings; None without one."""
     if column is None:
         return None
     if _unit(column) and _unit(column) != _unit(shown):
         raise table.error(f"column {column}: the unit must be that of {shown}; convert the values")
-    cells = table.column(column)
-    values = np.full(len(z), np.nan)
+    cells, values = table.column(column), np.full(len(z), np.nan)
     for i, row in enumerate(rows):
         text, where = cells[row]
         values[i] = table.value(text, where)

@@ -1,10 +1,6 @@
-"""What the residuals of one fit say of the model: whether they are as large as R says, whether they are white, and
-which readings are outliers. Numbers in, numbers out: where readings come from is left to others.
-"""
+"""What the residuals of one fit say of the model: whether they are white, and which readings are outliers."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,17 +18,6 @@ LEAST_P = 1 / (DRAWS + 1)
 _DRAWS_AT_ONCE = 250
 _MANY = 20_000
 """Of more readings than these a fit takes out too little to matter: Q is chi-square, and nothing need be simulated."""
-
-
-@dataclass(frozen=True)
-class Whiteness:
-    """The test that successive residuals of one instrument have nothing to do with each other."""
-
-    statistic: float
-    """Ljung and Box's Q; NaN where the residuals are not finite, or too few to have neighbours or to vary."""
-    lags: int
-    p_value: float
-    """Chance of a Q at least this large if the model and R are right."""
 
 
 def explained(J: Array, R: Covariance) -> Array:
@@ -71,8 +56,9 @@ def outlier_limit(m: int, level: float = OUTLIER_LEVEL) -> float:
     return -float(ndtri(level / (2 * max(m, 1))))
 
 
-def whiteness(w: Array, Q: Array, series: NDArray[np.intp], draws: int = DRAWS) -> Whiteness:
-    """Ljung and Box's test (Biometrika 65, 1978) of whitened residuals w (m,), pooled over instruments.
+def whiteness(w: Array, Q: Array, series: NDArray[np.intp], draws: int = DRAWS) -> float:
+    """The p of Ljung and Box's test (Biometrika 65, 1978) that successive residuals w (m,), whitened, of one instrument
+    do not resemble each other; NaN if they are not finite, or too few to have neighbours or to vary.
 
     series (channels, length) says which residual stands where in each instrument's succession, -1 where a reading is
     missing. Fitted residuals are not white even when the noise is: the fit has taken out what the basis Q (m, rank)
@@ -80,7 +66,6 @@ def whiteness(w: Array, Q: Array, series: NDArray[np.intp], draws: int = DRAWS) 
     test: Davison and Hinkley, Bootstrap Methods and their Application, 1997, section 4.2). The draws are always the
     same ones.
     """
-    lags = lags_of(series.shape[1])
 
     def statistic(w: Array) -> Array:
         return ljung_box(np.where(series >= 0, w[:, series], np.nan))
@@ -88,12 +73,12 @@ def whiteness(w: Array, Q: Array, series: NDArray[np.intp], draws: int = DRAWS) 
     observed = float(statistic(w[None])[0])
     # A single degree of freedom leaves one direction: its residuals differ in size alone, which Q does not see.
     if Q.shape[1] >= len(w) - 1 or not (np.isfinite(w).all() and np.isfinite(observed)):
-        return Whiteness(np.nan, lags, np.nan)
+        return np.nan
     if len(w) > _MANY:
-        return Whiteness(observed, lags, float(chdtrc(lags, observed)))
+        return float(chdtrc(lags_of(series.shape[1]), observed))
     rng = np.random.Generator(np.random.Philox(0))
     as_large = 0
     for start in range(0, draws, _DRAWS_AT_ONCE):
         noise = rng.standard_normal((min(_DRAWS_AT_ONCE, draws - start), len(w)))
         as_large += int(np.sum(statistic(noise - (noise @ Q) @ Q.T) >= observed * (1 - 1e-9)))
-    return Whiteness(observed, lags, (1 + as_large) / (1 + draws))
+    return (1 + as_large) / (1 + draws)

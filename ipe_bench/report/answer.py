@@ -174,7 +174,7 @@ def _verdicts(answer: Answer) -> Table:
         ]
     columns += [
         texts("dof", [str(one.degrees_of_freedom) for one in fits]),
-        texts("white p", [p_value(one.whiteness.p_value, LEAST_P) for one in fits]),
+        texts("white p", [p_value(one.white_p, LEAST_P) for one in fits]),
         texts("outliers", [str(int(one.outliers.sum())) for one in fits]),
         texts("deviation", [_number(one.residual_deviation) for one in fits]),
     ]
@@ -215,7 +215,7 @@ def _notes(answer: Answer) -> Iterator[str]:
             "The noise level is estimated from the residuals. Standard errors are scaled by it, intervals are those of"
             " Student's t, and the size of the residuals cannot test the model."
         )
-    if suspect := [one.label for one in fits if one.level is not None and one.whiteness.p_value < FIT_LEVEL]:
+    if suspect := [one.label for one in fits if one.level is not None and one.white_p < FIT_LEVEL]:
         yield (
             f"{', '.join(suspect)}: successive residuals resemble each other (white p below {FIT_LEVEL:g}); the model"
             " is in doubt, and standard errors are too small."
@@ -379,7 +379,7 @@ def _fitted(one: Fit, labels: list[dict[str, Any]]) -> dict[str, Any]:
         "standard_errors": _by_name(names, one.standard_errors),
         "intervals95": _by_name(names, np.transpose(one.interval())),
         "p": as_json(one.p_value),
-        "white_p": as_json(one.whiteness.p_value),
+        "white_p": as_json(one.white_p),
         "on_bounds": {names[k]: value for k, value in one.held_at.items()},
         "noise_level_estimated": one.levels or as_json(one.level),
         "outliers": [

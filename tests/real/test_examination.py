@@ -193,7 +193,7 @@ def test_with_as_many_readings_as_parameters_nothing_is_tested_but_a_worse_answe
     good, bad = fit(problem, model.recorded.z, {**LM, "linear": LinearLSE()})
     assert (good.fits, bad.fits) == (None, False)
     assert np.isnan(good.p_value)
-    assert np.isnan(good.whiteness.p_value)
+    assert np.isnan(good.white_p)
 
 
 def test_an_answer_is_a_frame_too():

@@ -142,7 +142,7 @@ def draw_residuals(model: Measurement, fits: Sequence[Fit]) -> Iterator[Drawing]
         else:
             ax.yaxis.set_major_locator(MaxNLocator(7, integer=True))
         ax.xaxis.set_major_locator(MaxNLocator(6, integer=heading == "reading"))
-        tests = f"fit p {p_value(one.p_value)}, white p {p_value(one.whiteness.p_value, LEAST_P)}"
+        tests = f"fit p {p_value(one.p_value)}, white p {p_value(one.white_p, LEAST_P)}"
         ax.set_title(f"{common.text(one.label)}\n{tests}")
     common.axis_labels(fig, common.text(heading), "residual / its deviation")
     common.legend(fig, axes)
