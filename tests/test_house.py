@@ -26,14 +26,14 @@ LINE = (
 )
 BUDGETS = {
     "basics": 979,
-    "measurements": 6796,
-    "noise": 633,
+    "measurements": 6763,
+    "noise": 618,
     "priors": 105,
     "states": 1188,
     "estimators": 1206,
     "solvers": 1239,
     "baselines": 2081,
-    "trials": 1991,
+    "trials": 1990,
     "runs": 2122,
     "statistics": 3832,
     "real": 2190,

@@ -15,8 +15,7 @@ from ipe_bench.basics.options import Positive
 from ipe_bench.measurements.arithmetic import Arithmetic, read
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.measurements.ode.trace import Graph, Program, tangent
-from ipe_bench.noise.base import Noise
-from ipe_bench.noise.kinds import Gaussian
+from ipe_bench.noise.base import Gaussian, Noise
 
 NO_LEVEL = (
     "noise=unknown: has no level to simulate with; choose another noise, give noise.levels=[...], or use `estimate`"

@@ -59,15 +59,13 @@ def errors_beside_scipy(scale, trials):
     return np.abs(Gins().simulate(x) - (reference - velocities(np.zeros((1, 11))))).max(axis=1)
 
 
+QUICK = [(scale, 4, 1e-6) for scale in (1.0, 33.0, 300.0, 3000.0)]
 SLOW = [(scale, 60, 2e-6 if scale == 10000.0 else 1e-6) for scale in (300.0, 1000.0, 3000.0, 10000.0)]
 
 
 @pytest.mark.parametrize(
     ("scale", "trials", "limit"),
-    [
-        *((scale, 4, 1e-6) for scale in (1.0, 33.0, 300.0, 3000.0)),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW),
-    ],
+    [*QUICK, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)],
 )
 def test_every_step_keeps_its_promise_whatever_the_scale(scale, trials, limit):
     assert errors_beside_scipy(scale, trials).max() < limit

@@ -7,7 +7,7 @@ from scipy.optimize import brentq, least_squares
 from ipe_bench.baselines import GaussNewton
 from ipe_bench.basics.linalg import Covariance
 from ipe_bench.measurements import Gnss, Ranging
-from ipe_bench.measurements.gnss import east_north_up
+from ipe_bench.measurements.positioning import east_north_up
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.solvers import Newton
 

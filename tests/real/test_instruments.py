@@ -158,7 +158,7 @@ def test_a_satellite_file_brings_its_own_sky(tmp_path):
     result = fit(Problem(found.model, ModelNoise().of(found.model).covariance(6)), found.z, {"gn": GaussNewton()})[0]
     low, high = result.interval(0.9999)
     assert ((low < p) & (p < high)).all()
-    from ipe_bench.measurements.gnss import east_north_up
+    from ipe_bench.measurements.positioning import east_north_up
 
     here = np.asarray(truth.position)
     axes = east_north_up(here)

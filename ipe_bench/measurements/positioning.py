@@ -1,4 +1,4 @@
-"""Satellite navigation: position and clocks of a receiver at rest from pseudo-ranges of one or more constellations."""
+"""Where something is: from ranges to beacons, from pseudo-ranges to satellites, or from bearings."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import MinLen
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.basics.options import Count
+from ipe_bench.basics.options import Count, Positive
 from ipe_bench.measurements.base import Epochs, Input, Measurement, Parameter, UsualNoise, parameter_table
 
 LIGHT = 299792458.0
@@ -31,6 +32,71 @@ _SKY = (
     ("galileo", 29_600e3, 290.0, 35.0),
 )  # fmt: skip
 """Constellation, radius of the orbit in m, azimuth and elevation in degrees of the satellites that are the default."""
+
+_BEACONS = (
+    (1000.0, 0.0, 300.0),
+    (500.0, 866.0, 20.0),
+    (-500.0, 866.0, 300.0),
+    (-1000.0, 0.0, 20.0),
+    (-500.0, -866.0, 300.0),
+    (500.0, -866.0, 20.0),
+    (0.0, 0.0, 600.0),
+)
+
+
+@dataclass(frozen=True)
+class Ranging(Measurement):
+    """Pseudoranges |s_i - p| + b from a receiver at p with clock bias b to beacons at known places s_i.
+
+    Parameters: east, north, up in m, and the clock bias as a length in m. Readings: pseudoranges in m, in `rounds` over
+    all beacons; each round is an epoch. A range of rho bends by d^2 / (2 rho) for a position error d across it: 0.05 m
+    at error scale 1 with the beacons given here, to be compared with a noise of 0.1 m.
+
+    Source: Kaplan and Hegarty, Understanding GPS, 2nd ed., section 2.4. The problem has a closed form: Bancroft, An
+    algebraic solution of the GPS equations, IEEE Transactions on Aerospace and Electronic Systems 21, 1985.
+    """
+
+    beacons: tuple[tuple[float, float, float], ...] = _BEACONS
+    """East, north, up of each beacon in m."""
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The presumed position of the receiver in m: the nominal point."""
+    rounds: Count = 3
+
+    reading_unit = "m"
+    usual_noise = UsualNoise(0.1)
+    analytic = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.beacons) * self.rounds < 5:
+            raise UserError("beacons: give at least 5 readings over all rounds")
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        place = ("east", "north", "up"), "m", 10.0, "position"
+        return parameter_table(place, (("clock",), "m", 10.0, "clock bias"))
+
+    @cached_property
+    def nominal(self) -> Array:
+        return np.append(np.asarray(self.position, dtype=float), 0.0) / self.sizes
+
+    @property
+    def index(self) -> Mapping[str, Sequence[Any]]:
+        beacons = range(1, len(self.beacons) + 1)
+        return {
+            "round": [k for k in range(1, self.rounds + 1) for _ in beacons],
+            "beacon": [i for _ in range(self.rounds) for i in beacons],
+        }
+
+    @cached_property
+    def epochs(self) -> Epochs:
+        return tuple(np.arange(self.m).reshape(self.rounds, -1))
+
+    def simulate(self, x: Array) -> Array:
+        p = x * self.sizes
+        towards = np.asarray(self.beacons, dtype=float) - p[:, None, :3]
+        ranges = np.sqrt(towards[..., 0] ** 2 + towards[..., 1] ** 2 + towards[..., 2] ** 2) + p[:, 3:]
+        return np.tile(ranges, (1, self.rounds))
 
 
 def east_north_up(position: Array) -> Array:
@@ -204,3 +270,85 @@ class Gnss(Measurement):
             turned = np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x, z
             distance = np.sqrt(sum((s - p) ** 2 for s, p in zip(turned, place, strict=True)))
         return distance
+
+
+@dataclass(frozen=True)
+class Bearings(Measurement):
+    """Bearings to a target of constant velocity, from an observer that sails straight legs at known courses and speeds.
+
+    Parameters: the target's position (east, north) at time 0 in m relative to the observer's start, and its velocity in
+    m/s. Readings: bearings in degrees clockwise from north, one per `interval`; each is an epoch. They are continuous
+    about the nominal target's bearing, within half a turn of it, so they may leave the range 0 to 360.
+
+    On a single leg the range is not observable: every target whose relative motion is scaled by one factor has the same
+    bearings. A turn makes it observable unless the observer's acceleration points along the line of sight (Nardone and
+    Aidala, Observability criteria for bearings-only target motion analysis, IEEE Transactions on Aerospace and
+    Electronic Systems 17, 1981). Estimators that linearise at the nominal point then say that H lacks rank.
+    """
+
+    legs: Annotated[tuple[tuple[float, float, float], ...], MinLen(1)] = ((900.0, 90.0, 6.0), (900.0, 330.0, 6.0))
+    """The observer's legs: duration in s, course in degrees from north, speed in m/s."""
+    interval: Positive = 60.0
+    """Time between bearings in s; the first is taken at time 0."""
+    target: tuple[float, float, float, float] = (3000.0, 5000.0, -3.0, 1.0)
+    """The presumed target (east and north in m, in m/s): the nominal point."""
+
+    reading_unit = "deg"
+    usual_noise = UsualNoise(0.5)
+    analytic = True
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        place = ("east", "north"), "m", 250.0, "position"
+        return parameter_table(place, (("v_east", "v_north"), "m/s", 0.25, "velocity"))
+
+    @cached_property
+    def nominal(self) -> Array:
+        return np.asarray(self.target, dtype=float) / self.sizes
+
+    @cached_property
+    def times(self) -> Array:
+        """When bearings are taken (m,), in s."""
+        total = sum(leg[0] for leg in self.legs)
+        return self.interval * np.arange(int(total / self.interval + 1e-9) + 1)
+
+    @cached_property
+    def observer(self) -> Array:
+        """Where they are taken (m, 2), east and north in m."""
+        path = np.zeros((len(self.times), 2))
+        began = 0.0
+        for duration, course, speed in self.legs:
+            sailed = np.clip(self.times - began, 0.0, duration)
+            heading = np.deg2rad(course)
+            path += speed * sailed[:, None] * np.array([np.sin(heading), np.cos(heading)])
+            began += duration
+        return path
+
+    @property
+    def index(self) -> Mapping[str, Sequence[Any]]:
+        return {"time [s]": self.times.tolist()}
+
+    @cached_property
+    def epochs(self) -> Epochs:
+        return tuple(np.arange(self.m)[:, None])
+
+    def _sight(self, x: Array) -> Array:
+        """The vectors (trials, m, 2) from the observer to the target."""
+        p = x * self.sizes
+        return p[:, None, :2] + self.times[:, None] * p[:, None, 2:] - self.observer
+
+    @cached_property
+    def _nominal_bearings(self) -> tuple[Array, Array]:
+        """Unit vectors (m, 2) towards the nominal target, and their bearings (m,) in rad without jumps."""
+        sight = self._sight(self.nominal[None])[0]
+        bearing = np.unwrap(np.arctan2(sight[:, 0], sight[:, 1]))
+        return sight / np.linalg.norm(sight, axis=1)[:, None], bearing - 2 * np.pi * np.floor(bearing[0] / (2 * np.pi))
+
+    def simulate(self, x: Array) -> Array:
+        sight = self._sight(x)
+        ahead, bearing = self._nominal_bearings
+        dot = sight[..., 0] * ahead[:, 0] + sight[..., 1] * ahead[:, 1]
+        cross = sight[..., 0] * ahead[:, 1] - sight[..., 1] * ahead[:, 0]
+        distance = np.sqrt(sight[..., 0] ** 2 + sight[..., 1] ** 2)
+        # The angle from the nominal line of sight by the half-angle formula, which is analytic and within half a turn.
+        return np.rad2deg(1.0) * (bearing + 2.0 * np.arctan(cross / (distance + dot)))
