@@ -300,6 +300,7 @@ def estimate(
     estimators: Mapping[str, Tracker] | None = None,
     *,
     ignore_columns: Sequence[str] = (),
+    find: str | Sequence[str] = (),
 ) -> TrackAnswer: ...
 
 
@@ -327,6 +328,7 @@ def estimate(
     error_scale: float | None = None,
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
     ignore_columns: Sequence[str] = (),
+    find: str | Sequence[str] = (),
 ) -> Answer | TrackAnswer:
     """Parameters from real readings, by every estimator: estimates, standard errors, residuals and a test of the fit.
 
@@ -341,7 +343,9 @@ def estimate(
     sequence of the fits; it shows itself in a notebook, and `table()` is a frame.
 
     Of a state model the `estimators` are trackers, `readings` is one log with a row per epoch or an array (K, m), and
-    the answer has a track of each (see `ipe_bench.real.tracks`); only `ignore_columns` goes with it.
+    the answer has a track of each (see `ipe_bench.real.tracks`); only `ignore_columns` and `find` go with
+    it. `find` names constants, process noises or readings of a model by formulas: each tracker then finds the numbers
+    under which it gives the log the largest likelihood, as `constants`.
 
     >>> import ipe_bench as ib
     >>> model = ib.measurements.Polynomial()
@@ -365,7 +369,9 @@ def estimate(
         stated = {"noise": noise, "prior": prior, "error_scale": error_scale, "parameters": parameters}
         if other := [name for name, value in stated.items() if value is not None]:
             raise UserError(f"{other[0]}=: is of a measurement, and this is a model of states that move; leave it out")
-        return _tracked(model, readings, estimators, ignore_columns)
+        return _tracked(model, readings, estimators, ignore_columns, find)
+    if find:
+        raise UserError("find=: is for models of states that move; all parameters of a measurement are found")
     if not isinstance(model, Measurement):
         scenario = _scenario(model, noise=noise, prior=prior, error_scale=error_scale)
         model, noise = scenario.measurement, None if scenario.noise.real else scenario.noise
@@ -382,8 +388,13 @@ def estimate(
 
 
 def _tracked(
-    model: StateModel, readings: Any, trackers: Mapping[str, Any] | None, ignored: Sequence[str]
+    model: StateModel,
+    readings: Any,
+    trackers: Mapping[str, Any] | None,
+    ignored: Sequence[str],
+    find: str | Sequence[str],
 ) -> TrackAnswer:
+    from ipe_bench.real.likelihood import found_and_tracked
     from ipe_bench.real.tracks import Log, Tracked
     from ipe_bench.report.tracked import TrackAnswer
     from ipe_bench.states.trackers import ckf, ekf, ukf
@@ -395,6 +406,9 @@ def _tracked(
     trackers = {"ekf": ekf(), "ukf": ukf(), "ckf": ckf()} if trackers is None else _labelled(trackers)
     log = Log.of(model, Path(readings) if isinstance(readings, str) else readings, ignored)
     validate([Tracking(log.model)], trackers, 1)
+    if find:
+        names = [find] if isinstance(find, str) else list(find)
+        return TrackAnswer(log, [found_and_tracked(log, label, tracker, names) for label, tracker in trackers.items()])
     return TrackAnswer(log, [Tracked.of(log, label, tracker) for label, tracker in trackers.items()])
 
 

@@ -38,7 +38,7 @@ OF_STATES = ("model", "tracker", "trackers")
 OF_CONSTANTS = ("measurement", "truth_measurement", "noise", "prior", "error_scale", "solver", "baseline")
 OF_CONSTANTS += ("estimators", "parameters", "write_readings")
 """Keys of parameters that stand still."""
-OF_FILES = ("readings", "ignore_columns")
+OF_FILES = ("readings", "ignore_columns", "find")
 """Keys of estimates from real readings."""
 _TRIALS, _MOST_TRIALS = 3, 100
 """Of `posterior`."""
@@ -89,7 +89,7 @@ def require_one_kind(words: Words, spec: Spec) -> None:
     """Refuses a tracker without a state model, and a state model together with a key of measurements, typed or from an
     experiment."""
     if spec.model is None:
-        words.refuse(OF_STATES[1:], "goes with model=NAME")
+        words.refuse((*OF_STATES[1:], "find"), "goes with model=NAME")
         return
     why = "is of a measurement, and model= chooses states that move"
     words.refuse(OF_CONSTANTS, why)
@@ -133,8 +133,9 @@ def _track(asked: Single, model: StateModel) -> int:
     from ipe_bench.report.tracked import NAME, TABLE, contents, write_tracks
 
     given, trackers = asked.spec.readings, asked.spec.estimators
-    answer = api.estimate(model, given, trackers, ignore_columns=asked.spec.ignored)
-    command = {"readings": given, "model": describe(model), "trackers": _described(trackers)}
+    find = asked.spec.find or ()
+    answer = api.estimate(model, given, trackers, ignore_columns=asked.spec.ignored, find=find)
+    command = {"readings": given, "find": find, "model": describe(model), "trackers": _described(trackers)}
     files, parts = [answer.log.file] if answer.log.file else [], [answer.log.model, *trackers.values()]
     folder = asked.folder(NAME, command, [TABLE])
     _show(contents(answer), write_tracks(folder, answer, command, _provenance(asked, files, parts)))

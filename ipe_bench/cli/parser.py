@@ -75,7 +75,7 @@ figures=main           figures to draw: main, all or none
 formats=pdf,svg        file formats of the figures besides PNG
 block_size=N           trials that are computed at once; it changes no number
 write_readings=FILE    writes the simulated readings of trial write_readings_trial=N, and computes nothing
-readings=FILE          is for `ipe-bench estimate`, as is ignore_columns=
+readings=FILE          is for `ipe-bench estimate`, as are ignore_columns= and find=
 +experiment=NAME       an experiment of `ipe-bench list experiment`, which sets some of these keys
 """,
         (
@@ -110,6 +110,7 @@ noise.deviation=X   the standard deviation of a reading; standard errors and tes
 noise=unknown       it is estimated, so the size of residuals tests nothing; noise.by=COLUMN: a level for each entry;
                     "noise.sigma=a + b*h": a formula of the reading's magnitude h and of levels a and b.
 ignore_columns=[A]  columns to leave out.
+find=[A,B]          constants, noises or readings of model=, whose numbers are those of largest likelihood.
 parameters.NAME.fixed=X, .lower=X, .upper=X   what is known of a parameter; parameters=FILE.yaml has that of many.
 error_scale=X       how far the parameters may lie from the nominal point: the prior of filters and map_lm.
 figures=none        draws nothing.

@@ -71,6 +71,7 @@ class Spec(Component):
     formats: Any = PAGE
     block_size: Count | None = None
     readings: str | tuple[str, ...] | None = None
+    find: str | tuple[str, ...] | None = None
     ignore_columns: str | tuple[str, ...] | None = None
     write_readings: str | None = None
     write_readings_trial: Whole = 0

@@ -95,6 +95,19 @@ def _read(table: Table, model: StateModel) -> Log:
 
 
 @dataclass(frozen=True)
+class Constant:
+    """A constant of largest likelihood."""
+
+    name: str
+    value: float
+    error: float
+    """Its standard error, by the curvature of the log likelihood."""
+    low: float
+    """The lower end of its 95 % interval, which for a standard deviation is symmetric in the logarithm."""
+    high: float
+
+
+@dataclass(frozen=True)
 class Tracked:
     """What one tracker makes of a log, in the units of the states."""
 
@@ -116,7 +129,9 @@ class Tracked:
     passes: bool
     """Whether there is a track, and its innovations are no larger than chance explains."""
     message: str
-    """Why there is no track; empty if there is one."""
+    """Why there is no track, or no constant; empty if there is one."""
+    constants: Sequence[Constant] = ()
+    """Those that were asked for."""
 
     @classmethod
     def of(cls, log: Log, label: str, tracker: Tracker) -> Tracked:

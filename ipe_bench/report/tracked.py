@@ -72,7 +72,7 @@ def contents(answer: TrackAnswer) -> list[Part]:
         interval("95 % if right", *limits, short),
         words("verdict", [one.verdict for one in found]),
         texts("white p", [p_value(one.white_p) for one in found]),
-        texts("log likelihood", [short(one.log_likelihood) for one in found]),
+        texts("log likelihood", [f"{one.log_likelihood:.2f}".replace("nan", "-") for one in found]),
     ]
     note = (
         "Innovations are readings less their predictions, in predicted standard deviations; NIS / m is their mean"
@@ -80,8 +80,17 @@ def contents(answer: TrackAnswer) -> list[Part]:
     )
     ends = [words("state", [state.name for state in states]), words("unit", [state.unit for state in states])]
     ends += [texts(one.label, map(with_error, one.mean[-1], one.deviation[-1])) for one in found]
+    constants = [(one.label, each) for one in found for each in one.constants]
+    rows = [each for _, each in constants]
+    maximum = [
+        words("tracker", [label for label, _ in constants]),
+        words("constant", [each.name for each in rows]),
+        texts("value ± standard error", [with_error(each.value, each.error) for each in rows]),
+        interval("95 %", [each.low for each in rows], [each.high for each in rows], short),
+    ]
     return [
         *(Strong(f"{one.label}: {one.message}") for one in found if one.message),
+        *([Table("constants", "Constants of largest likelihood", "", maximum)] if constants else ()),
         Table("innovations", f"{answer.log.model.name}: is the filter right?", "", columns, notes=[note]),
         Table("last", "States at the last epoch ± standard deviation", "", ends),
     ]
@@ -91,6 +100,8 @@ def write_tracks(folder: Path, answer: TrackAnswer, command: Any, provenance: Ma
     """Writes track.json, track.csv and track.html, and returns them."""
     log, rows = answer.log, ("message", "mean_nis", "limits", "verdict", "white_p", "log_likelihood", "passes")
     trackers = {one.label: {name: as_json(getattr(one, name)) for name in rows} for one in answer}
+    for one in answer:
+        trackers[one.label]["constants"] = {each.name: as_json([each.value, each.error]) for each in one.constants}
     content = {"schema": SCHEMA, "command": command, "trackers": trackers, **provenance}
     write_text(folder / f"{NAME}.json", json.dumps(content, indent=1) + "\n")
     lead = f"{int(np.isfinite(log.z).sum())} readings at {log.model.epochs} epochs"

@@ -1,0 +1,111 @@
+"""Constants of state models by maximum likelihood: a published estimate, dense likelihoods, and their coverage."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal, norm
+
+import ipe_bench as ib
+from ipe_bench.states import Bootstrap, Formulas, Smoother, ckf, ekf
+
+NILE = """
+1120 1160 963 1210 1160 1160 813 1230 1370 1140 995 935 1110 994 1020 960 1180 799 958 1140 1100 1210 1150 1250 1260
+1220 1030 1100 774 840 874 694 940 833 701 916 692 1020 1050 969 831 726 456 824 702 1120 1100 832 764 821 768 845 864
+862 698 845 744 796 1040 759 781 865 845 944 984 897 822 1010 771 676 649 846 812 742 801 1040 860 874 848 890 744 749
+838 1050 918 986 797 923 975 815 1020 906 901 1170 912 746 919 718 714 740
+"""
+"""Annual flow of the Nile at Aswan, 1871 to 1970, in 1e8 m^3 (Cobb, Biometrika 65, 1978)."""
+LEVEL = Formulas(
+    next={"level": "level + w"},
+    readings={"flow": "level"},
+    noise={"w": 100.0},
+    deviation={"flow": 100.0},
+    spread={"level": 1e5},
+)
+DAMPED = Formulas(
+    next={"x": "a*x + w"},
+    readings={"z": "x"},
+    constants={"a": 0.8},
+    noise={"w": 1.0},
+    deviation={"z": 1.0},
+    spread={"x": 2.0},
+    count=60,
+)
+
+
+def test_the_variances_of_the_nile_are_those_of_durbin_and_koopman():
+    """Time Series Analysis by State Space Methods, 2012, section 2.10.3: 15099 and 1469.1, from a diffuse prior."""
+    z = np.array(NILE.split(), dtype=float)[:, None]
+    assert z.sum() == 91935
+    (one,) = ib.estimate(LEVEL, z, {"kf": ekf()}, find=["flow", "w"])
+    assert [c.value**2 for c in one.constants] == pytest.approx([15099, 1469.1], rel=5e-4)
+    assert one.passes
+
+
+def dense_log_likelihood(a, w, s, z):
+    """Of readings z (K,) of the damped state, by their covariance."""
+    k = np.arange(1, len(z) + 1)
+    variance = 4.0 * a ** (2 * k) + w**2 * (1 - a ** (2 * k)) / (1 - a**2)
+    C = a ** np.abs(k[:, None] - k) * variance[np.minimum.outer(k, k) - 1] + s**2 * np.eye(len(z))
+    return multivariate_normal(np.zeros(len(z)), C).logpdf(z)
+
+
+def test_constants_and_errors_are_those_of_the_dense_likelihood():
+    z = DAMPED.draw(0, 1, 4).z[0]
+    for one in ib.estimate(DAMPED, z, {"ekf": ekf(), "ckf": ckf()}, find=["a", "w", "deviation.z"]):
+        (a, w, s), errors = ([getattr(c, key) for c in one.constants] for key in ("value", "error"))
+
+        def cost(u, a=a, w=w, s=s):
+            """By the constant and the logarithms of the standard deviations, from where the maximum is said to be."""
+            return -dense_log_likelihood(a + u[0], w * np.exp(u[1]), s * np.exp(u[2]), z[:, 0])
+
+        assert one.log_likelihood == pytest.approx(-cost(np.zeros(3)), abs=1e-6)
+        scale = np.array([errors[0], errors[1] / w, errors[2] / s])
+        E = 0.01 * np.diag(scale)
+        slopes = [(cost(e) - cost(-e)) / 0.02 for e in E]
+        np.testing.assert_allclose(slopes, 0.0, atol=2e-3)  # by so many standard errors off
+        H = [[(cost(e + f) - cost(e - f) - cost(f - e) + cost(-e - f)) / 4e-4 for e in E] for f in E]
+        np.testing.assert_allclose(np.sqrt(np.diag(np.linalg.inv(H))), 1.0, rtol=2e-3)
+        low, high = one.constants[1].low, one.constants[1].high
+        assert low * high == pytest.approx(w**2, rel=1e-9)
+        assert np.log(high / low) == pytest.approx(2 * norm.ppf(0.975) * scale[1], rel=1e-9)
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_constants_as_often_as_they_say():
+    model = replace(DAMPED, readings={"z": "x + b"}, constants={"a": 0.5, "b": 1.0}, deviation={"z": 0.5}, count=40)
+    z, held = model.draw(0, 300, 1).z, np.zeros((300, 2), dtype=bool)
+    for trial in range(300):
+        (one,) = ib.estimate(model, z[trial], {"kf": ekf()}, find=["b", "w"])
+        held[trial] = [c.low < 1.0 < c.high for c in one.constants]
+    assert (np.abs(held.mean(axis=0) - 0.95) < 3 * np.sqrt(0.95 * 0.05 / 300)).all(), held.mean(axis=0)
+
+
+def test_a_log_without_noise_determines_no_noise():
+    x = 0.8 ** np.arange(1, 61)
+    (one,) = ib.estimate(DAMPED, x[:, None], {"kf": ekf()}, find="w")
+    assert not one.passes
+    assert one.constants == ()
+    assert one.message.startswith("the likelihood has no maximum in w")
+
+
+@pytest.mark.parametrize(
+    ("trackers", "find", "complaint"),
+    [
+        ({"kf": ekf()}, "b", "find=b: there is no such constant"),
+        ({"kf": ekf()}, "noise.z", r"find=noise\.z: there is no such constant"),
+        ({"rts": Smoother(ekf())}, "a", "find: trackers.rts has no likelihood that can be maximised"),
+        ({"particles": Bootstrap(20)}, "a", "find: trackers.particles has no likelihood that can be maximised"),
+    ],
+)
+def test_what_cannot_be_found_is_refused(trackers, find, complaint):
+    with pytest.raises(ib.UserError, match=complaint):
+        ib.estimate(DAMPED, np.zeros((60, 1)), trackers, find=find)
+
+
+def test_parameters_of_a_measurement_are_not_named():
+    with pytest.raises(ib.UserError, match="find=: is for models of states that move"):
+        ib.estimate(ib.measurements.Polynomial(), np.zeros(8), find="c0")  # pyright: ignore
