@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ipe_bench.basics.errors import UserError, unknown
-from ipe_bench.measurements.ode.trace import special
+from ipe_bench.measurements.ode import trace
 
 
 def choose(condition: Any, a: Any, b: Any) -> Any:
@@ -27,25 +27,13 @@ def choose(condition: Any, a: Any, b: Any) -> Any:
     return (a if condition else b) if isinstance(condition, float) else np.where(condition, a, b)
 
 
-FUNCTIONS: dict[str, Callable[[Any], Any]] = {
-    "sin": np.sin,
-    "cos": np.cos,
-    "tan": np.tan,
-    "arctan": np.arctan,
+FUNCTIONS: dict[str, Callable[[Any], Any]] = trace.FUNCTIONS | {
     "atan": np.arctan,
-    "exp": np.exp,
-    "log": np.log,
     "ln": np.log,
     "log10": lambda a: np.log(a) / math.log(10.0),
-    "sqrt": np.sqrt,
-    "sinh": np.sinh,
-    "cosh": np.cosh,
-    "tanh": np.tanh,
-    "erf": special("erf"),
-    "erfc": special("erfc"),
     "abs": lambda a: choose(np.less(a, 0.0) * 1.0, -a, a),  # NumPy's drops the imaginary part of a complex step
 }
-"""Functions of one argument; log is the natural logarithm."""
+"""Functions of one argument."""
 SEVERAL: dict[str, Callable[[Any, Any], Any]] = {"min": np.minimum, "max": np.maximum}
 """Functions of two arguments or more."""
 _CALLED = (*FUNCTIONS, *SEVERAL)

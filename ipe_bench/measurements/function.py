@@ -82,10 +82,9 @@ class Function(WrittenModel):
             )
         if self.time and self.time not in self.headings:
             raise UserError(f"time={self.time}: {unknown(self.time, self.headings, 'column')}")
-        if self.columns and (absent := [name for name in self.headings if name not in self.columns]):
-            raise UserError(
-                f"columns: {absent[0]} is missing; give columns.{absent[0]}=[...], or start.{absent[0]}=VALUE"
-            )
+        for name in self.headings if self.columns else ():
+            if name not in self.columns:
+                raise UserError(f"columns: {name} is missing; give columns.{name}=[...], or start.{name}=VALUE")
         self.require_columns_and_parameters("size", "units")
 
     @cached_property
@@ -96,21 +95,21 @@ class Function(WrittenModel):
             UserError: there is no such module or function, or the module cannot be imported.
         """
         module, colon, name = self.of.partition(":")
-        if not (module and colon and name.isidentifier()):
-            raise UserError(
-                f"of={self.of}: give MODULE:FUNCTION, such as swing:angle for the function angle of swing.py"
-            )
         module = module.removesuffix(".py")
+        if not (module and colon and name.isidentifier()):
+            example = "such as swing:angle for the function angle of swing.py"
+            raise UserError(f"of={self.of}: give MODULE:FUNCTION, {example}")
         try:
-            _working_folder_first()
+            if os.getcwd() not in sys.path:  # worker processes take over the path
+                sys.path.insert(0, os.getcwd())
             found = sys.modules.get(module) or importlib.import_module(module)
         except Exception as error:
             if isinstance(error, ModuleNotFoundError) and error.name == module.partition(".")[0]:
                 raise UserError(f"of={self.of}: there is no module {module} here; {module}.py would be one") from None
             raise UserError(f"of={self.of}: {module} cannot be imported: {place_of(error)}") from None
-        functions = [key for key, value in vars(found).items() if inspect.isfunction(value) or key == name]
         if not callable(getattr(found, name, None)):
-            raise UserError(f"of={self.of}: {unknown(name, [f for f in functions if f != name], 'function')}")
+            functions = [key for key, value in vars(found).items() if inspect.isfunction(value)]
+            raise UserError(f"of={self.of}: {unknown(name, functions, 'function')}")
         return getattr(found, name)
 
     @property
@@ -139,9 +138,8 @@ class Function(WrittenModel):
             if name in self._keywords or value is argument.empty:
                 continue
             if isinstance(value, bool) or not isinstance(value, int | float):
-                raise UserError(
-                    f"of={self.of}: the default of {name} is no number; write * before it if it is a constant"
-                )
+                remedy = "write * before it if it is a constant"
+                raise UserError(f"of={self.of}: the default of {name} is no number; {remedy}")
             found[name] = float(value)
         return found
 
@@ -156,8 +154,8 @@ class Function(WrittenModel):
         except Exception:  # of names that the function's module does not hold
             hints = {}
         extras = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
-        texts = {name: [text for text in found if isinstance(text, str)] for name, found in extras.items()}
-        return {name: found[0] for name, found in texts.items() if found} | dict(self.units)
+        texts = {name: next((one for one in found if isinstance(one, str)), "") for name, found in extras.items()}
+        return texts | dict(self.units)
 
     @property
     def input_columns_known(self) -> bool:
@@ -198,10 +196,11 @@ class Function(WrittenModel):
             raise UserError(f"measurement.of={self.of}: {place_of(error, file)}") from error
 
     def _checked(self, z: Any, m: int | None) -> Any:
-        shape = np.shape(z)
-        if len(shape) != 1 or m not in (None, shape[0]):
-            wanted = "one number per reading" if m is None else f"one number per reading, ({m},)"
-            raise UserError(f"measurement.of={self.of}: returns an array of shape {shape}; let it return {wanted}")
+        if np.ndim(z) != 1 or m not in (None, len(z)):
+            wanted = "one number per reading" + ("" if m is None else f", ({m},)")
+            raise UserError(
+                f"measurement.of={self.of}: returns an array of shape {np.shape(z)}; let it return {wanted}"
+            )
         return z
 
     def _rows(self, x: Array) -> Array:
@@ -268,12 +267,6 @@ def function(h: Callable[..., Any], start: Mapping[str, float] | None = None, **
     if not name.isidentifier() or getattr(sys.modules.get(module), name, None) is not h:
         raise UserError(f"{name or h!r}: give a function that stands in a module by its own name, not inside another")
     return Function(of=f"{module}:{name}", start=start or {}, **options)
-
-
-def _working_folder_first() -> None:
-    """Lets imports look into the working folder first; worker processes take over the path."""
-    if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
 
 
 def _in_chunks(program: Callable[[Array], Any]) -> Callable[[Array], Array]:

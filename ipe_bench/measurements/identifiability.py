@@ -30,10 +30,12 @@ class Structure:
     """What exact readings of a model could tell."""
 
     unknowns: tuple[str, ...]
-    lost: tuple[str, ...]
-    """Those that no readings tell."""
     groups: tuple[tuple[str, ...], ...]
-    """The lost ones that move together and leave every reading as it is."""
+    """Those that no readings tell, as they move together and leave every reading as it is."""
+
+    @property
+    def lost(self) -> tuple[str, ...]:
+        return tuple(name for name in self.unknowns if any(name in group for group in self.groups))
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -72,7 +74,7 @@ def structure(model: Measurement) -> Structure | None:
         touched = [g for g in groups if g & moved]
         groups = [g for g in groups if not g & moved] + [moved.union(*touched)]
     named = tuple(tuple(unknowns[i] for i in sorted(g)) for g in groups)
-    return Structure(tuple(unknowns), tuple(name for name in unknowns if any(name in g for g in named)), named)
+    return Structure(tuple(unknowns), named)
 
 
 class _Free(dict[Any, int]):

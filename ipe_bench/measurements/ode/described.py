@@ -117,6 +117,7 @@ class Ode(WrittenModel, WrappedModel):
     index = WrappedModel.index
     reading_name = Measurement.reading_name
     own_parameters = property(lambda model: model.own)  # type: ignore[assignment]
+    usual_noise = property(lambda model: model.deviation and UsualNoise(model.deviation))  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -234,10 +235,6 @@ class Ode(WrittenModel, WrappedModel):
         return SubsetModel(engine, tuple(rows.ravel().tolist()))
 
     @property
-    def usual_noise(self) -> UsualNoise | None:  # type: ignore[override]
-        return None if self.deviation is None else UsualNoise(self.deviation)
-
-    @property
     def inputs(self) -> tuple[Input, ...]:
         stated = {name: values for name, values in self.constants.items() if not isinstance(values, tuple | list)}
         constants = (Input(name, default=stated.get(name)) for name in self.constant_names)
@@ -281,7 +278,12 @@ class Ode(WrittenModel, WrappedModel):
         found, engine = [], self.engine
         rates, outputs = self.rate_formulas.values(), self.output_formulas.values()
         if self.method == "auto" and engine.stiff:
-            found.append(engine.said_stiff)
+            work = engine.shape[1]
+            found.append(
+                f"the equations are stiff: an explicit method would need {work.explicit:.1e} steps for stability where "
+                f"the solution needs {work.steps}; they are integrated by the implicit method "
+                "(measurement.method=explicit or implicit fixes it)"
+            )
         kinked = any(part[0] in PIECEWISE for one in self.piecewise_rates[0].values() for part in parts(one.tree))
         if kinked and (off := engine.off(x)) > _KINKED:
             found.append(
@@ -402,7 +404,7 @@ class _Engine(OdeMeasurement):
         return np.stack(tables, axis=1)
 
     @cached_property
-    def _shape(self) -> tuple[Array, Work]:
+    def shape(self) -> tuple[Array, Work]:
         """The nominal readings (1, m) by the implicit method, near enough to show their size, and what they took."""
         return Rodas5P(self, SHAPE).measured(own(self.nominal[None]))
 
@@ -417,17 +419,8 @@ class _Engine(OdeMeasurement):
             return self.described.method == "implicit"
         if self.step is not None or self._ladder[self._nominal_place] <= _EASY:
             return False
-        z, work = self._shape
+        z, work = self.shape
         return bool(np.isfinite(z).all() and work.explicit > _STIFF * work.steps)
-
-    @property
-    def said_stiff(self) -> str:
-        _, work = self._shape
-        return (
-            f"the equations are stiff: an explicit method would need {work.explicit:.1e} steps for stability where "
-            f"the solution needs {work.steps}; they are integrated by the implicit method "
-            "(measurement.method=explicit or implicit fixes it)"
-        )
 
     def off(self, x: Array) -> float:
         """By how many tolerances the explicit method differs from the implicit one in a reading at x (n,); 0 where few
@@ -451,7 +444,7 @@ class _Engine(OdeMeasurement):
 
     @cached_property
     def _implicit(self) -> Rodas5P:
-        largest = float(np.nanmax(np.abs(self._shape[0]), initial=0.0)) or 1.0
+        largest = float(np.nanmax(np.abs(self.shape[0]), initial=0.0)) or 1.0
         return Rodas5P(self, float(np.clip(_IN_HAND * np.min(self._tolerances) / largest, 1e-10, 1e-4)))
 
     def _shown(self, x: Array, stop: int, offset: Array, *, coarse: bool = False) -> Array:
@@ -465,10 +458,8 @@ class _Engine(OdeMeasurement):
         return float(1 + self.n) if self.stiff else super().jacobian_cost
 
     def hindrance(self, x: Array) -> str:
-        x = own(x[None, : self.n])
-        if self.stiff and np.isfinite(self._implicit.simulate(x, len(self.times))).all():
-            return ""
-        return super().hindrance(x[0])
+        followed = self.stiff and np.isfinite(self.simulate(own(x[None, : self.n]))).all()
+        return "" if followed else super().hindrance(x)
 
     @cached_property
     def tolerance(self) -> float:  # type: ignore[override]
@@ -480,7 +471,7 @@ class _Engine(OdeMeasurement):
         trials = [replace(self.described, step=h, method="explicit").simulate(nominal) for h in (step, step / 2)]
         first, largest = (float(np.abs(z).max()) for z in trials)
         if not 0.9 * largest <= first <= 1.1 * largest:  # explicit steps are unstable
-            largest = float(np.abs(self._shape[0]).max())
+            largest = float(np.abs(self.shape[0]).max())
         return _SHARE * largest if 0 < largest < np.inf else _SHARE
 
     @cached_property

@@ -65,14 +65,14 @@ class _Writer:
         self.weigh = self._function("weigh", [PTR, F64], self._weigh)
         self.step = self._function("step", [PTR, F64, F64], self._step)
         self.read = self._function("read", [PTR, F64], self._read)
-        if plan.sensitive:
-            kinds, move, n = [PTR, PTR, PTR], plan.moving, len(plan.moving.lie)
-            paired = n - n % 2 if len(move.lie[0]) < _FILLED else 0
+        if plan.tangents:
+            kinds, n = [PTR, PTR, PTR], len(plan.tangents)
+            paired = n - n % 2 if len(plan.tangents[0]) < _FILLED else 0
             self.groups = [group for group in ((0, paired, 2), (paired, n, 1)) if group[0] < group[1]]
             self.move = {by: self._function(f"move{by}", kinds, partial(self._move, by)) for *_, by in self.groups}
             self.show = self._function("show", kinds, self._show)
-            self.sources = self._constant("sources", I64, [i for row in move.sources for i in row] or [0], 8)
-            shown = [i for row in move.show_sources for i in row] or [0]
+            self.sources = self._constant("sources", I64, [i for row in plan.motion.sources for i in row] or [0], 8)
+            shown = [i for row in plan.reading.sources for i in row] or [0]
             self.show_sources = self._constant("show_sources", I64, shown, 8)
         kinds = [PTR, PTR, PTR, I64, PTR, I64, I64, PTR, PTR, I64, PTR, I64, PTR, PTR]
         self._integrate(ir.Function(self.module, ir.FunctionType(VOID, kinds), "integrate"))
@@ -115,45 +115,46 @@ class _Writer:
         slopes: list[list[Value]] = []
         for s, row in enumerate(plan.tableau.weights[:-1]):
             at = v.combine(y, weights[s], [slopes[j] for j, _ in row])
-            time = [v.call("fma", v.spread(h), v.constant(plan.tableau.C[s]), v.spread(t))] if plan.step_timed else []
-            result = v.run(plan.step, [*time, *at, *fixed])
+            time = v.call("fma", v.spread(h), v.constant(plan.tableau.C[s]), v.spread(t))
+            result = v.run(plan.step, [time, *at, *fixed])
             slopes.append(result[: len(plan.y)])
             v.store(result[len(plan.y) :], frame, plan.kept[s])
         v.store(v.combine(y, weights[-1], [slopes[j] for j, _ in plan.tableau.weights[-1]]), frame, plan.y)
 
     def _read(self, v: _Vectors, frame: Value, t: Value) -> None:
-        plan, time = self.plan, [v.spread(t)] if self.plan.read_timed else []
-        v.store(v.run(plan.read, [*time, *v.load(frame, [*plan.y, *plan.driven, *plan.fixed])]), frame, plan.noted)
+        plan = self.plan
+        given = [v.spread(t), *v.load(frame, [*plan.y, *plan.driven, *plan.fixed])]
+        v.store(v.run(plan.read, given), frame, plan.noted)
 
     def _move(self, together: int, v: _Vectors, frame: Value, first: Value, driving: Value) -> None:
         """One step of some tangents; `driving` points to the places of their sources."""
-        plan, move, weights = self.plan, self.plan.moving, self._weights(v, frame)
-        one, d, count = range(together), len(move.lie[0]), len(move.sources[0])
+        plan, move, weights = self.plan, self.plan.motion, self._weights(v, frame)
+        one, d, count = range(together), len(plan.tangents[0]), len(move.sources[0])
         own = [range(k * d, (k + 1) * d) for k in one]
         y, fixed = [v.load(first, place) for place in own], v.load(frame, plan.fixed)
         places = [[number_at(v.builder, driving, integer(k * count + i), I64) for i in range(count)] for k in one]
         slopes: list[list[list[Value]]] = [[] for _ in one]
         for s, row in enumerate(plan.tableau.weights[:-1]):
             at = [v.combine(y[k], weights[s], [slopes[k][j] for j, _ in row]) for k in one]
-            stage = v.place(frame, s * move.stage_size)
+            stage = v.place(frame, s * plan.stage_size)
             saved = v.load(stage, move.saved)
             for k in one:
-                slopes[k].append(v.run(move.slope, [*at[k], *v.load(stage, places[k]), *saved, *fixed]))
+                slopes[k].append(v.run(move.program, [*at[k], *v.load(stage, places[k]), *saved, *fixed]))
         for k in one:
             ended = v.combine(y[k], weights[-1], [slopes[k][j] for j, _ in plan.tableau.weights[-1]])
             v.store(ended, first, own[k])
 
     def _show(self, v: _Vectors, frame: Value, first: Value, driving: Value) -> None:
-        move = self.plan.moving
-        places = [number_at(v.builder, driving, integer(i), I64) for i in range(len(move.show_sources[0]))]
-        given = [*v.load(first, range(len(move.lie[0]))), *v.load(frame, places), *v.load(frame, move.show_saved)]
-        v.store(v.run(move.show, [*given, *v.load(frame, self.plan.fixed)]), frame, self.plan.shown)
+        plan, show = self.plan, self.plan.reading
+        places = [number_at(v.builder, driving, integer(i), I64) for i in range(len(show.sources[0]))]
+        given = [*v.load(first, range(len(plan.tangents[0]))), *v.load(frame, [*places, *show.saved, *plan.fixed])]
+        v.store(v.run(show.program, given), frame, plan.shown)
 
     def _integrate(self, made: Any) -> None:
         x, si, cases, n_cases, rows, first, last, times, steps, n_times, offset, stride, out, frame = made.args
         b, plan, width = ir.IRBuilder(made.append_basic_block()), self.plan, self.width
         n, nc, no = len(plan.x), len(plan.constants), len(plan.shown)
-        columns = n if plan.sensitive else 1
+        columns = n if plan.tangents else 1
         target, shift, own = (room(b, I64, width) for _ in range(3))
         t, taken = room(b, F64), room(b, F64)
 
@@ -163,8 +164,8 @@ class _Writer:
 
         def tangent(j: Value, table: Value, sources: Sequence[Sequence[int]]) -> tuple[Value, Value]:
             """Where tangent j lies, and where the places of its sources are listed."""
-            first, size = plan.moving.lie[0].start, len(plan.moving.lie[0])
-            place = _Vectors(b, width).place(frame, b.add(integer(first), b.mul(j, integer(size))))
+            lies = b.add(integer(plan.tangents[0].start), b.mul(j, integer(len(plan.tangents[0]))))
+            place = _Vectors(b, width).place(frame, lies)
             return place, b.gep(table, [b.mul(j, integer(len(sources[0])))], source_etype=I64)
 
         with loop(b, first, last, width) as group:
@@ -195,9 +196,9 @@ class _Writer:
                 b.store(h, taken)
                 with loop(b, integer(0), count) as s:
                     b.call(self.step, [frame, b.fadd(since, b.fmul(b.sitofp(s, F64), h)), h])
-                    for begin, end, by in self.groups if plan.sensitive else ():
+                    for begin, end, by in self.groups if plan.tangents else ():
                         with loop(b, integer(begin), integer(end), by) as j:
-                            b.call(self.move[by], [frame, *tangent(j, self.sources, plan.moving.sources)])
+                            b.call(self.move[by], [frame, *tangent(j, self.sources, plan.motion.sources)])
                 b.store(to, t)
                 if plan.driven:
                     later = b.mul(b.add(k, integer(1)), b.mul(n_cases, integer(nc)))
@@ -208,13 +209,13 @@ class _Writer:
                 b.call(self.read, [frame, to])
                 done = b.mul(k, integer(no))
                 with loop(b, integer(0), integer(columns)) as j:
-                    if plan.sensitive:
-                        b.call(self.show, [frame, *tangent(j, self.show_sources, plan.moving.show_sources)])
+                    if plan.tangents:
+                        b.call(self.show, [frame, *tangent(j, self.show_sources, plan.reading.sources)])
                     with loop(b, integer(0), integer(width)) as lane:
                         begin, less = number_at(b, target, lane, I64), b.add(number_at(b, shift, lane, I64), done)
                         for i, place in enumerate(plan.shown):
                             value = number_at(b, frame, at(place, lane))
-                            if plan.sensitive:
+                            if plan.tangents:
                                 value = b.fmul(value, number_at(b, si, j))
                             else:
                                 value = b.fsub(value, number_at(b, offset, b.add(less, integer(i))))

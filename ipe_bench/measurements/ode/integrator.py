@@ -177,20 +177,15 @@ class Kernel:
                         out[trial, case, k, i, 0] = value - more[0].reshape(count, -1, out.shape[3])[case, k, i]
 
 
-@dataclass(frozen=True)
-class Rates:
-    """One number of each trial's parameters, as a recorded program computes it."""
+def rates(program: Program) -> Callable[[Array, Array, Array], None]:
+    """A function that fills its third argument (trials,) with the number that a recorded program computes of the
+    parameters x (trials, n), times their sizes (n,)."""
+    if compiled.available():
+        function = _compiled("rates", program, 1, (POINTER, POINTER, POINTER, INTEGER))
+        return lambda x, si, out: function(at(x), at(si), at(out), len(x))
 
-    program: Program
+    def by_numpy(x: Array, si: Array, out: Array) -> None:
+        with np.errstate(all="ignore"):
+            out[:] = program(list((x * si).T))[0]
 
-    @functools.cached_property
-    def _machine_code(self) -> Callable[..., None]:
-        return _compiled("rates", self.program, 1, (POINTER, POINTER, POINTER, INTEGER))
-
-    def __call__(self, x: Array, si: Array, out: Array) -> None:
-        """Of the parameters x (trials, n) times si."""
-        if compiled.available():
-            self._machine_code(at(x), at(si), at(out), len(x))
-        else:
-            with np.errstate(all="ignore"):
-                out[:] = self.program(list((x * si).T))[0]
+    return by_numpy

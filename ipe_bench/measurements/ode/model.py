@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, own
 from ipe_bench.measurements.base import Measurement
-from ipe_bench.measurements.ode.integrator import Kernel, Rates
+from ipe_bench.measurements.ode.integrator import Kernel, rates
 from ipe_bench.measurements.ode.plan import Equations, Variation, jumps
 from ipe_bench.measurements.ode.rodas import diagnose
 from ipe_bench.measurements.ode.steps import (
@@ -124,19 +124,16 @@ class OdeMeasurement(Measurement):
     """A method fastest_rate(p), recorded like `rhs`: how fast the solution may turn, grow or decay, per unit of time.
     It says with which step the search begins; where there is none, it begins with that of the nominal parameters."""
 
-    @property
-    def by_differential_equations(self) -> bool:
-        return True
+    by_differential_equations = True  # type: ignore[assignment]
 
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
-        cases, times, outputs = np.meshgrid(
-            np.arange(1, len(self.cases) + 1), self.times, np.arange(len(self.outputs)), indexing="ij"
-        )
+        shape = len(self.cases), len(self.times), len(self.outputs)
+        case, time, output = (places.ravel() for places in np.indices(shape))
         return {
-            "case": cases.ravel().tolist(),
-            time_heading(self.time_unit): times.ravel().tolist(),
-            "output": [self.outputs[i] for i in outputs.ravel()],
+            "case": (case + 1).tolist(),
+            time_heading(self.time_unit): self.times[time].tolist(),
+            "output": [self.outputs[i] for i in output],
         }
 
     @cached_property
@@ -266,11 +263,11 @@ class OdeMeasurement(Measurement):
         return rates, float(rates.max(initial=0.0))
 
     @cached_property
-    def _rate_function(self) -> Rates | None:
+    def _rate_function(self) -> Callable[[Array, Array, Array], None] | None:
         if self.fastest_rate is None:
             return None
         p = Graph().inputs("p", self.n)
-        return Rates(Program.of([self.fastest_rate(p)], p))
+        return rates(Program.of([self.fastest_rate(p)], p))
 
     @cached_property
     def _longest(self) -> float:

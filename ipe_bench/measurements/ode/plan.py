@@ -107,10 +107,9 @@ class Recording:
         """What is computed once for each lane: it depends on the parameters and the case alone."""
         return border(outputs, dependent(outputs, (self.t, *self.y, *self.u)))
 
-    def along_the_way(self, outputs: Sequence[Expression], fixed: Sequence[Expression]) -> tuple[Program, bool]:
-        """The program that computes the outputs from the state, and whether it needs the time."""
-        timed = self.t in in_order(outputs, fixed)
-        return Program.of(outputs, [*([self.t] if timed else []), *self.y, *self.u, *fixed]), timed
+    def along_the_way(self, outputs: Sequence[Expression], fixed: Sequence[Expression]) -> Program:
+        """From the time, the state, what is driven and what is fixed."""
+        return Program.of(outputs, [self.t, *self.y, *self.u, *fixed])
 
 
 class _Linear:
@@ -132,13 +131,11 @@ class _Linear:
         self.constant = _distinct(e for e in values if e not in varying)
         self.inputs, self.outputs = [*d, *names, *self.saved], outputs
 
-    def program(self, fixed: Sequence[Expression]) -> Program:
-        return Program.of(self.outputs, [*self.inputs, *fixed])
-
-    def places(self, begin: int) -> tuple[tuple[int, ...], ...]:
-        """Where each direction finds its sources in what is saved from `begin` on."""
-        order = {e: i for i, e in enumerate([*self.saved, *self.driving, *self.constant])}
-        return tuple(tuple(begin + order[e] for e in row) for row in self.sources)
+    def placed(self, at: range, fixed: Sequence[Expression]) -> Tangents:
+        """Where what is saved, driving and constant lies one behind the other from the beginning of `at`."""
+        order = {e: at.start + i for i, e in enumerate([*self.saved, *self.driving, *self.constant])}
+        sources = tuple(tuple(order[e] for e in row) for row in self.sources)
+        return Tangents(Program.of(self.outputs, [*self.inputs, *fixed]), sources, at[: len(self.saved)])
 
 
 def _distinct(expressions: Iterable[Expression]) -> list[Expression]:
@@ -146,18 +143,14 @@ def _distinct(expressions: Iterable[Expression]) -> list[Expression]:
 
 
 @dataclass(frozen=True)
-class Moving:
-    """Tangents: where they lie, and their slope from (tangent, sources, saved, fixed)."""
+class Tangents:
+    """Derivatives of slopes or readings along each direction."""
 
-    lie: tuple[range, ...]
-    slope: Program
+    program: Program
+    """From a tangent of the state, its sources, what is saved of the state, and what is fixed."""
     sources: tuple[tuple[int, ...], ...]
-    """The places (n, sources) of what drives each, in the first stage."""
+    """The places (n, sources) of what drives each direction; of slopes, in the first stage."""
     saved: range
-    stage_size: int
-    show: Program
-    show_sources: tuple[tuple[int, ...], ...]
-    show_saved: range
 
 
 @dataclass(frozen=True)
@@ -176,23 +169,23 @@ class Plan:
     fixed: range
     step: Program
     """From (t, y, driven, fixed): the slope, and what tangents need of a stage."""
-    step_timed: bool
     kept: tuple[range, ...]
     """Where each stage keeps what tangents need."""
+    stage_size: int
     read: Program
-    read_timed: bool
+    """From the same: the readings, or what their tangents need."""
     noted: range
-    """Where the results of `read` lie: the readings, or what their tangents need."""
     shown: range
     size: int
-    sensitive: bool
-    """Whether what is shown are Jacobians, and not readings."""
-    moving: Moving
+    tangents: tuple[range, ...]
+    """Where each lies; none where readings are shown, and not Jacobians."""
+    motion: Tangents
+    reading: Tangents
 
     @property
     def operations(self) -> int:
         """Arithmetic operations of a step of one lane: what it costs, whatever the machine."""
-        moving = sum(self._operations(self.moving.slope, len(lie)) for lie in self.moving.lie)
+        moving = sum(self._operations(self.motion.program, len(tangent)) for tangent in self.tangents)
         return self._operations(self.step, len(self.y)) + moving
 
     def _operations(self, program: Program, numbers: int) -> int:
@@ -249,8 +242,7 @@ def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> Plan:
     saved = [*motion.saved, *motion.driving]
     noted = [*reading.saved, *reading.driving] if sensitive else tape.shown
     fixed = _distinct([*tape.fixed(*tape.slope, *saved, *noted), *motion.fixed, *reading.fixed])
-    step, step_timed = tape.along_the_way([*tape.slope, *saved], fixed)
-    read, read_timed = tape.along_the_way(noted, fixed)
+    step, read = tape.along_the_way([*tape.slope, *saved], fixed), tape.along_the_way(noted, fixed)
     k, r = len(saved), len(noted)
     x, constants, y, fixed_at = map(room, (equations.parameters, equations.constants, equations.states, len(fixed)))
     lie = tuple(room(len(d)) for _ in dp)
@@ -260,12 +252,9 @@ def planned(equations: Equations, tableau: Tableau, *, sensitive: bool) -> Plan:
     begun = [i for place in (y, fixed_at, *lie, *(stage[k:] for stage in stages), noted_at[r:]) for i in place]
     started = [*tape.start, *fixed, *(e for row in tape.along_each(dp, starts) for e in row)]
     started += [*motion.constant * tableau.stages, *reading.constant]
-    moving = Moving(
-        lie, motion.program(fixed), motion.places(stages[0].start), stages[0][: len(motion.saved)], len(stages[0]),
-        reading.program(fixed), reading.places(noted_at.start), noted_at[: len(reading.saved)],
-    )  # fmt: skip
     return Plan(
         tableau, x, constants, Program.of(started, [*tape.p, *tape.c]), tuple(begun), y,
-        constants[len(constants) - equations.driven :], fixed_at, step, step_timed,
-        tuple(stage[:k] for stage in stages), read, read_timed, noted_at[:r], shown_at, size, sensitive, moving,
+        constants[len(constants) - equations.driven :], fixed_at, step, tuple(stage[:k] for stage in stages),
+        len(stages[0]), read, noted_at[:r], shown_at, size, lie, motion.placed(stages[0], fixed),
+        reading.placed(noted_at, fixed),
     )  # fmt: skip

@@ -17,11 +17,19 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-Operand: TypeAlias = "Expression | float"
 
-_FUNCTIONS = ("sin", "cos", "tan", "arctan", "exp", "log", "sqrt", "sinh", "cosh", "tanh", "erf", "erfc")
+def special(name: str) -> Callable[[Any], Any]:
+    """A function of scipy.special, which is imported where one is needed."""
+    return lambda a: getattr(importlib.import_module("scipy.special"), name)(a)
+
+
+FUNCTIONS: dict[str, Callable[[Any], Any]] = {
+    name: getattr(np, name) for name in ("sin", "cos", "tan", "arctan", "exp", "log", "sqrt", "sinh", "cosh", "tanh")
+}
+FUNCTIONS |= {name: special(name) for name in ("erf", "erfc")}
+"""The elementary functions that can be recorded, of numbers, arrays and expressions; log is the natural logarithm."""
 _UFUNCS = {"add": "add", "subtract": "sub", "multiply": "mul", "divide": "div", "true_divide": "div", "power": "pow"}
-_UFUNCS |= {"negative": "neg", "less": "less", "less_equal": "less_equal"} | {name: name for name in _FUNCTIONS}
+_UFUNCS |= {"negative": "neg", "less": "less", "less_equal": "less_equal"} | {name: name for name in FUNCTIONS}
 COMPARISONS = ("less", "less_equal")
 """Operations that are 1 where they hold and 0 elsewhere."""
 
@@ -66,9 +74,7 @@ class Graph:
                 return args[0]
             case ("mul", [0.0, _] | [_, 0.0]) | ("div", [0.0, _]):
                 return self.constant(0.0)
-            case ("sub", [0.0, _]):
-                return self.apply("neg", args[1])
-            case ("mul", [-1.0, _]):
+            case ("sub", [0.0, _]) | ("mul", [-1.0, _]):
                 return self.apply("neg", args[1])
             case ("pow", [_, 2.0]):
                 return self.apply("mul", args[0], args[0])
@@ -91,12 +97,10 @@ class Graph:
         return None
 
 
-def _operator(name: str) -> Any:
+def _operator(name: str, *, reflected: bool = False) -> Any:
+    if reflected:
+        return lambda self, other: self.graph.apply(name, other, self)
     return lambda self, other: self.graph.apply(name, self, other)
-
-
-def _reflected(name: str) -> Any:
-    return lambda self, other: self.graph.apply(name, other, self)
 
 
 class Expression:
@@ -115,11 +119,11 @@ class Expression:
         """The number this is, where it is a constant."""
         return float.fromhex(self.operands[0]) if self.operation == "constant" else None
 
-    __add__, __radd__ = _operator("add"), _reflected("add")
-    __sub__, __rsub__ = _operator("sub"), _reflected("sub")
-    __mul__, __rmul__ = _operator("mul"), _reflected("mul")
-    __truediv__, __rtruediv__ = _operator("div"), _reflected("div")
-    __pow__, __rpow__ = _operator("pow"), _reflected("pow")
+    __add__, __radd__ = _operator("add"), _operator("add", reflected=True)
+    __sub__, __rsub__ = _operator("sub"), _operator("sub", reflected=True)
+    __mul__, __rmul__ = _operator("mul"), _operator("mul", reflected=True)
+    __truediv__, __rtruediv__ = _operator("div"), _operator("div", reflected=True)
+    __pow__, __rpow__ = _operator("pow"), _operator("pow", reflected=True)
 
     def __neg__(self) -> Expression:
         return self.graph.apply("neg", self)
@@ -131,8 +135,8 @@ class Expression:
         remedy = "np.where, np.minimum and np.maximum are recorded"
         raise TypeError(f"a recorded expression has no truth value: write the model without if, min and max; {remedy}")
 
-    __lt__, __gt__ = _operator("less"), _reflected("less")
-    __le__, __ge__ = _operator("less_equal"), _reflected("less_equal")
+    __lt__, __gt__ = _operator("less"), _operator("less", reflected=True)
+    __le__, __ge__ = _operator("less_equal"), _operator("less_equal", reflected=True)
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
         if method != "__call__" or kwargs:
@@ -140,7 +144,7 @@ class Expression:
         if ufunc.__name__ in _COMPOSED:
             return _COMPOSED[ufunc.__name__](self.graph.apply, *inputs)
         if ufunc.__name__ not in _UFUNCS:
-            known = ", ".join((*_FUNCTIONS, *_COMPOSED))
+            known = ", ".join((*FUNCTIONS, *_COMPOSED))
             raise TypeError(f"np.{ufunc.__name__} cannot be recorded; use + - * / **, np.where and {known}")
         return self.graph.apply(_UFUNCS[ufunc.__name__], *inputs)
 
@@ -151,7 +155,7 @@ class Expression:
 
     def __getattr__(self, name: str) -> Any:
         # NumPy calls the method `sin` of each element when np.sin meets an array of objects.
-        if name in _FUNCTIONS:
+        if name in FUNCTIONS:
             return lambda: self.graph.apply(name, self)
         raise AttributeError(name)
 
@@ -173,11 +177,6 @@ def _first_if(apply: Callable[..., Any], condition: Any, a: Any, b: Any) -> Any:
     return apply("where", condition, a, apply("where", apply("less_equal", a, a), b, a))
 
 
-def special(name: str) -> Callable[[Any], Any]:
-    """A function of scipy.special, which is imported where one is needed."""
-    return lambda a: getattr(importlib.import_module("scipy.special"), name)(a)
-
-
 _SIGNS: dict[str, Callable[..., Any]] = {
     "add": operator.add,
     "sub": operator.sub,
@@ -191,7 +190,7 @@ _NUMBERS: dict[str, Callable[..., Any]] = _SIGNS | {
     "less": operator.lt,
     "less_equal": operator.le,
     "where": lambda condition, a, b: a if condition else b,
-    **{name: getattr(math, name) for name in _FUNCTIONS if name != "arctan"},
+    **{name: getattr(math, name) for name in FUNCTIONS if name != "arctan"},
 }
 _ARRAYS: dict[str, Callable[..., Any]] = _SIGNS | {
     "less": lambda a, b: np.less(a, b) * 1.0,
@@ -200,47 +199,34 @@ _ARRAYS: dict[str, Callable[..., Any]] = _SIGNS | {
     "fma": lambda a, b, c: a * b + c,
     "fms": lambda a, b, c: a * b - c,
     "fnma": lambda a, b, c: c - a * b,
-    **{name: getattr(np, name, None) or special(name) for name in _FUNCTIONS},
+    **FUNCTIONS,
 }
 """The operations of a program, on arrays; products are rounded before they are added."""
-_DERIVATIVES: dict[str, Callable[[Any, Any, Any], Any]] = {
-    "tan": lambda e, a, one: one + e * e,
-    "sin": lambda e, a, one: np.cos(a),
-    "cos": lambda e, a, one: -np.sin(a),
-    "arctan": lambda e, a, one: one / (one + a * a),
-    "exp": lambda e, a, one: e,
-    "log": lambda e, a, one: one / a,
-    "sqrt": lambda e, a, one: 0.5 / e,
-    "sinh": lambda e, a, one: np.cosh(a),
-    "cosh": lambda e, a, one: np.sinh(a),
-    "tanh": lambda e, a, one: one - e * e,
-    "erf": lambda e, a, one: 2.0 / math.sqrt(math.pi) * np.exp(-(a * a)),
-    "erfc": lambda e, a, one: -2.0 / math.sqrt(math.pi) * np.exp(-(a * a)),
+_PARTIALS: dict[str, Callable[[Any, Any, Any, Any], list[Any]]] = {
+    "add": lambda e, one, a, b: [one, one],
+    "sub": lambda e, one, a, b: [one, -one],
+    "mul": lambda e, one, a, b: [b, a],
+    "div": lambda e, one, a, b: [one / b, -(e / b)],
+    # d(a^b)/db = a^b log(a), which is 0 where a = 0 and b > 0, and not 0 times infinity.
+    "pow": lambda e, one, a, b: [
+        b * a ** (b - 1.0),
+        e.graph.apply("where", e, e * np.log(a), 0.0) if b.value is None else e.graph.constant(0.0),
+    ],
+    "neg": lambda e, one, a, _: [-one],
+    "tan": lambda e, one, a, _: [one + e * e],
+    "sin": lambda e, one, a, _: [np.cos(a)],
+    "cos": lambda e, one, a, _: [-np.sin(a)],
+    "arctan": lambda e, one, a, _: [one / (one + a * a)],
+    "exp": lambda e, one, a, _: [e],
+    "log": lambda e, one, a, _: [one / a],
+    "sqrt": lambda e, one, a, _: [0.5 / e],
+    "sinh": lambda e, one, a, _: [np.cosh(a)],
+    "cosh": lambda e, one, a, _: [np.sinh(a)],
+    "tanh": lambda e, one, a, _: [one - e * e],
+    "erf": lambda e, one, a, _: [2.0 / math.sqrt(math.pi) * np.exp(-(a * a))],
+    "erfc": lambda e, one, a, _: [-2.0 / math.sqrt(math.pi) * np.exp(-(a * a))],
 }
-"""Of e, a function of a."""
-
-
-def _partials(e: Expression) -> list[Any]:
-    """The derivatives of one operation with respect to its operands."""
-    a: Any = e.operands[0]
-    b: Any = e.operands[-1]
-    one = e.graph.constant(1.0)
-    match e.operation:
-        case "add":
-            return [one, one]
-        case "sub":
-            return [one, -one]
-        case "mul":
-            return [b, a]
-        case "div":
-            return [one / b, -(e / b)]
-        case "pow":
-            # d(a^b)/db = a^b log(a), which is 0 where a = 0 and b > 0, and not 0 times infinity.
-            to_exponent = e.graph.apply("where", e, e * np.log(a), 0.0) if b.value is None else e.graph.constant(0.0)
-            return [b * a ** (b - 1.0), to_exponent]
-        case "neg":
-            return [-one]
-    return [_DERIVATIVES[e.operation](e, a, one)]
+"""The derivatives of an operation e by its operands, the first a and the last b."""
 
 
 def in_order(outputs: Iterable[Expression], stop: Collection[Expression] = ()) -> list[Expression]:
@@ -308,7 +294,7 @@ def tangent(outputs: Sequence[Expression], direction: Mapping[Expression, Expres
             condition, *branches = operands(e)
             along[e.order] = e.graph.apply("where", condition, *(along[a.order] for a in branches))
             continue
-        partials = _partials(e)
+        partials = _PARTIALS[e.operation](e, e.graph.constant(1.0), e.operands[0], e.operands[-1])
         total = zero
         for da, i in moving:
             total = total + partials[i] * da
