@@ -183,8 +183,8 @@ def compare(
     """Whether a second version, setting or estimator is better or worse than a first, trial by trial.
 
     Compares every estimator and scenario that both directories have, or `first` of the first with `second` of the
-    second; without a second directory both are in the first one. Scenarios that differ in one setting are compared
-    where none is in both. Trials are matched by seed and number, else in their order.
+    second; without a second directory both are in the first one. Trials are matched by seed and number, else in their
+    order.
 
     The result has a row per comparison and quantity: success (a difference of shares), error (a ratio of mean
     Mahalanobis errors, each at most the radius of the gate), cost in simulations (a ratio), and time, which is not

@@ -303,11 +303,8 @@ def audit_parts(found: Audit) -> list[Part]:
         "true over reported is the root mean square of errors in reported standard deviations, 1 if the report is"
         " right; bias is their mean. Intervals hold for all parameters together, and for heavy tails."
     ]
-    low, high = found.nees_limits
-    if math.isfinite(low):
-        notes.append(f"NEES over n is {found.nees:.3f}; normal errors would leave it within {low:.3f} to {high:.3f}.")
     if not found.claims.joint:
-        notes.append("No covariances are reported, so directions and the NEES are not judged.")
+        notes.append("No covariances are reported, so directions are not judged.")
     title = f"Audit of {runs} runs" + (f", {left_out} rows without an estimate left out" if left_out else "")
     return [*found.sentences, Table("audit", title, "", columns, notes=notes)]
 

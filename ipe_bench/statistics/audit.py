@@ -20,7 +20,7 @@ from scipy.special import ndtr, ndtri, stdtr, stdtrit
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.comparisons import holm
-from ipe_bench.statistics.intervals import mean_limits, rms_interval
+from ipe_bench.statistics.intervals import rms_interval
 from ipe_bench.trials.observability import in_words
 
 if TYPE_CHECKING:
@@ -134,10 +134,6 @@ class Audit:
     """Of each parameter, all intervals together at 97.5 %."""
     bias: Array
     """Mean error in reported standard deviations with its interval (n, 3), all together at 95 %."""
-    nees: float
-    """Mean NEES over n: 1 if the report is true."""
-    nees_limits: tuple[float, float]
-    """Where it lies in 95 % of cases if errors are normal; NaN without correlations, or with several rows a run."""
     sentences: tuple[str, ...]
 
     @property
@@ -186,13 +182,11 @@ def audit(claims: Claims) -> Audit:
     asked = [(_SCALE, 0.0 if scale.wrong else 1.0, _of_scale(claims, scale, nees)), (_BIAS, p_bias, said)]
     if claims.n > 1 and claims.joint:
         asked.insert(1, (_DIRECTION, *_worst_direction(claims)))
-    single = claims.runs == len(nees)
-    if single:
+    if claims.runs == len(nees):
         asked.append((_TAILS, *_tails(claims)))
     weights, p, sentences = zip(*asked, strict=True)
     faults = [said for said, q in zip(sentences[1:], holm(p, weights)[1:], strict=True) if q <= ALPHA]
-    limits = mean_limits(claims.n, claims.runs) if claims.joint and single else (np.nan, np.nan)
-    return Audit(claims, scale, each, bias, float(nees.mean() / claims.n), limits, (sentences[0], *faults[:2]))
+    return Audit(claims, scale, each, bias, (sentences[0], *faults[:2]))
 
 
 def _of_scale(claims: Claims, scale: Factor, nees: Array) -> str:

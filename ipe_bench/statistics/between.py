@@ -21,15 +21,11 @@ from ipe_bench.trials.thresholds import gate
 
 JUDGED = ("success", "error", "cost")
 """Those that are tested. Time is not: the trials of a block share theirs evenly, and machines differ."""
-_SAYS_NOTHING = {"null": "-", "None": "-", "false": "-"}
 NOT_SETTINGS = (
     *("first", "second", "trials", "matched_by", "quantity", "first_value", "second_value"),
     *("change", "low", "high", "p", "e", "finding", *PLANNED),
 )
 """The columns of a row that do not say what is compared."""
-_Leaves = tuple[tuple[str, str], ...]
-_Setting = Mapping[str, tuple[str, str]]
-"""Keys in which the scenarios of both sides differ, with both values."""
 
 
 def described(row: Mapping[str, Any]) -> str:
@@ -73,7 +69,7 @@ def compared(
     return rows
 
 
-def _rows(a: Sample, b: Sample, setting: _Setting, alpha: float) -> Iterator[dict[str, Any]]:
+def _rows(a: Sample, b: Sample, alpha: float) -> Iterator[dict[str, Any]]:
     """A row per quantity of two estimators on one scenario."""
     if a.n != b.n:
         raise UserError(
@@ -85,7 +81,7 @@ def _rows(a: Sample, b: Sample, setting: _Setting, alpha: float) -> Iterator[dic
     if not len(one):
         # With other seeds trials are matched in their order: right, since all are independent, but nothing is gained.
         one = other = np.arange(min(len(a), len(b)))
-    head = _head(a.group, b.group, setting) | {"first": a.group.estimator, "second": b.group.estimator}
+    head = _head(a.group, b.group) | {"first": a.group.estimator, "second": b.group.estimator}
     head |= {"trials": len(one), "matched_by": matched_by}
     success = a.inside_gate[one], b.inside_gate[other]
     radius = float(np.sqrt(gate(a.n)))
@@ -102,20 +98,16 @@ def _rows(a: Sample, b: Sample, setting: _Setting, alpha: float) -> Iterator[dic
         yield head | {"quantity": quantity} | asdict(effect) | {"finding": ""} | discordant
 
 
-def _head(first: Group, second: Group, setting: _Setting) -> dict[str, Any]:
-    """What tells a comparison from the others: what both have, then what differs, with both values."""
-    columns = {k: v for k, v in first.columns.items() if k not in setting}
-    both = (first, second)
-    # A component is called by its name, not by its class.
-    differ = {k: [g.columns.get(k, v) for g, v in zip(both, values, strict=True)] for k, values in setting.items()}
+def _head(first: Group, second: Group) -> dict[str, Any]:
+    """What tells a comparison from the others: the scenario, and what differs in the options of one label, with both
+    values."""
+    columns = dict(first.columns)
     if first.label == second.label:
-        configs = [{"estimator": group.footer["identity"]["estimator"]} for group in both]
+        configs = [{"estimator": group.footer["identity"]["estimator"]} for group in (first, second)]
         leaves = [config_leaves(config) for config in configs]
-        differ |= {k: [shown_leaf(own[k][1]) if k in own else "-" for own in leaves] for k in differing(configs)}
-    for key, values in differ.items():
-        shown = [_SAYS_NOTHING.get(_plain(v), _plain(v)) for v in values]
-        if shown != ["-", "-"]:
-            columns[key] = " | ".join(shown)
+        for key in differing(configs):
+            shown = [_plain(shown_leaf(own[key][1])) if key in own else "-" for own in leaves]
+            columns[key] = " | ".join("-" if value == "None" else value for value in shown)
     return columns
 
 
@@ -124,12 +116,8 @@ def _head(first: Group, second: Group, setting: _Setting) -> dict[str, Any]:
 
 def _matches(
     first: Collection, second: Collection, labels: tuple[str | None, str | None]
-) -> Iterator[tuple[Sample, Sample, _Setting]]:
-    """The samples that are compared, of the same scenario but for its seed, under the labels or those that both have,
-    with the settings in which their scenarios differ.
-
-    If no scenario is in both, those are the same that differ only in what is one value throughout the first and another
-    throughout the second, such as a scale of the noise.
+) -> Iterator[tuple[Sample, Sample]]:
+    """The samples that are compared, of the same scenario but for its seed, under the labels or those that both have.
 
     Raises:
         UserError: there is none.
@@ -140,15 +128,10 @@ def _matches(
                 f"{_where(collection)}: holds no trials to compare; `ipe-bench status` says what is missing"
             )
     a, b = _by_scenario(first), _by_scenario(second)
-    setting: _Setting = {} if a.keys() & b.keys() else _differing_setting(a, b)
-    a, b = (
-        {tuple(leaf for leaf in leaves if leaf[0] not in setting): groups for leaves, groups in scenarios.items()}
-        for scenarios in (a, b)
-    )
     if not a.keys() & b.keys():
         raise UserError(
-            f"{_where(first)}, {_where(second)}: have no scenario in common, nor differ in one setting; compare runs of"
-            " the same measurement, noise and error scales"
+            f"{_where(first)}, {_where(second)}: have no scenario in common; compare runs of the same measurement,"
+            " noise and error scales, or show both side by side with `ipe-bench report A B output=DIR`"
         )
     wanted = labels[0] or labels[1], labels[1] or labels[0]
 
@@ -164,7 +147,7 @@ def _matches(
         mine, theirs = (next(samples(c, [g]), None) for c, g in ((first, one), (second, other)))
         if mine is None or theirs is None:
             raise UserError(f"{one.estimator}: has no trials to compare; run more of them")
-        yield mine, theirs, setting
+        yield mine, theirs
 
 
 def left_out(first: Collection, second: Collection) -> list[str]:
@@ -174,22 +157,10 @@ def left_out(first: Collection, second: Collection) -> list[str]:
     return [f"{_where(c)}: {count} scenarios that the other lacks are left out" for c, count in alone if count]
 
 
-def _by_scenario(collection: Collection) -> dict[_Leaves, list[Group]]:
-    found: dict[_Leaves, list[Group]] = {}
+def _by_scenario(collection: Collection) -> dict[str, list[Group]]:
+    found: dict[str, list[Group]] = {}
     for group in collection.groups:
-        leaves = config_leaves(scenario_of(group.cells[0])).items()
-        scenario = tuple(sorted((k, canonical_json(v)) for k, (_, v) in leaves))
-        found.setdefault(scenario, []).append(group)
-    return found
-
-
-def _differing_setting(a: Mapping[_Leaves, Any], b: Mapping[_Leaves, Any]) -> _Setting:
-    """The keys that have one value throughout the first and another throughout the second."""
-    found = {}
-    for key in dict.fromkeys(k for leaves in (*a, *b) for k, _ in leaves):
-        here, there = ({dict(leaves).get(key, "-") for leaves in scenarios} for scenarios in (a, b))
-        if len(here) == len(there) == 1 and here != there:
-            found[key] = (here.pop().strip('"'), there.pop().strip('"'))
+        found.setdefault(canonical_json(scenario_of(group.cells[0])), []).append(group)
     return found
 
 

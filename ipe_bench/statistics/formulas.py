@@ -217,18 +217,11 @@ def misfit(s: Sample) -> float:
     return share(~(s.scalars[FIT] >= FIT_LEVEL)) if known else np.nan
 
 
-def _looked(s: Sample) -> Array:
-    """Whether the estimator has looked for several minima (trials,)."""
-    return np.isfinite(s.scalars[AMBIGUOUS]) if AMBIGUOUS in s.scalars else np.zeros(len(s), dtype=bool)
-
-
 def ambiguous(s: Sample) -> float:
-    return share(s.scalars[AMBIGUOUS][looked] > 0) if (looked := _looked(s)).any() else np.nan
-
-
-def failures_flagged(s: Sample) -> float:
-    wrong = ~s.scalars["success"]
-    return share(s.scalars[AMBIGUOUS][wrong] > 0) if _looked(s).any() and wrong.any() else np.nan
+    """Share among the trials in which the estimator has looked for several minima."""
+    flags = s.scalars.get(AMBIGUOUS, np.empty(0))
+    flags = flags[np.isfinite(flags)]
+    return share(flags > 0) if len(flags) else np.nan
 
 
 def false_root_distance(s: Sample) -> float:

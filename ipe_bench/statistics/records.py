@@ -578,16 +578,6 @@ STATISTICS: tuple[Statistic, ...] = (
         rare=True,
     ),
     Statistic(
-        "failures_flagged",
-        "failures flagged",
-        "trials without success of estimators that look for several minima",
-        "Share that is flagged as ambiguous.",
-        f.failures_flagged,
-        kind="share",
-        where=("all_trials",),
-        rare=True,
-    ),
-    Statistic(
         "iterations_median",
         "iterations",
         "all trials",
