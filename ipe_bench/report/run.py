@@ -90,7 +90,11 @@ class Pending:
         added = [table for section in sections for table in section.tables]
         write_text(output / "summary.csv", analysis.summary.to_csv(index=False))
         files = [path for table in (*tables, *added) for path in write_table(table, output / "tables")]
-        drawn = draw_all(without_certified(analysis), output / "figures", which=self.figures, formats=self.formats)
+        simulated = without_certified(analysis)
+        if len(simulated.profiles):
+            files.append(output / "tables" / "profiles.csv")
+            write_text(files[-1], simulated.profiles.to_csv(index=False))
+        drawn = draw_all(simulated, output / "figures", which=self.figures, formats=self.formats)
         write_text(output / "report.html", render_page(analysis, tables, drawn, sections))
         result = ReportResult(
             summary=analysis.summary,

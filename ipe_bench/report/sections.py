@@ -46,7 +46,7 @@ def report_tables(analysis: Analysis) -> list[Table]:
 
 def written(group: str, analysis: Analysis, tables: Iterable[Table]) -> list[Written]:
     """What the tables or the sections of plugins come to, none of them under the name of one of these tables."""
-    names = {table.name for table in tables}
+    names = {"profiles", *(table.name for table in tables)}
 
     def make(record: Any) -> tuple[str, list[Part]]:
         if group == "section":

@@ -299,4 +299,6 @@ def without_certified(analysis: Analysis) -> Analysis:
         return analysis
     held: dict[str, Any] = {f.name: getattr(analysis, f.name) for f in fields(analysis)}
     held = {k: v[v["noise"] != "certified"] for k, v in held.items() if isinstance(v, pd.DataFrame) and "noise" in v}
+    if not groups:
+        held["profiles"] = analysis.profiles.iloc[:0]
     return replace(analysis, **held | {"collection": replace(analysis.collection, groups=groups)})

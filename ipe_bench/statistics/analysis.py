@@ -14,7 +14,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.statistics.calibration import POINTS, band
 from ipe_bench.statistics.certified import attained_table
 from ipe_bench.statistics.collect import Collection, Group, collect
-from ipe_bench.statistics.comparisons import Outcomes, compare_pairs, corrected, may_be_best
+from ipe_bench.statistics.comparisons import Outcomes, compare_pairs, corrected, may_be_best, profiles
 from ipe_bench.statistics.intervals import quantile
 from ipe_bench.statistics.records import BEST, SCORES, rows_of, summary_rows, to_frame
 from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of, samples
@@ -40,6 +40,8 @@ class Analysis:
     """Every pair of estimators on every scenario; see `comparisons.compare_pairs`."""
     scores: pd.DataFrame
     """Per scenario and estimator: capped mean error, and median costs."""
+    profiles: pd.DataFrame
+    """Estimator, profile (performance or data), `at` (cost ratio or budget) and share, over all scenarios."""
     calibration: pd.DataFrame
     """Of NEES: the probability `at`, the `difference` of the empirical distribution function from the uniform one
     there, and the ends `low` and `high` of the band; NEES and all parameters of an honest estimator keep within theirs
@@ -104,7 +106,8 @@ class Begun:
             label, present = {"estimator": sample.group.estimator}, sample.present
             numbered = where | label
             summary += summary_rows(sample)
-            outcomes[sample.group.estimator] = Outcomes(sample.distance[present], sample.inside_gate[present])
+            numbers = sample.distance[present], sample.inside_gate[present], sample.cost[present]
+            outcomes[sample.group.estimator] = Outcomes(*numbers)
             found["endings"] += [dict(sample.group.columns) | label | row for row in _ending_rows(sample)]
             found["scores"].append(numbered | rows_of(SCORES, sample)[-1])
             for whole in sample.calibrations[-1:]:
@@ -131,6 +134,7 @@ class Begun:
             endings=pd.DataFrame(rows["endings"]),
             pairs=pd.DataFrame(corrected(pairs)),
             scores=pd.DataFrame(rows["scores"]),
+            profiles=profiles([outcomes for _, outcomes in self._compared]),
             calibration=_joined(rows["calibration"]),
             contraction=pd.DataFrame(rows["contraction"]),
             tracks=_joined(rows["tracks"]),
