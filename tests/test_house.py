@@ -37,9 +37,9 @@ BUDGETS = {
     "runs": 2122,
     "statistics": 3819,
     "real": 2310,
-    "plugins": 1123,
+    "plugins": 1120,
     "report": 4030,
-    "cli": 2493,
+    "cli": 2486,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""
 PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}

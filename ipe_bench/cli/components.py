@@ -168,7 +168,6 @@ def check_command(words: Sequence[str]) -> int:
 
 
 def _check_chosen(words: Sequence[str]) -> list[Finding]:
-    """The findings on what these keys choose."""
     asked = single("check", words)
     parts = {key: getattr(asked.spec, key) for key in PARTS if key in asked.words.keys}
     if not set(plugins.PACKAGES).isdisjoint(asked.words.keys):
@@ -240,7 +239,6 @@ def _require_absent(path: Path) -> None:
 
 
 def _fill(path: Path, source: str, words: Mapping[str, str]) -> None:
-    """Writes a file from its template."""
     path.parent.mkdir(parents=True, exist_ok=True)
     template = files("ipe_bench.plugins") / "templates" / f"{source}.template"
     path.write_text(Template(template.read_text(encoding="utf-8")).substitute(words), encoding="utf-8")
@@ -294,7 +292,6 @@ def _page(kind: str) -> str:
 
 
 def _said(command: str) -> str:
-    """What a command prints."""
     with contextlib.redirect_stdout(io.StringIO()) as out:
         code = main(shlex.split(command))
     assert code == 0, f"{command}: {out.getvalue()}"

@@ -126,7 +126,6 @@ def _left_out(jobs: Sequence[Spec]) -> list[str]:
 
 
 def _flags(arguments: Sequence[str]) -> Namespace:
-    """The flags, and the other words as `overrides`."""
     flags = parsers()[1]["run"].parse(arguments)
     asked = [f"--{name}" for name in ("multirun", "cfg", "info", "shell_completion") if vars(flags)[name]]
     if len(asked) > 1:

@@ -199,7 +199,6 @@ def spec(plain: Mapping[Any, Any]) -> Spec:
 
 
 def _labelled(key: str, label: str, options: Any, known: Sequence[plugins.Option]) -> Any:
-    """The estimator or tracker of a label."""
     where = f"{key}.{label}"
     if not isinstance(options, Mapping):
         raise UserError(f"{where}={options}: set its options, such as {where}.KEY=VALUE")

@@ -188,7 +188,6 @@ def _from_file(group: str, name: str, word: str) -> list[str]:
 
 
 def _literal(value: Any, where: str) -> str:
-    """A value in the grammar of overrides."""
     if isinstance(value, dict):
         return "{" + ",".join(f"{k}:{_literal(v, where)}" for k, v in value.items()) + "}"
     if isinstance(value, list):
@@ -350,7 +349,6 @@ def jobs(overrides: Sequence[Override]) -> Iterator[list[Override]]:
 
 
 def _swept(override: Override) -> list[Override]:
-    """A word for each value of a sweep."""
     try:
         values = list(itertools.islice(override.sweep_string_iterator(), MOST_JOBS + 1))
     except (HydraException, ValueError, ArithmeticError, TypeError):

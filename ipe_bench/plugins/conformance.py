@@ -121,7 +121,6 @@ def describes_itself(component: Any) -> None:
 
 
 def _shaped(what: str, value: Any, wanted: tuple[int, ...], meaning: str = "") -> None:
-    """Whether an array has the shape that it should have."""
     expected = f"{meaning}, which is {wanted} here" if meaning else f"{wanted}"
     assert np.shape(value) == wanted, f"{what} has shape {np.shape(value)}, and not {expected}"
 
@@ -310,7 +309,6 @@ def differentiates(model: Measurement) -> None:
 
 
 def _largest(values: Array) -> tuple[int, ...]:
-    """The place of the largest entry."""
     return tuple(int(k) for k in np.unravel_index(int(values.argmax()), values.shape))
 
 

@@ -136,7 +136,6 @@ def described(option: discovery.Option) -> list[Described]:
 
 
 def _written(value: Any) -> str:
-    """A value as one writes it on the command line."""
     if value is None or isinstance(value, bool):
         return json.dumps(value)
     if isinstance(value, float):

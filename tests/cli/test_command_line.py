@@ -117,6 +117,50 @@ MISTAKES = {
 }
 
 
+IN_A_SWEEP = [
+    (["noise.deviation=0.1,abc"], "noise.deviation=abc: give a number above 0 or a list"),
+    (["noise.deviation=0.1,0"], "noise.deviation=0: give a number above 0 or a list"),
+    (["seed=1,first"], "seed=first: give a whole number from 0 up"),
+    (["error_scale=1,-1"], "error_scale=-1.0: give a number above 0"),
+    (["measurement.strength=0.1,[1]"], "measurement.strength=[1]: give a finite number"),
+    (["measurement=ranging,polynomial", "measurement.rounds=5"], "measurement.rounds: there is no such option"),
+    (["estimators.fixed_point.start=nominal,here"], "estimators.fixed_point.start=here: choose one of"),
+    (["+baseline@estimators.a=ekf,ukf", "estimators.a.engine=x,y"], "estimators.a.engine=x: choose one of"),
+    (["execution.threads=1,2"], "execution.threads: there is no such option"),
+    (["+prior.width=1,2"], "prior.width: there is no such option"),
+]
+"""No job begins where one would be refused."""
+OF_STATES = [
+    (["model=pendulum", "baseline=[ekf]"], "baseline: is of a measurement, and model= chooses states that move"),
+    (["model=pendulum", "error_scale=3"], "error_scale: is of a measurement, and model= chooses states that move"),
+    (["measurement=polynomial", "tracker=[ekf]"], "tracker: goes with model=NAME"),
+    (["model=pendulum", "tracker=[newton]"], "tracker=newton: newton is no tracker but a solver"),
+    (["model=pendulum", "trackers.ukf.iterations=0"], "trackers.ukf.iterations=0: give a whole number above 0"),
+    (["model=pendulum", "trackers.bootstrap.particles=5"], "trackers.bootstrap.particles: is set, but bootstrap"),
+    (
+        ["model=pendulum", "tracker=[grid]"],
+        "trackers.grid: is exact for one state, and pendulum has 2; leave it out",
+    ),
+    (["model=growth", "model.next.state=x"], "model.next.state: there is no such name"),
+    (["+experiment=polynomial", "model=growth"], "+experiment=polynomial: sets measurement, which is of a measur"),
+    (["+experiment=headline", "model=growth"], "+experiment=headline: sets noise, which is of a measurement"),
+    (["model=pendulum_book", "trials=2"], "trials=2: certified readings are one trial"),
+]
+COMMON = ("measurement=polynomial", "noise=gaussian", "execution=serial", "output=out", "trials=5")
+MISTAKES |= {" ".join(words): (["run", "-m", *COMMON, *words], f"ipe-bench: {said}") for words, said in IN_A_SWEEP}
+MISTAKES |= {" ".join(words): (["run", *words, "output=out"], f"ipe-bench: {said}") for words, said in OF_STATES}
+OBJECTIVES = [
+    ("newton.cost_medium", "objective=newton.cost_medium: there is no such column; did you mean cost_median?"),
+    ("newtn.cost_median", "objective=newtn.cost_median: there is no such estimator; did you mean newton?"),
+    ("cost_median", "objective=cost_median: write LABEL.COLUMN, such as newton.capped_error"),
+    ("newton.equation", "objective=newton.equation: there is no such column"),
+]
+MISTAKES |= {name: (["run", *COMMON, f"objective={name}", "solver=[newton]"], said) for name, said in OBJECTIVES}
+MANY = ["measurement=ranging", "measurement.rounds=many"]
+MISTAKES |= {
+    f"many rounds in {command}": ([command, *MANY], "measurement.rounds=many: give a whole number above 0")
+    for command in ("estimate", "design", "posterior")
+}
 QUICK = (*SMALL, "trials=4", "execution=serial")
 
 
@@ -128,6 +172,28 @@ def test_a_mistake_is_one_line_with_exit_code_2(tmp_path, ipe_bench, case):
     assert expected in error
     assert len(error.strip().splitlines()) == 1
     assert not list(tmp_path.rglob("*.parquet"))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["noise.deviation=${error_scale}"],
+        ["noise.deviation='${error_scale}'"],
+        [
+            "noise=gaussian",
+            "noise.deviation=1",
+            "noise._target_=ipe_bench.noise.StudentT",
+            "+noise.degrees_of_freedom=5",
+        ],
+        ["+experiment=triad", "measurement.field=5"],
+        ["solver=[newton]", "+solver@estimators.b=broyden", "estimators.b.tolerance=1e-3"],
+        ["measurement=nist/misra1a", "measurement.start=2"],
+        ["estimators.fixed_point.budget=null"],
+    ],
+)
+def test_what_is_right_is_taken(words, ipe_bench):
+    code, _, err = ipe_bench("run", *words, "--cfg", "job")
+    assert (code, err) == (0, "")
 
 
 def test_nothing_is_overwritten(readings, ipe_bench):
