@@ -25,8 +25,8 @@ LINE = (
     ("cli",),
 )
 BUDGETS = {
-    "basics": 995,
-    "measurements": 6705,
+    "basics": 981,
+    "measurements": 6702,
     "noise": 618,
     "priors": 105,
     "states": 1188,

@@ -14,12 +14,12 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.machine import keep_freed_memory
-
 Array: TypeAlias = NDArray[Any]
 Mask: TypeAlias = NDArray[Any]
 
-keep_freed_memory()
+# glibc keeps freed memory for the next array up to the size of the largest block that it has mapped and freed, at most
+# 32 MB (mallopt(3), M_MMAP_THRESHOLD): fetching the pages of Jacobians anew took a fifth of an estimation.
+np.empty(31 << 20, np.uint8)
 
 _WELL_CONDITIONED = 1e3
 """The condition of J, its columns scaled, up to which J' J has enough of its digits: nine or more."""
@@ -53,10 +53,8 @@ def solve(A: Array, b: Array) -> tuple[Array, Mask]:
 
     Returns x, NaN where A is singular or not finite, and the mask (trials,) of those trials.
     """
-    vectors = b.ndim == 2
-    rhs = b[..., None] if vectors else b
-    x, singular = _solve_columns(A, rhs)
-    return (x[..., 0] if vectors else x), singular
+    x, singular = _solve_columns(A, b[..., None] if b.ndim == 2 else b)
+    return (x[..., 0] if b.ndim == 2 else x), singular
 
 
 def inverse(A: Array) -> tuple[Array, Mask]:

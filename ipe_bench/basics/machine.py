@@ -26,18 +26,6 @@ def cores() -> int:
     return len(affinity(0)) if affinity else os.cpu_count() or 1
 
 
-def keep_freed_memory() -> None:
-    """Lets the C library keep freed memory for the next array, which otherwise begins with fetching its pages anew:
-    with the Jacobians of a batch that took a fifth of an estimation.
-
-    glibc takes the largest block that it has mapped and freed, up to 32 MB, for its measure of what to keep, mallopt(3)
-    at M_MMAP_THRESHOLD. Pages that are never touched are never fetched.
-    """
-    import numpy as np
-
-    np.empty(31 << 20, np.uint8)
-
-
 @functools.cache
 def library_versions() -> dict[str, str]:
     """Python and the libraries that results depend on, with their versions."""

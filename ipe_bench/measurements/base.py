@@ -234,8 +234,7 @@ class Measurement(Component, ABC):
 
     def rows(self, stop: int) -> NDArray[np.intp]:
         """The rows of z that have arrived after `stop` epochs, ascending."""
-        if self.epochs is None:
-            raise ValueError(f"{self.name} has no epochs")
+        assert self.epochs is not None
         return np.sort(np.concatenate(self.epochs[:stop]))
 
     def simulate_until(self, x: Array, stop: int) -> Array:

@@ -8,7 +8,7 @@ mass-unbalance errors observable. `RicherGins` has more errors than that: a trut
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from typing import Annotated, Any
@@ -318,6 +318,16 @@ class RicherGins(Gins):
             z[:, k] = y[:, :2]
         return z.reshape(len(x), cases * stop * 2)
 
+    def acceleration(self, u: Sequence[Any], p: Sequence[Any]) -> tuple[Any, Any]:
+        """With the errors of the accelerometers, where they stand behind the parameters."""
+        if len(p) == self.n:
+            return super().acceleration(u, p)
+        bx, by, kx, ky = p[:4]
+        qx, qy, mxy, myx = p[11:15]
+        fx, fy = self.gravity * u[0], self.gravity * u[1]
+        x, y = fx + qx * fx * fx + mxy * fy, fy + qy * fy * fy + myx * fx
+        return (1.0 + kx) * x + bx, (1.0 + ky) * y + by
+
     def _tilted(self, p: Array, c: Array) -> Array:
         """The platform is turned about x, then y, then z: true up and Earth axis turn the other way in its axes."""
         y = self.start(list(p.T), list(c.T))
@@ -328,7 +338,6 @@ class RicherGins(Gins):
     @cached_property
     def _motion(self) -> Kernel:
         """From one reading to the next: the parameters, the errors of the accelerometers and the state, as it was."""
-        moving = _Motion(**{f.name: getattr(self, f.name) for f in fields(Gins)})
         given = self.n + _SENSED
 
         def start(p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
@@ -337,19 +346,8 @@ class RicherGins(Gins):
         def read(t: Any, y: Sequence[Any], p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
             return y
 
-        equations = Equations(self.states, given + self.states, 0, self.states, start, moving.rhs, read)
+        equations = Equations(self.states, given + self.states, 0, self.states, start, self.rhs, read)
         return Kernel(equations, DOP853)
-
-
-class _Motion(Gins):
-    """The equations of motion with the errors of the accelerometers behind the parameters."""
-
-    def acceleration(self, u: Sequence[Any], p: Sequence[Any]) -> tuple[Any, Any]:
-        bx, by, kx, ky = p[:4]
-        qx, qy, mxy, myx = p[11:15]
-        fx, fy = self.gravity * u[0], self.gravity * u[1]
-        x, y = fx + qx * fx * fx + mxy * fy, fy + qy * fy * fy + myx * fx
-        return (1.0 + kx) * x + bx, (1.0 + ky) * y + by
 
 
 def _turned(v: Sequence[Any], angles: Sequence[NDArray[Any]]) -> list[Any]:
