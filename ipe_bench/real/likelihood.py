@@ -40,7 +40,6 @@ def found_and_tracked(log: Log, label: str, tracker: Tracker, find: Sequence[str
     positive = np.array([key != "constants" for key, _ in places])
     if (positive & ~(start > 0)).any():
         raise UserError(f"find={find[int(np.argmax(positive & ~(start > 0)))]}: is 0; give a value above to start from")
-
     size = np.where(start == 0, 1.0, np.abs(start))
 
     def values(u: Array) -> Array:
@@ -53,15 +52,17 @@ def found_and_tracked(log: Log, label: str, tracker: Tracker, find: Sequence[str
         return replace(model, **parts)
 
     def cost(u: Array) -> float:
-        if not (np.abs(u[positive]) < _FAR).all():
+        if not (np.abs(u[positive]) < _FAR).all() or tracker.hindrance(model_at(u)):
             return np.inf
         tracks, _ = track_safely(tracker, model_at(u), log.z[None])
-        return -float(tracks.log_likelihood[0]) if tracks.degrees.any() else np.nan
+        value = -float(tracks.log_likelihood[0])
+        return value if tracks.degrees.any() and np.isfinite(value) else np.inf
 
     u = np.zeros(len(find))
-    if isinstance(tracker, Bootstrap) or np.isnan(cost(u)):
+    if isinstance(tracker, Bootstrap) or not np.isfinite(cost(u)):
         raise UserError(f"find: trackers.{label} has no likelihood that can be maximised; choose a filter")
-    u, error = _minimum(cost, u)
+    with np.errstate(invalid="ignore"):
+        u, error = _minimum(cost, u)
     if not (np.isfinite(error).all() and (error[positive] < _VAGUE).all()):
         message = f"the likelihood has no maximum in {', '.join(find)}: the log does not determine them"
         return replace(Tracked.of(log, label, tracker), message=message, passes=False)

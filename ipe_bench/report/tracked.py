@@ -78,6 +78,8 @@ def contents(answer: TrackAnswer) -> list[Part]:
         "Innovations are readings less their predictions, in predicted standard deviations; NIS / m is their mean"
         " square. They are white if the filter is right (Ljung and Box). Smoothers have none."
     )
+    if any(one.constants for one in found):
+        note += " Since the constants were found by them, their mean square hardly tests the model; whiteness does."
     ends = [words("state", [state.name for state in states]), words("unit", [state.unit for state in states])]
     ends += [texts(one.label, map(with_error, one.mean[-1], one.deviation[-1])) for one in found]
     constants = [(one.label, each) for one in found for each in one.constants]

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import multivariate_normal, norm
 
 import ipe_bench as ib
-from ipe_bench.states import Bootstrap, Formulas, Smoother, ckf, ekf
+from ipe_bench.states import Bootstrap, Formulas, Grid, Smoother, ckf, ekf
 
 NILE = """
 1120 1160 963 1210 1160 1160 813 1230 1370 1140 995 935 1110 994 1020 960 1180 799 958 1140 1100 1210 1150 1250 1260
@@ -109,3 +109,12 @@ def test_what_cannot_be_found_is_refused(trackers, find, complaint):
 def test_parameters_of_a_measurement_are_not_named():
     with pytest.raises(ib.UserError, match="find=: is for models of states that move"):
         ib.estimate(ib.measurements.Polynomial(), np.zeros(8), find="c0")  # pyright: ignore
+
+
+def test_the_exact_likelihood_of_a_grid_has_the_same_maximum():
+    model = replace(DAMPED, count=15)
+    z = model.draw(0, 1, 6).z[0]
+    exact, filtered = ib.estimate(model, z, {"grid": Grid(300), "kf": ekf()}, find="deviation.z")
+    for one, other in zip(exact.constants, filtered.constants, strict=True):
+        assert one.value == pytest.approx(other.value, rel=1e-4)
+        assert one.error == pytest.approx(other.error, rel=1e-3)
