@@ -73,8 +73,11 @@ class StoredCell:
     @property
     def written(self) -> float:
         """When the youngest of its files was written; 0 if they went away meanwhile."""
-        times = [os.path.getmtime(part.path) for part in self.parts if part.path.is_file()]
-        return max(times, default=0.0)
+        times = [0.0]
+        for part in self.parts:
+            with contextlib.suppress(OSError):
+                times.append(part.path.stat().st_mtime)
+        return max(times)
 
 
 @dataclass(frozen=True)
@@ -92,10 +95,11 @@ class CellState:
     """Trials that another version of the source computed; they do not count as done."""
     messages: tuple[str, ...]
     """Why trials failed."""
-    tag: str = ""
-    """The beginning of its key, if other cells have the same names."""
+    key: str
     refused: str = ""
     """Why the run that asked for it was refused, if it was."""
+    tag: str = ""
+    """The beginning of its key, if other cells have the same names."""
 
     @property
     def title(self) -> str:
@@ -295,25 +299,20 @@ class Results:
     @cached_property
     def cells(self) -> tuple[CellState, ...]:
         """How far every cell is: those that runs asked for in their order, then others that are there."""
-        states, keys = [], []
-        for identity, (key, trials, names, refused) in self._asked_for.items():
+        found = {identity: cell for identity, (cell, _) in self._rivals.items() if cell is not None}
+        asked = {identity: _Asked(cell.key, 0, cell.names, "") for identity, cell in found.items()}
+        asked, states = self._asked_for | {i: of for i, of in asked.items() if i not in self._asked_for}, []
+        for identity, (key, trials, names, refused) in asked.items():
             lost = [failure for failure in self.failures if failure["key"] == key]
             tried = [*self._covered(key), *((failure["start"], failure["stop"]) for failure in lost)]
             missing, lacking = _count(gaps(tried, 0, trials)), _count(self.missing(key, trials))
+            done = trials - lacking if trials else found[identity].trials
             stale = sum(cell.trials for cell in self._rivals.get(identity, (None, []))[1])
             messages = tuple(dict.fromkeys(f"{f['status']}: {f['message']}" for f in lost))
-            counts = trials, trials - lacking, lacking - missing, missing, stale
-            states.append(CellState(names, *counts, messages, refused=refused if missing else ""))
-            keys.append(key)
-        for identity, (cell, old) in self._rivals.items():
-            if identity not in self._asked_for and cell is not None:
-                states.append(CellState(cell.names, 0, cell.trials, 0, 0, sum(c.trials for c in old), ()))
-                keys.append(cell.key)
+            counts = trials, done, lacking - missing, missing, stale
+            states.append(CellState(names, *counts, messages, key, refused if missing else ""))
         alike = Counter(describe_names(state.names) for state in states)
-        return tuple(
-            replace(state, tag=f" (#{key[:6]})") if alike[describe_names(state.names)] > 1 else state
-            for state, key in zip(states, keys, strict=True)
-        )
+        return tuple(replace(s, tag=f" (#{s.key[:6]})") if alike[describe_names(s.names)] > 1 else s for s in states)
 
     def set_aside(self) -> list[str]:
         """Renames what is damaged, so that it is computed again under its own name; returns a line for each file."""

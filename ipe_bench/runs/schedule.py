@@ -27,7 +27,7 @@ from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.runs.results import Results
 from ipe_bench.runs.store import ResultKey, Store, describe_names
 from ipe_bench.trials.scoring import HISTORIES
-from ipe_bench.trials.tracking import AnyScenario, block_of
+from ipe_bench.trials.tracking import block_of
 
 log = logging.getLogger(__name__)
 
@@ -115,11 +115,8 @@ def block_size_for(trials: int) -> int:
     return min(max(trials // _WORTH_BLOCKS // BLOCK_SIZE, 1) * BLOCK_SIZE, LARGEST_BLOCK)
 
 
-def plan(
-    directory: Path, cells: Sequence[ResultKey], results: Results, trials: int, block_size: int | None = None
-) -> list[Task]:
+def plan(directory: Path, cells: Sequence[ResultKey], results: Results, trials: int, block_size: int) -> list[Task]:
     """Blocks on a fixed grid, each with the cells of one scenario that lack some of its trials."""
-    block_size = block_size_for(trials) if block_size is None else block_size
     lacking: dict[tuple[int, int], list[ResultKey]] = {}
     for cell in cells:
         for start, stop in results.missing(cell.key, trials):
@@ -210,7 +207,13 @@ def _compute_cell(store: Store, block: Any, cell: ResultKey) -> None:
     else:
         estimates, columns = block.estimate(cell.estimator)
         if start == 0 and estimates.history is not None:
-            history = _history_columns(cell.scenario, estimates.history[:HISTORIES])
+            paths = estimates.history[:HISTORIES]
+            history = {
+                "trial": np.repeat(np.arange(len(paths)), [len(path) for path in paths]),
+                "iteration": np.concatenate([np.arange(len(path)) for path in paths]),
+            }
+            names = (f"x_{parameter.name}" for parameter in cell.scenario.measurement.parameters)
+            history |= dict(zip(names, np.concatenate(paths).T, strict=True))
     if not store.trials.is_dir():  # what it held is missing, and would not be missed
         raise StorageError(f"{store.directory}: went away while it was being filled; the same command starts anew")
     store.write(cell, start, stop, columns, history)
@@ -223,16 +226,6 @@ def _check_source(cells: Sequence[ResultKey]) -> None:
             "the numerical source of ipe-bench or of a plugin is not what it was where the run began: "
             "install the same versions on all machines, or start the run again"
         )
-
-
-def _history_columns(scenario: AnyScenario, history: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-    x = np.concatenate(list(history))
-    lengths = [len(rows) for rows in history]
-    return {
-        "trial": np.repeat(np.arange(len(history)), lengths),
-        "iteration": np.concatenate([np.arange(length) for length in lengths]),
-        **{f"x_{p.name}": x[:, i] for i, p in enumerate(scenario.measurement.parameters)},
-    }
 
 
 def run_tasks(tasks: Sequence[Task], execution: Execution, store: Store, watch: Watcher) -> tuple[str, ...]:

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.batches import put
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, Mask, finite
+from ipe_bench.basics.linalg import Array, finite
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator
@@ -119,13 +118,10 @@ def _bound(problem: Problem, state: Round) -> Array:
     """(J' R^-1 J)^-1 (trials, n, n) at the end: H+ R H+', where the last round has found H+ there; else computed anew,
     for the report alone, so not counted. The model may raise at a bad end."""
     P = frozen_covariance(state.H_plus, problem.R)
-    lost: Mask = (state.H_plus == 0).all(axis=(1, 2))
-    usable = lost & finite(state.x)
-    if not lost.any():
-        return P
-    J = np.full((len(P), problem.measurement.m, state.x.shape[1]), np.nan)
-    if usable.any():
-        model = CountingModel.uncounted(problem.measurement, len(P))
-        J[usable] = model.jacobian(state.x[usable], np.flatnonzero(usable))
-    inverse_U = inverse_factor(problem.R.whiten_jacobian(J[lost]))
-    return put(P, lost, np.matmul(inverse_U, inverse_U.swapaxes(1, 2)))
+    failed = (state.H_plus == 0).all(axis=(1, 2))
+    P[failed], lost = np.nan, np.flatnonzero(failed & finite(state.x))
+    if len(lost):
+        J = CountingModel.uncounted(problem.measurement, len(P)).jacobian(state.x[lost], lost)
+        inverse_U = inverse_factor(problem.R.whiten_jacobian(J))
+        P[lost] = np.matmul(inverse_U, inverse_U.swapaxes(1, 2))
+    return P

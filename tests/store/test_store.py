@@ -110,7 +110,7 @@ def test_gaps_are_what_no_range_holds(covered, start, length):
 def test_a_refused_job_of_a_sweep_stays_in_the_books_until_it_is_accepted(tmp_path, capsys, monkeypatch):
     output, sweep = f"output={tmp_path}", ["run", "-m", "measurement=polynomial", "noise=gaussian", "trials=5"]
     sweep += ["solver=[]", "baseline=[linear_lse]", "figures=none", "execution=serial", output]
-    job = "measurement=polynomial noise=gaussian noise.deviation=1e-102"
+    job = "measurement=polynomial, noise=gaussian, noise.deviation=1e-102"
     assert main([*sweep, "noise.deviation=0.02,1e-102"]) == 2
     assert f"choose another scale of the noise (refused: {job})" in capsys.readouterr().err
     assert main(["status", str(tmp_path)]) == 1
