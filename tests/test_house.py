@@ -35,7 +35,7 @@ BUDGETS = {
     "baselines": 2081,
     "trials": 1990,
     "runs": 2114,
-    "statistics": 3819,
+    "statistics": 3777,
     "real": 2311,
     "plugins": 1120,
     "report": 4032,

@@ -207,5 +207,5 @@ def _paper(folders: Sequence[Path], keys: Mapping[str, Any]) -> int:
     analysis = analyse(folders)
     analysis.collection.extra_problems += faults
     say(*map(str, export(analysis, Path(keys.get("output", folders[0] / "paper")), keys["paper"], **chosen)))
-    print_problems([*analysis.problems, *analysis.stale])
-    return 1 if analysis.problems else 0
+    print_problems([*analysis.collection.problems, *analysis.collection.stale])
+    return 1 if analysis.collection.problems else 0

@@ -102,8 +102,8 @@ class Pending:
             tables=tuple(files),
             figures=tuple(path for figure in drawn for path in figure.files),
             report=output / "report.html",
-            problems=analysis.problems,
-            stale=analysis.stale,
+            problems=tuple(analysis.collection.problems),
+            stale=tuple(analysis.collection.stale),
             headline=tuple(headline(analysis)),
         )
         if len(problems) == known:  # what plugins cannot make is said each time

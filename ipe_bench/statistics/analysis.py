@@ -55,14 +55,6 @@ class Analysis:
     """Which estimator attains known minima, over all scenarios; see `certified.attained_table`."""
 
     @property
-    def problems(self) -> tuple[str, ...]:
-        return tuple(self.collection.problems)
-
-    @property
-    def stale(self) -> tuple[str, ...]:
-        return tuple(self.collection.stale)
-
-    @property
     def setting_columns(self) -> list[str]:
         """The columns that tell scenarios apart, but for the error scale."""
         first = self.collection.groups[0].columns if self.collection.groups else {}

@@ -59,8 +59,7 @@ def share(mask: Array) -> float:
 def ratio(a: Any, b: Any) -> Array:
     """a / b; NaN where b is not above 0."""
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
-    with np.errstate(all="ignore"):
-        return np.where(b > 0, a / b, np.nan)
+    return np.where(b > 0, a / b, np.nan)
 
 
 def rms(values: Array) -> float:
@@ -70,9 +69,9 @@ def rms(values: Array) -> float:
     return float(size * np.sqrt(np.mean((values / size) ** 2)))
 
 
-def rms_columns(values: Array) -> Array:
-    """The root mean squares (n,) of columns (trials, n)."""
-    return np.sqrt(mean(values**2))
+def rms_columns(values: Array, used: Array | None = None) -> Array:
+    """The root mean squares (n,) of columns (trials, n) over the trials used."""
+    return np.sqrt(mean(values**2, used))
 
 
 def in_units(values: Array, s: Sample) -> Array:
@@ -89,18 +88,8 @@ def of_each(values: Callable[[Sample], Array]) -> Callable[[Sample], Array]:
 
 
 @once
-def bias(s: Sample) -> Array:
-    return mean(s.error, s.solved)
-
-
-@once
 def rmse(s: Sample) -> Array:
-    return np.sqrt(mean(s.error**2, s.solved))
-
-
-@once
-def rmse_common(s: Sample) -> Array:
-    return np.sqrt(mean(s.error**2, s.solved & s.solved_by_all))
+    return rms_columns(s.error, s.solved)
 
 
 @once
@@ -235,17 +224,17 @@ def false_root_distance(s: Sample) -> float:
 
 @once
 def crlb(s: Sample) -> Array:
-    return np.sqrt(mean(s.crlb**2, s.solved))
+    return rms_columns(s.of_truth("crlb"), s.solved)
 
 
 @once
 def bayes(s: Sample) -> Array:
-    return np.sqrt(mean(s.of_truth("bayes") ** 2, s.solved))
+    return rms_columns(s.of_truth("bayes"), s.solved)
 
 
 def applying_bound(s: Sample) -> Array:
-    """The bound that the estimator is held against."""
-    return bayes(s) if s.bound_kind == "bayes" else crlb(s)
+    """The bound that the estimator is held against: the Bayesian one if it uses a prior."""
+    return bayes(s) if s.group.footer["bound"] == "bayes" else crlb(s)
 
 
 def efficiency(s: Sample) -> Array:
@@ -277,12 +266,7 @@ def eq_14(s: Sample) -> Array:
     """Eq. (14): eq. (5) plus the mean square of H+ dN, which at a root of eq. (11) is the error less H+ v."""
     if s.group.footer.get("equation") != "frozen":
         return np.full(s.n, np.nan)
-    return np.sqrt(s.linear_bound**2 + _compensation(s))
-
-
-@once
-def _compensation(s: Sample) -> Array:
-    return mean((s.error - s.of_truth("linear_error")) ** 2, s.solved)
+    return np.sqrt(s.linear_bound**2 + mean((s.error - s.of_truth("linear_error")) ** 2, s.solved))
 
 
 @once
@@ -301,7 +285,7 @@ def predicted(s: Sample) -> tuple[Array, Array]:
     box = s.of_truth("box_bias")
     known: Array = np.asarray(np.isfinite(box).all(axis=1))
     square = mean(box**2, known)
-    return mean(box, known), np.sqrt(mean(s.crlb**2, s.solved) + np.where(np.isnan(square), 0.0, square))
+    return mean(box, known), np.sqrt(mean(s.of_truth("crlb") ** 2, s.solved) + np.where(np.isnan(square), 0.0, square))
 
 
 def median_of_truth(s: Sample, name: str) -> float:
@@ -315,11 +299,6 @@ def median_of_truth(s: Sample, name: str) -> float:
 @once
 def reports_covariance(s: Sample) -> bool:
     return bool(np.isfinite(s.deviation).any())
-
-
-@once
-def reported(s: Sample) -> Array:
-    return np.sqrt(mean(s.deviation**2, s.solved & np.isfinite(s.deviation).all(axis=1)))
 
 
 @once
@@ -356,10 +335,6 @@ def coverage(s: Sample) -> Any:
         return np.nan
     each = mean(np.abs(s.error) / s.deviation <= NORMAL_95)
     return np.append(each, share(s.scalars["nees"] <= 2 * gammaincinv(s.n / 2, 0.95)))
-
-
-def claims(s: Sample) -> int:
-    return int((s.converged & ~np.isnan(s.scalars["nees"])).sum())
 
 
 def calibration_p(s: Sample) -> Any:

@@ -90,7 +90,8 @@ class Statistic:
 
     def columns_of(self, sample: Sample) -> dict[str, list[Any]]:
         """Its columns, a value for each parameter and one for all together."""
-        found = [self.values(sample), *(() if self.limits is None else self.limits(sample))]
+        with np.errstate(all="ignore"):
+            found = [self.values(sample), *(() if self.limits is None else self.limits(sample))]
         columns = [np.asarray(one).tolist() if np.ndim(one) else [one] * (sample.n + 1) for one in found]
         return dict(zip(self.columns, columns, strict=True))
 
@@ -270,7 +271,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "bias",
         "solved trials",
         "Mean error.",
-        f.of_each(f.bias),
+        f.of_each(lambda s: f.mean(s.error, s.solved)),
         given="solved",
         kind="physical",
         where=("parameters", "theory"),
@@ -329,7 +330,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "rmse, common",
         "trials that every estimator of the scenario solved",
         "Root mean square error.",
-        f.of_each(f.rmse_common),
+        f.of_each(lambda s: f.rms_columns(s.error, s.solved & s.solved_by_all)),
         given="common",
         where=("solved_trials",),
     ),
@@ -425,7 +426,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "solved trials",
         "Root mean square of the standard deviation that the estimator itself reports: eq. (5) for the linear LSE, the"
         " sandwich (H⁺J)⁻¹ H⁺RH⁺' (H⁺J)⁻ᵀ at the estimate for the frozen root.",
-        f.of_each(f.reported),
+        f.of_each(lambda s: f.rms_columns(s.deviation, s.solved & np.isfinite(s.deviation).all(axis=1))),
         given="solved",
         kind="physical",
         where=("covariances",),
@@ -527,7 +528,7 @@ STATISTICS: tuple[Statistic, ...] = (
         "claims",
         "all trials",
         "Number of trials that converged and report a covariance, over which calibration is computed.",
-        f.claims,
+        lambda s: int((s.converged & ~np.isnan(s.scalars["nees"])).sum()),
         kind="count",
         where=("calibration",),
     ),
@@ -799,8 +800,7 @@ def columns_of_added(record: Statistic, sample: Sample) -> dict[str, list[Any]]:
         UserError: it raises, or gives something else than a value per parameter and one over all.
     """
     try:
-        with np.errstate(all="ignore"):
-            columns = record.columns_of(sample)
+        columns = record.columns_of(sample)
     except Exception as error:
         raise UserError(place_of(error)) from error
     for name, values in columns.items():

@@ -158,23 +158,14 @@ class Sample:
 
     @property
     def inside_gate(self) -> Mask:
-        """Success (trials,) by the Cramér-Rao bound, one gate for all; the column `success` is by `bound_kind`."""
+        """Success (trials,) by the Cramér-Rao bound, one gate for all; the column `success` is by the bound that
+        the estimator is held against."""
         return self.scalars["crlb_distance"] <= gate(self.n)
 
     @property
     def normalised(self) -> Array:
         """Errors over the linear bound (trials, n)."""
         return self.error / self.linear_bound
-
-    @property
-    def crlb(self) -> Array:
-        """(trials, n), deviations of the Cramér-Rao bound at the truth; NaN where the truth is missing."""
-        return self.of_truth("crlb")
-
-    @property
-    def bound_kind(self) -> str:
-        """The bound that the estimator is held against: `bayes` where it uses a prior, else `crlb`."""
-        return "bayes" if self.group.footer["bound"] == "bayes" else "crlb"
 
     def of_truth(self, kind: str) -> Array:
         """What is stored of the truth for each parameter (trials, n), or (trials,) by a name in `TRUTH`, read anew; NaN
@@ -216,7 +207,7 @@ class Sample:
                 found += [(row, iterates) for row in rows.tolist() if len(iterates) > 1]
         if not found:
             return []
-        crlb, cost = self.crlb, self.cost.tolist()
+        crlb, cost = self.of_truth("crlb"), self.cost.tolist()
         return [History(distances_to_limit(iterates, crlb[row]), cost[row]) for row, iterates in found]
 
 

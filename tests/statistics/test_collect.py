@@ -51,7 +51,7 @@ def test_a_truncated_file_is_named_skipped_and_left_alone(filled, keep):
     content = path.read_bytes()[:keep]
     path.write_bytes(content)
     analysis = analyse([filled.directory])
-    assert any(str(path) in line and "damaged" in line for line in analysis.problems)
+    assert any(str(path) in line and "damaged" in line for line in analysis.collection.problems)
     assert path.read_bytes() == content
     rows = analysis.summary[analysis.summary["parameter"] == "all"].set_index("estimator")
     assert rows.loc["one", "trials"] == 40
@@ -66,7 +66,7 @@ def test_foreign_files_under_our_names_are_named_and_skipped(filled):
     shutil.copy(pieces(filled)[0], trials / "fedcba9876543210-0-20.parquet")
     (filled.store.runs / "note.json").write_text("[1, 2]")
     analysis = analyse([filled.directory])
-    assert len(analysis.problems) == 4
+    assert len(analysis.collection.problems) == 4
     assert (analysis.summary["trials"] == 60).all()
     assert (trials / "weather.parquet").exists()
 
@@ -86,8 +86,8 @@ def test_stale_results_are_named_and_never_mixed_in(filled):
         table = table.set_column(table.column_names.index("error_a"), "error_a", [np.full(20, 1e9)])
         parts.write(path.with_name(path.name.replace(path.name[:16], footer["key"])), table, footer)
     analysis = analyse([filled.directory])
-    assert not analysis.problems
-    (line,) = analysis.stale
+    assert not analysis.collection.problems
+    (line,) = analysis.collection.stale
     assert line.startswith("stale: one on repeated")
     assert "60 trials" in line
     assert analysis.summary["rmse"].max() < 1e3
@@ -116,6 +116,6 @@ def test_the_truth_being_absent_is_a_problem_and_not_a_crash(filled):
     for path in pieces(filled, "truth"):
         path.unlink()
     analysis = analyse([filled.directory])
-    assert any("the truth" in line for line in analysis.problems)
+    assert any("the truth" in line for line in analysis.collection.problems)
     assert analysis.summary["crlb"].isna().all()
     assert analysis.summary["rmse"].notna().all()

@@ -124,7 +124,7 @@ def test_a_truth_that_is_missing_is_not_a_number_beside_its_estimates(synthetic)
     for sample in samples(collection, collection.groups):
         trial = sample.number % (1 << 40)
         known = ~((trial >= 10) & (trial < 20) | (trial >= 40))
-        np.testing.assert_array_equal(np.isfinite(sample.crlb), np.repeat(known[:, None], 3, axis=1))
+        np.testing.assert_array_equal(np.isfinite(sample.of_truth("crlb")), np.repeat(known[:, None], 3, axis=1))
         assert np.isnan(sample.of_truth("linear_error")).all()
 
 
