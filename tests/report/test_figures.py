@@ -89,6 +89,8 @@ def test_costs_and_errors_stand_at_quantiles_of_all_trials(synthetic):
     (panel, *_) = drawn(costs, view)["cost_against_accuracy"].figure.axes
     ((cost, at),) = [point for marks in panel.collections for point in marks.get_offsets()]
     assert (cost, at) == pytest.approx((7.0, distance[189]), rel=0.05)
+    simulated = np.sqrt((np.random.default_rng(0).normal(size=(200_000, 3)) ** 2).mean(axis=1))
+    assert panel.lines[0].get_ydata()[0] == pytest.approx(np.quantile(simulated, 0.95), rel=0.01)
     median = drawn(errors, view)["headline"].figure.axes[1]
     shown = points(median, view.look["one"].color)
     assert [shown[s][0] for s in SCALES] == pytest.approx([distance[99:101].mean()] * 3, rel=0.05)

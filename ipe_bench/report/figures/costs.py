@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pandas as pd
+from scipy.special import chdtri
 
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing, Figure
@@ -33,10 +34,11 @@ def draw_costs(view: View) -> Iterator[Drawing]:
     # Equal points lie upon each other: the later ones are smaller, so that all are seen.
     areas = zip(style["hue_order"], np.linspace(80, 30, len(look)), strict=True)
     sizes = {label: area if look[label].color != GREY else 20.0 for label, area in areas}
+    efficient = float(np.sqrt(chdtri(view.n, 0.05) / view.n))  # the 95 % quantile of chi, over its root mean square
     for ax, here in panels:
-        common.decades(ax, [*rows["error"], 1.0])
+        common.decades(ax, [*rows["error"], efficient])
         sns.scatterplot(here, x="cost", y="error", ax=ax, size="estimator", sizes=sizes, **style)
-        common.bound_line(ax, 1.0, "Cramér-Rao bound")
+        common.bound_line(ax, efficient, "efficient estimator")
         ax.set_xscale("log")
         ax.set_xlim(rows["cost"].min() / 1.5, rows["cost"].max() * 1.5)
         common.log_ticks(ax.xaxis, *ax.get_xlim())
