@@ -12,22 +12,20 @@ from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from string import Template
+from typing import TYPE_CHECKING
 
-from ipe_bench import __version__, api
+import ipe_bench as ib
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.cli import print_problems, say, show
-from ipe_bench.cli import words as w
-from ipe_bench.cli.estimate import single
 from ipe_bench.cli.main import main
 from ipe_bench.cli.parser import KINDS, MODELS
-from ipe_bench.cli.session import jobs_of, session
-from ipe_bench.cli.spec import PARTS
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.plugins import discovery as plugins
-from ipe_bench.plugins.conformance import Finding, check_component
 from ipe_bench.plugins.construct import construct, described
 from ipe_bench.report.table import Table, words
-from ipe_bench.runs.run import validate
+
+if TYPE_CHECKING:
+    from ipe_bench.plugins.conformance import Finding
 
 RECORDS = {"statistic": "STATISTIC", "figure": "FIGURE", "table": "table", "section": "SECTION"}
 """What reports are made of, and what each is called in its module."""
@@ -157,7 +155,7 @@ def check_command(words: Sequence[str]) -> int:
     print_problems(plugins.take_problems())
     failed = 0
     for folder in [*folders, *([" ".join(keys)] if keys else [])]:
-        findings = [*api.check(folder), *_check_experiments(folder)] if folder in folders else _check_chosen(keys)
+        findings = [*ib.check(folder), *_check_experiments(folder)] if folder in folders else _check_chosen(keys)
         for one in findings:
             complaint = f" -- {one.complaint}" if one.complaint else ""
             say(f"{'FAILED' if complaint else 'ok':7}{one.component}: {one.check}{complaint}")
@@ -168,6 +166,10 @@ def check_command(words: Sequence[str]) -> int:
 
 
 def _check_chosen(words: Sequence[str]) -> list[Finding]:
+    from ipe_bench.cli.estimate import single
+    from ipe_bench.cli.spec import PARTS
+    from ipe_bench.plugins.conformance import check_component
+
     asked = single("check", words)
     parts = {key: getattr(asked.spec, key) for key in PARTS if key in asked.words.keys}
     if not set(plugins.PACKAGES).isdisjoint(asked.words.keys):
@@ -177,6 +179,11 @@ def _check_chosen(words: Sequence[str]) -> list[Finding]:
 
 def _check_experiments(folder: str) -> Iterator[Finding]:
     """Whether each experiment of the plugin asks for what there is."""
+    from ipe_bench.cli import words as w
+    from ipe_bench.cli.session import jobs_of, session
+    from ipe_bench.plugins.conformance import Finding
+    from ipe_bench.runs.run import validate
+
     for option in plugins.options_in(Path(folder)):
         if option.group == "experiment" and option.fault is None:
             complaint = ""
@@ -271,7 +278,7 @@ def _write_skill(folder: Path) -> list[Path]:
         texts = {f"new-{kind}": _page(kind) for kind in PAGES}
     plugins.sources.cache_clear()
     pages = [f"- a new {kind}: `new-{kind}.md`" for kind in PAGES]
-    words = {"version": __version__, "bent": BENT, "small": SMALL}
+    words = {"version": ib.__version__, "bent": BENT, "small": SMALL}
     _fill(folder / "SKILL.md", "skill.md", {**words, "pages": "\n".join(pages), "options": "\n".join(known)})
     for name, text in texts.items():
         (folder / f"{name}.md").write_text(text, encoding="utf-8")

@@ -8,9 +8,9 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ipe_bench import api
+import ipe_bench as ib
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.machine import library_versions
 from ipe_bench.cli import console, say, show
@@ -20,13 +20,15 @@ from ipe_bench.cli.spec import Spec
 from ipe_bench.cli.words import Words
 from ipe_bench.measurements import Nist
 from ipe_bench.plugins.extensions import richer_models
-from ipe_bench.real.estimation import Opened
 from ipe_bench.report.table import Part
 from ipe_bench.report.writer import reserve_output_folder
 from ipe_bench.runs.provenance import describe, fingerprint
 from ipe_bench.runs.run import validate
 from ipe_bench.states.base import StateModel
-from ipe_bench.trials.design import Criterion
+
+if TYPE_CHECKING:
+    from ipe_bench.real.estimation import Opened
+    from ipe_bench.trials.design import Criterion
 
 STANDARD_ESTIMATORS = ("solver=[auto]", "baseline=[linear_lse,levenberg_marquardt]")
 """Of `estimate`: the one that chooses its way by itself, and two that it can be held against."""
@@ -134,7 +136,7 @@ def _track(asked: Single, model: StateModel) -> int:
 
     given, trackers = asked.spec.readings, asked.spec.estimators
     find = asked.spec.find or ()
-    answer = api.estimate(model, given, trackers, ignore_columns=asked.spec.ignored, find=find)
+    answer = ib.estimate(model, given, trackers, ignore_columns=asked.spec.ignored, find=find)
     command = {"readings": given, "find": find, "model": describe(model), "trackers": _described(trackers)}
     files, parts = [answer.log.file] if answer.log.file else [], [answer.log.model, *trackers.values()]
     folder = asked.folder(NAME, command, [TABLE])
@@ -180,7 +182,7 @@ def design_command(
     if scenario.noise.real:
         raise UserError("noise=certified: a design is of readings that are still to be taken; choose another noise")
     errors = richer_models(scenario)
-    found = api.design(scenario, by=by, readings=readings, criterion=criterion, errors=errors)
+    found = ib.design(scenario, by=by, readings=readings, criterion=criterion, errors=errors)
     command = {
         "scenario": describe(dataclasses.replace(scenario, truth=None)),
         "errors": [describe(error) for error in errors],
@@ -216,7 +218,7 @@ def posterior_command(arguments: Sequence[str], particles: int) -> int:
     def tell(trial: int) -> None:
         print(f"{name}: trial {trial + 1} of {trials}", file=sys.stderr, flush=True)
 
-    found = api.posterior(scenario, job.estimators, trials, particles=particles, watch=tell)
+    found = ib.posterior(scenario, job.estimators, trials, particles=particles, watch=tell)
     title = f"{name}, {scenario.noise.name}, error scale {scenario.error_scale:g}"
     files = write_posteriors(folder, name, title, scenario.measurement, found)
     _show(posterior_parts(title, found), files)

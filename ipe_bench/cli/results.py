@@ -7,10 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ipe_bench import api
+import ipe_bench as ib
 from ipe_bench.basics.errors import UserError
 from ipe_bench.cli import NAMES, console, places_and_keys, print_problems, say, show
-from ipe_bench.report.run import begin_report
 from ipe_bench.report.style import PAGE, Which
 from ipe_bench.report.table import Table, texts, words
 from ipe_bench.runs.bundles import BUNDLES, SUFFIX, is_bundle, opened, read_bundle, write_bundle
@@ -39,7 +38,7 @@ def audit_command(arguments: Sequence[str]) -> int:
     files, keys = places_and_keys("audit", arguments, {"output": str})
     if len(files) != 1:
         raise UserError("audit: name one table of truths, estimates and deviations, such as runs.csv")
-    found = api.audit(files[0], **keys)
+    found = ib.audit(files[0], **keys)
     show(audit_parts(found))
     if "output" in keys:
         say(f"\nTable   {keys['output']}/audit.csv", f"Page    {keys['output']}/audit.html")
@@ -78,7 +77,7 @@ def compare_command(arguments: Sequence[str]) -> int:
     folders, keys = places_and_keys("compare", arguments, _COMPARE)
     if not 1 <= len(folders) <= 2:
         raise UserError("compare: name one or two folders of results, such as outputs/before outputs/after")
-    frame = api.compare(*folders, **keys)
+    frame = ib.compare(*folders, **keys)
     show(comparison_parts(frame, keys.get("alpha", 0.05)))
     print_problems([*frame.attrs["problems"], *frame.attrs["stale"], *frame.attrs["notes"]])
     if "output" in keys:
@@ -147,6 +146,7 @@ def show_report(
 
     `cells` has a line for people by key.
     """
+    from ipe_bench.report.run import begin_report
     from ipe_bench.statistics.analysis import Begun
     from ipe_bench.statistics.collect import collect
 
