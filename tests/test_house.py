@@ -39,7 +39,7 @@ BUDGETS = {
     "real": 2311,
     "plugins": 1120,
     "report": 4034,
-    "cli": 2495,
+    "cli": 2496,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""
 PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}

@@ -105,6 +105,7 @@ readings=FILE          is for `ipe-bench estimate`, as are ignore_columns= and f
 
 readings=FILE       CSV or Parquet; `ipe-bench list measurement -v` says which rows and columns a model wants.
                     A missing reading keeps its row, with an empty cell. A column sigma has standard deviations.
+                    With model=, a row per epoch and a column per reading.
 readings=[A,B]      several files, which share all parameters but those in measurement.own=[NAME].
 noise.deviation=X   the standard deviation of a reading; standard errors and tests rest on it.
 noise=unknown       it is estimated, so the size of residuals tests nothing; noise.by=COLUMN: a level for each entry;
