@@ -36,7 +36,7 @@ BUDGETS = {
     "trials": 1990,
     "runs": 2114,
     "statistics": 3777,
-    "real": 2311,
+    "real": 2301,
     "plugins": 1120,
     "report": 4034,
     "cli": 2496,

@@ -11,6 +11,7 @@ model with levels by groups (Patterson and Thompson, Biometrika 58, 1971).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -82,6 +83,9 @@ class Levelled(WrappedModel):
 
     def physical_slope(self, x: Array) -> Array:
         return np.concatenate([self.whole.physical_slope(self.whole_x(x)), np.exp(self._logarithms(x))], axis=1)
+
+    def near_bounds(self, x: Array) -> Mapping[int, float]:
+        return self.whole.near_bounds(x[: self.whole.n])
 
     def whole_x(self, x: Array) -> Array:
         return x[:, : self.whole.n]

@@ -122,79 +122,58 @@ def profiles(
     behind = freedom if isinstance(freedom, np.ndarray) else np.full(len(x), np.inf)
     objective = objective_of(problem, z[None])
     least = float(objective.cost(x[None], objective.residual(x[None]))[0])
+
+    def end(place: int, sign: int) -> float:
+        """The distance from the estimate to an end; infinite if there is none."""
+        half = float(q[place] * np.sqrt(P[place, place]))
+        # By distance: the rise of root chi-square, up to twice q, and the parameters.
+        seen: dict[float, tuple[float, Array]] = {0.0: (0.0, x)}
+
+        def rise(distance: float) -> float:
+            if distance not in seen:
+                usable = [known for known, (zeta, _) in seen.items() if zeta < 2.0 * q[place]]
+                near = seen[min(usable, key=lambda known: abs(known - distance))][1]
+                point, total = _least_at(problem, z, P, place, float(x[place] + sign * distance), near, released)
+                change = total - least
+                if np.isfinite(behind[place]):
+                    # Levels that are among the other parameters, of f degrees of freedom, raise chi-square by
+                    # f log(1 + t^2 / f) where a linear model would give Student's t.
+                    with np.errstate(over="ignore"):
+                        change = behind[place] * np.expm1(change / behind[place])
+                if change < -_LOWER * max(1.0, least):
+                    raise _BetterFit
+                seen[distance] = float(np.fmin(np.sqrt(np.maximum(change, 0.0)), 2.0 * q[place])), point
+            return seen[distance][0]
+
+        near, far = 0.0, half
+        for _ in range(_STRETCHES):
+            if (risen := rise(far)) >= q[place]:
+                found = brentq(lambda distance: rise(distance) - q[place], near, far, xtol=_PRECISION * half)
+                return float(found)  # type: ignore[arg-type]
+            near, far = far, far * float(np.clip(1.05 * q[place] / max(risen, 1e-3), 1.1, 2.0))
+            if far > _FARTHEST * half:
+                break
+        return np.inf
+
     start, limits, found = model.physical(model.nominal[None])[0], natural_limits(model), []
     for k in range(len(x)) if places is None else places:
-        sides = {s: _Side(problem, z, x, P, k, s, q[k], behind[k], least, released) for s in signs}
         ends = np.repeat(x[None], 2, axis=0)
-        ends[:, k] += [s * (sides[s].end() if s in sides else np.inf) for s in (-1, 1)]
+        try:
+            ends[:, k] += [s * (end(k, s) if s in signs else np.inf) for s in (-1, 1)]
+        except _BetterFit:
+            ends[:, k] = np.nan
         with np.errstate(invalid="ignore"):
             values = np.sort(model.physical(ends)[:, k])
         for bound in (limits[0][k], limits[1][k]):
             if np.isfinite(bound):
                 values[np.abs(values - bound) <= _ON_BOUND * abs(start[k] - bound)] = bound
-        found.append(np.full(2, np.nan) if any(one.lower for one in sides.values()) else values)
+        found.append(values)
     low, high = np.array(found).reshape(-1, 2).T
     return low, high
 
 
-@dataclass
-class _Side:
-    """One side of the profile of a parameter."""
-
-    problem: Problem
-    z: Array
-    x: Array
-    P: Array
-    place: int
-    sign: int
-    q: float
-    """The rise of root chi-square at the end."""
-    freedom: float
-    """Degrees of freedom f of levels that are among the other parameters: chi-square then rises by f log(1 + t^2 / f)
-    where a linear model would give Student's t; infinite if the levels stay as they are."""
-    least: float
-    """The sum of squares at the estimate."""
-    released: Released | None
-    lower: bool = False
-    """Whether a better fit than the estimate was found."""
-
-    def __post_init__(self) -> None:
-        # By distance from the estimate: the rise of root chi-square, and the parameters.
-        self.seen: dict[float, tuple[float, Array]] = {0.0: (0.0, self.x)}
-
-    def end(self) -> float:
-        """The distance from the estimate to the end of the interval; infinite if there is none."""
-        half = self.q * float(np.sqrt(self.P[self.place, self.place]))
-        near, far = 0.0, half
-        for _ in range(_STRETCHES):
-            if (risen := self.rise(far)) >= self.q:
-                end = brentq(lambda distance: self.rise(distance) - self.q, near, far, xtol=_PRECISION * half)
-                return float(end)  # type: ignore[arg-type]
-            near, far = far, far * float(np.clip(1.05 * self.q / max(risen, 1e-3), 1.1, 2.0))
-            if self.lower or far > _FARTHEST * half:
-                break
-        return np.inf
-
-    def rise(self, distance: float) -> float:
-        """The rise of root chi-square, up to twice q, the others beginning at the nearest point that is known, moved
-        along the line on which they would follow in a linear model."""
-        if distance not in self.seen:
-            usable = [known for known, (zeta, _) in self.seen.items() if zeta < 2.0 * self.q]
-            nearest = min(usable, key=lambda known: abs(known - distance))
-            at = self.x[self.place] + self.sign * distance
-            point, total = _fit_others(self.problem, self.z, self.P, self.place, at, self.seen[nearest][1])
-            if (free := self.released) is not None:
-                place = int(np.setdiff1d(np.arange(len(free.x)), free.places)[self.place])
-                freed, less = _fit_others(free.problem, self.z, free.P, place, at, free.x)
-                total = np.fmin(total, less) if free.inside(freed[None]).all() else total
-            change = total - self.least
-            if np.isfinite(self.freedom):
-                with np.errstate(over="ignore"):
-                    change = self.freedom * np.expm1(change / self.freedom)
-            self.lower |= change < -_LOWER * max(1.0, self.least)
-            zeta = np.fmin(np.sqrt(np.maximum(change, 0.0)), 2.0 * self.q)
-            self.seen[distance] = float(zeta), point
-        return self.seen[distance][0]
+class _BetterFit(Exception):
+    """The search has found a better fit than the estimate."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,14 +193,21 @@ class _Pinned(CountingModel):
         return np.insert(x, self.place, self.value, axis=1)
 
 
-def _fit_others(problem: Problem, z: Array, P: Array, place: int, at: float, near: Array) -> tuple[Array, float]:
+def _least_at(
+    problem: Problem, z: Array, P: Array, place: int, at: float, near: Array, released: Released | None
+) -> tuple[Array, float]:
     """The minimum (n,) with one parameter at a value, and the sum of squares there, from where a linear model of
-    covariance P (n, n) would lead from a point `near` (n,)."""
+    covariance P (n, n) would lead from a point `near` (n,); the sum is smaller if parameters that are released fit
+    better inside of their bounds."""
     model = _Pinned(problem.measurement, EvaluationCount.zeros(1), place=place, value=at)
     objective = objective_of(problem, z[None], model)
     x = np.delete(near + P[:, place] / P[place, place] * (at - near[place]), place)[None]
     with np.errstate(all="ignore"):
         if x.size:
             x = minimize(objective, LevenbergMarquardtMethod(1e-3), x, _LIMITS).x
-        total = objective.cost(x, objective.residual(x))
-    return model.whole(x)[0], float(total[0])
+        total = float(objective.cost(x, objective.residual(x))[0])
+    if released is not None:
+        free = int(np.setdiff1d(np.arange(len(released.x)), released.places)[place])
+        freed, less = _least_at(released.problem, z, released.P, free, at, released.x, None)
+        total = float(np.fmin(total, less)) if released.inside(freed[None]).all() else total
+    return model.whole(x)[0], total

@@ -224,6 +224,7 @@ def test_a_parameter_on_its_bound_is_held_there_beside_the_levels():
     assert np.array(answer["lm"].interval())[:, [0, 2, 3, 4]] == pytest.approx(np.array(alone.interval()), rel=1e-4)
     assert [p.name for p in found.model.physical_parameters] == ["a", "l", "sigma_0", "sigma_1"]
     assert found.on_bounds[0].other > 1.0
+    assert found.bootstrap.converged == found.bootstrap.drawn
 
 
 @pytest.mark.parametrize(
