@@ -27,13 +27,10 @@ class EsMda(Estimator):
     """All readings at once, assimilated `steps` times by an ensemble with inflated noise (Emerick and Reynolds,
     Computers & Geosciences 55, 2013).
 
-    Step k takes the noise for alpha_k R, with 1 / alpha_k adding up to 1, perturbs the readings by it for each member,
-    and moves the members by the gain of their own covariances. On a linear model with many members that is the Kalman
-    filter. Where the noise is far below the prior the information 1 / alpha_k has to grow in geometric progression,
-    here from `first` up. A member whose simulation overflows is left out of the step and drawn anew from the others.
-
-    The members' mean and covariance are the estimate; then `polish` Gauss-Newton steps on the maximum a posteriori,
-    whose covariance is reported instead.
+    Step k takes the noise for alpha_k R, with 1 / alpha_k adding up to 1 and growing geometrically from `first` up,
+    perturbs the readings by it for each member, and moves the members by the gain of their own covariances. A member
+    whose simulation overflows is drawn anew from the others. The members' mean and covariance are the estimate; then
+    `polish` Gauss-Newton steps on the maximum a posteriori, whose covariance is reported instead.
     """
 
     members: Annotated[int, Gt(1)] = 100

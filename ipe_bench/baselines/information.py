@@ -156,10 +156,9 @@ class _Beliefs(Walk):
 class RecursiveUpdate(InformationFilter):
     """Zanetti's idea (IEEE TAC 57, 2012): an extended Kalman filter moves a part of the way and linearises again.
 
-    A step takes in the readings as if their information were w_k R^-1, with weights w_k that add up to 1. Equal weights
-    fail where the noise is far below the prior: the first of them is nearly a full update. Here they are in geometric
-    progression, so that each step multiplies what is known by about the same factor, and the first is such that the
-    largest eigenvalue of w_1 H P H' (H whitened) is about `first`. On a linear model all this is the Kalman filter.
+    A step takes in the readings as if their information were w_k R^-1, with weights w_k in geometric progression that
+    add up to 1, so that each step multiplies what is known by about the same factor; the first is such that the largest
+    eigenvalue of w_1 H P H' (H whitened) is about `first`. On a linear model all this is the Kalman filter.
     """
 
     steps: Count = 8

@@ -81,9 +81,8 @@ class IPLF(InformationFilter, Solver[Linearized]):
     (IEEE SPL 25(4), 2018; arXiv 1704.01113).
 
     At 2n cubature points of the posterior so far, h is about A x + b with an error of covariance Omega; that affine
-    model, of noise R + Omega, updates the prior. While the posterior is wide Omega is large and the readings say
-    little, so it narrows by degrees. The inner loop moves the mean at a fixed posterior covariance and Omega, by
-    Gauss-Newton steps halved until the misfit decreases; the outer loop brings the covariance and Omega up to date.
+    model, of noise R + Omega, updates the prior. The inner loop moves the mean at a fixed posterior covariance and
+    Omega, by Gauss-Newton steps halved until the misfit decreases; the outer loop brings both up to date.
     """
 
     max_iterations: Count = 30

@@ -123,11 +123,9 @@ class MapLM(Batch):
 class MultiscaleLM(Estimator):
     """Least squares for hard starts: minimised twice from the nominal point, and the lower minimum kept.
 
-    Damping pulls a step towards short ones, and what is short depends on the scaling. Marquardt's (column norms of J,
-    growing) does not care for units but may run along a parameter that the readings hardly see at the start; parameters
-    in multiples of their size, which a model states for this very purpose, do not, but they bend the path where a
-    parameter ends far from its size. The two fail in different places. Steps by QR, to a tolerance near round-off.
-    Costs about twice as much as one Levenberg-Marquardt.
+    Marquardt's scaling (column norms of J, growing) may run along a parameter that the readings hardly see at the
+    start; parameters in multiples of their size do not, but fail where one ends far from its size. Costs about twice as
+    much as one Levenberg-Marquardt.
     """
 
     max_iterations: Count = 1000

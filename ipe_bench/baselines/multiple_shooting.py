@@ -37,13 +37,10 @@ class MultipleShooting(Estimator):
     Physics 18, 1981): the states at the beginning of each segment are unknowns beside the parameters, the segments'
     ends have to meet the next beginnings, and a Gauss-Newton step satisfies the linearised conditions exactly.
 
-    Segments begin where the readings put them, so what a trajectory from far-off parameters would do later (leave for
-    infinity, turn the wrong way round) does no harm. The conditions are eliminated by an orthogonal basis of their null
-    space, since substitution from the start would grow like the solutions. Steps are halved until the next step, by the
-    same linearisation, would be shorter: Deuflhard's natural monotonicity test (Newton Methods for Nonlinear Problems,
-    2004, section 4.3.4).
-
-    A simulation integrates all segments once; a Jacobian counts 1 + states/n, since it has as many more directions.
+    Segments begin where the readings put them, so what a trajectory from far-off parameters would do later does no
+    harm. The conditions are eliminated by an orthogonal basis of their null space. Steps are halved by Deuflhard's
+    natural monotonicity test (Newton Methods for Nonlinear Problems, 2004, section 4.3.4). A simulation integrates all
+    segments once; a Jacobian counts 1 + states/n.
     """
 
     segments: Count = 10

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt from many starts: the plainest way to look for a global minimum, and to see whether it is one."""
+"""Levenberg-Marquardt from many starts: the plainest way to look for a global minimum."""
 
 from __future__ import annotations
 
@@ -22,15 +22,12 @@ from ipe_bench.measurements.problem import Problem
 @dataclass(frozen=True)
 class Multistart(Estimator):
     """Levenberg-Marquardt from the nominal point, then from draws of the prior, until the residuals pass the
-    chi-square test; of all minima the lowest counts (Boender and Rinnooy Kan, Mathematical Programming 37, 1987,
-    on when such a search may stop).
+    chi-square test; of all minima the lowest counts (Boender and Rinnooy Kan, Mathematical Programming 37, 1987).
 
     After the first fit `confirmations` further starts look for another minimum that fits. Extras: `minima`, how many
-    distinct minima that fit were found, and `ambiguous`, 1 where there are several: then no residual can tell which is
-    the truth, and `alternatives` lists the others. That none was found is no proof that there is none.
-
-    Damping is in the metric of the prior. Where none is known it is in Marquardt's, and the starts are spread by the
-    size of the nominal point, or by 1 where that is zero.
+    distinct minima that fit were found, and `ambiguous`, 1 where there are several; `alternatives` lists the others.
+    Damping is in the metric of the prior. Without a prior it is in Marquardt's, and starts are spread by the size of
+    the nominal point.
     """
 
     starts: Count = 8

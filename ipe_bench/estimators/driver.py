@@ -1,8 +1,4 @@
-"""The loop that iterates any method on a batch of trials until each has an answer, or a failure that has a name.
-
-A method (`Solver`) says where it begins, what a step is, and how far its equation is from holding. Stopping, counting,
-histories and the table of endings are here.
-"""
+"""The loop that iterates any method on a batch of trials until each has an answer, or a failure that has a name."""
 
 from __future__ import annotations
 

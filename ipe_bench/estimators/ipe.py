@@ -1,8 +1,4 @@
-"""Iterative parameter estimation: the nonlinear system of eq. (11), and IPE, from which every solver derives.
-
-A solver is a frozen dataclass with one method, `step`, that reads like its textbook page; the loop, the stopping rules
-and the counting are the driver's.
-"""
+"""Iterative parameter estimation: the nonlinear system of eq. (11), and IPE, from which every solver derives."""
 
 from __future__ import annotations
 
@@ -179,11 +175,8 @@ def begin(problem: Problem, z: Array, start: Start) -> tuple[Array, FrozenSystem
 
 
 def starting_points(problem: Problem, z: Array, start: Start, tally: EvaluationCount) -> Array:
-    """Where least squares begins (trials, n); what that costs goes to the tally.
-
-    Where H has not full column rank at the nominal point there is no linear LSE, and it begins at the nominal point:
-    that the parameters cannot be told apart there says nothing of other points.
-    """
+    """Where least squares begins (trials, n): at the nominal point where H has not full column rank. What that costs
+    goes to the tally."""
     if start == "nominal" or problem.rankless:
         return np.repeat(problem.x0[None], len(z), axis=0)
     x, system = begin(problem, z, start)

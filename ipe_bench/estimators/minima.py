@@ -84,11 +84,10 @@ class Minima:
 
 
 def minimize(objective: Objective, method: Solver[LeastSquaresSystem], x: Array, limits: Limits) -> Minima:
-    """Minimises the objective from x (trials, n) by Gauss-Newton or Levenberg-Marquardt.
+    """Minimises the objective from x (trials, n), by coarse Jacobians on the way if the model has any that are cheaper.
 
     Converged is where the Gauss-Newton step, which is the gradient in whitened units, is at most `limits.tolerance`
-    standard deviations of the local bound in every parameter. An iteration is a step tried, taken or not. Jacobians are
-    coarse on the way, if the model has cheaper ones, and exact at the end.
+    standard deviations of the local bound in every parameter. An iteration is a step tried, taken or not.
     """
     if np.isinf(objective.exact_within):
         objective = objective.coarsened(_NEAR)

@@ -1,6 +1,4 @@
-"""Attempts at least squares from far away: by growing windows of data where readings arrive in epochs, and from other
-starts and metrics. `progressive` says which trials need another one.
-"""
+"""Attempts at least squares from far away: by growing windows of data, and from other starts and metrics."""
 
 from __future__ import annotations
 
@@ -233,12 +231,9 @@ class Windows(Attempts):
     """By growing windows of data: from the nominal point, then carefully from there, then from 16, 32, ... 256 draws of
     the prior; among them, where a prior is known after the first draws, Levenberg-Marquardt on all data.
 
-    The first two windows have about as many readings as there are parameters, so their fits have several minima of
-    one depth, and a common prior would draw all candidates to one of them. Until then each candidate's prior is
-    centred at its own draw, which makes the candidates about a sample of what the readings so far leave possible: the
-    randomised maximum likelihood of Oliver, He and Reynolds (5th European Conference on the Mathematics of Oil
-    Recovery, 1996). Where that fails, a minimum of the next window has drawn them all: so each later attempt keeps them
-    apart for one window more.
+    In the first two windows, whose fits have several minima of one depth, each candidate's prior is centred at its own
+    draw: the randomised maximum likelihood of Oliver, He and Reynolds (5th European Conference on the Mathematics of
+    Oil Recovery, 1996). Each later attempt from draws keeps the candidates apart for one window more.
     """
 
     planned = 9
@@ -271,8 +266,7 @@ class Windows(Attempts):
 
     def _reach(self, rows: Rows) -> Array:
         """How far the parameters of the trials `rows` may lie if no prior says so: the median of the distances in the
-        linear estimate, rounded up to a power of ten. On GINS that median is mostly right within a factor of three at
-        any scale, and a prior ten times too wide does no harm."""
+        linear estimate, rounded up to a power of ten, since a prior ten times too wide does no harm."""
         tally = EvaluationCount.zeros(len(rows))
         x = starting_points(self.problem, self.z[rows], "linear_lse", tally)
         self.tally.simulations[rows] += tally.simulations

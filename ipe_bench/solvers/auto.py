@@ -1,7 +1,4 @@
-"""The estimator for people who do not want to choose: the cheapest way first, a judge, and more where it says no.
-
-The cheapest way are chords: Gauss-Newton steps with a Jacobian of nearby, each for one simulation.
-"""
+"""The estimator that chooses for itself: chord steps with a Jacobian of nearby, a judge, and more where it says no."""
 
 from __future__ import annotations
 
@@ -44,12 +41,10 @@ class Auto(Estimator):
     Gomes and Selman (Artificial Intelligence 126, 2001).
 
     Where the first stage did not suffice, or plain fixed-point iteration would hardly contract at its answer, eq. (18),
-    `confirmations` minimisations from draws of the prior look for other minima that fit. Of several the one counts that
-    is the most probable with the prior, since no residual can tell. Extras: `minima`, how many distinct minima that fit
-    were found, and `ambiguous`, 1 where there are several, 0 where the look found none, which is no proof that there is
-    none, and NaN if no look was taken; `alternatives` lists the others.
-
-    One Jacobian of the first stage is the covariance's, and as with every solver not counted where it ends there.
+    `confirmations` minimisations from draws of the prior look for other minima that fit, of which the one counts that
+    is the most probable with the prior. Extras: `minima`, how many distinct minima that fit were found, and
+    `ambiguous`, 1 where there are several, 0 where the look found none, and NaN if no look was taken; `alternatives`
+    lists the others.
     """
 
     tolerance: Positive = 1e-6
@@ -175,11 +170,12 @@ class OnChord:
 
     @property
     def off(self) -> Array:
-        """How far from the minimum (trials,), in deviations, it may be where the steps end.
+        """How far from the minimum (trials,), in deviations, it may be where the steps end, at J' r = 0 for the J of
+        the start.
 
-        They end where J' r = 0 for the J of the start. A change of J by the part e on the way, with residuals of one
-        deviation, makes that an error of about e deviations. e is seen twice: in the part of the first step that was
-        taken back, and in the change of J on the way to the start, which is taken to go on at that rate.
+        A change of J by the part e on the way makes that an error of about e deviations. e is seen twice: in the part
+        of the first step that was taken back, and in the change of J on the way to the start, taken to go on at that
+        rate.
         """
         inverse_U = self.slope.inverse_U
         gone = np.linalg.norm(multiply(self.slope.U, self.x - self.start), axis=1)

@@ -1,7 +1,4 @@
-"""Progressive IPE: the least-squares estimate, reached from far away by windows that grow as a filter sees the data.
-
-The attempts are those of `attempts`; here are the judge and the end of the search.
-"""
+"""Progressive IPE: the least-squares estimate, reached from far away by windows that grow as a filter sees the data."""
 
 from __future__ import annotations
 
@@ -40,8 +37,7 @@ class Progressive(Estimator):
 
     A short stretch of data is nearly linear in the parameters, so its fit is easy to find; it starts the fit of a
     window `growth` times as long, and so on to all data. In the windows the prior counts, as it does for a filter, and
-    damps in its own metric, lambda |dx / prior_deviation|^2; Marquardt's scaling fails there, since an early window
-    leaves some parameters nearly free. The last pass, on all data, is plain least squares without the prior.
+    damps in its own metric, lambda |dx / prior_deviation|^2. The last pass, on all data, is plain least squares.
 
     The test of the residuals is the estimator's own verdict, extras `fit_p`. A trial that fails it, and whose bulk of
     residuals is large too, is tried again: carefully from the nominal point (windows that grow slowly, damping by the

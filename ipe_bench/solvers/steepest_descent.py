@@ -17,9 +17,8 @@ _HALVINGS = 40
 class SteepestDescent(IPE):
     """x <- x - alpha d along the gradient of g = |F|^2, alpha by quadratic interpolation of g at 0, alpha/2 and alpha.
 
-    The book's first trial step has length one, which presumes variables of order one; here it is as long as F, the step
-    of fixed-point iteration. Slow near a root, but g decreases from anywhere; where it no longer does, a local minimum
-    of g that is no root, the step is zero and the trial has stalled.
+    The book's first trial step has length one; here it is as long as F, the step of fixed-point iteration. Where g no
+    longer decreases, at a local minimum that is no root, the step is zero and the trial has stalled.
     """
 
     max_iterations: Count = field(default=500, kw_only=True)
