@@ -26,7 +26,7 @@ LINE = (
 )
 BUDGETS = {
     "basics": 981,
-    "measurements": 6702,
+    "measurements": 6686,
     "noise": 618,
     "priors": 105,
     "states": 1188,

@@ -22,8 +22,7 @@ from ipe_bench.basics.options import Count, Finite, NonNegative, Positive
 from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise, parameter_table
 from ipe_bench.measurements.ode.integrator import Kernel
 from ipe_bench.measurements.ode.model import OdeMeasurement
-from ipe_bench.measurements.ode.plan import Equations, Variation
-from ipe_bench.measurements.ode.tableau import DOP853
+from ipe_bench.measurements.ode.plan import DOP853, Equations, Variation
 from ipe_bench.measurements.ode.trace import tangent
 
 FOOT = 0.3048

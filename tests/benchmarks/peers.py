@@ -13,8 +13,7 @@ import numpy as np
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.ode.model import OdeMeasurement
-from ipe_bench.measurements.ode.plan import Recording
-from ipe_bench.measurements.ode.tableau import DOP853
+from ipe_bench.measurements.ode.plan import DOP853, Recording
 from ipe_bench.measurements.ode.trace import Program
 
 Simulate = Callable[[Array], Array]

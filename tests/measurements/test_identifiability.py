@@ -77,6 +77,8 @@ CASES = {
     "one temperature": ({"y": "-A*exp(-E/T)*y"}, {"y": "y0"}, {"r": "y"}, {"T": 300.0}, {"A", "E"}),
     "two temperatures": ({"y": "-A*exp(-E/T)*y"}, {"y": "y0"}, {"r": "y"}, {"T": (300.0, 350.0)}, set()),
     "exponent": ({"y": "-k*y**n"}, {"y": "y0"}, {"r": "y"}, {}, set()),
+    "scaled exponent": ({"y": "-k*y**n"}, {"y": "y0"}, {"r": "s*y"}, {}, {"k", "s", "y0"}),
+    "weir": ({"h": "-c*h**1.5"}, {"h": "h0"}, {"r": "g*h"}, {}, {"c", "g", "h0"}),
     "torricelli": ({"h": "-c*sqrt(h)"}, {"h": "h0"}, {"r": "g*h"}, {}, {"c", "g", "h0"}),
 }
 

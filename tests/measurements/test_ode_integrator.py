@@ -10,7 +10,7 @@ from ipe_bench.basics import compiled
 from ipe_bench.basics.errors import UserError
 from ipe_bench.measurements import OdeMeasurement, Parameter, ode
 from ipe_bench.measurements.base import differentiate
-from ipe_bench.measurements.ode import tableau
+from ipe_bench.measurements.ode import plan
 from ipe_bench.measurements.ode.steps import contraction
 
 
@@ -58,9 +58,9 @@ class Cases(Pulse):
 
 
 def test_the_coefficients_are_those_of_scipy():
-    for mine, theirs in ((tableau.DOP853.B, DOP853.B[:12]), (tableau.DOP853.C, DOP853.C[:12])):
+    for mine, theirs in ((plan.DOP853.B, DOP853.B[:12]), (plan.DOP853.C, DOP853.C[:12])):
         assert mine == tuple(theirs)
-    for s, row in enumerate(tableau.DOP853.A):
+    for s, row in enumerate(plan.DOP853.A):
         assert row == tuple(DOP853.A[s, :s])
 
 

@@ -20,8 +20,8 @@ from ipe_bench.measurements import LotkaVolterra, Ode, OdeMeasurement, Parameter
 from ipe_bench.measurements.joint import Joint
 from ipe_bench.measurements.known import ConstrainedModel, ParameterInfo
 from ipe_bench.measurements.ode.interval import Interval
+from ipe_bench.measurements.ode.plan import DOP853
 from ipe_bench.measurements.ode.steps import contraction
-from ipe_bench.measurements.ode.tableau import DOP853
 
 BATCHES = (1, 7, 8, 9, 64, 250)
 TOLERANCE = 1e-8

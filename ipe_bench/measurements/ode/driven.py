@@ -7,6 +7,7 @@ holds throughout or nowhere, a held input is a constant, and one that is straigh
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -47,12 +48,10 @@ def separated(
         b = other[0] if other else ("negative", a)
         return rewritten(("if", ("<" if operation == "min" else ">", a, b, f"the {operation} of t"), a, b), new)
 
-    found = {}
+    found = dict(formulas)
     for key, formula in formulas.items():
-        tree = formula.tree
-        if any(part[0] in PIECEWISE for part in parts(tree)):
-            tree = rewritten(tree, new)
-        found[key] = Arithmetic(formula.text, tree, tuple(dict.fromkeys(names_in(tree))))
+        if any(part[0] in PIECEWISE for part in parts(formula.tree)):
+            found[key] = replace(formula, tree=rewritten(formula.tree, new))
     return found, {name: tree for tree, name in switches.items()}
 
 

@@ -23,8 +23,7 @@ from ipe_bench.basics import compiled
 from ipe_bench.basics.compiled import INTEGER, POINTER, WHOLE, aligned, at
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.machine import cores
-from ipe_bench.measurements.ode.plan import Equations, Plan, Recording, planned
-from ipe_bench.measurements.ode.tableau import Tableau
+from ipe_bench.measurements.ode.plan import Equations, Plan, Recording, Tableau, planned
 from ipe_bench.measurements.ode.trace import Program
 
 if TYPE_CHECKING:
@@ -35,6 +34,7 @@ _WORTH_THREADS = 40_000
 """Steps times lanes times states from which a second thread gains more than it costs, some 150 microseconds."""
 _NARROW = 4
 """Lanes up to which half of the usual vectors do: one simulation of GINS in two thirds of the time."""
+Whole = NDArray[np.integer[Any]]
 _EMIT = Path(__file__).with_name("emit.py")
 _ARGUMENTS = tuple(INTEGER if i in (3, 5, 6, 9, 11) else POINTER for i in range(14))
 
@@ -81,16 +81,7 @@ class Kernel:
         weights = -(-sum(map(len, self.plan.tableau.weights)) // width)
         return _compiled("integrate", self.plan, width, _ARGUMENTS), (self.plan.size + weights) * width
 
-    def run(
-        self,
-        x: Array,
-        si: Array,
-        cases: Array,
-        rows: NDArray[np.int64],
-        times: Array,
-        steps: NDArray[np.int64],
-        *more: Array,
-    ) -> None:
+    def run(self, x: Array, si: Array, cases: Array, rows: Whole, times: Array, steps: Whole, *more: Array) -> None:
         """Integrates the trials in these rows of x (trials, n) from time 0, in every case, `steps[k]` equal steps to
         `times[k]`. `cases` has the constants (cases, constants), or where some are driven those of every interval and
         those after the last time (times + 1, cases, constants). The last of `more` takes the results, C-contiguous, in
@@ -142,7 +133,9 @@ class Kernel:
             Program.of(shown, at),
         )
 
-    def _interpret(self, x: Array, si: Array, cases: Array, rows: Any, times: Array, steps: Any, *more: Array) -> None:
+    def _interpret(
+        self, x: Array, si: Array, cases: Array, rows: Whole, times: Array, steps: Whole, *more: Array
+    ) -> None:
         """`run` in NumPy, all lanes at once; products are rounded before they are added."""
         begin, slope, read = self._programs
         intervals = cases if cases.ndim == 3 else cases[None]

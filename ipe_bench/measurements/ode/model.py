@@ -18,7 +18,7 @@ from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, own
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.ode.integrator import Kernel, rates
-from ipe_bench.measurements.ode.plan import Equations, Variation, jumps
+from ipe_bench.measurements.ode.plan import DOP853, RK4, Equations, Variation, jumps
 from ipe_bench.measurements.ode.rodas import diagnose
 from ipe_bench.measurements.ode.steps import (
     CONTRACTION,
@@ -34,7 +34,6 @@ from ipe_bench.measurements.ode.steps import (
     ladder,
     search,
 )
-from ipe_bench.measurements.ode.tableau import DOP853, RK4
 from ipe_bench.measurements.ode.trace import Graph, Program
 
 _FAR = 1e3
@@ -165,21 +164,29 @@ class OdeMeasurement(Measurement):
         """Readings less the offset (m,)."""
         x = own(x)
         z = np.empty((len(x), len(self._cases) * stop * len(self.outputs)))
-        everyone, common = np.arange(len(x)), self._common_steps(x)
-        if common is not None:
-            groups = [(everyone, common)]
-        elif coarse and self._guessed:
-            groups = self._groups(self._guess(x), everyone)
-        else:
-            found = self._search(x, offset)
-            cases, outputs = len(self._cases), len(self.outputs)
-            whole = found.z.reshape(len(found.z), cases, len(self.times), outputs)
-            z.reshape(len(x), cases, stop, outputs)[found.computed] = whole[:, :, :stop]
-            others = np.delete(everyone, found.computed)
-            groups = self._groups(found.places[others], others)
-        for rows, steps in groups:
+        for rows, steps in self._groups(x, offset, guess=coarse, z=z):
             self._simulate(x, rows, steps, offset, z)
         return z
+
+    def _groups(
+        self, x: Array, offset: Array, *, guess: bool = False, z: Array | None = None
+    ) -> list[tuple[Indices, NDArray[np.int64]]]:
+        """The trials that share a level, and their steps to each time; those whose readings the search for their level
+        has left in z (trials, readings) are left out."""
+        rows, common = np.arange(len(x)), self._common_steps(x)
+        if common is not None:
+            return [(rows, common)]
+        if guess and self._guessed:
+            places = self._guess(x)
+        else:
+            found = self._search(x, offset)
+            places = found.places
+            if z is not None:
+                shape = len(self._cases), len(self.times), len(self.outputs)
+                shown = z.reshape(len(x), shape[0], -1, shape[2])
+                shown[found.computed] = found.z.reshape(len(found.z), *shape)[:, :, : shown.shape[2]]
+                rows = np.delete(rows, found.computed)
+        return [(group, self._ladder[place] * self._parts) for place, group in grouped(places[rows], rows)]
 
     @property
     def _guessed(self) -> bool:
@@ -190,10 +197,6 @@ class OdeMeasurement(Measurement):
         """The level of each trial by its rate alone."""
         trusted = self._trusted(x)
         return np.where(trusted < 0, self._first_guess(x), trusted)
-
-    def _groups(self, places: Indices, rows: Indices) -> list[tuple[Indices, NDArray[np.int64]]]:
-        """The trials that share a level, and the steps of that level to each time."""
-        return [(group, self._ladder[place] * self._parts) for place, group in grouped(places, rows)]
 
     def hindrance(self, x: Array) -> str:
         x = own(x[None, : self.n])
@@ -321,11 +324,7 @@ class OdeMeasurement(Measurement):
     def jacobian_until(self, x: Array, stop: int) -> Array:
         """dh/dx by the variational equations, integrated by the same formula and steps as the readings of that x."""
         x = own(x)
-        everyone, common = np.arange(len(x)), self._common_steps(x)
-        if common is not None:
-            groups = [(everyone, common)]
-        else:
-            groups = self._groups(self._search(x, self._zeros).places, everyone)
+        groups = self._groups(x, self._zeros)
         return self._tangents(x, stop, [(self._jacobian_kernel, rows, steps) for rows, steps in groups])
 
     def coarse_jacobian_until(self, x: Array, stop: int) -> Array:

@@ -1,4 +1,4 @@
-"""What an integrator of recorded equations computes: programs, and where their numbers lie.
+"""What an integrator of recorded equations computes: formulas, programs, and where their numbers lie.
 
 What is recorded is said by `Equations`; a `Plan` is run by `integrator`.
 """
@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.measurements.ode.tableau import Tableau
 from ipe_bench.measurements.ode.trace import (
     COMPARISONS,
     Expression,
@@ -29,6 +28,77 @@ from ipe_bench.measurements.ode.trace import (
 Arithmetic = Callable[..., Sequence[Any]]
 _POINTS, _NEWTON = 64, 30
 """Points at which a comparison is examined, and the steps that move them to where it changes."""
+
+
+@dataclass(frozen=True)
+class Tableau:
+    """An explicit formula: stage s starts from y + h sum_j A[s][j] k_j at t + C[s] h, the step ends at
+    y + h sum_s B[s] k_s."""
+
+    A: tuple[tuple[float, ...], ...]
+    B: tuple[float, ...]
+    C: tuple[float, ...]
+
+    @property
+    def stages(self) -> int:
+        return len(self.B)
+
+    @property
+    def weights(self) -> list[list[tuple[int, float]]]:
+        """For every stage, and last for the end of the step: the slopes that count, with their weights."""
+        return [[(j, v) for j, v in enumerate(row) if v != 0.0] for row in (*self.A, self.B)]
+
+
+# fmt: off
+DOP853 = Tableau(
+    A=(
+        (),
+        (0.05260015195876773,),
+        (0.0197250569845379, 0.0591751709536137),
+        (0.02958758547680685, 0.0, 0.08876275643042054),
+        (0.2413651341592667, 0.0, -0.8845494793282861, 0.924834003261792),
+        (0.037037037037037035, 0.0, 0.0, 0.17082860872947386, 0.12546768756682242),
+        (0.037109375, 0.0, 0.0, 0.17025221101954405, 0.06021653898045596, -0.017578125),
+        (
+            0.03709200011850479, 0.0, 0.0, 0.17038392571223998, 0.10726203044637328, -0.015319437748624402,
+            0.008273789163814023,
+        ),
+        (
+            0.6241109587160757, 0.0, 0.0, -3.3608926294469414, -0.868219346841726, 27.59209969944671,
+            20.154067550477894, -43.48988418106996,
+        ),
+        (
+            0.47766253643826434, 0.0, 0.0, -2.4881146199716677, -0.590290826836843, 21.230051448181193,
+            15.279233632882423, -33.28821096898486, -0.020331201708508627,
+        ),
+        (
+            -0.9371424300859873, 0.0, 0.0, 5.186372428844064, 1.0914373489967295, -8.149787010746927,
+            -18.52006565999696, 22.739487099350505, 2.4936055526796523, -3.0467644718982196,
+        ),
+        (
+            2.273310147516538, 0.0, 0.0, -10.53449546673725, -2.0008720582248625, -17.9589318631188, 27.94888452941996,
+            -2.8589982771350235, -8.87285693353063, 12.360567175794303, 0.6433927460157636,
+        ),
+    ),
+    B=(
+        0.054293734116568765, 0.0, 0.0, 0.0, 0.0, 4.450312892752409, 1.8915178993145003, -5.801203960010585,
+        0.3111643669578199, -0.1521609496625161, 0.20136540080403034, 0.04471061572777259,
+    ),
+    C=(
+        0.0, 0.05260015195876773, 0.0789002279381516, 0.1183503419072274, 0.2816496580927726, 0.3333333333333333, 0.25,
+        0.3076923076923077, 0.6512820512820513, 0.6, 0.8571428571428571, 1.0,
+    ),
+)
+# fmt: on
+"""Eighth order in twelve stages (Dormand and Prince; Hairer, Norsett, Wanner, Solving Ordinary Differential Equations
+I, 2nd ed. 1993, II.5, table 5.4 and the code DOP853)."""
+
+RK4 = Tableau(
+    A=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
+    B=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
+    C=(0.0, 0.5, 0.5, 1.0),
+)
+"""The classical formula of fourth order (Kutta, 1901)."""
 
 
 @dataclass(frozen=True)
