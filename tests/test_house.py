@@ -35,7 +35,7 @@ BUDGETS = {
     "baselines": 2068,
     "trials": 1990,
     "runs": 2114,
-    "statistics": 3777,
+    "statistics": 3751,
     "real": 2301,
     "plugins": 1120,
     "report": 4034,

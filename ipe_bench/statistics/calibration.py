@@ -183,12 +183,6 @@ def calibrations(error: Array, deviation: Array, nees: Array, claimed: Array) ->
     return [*parts, Calibration(together, n, level, found[-1])]
 
 
-def overall_p(parts: Sequence[Calibration]) -> float:
-    """The probability that any of the parts is so far off if all claims are true: Bonferroni's, which needs no
-    independence."""
-    return min(1.0, len(parts) * min(part.p for part in parts)) if parts else np.nan
-
-
 def overall_words(parts: Sequence[Calibration], names: Sequence[str]) -> str:
     """The verdict on an estimator: what is wrong with NEES, and with the parameter that is farthest off."""
     if not parts:

@@ -144,13 +144,6 @@ class Squares:
         mean = scaled.mean(axis=1)
         return cls(count, size, mean, ((scaled - mean[:, None]) ** 2).sum(axis=1))
 
-    @property
-    def effective(self) -> Array:
-        """The effective number (k,) of those that share in the sum: its square over the sum of squares."""
-        with np.errstate(all="ignore"):
-            total = self.count * self.mean
-            return total**2 / (self.deviations + total * self.mean)
-
 
 def few_carry(squares: Squares, degrees: Array) -> Array:
     """Whether few trials carry the sum of squares (k,), so that no interval made of the trials can be relied on.
@@ -161,8 +154,9 @@ def few_carry(squares: Squares, degrees: Array) -> Array:
     of the trials: then nothing in them can tell.
     """
     with np.errstate(all="ignore"):
-        shares = 1 / squares.effective
-        largest = 1 / (squares.deviations + squares.count * squares.mean**2)
+        total = squares.count * squares.mean
+        power = squares.deviations + total * squares.mean
+        shares, largest = power / total**2, 1 / power
     limits = np.array([_heaviest(squares.count, int(d)) for d in degrees])
     return (shares > limits) & (largest > _ONE_TRIAL)
 
@@ -307,16 +301,10 @@ def rms_sequence(squares: Squares, degrees: Array, level: float = LEVEL) -> tupl
 
 def quantile(values: Array, q: float) -> float:
     """Quantile of non-negative numbers where non-finite ones count as infinite (linear between order statistics)."""
-    return float(quantiles(values, np.array([q]))[0])
-
-
-def quantiles(values: Array, q: Array) -> Array:
-    """Several quantiles at once; see `quantile`."""
     if len(values) == 0:
-        return np.full(len(q), np.nan)
+        return np.nan
     position = (len(values) - 1) * q
-    places = np.array([np.floor(position), np.ceil(position)]).astype(int)
-    a, b = np.partition(np.where(np.isfinite(values), values, np.inf), np.unique(places))[places]
-    with np.errstate(invalid="ignore"):
-        # Between two infinite values nothing is interpolated: inf - inf is not a number.
-        return np.where(a < b, a + (b - a) * (position - places[0]), a)
+    places = math.floor(position), math.ceil(position)
+    a, b = np.partition(np.where(np.isfinite(values), values, np.inf), places)[[*places]]
+    # Between two infinite values nothing is interpolated: inf - inf is not a number.
+    return float(a + (b - a) * (position - places[0]) if a < b else a)

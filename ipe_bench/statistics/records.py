@@ -294,7 +294,8 @@ STATISTICS: tuple[Statistic, ...] = (
         f" Tibshirani, An Introduction to the Bootstrap, 1993, ch. 12), {intervals.RESAMPLES} resamples, the same for"
         f" every estimator; above {intervals.LARGEST_SAMPLE} trials, groups of consecutive trials are resampled. None"
         f" for fewer than {FEW} trials, and none where a few trials carry the sum of squares: where its effective"
-        f" number of trials is less than that of normal errors in all but {100 * intervals.HEAVY:g} % of cases.",
+        " number of trials, (Σ e²)² / Σ e⁴ (Kish, Survey Sampling, 1965), is less than that of normal errors in all but"
+        f" {100 * intervals.HEAVY:g} % of cases.",
         f.of_each(f.rmse),
         limits=f.ends_in_units(f.rmse_ends),
         given="solved",
@@ -313,17 +314,6 @@ STATISTICS: tuple[Statistic, ...] = (
         limits=f.ends_in_units(f.rmse_ends_anytime),
         given="solved",
         kind="physical",
-    ),
-    Statistic(
-        "effective_trials",
-        "effective trials",
-        "solved trials",
-        "Number of equal trials that would share the sum of squared errors as evenly, (Σ e²)² / Σ e⁴ (Kish,"
-        " Survey Sampling, 1965): a third of the trials for normal errors of one parameter, one if a single trial"
-        " carries the whole sum.",
-        lambda s: f.squares(s).effective,
-        given="solved",
-        where=("parameters",),
     ),
     Statistic(
         "rmse_common",

@@ -20,7 +20,6 @@ from ipe_bench.statistics.calibration import (
     calibrations,
     covered,
     curves,
-    overall_p,
     overall_words,
 )
 
@@ -158,7 +157,6 @@ def test_what_makes_no_claim_and_what_is_no_covariance():
     assert calibrations(error, deviation, nees, np.zeros(300, dtype=bool)) == []
     assert calibrations(error, np.full_like(error, np.nan), np.full(300, np.nan), np.ones(300, dtype=bool)) == []
     assert overall_words([], []) == "-"
-    assert np.isnan(overall_p([]))
     void = calibrations(error, np.full_like(error, np.nan), np.full(300, np.inf), np.ones(300, dtype=bool))
     assert overall_words(void, ["a", "b"]).startswith("most reported covariances are void")
 
