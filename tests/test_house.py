@@ -29,7 +29,7 @@ BUDGETS = {
     "measurements": 6686,
     "noise": 618,
     "priors": 105,
-    "states": 1188,
+    "states": 1199,
     "estimators": 1194,
     "solvers": 1197,
     "baselines": 2068,

@@ -158,7 +158,7 @@ class Formulas(StateModel):
         """Those formulas (..., number) at states x (..., n) at epoch k."""
         known = dict(zip(self.next, np.moveaxis(x, -1, 0), strict=True)) | dict(noise)
         known |= {name: float(values[k]) for name, values in self._inputs.items()}
-        known |= {**self.constants, "k": k + 1.0, "t": float(self.times[k])}
+        known |= {**self.constants, "k": k + 1.0, "t": self.step * (k + 1.0)}
         with np.errstate(all="ignore"):
             values = np.broadcast_arrays(x[..., 0], *(formula(known) for formula in formulas.values()))[1:]
         return np.stack(np.broadcast_arrays(*values), axis=-1)

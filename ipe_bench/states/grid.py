@@ -18,6 +18,8 @@ _BEYOND = 3.0
 _COARSE = 1.6
 """Largest squared step of the points in standard deviations of process noise, and of the density about its peak: an
 integral is then wrong by a share of exp(-2 pi^2 / 1.6) = 4e-6."""
+_AT_ONCE = 25
+"""Trials that are smoothed at once."""
 _CUT = 1e-6
 """Largest density at an end of the grid, in parts of the peak."""
 
@@ -45,29 +47,31 @@ class Grid(Tracker):
         return ""
 
     def track(self, model: StateModel, z: Array) -> Tracks:
+        if self.smooths and len(z) > _AT_ONCE:  # whose densities are kept for all epochs
+            return Tracks.join([self.track(model, z[i : i + _AT_ONCE]) for i in range(0, len(z), _AT_ONCE)])
         out, grids = Tracks.empty(model, len(z)), self._grids(model)
         out.nis[:] = np.nan  # a density has no innovation
+        out.calls = 2.0 * self.points * model.epochs
         m, P = model.prior.mean[0], model.prior.covariance[0, 0]
         p = np.exp(-0.5 * (grids[0] - m) ** 2 / (P or 1.0))
         p = np.repeat(p[None] / p.sum(), len(z), axis=0)
-        predicted, filtered = [], []
+        kept = []
         for k in range(model.epochs):
             if model.moves(k):
                 p = multiply(_kernel(model, grids, k), p)
                 p /= p.sum(axis=1, keepdims=True)
-            predicted.append(p)
+            predicted = p
             p = weighed(model, np.repeat(grids[k + 1][None, :, None], len(z), 0), k, z[:, k], p, out)
             _require_resolved(p, k)
-            filtered.append(p)
-        for k in range(model.epochs - 1, -1, -1):
-            if self.smooths and k < model.epochs - 1:
-                ratio = np.where(predicted[k + 1] > 0, p / np.maximum(predicted[k + 1], 1e-300), 0.0)
-                p = filtered[k] * multiply(_kernel(model, grids, k + 1).T, ratio)
-                p /= p.sum(axis=1, keepdims=True)
-            density, g = p if self.smooths else filtered[k], grids[k + 1]
-            out.mean[:, k, 0] = mean = np.sum(density * g, axis=1)
-            out.covariance[:, k, 0, 0] = np.sum(density * (g - mean[:, None]) ** 2, axis=1)
-        out.calls = 2.0 * self.points * model.epochs
+            _describe(out, k, p, grids)
+            if self.smooths:
+                kept.append((predicted, p))
+        for k in range(len(kept) - 2, -1, -1):
+            predicted = kept[k + 1][0]
+            ratio = np.where(predicted > 0, p / np.maximum(predicted, 1e-300), 0.0)
+            p = kept[k][1] * multiply(_kernel(model, grids, k + 1).T, ratio)
+            p /= p.sum(axis=1, keepdims=True)
+            _describe(out, k, p, grids)
         return out
 
     def _grids(self, model: StateModel) -> Array:
@@ -86,6 +90,13 @@ def _kernel(model: StateModel, grids: Array, k: int) -> Array:
 def _moved(model: StateModel, grids: Array, k: int) -> Array:
     """Where the points before epoch k are moved to without process noise (points,)."""
     return model.transition(grids[k][:, None], k)[:, 0]
+
+
+def _describe(out: Tracks, k: int, p: Array, grids: Array) -> None:
+    """Notes the mean and the variance of the densities p (trials, points) of epoch k."""
+    g = grids[k + 1]
+    out.mean[:, k, 0] = mean = np.sum(p * g, axis=1)
+    out.covariance[:, k, 0, 0] = np.sum(p * (g - mean[:, None]) ** 2, axis=1)
 
 
 def _require_resolved(p: Array, k: int) -> None:
