@@ -53,7 +53,8 @@ def test_all_kinds_of_plugins_are_made_checked_run_and_seen(installed, tmp_path)
         assert "all checks passed" in run("check", f"plugins/own_{kind}")
         assert f"own_{kind}" in run("list", "baseline" if kind == "filter" else kind)
     # Parts of reports of their own are in the page of any run.
-    run("run", "measurement=own_measurement", "solver=[own_solver]", "trials=20", "output=out", "figures=all")
+    chosen = ("measurement=own_measurement", "noise=own_noise", "solver=[own_solver]")
+    run("run", *chosen, "trials=20", "output=out", "figures=all")
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     for text in ("own_statistic", "figure-own_figure", "table-own_table", "What own_section says"):
         assert text in page
