@@ -290,6 +290,14 @@ def test_a_random_walk_keeps_the_tolerance_of_gins(scale):
     assert (rich.simulate_until(x, 7) == rich.simulate(x)[:, rich.rows(7)]).all()
 
 
+def test_a_level_accelerometer_senses_the_other_axis_and_a_square():
+    p, gravity = np.zeros(15), RicherGins().gravity
+    p[11:] = 1e-3, 2e-3, 3e-4, 5e-4  # quadratic x and y in 1 / (m/s^2), misalignment of x to y and of y to x in rad
+    fx, fy = 0.02, -0.05
+    shown = RicherGins().acceleration((fx / gravity, fy / gravity), p)
+    np.testing.assert_allclose(shown, (fx + 1e-3 * fx**2 + 3e-4 * fy, fy + 2e-3 * fy**2 + 5e-4 * fx), rtol=1e-14)
+
+
 def test_the_parameters_of_a_trial_are_those_of_the_plain_scenario():
     plain = Scenario(Gins(), NOISE, error_scale=33.0).draw(0, 5)
     rich = scenario(gyro_random_walk=0.01).draw(0, 5)

@@ -4,17 +4,8 @@ import numpy as np
 import pytest
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.measurements import (
-    Accelerometer,
-    Bearings,
-    Bock,
-    Gnss,
-    Ode,
-    Polynomial,
-    Ranging,
-    Sir,
-    Triad,
-)
+from ipe_bench.measurements import Accelerometer, Bearings, Bock, Gins, Gnss, Ode, Polynomial, Ranging, Sir, Triad
+from ipe_bench.measurements.known import ParameterInfo
 from ipe_bench.noise import Colored, Correlated
 
 FEW = ((1.0, 0.0, 0.0),) * 9
@@ -36,6 +27,11 @@ MISTAKES = [
     (lambda: Gnss(satellites=HIGH[:3]), "satellites: 3 readings"),
     (lambda: Gnss(satellites=((2e7, 0.0),) * 9), r"satellites\[0\]=\[2.*, 0\.0\]: give a list of 5"),
     (lambda: Gnss(position=(0.0, 0.0, 0.0)), "position:"),
+    (lambda: Gins(injected=()), r"injected=\[\]: give a list of at least 1"),
+    (lambda: ParameterInfo("k", fixed=1.0, lower=0.0), "fixed=1.0: a fixed parameter has no lower"),
+    (lambda: ParameterInfo("k", positive=True, lower=-1.0), "lower=-1.0: is given with positive=true"),
+    (lambda: ParameterInfo("k", lower=2.0, upper=1.0), "upper=1.0: give a number above lower=2"),
+    (lambda: ParameterInfo("k", deviation=0.0), "deviation=0.0: give a number above 0 or null"),
     (lambda: Sir(size={"beta": 1.0}), "size: beta is not a parameter"),
     (lambda: Sir(constants={"population": 763.0}).simulate(np.ones((1, 3))), "measurement: infection is not known"),
     (lambda: Bock(tolerance="1e-13*cosh(nu*t)"), "tolerance: nu is neither a constant nor t"),

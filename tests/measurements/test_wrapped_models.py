@@ -42,6 +42,13 @@ def test_a_subset_of_a_window_takes_its_columns_of_what_has_arrived(kept):
     np.testing.assert_array_equal(model.coarse_jacobian(x), GINS.coarse_jacobian_until(x, 3)[:, list(kept)])
 
 
+def test_readings_of_some_cases_are_computed_without_the_others():
+    rows = [62, 70, 181, 239]  # of the second and the fourth case
+    model, x = GINS.taking(rows), draw(GINS)
+    assert len(model.whole.cases) == 2
+    np.testing.assert_allclose(model.simulate(x), GINS.simulate(x)[:, rows], atol=1e-9)
+
+
 def test_a_truth_that_is_richer_keeps_its_nuisances_in_a_subset():
     whole = RicherGins(accelerometer_quadratic=10.0)
     model = SubsetModel(whole, (3, 70))
