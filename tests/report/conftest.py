@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import contextlib
 import fcntl
 import json
 import os
@@ -85,42 +84,31 @@ class Page:
         return base64.b64decode(answer["data"])
 
 
-@contextlib.contextmanager
-def chromium(program: str) -> Iterator[Page]:
-    """Starts Chromium with its pipe on descriptors 3 and 4, and ends it."""
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Page]:
+    """A page of a headless Chromium, whose pipe is on descriptors 3 and 4; skips where there is none."""
+    program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if program is None:
+        pytest.skip("there is no Chromium")
     # Chromium reads descriptor 3 and writes 4: ours are kept above, so that the shell's redirections cannot meet them.
     low = [*os.pipe(), *os.pipe()]
     to_read, to_write, from_read, from_write = (fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, 10) for fd in low)
-    for fd in low:
-        os.close(fd)
     with tempfile.TemporaryDirectory(prefix="ipe-bench-chromium-", ignore_cleanup_errors=True) as profile:
         script = f'exec "$@" 3<&{to_read} 4>&{from_write} {to_read}<&- {from_write}>&-'
         command = ["bash", "-c", script, "bash", program, *FLAGS, f"--user-data-dir={profile}"]
         process = subprocess.Popen(
             command, pass_fds=(to_read, from_write), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
-        os.close(to_read)
-        os.close(from_write)
-        page = None
+        for fd in (*low, to_read, from_write):
+            os.close(fd)
         try:
             page = Page(from_read, to_write)
             yield page
+            page.reader.close()
         finally:
             process.terminate()
             process.wait(timeout=30)
             os.close(to_write)
-            if page is not None:
-                page.reader.close()
-
-
-@pytest.fixture(scope="session")
-def browser() -> Iterator[Page]:
-    """A page of a headless Chromium; skips where there is none."""
-    program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if program is None or shutil.which("bash") is None:
-        pytest.skip("there is no Chromium")
-    with chromium(program) as page:
-        yield page
 
 
 @pytest.fixture

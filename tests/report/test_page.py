@@ -147,17 +147,6 @@ def test_the_page_is_dark_where_the_reader_has_it_so(desktop, page_file):
         desktop.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}])
 
 
-def test_names_stay_in_sight_when_a_table_is_scrolled(desktop):
-    left, right, visible = desktop.run(
-        "(function () { const box = document.querySelector('#table-parameters').parentElement; box.scrollLeft = 400;"
-        " const cell = box.querySelector('td.frozen').getBoundingClientRect(), frame = box.getBoundingClientRect();"
-        " return [cell.left - frame.left, frame.right - cell.right, box.scrollLeft]; })()"
-    )
-    assert visible > 0
-    assert 0 <= left <= 2
-    assert right > 0
-
-
 def test_the_page_opens_with_the_answer_and_a_link_unfolds_the_rest(browser, page_file):
     browser.go(page_file)
     order = browser.run(
