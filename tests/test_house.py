@@ -25,8 +25,8 @@ LINE = (
     ("cli",),
 )
 BUDGETS = {
-    "basics": 981,
-    "measurements": 6686,
+    "basics": 977,
+    "measurements": 6636,
     "noise": 618,
     "priors": 105,
     "states": 1199,

@@ -168,11 +168,7 @@ DOUBLE, WHOLE = np.dtype(np.float64), np.dtype(np.int64)
 
 
 def at(a: Any, kind: Any = DOUBLE) -> int:
-    """Where the numbers of an array lie; a third of the time that `a.ctypes.data` takes.
-
-    Raises:
-        TypeError: the numbers are of another kind, not C-contiguous, or not to be written to.
-    """
+    """Where the numbers of a C-contiguous array lie, in a third of the time that `a.ctypes.data` takes."""
     if a.dtype != kind:
         raise TypeError(f"an array of {a.dtype}, where one of {kind} is taken")
     if not a.size:

@@ -89,11 +89,7 @@ class Function(WrittenModel):
 
     @cached_property
     def function(self) -> Callable[..., Any]:
-        """The function that `of` names.
-
-        Raises:
-            UserError: there is no such module or function, or the module cannot be imported.
-        """
+        """The function that `of` names; its module is imported from the working folder or the path."""
         module, colon, name = self.of.partition(":")
         module = module.removesuffix(".py")
         if not (module and colon and name.isidentifier()):

@@ -91,11 +91,12 @@ class _Free(dict[Any, int]):
 
     def power(self, base: int, exponent: int) -> int:
         """Exponents one apart, such as those of a power and its derivative, have powers that the base divides."""
+        key = ("pow", base, exponent)
         for apart in (1, -1):
-            key = ("pow", base, (exponent + apart) % self.prime)
-            if key in self:
-                return self[key] * pow(base, -apart, self.prime) % self.prime
-        return self["pow", base, exponent]
+            other = ("pow", base, (exponent + apart) % self.prime)
+            if key not in self and other in self:
+                self[key] = self[other] * pow(base, -apart, self.prime) % self.prime
+        return self[key]
 
 
 def _jacobian(
@@ -171,10 +172,10 @@ class _Series(dict[int, list[int]]):
             case "div":
                 return (a[k] - _product(b[1:], u, k - 1)) * self._inverse(b[0])
             case "exp":
-                return self._integral(_product(_derivative(a), u, k - 1), k) if k else self.free["exp", a[0]]
+                return _product(_derivative(a), u, k - 1) * pow(k, -1, self.p) if k else self.free["exp", a[0]]
             case "log":
                 rest = _derivative(a)[k - 1] - _product(_derivative(u), a[1:], k - 2) if k else 0
-                return self._integral(rest * self._inverse(a[0]), k) if k else self.free["log", a[0]]
+                return rest * self._inverse(k * a[0]) if k else self.free["log", a[0]]
             case "where" if a[0]:  # of a power's derivative: what is not 0 here is not 0 nearby
                 return self[e.operands[1].order][k]
             case "pow" if e.operands[1].value in _POWERS:
@@ -190,14 +191,9 @@ class _Series(dict[int, list[int]]):
 
     def _power(self, u: list[int], a: list[int], exponent: int, k: int) -> int:
         """Of u = a^exponent, by a u' = exponent u a'."""
-        inverse = self._inverse(a[0])
-        if k == 0:
-            return self.free.power(a[0], exponent)
+        inverse = self._inverse(max(k, 1) * a[0])
         rest = exponent * _product(_derivative(a), u, k - 1) - _product(_derivative(u), a[1:], k - 2)
-        return self._integral(rest * inverse, k)
-
-    def _integral(self, coefficient: int, k: int) -> int:
-        return coefficient * pow(k, -1, self.p)
+        return rest * inverse if k else self.free.power(a[0], exponent)
 
     def _inverse(self, value: int) -> int:
         if value == 0:

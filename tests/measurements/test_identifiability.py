@@ -115,6 +115,7 @@ def test_what_is_fixed_is_known():
         ("a*exp(-b*t)+c", set()),
         ("a*t**n", set()),
         ("sqrt(a*b)*t", {"a", "b"}),
+        ("c*a**2.5*t + c*a*a**1.5*t**2", {"a", "c"}),
     ],
 )
 def test_formulas(expression, lost):

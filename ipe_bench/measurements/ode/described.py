@@ -151,7 +151,7 @@ class Ode(WrittenModel, WrappedModel):
                 raise UserError(f"{name}: is a column of every readings file, and not known in a formula; {remedy}")
         for name in self.constants:
             if name not in self.constant_names:
-                known = "is a state, a parameter or the time" if name in self._named else "appears in no formula"
+                known = "is a state, a parameter or the time" if name in self._used else "appears in no formula"
                 raise UserError(f"constants.{name}: {known}")
         lengths = {name: len(v) for name, v in self.constants.items() if isinstance(v, tuple | list)}
         if len(set(lengths.values())) > 1 or 0 in lengths.values():
@@ -161,15 +161,10 @@ class Ode(WrittenModel, WrappedModel):
                 raise UserError(f"columns.{name}: {unknown(name, ['case', 'time', *self.driven_by], 'input')}")
         self.require_columns_and_parameters("size", "units", "answer", "own")
 
-    @property
-    def _named(self) -> set[str]:
-        """The names that mean something without a constant of that name."""
-        return {*self.start, *self.rates, *self.driven_by, "t"}
-
     @cached_property
     def constant_names(self) -> tuple[str, ...]:
         """The names that are constants of a case, in order of appearance."""
-        return tuple(name for name in self._used if name not in self._named)
+        return tuple(name for name in self._used if name not in {*self.start, *self.rates, *self.driven_by, "t"})
 
     @cached_property
     def _used(self) -> tuple[str, ...]:
@@ -182,11 +177,9 @@ class Ode(WrittenModel, WrappedModel):
         """The constants of each case (cases, constants)."""
         for name in self.constant_names:
             if name not in self.constants:
-                raise UserError(
-                    f"measurement: {name} is not known; give it a start, measurement.start.{name}=1, if it is a "
-                    f"parameter, or its value in each case, as a column of readings=FILE or "
-                    f"measurement.constants.{name}=[...]"
-                )
+                remedy = f"give it a start, measurement.start.{name}=1, if it is a parameter, or its value in each case"
+                places = f"as a column of readings=FILE or measurement.constants.{name}=[...]"
+                raise UserError(f"measurement: {name} is not known; {remedy}, {places}")
         columns = [np.atleast_1d(self.constants[name]) for name in self.constant_names]
         count = max([len(self.courses), *map(len, columns)], default=1) or 1
         if any(len(column) not in (1, count) for column in [*columns, *([self.courses] if self.courses else [])]):
@@ -254,11 +247,7 @@ class Ode(WrittenModel, WrappedModel):
         return found | {name: self._at_readings(name) for name in self.driven_by}
 
     def _at_readings(self, name: str) -> list[float]:
-        """The values (m,) of an input.
-
-        Raises:
-            UserError: it changes at other times, too, which would be lost with the readings alone.
-        """
+        """The values (m,) of an input; refused where it changes at other times, too."""
         if lost := {float(t) for one in self.courses for t in one["time"]} - set(map(float, self.reading_times)):
             remedy = "add it to measurement.times to write the readings with their inputs"
             raise UserError(f"measurement.columns.time: {name} changes at {min(lost):g} without a reading; {remedy}")

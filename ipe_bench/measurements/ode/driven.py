@@ -56,11 +56,7 @@ def separated(
 
 
 def switching_times(comparison: Tree, cases: Sequence[Mapping[str, float]]) -> list[float]:
-    """When a comparison of t begins or ceases to hold in one of the cases, given by their constants.
-
-    Raises:
-        UserError: t does not stand there by itself, or times a constant.
-    """
+    """When a comparison of t, by itself or times a constant, begins or ceases to hold in one of the cases."""
     _, left, right, text = comparison
     found = []
     for case in cases:
@@ -100,11 +96,7 @@ def course(kind: str, times: Array, values: Array, at: Array) -> list[Array]:
 
 
 def numbered_cases(numbers: Sequence[int]) -> int:
-    """How many cases a column numbers.
-
-    Raises:
-        UserError: a number is left out.
-    """
+    """How many cases a column numbers."""
     known = sorted(set(numbers))
     if known != list(range(1, len(known) + 1)):
         raise UserError(f"case={known[-1]}: cases are numbered 1, 2 and so on; there are {', '.join(map(str, known))}")
@@ -114,11 +106,7 @@ def numbered_cases(numbers: Sequence[int]) -> int:
 def agreed(
     name: str, column: Sequence[float], places: Sequence[tuple[float, ...]], remedy: str = ""
 ) -> dict[tuple[float, ...], float]:
-    """What a column of a file says of each place in ascending order: a case, or a time of a case.
-
-    Raises:
-        UserError: two rows of a place differ.
-    """
+    """What a column of a file says of each place in ascending order: a case, or a time of a case."""
     found: dict[tuple[float, ...], float] = {}
     for value, place in zip(column, places, strict=True):
         if found.setdefault(place, value) != value:
@@ -128,18 +116,12 @@ def agreed(
 
 
 def courses(columns: Mapping[str, Sequence[Any]], names: Collection[str]) -> list[dict[str, Array]]:
-    """The columns `time` and those of the inputs, of each case.
-
-    Raises:
-        UserError: a column is missing, or its times do not ascend.
-    """
+    """The columns `time` and those of the inputs, of each case."""
     for name in ("time", *names):
         if not len(columns.get(name, ())):
             here = " ".join(f"measurement.columns.{one}=[...]" for one in ("time", *names))
-            raise UserError(
-                f"measurement.columns: {name} is not known; give readings=FILE with columns time and "
-                f"{', '.join(names)}, or {here}"
-            )
+            file = f"readings=FILE with columns time and {', '.join(names)}"
+            raise UserError(f"measurement.columns: {name} is not known; give {file}, or {here}")
     arrays = {name: np.asarray(columns[name], dtype=float) for name in ("time", *names)}
     case = np.asarray(columns.get("case", np.ones(len(arrays["time"]))), dtype=int)
     numbers = range(1, numbered_cases(case.tolist()) + 1)

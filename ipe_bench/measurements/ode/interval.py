@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array
 from ipe_bench.measurements.base import Parameter
 from ipe_bench.measurements.ode.model import OdeMeasurement
 
@@ -25,6 +24,7 @@ class Interval(OdeMeasurement):
     """Share of the interval."""
 
     states = property(lambda interval: interval.whole.states)  # type: ignore[assignment]
+    times = np.ones(1)  # type: ignore[assignment]
 
     @property
     def outputs(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -32,15 +32,8 @@ class Interval(OdeMeasurement):
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        return tuple(Parameter(f"x{i}") for i in range(self.whole.n + self.states + self._constants + 2))
-
-    @property
-    def _constants(self) -> int:
-        return self.whole.tables.shape[2] * (1 if self.whole.driven is None else 2)
-
-    @property
-    def times(self) -> Array:
-        return np.ones(1)
+        constants = self.whole.tables.shape[2] * (1 if self.whole.driven is None else 2)
+        return tuple(Parameter(f"x{i}") for i in range(self.whole.n + self.states + constants + 2))
 
     def start(self, p: Sequence[Any], c: Sequence[Any]) -> Sequence[Any]:
         return self._split(p)[1]

@@ -416,20 +416,14 @@ class OdeMeasurement(Measurement):
 
     @cached_property
     def equations(self) -> Equations:
-        """What is integrated.
-
-        Raises:
-            UserError: a rate jumps where the solution decides.
-        """
+        """What is integrated; refused where a rate jumps when the solution decides."""
         constants, driven = self.tables.shape[2], self.tables.shape[2] - self.cases.shape[1]
         arithmetic = (self.start, self.rhs, self.read, self.variation, driven)
         equations = Equations(self.states, self.n, constants, len(self.outputs), *arithmetic)
         if jumps(equations):
+            what = "a rate jumps at a moment that a state or a parameter decides, which no step can end at"
             remedy = "let both sides agree there, or blend them, as by 1/(1+exp((b-a)/width)) for a > b"
-            raise UserError(
-                f"measurement={self.name}: a rate jumps at a moment that a state or a parameter decides, which no step "
-                f"can end at; {remedy}"
-            )
+            raise UserError(f"measurement={self.name}: {what}; {remedy}")
         return equations
 
 
