@@ -95,22 +95,15 @@ def test_the_choice_is_near_that_of_brute_force(criterion, seed):
         assert way.saving.readings <= min(len(rows) for rows, bound in every.items() if bound <= 1) + 1
 
 
-def test_a_parabola_is_best_read_at_its_ends_and_in_the_middle():
-    """The D-optimal design of quadratic regression: a third each (Smith, Biometrika 12, 1918)."""
-    (way,) = design(scenario(Curve()), by=["time", "repeat"], readings=12, criterion="D").ways
-    entries = [way.units.entries[u][0] for u in way.sharpest.taken]
-    assert sorted(set(entries)) == [-1.0, 0.0, 1.0]
-    assert [entries.count(t) for t in (-1.0, 0.0, 1.0)] == [4, 4, 4]
-
-
-def test_a_cubic_is_best_read_where_theory_says():
-    """The D-optimal points of a polynomial of degree p: the ends, and the zeros of P_p' (Guest, Ann. Math. Stat. 29,
-    1958); for degree 3 they are at 1/sqrt(5)."""
-    (way,) = design(scenario(Curve(3)), by=["time", "repeat"], readings=16, criterion="D").ways
+@pytest.mark.parametrize(("degree", "best"), [(2, (-1.0, 0.0, 1.0)), (3, (-1.0, -(5**-0.5), 5**-0.5, 1.0))])
+def test_polynomials_are_best_read_where_theory_says(degree, best):
+    """The D-optimal points of degree p are the ends and the zeros of P_p', equally often (Smith, Biometrika 12, 1918;
+    Guest, Ann. Math. Stat. 29, 1958); the grid has 0.4 and 0.5 about 1/sqrt(5)."""
+    (way,) = design(scenario(Curve(degree)), by=["time", "repeat"], readings=4 * len(best), criterion="D").ways
     entries = np.array([way.units.entries[u][0] for u in way.sharpest.taken])
-    inner = np.abs(entries)[np.abs(entries) < 0.99]
-    assert len(inner) == 8
-    assert np.abs(inner - 1 / np.sqrt(5)).max() < 0.06  # the grid has 0.4 and 0.5
+    apart = np.abs(entries[:, None] - np.array(best))
+    assert apart.min(axis=1).max() < 0.06
+    assert np.bincount(apart.argmin(axis=1)).tolist() == [4] * len(best)
 
 
 def test_bounds_and_correlations_are_those_of_the_covariance():

@@ -7,7 +7,7 @@ from small_models import Bent
 
 from ipe_bench.baselines import EKF, GaussNewton, MapLM
 from ipe_bench.basics.linalg import Covariance, information
-from ipe_bench.measurements import Formula, Gins, Polynomial
+from ipe_bench.measurements import Formula, Polynomial
 from ipe_bench.noise import Colored, Correlated, Gaussian, NoNoise, Outliers, Quantization, StudentT
 from ipe_bench.solvers import Newton
 from ipe_bench.trials.fit_test import (
@@ -70,20 +70,6 @@ def test_p_is_uniform_for_the_frozen_root_where_its_projection_is_oblique():
     assert kstest(columns["fit_p"][solved], "uniform").pvalue > 0.01
     squares = np.sum(((block.trials.z - block.readings_at(estimates.x)) / 0.003) ** 2, axis=1)
     assert kstest(chi2.sf(squares[solved], 8 - 3), "uniform").pvalue < 1e-6
-
-
-@pytest.mark.campaign
-def test_the_table_of_uniformity():
-    """Kolmogorov and Smirnov's p of 2000 trials."""
-    cases = [(Polynomial(strength=0.01), noise, scale) for noise in NOISES for scale in (0.1, 1.0)]
-    cases += [(Gins(), Quantization(0.02286), 33.0), (Gins(), Gaussian(0.0066), 0.1), (Gins(), Gaussian(0.0066), 100.0)]
-    worst = 1.0
-    for model, noise, scale in cases:
-        for estimator in (GaussNewton(), Newton(), MapLM()):
-            p = p_values(model, noise, scale, estimator)
-            worst = min(worst, kstest(p, "uniform").pvalue)
-    # The smallest of some fifty, many of them of the same draws.
-    assert worst > 0.002
 
 
 def test_least_squares_and_normal_noise_is_chi_square():

@@ -80,47 +80,25 @@ def test_what_is_no_precision_is_refused(given):
         precision_of(given)
 
 
-def trials_taken(p: float, wanted: float, rng: np.random.Generator, block: int = 50) -> tuple[int, bool]:
-    """How many trials a study takes, and whether the interval that it ends with holds the share."""
+def trials_taken(p: float, wanted: float, rng: np.random.Generator, block: int = 50) -> int:
+    """How many trials a study takes."""
     seen, trials = rng.uniform(size=100_000) < p, block
     while True:
         count = int(seen[:trials].sum())
         low, high = share_sequence(count, trials)
         width = max(high - count / trials, count / trials - low)
         if width <= wanted or trials == len(seen):
-            return trials, low <= p <= high
+            return trials
         trials = next_trials(trials, width / wanted, block, len(seen))
 
 
 def test_shares_near_0_and_1_take_fewer_trials_than_a_fixed_thousand_and_one_half_more():
     """To within the 3.1 % that a thousand trials give in the worst case, p = 0.5."""
     rng = np.random.default_rng(0)
-    taken = {p: np.mean([trials_taken(p, 0.0316, rng)[0] for _ in range(20)]) for p in (0.0, 0.01, 0.99, 1.0, 0.5)}
+    taken = {p: np.mean([trials_taken(p, 0.0316, rng) for _ in range(20)]) for p in (0.0, 0.01, 0.99, 1.0, 0.5)}
     assert max(taken[0.0], taken[1.0]) <= 250
     assert max(taken[0.01], taken[0.99]) < 500
     assert 2000 < taken[0.5] < 3000
-
-
-@pytest.mark.campaign
-@pytest.mark.parametrize("p", [0.5, 0.9, 0.99, 0.999])
-def test_2000_studies_that_look_after_every_block_are_covered(p):
-    """100 looks at blocks of 50: missed anywhere in at most 5 % of studies; so are those that stop when it suits."""
-    rng = np.random.default_rng(1)
-    ends: dict[tuple[int, int], bool] = {}
-    missed = 0
-    for row in np.cumsum(rng.binomial(50, p, (2000, 100)), axis=1).tolist():
-        for look, count in enumerate(row, 1):
-            key = count, 50 * look
-            if key not in ends:
-                low, high = share_sequence(*key)
-                ends[key] = low <= p <= high
-            if not ends[key]:
-                missed += 1
-                break
-    stopped = [trials_taken(p, 0.05, rng)[1] for _ in range(300)]
-    print(f"p = {p}: covered at all times {1 - missed / 2000:.4f}, on stopping {np.mean(stopped):.3f}")
-    assert missed / 2000 <= 0.05
-    assert np.mean(stopped) >= 0.95
 
 
 LAWS = {
