@@ -25,12 +25,12 @@ LINE = (
     ("cli",),
 )
 BUDGETS = {
-    "basics": 977,
+    "basics": 968,
     "measurements": 6636,
     "noise": 618,
     "priors": 105,
     "states": 1199,
-    "estimators": 1194,
+    "estimators": 1170,
     "solvers": 1197,
     "baselines": 2068,
     "trials": 1990,

@@ -245,9 +245,9 @@ class _Standardized:
     def cost(self, y: Array, r: Array) -> Array:
         return squared(r)
 
-    def slopes(self, y: Array, *, coarse: Mask | bool) -> tuple[Array, None]:
+    def jacobian(self, y: Array, *, coarse: Mask | bool) -> Array:
         J = np.matmul(self.readings.slope(self._x(y)), self.root)
-        return np.concatenate([J, np.broadcast_to(np.eye(self.n), self.root.shape)], axis=1), None
+        return np.concatenate([J, np.broadcast_to(np.eye(self.n), self.root.shape)], axis=1)
 
     def subset(self, kept: Mask) -> _Standardized:
         return _Standardized(self.readings.subset(kept), self.root[kept])

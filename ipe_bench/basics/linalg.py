@@ -164,18 +164,9 @@ class Covariance:
 
 def information(J: Array, R: Covariance) -> Array:
     """The Fisher information J' R^-1 J for J (..., m, n)."""
-    if J.ndim == 3 and R.factor.ndim == 1:
-        return normal_equations(J, np.zeros(J.shape[:2]), R.factor)[0]
-    Jw = R.whiten_jacobian(J)
-    return np.matmul(Jw.swapaxes(-1, -2), Jw)
-
-
-def normal_equations(J: Array, r: Array, deviation: Array | None = None) -> tuple[Array, Array]:
-    """A' A (trials, n, n) and A' r (trials, n) for J (trials, m, n) and r (trials, m), where A is J with its rows
-    divided by `deviation` (m,), or J."""
     with np.errstate(all="ignore"):
-        A = np.ascontiguousarray(J if deviation is None else J / deviation[:, None])
-        return np.matmul(A.swapaxes(1, 2), A), np.matmul(np.ascontiguousarray(r)[:, None], A)[:, 0]
+        Jw = np.ascontiguousarray(R.whiten_jacobian(J))
+        return np.matmul(Jw.swapaxes(-1, -2), Jw)
 
 
 def definite_factor(G: Array) -> tuple[Array, Array, Mask]:

@@ -10,18 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.batches import put
-from ipe_bench.basics.linalg import (
-    Array,
-    Covariance,
-    Mask,
-    definite_factor,
-    finite,
-    inverse,
-    multiply,
-    normal_equations,
-    solve,
-    squared,
-)
+from ipe_bench.basics.linalg import Array, Covariance, Mask, definite_factor, finite, inverse, multiply, solve, squared
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.driver import ConvergenceCheck
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
@@ -41,7 +30,7 @@ class Residuals(Protocol):
     @property
     def exact_within(self) -> float: ...
     def residual(self, x: Array, /) -> Array: ...
-    def slopes(self, x: Array, /, *, coarse: Mask | bool) -> tuple[Array, Array | None]: ...
+    def jacobian(self, x: Array, /, *, coarse: Mask | bool) -> Array: ...
     def cost(self, x: Array, r: Array, /) -> Array: ...
     def subset(self, kept: Mask, /) -> Residuals: ...
 
@@ -84,22 +73,15 @@ class Objective:
         """What is minimised (trials,) at x, where the residuals are r: half its gradient is J' r."""
         return squared(r)
 
-    def jacobian(self, x: Array) -> Array:
-        """The derivative of the whitened residuals (trials, m, n) or (trials, m + n, n)."""
-        J, deviation = self.slopes(x, coarse=False)
-        return J if deviation is None else J / deviation[:, None]
-
-    def slopes(self, x: Array, *, coarse: Mask | bool) -> tuple[Array, Array | None]:
-        """The same, or where `coarse` (trials,) says so a derivative that is near enough for steps, before its rows are
-        divided by deviations (m,) or (m + n,), if there are any."""
-        J, deviation = self.model.jacobian(x, self.rows, coarse=coarse), self.R.factor
-        if deviation.ndim == 2:
-            J, deviation = self.R.whiten_jacobian(J), np.ones(J.shape[1])
+    def jacobian(self, x: Array, *, coarse: Mask | bool = False) -> Array:
+        """The derivative of the residuals (trials, m, n) or (trials, m + n, n); where `coarse` (trials,) says so, one
+        that is near enough for steps."""
+        J = self.R.whiten_jacobian(self.model.jacobian(x, self.rows, coarse=coarse))
         if self.prior is None:
-            return J, deviation
+            return J
         n = x.shape[1]
         prior = np.broadcast_to(self.prior.whiten_jacobian(np.eye(n)), (len(x), n, n))
-        return np.concatenate([J, prior], axis=1), np.concatenate([deviation, np.ones(n)])
+        return np.concatenate([J, prior], axis=1)
 
     def coarsened(self, exact_within: float) -> Objective:
         """The same with coarse Jacobians where steps are longer, if the model has any that are cheaper."""
@@ -136,19 +118,17 @@ class NormalEquations:
     """(trials, m, n), where a method asks for it."""
 
     @classmethod
-    def of(cls, J: Array, r: Array, deviation: Array | None = None, *, keep_Q: bool = False) -> NormalEquations:
-        """Of J (trials, m, n), its rows divided by `deviation` (m,), and residuals r (trials, m)."""
-        G, along = normal_equations(J, r, deviation)
-        U, inverse_U, well = definite_factor(G)
-        well = well & finite(r)
+    def of(cls, J: Array, r: Array, *, keep_Q: bool = False) -> NormalEquations:
+        """Of J (trials, m, n) and residuals r (trials, m)."""
+        A = np.ascontiguousarray(J)
         with np.errstate(all="ignore"):
+            U, inverse_U, well = definite_factor(np.matmul(A.swapaxes(1, 2), A))
+            along = np.matmul(np.ascontiguousarray(r)[:, None], A)[:, 0]
             gradient = multiply(inverse_U.swapaxes(1, 2), along)
-        if deviation is not None and keep_Q:
-            J, deviation = J / deviation[:, None], None
-        Q = np.matmul(np.ascontiguousarray(J), inverse_U) if keep_Q else None
+        well = well & finite(r)
+        Q = np.matmul(A, inverse_U) if keep_Q else None
         if not well.all():
-            ill = J[~well] if deviation is None else J[~well] / deviation[:, None]
-            QU, U[~well], inverse_U[~well], gradient[~well] = _by_orthogonal_factor(ill, r[~well])
+            QU, U[~well], inverse_U[~well], gradient[~well] = _by_orthogonal_factor(J[~well], r[~well])
             if Q is not None:
                 Q[~well] = QU
         columns = np.sqrt(np.sum(U**2, axis=1))
@@ -214,8 +194,7 @@ def slope_at(
 ) -> tuple[NormalEquations, Mask]:
     """The slope at x, where the residuals are r, and where it is that of an exact Jacobian: where `exact` (trials,)
     says so, and where a coarse one has not full rank."""
-    J, deviation = objective.slopes(x, coarse=~exact)
-    slope = NormalEquations.of(J, r, deviation, keep_Q=keep_Q)
+    slope = NormalEquations.of(objective.jacobian(x, coarse=~exact), r, keep_Q=keep_Q)
     lost = ~exact & ~np.isfinite(slope.size)
     if lost.any():
         again, _ = slope_at(objective.subset(lost), x[lost], r[lost], np.ones(lost.sum(), dtype=bool), keep_Q=keep_Q)
@@ -277,11 +256,6 @@ class LeastSquaresSystem:
         return np.where(visible, cost, self.mark), np.where(visible, 0, self.idle + 1)
 
     @property
-    def settled(self) -> Mask:
-        """Where nothing can be gained: the answer is there, however badly the Jacobian or round-off behaves."""
-        return (self.idle >= _FLAT) & (self.slope.stationary <= _STATIONARY) & self.regular
-
-    @property
     def rankless(self) -> Mask:
         """Where J has not full rank (trials,)."""
         return ~np.isfinite(self.slope.size)
@@ -293,7 +267,9 @@ class LeastSquaresSystem:
         level = np.where(known, np.sqrt(self.cost), np.nan)
         ending = np.where(self.rankless, Status.SINGULAR, Status.STALLED)
         size = np.where(self.rankless & self.regular, self.slope.stationary, self.slope.size)
-        size = np.where(self.settled, 0.0, size)
+        # Where nothing can be gained the answer is there, however badly the Jacobian or round-off behaves.
+        settled = (self.idle >= _FLAT) & (self.slope.stationary <= _STATIONARY) & self.regular
+        size = np.where(settled, 0.0, size)
         if objective.exact_within > 0:
             size = np.where(self.exact, size, np.inf)
         return ConvergenceCheck(size, level, self.moved, stuck, ending)

@@ -142,12 +142,12 @@ class Likelihood(Objective):
         f = self.levelled.spare
         return np.concatenate([w, (f - w**2) / np.sqrt(f + w**2), _HOLD * moved], axis=1)
 
-    def slopes(self, x: Array, *, coarse: Mask | bool) -> tuple[Array, None]:
+    def jacobian(self, x: Array, *, coarse: Mask | bool = False) -> Array:
         """The second residuals' information is f + w^2, whose mean is Fisher's 2 f: steps of log sigma are below 1."""
         w, log, moved = self._split(x)
         weights = [np.exp(-log), np.sqrt(self.levelled.spare + w**2), np.full(moved.shape, _HOLD)]
         J = self.model.jacobian(x, self.rows, coarse=coarse)
-        return J * np.concatenate(weights, axis=1)[:, :, None], None
+        return J * np.concatenate(weights, axis=1)[:, :, None]
 
     def cost(self, x: Array, r: Array) -> Array:
         w, log, moved = self._split(x)

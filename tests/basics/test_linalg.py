@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ipe_bench.basics.linalg import Covariance, definite_factor, normal_equations, pseudo_inverse, read_only
+from ipe_bench.basics.linalg import Covariance, definite_factor, information, pseudo_inverse, read_only
 
 M, N = 30, 5
 
@@ -90,18 +90,13 @@ def test_a_matrix_that_is_not_definite_has_no_factor_and_spoils_no_other(n):
 
 @pytest.mark.parametrize("n", [1, 3, 8, 11, 12, 13, 14])
 @pytest.mark.parametrize("m", [1, 7, 240])
-def test_normal_equations_are_those_of_weighted_rows(n, m):
+def test_information_is_that_of_weighted_rows(n, m):
     rng = np.random.default_rng(n)
-    J, r, deviation = rng.normal(size=(5, m, n)), rng.normal(size=(5, m)), rng.uniform(0.1, 9.0, m)
-    A = J / deviation[:, None]
-    for given, rows in ((deviation, A), (None, J)):
-        G, along = normal_equations(J, r, given)
-        np.testing.assert_allclose(G, np.einsum("tia,tib->tab", rows, rows), rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(along, np.einsum("tia,ti->ta", rows, r), rtol=1e-12, atol=1e-12)
-        assert np.array_equal(G, G.swapaxes(1, 2))
-        alone = normal_equations(J[2:3], r[2:3], given)
-        assert np.array_equal(alone[0], G[2:3])
-        assert np.array_equal(alone[1], along[2:3])
-        # How the numbers lie in memory is nothing to the bits, nor whether they may be written to.
-        assert np.array_equal(normal_equations(read_only(J), read_only(r), given)[0], G)
-        assert np.array_equal(normal_equations(np.asfortranarray(J), r, given)[0], G)
+    J, R = rng.normal(size=(5, m, n)), Covariance(rng.uniform(0.1, 9.0, m))
+    rows, G = J / R.factor[:, None], information(J, R)
+    np.testing.assert_allclose(G, np.einsum("tia,tib->tab", rows, rows), rtol=1e-12, atol=1e-12)
+    assert np.array_equal(G, G.swapaxes(1, 2))
+    assert np.array_equal(information(J[2:3], R), G[2:3])
+    # How the numbers lie in memory is nothing to the bits, nor whether they may be written to.
+    assert np.array_equal(information(read_only(J), R), G)
+    assert np.array_equal(information(np.asfortranarray(J), R), G)
