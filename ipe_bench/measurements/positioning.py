@@ -163,12 +163,12 @@ class Gnss(Measurement):
     @cached_property
     def _columns(self) -> tuple[tuple[int, ...], tuple[str, ...], Array]:
         """Epoch, constellation and satellite (m, 3) of each reading."""
-        if self.satellites is not None:
-            times, systems, *places = zip(*self.satellites, strict=True)
-            return times, systems, np.array(places, dtype=float).T
-        sky = np.array([self._overhead(*place[1:]) for place in _SKY])
-        times = tuple(k for k in range(1, self.rounds + 1) for _ in _SKY)
-        return times, tuple(place[0] for place in _SKY) * self.rounds, np.tile(sky, (self.rounds, 1))
+        rows = self.satellites
+        if rows is None:
+            sky = [(name, *self._overhead(*direction)) for name, *direction in _SKY]
+            rows = [(k, *seen) for k in range(1, self.rounds + 1) for seen in sky]
+        times, systems, *places = zip(*rows, strict=True)
+        return times, systems, np.array(places, dtype=float).T
 
     def _overhead(self, radius: float, azimuth: float, elevation: float) -> Array:
         """The place (3,) on a sphere about the Earth's centre that is seen in that direction."""
