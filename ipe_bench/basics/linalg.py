@@ -53,20 +53,16 @@ def solve(A: Array, b: Array) -> tuple[Array, Mask]:
 
     Returns x, NaN where A is singular or not finite, and the mask (trials,) of those trials.
     """
-    x, singular = _solve_columns(A, b[..., None] if b.ndim == 2 else b)
-    return (x[..., 0] if b.ndim == 2 else x), singular
+    columns = b[..., None] if b.ndim == 2 else b
+    usable = finite(A) & finite(b)
+    x = np.full(columns.shape, np.nan)
+    x[usable] = _of_each(np.linalg.solve, A[usable], columns[usable])
+    return x.reshape(b.shape), ~finite(x)
 
 
 def inverse(A: Array) -> tuple[Array, Mask]:
     """The inverse of each A (trials, n, n); NaN and flagged where there is none."""
-    return _solve_columns(A, np.broadcast_to(np.eye(A.shape[-1]), A.shape))
-
-
-def _solve_columns(A: Array, b: Array) -> tuple[Array, Mask]:
-    usable = finite(A) & finite(b)
-    x = np.full(b.shape, np.nan)
-    x[usable] = _of_each(np.linalg.solve, A[usable], b[usable])
-    return x, ~finite(x)
+    return solve(A, np.broadcast_to(np.eye(A.shape[-1]), A.shape))
 
 
 def cholesky(P: Array) -> Array:
