@@ -110,7 +110,7 @@ def _tree(node: ast.expr, source: str) -> Tree:
         SyntaxError: the part is Python and no formula.
         NameError: a function is not known.
     """
-    reason = "it is no formula"
+    reason = "this is Python, and not of this language"
     match node:
         case ast.Constant() if _NUMBER.fullmatch(number := ast.get_source_segment(source, node) or ""):
             return ("number", float(number))
