@@ -26,8 +26,8 @@ LINE = (
 )
 BUDGETS = {
     "basics": 949,
-    "measurements": 6636,
-    "noise": 618,
+    "measurements": 6631,
+    "noise": 614,
     "priors": 105,
     "states": 1199,
     "estimators": 1170,

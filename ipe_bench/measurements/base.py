@@ -255,6 +255,11 @@ class Measurement(Component, ABC):
         return self.coarse_jacobian(x)[:, self.rows(stop)]
 
 
+def one_by_one(model: Measurement) -> Epochs:
+    """Epochs of a single reading each."""
+    return tuple(np.arange(model.m)[:, None])
+
+
 def _delegating(cls: type[WrappedModel]) -> type[WrappedModel]:
     """Gives a class the attributes and the methods of the model inside; what is computed passes the class's hooks."""
 

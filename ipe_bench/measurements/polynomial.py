@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebvander
-from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Finite
-from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise
+from ipe_bench.measurements.base import Measurement, Parameter, UsualNoise, one_by_one
 
 
 @dataclass(frozen=True)
@@ -35,6 +34,7 @@ class Polynomial(Measurement):
 
     analytic = True
     usual_noise = UsualNoise(0.01)
+    epochs = cached_property(one_by_one)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -58,10 +58,6 @@ class Polynomial(Measurement):
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
         return {"time": self.times.tolist()}
-
-    @cached_property
-    def epochs(self) -> tuple[NDArray[np.intp], ...]:
-        return tuple(np.arange(self.m)[:, None])
 
     def simulate(self, x: Array) -> Array:
         u = np.einsum("kj,tj->tk", self.matrix, x)

@@ -15,7 +15,7 @@ from annotated_types import MinLen
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Count, Positive
-from ipe_bench.measurements.base import Epochs, Input, Measurement, Parameter, UsualNoise, parameter_table
+from ipe_bench.measurements.base import Epochs, Input, Measurement, Parameter, UsualNoise, one_by_one, parameter_table
 
 LIGHT = 299792458.0
 """Speed of light in m/s."""
@@ -296,6 +296,7 @@ class Bearings(Measurement):
     reading_unit = "deg"
     usual_noise = UsualNoise(0.5)
     analytic = True
+    epochs = cached_property(one_by_one)  # type: ignore[assignment]
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -327,10 +328,6 @@ class Bearings(Measurement):
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
         return {"time [s]": self.times.tolist()}
-
-    @cached_property
-    def epochs(self) -> Epochs:
-        return tuple(np.arange(self.m)[:, None])
 
     def _sight(self, x: Array) -> Array:
         """The vectors (trials, m, 2) from the observer to the target."""

@@ -17,7 +17,7 @@ from annotated_types import MinLen
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.options import Positive
-from ipe_bench.measurements.base import Epochs, Input, Measurement, Parameter, UsualNoise, parameter_table
+from ipe_bench.measurements.base import Input, Measurement, Parameter, UsualNoise, one_by_one, parameter_table
 
 Vector = tuple[float, float, float]
 
@@ -38,6 +38,7 @@ class Magnitudes(Measurement):
     """
 
     analytic = True
+    epochs = cached_property(one_by_one)  # type: ignore[assignment]
     outputs_option: ClassVar[str]
     """The name of the option that holds the outputs."""
     angles: ClassVar[tuple[str, str, str]]
@@ -80,10 +81,6 @@ class Magnitudes(Measurement):
     @property
     def index(self) -> Mapping[str, Sequence[Any]]:
         return {"attitude": list(range(1, len(self.measured) + 1))}
-
-    @cached_property
-    def epochs(self) -> Epochs:
-        return tuple(np.arange(self.m)[:, None])
 
     def simulate(self, x: Array) -> Array:
         a = self.corrected(x)

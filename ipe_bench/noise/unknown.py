@@ -68,24 +68,6 @@ class Levels:
     unit: str = ""
     """Unit of the readings."""
 
-    @classmethod
-    def of(cls, formula: Arithmetic, weights: Array, by: str | None, model: Measurement) -> Levels:
-        """The levels of a model's readings, by a column of its index.
-
-        Raises:
-            UserError: there is no such column, or a level has the name of a parameter.
-        """
-        if by is not None and by not in model.index:
-            raise UserError(f"noise.by={by}: {unknown(by, model.index, 'column of the readings')}")
-        column = [""] * model.m if by is None else model.index[by]
-        entries = [f"{entry:g}" if isinstance(entry, float) else str(entry) for entry in column]
-        groups = tuple(dict.fromkeys(entries))
-        group = np.array([groups.index(entry) for entry in entries], dtype=np.intp)
-        found, taken = cls(formula, weights, groups, group, model.reading_unit), model.physical_parameters
-        if both := {p.name for p in found.parameters} & {p.name for p in taken}:
-            raise UserError(f"noise.sigma: {min(both)} is a parameter of the model; give the level another name")
-        return found
-
     @property
     def names(self) -> tuple[str, ...]:
         return level_names(self.formula)
@@ -170,10 +152,24 @@ class Unknown(Noise):
             raise UserError("noise.by: does not go with noise.levels; state what is known, as in noise=gaussian")
 
     def levels_of(self, model: Measurement) -> Levels | None:
-        """The levels of a model's readings; None if a single one multiplies all standard deviations."""
+        """The levels of a model's readings; None if a single one multiplies all standard deviations.
+
+        Raises:
+            UserError: there is no such column, or a level has the name of a parameter.
+        """
         if self.by is None and self.sigma == "sigma":
             return None
-        return Levels.of(read_sigma(self.sigma), self.covariance(model.m).factor, self.by, model)
+        if self.by is not None and self.by not in model.index:
+            raise UserError(f"noise.by={self.by}: {unknown(self.by, model.index, 'column of the readings')}")
+        column = [""] * model.m if self.by is None else model.index[self.by]
+        entries = [f"{entry:g}" if isinstance(entry, float) else str(entry) for entry in column]
+        groups = tuple(dict.fromkeys(entries))
+        group = np.array([groups.index(entry) for entry in entries], dtype=np.intp)
+        weights = self.covariance(model.m).factor
+        found = Levels(read_sigma(self.sigma), weights, groups, group, model.reading_unit)
+        if both := {p.name for p in found.parameters} & {p.name for p in model.physical_parameters}:
+            raise UserError(f"noise.sigma: {min(both)} is a parameter of the model; give the level another name")
+        return found
 
     def true_levels(self, m: int) -> tuple[Levels, Array] | None:
         if self.levels is None:

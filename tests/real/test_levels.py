@@ -13,7 +13,6 @@ from ipe_bench.measurements import Formula, Nist
 from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Unknown
-from ipe_bench.noise.unknown import Levels, read_sigma
 from ipe_bench.real.examination import examine
 from ipe_bench.real.fits import fit
 from ipe_bench.real.levels import Levelled, minimise
@@ -268,7 +267,7 @@ def test_a_standard_deviation_of_zero_is_refused():
 
 
 def test_a_formula_of_the_standard_deviation_has_exact_slopes():
-    levels = Levels.of(read_sigma("floor + sqrt(share*h)"), np.linspace(1, 2, 60), "second", DECAY)
+    levels = Unknown(tuple(np.linspace(1, 2, 60).tolist()), "second", "floor + sqrt(share*h)").levels_of(DECAY)
     h, theta = np.random.default_rng(0).normal(0, 3, (2, 60)), np.log([[0.5, 0.1, 0.4, 2.0]] * 2)
     _, by_h, by_theta = levels.at(h, theta)
     step = 1e-6
