@@ -12,7 +12,7 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements import Bock, Gins, LotkaVolterra, Sir
 from ipe_bench.measurements.base import SubsetModel
 from ipe_bench.measurements.problem import Problem, recorded_problem
-from ipe_bench.noise import Gaussian, Quantization
+from ipe_bench.noise import Gaussian
 from ipe_bench.priors import GaussianPrior
 from ipe_bench.trials.scenario import Scenario
 
@@ -68,14 +68,6 @@ def test_a_bad_trial_disturbs_no_other():
     found, alone = (MultipleShooting().estimate(whole.problem, a) for a in (spoiled, z))
     assert found.status[1] == Status.NONFINITE
     np.testing.assert_array_equal(found.x[[0, 2, 3]], alone.x[[0, 2, 3]])
-
-
-def test_gins_at_scale_300():
-    drawn = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), 300.0, 91)
-    trials = drawn.draw(0, 4)
-    found = MultipleShooting().estimate(drawn.problem, trials.z)
-    assert (found.status == Status.CONVERGED).all()
-    assert np.abs((found.x - trials.x) / np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))).max() < 6
 
 
 def test_other_models_are_refused():

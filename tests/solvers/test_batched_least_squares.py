@@ -209,17 +209,6 @@ def test_newtons_method_is_coarse_far_away_and_of_order_two_near_a_root(solver):
     np.testing.assert_allclose(found.jacobians, found.iterations - 0.75 * far, rtol=1e-12)
 
 
-def test_newtons_root_and_its_covariance_are_those_of_exact_jacobians():
-    problem, trials = gins(33.0, 20)
-    found = Newton().estimate(problem, trials.z)
-    assert (found.status == Status.CONVERGED).all()
-    system = FrozenSystem.at_nominal(problem, trials.z)
-    assert (np.abs(system.F(found.x)) <= 1e-6 * system.deviation).all()
-    slope = np.linalg.inv(system.H_plus @ problem.measurement.jacobian(found.x))
-    np.testing.assert_allclose(found.covariance, slope @ system.covariance() @ slope.swapaxes(1, 2), rtol=1e-9)
-    assert (found.jacobians < 0.7 * found.iterations).all()
-
-
 COARSE = [GaussNewton(), LevenbergMarquardt(), Progressive(), Auto()]
 
 
