@@ -29,7 +29,7 @@ BUDGETS = {
     "measurements": 6631,
     "noise": 614,
     "priors": 105,
-    "states": 1199,
+    "states": 1170,
     "estimators": 1170,
     "solvers": 1197,
     "baselines": 2068,

@@ -6,8 +6,10 @@ import numpy as np
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.states.algebra import divide, symmetric, transposed
-from ipe_bench.states.base import Paths, StateModel, slope
+from ipe_bench.states.algebra import symmetric, transposed
+from ipe_bench.states.base import Gaussian, Paths, StateModel, slope
+from ipe_bench.states.linearisation import Taylor
+from ipe_bench.states.trackers import Tracks, filtered
 
 
 def posterior_bounds(model: StateModel, paths: Paths) -> tuple[Array, Array]:
@@ -58,16 +60,7 @@ def bound_at_truth(model: StateModel, paths: Paths) -> Array:
     """The error covariances (trials, K, n, n) of an extended Kalman filter that is linearised at the true path (Taylor,
     IEEE TAC 24, 1979). They exist for every Q, zero included; their mean is what a good filter attains, but no bound of
     errors averaged over paths."""
-    P, before = np.repeat(model.prior.covariance[None], len(paths.x), 0), paths.start
-    out = []
-    for k in range(model.epochs):
-        if model.moves(k):
-            F = slope(lambda at, k=k: model.transition(at, k), before)[1]
-            P = np.matmul(np.matmul(F, P), transposed(F)) + model.Q(k)
-        before = paths.x[:, k]
-        H = slope(lambda at, k=k: model.observe(at, k), before)[1]
-        PH = np.matmul(P, transposed(H))
-        S = np.matmul(H, PH) + model.R(k)
-        P = symmetric(P - np.matmul(divide(PH, S), transposed(PH)))
-        out.append(P)
-    return np.stack(out, axis=1)
+    path = Tracks.empty(model, len(paths.x))
+    path.mean, path.covariance[:] = paths.x, model.prior.covariance
+    path.start = Gaussian(paths.start, path.start.covariance)
+    return filtered(model, np.zeros((*paths.x.shape[:2], len(model.R(0)))), Taylor(), path=path).covariance

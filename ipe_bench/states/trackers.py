@@ -60,6 +60,10 @@ class Tracks:
         start = spread_prior(model, trials)
         return cls(means, covariances, nis, innovations, degrees, np.zeros(trials), 0.0, start)
 
+    def at(self, k: int) -> Gaussian:
+        """The states at epoch k; before the first transition if that is -1."""
+        return self.start if k < 0 else Gaussian(self.mean[:, k], self.covariance[:, k])
+
     @classmethod
     def lost(cls, model: StateModel, trials: int) -> Tracks:
         """Tracks of which nothing is known."""
@@ -160,30 +164,29 @@ class Filter(Tracker):
     """Linearisations of each reading."""
 
     def track(self, model: StateModel, z: Array) -> Tracks:
-        out = Tracks.empty(model, len(z))
-        x = out.start
-        for k in range(model.epochs):
-            if model.moves(k):
-                move = self.rule.linearise(lambda at, k=k: model.transition(at, k), *x)
-                x = predict(x, move, model.Q(k))
-                out.moves.append(move)
-                out.predicted.append(x)
-            x = self._updated(model, x, k, z[:, k], out)
-            out.mean[:, k], out.covariance[:, k] = x
-        steps = len(out.moves) + self.iterations * model.epochs
-        out.calls = float(self.rule.calls(model.n) * steps)
-        return out
+        return filtered(model, z, self.rule, self.iterations)
 
-    def _updated(self, model: StateModel, x: Gaussian, k: int, z: Array, out: Tracks) -> Gaussian:
-        at, R, found = x, model.R(k), None
-        for _ in range(self.iterations):
-            read = linearised_reading(model, self.rule, k, z, at)
-            found = update(x, read, R, z)
+
+def filtered(model: StateModel, z: Array, rule: Rule, iterations: int = 1, path: Tracks | None = None) -> Tracks:
+    """The filter of the model that a rule linearises about the filter's own states, or about those of a path."""
+    out = Tracks.empty(model, len(z))
+    x, found = out.start, None
+    for k in range(model.epochs):
+        if model.moves(k):
+            move = rule.linearise(lambda at, k=k: model.transition(at, k), *(x if path is None else path.at(k - 1)))
+            x = predict(x, move, model.Q(k))
+            out.moves.append(move)
+            out.predicted.append(x)
+        at, R = x if path is None else path.at(k), model.R(k)
+        for _ in range(iterations):
+            found = update(x, linearised_reading(model, rule, k, z[:, k], at), R, z[:, k])
             at = found.x
         assert found is not None
+        out.mean[:, k], out.covariance[:, k] = x = found.x
         out.nis[:, k], out.innovations[:, k], out.degrees[:, k] = found.nis, found.innovation, found.degrees
         out.log_likelihood += found.log_likelihood
-        return at
+    out.calls = float(rule.calls(model.n) * (len(out.moves) + iterations * model.epochs))
+    return out
 
 
 @dataclass(frozen=True)
@@ -221,8 +224,8 @@ class IteratedSmoother(Tracker):
         path = self.first.track(model, z)
         calls = path.calls
         for _ in range(self.iterations):
-            new = smoothed(model, _along(model, z, path, self.rule))
-            calls += self.rule.calls(model.n) * (model.epochs + len(new.moves))
+            new = smoothed(model, filtered(model, z, self.rule, path=path))
+            calls += new.calls
             if self.damped:
                 new = _shortened(model, z, path, new)
             moved = np.abs(new.mean - path.mean) / np.sqrt(np.diagonal(new.covariance, axis1=-2, axis2=-1))
@@ -236,13 +239,10 @@ class IteratedSmoother(Tracker):
 def smoothed(model: StateModel, tracks: Tracks) -> Tracks:
     """The backward pass of Rauch, Tung and Striebel through a filter's tracks, to before the first transition."""
     out = Tracks.empty(model, len(tracks.mean))
-    x = Gaussian(tracks.mean[:, -1], tracks.covariance[:, -1])
-    out.mean[:, -1], out.covariance[:, -1] = x
+    out.mean[:, -1], out.covariance[:, -1] = x = tracks.at(model.epochs - 1)
     first = 0 if model.moved_first else 1
-    start = spread_prior(model, len(tracks.mean)) if model.moved_first else None
     for k in range(model.epochs - 1, first - 1, -1):
-        before = Gaussian(tracks.mean[:, k - 1], tracks.covariance[:, k - 1]) if k else start
-        assert before is not None
+        before = tracks.at(k - 1)
         move, predicted = tracks.moves[k - first], tracks.predicted[k - first]
         G = divide(np.matmul(before.covariance, transposed(move.A)), predicted.covariance)
         P = np.matmul(np.matmul(G, x.covariance - predicted.covariance), transposed(G))
@@ -254,24 +254,6 @@ def smoothed(model: StateModel, tracks: Tracks) -> Tracks:
     return out
 
 
-def _along(model: StateModel, z: Array, path: Tracks, rule: Rule) -> Tracks:
-    """The exact filter of the model linearised about a path."""
-    out = Tracks.empty(model, len(z))
-    x, before = out.start, path.start
-    for k in range(model.epochs):
-        here = Gaussian(path.mean[:, k], path.covariance[:, k])
-        if model.moves(k):
-            move = rule.linearise(lambda at, k=k: model.transition(at, k), *before)
-            x = predict(x, move, model.Q(k))
-            out.moves.append(move)
-            out.predicted.append(x)
-        read = linearised_reading(model, rule, k, z[:, k], here)
-        x = update(x, read, model.R(k), z[:, k]).x
-        out.mean[:, k], out.covariance[:, k] = x
-        before = here
-    return out
-
-
 def path_cost(model: StateModel, z: Array, start: Array, mean: Array) -> Array:
     """-2 log p(path | readings) (trials,) up to a constant; disturbances count by the pseudo-inverse of the gain."""
     total, before = mahalanobis(start - model.prior.mean, model.prior.covariance), start
@@ -279,16 +261,18 @@ def path_cost(model: StateModel, z: Array, start: Array, mean: Array) -> Array:
         if model.moves(k):
             w = multiply(np.linalg.pinv(model.gain(k)), mean[:, k] - model.transition(before, k))
             total = total + np.sum(w**2, axis=-1)
-        total, before = total + misfit(model, z[:, k], mean[:, k], k), mean[:, k]
+        total, before = total + misfit(model, z[:, k], mean[:, k, None], k)[0][:, 0], mean[:, k]
     return total
 
 
-def misfit(model: StateModel, z: Array, x: Array, k: int) -> Array:
-    """(z - h)' R^-1 (z - h) (trials,) over the readings z (trials, m) of epoch k that are there."""
-    r = z - model.observe_near(x, k, np.where(np.isfinite(z), z, 0.0))
-    seen = np.isfinite(r)
-    R = np.where(seen[:, :, None] & seen[:, None, :], model.R(k), np.eye(r.shape[1]))
-    return mahalanobis(np.where(seen, r, 0.0), R)
+def misfit(model: StateModel, z: Array, x: Array, k: int) -> tuple[Array, Array]:
+    """(z - h)' R^-1 (z - h) (trials, N) of states x (trials, N, n) over the readings z (trials, m) of epoch k that are
+    there, and log det 2 pi R (trials,) of these."""
+    seen = np.isfinite(z)
+    r = np.where(seen[:, None], z[:, None] - model.observe_near(x, k, np.where(seen, z, 0.0)), 0.0)
+    L = factor(np.where(seen[:, :, None] & seen[:, None, :], model.R(k), np.eye(z.shape[1])))
+    size = 2 * np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1) + np.log(2 * np.pi) * seen.sum(axis=1)
+    return np.sum(lower_solve(L, transposed(r)) ** 2, axis=1), size
 
 
 def _halved(old: Array, new: Array, cost: Callable[[Array], Array]) -> Array:
@@ -349,18 +333,12 @@ class Bootstrap(Tracker):
 def weighed(model: StateModel, x: Array, k: int, z: Array, before: Array | float, out: Tracks) -> Array:
     """The weights `before` (trials, N) of states x (trials, N, n) times the likelihood of readings z (trials, m), with
     sum 1; the logarithm of their sum is added to the log likelihood of the track."""
-    r = z[:, None] - model.observe_near(x, k, np.where(np.isfinite(z), z, 0.0))
-    seen = np.isfinite(z)
-    both = seen[:, :, None] & seen[:, None, :]
-    L = factor(np.where(both, model.R(k), np.eye(z.shape[1])))
-    white = lower_solve(L, transposed(np.where(seen[:, None], r, 0.0)))
-    log = -0.5 * np.sum(white**2, axis=1)
-    top = log.max(axis=1, keepdims=True)
-    w = before * np.exp(log - top)
+    square, size = misfit(model, z, x, k)
+    least = square.min(axis=1, keepdims=True)
+    w = before * np.exp(-0.5 * (square - least))
     total = w.sum(axis=1, keepdims=True)
-    constant = np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1) + 0.5 * np.log(2 * np.pi) * seen.sum(axis=1)
-    out.log_likelihood += top[:, 0] + np.log(total[:, 0]) - constant
-    out.degrees[:, k] = seen.sum(axis=1)
+    out.log_likelihood += np.log(total[:, 0]) - 0.5 * (least[:, 0] + size)
+    out.degrees[:, k] = np.isfinite(z).sum(axis=1)
     return w / total
 
 
