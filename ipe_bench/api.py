@@ -97,7 +97,7 @@ def run(
         scenarios = [_tracking(scenarios) or _scenario(scenarios, **stated)]
     estimators, stored = _labelled(estimators), Stored(output)
     options: dict[str, Any] = {"execution": execution, "block_size": block_size, "watch": watch}
-    stops: Sequence[Any] = ()
+    stops: list[Any] = []
     if precision is None:
         check_time_limit(time_limit)
         failures = compute(scenarios, estimators, TRIALS if trials is None else trials, stored.folder, **options)
@@ -107,7 +107,7 @@ def run(
     _warn([*(f"failed: {failure}" for failure in failures), *use_statistics()])
     table = Summary.of(summarize([stored.folder]), stored)
     if precision is not None:
-        table.attrs["stops"] = [stop.row for stop in stops]
+        table.attrs["stops"] = stops
     return table
 
 

@@ -185,13 +185,14 @@ def _computed(job: Spec, begun: Outcome, command: str) -> Outcome:
         if job.precision is None:
             done = replace(begun, failures=compute(*asked, **options, watch=watch))
         else:
-            from ipe_bench.statistics.stopping import compute_until
+            from ipe_bench.statistics.stopping import NARROW, compute_until
 
             options |= {"precision": job.precision, "time_limit": job.time_limit}
             failures, (stop,) = compute_until(*asked, **options, watch=watch)
-            verdict = "" if stop.reached else "the precision is not reached: "
-            said = f"{begun.job}: {stop.trials} trials; {verdict}{stop.reason} ({stop.widest})"
-            done = replace(begun, failures=failures, stop=said, precision_missed=not stop.reached)
+            missed = stop["reason"] != NARROW
+            verdict = "the precision is not reached: " if missed else ""
+            said = f"{begun.job}: {stop['trials']} trials; {verdict}{stop['reason']} ({stop['widest']})"
+            done = replace(begun, failures=failures, stop=said, precision_missed=missed)
     value = None
     if job.objective is not None:
         from ipe_bench.statistics.stopping import objective

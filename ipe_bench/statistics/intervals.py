@@ -270,26 +270,22 @@ def first_that(holds: Callable[[float], bool], inside: float, outside: float) ->
     return outside
 
 
-def mean_sequence(deviation: Array, count: int, level: float = LEVEL) -> Array:
-    """How far a mean of `count` values of that deviation may lie from its true value.
+def rms_sequence(squares: Squares, degrees: Array, level: float = LEVEL) -> tuple[Array, Array]:
+    """Root mean square (k,): the sequence of the logarithm of the mean square; NaN below `FIRST`, and where few trials
+    carry the sum; see `few_carry`.
 
     The asymptotic confidence sequence of a Gaussian mixture (Waudby-Smith, Arbour, Sinha, Kennedy and Ramdas, Ann.
     Statist. 52, 2024, theorem 2.2), tightest at `TIGHTEST`: what the central limit theorem is to a fixed number of
     trials.
     """
-    alpha, rho2 = 1 - level, 1 / _WEIGHT
-    grown = count * rho2 + 1
-    return deviation * math.sqrt(2 * grown / (count**2 * rho2) * math.log(math.sqrt(grown) / alpha))
-
-
-def rms_sequence(squares: Squares, degrees: Array, level: float = LEVEL) -> tuple[Array, Array]:
-    """Root mean square (k,): the sequence of the logarithm of the mean square; NaN below `FIRST`, and where few trials
-    carry the sum; see `few_carry`."""
     size, mean, count = squares.size, squares.mean, squares.count
     if count < FIRST:
         return np.full(len(size), np.nan), np.full(len(size), np.nan)
+    alpha, rho2 = 1 - level, 1 / _WEIGHT
+    grown = count * rho2 + 1
     with np.errstate(all="ignore"):
-        reach = mean_sequence(np.sqrt(squares.deviations / (count - 1)) / mean, count, level) / 2
+        deviation = np.sqrt(squares.deviations / (count - 1)) / mean
+        reach = deviation * math.sqrt(2 * grown / (count**2 * rho2) * math.log(math.sqrt(grown) / alpha)) / 2
         root = np.sqrt(size * mean)
         ends = [np.where(size > 0, root * np.exp(side * reach), 0.0) for side in (-1, 1)]
     few = few_carry(squares, degrees)

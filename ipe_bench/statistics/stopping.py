@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -66,28 +65,6 @@ def _distances(sample: Sample, wanted: Mapping[str, float]) -> Iterator[tuple[fl
         yield width / precision if known else np.inf, f"{sample.group.estimator}: {statistic} ± {shown}"
 
 
-@dataclasses.dataclass(frozen=True)
-class Stop:
-    """How many trials a scenario took until its intervals were narrow enough, or why it took no more."""
-
-    scenario: AnyScenario
-    trials: int
-    reason: str
-    widest: str
-    """The statistic that is farthest from the precision that was asked for, or was nearest to it last."""
-
-    @property
-    def reached(self) -> bool:
-        """Whether the precision that was asked for is there."""
-        return self.reason == NARROW
-
-    @property
-    def row(self) -> dict[str, Any]:
-        """What it says, by name."""
-        names = {k: v for k, v in ResultKey(self.scenario).names.items() if k != "estimator"}
-        return names | {"trials": self.trials, "reason": self.reason, "widest": self.widest}
-
-
 def compute_until(
     scenarios: Sequence[AnyScenario],
     estimators: Mapping[str, Any],
@@ -100,11 +77,12 @@ def compute_until(
     block_size: int | None = None,
     watch: Watcher | None = None,
     command: str | None = None,
-) -> tuple[tuple[str, ...], tuple[Stop, ...]]:
+) -> tuple[tuple[str, ...], list[dict[str, Any]]]:
     """Adds blocks to what is stored under `output` until every interval is narrow enough, there are `most` trials
     (`MOST_TRIALS` where None), or `time_limit` seconds are over, which is looked at between rounds of blocks.
 
-    Returns the messages of what failed, and why each scenario stopped.
+    Returns the messages of what failed, and a row per scenario: its names, how many `trials` it took, the `reason` why
+    it took no more, `NARROW` if the precision is reached, and the `widest` statistic, which is farthest from it.
 
     Raises:
         UserError: what was asked for cannot be computed; nothing is computed then.
@@ -120,7 +98,7 @@ def compute_until(
     options |= {"further": {"precision": wanted}, "command": command}
     at = [_first_trials(s, estimators, Path(output), block_size, budget) for s in scenarios]
     names, failures = [new_name() for _ in scenarios], []
-    stops: dict[int, Stop] = {}
+    stops: dict[int, dict[str, Any]] = {}
     while len(stops) < len(scenarios):
         for i in [i for i in range(len(scenarios)) if i not in stops]:
             failed = compute([scenarios[i]], estimators, at[i], output, record_as=names[i], **options)
@@ -135,10 +113,11 @@ def compute_until(
             }
             if reason := next((words for words, applies in reasons.items() if applies), ""):
                 failures += failed
-                stops[i] = Stop(scenarios[i], at[i], reason, widest)
+                known = {k: v for k, v in ResultKey(scenarios[i]).names.items() if k != "estimator"}
+                stops[i] = known | {"trials": at[i], "reason": reason, "widest": widest}
             else:
                 at[i] = next_trials(at[i], ratio, block_size, budget)
-    return tuple(failures), tuple(stops[i] for i in range(len(scenarios)))
+    return tuple(failures), [stops[i] for i in range(len(scenarios))]
 
 
 def next_trials(trials: int, ratio: float, block: int, most: int) -> int:

@@ -6,7 +6,7 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import binom
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.statistics.intervals import Squares, clopper_pearson, mean_sequence, rms_sequence, share_sequence
+from ipe_bench.statistics.intervals import Squares, clopper_pearson, rms_sequence, share_sequence
 from ipe_bench.statistics.stopping import next_trials, precision_of
 
 
@@ -56,7 +56,10 @@ def test_the_sequence_of_a_mean_is_as_narrow_as_a_mixture_can_be_at_a_thousand_t
         return float(np.sqrt(2 * grown / (grown - 1) * np.log(np.sqrt(grown) / 0.05)))
 
     least = minimize_scalar(errors, bounds=(-12, 0), method="bounded").fun
-    assert mean_sequence(np.array(2.0), 1000) == pytest.approx(2 * least / np.sqrt(1000), rel=5e-3)
+    squares = np.random.default_rng(0).chisquare(11, (1, 1000))
+    low, high = rms_sequence(Squares.of(squares), np.array([11]))
+    reach = least * squares.std(ddof=1) / squares.mean() / np.sqrt(1000)
+    assert np.log(high / low) == pytest.approx(reach, rel=5e-3)
 
 
 def test_a_root_mean_square_scales_with_its_errors_and_narrows_with_trials():
