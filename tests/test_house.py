@@ -35,11 +35,11 @@ BUDGETS = {
     "baselines": 2068,
     "trials": 1990,
     "runs": 2114,
-    "statistics": 3751,
+    "statistics": 3701,
     "real": 2301,
     "plugins": 1120,
     "report": 4034,
-    "cli": 2496,
+    "cli": 2497,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""
 PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}

@@ -19,14 +19,13 @@ from scipy.special import ndtr, ndtri, stdtr, stdtrit
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array
-from ipe_bench.statistics.comparisons import holm
+from ipe_bench.statistics.comparisons import ALPHA, holm
 from ipe_bench.statistics.intervals import rms_interval
 from ipe_bench.trials.observability import in_words
 
 if TYPE_CHECKING:
     import pandas as pd
 
-ALPHA = 0.05
 FEWEST_RUNS = 20
 MATTERS = 1.1
 """A factor of the standard deviation below which a covariance can be believed."""

@@ -62,11 +62,6 @@ class Collection(Results):
             result.setdefault(tuple(group.columns.values()), []).append(group)
         return result
 
-    @property
-    def estimators(self) -> list[str]:
-        """The labels of the estimators, in the order in which runs list them."""
-        return list(dict.fromkeys(g.estimator for g in self.groups))
-
 
 def collect(directories: Sequence[Path | str], keys: Keys[str] | None = None) -> Collection:
     """Finds what is stored under the directories, or of the cells with these keys alone.

@@ -85,8 +85,6 @@ def differences(first: Array, second: Array) -> Array:
 
 def mcnemar(only_first: int, only_second: int) -> float:
     """Two-sided p of McNemar's exact test (Psychometrika 12, 1947): discordant trials are fair coin tosses."""
-    if only_first + only_second == 0:
-        return 1.0
     return min(1.0, 2 * float(bdtr(min(only_first, only_second), only_first + only_second, 0.5)))
 
 
@@ -109,9 +107,8 @@ def may_be_best(success: Array, level: float = ALPHA) -> Array:
     left out with a probability of at most `level` (multiple comparisons with the best: Hsu, Ann. Statist. 9, 1981).
     """
     k = success.shape[1]
-    won = success.astype(float).T @ (~success).astype(float)
-    discordant = (won + won.T).astype(int)
-    p = np.where(discordant > 0, bdtr(won, np.maximum(discordant, 1), 0.5), 1.0)
+    won = (success.astype(float).T @ (~success).astype(float)).astype(int)
+    p = bdtr(won, won + won.T, 0.5)
     return p.min(axis=1, initial=1.0) > level / max(k - 1, 1)
 
 

@@ -66,9 +66,8 @@ def rms_interval(squares: Array, used: Array | None = None, level: float = LEVEL
 
     squares is (trials, k), used (trials,) boolean, all where it is not given. The logarithm of the mean square is
     studentised (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, ch. 12), which makes its variance nearly
-    constant: the plain percentile interval of 20 normal errors holds the truth in 88 % of cases instead of 95 %. Its
-    standard error s is taken s times larger, since where few large errors carry the mean, s itself comes out too small:
-    found by simulation, coverage is then 94 % or more from 20 trials on for errors from uniform to Student's t with 5
+    constant. Its standard error s is taken s times larger, since s comes out too small where few large errors carry the
+    mean: by simulation, coverage is then 94 % or more from 20 trials on for errors from uniform to Student's t with 5
     degrees. Trials are drawn with replacement, used or not; the draws are the same for every estimator. Of more than
     `LARGEST_SAMPLE` trials, groups of consecutive ones are drawn, which is as good since trials are independent.
     """
@@ -150,8 +149,7 @@ def few_carry(squares: Squares, degrees: Array) -> Array:
 
     `degrees` (k,) are those of the chi-square law that a square has for normal errors. The sum of squared shares of
     the trials is beyond what such errors exceed in a share `HEAVY` of cases, and one trial makes up a twentieth of it.
-    Errors larger than those of three trials in their number, such as one outlier among 20 trials in 50, may be in none
-    of the trials: then nothing in them can tell.
+    Where none of the trials has a rare large error, nothing in them can tell.
     """
     with np.errstate(all="ignore"):
         total = squares.count * squares.mean

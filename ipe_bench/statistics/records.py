@@ -18,7 +18,7 @@ import ipe_bench.statistics.tracks as t
 from ipe_bench.basics.errors import UserError, place_of
 from ipe_bench.statistics.collect import ALWAYS_COLUMNS
 from ipe_bench.statistics.intervals import clopper_pearson, quantile, share_sequence, verdict
-from ipe_bench.statistics.sample import CLOSE, NIS, Sample, orders_of
+from ipe_bench.statistics.sample import CLOSE, NIS, Sample, iterations_to_limit, orders_of
 from ipe_bench.trials.thresholds import EXPECTED, FEW, GATE, SAME_ROOT
 
 if TYPE_CHECKING:
@@ -708,7 +708,7 @@ SCORES: tuple[Statistic, ...] = (
         "converged trials with a stored history",
         f"Median cost until all further iterates are within {CLOSE:g} standard deviations of the last, in every"
         " parameter; iterate k of K is taken to cost (k + 1) / (K + 1) of the trial.",
-        lambda s: quantile(np.array([h.cost_to_limit for h in s.histories]), 0.5),
+        lambda s: quantile(np.array([cost * (iterations_to_limit(d) + 1) / len(d) for d, cost in s.histories]), 0.5),
         where=("costs",),
     ),
     Statistic(
@@ -725,7 +725,7 @@ SCORES: tuple[Statistic, ...] = (
         "order",
         "converged trials with a stored history",
         "Median of the last observed order of convergence: 1 linear, 2 quadratic.",
-        lambda s: quantile(np.array([o[-1] for h in s.histories if len(o := orders_of(h.distances))]), 0.5),
+        lambda s: quantile(np.array([o[-1] for d, _ in s.histories if len(o := orders_of(d))]), 0.5),
         where=("costs",),
     ),
     Statistic(

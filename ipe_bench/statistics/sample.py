@@ -37,21 +37,6 @@ FLOOR = 1e-9
 _SEED = 1 << 40
 
 
-@dataclass(frozen=True)
-class History:
-    """How a converged trial came to its limit."""
-
-    distances: Array
-    """(iterates,) from the last iterate, in deviations of the bound."""
-    cost: float
-    """Of the whole trial."""
-
-    @property
-    def cost_to_limit(self) -> float:
-        """The cost of coming close; that of iterate k is its share (k + 1) / (iterates) of the trial's whole cost."""
-        return self.cost * (iterations_to_limit(self.distances) + 1) / len(self.distances)
-
-
 @dataclass(frozen=True, eq=False)
 class Sample:
     """All trials of one group, seeds one after another; errors and deviations in multiples of the parameters' sizes.
@@ -194,8 +179,9 @@ class Sample:
         return calibrations(self.error, self.deviation, self.scalars["nees"], self.converged)
 
     @cached_property
-    def histories(self) -> list[History]:
-        """Those of the converged trials whose iterates are stored; none of a filter, which has epochs instead."""
+    def histories(self) -> list[tuple[Array, float]]:
+        """Of each converged trial whose iterates are stored, their distances (iterates,) from the last one in
+        deviations of the bound, and the cost of the trial; none of a filter, which has epochs instead."""
         if not self.iterates:
             return []
         found = []
@@ -208,7 +194,7 @@ class Sample:
         if not found:
             return []
         crlb, cost = self.of_truth("crlb"), self.cost.tolist()
-        return [History(distances_to_limit(iterates, crlb[row]), cost[row]) for row, iterates in found]
+        return [(distances_to_limit(iterates, crlb[row]), cost[row]) for row, iterates in found]
 
 
 def label_of(number: Any) -> str:

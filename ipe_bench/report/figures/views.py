@@ -129,7 +129,7 @@ def _word(value: Any) -> str:
 def _looks(analysis: Analysis) -> dict[str, Look]:
     """A look for each estimator, in the colours of its family; of more than `MOST_FACES` the two best of each family
     and the reference are in colour."""
-    labels = analysis.collection.estimators
+    labels = list(dict.fromkeys(g.estimator for g in analysis.collection.groups))
     families = {g.estimator: family_of(g.footer) for g in analysis.collection.groups}
     if len(labels) <= MOST_FACES or analysis.summary.empty:
         return looks(labels, families)
