@@ -76,12 +76,19 @@ _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
         " if the relative curvatures are below 0.3.",
         lambda rows: rows["predicted_rmse"].notna(),
     ),
+    "iterations": (
+        "Bounds on the iterations",
+        "Over the first trials, whose iterates are stored. Eq. (18) bounds fixed-point iteration if K of eq. (15) is"
+        " below 1; eq. (23) bounds Newton's method by the curvature M of its g. Constants are taken at the truth, and"
+        " the last iterate is taken for the root.",
+        lambda rows: (rows["eq_18_trials"] > 0) | rows["eq_23_observed"].notna(),
+    ),
 }
 """Title, caption and rows of the tables that are made of recorded statistics alone."""
 _OF_PARAMETERS = ("tracks", "parameters", "theory")
 """Those of them that have a row per parameter."""
 _MAIN = ("overview", "tracks", "costs", "comparisons", "parameters", "calibration", "endings")
-_APPENDIX = ("all_trials", "solved_trials", "contraction", "covariances", "theory")
+_APPENDIX = ("all_trials", "solved_trials", "contraction", "covariances", "theory", "iterations")
 
 
 def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]:

@@ -15,7 +15,7 @@ from scipy.special import betaincinv, gammaincinv, ndtri
 from ipe_bench.basics.linalg import Array
 from ipe_bench.statistics.calibration import overall_words
 from ipe_bench.statistics.intervals import Squares, few_carry, mean_limits, quantile, rms_interval, rms_sequence
-from ipe_bench.statistics.sample import AMBIGUOUS, FIT, NIS, Sample
+from ipe_bench.statistics.sample import AMBIGUOUS, FIT, FLOOR, NIS, Sample
 from ipe_bench.trials.thresholds import FIT_LEVEL, gate
 
 T = TypeVar("T")
@@ -351,3 +351,49 @@ def calibration(s: Sample) -> Any:
 def mean_nis(s: Sample) -> float:
     values = s.scalars[NIS] if NIS in s.scalars else np.empty(0)
     return float(np.mean(values[np.isfinite(values)])) if np.isfinite(values).any() else np.nan
+
+
+# Iterations ----------------------------------------------------------------------------------------------------------
+
+
+def _uses(s: Sample, method: str) -> bool:
+    """Whether the estimator iterates by that method on the frozen equation."""
+    target = str((s.group.footer["identity"]["estimator"] or {}).get("_target_", ""))
+    return s.group.footer.get("equation") == "frozen" and target.rpartition(".")[2] == method
+
+
+def fixed_point_bound(iterates: Array, K: float) -> tuple[bool, float]:
+    """Whether the largest error |x_k - x| of each iterate (iterates, n) is at most K^k / (1 - K) |x_1 - x_0|, eq. (18)
+    with the k that the print lost, for K below 1, and the largest such ratio of the iterates between the ends.
+
+    The last iterate is taken for x (Burden and Faires, Numerical Analysis). The bound is proven for a K that holds all
+    along the iterates.
+    """
+    error = np.abs(iterates - iterates[-1]).max(axis=1)
+    bound = K ** np.arange(len(iterates)) / (1 - K) * np.abs(iterates[1] - iterates[0]).max()
+    ratio = (error / bound)[1:-1][error[1:-1] > FLOOR].max(initial=0.0)
+    return bool(np.all(error <= bound + 1e-12 * (1.0 + error.max()))), float(ratio)
+
+
+def observed_constant(iterates: Array) -> float:
+    """The least M with which eq. (23), e_(k+1) <= n^2 M / 2 e_k^2, explains the errors of iterates (iterates, n) that
+    exceed round-off, with the last iterate for the root; NaN where they are over too soon."""
+    e = np.abs(iterates - iterates[-1]).max(axis=1)
+    usable = (e[:-1] > FLOOR) & (e[1:] > FLOOR)
+    ratios = 2 * e[1:][usable] / (iterates.shape[1] ** 2 * e[:-1][usable] ** 2)
+    return float(ratios.max()) if len(ratios) else np.nan
+
+
+@once
+def fixed_point_bounds(s: Sample) -> Array:
+    """(histories, 2): what `fixed_point_bound` says of each history of fixed-point iteration whose K is below 1."""
+    histories = s.histories if _uses(s, "FixedPoint") else ()
+    return np.array([fixed_point_bound(h.iterates, h.K) for h in histories if h.K < 1]).reshape(-1, 2)
+
+
+@once
+def constants(s: Sample) -> Array:
+    """(histories, 2): M as observed and at the truth, of each history of Newton's method that has both."""
+    histories = s.histories if _uses(s, "Newton") else ()
+    pairs = np.array([(observed_constant(h.iterates), h.M) for h in histories]).reshape(-1, 2)
+    return pairs[np.isfinite(pairs).all(axis=1)]

@@ -34,6 +34,7 @@ Where = Literal[
     "costs",
     "parameters",
     "covariances",
+    "iterations",
     "theory",
     "calibration",
     "tracks",
@@ -708,7 +709,9 @@ SCORES: tuple[Statistic, ...] = (
         "converged trials with a stored history",
         f"Median cost until all further iterates are within {CLOSE:g} standard deviations of the last, in every"
         " parameter; iterate k of K is taken to cost (k + 1) / (K + 1) of the trial.",
-        lambda s: quantile(np.array([cost * (iterations_to_limit(d) + 1) / len(d) for d, cost in s.histories]), 0.5),
+        lambda s: quantile(
+            np.array([h.cost * (iterations_to_limit(h.distances) + 1) / len(h.distances) for h in s.histories]), 0.5
+        ),
         where=("costs",),
     ),
     Statistic(
@@ -725,8 +728,63 @@ SCORES: tuple[Statistic, ...] = (
         "order",
         "converged trials with a stored history",
         "Median of the last observed order of convergence: 1 linear, 2 quadratic.",
-        lambda s: quantile(np.array([o[-1] for d, _ in s.histories if len(o := orders_of(d))]), 0.5),
+        lambda s: quantile(np.array([o[-1] for h in s.histories if len(o := orders_of(h.distances))]), 0.5),
         where=("costs",),
+    ),
+    Statistic(
+        "eq_18_trials",
+        "K below 1",
+        "converged trials of fixed-point iteration with a stored history",
+        "Number of those in which the K of eq. (15) at the truth is below 1, so that eq. (18) says something.",
+        lambda s: len(f.fixed_point_bounds(s)),
+        kind="count",
+        where=("iterations",),
+    ),
+    Statistic(
+        "eq_18_holds",
+        "eq. (18) holds",
+        "those trials in which K is below 1",
+        "Share in which no iterate is farther from the limit than K^k / (1 - K) times the first step, eq. (18) with the"
+        " k that the print lost (Burden and Faires, Numerical Analysis, have it). K is that at the truth: the theorem"
+        " wants the largest on the way, so this is an observation and no proof.",
+        lambda s: float(f.mean(f.fixed_point_bounds(s))[0]),
+        kind="share",
+        where=("iterations",),
+    ),
+    Statistic(
+        "eq_18_error_over_bound",
+        "error / bound of eq. (18)",
+        "those trials in which K is below 1",
+        "Median of the largest distance of an iterate after the first from the limit, over its bound.",
+        lambda s: quantile(f.fixed_point_bounds(s)[:, 1], 0.5),
+        where=("iterations",),
+    ),
+    Statistic(
+        "eq_23_observed",
+        "M observed",
+        "converged trials of Newton's method with a stored history",
+        "Median of the least M with which eq. (23), |x_(k+1) - root| <= n² M / 2 |x_k - root|², explains the history;"
+        " the last iterate stands for the root.",
+        lambda s: quantile(f.constants(s)[:, 0], 0.5),
+        where=("iterations",),
+    ),
+    Statistic(
+        "eq_23_M",
+        "M at the truth",
+        "the same trials",
+        "Median of the largest |∂²g_i / ∂x_j ∂x_k| of Newton's g at the truth, by central differences. The theorem"
+        " wants the largest over a neighbourhood.",
+        lambda s: quantile(f.constants(s)[:, 1], 0.5),
+        where=("iterations",),
+    ),
+    Statistic(
+        "eq_23_holds",
+        "eq. (23) holds",
+        "the same trials",
+        "Share in which the least M that explains the history is at most M at the truth.",
+        lambda s: f.share(constants[:, 0] <= constants[:, 1]) if len(constants := f.constants(s)) else np.nan,
+        kind="share",
+        where=("iterations",),
     ),
     Statistic(
         NIS,

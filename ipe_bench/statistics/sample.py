@@ -28,13 +28,29 @@ PATH = ("path_nees", "white_p", "log_likelihood", "first_bad_epoch")
 OPTIONAL = ("message", FIT, NIS, AMBIGUOUS, "root_distance", *PATH)
 """Columns that not every version or estimator stores."""
 CONTRACTION = ("contraction_K", "contraction_norm", "contraction_radius")
-TRUTH = ("curvature_intrinsic", "curvature_parameter")
+TRUTH = (*CONTRACTION, "curvature_M", "curvature_intrinsic", "curvature_parameter")
 """Numbers of the truth."""
 CLOSE = 0.05
 """An iterate within this many standard deviations of the last one is as good as the last one."""
 FLOOR = 1e-9
 """Distances between iterates below this are round-off."""
 _SEED = 1 << 40
+
+
+@dataclass(frozen=True)
+class History:
+    """How a converged trial came to its limit."""
+
+    iterates: Array
+    """(iterates, n)"""
+    distances: Array
+    """(iterates,) from the last iterate, in deviations of the bound."""
+    cost: float
+    """Of the whole trial."""
+    K: float
+    """Of eq. (15) at the truth."""
+    M: float
+    """Of eq. (23) at the truth; NaN where it is not stored."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,9 +195,8 @@ class Sample:
         return calibrations(self.error, self.deviation, self.scalars["nees"], self.converged)
 
     @cached_property
-    def histories(self) -> list[tuple[Array, float]]:
-        """Of each converged trial whose iterates are stored, their distances (iterates,) from the last one in
-        deviations of the bound, and the cost of the trial; none of a filter, which has epochs instead."""
+    def histories(self) -> list[History]:
+        """Those of the converged trials whose iterates are stored; none of a filter, which has epochs instead."""
         if not self.iterates:
             return []
         found = []
@@ -194,7 +209,11 @@ class Sample:
         if not found:
             return []
         crlb, cost = self.of_truth("crlb"), self.cost.tolist()
-        return [(distances_to_limit(iterates, crlb[row]), cost[row]) for row, iterates in found]
+        K, M = (self.of_truth(name).tolist() for name in ("contraction_K", "curvature_M"))
+        return [
+            History(iterates, distances_to_limit(iterates, crlb[row]), cost[row], K[row], M[row])
+            for row, iterates in found
+        ]
 
 
 def label_of(number: Any) -> str:

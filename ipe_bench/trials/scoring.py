@@ -32,7 +32,14 @@ from ipe_bench.trials.bounds import bound_deviations, informative_rows
 from ipe_bench.trials.fit_test import Spread, fit_probability, inflation_of, spread_of
 from ipe_bench.trials.roots import frozen_root, least_squares_root
 from ipe_bench.trials.scenario import Scenario, Trials
-from ipe_bench.trials.theory import box_bias, contraction, misspecified, relative_curvatures, second_derivatives
+from ipe_bench.trials.theory import (
+    box_bias,
+    contraction,
+    curvature,
+    misspecified,
+    relative_curvatures,
+    second_derivatives,
+)
 from ipe_bench.trials.thresholds import EXPECTED, SAME_ROOT, gate
 
 HISTORIES = 20
@@ -156,10 +163,10 @@ class Block:
         return CountingModel.uncounted(self.problem.measurement, len(x)).simulate(read_only(x), np.arange(len(x)))
 
     def _curvature_columns(self, names: list[str]) -> Columns:
-        """What second derivatives at the truth say, for the first trials and NaN for the others: the relative
-        curvatures, and the bias of least squares."""
+        """What second derivatives at the truth say, for the first trials and NaN for the others: M of
+        eq. (23), the relative curvatures, and the bias of least squares."""
         kept = max(0, min(CURVED, self.trials.stop) - self.trials.start)
-        intrinsic, parametric = np.full((2, len(self.trials.x)), np.nan)
+        M, intrinsic, parametric = np.full((3, len(self.trials.x)), np.nan)
         bias = np.full(self.trials.x.shape, np.nan)
         if kept:
             J, R = self.jacobian[:kept], self.problem.R
@@ -169,7 +176,9 @@ class Block:
                 J, second = (np.where(usable.reshape(-1, *[1] * (a.ndim - 1)), a, np.nan) for a in (J, second))
                 bias[:kept] = box_bias(J, second, R)
                 intrinsic[:kept], parametric[:kept] = relative_curvatures(J, second, R)
+                M[:kept] = curvature(J, second, self.problem.H_plus[None])
         return {
+            "curvature_M": M,
             "curvature_intrinsic": intrinsic,
             "curvature_parameter": parametric,
             **by_parameter("box_bias", names, bias),

@@ -31,6 +31,16 @@ def contraction(J_F: Array) -> tuple[Array, Array, Array]:
     return K, norm, np.where(bad, np.nan, radius)
 
 
+def curvature(J: Array, second: Array, H_plus: Array) -> Array:
+    """M (trials,) of eq. (23): the largest abs(d2g_i / dx_j dx_k) of Newton's g, where at a root d2g = J_F^-1 d2F with
+    J_F = H+ J, from the slopes J (trials, m, n) and second derivatives (trials, m, n, n) of the readings, for
+    H+ (1, n, m); NaN where J_F is singular.
+    """
+    trials, m, n = J.shape
+    bent, _ = solve(np.matmul(H_plus, J), np.matmul(H_plus, second.reshape(trials, m, n * n)))
+    return np.asarray(np.abs(bent).max(axis=(1, 2)))
+
+
 def second_derivatives(model: Measurement, x: Array) -> Array:
     """d2h/dx_j dx_k at x (trials, n): (trials, m, n, n), by central differences of the Jacobian, symmetrised."""
     second = np.stack(list(_bends(model, x)), axis=3)

@@ -16,10 +16,12 @@ from ipe_bench.report.tables import all_tables
 from ipe_bench.runs.run import compute
 from ipe_bench.solvers import FixedPoint, Newton
 from ipe_bench.statistics import analyse
+from ipe_bench.statistics.formulas import fixed_point_bound, observed_constant
 from ipe_bench.statistics.sample import orders_of
+from ipe_bench.trials.roots import frozen_root
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import CURVED, Block
-from ipe_bench.trials.theory import contraction
+from ipe_bench.trials.theory import contraction, curvature, second_derivatives
 
 
 def contracting(problem, x):
@@ -45,6 +47,43 @@ def test_the_three_contractions_stand_in_order():
     assert (FixedPoint().estimate(scenario.problem, trials.z).status == Status.CONVERGED).all()
 
 
+def test_eq_18_holds_with_the_k_that_the_print_lost():
+    """g(x) = x/2 has K = 1/2 and |x_k| = 2^-k, where the bound is 2^-k as well: sharp."""
+    iterates = np.append(0.5 ** np.arange(12), 0.0)[:, None]
+    assert fixed_point_bound(iterates, 0.5) == (True, pytest.approx(1.0))
+    assert not fixed_point_bound(iterates, 0.4)[0]
+
+
+def test_eq_18_holds_on_gins_at_scale_1():
+    scenario = Scenario(Gins(), Quantization(0.02286), GaussianPrior(), 1.0)
+    trials = scenario.draw(0, 10)
+    histories = FixedPoint(tolerance=1e-9).estimate(scenario.problem, trials.z, history=True).history
+    root = frozen_root(scenario.problem, trials.z, trials.x)
+    for iterates, x in zip(histories, root, strict=True):
+        K = 1.05 * contracting(scenario.problem, iterates)[0].max()
+        assert K < 1
+        assert fixed_point_bound(np.vstack([iterates[:3], x]), K)[0]
+
+
+def test_the_constant_of_eq_23_is_that_of_a_quadratic():
+    """h(x) = A x + b (A x)^2 with one parameter: F'' = 2 b H+ A^2 and F' = H+ (A + 2 b A^2 x)."""
+    scenario = Scenario(Polynomial(unknowns=1, strength=0.1), Gaussian(0.01), GaussianPrior(), 1.0)
+    problem, trials = scenario.problem, scenario.draw(0, 1)
+    root = frozen_root(problem, trials.z, trials.x)
+    iterates = Newton(start="nominal").estimate(problem, trials.z, history=True).history[0]
+    model = problem.measurement
+    M = curvature(model.jacobian(root), second_derivatives(model, root), problem.H_plus[None])[0]
+    u, s = root[0, 0], 0.1
+    np.testing.assert_allclose(M, (s + s**2 * u) / (1 + s * u + s**2 * u**2 / 2), rtol=1e-5)
+    assert 0.5 * M < observed_constant(np.vstack([iterates, root])) < 2 * M
+
+
+def test_eq_23_takes_the_largest_second_derivative_over_all_pairs():
+    """A square model whose second derivatives are known: h = (x + x y, y + 3 y^2) at 0 has the largest, 6, in y, y."""
+    J, second = np.eye(2)[None], np.array([[[[0.0, 1.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 6.0]]]])
+    np.testing.assert_allclose(curvature(J, second, np.eye(2)[None]), 6.0, rtol=1e-12)
+
+
 def test_orders_of_sequences_are_recovered():
     linear = 0.3 ** np.arange(10)
     assert orders_of(linear)[-1] == pytest.approx(1.0, abs=1e-9)
@@ -62,6 +101,10 @@ def test_stored_contraction_is_that_of_the_model_at_the_truth():
     np.testing.assert_allclose(columns["contraction_norm"], np.abs(slope).sum(axis=2).max(axis=1), rtol=1e-9)
     radius = [np.abs(np.linalg.eigvals(s)).max() for s in slope]
     np.testing.assert_allclose(columns["contraction_radius"], radius, rtol=1e-7)
+    # M is stored for the first trials of the scenario, whatever the block.
+    assert np.isfinite(columns["curvature_M"]).tolist() == [True] * CURVED + [False] * 3
+    later = Block.draw(scenario, CURVED - 1, CURVED + 3).truth_columns()
+    assert np.array_equal(later["curvature_M"], columns["curvature_M"][CURVED - 1 :], equal_nan=True)
 
 
 @pytest.fixture(scope="module")
@@ -108,8 +151,15 @@ def test_how_iterations_converge_is_in_the_report(analysis):
     orders = analysis.scores.set_index(["estimator", "error_scale"])["order_median"]
     assert orders["newton", 5.0] == pytest.approx(2.0, abs=0.4)
     assert orders["fixed_point", 5.0] == pytest.approx(1.0, abs=0.2)
+    scores = analysis.scores.set_index(["estimator", "error_scale"])
+    fixed, newton = scores.loc[("fixed_point", 1.0)], scores.loc[("newton", 5.0)]
+    assert fixed["eq_18_trials"] > 0
+    assert fixed["eq_18_holds"] == 1.0
+    assert 0 < fixed["eq_18_error_over_bound"] < 1
+    assert newton["eq_23_M"] > 0
+    assert newton["eq_18_trials"] == 0
     names = [t.name for t in all_tables(analysis) if t.appendix]
-    assert {"contraction", "covariances"} <= set(names)
+    assert {"contraction", "covariances", "iterations"} <= set(names)
 
 
 def test_false_roots_say_how_far_off_they_are(synthetic):
