@@ -20,12 +20,11 @@ from ipe_bench.priors import Prior
 from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.results import Results, require_results
-from ipe_bench.runs.run import TRIALS, compute, validate
+from ipe_bench.runs.run import compute, validate
 from ipe_bench.runs.schedule import Watcher
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.trackers import Tracker
-from ipe_bench.trials.scenario import Scenario
-from ipe_bench.trials.tracking import AnyScenario, Tracking
+from ipe_bench.trials.scenario import TRIALS, AnyScenario, Scenario, Tracking
 
 if TYPE_CHECKING:
     import pandas as pd

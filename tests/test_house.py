@@ -26,20 +26,20 @@ LINE = (
 )
 BUDGETS = {
     "basics": 949,
-    "measurements": 6631,
+    "measurements": 6634,
     "noise": 614,
     "priors": 105,
     "states": 1170,
-    "estimators": 1170,
+    "estimators": 1178,
     "solvers": 1197,
     "baselines": 2068,
-    "trials": 2009,
-    "runs": 2114,
-    "statistics": 3824,
+    "trials": 2013,
+    "runs": 2109,
+    "statistics": 3829,
     "real": 2301,
     "plugins": 1120,
-    "report": 4041,
-    "cli": 2497,
+    "report": 4044,
+    "cli": 2495,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""
 PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}

@@ -22,11 +22,9 @@ from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.report.style import PAGE, Which, file_formats, which_figures
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.provenance import TARGET, canonical_json, describe
-from ipe_bench.runs.run import MOST_TRIALS, TRIALS
 from ipe_bench.states.base import StateModel
 from ipe_bench.states.trackers import Tracker
-from ipe_bench.trials.scenario import Scenario
-from ipe_bench.trials.tracking import Tracking
+from ipe_bench.trials.scenario import MOST_TRIALS, TRIALS, Scenario, Tracking
 
 if TYPE_CHECKING:
     from ipe_bench.real.estimation import Question

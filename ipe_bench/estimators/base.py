@@ -6,7 +6,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,10 @@ from ipe_bench.basics.errors import UserError, describe_exception
 from ipe_bench.basics.linalg import Array, read_only
 from ipe_bench.basics.options import Component
 from ipe_bench.basics.statuses import Status
-from ipe_bench.measurements.counted import EvaluationCount
-from ipe_bench.measurements.problem import Problem
+
+if TYPE_CHECKING:
+    from ipe_bench.measurements.counted import EvaluationCount
+    from ipe_bench.measurements.problem import Problem
 
 Need = Literal["differential equations", "epochs", "prior"]
 Family = Literal["IPE", "filters", "least squares", "ensembles"]

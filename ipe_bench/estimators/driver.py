@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from ipe_bench.basics.batches import gather, take
 from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.basics.statuses import Status
-from ipe_bench.measurements.counted import CountingModel
+
+if TYPE_CHECKING:
+    from ipe_bench.measurements.counted import CountingModel
 
 FAR = 1e8
 """Where the residual is this many times larger than at the start, the iteration has diverged."""

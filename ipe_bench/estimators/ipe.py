@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any, Generic, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,9 @@ from ipe_bench.basics.options import Count, Positive
 from ipe_bench.estimators.base import Estimates, Estimator
 from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, iterate
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
-from ipe_bench.measurements.problem import Problem
+
+if TYPE_CHECKING:
+    from ipe_bench.measurements.problem import Problem
 
 Start = Literal["linear_lse", "nominal", "best"]
 """Where an iteration begins: at the linear LSE, eq. (16), at the nominal point, or at that of the two where the

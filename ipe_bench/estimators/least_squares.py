@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,9 @@ from ipe_bench.basics.linalg import Array, Covariance, Mask, definite_factor, fi
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.driver import ConvergenceCheck
 from ipe_bench.measurements.counted import CountingModel, EvaluationCount
-from ipe_bench.measurements.problem import Problem
+
+if TYPE_CHECKING:
+    from ipe_bench.measurements.problem import Problem
 
 _VISIBLE = 1e-8
 """The smallest share by which the objective must have decreased to have decreased at all."""

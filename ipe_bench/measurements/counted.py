@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import describe_exception
 from ipe_bench.basics.linalg import Array, Mask, finite
-from ipe_bench.measurements.base import Measurement
+
+if TYPE_CHECKING:
+    from ipe_bench.measurements.base import Measurement
 
 
 def cost(simulations: Array, jacobians: Array, jacobian_cost: float) -> Array:

@@ -8,22 +8,24 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from importlib import resources
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ipe_bench import __version__
-from ipe_bench.report.figures import Drawn
 from ipe_bench.report.figures.views import View, views
 from ipe_bench.report.headline import about, headline
-from ipe_bench.report.sections import Written
 from ipe_bench.report.style import ON_DARK
 from ipe_bench.report.table import Table, environment
 from ipe_bench.report.tables import without_certified
 from ipe_bench.report.words import CITATION
-from ipe_bench.statistics.analysis import Analysis
-from ipe_bench.statistics.collect import Run
 from ipe_bench.statistics.comparisons import TIE
 from ipe_bench.statistics.records import SCORES, STATISTICS, all_statistics
 from ipe_bench.trials.thresholds import FEW
+
+if TYPE_CHECKING:
+    from ipe_bench.report.figures import Drawn
+    from ipe_bench.report.sections import Written
+    from ipe_bench.statistics.analysis import Analysis
+    from ipe_bench.statistics.collect import Run
 
 MOST_RUNS = 20
 MOST_COMMANDS = 3

@@ -27,15 +27,10 @@ from ipe_bench.runs.results import Results
 from ipe_bench.runs.schedule import Watcher, block_size_for, plan, run_tasks
 from ipe_bench.runs.store import ResultKey, Store
 from ipe_bench.states.trackers import Tracker
-from ipe_bench.trials.scenario import Scenario
-from ipe_bench.trials.tracking import AnyScenario, Tracking
+from ipe_bench.trials.scenario import AnyScenario, Scenario, Tracking
 
 log = logging.getLogger(__name__)
 
-TRIALS = 1000
-"""Number of trials if neither a number nor a precision is given."""
-MOST_TRIALS = 100_000
-"""Largest number of trials with a precision, if no number is given."""
 MOST_BLOCKS = 1_000_000
 LARGEST = 1e100
 """Bound on scales: the squares of larger numbers, and of those below its inverse, are not representable."""

@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ipe_bench.basics.linalg import Array
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements import mgh, nist
 from ipe_bench.measurements.counted import cost
-from ipe_bench.statistics.collect import Collection, Group, StoredCell
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from ipe_bench.basics.linalg import Array
+    from ipe_bench.statistics.collect import Collection, Group, StoredCell
 
 DIGITS = ("dataset", "start", "estimator", "lre_parameters", "lre_deviations", "lre_rss", "status")
 ATTAINED = ("function", "start", "estimator", "solved", "minimum", "sum_of_squares", "status", "cost", "gradients")

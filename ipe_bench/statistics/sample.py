@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, reduce
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.basics.statuses import Status
 from ipe_bench.measurements.counted import cost
-from ipe_bench.runs.results import StoredCell
 from ipe_bench.statistics.calibration import Calibration, calibrations
-from ipe_bench.statistics.collect import Collection, Group
 from ipe_bench.trials.thresholds import gate
+
+if TYPE_CHECKING:
+    from ipe_bench.runs.results import StoredCell
+    from ipe_bench.statistics.collect import Collection, Group
 
 FIT = "fit_p"
 NIS = "extra_nis"

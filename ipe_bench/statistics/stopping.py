@@ -13,7 +13,7 @@ import numpy as np
 from ipe_bench.basics.errors import UserError, unknown
 from ipe_bench.runs.execution import Execution
 from ipe_bench.runs.results import Results
-from ipe_bench.runs.run import MOST_TRIALS, compute, new_name, result_keys, validate
+from ipe_bench.runs.run import compute, new_name, result_keys, validate
 from ipe_bench.runs.schedule import BLOCK_SIZE, Watcher
 from ipe_bench.runs.store import ResultKey, describe_names
 from ipe_bench.statistics.collect import collect
@@ -21,7 +21,7 @@ from ipe_bench.statistics.formulas import rmse_ends_anytime
 from ipe_bench.statistics.intervals import share_sequence
 from ipe_bench.statistics.records import SCORES, rows_of, summary_rows
 from ipe_bench.statistics.sample import Sample, samples
-from ipe_bench.trials.tracking import AnyScenario
+from ipe_bench.trials.scenario import MOST_TRIALS, AnyScenario
 
 NARROW = "every interval is narrow enough"
 """Why a scenario stops that has come to the precision that was asked for."""

@@ -8,16 +8,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ipe_bench.basics.linalg import Array
-from ipe_bench.runs.results import StoredCell
 from ipe_bench.statistics import formulas as f
 from ipe_bench.statistics.intervals import clopper_pearson, mean_limits, verdict
 from ipe_bench.statistics.sample import NIS, Sample
 from ipe_bench.trials.tracking import unpacked
+
+if TYPE_CHECKING:
+    from ipe_bench.runs.results import StoredCell
 
 NOT_WHITE = 0.05
 """Level of the test that innovations are white."""

@@ -4,18 +4,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, read_only
+from ipe_bench.basics.linalg import Array, deviations, read_only
 from ipe_bench.basics.streams import numbered
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem, recorded_problem, require_nominal
-from ipe_bench.noise.base import ModelNoise, Noise, resolved
+from ipe_bench.noise.base import Certified, ModelNoise, Noise, resolved
 from ipe_bench.priors import GaussianPrior, Prior
+from ipe_bench.states.base import Paths, StateModel, require_sound
+from ipe_bench.states.bounds import bound_at_truth
+from ipe_bench.states.formulas import Recorded
 from ipe_bench.trials.bounds import linear_bound
 
+TRIALS = 1000
+"""Number of trials if neither a number nor a precision is given."""
+MOST_TRIALS = 100_000
+"""Largest number of trials with a precision, if no number is given."""
 _PARAMETERS, _NOISE = 0, 1
 """The two random streams of a trial."""
 _SEEDS = 1 << 23
@@ -139,3 +147,52 @@ def _recorded_trial(measurement: Measurement, start: int, stop: int) -> Trials:
         raise UserError("noise=certified: has one trial; set trials=1")
     assert measurement.recorded is not None
     return Trials(0, measurement.recorded.x[None], measurement.recorded.z[None])
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """Everything that determines the trials of a state model. Paths and readings are drawn by the model's own prior, Q
+    and R; trial t is the same in whatever block it is drawn."""
+
+    model: StateModel
+    seed: int = 0
+
+    error_scale: ClassVar[float] = 1.0
+    truth: ClassVar[None] = None
+    prior: ClassVar[Prior] = GaussianPrior()
+
+    def __post_init__(self) -> None:
+        check_seed(self.seed)
+        require_sound(self.model)
+
+    @property
+    def noise(self) -> Noise:
+        return Certified() if isinstance(self.model, Recorded) else ModelNoise()
+
+    @property
+    def measurement(self) -> StateModel:
+        """The model, as the other scenario calls it."""
+        return self.model
+
+    @property
+    def linear_bound(self) -> Array:
+        """Standard deviations (n,) of the states at the last epoch in a filter that is linearised along the path
+        without process noise from the mean of the prior."""
+        return deviations(self._nominal)
+
+    @cached_property
+    def _nominal(self) -> Array:
+        model = self.model
+        start = x = model.prior.mean[None]
+        path = np.empty((1, model.epochs, model.n))
+        for k in range(model.epochs):
+            x = path[:, k] = model.transition(x, k) if model.moves(k) else x
+        with np.errstate(all="ignore"):
+            return bound_at_truth(model, Paths(start, path, np.empty(0)))[0, -1]
+
+    def draw(self, start: int, stop: int) -> Paths:
+        """Paths of trials start to stop."""
+        return self.model.draw(start, stop, self.seed)
+
+
+AnyScenario = Scenario | Tracking

@@ -191,7 +191,8 @@ class Block:
             return {}
         h = self.scenario.error_free(self.trials.start, self.trials.stop)
         with np.errstate(all="ignore"):
-            bias, deviation = misspecified(self.problem, h, self.trials.x)
+            closest = least_squares_root(self.problem, h, self.trials.x, prior=None)
+            bias, deviation = misspecified(self.problem, h, self.trials.x, closest)
         return by_parameter("pseudo_bias", names, bias) | by_parameter("misspecified", names, deviation)
 
     def reference_root(self, equation: Equation, inflation: float = 1.0) -> Array:

@@ -10,7 +10,6 @@ import numpy as np
 from ipe_bench.basics.linalg import Array, Covariance, deviations, finite, inverse, multiply, solve
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.trials.roots import least_squares_root
 
 _STEP = 1e-4
 """Of central differences of the Jacobian, in parameters' sizes or as a share of their values."""
@@ -98,7 +97,7 @@ def _mean_square(a: Array) -> Array:
     return np.asarray(np.sqrt(squares / (n * (n + 2))))
 
 
-def misspecified(problem: Problem, h: Array, x: Array) -> tuple[Array, Array]:
+def misspecified(problem: Problem, h: Array, x: Array, root: Array) -> tuple[Array, Array]:
     """The asymptotic error of least squares under a wrong model, for normal noise and error-free readings h (trials, m)
     of truths x (trials, n): the bias (trials, n), which is that of the parameters that come closest to h, and the
     standard deviation (trials, n) of estimates about these; NaN where there is no minimum (Vuong, Caltech working paper
@@ -108,7 +107,6 @@ def misspecified(problem: Problem, h: Array, x: Array) -> tuple[Array, Array]:
     arXiv 2605.20739). Estimates scatter with A^-1 B A^-1, B = J' R^-1 J and A = B - sum_i (R^-1 r)_i d2h_i with the
     residuals r that remain at the minimum.
     """
-    root = least_squares_root(problem, h, x, prior=None)
     found = np.isfinite(root).all(axis=1)
     bias, deviation = root - x, np.full(x.shape, np.nan)
     if found.any():

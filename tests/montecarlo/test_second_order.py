@@ -99,7 +99,9 @@ def test_the_mean_error_of_least_squares_is_the_bias_of_box():
 def test_under_a_wrong_linear_model_the_bias_is_h_plus_times_what_is_left_out():
     model, R = Bent(), Covariance(np.full(12, 0.3))
     x, left_out = np.zeros((2, 3)), np.random.default_rng(1).normal(size=(2, 12))
-    bias, deviation = misspecified(Problem(model, R), left_out, x)
+    bias, deviation = misspecified(
+        Problem(model, R), left_out, x, least_squares_root(Problem(model, R), left_out, x, prior=None)
+    )
     np.testing.assert_allclose(bias, left_out @ np.linalg.pinv(model.A).T, atol=1e-9)
     crlb = np.sqrt(np.diag(np.linalg.inv(information(model.A, R))))
     np.testing.assert_allclose(deviation, np.broadcast_to(crlb, (2, 3)), rtol=1e-9)
@@ -110,7 +112,7 @@ def test_where_residuals_remain_the_scatter_is_the_sandwich_and_not_the_bound():
     x = np.array([[0.4, -0.3, 0.2]])
     h = model.simulate(x) + 0.5 * np.sin(3.0 * np.arange(12))
     problem = Problem(model, R)
-    bias, deviation = misspecified(problem, h, x)
+    bias, deviation = misspecified(problem, h, x, least_squares_root(problem, h, x, prior=None))
     trials = 8000
     z = h + sigma * np.random.default_rng(0).normal(size=(trials, 12))
     error = least_squares_root(problem, z, np.repeat(x + bias, trials, axis=0), prior=None) - x

@@ -28,7 +28,6 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.plugins.construct import described
 from ipe_bench.plugins.discovery import PACKAGES, Option, options
 from ipe_bench.report.figures import INDEX
-from ipe_bench.report.html import DEFINITIONS
 from ipe_bench.report.table import environment
 from ipe_bench.report.words import brief, duration, enumerate_few, percent
 from ipe_bench.statistics.records import ALL, STATISTICS
@@ -128,6 +127,8 @@ def _ours(group: str) -> list[Option]:
 
 def write_reference(folder: Path) -> None:
     """Adds pages of options, commands, statuses, statistics and Python names to a folder."""
+    from ipe_bench.report.html import DEFINITIONS
+
     for group, title in GROUPS.items():
         rows = [(option, described(option)) for option in _ours(group)]
         key = f"{PACKAGES[group]}.NAME" if group in PACKAGES else group
