@@ -32,7 +32,7 @@ BUDGETS = {
     "states": 1170,
     "estimators": 1178,
     "solvers": 1197,
-    "baselines": 2068,
+    "baselines": 2057,
     "trials": 2013,
     "runs": 2109,
     "statistics": 3829,

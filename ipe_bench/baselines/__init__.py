@@ -4,9 +4,15 @@ from ipe_bench.baselines.es_mda import EsMda
 from ipe_bench.baselines.information import LMIEKF, RecursiveUpdate
 from ipe_bench.baselines.iplf import IPLF
 from ipe_bench.baselines.kalman import CKF, EKF, UKF, EnKF, IteratedEKF
-from ipe_bench.baselines.least_squares import GaussNewton, LevenbergMarquardt, LinearLSE, MapLM, MultiscaleLM
+from ipe_bench.baselines.least_squares import (
+    GaussNewton,
+    LevenbergMarquardt,
+    LinearLSE,
+    MapLM,
+    MultiscaleLM,
+    Multistart,
+)
 from ipe_bench.baselines.multiple_shooting import MultipleShooting
-from ipe_bench.baselines.multistart import Multistart
 from ipe_bench.baselines.scipy_least_squares import LeastSquares
 from ipe_bench.basics.errors import without_modules
 
