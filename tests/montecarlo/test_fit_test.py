@@ -101,9 +101,9 @@ def test_no_noise_fits_perfectly():
     assert (p_values(Polynomial(), NoNoise(0.1), 1.0, GaussNewton(), 20) > 0.999).all()
 
 
-def test_spreads_are_the_eigenvalues_of_the_residuals_covariance():
-    rng = np.random.default_rng(1)
-    m, n = 15, 4
+@pytest.mark.parametrize("m", [15, 6])
+def test_spreads_are_the_eigenvalues_of_the_residuals_covariance(m):
+    rng, n = np.random.default_rng(1), 4
     H, J = rng.normal(size=(m, n)), rng.normal(size=(3, m, n))
     R = Covariance(np.linalg.cholesky(np.cov(rng.normal(size=(m, 60)))))
     d = rng.uniform(0.1, 2.0, n)

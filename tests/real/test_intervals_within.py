@@ -178,7 +178,7 @@ def test_1000_truths_on_and_near_a_bound_are_in_every_interval(c):
     assert (covered >= 0.93 - 2 * np.sqrt(0.07 * 0.93 / np.array([studies, studies, drawn]))).all()
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize("rate", [0.0, 0.02, 0.04])
 def test_truths_near_a_bound_are_in_the_intervals_at_least_as_often_as_they_say(rate):
     """A decay that is hardly one, with a rate that cannot be negative: on its bound or off it."""
