@@ -107,6 +107,7 @@ class Formula(WrittenModel):
     """
 
     expression: str
+    """The formula of a reading, such as b1*(1-exp(-b2*t))."""
     start: Mapping[str, Finite] = field(default_factory=dict)
     """Where estimation begins, for each parameter: the nominal point."""
     columns: Mapping[str, Sequence[float]] = field(default_factory=dict)
