@@ -50,7 +50,8 @@ _RECORDED: dict[Where, tuple[str, str, Callable[[pd.DataFrame], Any]]] = {
     ),
     "all_trials": (
         "All trials",
-        "Over all trials, the same for every estimator.",
+        "Over all trials, the same for every estimator. A single trial may decide the root mean square error and the"
+        " uncapped efficiency.",
         lambda rows: rows["trials"] > 0,
     ),
     "solved_trials": (

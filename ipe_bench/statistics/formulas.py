@@ -93,6 +93,11 @@ def rmse(s: Sample) -> Array:
 
 
 @once
+def rmse_all(s: Sample) -> Array:
+    return rms_columns(np.where(np.isfinite(s.error), s.error, np.inf))
+
+
+@once
 def products(s: Sample) -> Array:
     """Sums (n, n) over solved trials of products of the deviations of errors from their mean, in multiples of the
     linear bound: parameters may differ by many orders of magnitude."""
@@ -213,6 +218,11 @@ def ambiguous(s: Sample) -> float:
     return share(flags > 0) if len(flags) else np.nan
 
 
+def failures_flagged(s: Sample) -> float:
+    flags, wrong = s.scalars.get(AMBIGUOUS, np.empty(0)), ~s.scalars["success"]
+    return share(flags[wrong] > 0) if np.isfinite(flags).any() and wrong.any() else np.nan
+
+
 def false_root_distance(s: Sample) -> float:
     wrong = s.converged & ~s.solved
     known = "root_distance" in s.scalars and wrong.any()
@@ -244,6 +254,11 @@ def efficiency(s: Sample) -> Array:
 def efficiency_limits(s: Sample) -> Limits:
     bound, (low, high) = in_units(applying_bound(s), s), ends_in_units(rmse_ends)(s)
     return ratio(bound, high), ratio(bound, low)
+
+
+def efficiency_all(s: Sample) -> Array:
+    bound, error = rms_columns(s.of_truth(s.group.footer["bound"])), rmse_all(s)
+    return np.append(ratio(bound, error), ratio(rms(bound / s.linear_bound), rms(error / s.linear_bound)))
 
 
 @once

@@ -143,6 +143,12 @@ class Squares:
         mean = scaled.mean(axis=1)
         return cls(count, size, mean, ((scaled - mean[:, None]) ** 2).sum(axis=1))
 
+    @property
+    def effective(self) -> Array:
+        """The effective number (k,) of those that share in the sum: its square over the sum of squares."""
+        total = self.count * self.mean
+        return total**2 / (self.deviations + total * self.mean)
+
 
 def few_carry(squares: Squares, degrees: Array) -> Array:
     """Whether few trials carry the sum of squares (k,), so that no interval made of the trials can be relied on.
@@ -152,9 +158,8 @@ def few_carry(squares: Squares, degrees: Array) -> Array:
     Where none of the trials has a rare large error, nothing in them can tell.
     """
     with np.errstate(all="ignore"):
-        total = squares.count * squares.mean
-        power = squares.deviations + total * squares.mean
-        shares, largest = power / total**2, 1 / power
+        shares = 1 / squares.effective
+        largest = 1 / (squares.deviations + squares.count * squares.mean**2)
     limits = np.array([_heaviest(squares.count, int(d)) for d in degrees])
     return (shares > limits) & (largest > _ONE_TRIAL)
 

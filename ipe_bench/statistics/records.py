@@ -317,6 +317,17 @@ STATISTICS: tuple[Statistic, ...] = (
         kind="physical",
     ),
     Statistic(
+        "effective_trials",
+        "effective trials",
+        "solved trials",
+        "Number of equal trials that would share the sum of squared errors as evenly, (Σ e²)² / Σ e⁴ (Kish,"
+        " Survey Sampling, 1965): a third of the trials for normal errors of one parameter, one if a single trial"
+        " carries the whole sum.",
+        lambda s: f.squares(s).effective,
+        given="solved",
+        where=("parameters",),
+    ),
+    Statistic(
         "rmse_common",
         "rmse, common",
         "trials that every estimator of the scenario solved",
@@ -457,6 +468,26 @@ STATISTICS: tuple[Statistic, ...] = (
         limits_titles={"solved_trials": "95 % of efficiency"},
     ),
     Statistic(
+        "rmse_all",
+        "rmse, all",
+        "all trials",
+        "Root mean square error over all trials; infinite if one of them has no finite estimate.",
+        f.of_each(f.rmse_all),
+        kind="physical",
+        where=("all_trials", "parameters"),
+        titles={"all_trials": "rmse / linear bound"},
+    ),
+    Statistic(
+        "efficiency_all",
+        "efficiency, all",
+        "all trials",
+        "The same bound over the root mean square error of all trials. Because no trial is left out, it compares"
+        " estimators that solve an equation with those that do not.",
+        f.efficiency_all,
+        where=("all_trials", "parameters"),
+        titles={"all_trials": "efficiency, uncapped"},
+    ),
+    Statistic(
         "median_abs_error",
         "median abs error",
         "all trials",
@@ -536,6 +567,15 @@ STATISTICS: tuple[Statistic, ...] = (
         where=("calibration",),
     ),
     Statistic(
+        "calibration_excursion",
+        "excursion",
+        "the same trials",
+        "The largest difference between these distribution functions and the uniform one; over all parameters, that of"
+        " NEES.",
+        lambda s: [max(c.excursion for c in (one.size, one.place) if c) for one in s.calibrations] or np.nan,
+        where=("calibration",),
+    ),
+    Statistic(
         "calibration",
         "calibration",
         "the same trials",
@@ -565,6 +605,16 @@ STATISTICS: tuple[Statistic, ...] = (
         "the trials in which the estimator has looked for it",
         "Share in which several distinct minima fit the readings, so that no residual can tell which is the truth.",
         f.ambiguous,
+        kind="share",
+        where=("all_trials",),
+        rare=True,
+    ),
+    Statistic(
+        "failures_flagged",
+        "failures flagged",
+        "trials without success of estimators that look for several minima",
+        "Share that is flagged as ambiguous.",
+        f.failures_flagged,
         kind="share",
         where=("all_trials",),
         rare=True,

@@ -38,6 +38,7 @@ def test_the_summary_counts_the_flags_that_are_stored(folders):
         assert failed.any()
         np.testing.assert_array_equal(flagged, own["extra_minima"] > 1)
         assert summary.loc[label, "ambiguous"] == flagged.mean()
+        assert summary.loc[label, "failures_flagged"] == flagged[failed].mean()
         assert summary.loc[label, "failed_known"] >= (flagged & failed).mean()
     assert np.isnan(summary.loc["levenberg_marquardt", "ambiguous"])
 
@@ -46,5 +47,5 @@ def test_tables_have_the_columns_only_where_somebody_looks(folders):
     for folder, there in zip(folders, (True, False), strict=True):
         table = next(t for t in all_tables(analyse([folder])) if t.name == "all_trials")
         titles = {c.title for c in table.columns}
-        assert ("ambiguous" in titles) == there
+        assert ({"ambiguous", "failures flagged"} <= titles) == there
         assert "misfit" in titles

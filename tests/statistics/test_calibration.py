@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, kstest
 from synthetic_store import Seeker
 
 import ipe_bench as ib
@@ -186,6 +186,9 @@ def test_summary_table_and_figures_say_so(synthetic):
     assert summary.loc[("honest", "all"), "calibration"] == INSIDE
     assert re.search("deviations (1.9|2.0)[0-9]* times too small", summary.loc[("boaster", "all"), "calibration"])
     assert "deviations" in summary.loc[("boaster", "b"), "calibration"]
+    # Off the grid of points the distribution functions differ by hardly more.
+    farthest = kstest((error[:, 1] / 0.05) ** 2, "chi2", (1,)).statistic
+    assert summary.loc[("boaster", "b"), "calibration_excursion"] == pytest.approx(farthest, abs=0.02)
     assert (summary.loc["silent", "calibration"] == "-").all()
     assert (summary.loc["silent", "claims"] == 0).all()
     (shown,) = [table for table in all_tables(analysis) if table.name == "calibration"]

@@ -90,6 +90,8 @@ def test_every_sum_is_that_of_pandas_over_all_rows_at_once(store, analysis):
                 "std": size * e.std(),
                 "rmse": size * np.sqrt((e**2).mean()),
                 "rmse_common": size * np.sqrt((every[f"error_{name}"] ** 2).mean()),
+                "rmse_all": np.inf,
+                "effective_trials": (e**2).sum() ** 2 / (e**4).sum(),
                 "crlb": size * np.sqrt((solved[f"crlb_{name}"] ** 2).mean()),
                 "bayes_bound": size * np.sqrt((solved[f"bayes_{name}"] ** 2).mean()),
                 "reported": size * np.sqrt((solved[f"deviation_{name}"] ** 2).mean()),

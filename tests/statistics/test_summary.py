@@ -156,6 +156,7 @@ def test_efficiency_is_against_the_bound_that_applies_and_not_the_linear_one(syn
     rewrite_truth(synthetic, "crlb", 0.08)
     frame = summarize([synthetic.directory])
     np.testing.assert_allclose(frame["efficiency"], 0.8, rtol=1e-9)
+    np.testing.assert_allclose(frame["efficiency_all"], 0.8, rtol=1e-9)
     np.testing.assert_allclose(frame["rmse_over_linear_bound"], 1.0, rtol=1e-9)
     assert (frame["efficiency_low"] < 0.8).all()
     assert (frame["efficiency_high"] > 0.8).all()
@@ -172,11 +173,28 @@ def test_few_solved_trials_have_no_interval(synthetic, solved, known):
     assert frame["rmse"].notna().all()
 
 
+def test_errors_of_all_trials_let_none_off(synthetic):
+    e = errors(100)
+    e[0] = 1e3
+    synthetic.add(synthetic.scenario(), "far", e, solved=np.arange(100) > 0)
+    e = e.copy()
+    e[0] = np.nan
+    status = np.where(np.arange(100) > 0, "converged", "nonfinite")
+    synthetic.add(synthetic.scenario(), "gone", e, solved=np.arange(100) > 0, status=status)
+    frame = summarize([synthetic.directory])
+    far, gone = row(frame, "far"), row(frame, "gone")
+    assert far["rmse"] == gone["rmse"]
+    assert far["rmse_all"] == pytest.approx(1e4 / np.sqrt(100), rel=1e-3)
+    assert gone["rmse_all"] == np.inf
+    assert gone["efficiency_all"] == 0.0
+
+
 def test_one_runaway_does_not_decide(synthetic):
     e = errors(200, bias=(0, 0, 0))
     e[0] = 1e9
     synthetic.add(synthetic.scenario(), "one", e)
     total = row(summarize([synthetic.directory]), "one")
+    assert total["efficiency_all"] < 1e-6
     squares = np.minimum((e**2).sum(axis=1) / 0.1**2 / 3, 25.0)
     assert total["efficiency_capped"] == pytest.approx(1 / np.sqrt(squares.mean()))
     assert 0.9 < total["efficiency_capped"] < 0.97
