@@ -34,7 +34,7 @@ BUDGETS = {
     "solvers": 1197,
     "baselines": 2057,
     "trials": 2013,
-    "runs": 2109,
+    "runs": 2105,
     "statistics": 3899,
     "real": 2301,
     "plugins": 1120,

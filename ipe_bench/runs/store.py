@@ -207,20 +207,18 @@ class Store:
             Unusable: a part is damaged; all stay as they are.
             StorageError: the folder cannot be written to any more; everything that was there is there.
         """
-        found, gone, footer = self.parts({key}), 0, None
-        group: list[Part] = []
-        tables: list[pa.Table] = []
+        found, gone, reached = self.parts({key}), 0, 0
+        groups: list[tuple[Mapping[str, Any], list[Part], list[pa.Table]]] = []
         with contextlib.suppress(FileNotFoundError):  # another run merges the same
             for part in found if len(found) > 1 else ():
-                belongs, table = part.read()
-                reached = max((p.stop for p in group), default=0)
-                if group and (part.start > reached or belongs != footer):
-                    gone += _join(group, tables)
-                    group, tables = [], []
-                tables.append(table.slice(max(0, reached - part.start) if group else 0))
-                group.append(part)
-                footer = belongs
-            gone += _join(group, tables)
+                footer, table = part.read()
+                if not groups or part.start > reached or footer != groups[-1][0]:
+                    groups.append((footer, [], []))
+                    reached = part.start
+                groups[-1][1].append(part)
+                groups[-1][2].append(table.slice(max(0, reached - part.start)))
+                reached = max(reached, part.stop)
+            gone = sum(_join(*group) for group in groups if len(group[1]) > 1)
         return gone
 
 
@@ -231,15 +229,13 @@ def _typed(name: str, values: Array) -> Array:
     return values.astype(np.int64) if values.dtype.kind in "iu" else values
 
 
-def _join(group: Sequence[Part], tables: Sequence[pa.Table]) -> int:
+def _join(footer: Mapping[str, Any], group: Sequence[Part], tables: Sequence[pa.Table]) -> int:
     """Writes one part with the rows of a group, unless there is one, and removes the others; returns their number."""
-    if len(group) < 2:
-        return 0
     first, stop = group[0], max(part.stop for part in group)
     whole = replace(first, path=first.path.with_name(f"{first.key}-{first.start}-{stop}.parquet"), stop=stop)
     if whole not in group:
         table = pa.concat_tables(tables, promote_options="default")
-        parts.write(whole.path, table, first.read(())[0], first.history(), lasting=True)
+        parts.write(whole.path, table, footer, first.history(), lasting=True)
     whole.read()
     others = [part.path for part in group if part != whole]
     for path in others:
