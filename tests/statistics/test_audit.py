@@ -64,6 +64,17 @@ def test_a_planted_direction_is_named():
     assert not any("tails" in s for sentences in told for s in sentences)
 
 
+def test_a_direction_is_named_as_a_combination_of_reported_deviations():
+    """Errors of correlation C = [[1, .6], [.6, 1]] with the first whitened one three times too large: C^(-1/2) maps
+    parameters to it by 1.19 and -.40."""
+    rng, C = np.random.default_rng(6), np.array([[1.0, 0.6], [0.6, 1.0]])
+    values, vectors = np.linalg.eigh(C)
+    error = (rng.standard_normal((2000, 2)) * [3.0, 1.0]) @ ((vectors * values**0.5) @ vectors.T)
+    found = audit(Claims(("a", "b"), error, np.ones_like(error), np.tile(C, (2000, 1, 1)), np.arange(2000)))
+    (said,) = [s for s in found.sentences if s.startswith("In the worst direction")]
+    assert float(re.search(r"a - ([\d.]+) b in reported", said)[1]) == pytest.approx(1 / 3, abs=0.05)
+
+
 def test_heavy_tails_and_bias_are_told_apart_from_scale():
     rng = np.random.default_rng(4)
     heavy = audit(claims(rng, runs=400, law="t5")).sentences

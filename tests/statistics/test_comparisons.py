@@ -106,6 +106,10 @@ def test_who_may_be_the_best_is_mcnemar_s_exact_test_against_every_rival():
         expected.append(min(p) > 0.05 / 3)
     assert may_be_best(success).tolist() == expected
     assert len(set(expected)) == 2
+    # Five wins without a loss have a p of 1/32, which is below 5 %, but not below a third of that.
+    success = np.arange(30)[:, None] < [20, 25, 20, 20]
+    assert may_be_best(success).all()
+    assert may_be_best(success[:, :2]).tolist() == [False, True]
     assert may_be_best(np.ones((30, 3), dtype=bool)).all()
     assert may_be_best(np.zeros((30, 1), dtype=bool)).all()
 

@@ -107,6 +107,12 @@ def test_no_scale_changes_what_carries_a_sum():
         np.testing.assert_array_equal(carried(squares * size, 1), found)
 
 
+def test_one_trial_has_to_make_up_a_twentieth():
+    """Of 400 trials 15 or 25 have all the errors, each as large: one makes up a fifteenth, or a twenty-fifth."""
+    squares = (np.arange(400)[:, None] < [15, 25]).astype(float)
+    assert carried(squares, 1).tolist() == [True, False]
+
+
 def test_many_trials_that_are_a_little_uneven_carry_a_sum_together():
     """Half of the errors are twice as large: of 20,000 trials none matters, though the errors are surely not normal."""
     rng = np.random.default_rng(0)
