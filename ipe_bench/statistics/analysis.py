@@ -14,7 +14,15 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.statistics.calibration import POINTS, band
 from ipe_bench.statistics.certified import attained_table
 from ipe_bench.statistics.collect import Collection, Group, collect
-from ipe_bench.statistics.comparisons import Outcomes, compare_pairs, corrected, may_be_best, profiles
+from ipe_bench.statistics.comparisons import (
+    Outcomes,
+    compare_pairs,
+    corrected,
+    may_be_best,
+    profiles,
+    rank_over_replicates,
+)
+from ipe_bench.statistics.formulas import capped_error
 from ipe_bench.statistics.intervals import quantile
 from ipe_bench.statistics.records import BEST, SCORES, rows_of, summary_rows, to_frame
 from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of, samples
@@ -40,6 +48,8 @@ class Analysis:
     """Every pair of estimators on every scenario; see `comparisons.compare_pairs`."""
     scores: pd.DataFrame
     """Per scenario and estimator: capped mean error, and median costs."""
+    ranks: pd.DataFrame
+    """Mean ranks over seeds; see `comparisons.rank_over_replicates`."""
     profiles: pd.DataFrame
     """Estimator, profile (performance or data), `at` (cost ratio or budget) and share, over all scenarios."""
     calibration: pd.DataFrame
@@ -102,6 +112,10 @@ class Begun:
             outcomes[sample.group.estimator] = Outcomes(*numbers)
             found["endings"] += [dict(sample.group.columns) | label | row for row in _ending_rows(sample)]
             found["scores"].append(numbered | rows_of(SCORES, sample)[-1])
+            found["replicates"] += [
+                numbered | {"seed": seed, "error": capped_error(sample, sample.seeds == seed)}
+                for seed in np.unique(sample.seeds).tolist()
+            ]
             for whole in sample.calibrations[-1:]:
                 low, high = band(len(whole.z), whole.level)
                 curve = {"at": POINTS, "difference": whole.size.difference, "low": low, "high": high}
@@ -126,6 +140,9 @@ class Begun:
             endings=pd.DataFrame(rows["endings"]),
             pairs=pd.DataFrame(corrected(pairs)),
             scores=pd.DataFrame(rows["scores"]),
+            ranks=rank_over_replicates(
+                pd.DataFrame(rows["replicates"], columns=["scenario", "seed", "estimator", "error"])
+            ),
             profiles=profiles([outcomes for _, outcomes in self._compared]),
             calibration=_joined(rows["calibration"]),
             contraction=pd.DataFrame(rows["contraction"]),

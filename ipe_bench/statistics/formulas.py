@@ -190,9 +190,10 @@ def efficiency_capped_limits(s: Sample) -> Limits:
     return float(ratio(1.0, high[0])), float(ratio(1.0, low[0]))
 
 
-def capped_error(s: Sample) -> float:
-    """Mean Mahalanobis error of the trials that all have, each at most the gate's radius."""
-    return float(np.minimum(s.distance[s.present], np.sqrt(gate(s.n))).mean()) if s.present.any() else np.nan
+def capped_error(s: Sample, among: Array | bool = True) -> float:
+    """Mean Mahalanobis error of the trials that all have, or of those `among` them, each at most the gate's radius."""
+    used = s.present & among
+    return float(np.minimum(s.distance[used], np.sqrt(gate(s.n))).mean()) if used.any() else np.nan
 
 
 def failed(s: Sample, *, known: bool) -> float:
