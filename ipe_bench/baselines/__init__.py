@@ -1,11 +1,11 @@
 """Baselines: estimators that are not IPE. Config group `baseline`."""
 
 from ipe_bench.baselines.es_mda import EsMda
-from ipe_bench.baselines.information import LMIEKF, RecursiveUpdate
-from ipe_bench.baselines.iplf import IPLF
+from ipe_bench.baselines.information import IPLF, LMIEKF, RecursiveUpdate
 from ipe_bench.baselines.kalman import CKF, EKF, UKF, EnKF, IteratedEKF
 from ipe_bench.baselines.least_squares import (
     GaussNewton,
+    LeastSquares,
     LevenbergMarquardt,
     LinearLSE,
     MapLM,
@@ -13,7 +13,6 @@ from ipe_bench.baselines.least_squares import (
     Multistart,
 )
 from ipe_bench.baselines.multiple_shooting import MultipleShooting
-from ipe_bench.baselines.scipy_least_squares import LeastSquares
 from ipe_bench.basics.errors import without_modules
 
 __all__ = [

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ipe_bench.basics.batches import put
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance, finite
 from ipe_bench.basics.statuses import Status
@@ -128,13 +129,14 @@ class Walk(ABC):
         n), for those that the model does not end."""
         model, x = epoch.counted(self.tally), self.problem.x0 + s * self.d
         h, H = read_members(model, epoch.R, x, at), None
+        kept = finite(h)
         if slopes:
             H = np.ascontiguousarray(epoch.R.whiten_jacobian(model.jacobian(x[:, 0], at))) * self.d
+            kept &= finite(H)
         raised = self.tally.failed(at)
         self.status[at[raised]] = Status.ERROR
-        overflowed = ~raised & ~(finite(h) & (True if H is None else finite(H)))
-        self.end(at[overflowed], Status.NONFINITE, f"the model overflowed at epoch {epoch.number}")
-        kept = ~(raised | overflowed)
+        self.end(at[~kept & ~raised], Status.NONFINITE, f"the model overflowed at epoch {epoch.number}")
+        kept &= ~raised
         return at[kept], h[kept], None if H is None else H[kept]
 
     def estimates(self, *, history: bool) -> Estimates:
@@ -145,8 +147,7 @@ class Walk(ABC):
             if len(self.going):
                 self.take_in(epoch, self.going)
             at = self.going
-            x = x.copy()
-            x[at] = self.x[at]
+            x = put(x, at, self.x[at])
             taken[at] += 1
             path.append(x)
             lost = at[~(finite(self.x[at]) & finite(self.P[at]))]
@@ -157,10 +158,8 @@ class Walk(ABC):
         P[finished] = self.covariance(finished)
         nis = np.full(len(x), np.nan)
         nis[finished] = self.nis[finished] / self.z.shape[1]
-        iterates = None
-        if history:
-            physical = self.problem.x0 + np.stack(path, axis=1) * self.d
-            iterates = [rows[: count + 1] for rows, count in zip(physical, taken, strict=True)]
+        physical = self.problem.x0 + np.stack(path, axis=1) * self.d
+        iterates = [rows[: count + 1] for rows, count in zip(physical, taken, strict=True)]
         return Estimates(
             x=self.problem.x0 + x * self.d,
             status=self.status,
@@ -169,6 +168,6 @@ class Walk(ABC):
             simulations=self.tally.simulations,
             jacobians=self.tally.jacobians,
             messages=self.messages | self.tally.messages,
-            history=iterates,
+            history=iterates if history else None,
             extras={"nis": nis},
         )

@@ -57,37 +57,38 @@ class EsMda(Estimator):
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         self.require_needs(problem)
-        objective = Objective.of(problem, z, prior=True, inflation=self.prior_inflation)
+        objective = Objective.of(problem, z, self.prior_inflation)
         with np.errstate(all="ignore"):
             smoothed = self._smooth(objective)
-            return self._polish(objective, smoothed) if self.polish else smoothed
+            if not self.polish:
+                return smoothed
+            limits = Limits(self.tolerance, self.polish, history=True)
+            minima = continued(smoothed, minimize(objective, GaussNewtonMethod(), smoothed.x, limits))
+            return minima.estimates(objective.model.tally, objective.readings)
 
     def _smooth(self, objective: Objective) -> Estimates:
         """The ensemble's mean and covariance after all steps, with the means on the way."""
         assert objective.prior is not None
         d = objective.prior.deviations
-        z, n = objective.R.whiten(objective.z), len(objective.x0)
+        z, n, tally = objective.R.whiten(objective.z), len(objective.x0), objective.model.tally
         generators = own_generators(self.seed, objective.z)
         # Members are distances from the nominal point in deviations of the prior.
         s = objective.prior.coloured(normals(generators, self.members, n)) / d
         path = [s.mean(axis=1)]
         for weight in geometric_weights(np.array([1.0 / self.first]), self.steps)[0]:
-            going = np.flatnonzero(finite(z) & finite(s) & ~objective.model.tally.failed(objective.rows))
+            going = np.flatnonzero(finite(z) & finite(s) & ~tally.failed(objective.rows))
             if len(going):
                 h = read_members(objective.model, objective.R, objective.x0 + s[going] * d, objective.rows[going])
                 noise = normals([generators[i] for i in going], *h.shape[1:]) / np.sqrt(weight)
-                lost: Mask = ~_finite_members(h)
+                lost = ~np.isfinite(h).all(axis=2)
                 s[going] = assimilated(s[going], h, z[going, None] + noise, 1.0 / weight)
                 for k in np.flatnonzero(np.any(lost, axis=1) & ~np.all(lost, axis=1)):
                     i, j = going[k], lost[k]
                     s[i, j] = _redrawn(s[i, ~j], generators[i], int(j.sum()))
             path.append(s.mean(axis=1))
-        return self._report(objective, s * d, objective.x0 + np.stack(path, axis=1) * d)
-
-    def _report(self, objective: Objective, s: Array, path: Array) -> Estimates:
-        tally, anomalies = objective.model.tally, s - s.mean(axis=1, keepdims=True)
-        x = path[:, -1]
-        status = np.where(finite(objective.z) & finite(x), Status.CONVERGED, Status.NONFINITE)
+        s, history = s * d, objective.x0 + np.stack(path, axis=1) * d
+        anomalies, x = s - s.mean(axis=1, keepdims=True), history[:, -1]
+        status = np.where(finite(z) & finite(x), Status.CONVERGED, Status.NONFINITE)
         return Estimates(
             x=x,
             status=np.where(tally.failed(objective.rows), Status.ERROR, status).astype(np.int8),
@@ -95,13 +96,8 @@ class EsMda(Estimator):
             iterations=np.full(len(x), self.steps),
             simulations=tally.simulations,
             messages=dict(tally.messages),
-            history=list(path),
+            history=list(history),
         )
-
-    def _polish(self, objective: Objective, smoothed: Estimates) -> Estimates:
-        limits = Limits(self.tolerance, self.polish, history=True)
-        minima = continued(smoothed, minimize(objective, GaussNewtonMethod(), smoothed.x, limits))
-        return minima.estimates(objective.model.tally, objective.readings)
 
 
 def assimilated(s: Array, h: Array, z: Array, inflation: float) -> Array:
@@ -111,7 +107,7 @@ def assimilated(s: Array, h: Array, z: Array, inflation: float) -> Array:
     The system is as large as the readings or the ensemble, whichever is smaller, since with anomalies S and D
     S' D (D' D + c I)^-1 = S' (D D' + c I)^-1 D, c = (members - 1) alpha.
     """
-    usable = _finite_members(h)
+    usable = np.isfinite(h).all(axis=2)
     count = np.maximum(usable.sum(axis=1), 2)[:, None, None]
     S, D = (_anomalies(a, usable) for a in (s, h))
     c = (count - 1) * inflation
@@ -122,11 +118,6 @@ def assimilated(s: Array, h: Array, z: Array, inflation: float) -> Array:
     G = np.matmul(D, D.swapaxes(1, 2)) + c * np.eye(s.shape[1])
     weights, _ = solve(G, np.matmul(D, innovation.swapaxes(1, 2)))
     return s + np.matmul(weights.swapaxes(1, 2), S)
-
-
-def _finite_members(h: Array) -> Mask:
-    """Which members (trials, members) of h (trials, members, m) did not overflow."""
-    return np.asarray(np.isfinite(h).all(axis=2))
 
 
 def _anomalies(a: Array, usable: Mask) -> Array:

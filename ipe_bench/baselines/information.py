@@ -19,11 +19,13 @@ from ipe_bench.basics.linalg import Array, Mask, finite, inverse, multiply, squa
 from ipe_bench.basics.options import Count, Positive
 from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Estimates, Estimator, Need
-from ipe_bench.estimators.driver import Limits, SolveResult, iterate
-from ipe_bench.estimators.least_squares import LeastSquaresSystem
+from ipe_bench.estimators.driver import ConvergenceCheck, Limits, Solver, iterate
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
-from ipe_bench.measurements.counted import CountingModel, EvaluationCount
+from ipe_bench.measurements.counted import CountingModel
 from ipe_bench.measurements.problem import Problem
+
+_SHORTEST = 2.0**-10
+"""A share of a step below which no shorter one is tried: the covariance is brought up to date instead."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +47,8 @@ class Belief:
         return inverse(self.U)[0]
 
     def given(self, J: Array, r: Array, at: Array) -> tuple[Belief, Array]:
-        """What is believed after readings of unit variance, linear in x: h(at) - z is r (trials, m), dh/dx is J.
-
-        Returns it with the squared innovations y' S^-1 y (trials,): chi-square with m degrees where the belief was
-        right (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 5.4).
-        """
+        """What is believed after readings of unit variance, linear in x, with h(at) - z = r (trials, m) and dh/dx = J,
+        and the squared innovations y' S^-1 y (trials,) of these readings."""
         # The step s = x - at that minimises |U (s + at - mean)|^2 + |J s + r|^2.
         rows = np.concatenate([self.U, J], axis=1)
         wanted = -np.concatenate([multiply(self.U, at - self.mean), r], axis=1)
@@ -67,17 +66,13 @@ class EpochReadings:
     """
 
     epoch: Epoch
-    problem: Problem
+    model: CountingModel
+    x0: Array
     deviation: Array
     """Of the scenario's prior (n,), in multiples of the parameters' units."""
-    tally: EvaluationCount
     z: Array
     rows: Rows
     belief: Belief
-
-    @property
-    def model(self) -> CountingModel:
-        return self.epoch.counted(self.tally)
 
     def misfit(self, x: Array) -> Array:
         """h(x) - z (trials, m), whitened."""
@@ -91,12 +86,12 @@ class EpochReadings:
         """h - z (trials, points, m) at points (trials, points, n), whitened."""
         return read_members(self.model, self.epoch.R, self.physical(points), self.rows) - self.z[:, None]
 
-    def subset(self, kept: Mask) -> EpochReadings:
-        return replace(self, z=self.z[kept], rows=self.rows[kept], belief=take(self.belief, kept))
-
     def physical(self, x: Array) -> Array:
         """In multiples of the parameters' units."""
-        return self.problem.x0 + x * self.deviation
+        return self.x0 + x * self.deviation
+
+    def subset(self, kept: Mask) -> EpochReadings:
+        return replace(self, z=self.z[kept], rows=self.rows[kept], belief=take(self.belief, kept))
 
 
 @dataclass(frozen=True)
@@ -133,8 +128,8 @@ class _Beliefs(Walk):
         self.belief = Belief(np.zeros((len(z), len(U0))), np.repeat(U0[None], len(z), axis=0))
 
     def take_in(self, epoch: Epoch, at: Rows) -> None:
-        z = epoch.whitened(self.z[at])
-        readings = EpochReadings(epoch, self.problem, self.d, self.tally, z, at, take(self.belief, at))
+        z, model = epoch.whitened(self.z[at]), epoch.counted(self.tally)
+        readings = EpochReadings(epoch, model, self.problem.x0, self.d, z, at, take(self.belief, at))
         after, nis = self.filter.update(readings)
         raised, singular = self.tally.failed(at), ~finite(after.root()) & after.usable
         good = after.usable & np.isfinite(nis) & ~raised & ~singular
@@ -170,7 +165,11 @@ class RecursiveUpdate(InformationFilter):
         belief = readings.belief
         r, J = readings.misfit(belief.mean), readings.slope(belief.mean)
         innovations = belief.given(J, r, belief.mean)[1]
-        weights = geometric_weights(1.0 + _strength(J, belief) / self.first, self.steps)
+        # The largest eigenvalue of H P H' for whitened slopes H.
+        moved = np.matmul(J, belief.root())
+        moved = np.where(np.isfinite(moved).all(axis=(1, 2), keepdims=True), moved, 0.0)
+        strength = np.linalg.norm(moved, ord=2, axis=(1, 2)) ** 2
+        weights = geometric_weights(1.0 + strength / self.first, self.steps)
         for k in range(self.steps):
             if k:
                 r, J = readings.misfit(belief.mean), readings.slope(belief.mean)
@@ -183,13 +182,6 @@ def geometric_weights(ratio: Array, steps: int) -> Array:
     """Weights (trials, steps) that add up to 1, the last `ratio` (trials,) times the first."""
     weights = ratio[:, None] ** (np.arange(steps) / max(steps - 1, 1))
     return weights / weights.sum(axis=1, keepdims=True)
-
-
-def _strength(J: Array, belief: Belief) -> Array:
-    """The largest eigenvalue of H P H' (trials,) for whitened slopes H."""
-    moved = np.matmul(J, belief.root())
-    moved = np.where(np.isfinite(moved).all(axis=(1, 2), keepdims=True), moved, 0.0)
-    return np.linalg.norm(moved, ord=2, axis=(1, 2)) ** 2
 
 
 @dataclass(frozen=True)
@@ -210,11 +202,16 @@ class LMIEKF(InformationFilter):
     name = "lm_iekf"
 
     def update(self, readings: EpochReadings) -> tuple[Belief, Array]:
-        problem = _Standardized(readings, readings.belief.root())
-        method = LevenbergMarquardtMethod(self.damping, np.ones(problem.n))
-        start = method.begin(problem, np.zeros_like(readings.belief.mean))
+        problem, mean = _Standardized(readings, readings.belief.root()), readings.belief.mean
+        method = LevenbergMarquardtMethod(self.damping, np.ones(mean.shape[1]))
+        start = method.begin(problem, np.zeros_like(mean))
         ended = iterate(problem, method, start, Limits(self.tolerance, self.max_iterations))
-        return problem.belief(ended), start.cost - squared(start.slope.gradient)
+        slope = ended.state.slope
+        # The step still to go is within the tolerance, and costs nothing.
+        y = ended.x + np.where(ended.converged[:, None], slope.newton, 0.0)
+        y = np.where((ended.status == Status.NONFINITE)[:, None], np.nan, y)
+        found = Belief(mean + multiply(problem.root, y), np.matmul(slope.U, readings.belief.U))
+        return found, start.cost - squared(start.slope.gradient)
 
 
 @dataclass(frozen=True)
@@ -225,10 +222,6 @@ class _Standardized:
     root: Array
     """U^-1 (trials, n, n)."""
     exact_within: float = np.inf
-
-    @property
-    def n(self) -> int:
-        return self.root.shape[1]
 
     @property
     def model(self) -> CountingModel:
@@ -247,18 +240,140 @@ class _Standardized:
 
     def jacobian(self, y: Array, *, coarse: Mask | bool) -> Array:
         J = np.matmul(self.readings.slope(self._x(y)), self.root)
-        return np.concatenate([J, np.broadcast_to(np.eye(self.n), self.root.shape)], axis=1)
+        return np.concatenate([J, np.broadcast_to(np.eye(self.root.shape[1]), self.root.shape)], axis=1)
 
     def subset(self, kept: Mask) -> _Standardized:
         return _Standardized(self.readings.subset(kept), self.root[kept])
 
-    def belief(self, ended: SolveResult[LeastSquaresSystem]) -> Belief:
-        """What is believed where the search has ended, the readings linearised there; a lost trial has no mean."""
-        slope = ended.state.slope
-        # The step still to go is within the tolerance, and costs nothing.
-        y = ended.x + np.where(ended.converged[:, None], slope.newton, 0.0)
-        y = np.where((ended.status == Status.NONFINITE)[:, None], np.nan, y)
-        return Belief(self._x(y), np.matmul(slope.U, self.readings.belief.U))
-
     def _x(self, y: Array) -> Array:
         return self.readings.belief.mean + multiply(self.root, y)
+
+
+def regressed(readings: EpochReadings, x: Array, U: Array) -> tuple[Array, Array, Array]:
+    """r (trials, m), A (trials, m, n) and Omega (trials, m, m) by regression over 2n cubature points: over
+    N(x, (U'U)^-1), h - z is about r + A (. - x) with an error of covariance Omega."""
+    n = x.shape[1]
+    S = np.sqrt(n) * inverse(U)[0].swapaxes(1, 2)
+    d = readings.misfits(np.concatenate([x[:, None] + S, x[:, None] - S], axis=1))
+    r = d.mean(axis=1)
+    spread = d - r[:, None]
+    # A U^-1, since the points are U^-1 times sqrt(n) unit vectors.
+    B = (d[:, :n] - d[:, n:]).swapaxes(1, 2) / (2.0 * np.sqrt(n))
+    Omega = np.matmul(spread.swapaxes(1, 2), spread) / (2 * n) - np.matmul(B, B.swapaxes(1, 2))
+    return r, np.matmul(B, U), Omega
+
+
+@dataclass(frozen=True)
+class Linearized:
+    """Where an epoch stands; every field has the trials in front."""
+
+    x: Array
+    U: Array
+    """Of the covariance over which the readings are linearised."""
+    r: Array
+    A: Array
+    W: Array
+    """(R + Omega)^-1/2 (trials, m, m)."""
+    cost: Array
+    """|W r|^2 + |U0 (x - x0)|^2 (trials,)."""
+    proposal: Belief
+    """The posterior by the present linearisation."""
+    innovations: Array
+    share: Array
+    """Of the step to the proposal's mean that is tried next."""
+    inner: Array
+    """Regressions since the covariance was brought up to date."""
+    change: Array
+    """What that changed, in deviations and in share of them; infinite before."""
+
+    @classmethod
+    def over(cls, readings: EpochReadings, x: Array, U: Array, change: Array) -> Linearized:
+        """The state at x once the readings are linearised over N(x, (U'U)^-1)."""
+        r, A, Omega = regressed(readings, x, U)
+        W = _whitener(Omega)
+        proposal, innovations = readings.belief.given(np.matmul(W, A), multiply(W, r), x)
+        cost = _cost(readings, W, r, x)
+        return cls(x, U, r, A, W, cost, proposal, innovations, np.ones(len(x)), np.zeros(len(x)), change)
+
+
+@dataclass(frozen=True)
+class IPLF(InformationFilter, Solver[Linearized]):
+    """Readings linearised by regression over the posterior itself, again and again (García-Fernández, Svensson,
+    Morelande, Särkkä, IEEE TSP 63(20), 2015), the mean damped as in Raitoharju, Svensson, García-Fernández and Piché
+    (IEEE SPL 25(4), 2018; arXiv 1704.01113).
+
+    At 2n cubature points of the posterior so far, h is about A x + b with an error of covariance Omega; that affine
+    model, of noise R + Omega, updates the prior. The inner loop moves the mean at a fixed posterior covariance and
+    Omega, by Gauss-Newton steps halved until the misfit decreases; the outer loop brings both up to date.
+    """
+
+    max_iterations: Count = 30
+    """Regressions per epoch; an epoch that has not settled by then goes on from where it is."""
+    inner_iterations: Count = 3
+    """Regressions between two covariances."""
+    tolerance: Positive = 1e-2
+    """Largest change, in deviations of the updated P and in share of them, at which an epoch is done."""
+
+    def update(self, readings: EpochReadings) -> tuple[Belief, Array]:
+        start = self.begin(readings, readings.belief.mean)
+        ended = iterate(readings, self, start, Limits(self.tolerance, self.max_iterations))
+        lost = (ended.status == Status.NONFINITE)[:, None]
+        belief = ended.state.proposal
+        return replace(belief, mean=np.where(lost, np.nan, belief.mean)), start.innovations
+
+    def begin(self, system: EpochReadings, x: Array) -> Linearized:
+        return Linearized.over(system, x, system.belief.U, np.full(len(x), np.inf))
+
+    def step(self, system: EpochReadings, state: Linearized) -> Linearized:
+        """One regression at the point that the last step proposes, and another where the covariance is renewed."""
+        x = state.x + state.share[:, None] * (state.proposal.mean - state.x)
+        r, A, _ = regressed(system, x, state.U)
+        cost = _cost(system, state.W, r, x)
+        taken = cost < state.cost
+        x, r = np.where(taken[:, None], x, state.x), np.where(taken[:, None], r, state.r)
+        A = np.where(taken[:, None, None], A, state.A)
+        proposal, _ = system.belief.given(np.matmul(state.W, A), multiply(state.W, r), x)
+        state = replace(
+            state,
+            x=x,
+            r=r,
+            A=A,
+            cost=np.where(taken, cost, state.cost),
+            share=np.where(taken, 1.0, state.share / 2),
+            inner=state.inner + 1,
+            proposal=proposal,
+        )
+        # The largest distance to the proposed mean, in deviations.
+        to_go = np.abs((proposal.mean - x) / _deviations(proposal.U)).max(axis=1)
+        settled = (state.inner >= self.inner_iterations) & taken
+        settled |= (to_go <= self.tolerance) | (state.share < _SHORTEST)
+        if settled.any():
+            part = take(state, settled)
+            narrowed = np.abs(_deviations(part.proposal.U) / _deviations(part.U) - 1.0).max(axis=1)
+            change = np.fmax(to_go[settled], narrowed)
+            renewed = Linearized.over(system.subset(settled), part.x, part.proposal.U, change)
+            state = put(state, settled, replace(renewed, innovations=part.innovations))
+        return state
+
+    def check(self, system: EpochReadings, before: Linearized | None, state: Linearized) -> ConvergenceCheck:
+        """Done where bringing the covariance up to date has changed neither it nor the mean."""
+        level = np.where(np.isfinite(state.cost) & state.proposal.usable, 1.0, np.nan)
+        return ConvergenceCheck(state.change, level, np.full(len(state.x), np.inf))
+
+
+def _cost(readings: EpochReadings, W: Array, r: Array, x: Array) -> Array:
+    return squared(multiply(W, r)) + squared(multiply(readings.belief.U, x - readings.belief.mean))
+
+
+def _deviations(U: Array) -> Array:
+    """Standard deviations (trials, n) where the information is U'U."""
+    return np.linalg.norm(inverse(U)[0], axis=2)
+
+
+def _whitener(Omega: Array) -> Array:
+    """(I + Omega)^-1/2 (trials, m, m), where rounding has left Omega an eigenvalue below zero as if it were zero."""
+    usable: Mask = finite(Omega)
+    Omega = np.where(usable[:, None, None], Omega, 0.0)
+    values, vectors = np.linalg.eigh((Omega + Omega.swapaxes(1, 2)) / 2)
+    scale = np.where(usable[:, None], 1.0 / np.sqrt(1.0 + np.maximum(values, 0.0)), np.nan)
+    return scale[:, :, None] * vectors.swapaxes(1, 2)

@@ -1,26 +1,38 @@
-"""Least squares on all readings at once: the linear estimate, Gauss-Newton, and variants of Levenberg-Marquardt."""
+"""Least squares on all readings at once: the linear estimate, Gauss-Newton, Levenberg-Marquardt, and SciPy's own."""
 
 from __future__ import annotations
 
+import warnings
 from abc import abstractmethod
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
+from annotated_types import Ge, doc
 from numpy.typing import NDArray
 
-from ipe_bench.basics.batches import put, take
-from ipe_bench.basics.linalg import Array, Mask, finite
+from ipe_bench.basics.batches import take
+from ipe_bench.basics.errors import UserError, describe_exception
+from ipe_bench.basics.linalg import Array, Covariance, Mask, finite, pseudo_inverse
 from ipe_bench.basics.options import Count, Positive, Whole
 from ipe_bench.basics.statuses import Status
 from ipe_bench.basics.streams import normals, own_generators
-from ipe_bench.estimators.base import Estimates, Estimator
+from ipe_bench.estimators.base import Equation, Estimates, Estimator, one_by_one
 from ipe_bench.estimators.driver import Limits, Solver
 from ipe_bench.estimators.ipe import Start, begin, starting_points
 from ipe_bench.estimators.least_squares import LeastSquaresSystem, Objective
 from ipe_bench.estimators.levenberg_marquardt import GaussNewtonMethod, LevenbergMarquardtMethod
 from ipe_bench.estimators.minima import Fitting, Minima, minimize, passes, spread_of_starts
+from ipe_bench.measurements.counted import EvaluationCount
 from ipe_bench.measurements.problem import Problem
+
+_OUT_OF_EVALUATIONS = 0
+"""SciPy's status for it."""
+_SCIPYS = ("method", "loss", "f_scale", "ftol", "xtol", "gtol", "max_nfev")
+"""The options that are SciPy's own."""
+
+Rounding = Annotated[float, Ge(float(np.finfo(float).eps)), doc("a number of at least 2.3e-16, the rounding of a 1")]
 
 
 @dataclass(frozen=True)
@@ -56,7 +68,7 @@ class Batch(Estimator):
 
     def objective(self, problem: Problem, z: Array) -> Objective:
         """What is minimised for readings z (trials, m)."""
-        return Objective.of(problem, z, prior=False)
+        return Objective.of(problem, z)
 
     @abstractmethod
     def method(self, objective: Objective) -> Solver[LeastSquaresSystem]:
@@ -115,10 +127,10 @@ class MapLM(Batch):
     equation = "map"
 
     def objective(self, problem: Problem, z: Array) -> Objective:
-        return Objective.of(problem, z, prior=True, inflation=self.prior_inflation)
+        return Objective.of(problem, z, self.prior_inflation)
 
     def method(self, objective: Objective) -> Solver[LeastSquaresSystem]:
-        return LevenbergMarquardtMethod(self.damping, None if objective.prior is None else objective.prior.deviations)
+        return LevenbergMarquardtMethod(self.damping, objective.prior and objective.prior.deviations)
 
 
 @dataclass(frozen=True)
@@ -140,7 +152,7 @@ class MultiscaleLM(Estimator):
     equation = "least_squares"
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        objective = Objective.of(problem, z, prior=False)
+        objective = Objective.of(problem, z)
         size = np.full(len(problem.x0), 1.0 / np.linalg.norm(problem.R.whiten_jacobian(problem.H)))
         start = np.repeat(problem.x0[None], len(z), axis=0)
         limits = Limits(self.tolerance, self.max_iterations, history=history)
@@ -148,9 +160,7 @@ class MultiscaleLM(Estimator):
         by_size, by_columns = (minimize(objective, method, start, limits) for method in methods)
         costs = [np.where(np.isfinite(m.chi_square), m.chi_square, np.inf) for m in (by_size, by_columns)]
         # The first where they fit alike to round-off; without a finite fit anywhere it keeps its status.
-        improves = costs[1] < costs[0] * (1 - 1e-12)
-        best = put(by_size, improves, take(by_columns, improves))
-        best = replace(best, iterations=by_size.iterations + by_columns.iterations)
+        best = by_size.replaced(np.arange(len(z)), by_columns, costs[1] < costs[0] * (1 - 1e-12))
         return best.estimates(objective.model.tally, z.shape[1])
 
 
@@ -182,17 +192,19 @@ class Multistart(Estimator):
     equation = "least_squares"
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
-        objective = Objective.of(problem, z, prior=False)
+        objective = Objective.of(problem, z)
         tally, x0, trials = objective.model.tally, problem.x0, len(z)
         draws = normals(own_generators(self.seed, z), self.starts - 1, len(x0))
         fitting = Fitting.none(trials, z.shape[1])
+        method = LevenbergMarquardtMethod(self.damping, problem.prior_used())
+        limits = Limits(self.tolerance, self.max_iterations, self.budget, history)
 
-        def fits(found: Minima, rows: NDArray[np.intp]) -> Mask:
+        def believed(found: Minima, rows: NDArray[np.intp]) -> Mask:
             """Which minima are believed; those that fit are noted."""
             return fitting.note(found, rows) & passes(found, z.shape[1], problem.doubted)
 
-        best = self._descend(objective, problem, np.repeat(x0[None], trials, axis=0), history)
-        confirmed = np.where(fits(best, np.arange(trials)), 0, -1)
+        best = minimize(objective, method, np.repeat(x0[None], trials, axis=0), limits)
+        confirmed = np.where(believed(best, np.arange(trials)), 0, -1)
         for k in range(self.starts - 1):
             affordable = tally.cost(len(x0)) < (np.inf if self.budget is None else self.budget)
             hopeless = ~finite(z) | tally.failed(np.arange(trials))
@@ -200,11 +212,125 @@ class Multistart(Estimator):
             if not len(rows):
                 break
             x = x0 + spread_of_starts(problem) * draws[rows, k]
-            again = self._descend(objective.subset(rows), problem, x, history)
-            confirmed[rows] += (confirmed[rows] >= 0) | fits(again, rows)
+            again = minimize(objective.subset(rows), method, x, limits)
+            confirmed[rows] += (confirmed[rows] >= 0) | believed(again, rows)
             best = best.replaced(rows, again, again.better_than(take(best, rows)))
         return fitting.report(best.estimates(tally, z.shape[1]))
 
-    def _descend(self, objective: Objective, problem: Problem, x: Array, history: bool) -> Minima:
-        method = LevenbergMarquardtMethod(self.damping, problem.prior_used())
-        return minimize(objective, method, x, Limits(self.tolerance, self.max_iterations, self.budget, history))
+
+@dataclass(frozen=True)
+class LeastSquares(Estimator):
+    """`scipy.optimize.least_squares` on the whitened residuals, with the model's own Jacobian.
+
+    Parameters are scaled by the columns of that Jacobian (x_scale="jac"). Reports (J' J)^-1 of the whitened J; with a
+    robust loss, of the J that SciPy has reweighted for it. SciPy's own rules end the search; the trial has converged
+    if a Gauss-Newton step from there would be below `tolerance` deviations, else it has stalled.
+    """
+
+    method: Literal["trf", "lm", "dogbox"] = "trf"
+    """Trust region, MINPACK's Levenberg-Marquardt, or dogleg."""
+    start: Start = "best"
+    """The linear LSE, eq. (16), the nominal point, or that of the two where the readings fit better (`best`)."""
+    loss: Literal["linear", "soft_l1", "huber", "cauchy", "arctan"] = "linear"
+    """Anything but linear bounds what one bad reading can do; `lm` knows linear only."""
+    f_scale: Positive = 1.0
+    """The residual, in deviations of the reading, from which a robust loss begins to flatten."""
+    ftol: Rounding = 1e-14
+    """Relative decrease of the cost. At SciPy's 1e-8 the last step may still be a thousandth of a deviation."""
+    xtol: Rounding = 1e-12
+    gtol: Rounding = 1e-12
+    max_nfev: Count | None = None
+    """Evaluations of h after which the trial ends as max_iterations; None: SciPy's limit, 100 n."""
+    tolerance: Positive = 1e-4
+    """Largest Gauss-Newton step still to go, in reported deviations, of a converged trial. SciPy cannot promise less
+    than about 1e-5: it watches the cost, which is flat there."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.method == "lm" and self.loss != "linear":
+            raise UserError(f"loss={self.loss}: method=lm knows loss=linear only; choose method=trf or dogbox")
+
+    @property
+    def equation(self) -> Equation | None:  # type: ignore[override]
+        """A robust loss has roots of its own."""
+        return "least_squares" if self.loss == "linear" else None
+
+    def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
+        tally = EvaluationCount.zeros(len(z))
+        x = starting_points(problem, z, self.start, tally)
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)
+            trials = [_Residuals(problem, *trial) for trial in zip(z, x, tally.simulations, strict=True)]
+            return one_by_one(trials, lambda trial: self._search(trial, history=history), problem.measurement.n)
+
+    def _search(self, residuals: _Residuals, *, history: bool) -> Estimates:
+        """One trial, as a batch of one."""
+        from scipy.optimize import least_squares
+
+        jacobian: Any = residuals.J  # SciPy's stubs know its finite differences only
+        options: Any = {name: getattr(self, name) for name in _SCIPYS}
+        x, covariance = residuals.start, np.full((1, len(residuals.start), len(residuals.start)), np.nan)
+        status, message = Status.NONFINITE, "a reading, or the model at the start, is not a finite number"
+        try:
+            if np.isfinite(residuals.r(x)).all():
+                found = least_squares(residuals.r, x, jac=jacobian, x_scale="jac", **options)
+                x, message = found.x, ""
+                status, covariance = self._judge(found)
+        except Exception as error:
+            x, message = residuals.iterates[-1], describe_exception(error)
+            status = Status.SINGULAR if isinstance(error, np.linalg.LinAlgError) else Status.ERROR
+        if not np.array_equal(x, residuals.iterates[-1]):
+            residuals.iterates.append(x)
+        return Estimates(
+            x=x[None],
+            status=np.array([status], dtype=np.int8),
+            covariance=covariance,
+            iterations=np.array([len(residuals.iterates) - 1], dtype=np.int64),
+            simulations=np.array([residuals.simulations]),
+            jacobians=np.array([residuals.jacobians]),
+            messages={0: message} if message else {},
+            history=[np.array(residuals.iterates)] if history else None,
+        )
+
+    def _judge(self, found: Any) -> tuple[Status, Array]:
+        """The status and (J' J)^-1 (1, n, n) of where SciPy ended."""
+        J_plus, deficient = pseudo_inverse(found.jac[None], Covariance(np.ones(len(found.jac))))
+        P = np.matmul(J_plus, J_plus.swapaxes(1, 2))
+        if not (np.isfinite(found.x).all() and np.isfinite(found.jac).all()):
+            return Status.NONFINITE, P
+        if deficient[0]:
+            return Status.SINGULAR, P
+        if found.status == _OUT_OF_EVALUATIONS:
+            return Status.MAX_ITERATIONS, P
+        to_go = np.abs(P[0] @ found.grad) / np.sqrt(np.diag(P[0]))
+        return (Status.CONVERGED if to_go.max() <= self.tolerance else Status.STALLED), P
+
+
+@dataclass
+class _Residuals:
+    """Whitened residuals of one trial and their slopes, as SciPy wants them, counted."""
+
+    problem: Problem
+    z: Array
+    start: Array
+    simulations: float
+    jacobians: float = 0.0
+    _last: tuple[Array, Array] | None = None
+
+    @cached_property
+    def iterates(self) -> list[Array]:
+        """Where slopes were asked for: the start and every accepted step."""
+        return [self.start]
+
+    def r(self, x: Array) -> Array:
+        if self._last is None or not np.array_equal(x, self._last[0]):
+            self.simulations += 1
+            h = self.problem.measurement.simulate(x[None])[0]
+            self._last = x.copy(), self.problem.R.whiten(h - self.z)
+        return self._last[1].copy()
+
+    def J(self, x: Array) -> Array:
+        self.jacobians += 1
+        if not np.array_equal(x, self.iterates[-1]):
+            self.iterates.append(x.copy())
+        return self.problem.R.whiten_jacobian(self.problem.measurement.jacobian(x[None]))[0]

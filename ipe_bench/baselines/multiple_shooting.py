@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -60,14 +60,13 @@ class MultipleShooting(Estimator):
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         self.require_needs(problem)
-        pieces = Pieces.of(problem, self.segments, self.step)
+        counted = CountingModel(problem.measurement, EvaluationCount.zeros(len(z)))
+        shooting = Shooting(Pieces.of(problem, self.segments, self.step), counted, z, np.arange(len(z)))
+        limits = Limits(self.tolerance, self.max_iterations, self.budget, history)
         with np.errstate(all="ignore"):
-            shooting = Shooting(pieces, z, EvaluationCount.zeros(len(z)), np.arange(len(z)))
-            x = np.repeat(problem.x0[None], len(z), axis=0)
-            limits = Limits(self.tolerance, self.max_iterations, self.budget, history)
-            ended = iterate(shooting, CondensedGaussNewton(), x, limits)
+            ended = iterate(shooting, CondensedGaussNewton(), np.repeat(problem.x0[None], len(z), axis=0), limits)
             minima = Minima.of(ended, ended.state.linear.covariance, ended.state.r)
-            return minima.estimates(shooting.tally, z.shape[1])
+            return minima.estimates(counted.tally, z.shape[1])
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ class Pieces:
         intervals = len(self.grid) - 1
         return np.unique(np.linspace(0, intervals, min(self.wanted, intervals) + 1).round().astype(np.intp))
 
-    @property
+    @cached_property
     def cases(self) -> int:
         return len(self.model.cases)
 
@@ -111,8 +110,7 @@ class Pieces:
 
         def states(x: Array) -> Array:
             shape = (*x.shape[:2], self.cases)
-            p, c = (x * self.model.si_sizes)[:, :, None], self.model.tables[0]
-            return _stacked(self.model.start(_columns(p, shape), _columns(c, shape)), shape)
+            return _entrywise(self.model.start, shape, (x * self.model.si_sizes)[:, :, None], self.model.tables[0])
 
         return _with_slope(states, x)
 
@@ -120,13 +118,8 @@ class Pieces:
         """The outputs (trials, cases, outputs) of the states y (trials, cases, states) at times[k], and their
         derivatives by the states."""
         p, c = (x * self.model.si_sizes)[:, None, None], self.model.tables[min(k + 1, len(self.model.tables) - 1)]
-
-        def outputs(y: Array) -> Array:
-            shape = y.shape[:3]
-            h = self.model.read(self.grid[k + 1], _columns(y, shape), _columns(p, shape), _columns(c, shape))
-            return _stacked(h, shape)
-
-        return _with_slope(outputs, y)
+        read = partial(self.model.read, self.grid[k + 1])
+        return _with_slope(lambda y: _entrywise(read, y.shape[:3], y, p, c), y)
 
     def inputs(self, x: Array, y: Array, k: NDArray[np.intp]) -> Array:
         """What `interval` takes for states y (trials, lanes, states) at the times grid[k] (lanes,)."""
@@ -196,13 +189,10 @@ class Pieces:
         return y
 
 
-def _columns(a: Array, shape: tuple[int, ...]) -> list[Array]:
-    """The entries of vectors (..., k), each as an array of that shape."""
-    return list(np.moveaxis(np.broadcast_to(a, (*shape, a.shape[-1])), -1, 0))
-
-
-def _stacked(values: Sequence[Any], shape: tuple[int, ...]) -> Array:
-    return np.stack([np.broadcast_to(value, shape) for value in values], axis=-1)
+def _entrywise(function: Callable[..., Sequence[Any]], shape: tuple[int, ...], *vectors: Array) -> Array:
+    """A function of the entries of vectors (..., k), each entry of that shape: (*shape, outputs)."""
+    entries = (list(np.moveaxis(np.broadcast_to(a, (*shape, a.shape[-1])), -1, 0)) for a in vectors)
+    return np.stack([np.broadcast_to(value, shape) for value in function(*entries)], axis=-1)
 
 
 def _with_slope(function: Callable[[Array], Array], x: Array) -> tuple[Array, Array]:
@@ -234,13 +224,11 @@ class Linear:
     def of(cls, C: Array, J: Array) -> Linear:
         weights, usable = np.linalg.norm(C, axis=2), (finite(C) & finite(J))[:, None, None]
         weights = np.where(weights > 0, weights, 1.0)
-        count = C.shape[1]
         Q, U = np.linalg.qr(np.where(usable, C / weights[:, :, None], 0.0).swapaxes(1, 2), mode="complete")
-        Z = Q[:, :, count:]
+        Y, Z = np.split(Q, [C.shape[1]], axis=2)
         Qz, V = np.linalg.qr(np.matmul(np.where(usable, J, 0.0), Z))
-        return cls(
-            Q[:, :, :count], U[:, :count], Z, Qz, np.where(usable, V, np.nan), np.where(usable, J, np.nan), weights
-        )
+        V, J = (np.where(usable, A, np.nan) for A in (V, J))
+        return cls(Y, U[:, : C.shape[1]], Z, Qz, V, J, weights)
 
     def step(self, d: Array, r: Array) -> Array:
         """The unknowns' change (trials, unknowns) that closes the gaps d and fits the residuals r best."""
@@ -283,20 +271,16 @@ class Shooting:
     """The problem for the trials `rows` of a batch."""
 
     pieces: Pieces
+    model: CountingModel
     z: Array
-    tally: EvaluationCount
     rows: NDArray[np.intp]
-
-    @property
-    def model(self) -> CountingModel:
-        return CountingModel(self.pieces.problem.measurement, self.tally)
 
     def subset(self, kept: Mask) -> Shooting:
         return replace(self, z=self.z[kept], rows=self.rows[kept])
 
     def gaps(self, x: Array, nodes: Array, size: Array) -> tuple[Array, Array]:
         """The gaps in multiples of `size`, and the whitened residuals."""
-        self.tally.simulations[self.rows] += 1.0
+        self.model.tally.simulations[self.rows] += 1.0
         pieces = self.pieces
         ends, h = pieces.follow(x, np.concatenate([pieces.start(x)[0], nodes], axis=1))
         d = (ends[:, : nodes.shape[1]] - nodes) / size[:, None]
@@ -306,7 +290,7 @@ class Shooting:
     def linear(self, x: Array, nodes: Array, size: Array) -> Linear:
         """The gaps' and residuals' derivatives along the parameters and the nodes in multiples of `size`."""
         pieces, n, (lanes, states) = self.pieces, x.shape[1], nodes.shape[1:]
-        self.tally.jacobians[self.rows] += 1.0 + states / n
+        self.model.tally.jacobians[self.rows] += 1.0 + states / n
         start, S = pieces.start(x)
         M, Jh = pieces.slopes(x, np.concatenate([start, nodes], axis=1))
         C = np.zeros((len(x), lanes, states, n + lanes * states))
@@ -338,16 +322,15 @@ class CondensedGaussNewton(Solver[Trajectory]):
         largest = np.abs(nodes).max(axis=1)
         size = np.where((largest > 0) & np.isfinite(largest), largest, 1.0)
         nodes = nodes[:, system.pieces.cases :]
-        system.tally.simulations[system.rows] += 1.0
+        system.model.tally.simulations[system.rows] += 1.0
         d, r = system.gaps(x, nodes, size)
         linear = system.linear(x, nodes, size)
         return Trajectory(x, nodes, size, d, r, linear, linear.step(d, r), np.ones(len(x)), np.full(len(x), np.inf))
 
     def step(self, system: Shooting, state: Trajectory) -> Trajectory:
         change = state.share[:, None] * state.step
-        n = state.x.shape[1]
-        x = state.x + change[:, :n]
-        nodes = state.nodes + change[:, n:].reshape(state.nodes.shape) * state.size[:, None]
+        of_x, of_nodes = np.split(change, [state.x.shape[1]], axis=1)
+        x, nodes = state.x + of_x, state.nodes + of_nodes.reshape(state.nodes.shape) * state.size[:, None]
         d, r = system.gaps(x, nodes, state.size)
         simplified = _length(state, state.linear.step(d, r))
         taken = simplified <= (1 - state.share / 4) * _length(state, state.step)
@@ -378,6 +361,5 @@ def _reach(state: Trajectory, change: Array) -> Array:
 
 def _length(state: Trajectory, change: Array) -> Array:
     """The length (trials,) of a change of all unknowns, parameters and states in their sizes."""
-    n = state.x.shape[1]
-    scale = np.fmax(1.0, np.abs(state.x))
-    return np.linalg.norm(np.concatenate([change[:, :n] / scale, change[:, n:]], axis=1), axis=1)
+    parameters, states = np.split(change, [state.x.shape[1]], axis=1)
+    return np.linalg.norm(np.concatenate([parameters / np.fmax(1.0, np.abs(state.x)), states], axis=1), axis=1)

@@ -139,19 +139,16 @@ class _Tracks(_Filters):
         try:
             return action()
         except Exception as error:
-            named = {np.linalg.LinAlgError: Status.SINGULAR, OverflowError: Status.NONFINITE}
-            status = next((status for kind, status in named.items() if isinstance(error, kind)), Status.ERROR)
-            self.end([trial], status, describe_exception(error))
-            return None
+            known = {np.linalg.LinAlgError: Status.SINGULAR, OverflowError: Status.NONFINITE}
+            self.end([trial], known.get(type(error), Status.ERROR), describe_exception(error))
 
     def take_in(self, epoch: Epoch, at: Rows) -> None:
         for trial in at.tolist():
             self.attempt(trial, self.tracks[trial].predict)
         waiting = self.going.tolist()
         while waiting:
-            points = {t: self.attempt(t, self.tracks[t].points) for t in waiting}
-            points = {t: s for t, s in points.items() if s is not None}
-            waiting = []
+            tried = {t: self.attempt(t, self.tracks[t].points) for t in waiting}
+            points, waiting = {t: s for t, s in tried.items() if s is not None}, []
             if points:
                 s = np.stack(list(points.values()))
                 kept, h, H = self.read(epoch, s, np.array(list(points), dtype=np.intp), slopes=self.filter.slopes)
@@ -218,14 +215,13 @@ class _TurnedReadings:
 
     def _read(self, x: Array, *, slopes: bool) -> tuple[Array, Array]:
         """h (trials, points, m) as it is and, for one point, dh/dx (trials, m, n)."""
-        known, m = finite(x), self.z.shape[1]
-        lost = f"the filter's P is not positive definite at epoch {self.epoch.number}"
-        self.walk.end(self.at[~known], Status.SINGULAR, lost)
+        known, number = finite(x), self.epoch.number
+        self.walk.end(self.at[~known], Status.SINGULAR, f"the filter's P is not positive definite at epoch {number}")
         kept, h, H = self.walk.read(self.epoch, x[known], self.at[known], slopes=slopes)
         beyond = ~(np.abs(h if H is None else H).max(axis=(1, 2), initial=0) < LARGEST)
         self.walk.end(kept[beyond], Status.NONFINITE, "what the filter is to take in is beyond the range of numbers")
-        rows = np.isin(self.at, kept[~beyond])
-        values, tangents = np.full((*x.shape[:2], m), np.nan), np.full((len(x), m, x.shape[2]), np.nan)
+        rows, (trials, points, n), m = np.isin(self.at, kept[~beyond]), x.shape, self.z.shape[1]
+        values, tangents = np.full((trials, points, m), np.nan), np.full((trials, m, n), np.nan)
         values[rows] = h[~beyond]
         if H is not None:
             tangents[rows] = H[~beyond]

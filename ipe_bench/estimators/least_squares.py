@@ -54,11 +54,11 @@ class Objective:
     coarse; infinite: they are exact everywhere; 0: coarse, and good enough to end with."""
 
     @classmethod
-    def of(cls, problem: Problem, z: Array, *, prior: bool, inflation: float = 1.0) -> Objective:
-        """The objective of all readings z (trials, m); with the prior, its deviations times `inflation`."""
+    def of(cls, problem: Problem, z: Array, inflation: float | None = None) -> Objective:
+        """The objective of all readings z (trials, m), with the prior, its deviations times `inflation`, if given."""
         model = CountingModel(problem.measurement, EvaluationCount.zeros(len(z)))
-        counting = problem.prior_covariance(inflation) if prior else None
-        return cls(model, problem.R, z, np.arange(len(z)), problem.x0, counting)
+        prior = None if inflation is None else problem.prior_covariance(inflation)
+        return cls(model, problem.R, z, np.arange(len(z)), problem.x0, prior)
 
     @property
     def readings(self) -> int:

@@ -62,7 +62,7 @@ class Auto(Estimator):
 
     def estimate(self, problem: Problem, z: Array, *, history: bool = False) -> Estimates:
         everyone, m = np.arange(len(z)), z.shape[1]
-        objective = Objective.of(problem, z, prior=False)
+        objective = Objective.of(problem, z)
         best, contracts = by_chords(objective, problem.H, self.tolerance, self.budget, history=history)
         fitting = Fitting.none(len(z), m)
         fits = fitting.note(best, everyone)

@@ -56,11 +56,8 @@ def least_squares_root(problem: Problem, z: Array, x_start: Array, *, prior: flo
 
     Gauss-Newton; Levenberg-Marquardt for the trials where that fails.
     """
-
-    def objective(z: Array) -> Objective:
-        return Objective.of(problem, z, prior=prior is not None, inflation=prior or 1.0)
-
-    return _first_root(objective, z, x_start, (GaussNewtonMethod(), 20), (LevenbergMarquardtMethod(1e-3), 100))
+    methods = (GaussNewtonMethod(), 20), (LevenbergMarquardtMethod(1e-3), 100)
+    return _first_root(lambda z: Objective.of(problem, z, prior), z, x_start, *methods)
 
 
 def _first_root(
