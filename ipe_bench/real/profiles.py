@@ -17,6 +17,7 @@ from scipy.special import chdtri, fdtri, stdtrit
 
 from ipe_bench.basics.linalg import Array, Mask
 from ipe_bench.estimators.driver import Limits
+from ipe_bench.estimators.least_squares import Objective
 from ipe_bench.estimators.levenberg_marquardt import LevenbergMarquardtMethod
 from ipe_bench.estimators.minima import minimize
 from ipe_bench.measurements.base import Measurement
@@ -31,6 +32,10 @@ _STRETCHES = 24
 """The most steps outwards."""
 _PRECISION = 1e-8
 """The precision of an end, as a share of the half-width."""
+_JUMP = 0.01
+"""A rise at an end that is smaller than it should be by more than this share is that of another valley."""
+_STEP = 1e-4
+"""The share of the distance to an end within which a rise does not fall that far, unless minima were lost there."""
 _LIMITS = Limits(1e-7, 100)
 _LOWER = 1e-6
 """A chi-square that is smaller than at the estimate by more than this is that of a lower minimum."""
@@ -110,7 +115,8 @@ def profiles(
     """The profile intervals (places,), (places,) of the parameters `places`, or of all, in their own units, about the
     least-squares estimate x (n,) of covariance P (n, n) from readings z (m,), all present.
 
-    An end is infinite if the readings set no limit; both are NaN if the search finds a better fit than the estimate.
+    An end is infinite if the readings set no limit, and NaN if no minimum is found on the way to it; both are NaN if
+    the search finds a better fit than the estimate.
     `freedom` (n,) stands for several levels of the noise among the parameters. `signs` are the sides on which an end is
     searched for; the other end is infinite. Parameters that are `released` may leave their bounds inwards.
 
@@ -122,48 +128,20 @@ def profiles(
     behind = freedom if isinstance(freedom, np.ndarray) else np.full(len(x), np.inf)
     objective = objective_of(problem, z[None])
     least = float(objective.cost(x[None], objective.residual(x[None]))[0])
-
-    def end(place: int, sign: int) -> float:
-        """The distance from the estimate to an end; infinite if there is none."""
-        half = float(q[place] * np.sqrt(P[place, place]))
-        # By distance: the rise of root chi-square, up to twice q, and the parameters.
-        seen: dict[float, tuple[float, Array]] = {0.0: (0.0, x)}
-
-        def rise(distance: float) -> float:
-            if distance not in seen:
-                usable = [known for known, (zeta, _) in seen.items() if zeta < 2.0 * q[place]]
-                near = seen[min(usable, key=lambda known: abs(known - distance))][1]
-                point, total = _least_at(problem, z, P, place, float(x[place] + sign * distance), near, released)
-                change = total - least
-                if np.isfinite(behind[place]):
-                    # Levels that are among the other parameters, of f degrees of freedom, raise chi-square by
-                    # f log(1 + t^2 / f) where a linear model would give Student's t.
-                    with np.errstate(over="ignore"):
-                        change = behind[place] * np.expm1(change / behind[place])
-                if change < -_LOWER * max(1.0, least):
-                    raise _BetterFit
-                seen[distance] = float(np.fmin(np.sqrt(np.maximum(change, 0.0)), 2.0 * q[place])), point
-            return seen[distance][0]
-
-        near, far = 0.0, half
-        for _ in range(_STRETCHES):
-            if (risen := rise(far)) >= q[place]:
-                found = brentq(lambda distance: rise(distance) - q[place], near, far, xtol=_PRECISION * half)
-                return float(found)  # type: ignore[arg-type]
-            near, far = far, far * float(np.clip(1.05 * q[place] / max(risen, 1e-3), 1.1, 2.0))
-            if far > _FARTHEST * half:
-                break
-        return np.inf
-
     start, limits, found = model.physical(model.nominal[None])[0], natural_limits(model), []
     for k in range(len(x)) if places is None else places:
+        sides = (
+            _Side(problem, z, x, P, k, s, float(q[k]), float(behind[k]), least, objective, released) for s in (-1, 1)
+        )
         ends = np.repeat(x[None], 2, axis=0)
         try:
-            ends[:, k] += [s * (end(k, s) if s in signs else np.inf) for s in (-1, 1)]
+            ends[:, k] += [side.sign * (side.end() if side.sign in signs else np.inf) for side in sides]
         except _BetterFit:
             ends[:, k] = np.nan
         with np.errstate(invalid="ignore"):
-            values = np.sort(model.physical(ends)[:, k])
+            values = model.physical(ends)[:, k]
+        # A negative unit turns the order.
+        values = values if model.physical_slope(x[None])[0, k] > 0 else values[::-1]
         for bound in (limits[0][k], limits[1][k]):
             if np.isfinite(bound):
                 values[np.abs(values - bound) <= _ON_BOUND * abs(start[k] - bound)] = bound
@@ -174,6 +152,80 @@ def profiles(
 
 class _BetterFit(Exception):
     """The search has found a better fit than the estimate."""
+
+
+@dataclass
+class _Side:
+    """One side of the profile of the parameter of a place."""
+
+    problem: Problem
+    z: Array
+    x: Array
+    P: Array
+    place: int
+    sign: int
+    q: float
+    """The rise of root chi-square at the end."""
+    behind: float
+    """The degrees of freedom of levels of the noise among the parameters; infinite if there are none."""
+    least: float
+    objective: Objective
+    released: Released | None
+
+    def __post_init__(self) -> None:
+        self.seen: dict[float, tuple[float, Array]] = {0.0: (0.0, self.x)}
+        """By distance from the estimate: the rise up to twice q, and the parameters."""
+
+    def end(self) -> float:
+        """The distance to the end; infinite if there is none, NaN if minima cannot be followed to it."""
+        half = self.q * float(np.sqrt(self.P[self.place, self.place]))
+        near, far = 0.0, half
+        for _ in range(_STRETCHES):
+            if (risen := self.rise(far)) >= self.q:
+                found = brentq(lambda distance: self.rise(distance) - self.q, near, far, xtol=_PRECISION * half)
+                far = float(found)  # type: ignore[arg-type]
+                if (risen := self.rise(far, around=True)) >= (1 - _JUMP) * self.q:
+                    return far if self.rise((1 - _STEP) * far) >= (1 - _JUMP) * self.q else np.nan
+                self.seen = {far: self.seen[far]}
+            near, far = far, far * float(np.clip(1.05 * self.q / max(risen, 1e-3), 1.1, 2.0))
+            if far > _FARTHEST * half:
+                break
+        return np.inf
+
+    def rise(self, distance: float, *, around: bool = False) -> float:
+        """The rise of root chi-square at a distance; that of the least minimum found from the profile's nearest points
+        and, if asked, from all around, where another valley may be lower."""
+        if distance in self.seen and not around:
+            return self.seen[distance][0]
+        at = float(self.x[self.place] + self.sign * distance)
+        usable = sorted((abs(d - distance), d) for d, (zeta, _) in self.seen.items() if zeta < 2.0 * self.q)
+        nearest = usable[0][1]
+        beyond = [d for _, d in usable if (d - distance) * (nearest - distance) < 0]
+        points = [self.seen[d][1] for d in (nearest, *beyond[:1])]
+        starts = np.vstack([_ahead(self.objective, points[0], self.place, at), *points])
+        if around:
+            starts = np.vstack([starts, self._around(at)])
+        point, total = _least_at(self.problem, self.z, self.place, at, starts, self.released)
+        change = total - self.least
+        if np.isfinite(self.behind):
+            # Levels that are among the other parameters, of f degrees of freedom, raise chi-square by
+            # f log(1 + t^2 / f) where a linear model would give Student's t.
+            with np.errstate(over="ignore"):
+                change = self.behind * np.expm1(change / self.behind)
+        if change < -_LOWER * max(1.0, self.least):
+            raise _BetterFit
+        # Where the model has no value, it has risen.
+        risen = float(np.fmin(np.sqrt(np.maximum(change, 0.0)), 2.0 * self.q))
+        self.seen[distance] = risen, point
+        return risen
+
+    def _around(self, at: float) -> Array:
+        """Two deviations of the others to both sides of where a linear model would lead from the estimate, along each
+        axis of their covariance, (starts, n)."""
+        gain = self.P[:, self.place] / self.P[self.place, self.place]
+        sizes, axes = np.linalg.eigh(self.P - np.outer(gain, self.P[self.place]))
+        steps = 2.0 * np.sqrt(np.maximum(sizes, 0.0))[:, None] * axes.T
+        return self.x + gain * (at - self.x[self.place]) + np.vstack([steps, -steps])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,21 +245,36 @@ class _Pinned(CountingModel):
         return np.insert(x, self.place, self.value, axis=1)
 
 
+def _ahead(objective: Objective, near: Array, place: int, at: float) -> Array:
+    """Where the profile leads from one of its points `near` (n,) if the model is straight on the way, when the
+    parameter of a place has a value."""
+    with np.errstate(all="ignore"):
+        J = objective.jacobian(near[None])[0]
+    if not np.isfinite(J).all():
+        return near
+    step = np.full(len(near), at - near[place])
+    step[np.arange(len(near)) != place] *= -np.linalg.lstsq(np.delete(J, place, axis=1), J[:, place], rcond=None)[0]
+    return near + step
+
+
 def _least_at(
-    problem: Problem, z: Array, P: Array, place: int, at: float, near: Array, released: Released | None
+    problem: Problem, z: Array, place: int, at: float, starts: Array, released: Released | None
 ) -> tuple[Array, float]:
-    """The minimum (n,) with one parameter at a value, and the sum of squares there, from where a linear model of
-    covariance P (n, n) would lead from a point `near` (n,); the sum is smaller if parameters that are released fit
-    better inside of their bounds."""
-    model = _Pinned(problem.measurement, EvaluationCount.zeros(1), place=place, value=at)
-    objective = objective_of(problem, z[None], model)
-    x = np.delete(near + P[:, place] / P[place, place] * (at - near[place]), place)[None]
+    """The least of the minima (n,) with one parameter at a value that are found from `starts` (starts, n), and the sum
+    of squares there; that is smaller if parameters that are released fit better inside of their bounds, and NaN where
+    the model has no value."""
+    model = _Pinned(problem.measurement, EvaluationCount.zeros(len(starts)), place=place, value=at)
+    objective = objective_of(problem, np.repeat(z[None], len(starts), axis=0), model)
+    x = np.delete(starts, place, axis=1)
     with np.errstate(all="ignore"):
         if x.size:
             x = minimize(objective, LevenbergMarquardtMethod(1e-3), x, _LIMITS).x
-        total = float(objective.cost(x, objective.residual(x))[0])
+        totals = objective.cost(x, objective.residual(x))
+    best = int(np.argmin(np.where(np.isnan(totals), np.inf, totals)))
+    total = float(totals[best])
     if released is not None:
         free = int(np.setdiff1d(np.arange(len(released.x)), released.places)[place])
-        freed, less = _least_at(released.problem, z, released.P, free, at, released.x, None)
+        start = _ahead(objective_of(released.problem, z[None]), released.x, free, at)
+        freed, less = _least_at(released.problem, z, free, at, start[None], None)
         total = float(np.fmin(total, less)) if released.inside(freed[None]).all() else total
-    return model.whole(x)[0], total
+    return model.whole(x)[best], total

@@ -291,7 +291,8 @@ def _interval(low: float, high: float, middle: float) -> str:
     """Each end to a hundredth of twice its distance to the estimate `middle`, if that lies between them, or of the
     width; infinite ends as such."""
     if not math.isfinite(high - low) or high <= low:
-        return f"{low:.6g} … {high:.6g}".replace("-inf", "−∞").replace("inf", "∞").replace("nan", "-")
+        text = f"{low:.6g} … {high:.6g}".replace("-inf", "−∞").replace("inf", "∞").replace("nan", "-")
+        return "-" if text == "- … -" else text
     reaches = (2 * (middle - low), 2 * (high - middle)) if low < middle < high else (high - low, high - low)
     ends = zip((low, high), reaches, strict=True)
     return " … ".join(_rounded((end,), math.floor(math.log10(reach)) - 2)[0] for end, reach in ends)
@@ -314,8 +315,10 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
         yield f"AMBIGUOUS: the readings fit as well at {at(one.x)} (chi-square {one.chi_square:.5g})."
     if bent := list(compress(names, found.bent.tolist())):
         yield f"Profiles that are no parabola: {', '.join(bent)}; trust their profile intervals."
-    if unlimited := [n for n, low, high in zip(names, *found.profiles, strict=True) if math.isinf(high - low)]:
+    if unlimited := list(compress(names, np.isinf(found.profiles).any(axis=0).tolist())):
         yield f"The readings set no limit to one side of {', '.join(unlimited)}."
+    if lost := list(compress(names, np.isnan(found.profiles).any(axis=0).tolist())):
+        yield f"The profile could not be followed to its end: {', '.join(lost)}."
     for one in found.on_bounds:
         yield (
             f"{one.parameter.name}: its estimate is on the bound {one.bound:g}, which is one end of its interval; the"

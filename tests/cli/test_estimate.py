@@ -271,4 +271,6 @@ def test_noise_that_is_overstated_is_said_and_rounded_intervals_hold_the_estimat
     assert code == 0, printed
     printed = " ".join(printed.split())
     assert "the residuals are up to 1.1e+02 times smaller than the stated noise" in printed
-    assert "a -2.35 … 6.37 -138 … 7.5" in printed  # to tens, as the width is, the upper end would be 10
+    # A straight line, with b near zero and a as large as one likes to both sides, is within the stated noise.
+    assert "a -2.35 … 6.37 −∞ … ∞" in printed
+    assert "c -2.30 … 2.90 −∞ … ∞ -10.0 … 1.57" in printed  # to tens, as the width is, the upper end would be 0
