@@ -79,7 +79,7 @@ class Pending:
         from ipe_bench.report.figures import draw_all
         from ipe_bench.report.headline import headline
         from ipe_bench.report.html import render_page
-        from ipe_bench.report.sections import report_tables, written
+        from ipe_bench.report.sections import CURVES, report_tables, written
         from ipe_bench.report.table import write_table
         from ipe_bench.report.tables import without_certified
 
@@ -91,9 +91,10 @@ class Pending:
         write_text(output / "summary.csv", analysis.summary.to_csv(index=False))
         files = [path for table in (*tables, *added) for path in write_table(table, output / "tables")]
         simulated = without_certified(analysis)
-        if len(simulated.profiles):
-            files.append(output / "tables" / "profiles.csv")
-            write_text(files[-1], simulated.profiles.to_csv(index=False))
+        for name, frame in {n: getattr(simulated, n) for n in CURVES}.items():
+            if len(frame):
+                files.append(output / "tables" / f"{name}.csv")
+                write_text(files[-1], frame.to_csv(index=False))
         drawn = draw_all(simulated, output / "figures", which=self.figures, formats=self.formats)
         write_text(output / "report.html", render_page(analysis, tables, drawn, sections))
         result = ReportResult(

@@ -15,6 +15,9 @@ from ipe_bench.report.table import Part, Table
 from ipe_bench.report.tables import all_tables, certified_tables, without_certified
 from ipe_bench.statistics.analysis import Analysis
 
+CURVES = ("profiles", "distributions")
+"""Frames of an analysis that are files beside the tables, and too long to be read on a page."""
+
 
 @dataclass(frozen=True)
 class Section:
@@ -46,7 +49,7 @@ def report_tables(analysis: Analysis) -> list[Table]:
 
 def written(group: str, analysis: Analysis, tables: Iterable[Table]) -> list[Written]:
     """What the tables or the sections of plugins come to, none of them under the name of one of these tables."""
-    names = {"profiles", *(table.name for table in tables)}
+    names = {*CURVES, *(table.name for table in tables)}
 
     def make(record: Any) -> tuple[str, list[Part]]:
         if group == "section":

@@ -25,12 +25,14 @@ from ipe_bench.statistics.comparisons import (
 from ipe_bench.statistics.formulas import capped_error
 from ipe_bench.statistics.intervals import quantile
 from ipe_bench.statistics.records import BEST, SCORES, rows_of, summary_rows, to_frame
-from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of, samples
+from ipe_bench.statistics.sample import CONTRACTION, Sample, label_of, median_distances, samples
 from ipe_bench.statistics.tracks import curves
 
 if TYPE_CHECKING:
     import pandas as pd
 
+PROBABILITIES = np.unique(np.concatenate([np.linspace(0, 1, 101), [0.001, 0.005, 0.025, 0.975, 0.995, 0.999]]))
+"""Where the distribution of errors is tabulated."""
 MESSAGES = 20
 """Different messages of one estimator on one scenario that are listed one by one."""
 
@@ -52,6 +54,11 @@ class Analysis:
     """Mean ranks over seeds; see `comparisons.rank_over_replicates`."""
     profiles: pd.DataFrame
     """Estimator, profile (performance or data), `at` (cost ratio or budget) and share, over all scenarios."""
+    distributions: pd.DataFrame
+    """Quantiles of the Mahalanobis error over all trials: `probability` (of `PROBABILITIES`) and `distance`."""
+    convergence: pd.DataFrame
+    """Of estimators that iterate: `iteration`, and the median `distance` of the iterate from the last one, the largest
+    over the parameters in deviations of the bound, over the first converged trials; 0 when half of them have ended."""
     calibration: pd.DataFrame
     """Of NEES: the probability `at`, the `difference` of the empirical distribution function from the uniform one
     there, and the ends `low` and `high` of the band; NEES and all parameters of an honest estimator keep within theirs
@@ -116,6 +123,11 @@ class Begun:
                 numbered | {"seed": seed, "error": capped_error(sample, sample.seeds == seed)}
                 for seed in np.unique(sample.seeds).tolist()
             ]
+            distances = np.array([quantile(sample.distance, p) for p in PROBABILITIES])
+            found["distributions"].append(numbered | {"probability": PROBABILITIES, "distance": distances})
+            if sample.histories and sample.group.footer.get("equation") is not None:
+                medians = median_distances(sample.histories)
+                found["convergence"].append(numbered | {"iteration": np.arange(len(medians)), "distance": medians})
             for whole in sample.calibrations[-1:]:
                 low, high = band(len(whole.z), whole.level)
                 curve = {"at": POINTS, "difference": whole.size.difference, "low": low, "high": high}
@@ -144,6 +156,8 @@ class Begun:
                 pd.DataFrame(rows["replicates"], columns=["scenario", "seed", "estimator", "error"])
             ),
             profiles=profiles([outcomes for _, outcomes in self._compared]),
+            distributions=_joined(rows["distributions"]),
+            convergence=_joined(rows["convergence"]),
             calibration=_joined(rows["calibration"]),
             contraction=pd.DataFrame(rows["contraction"]),
             tracks=_joined(rows["tracks"]),

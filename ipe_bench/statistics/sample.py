@@ -262,6 +262,15 @@ def distances_to_limit(iterates: Array, deviation: Array) -> Array:
         return np.abs((iterates - iterates[-1]) / deviation).max(axis=1)
 
 
+def median_distances(histories: Sequence[History]) -> Array:
+    """Medians (iterates,) over trials of the distances from their limits, where a trial that has ended is nearer than
+    any other: 0 from where half of them have."""
+    table = np.zeros((max(len(h.distances) for h in histories), len(histories)))
+    for i, h in enumerate(histories):
+        table[: len(h.distances), i] = np.where(np.isfinite(h.distances), h.distances, np.inf)
+    return np.sort(table)[:, (len(histories) - 1) // 2]
+
+
 def iterations_to_limit(distances: Array) -> int:
     """The first iterate from which on all are within `CLOSE` of the last."""
     far = np.flatnonzero(~(distances <= CLOSE))

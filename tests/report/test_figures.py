@@ -27,6 +27,7 @@ from ipe_bench.report.figures.views import View, views
 from ipe_bench.report.style import FAMILIES, GREY, REFERENCE, house_style, looks, print_style
 from ipe_bench.solvers import Auto
 from ipe_bench.statistics import analyse
+from ipe_bench.statistics.sample import History, median_distances
 
 SCALES = (1.0, 10.0, 100.0)
 MODULES = (errors, costs, parameters)
@@ -158,7 +159,8 @@ def test_scales_are_labelled_as_far_as_there_is_room_with_both_ends():
         assert all(np.log10(b / a) > letter * (len(f"{a:g}") + len(f"{b:g}")) / 2 for a, b in pairwise(kept))
     assert kept == scales
     assert common.labelled([33.0], 1.0) == [33.0]
-    assert [common.number(v) for v in (200.0, -0.05, 5e-7, 1e-12)] == ["200", "−0.05", "5·10⁻⁷", "10⁻¹²"]
+    shown = {0.0: "0", 1e-3: "0.001", -0.05: "−0.05", 200.0: "200", 1e4: "10⁴", 5e-7: "5·10⁻⁷", 1e-12: "10⁻¹²"}
+    assert [common.number(v) for v in shown] == list(shown.values())
 
 
 # Colours -------------------------------------------------------------------------------------------------------------
@@ -191,6 +193,48 @@ def test_an_estimator_is_in_the_colours_of_its_family_and_of_many_the_best_are_i
     assert colored == {"filter0", "filter1", "iterated0", "iterated1"}
     (legend,) = drawn(errors, view)["headline"].figure.legends
     assert [t.get_text() for t in legend.get_texts()][:5] == [*(e for e in view.look if e in colored), "8 others"]
+
+
+# Distributions and convergence ---------------------------------------------------------------------------------------
+
+
+def test_distributions_of_all_trials_leave_the_panel_where_trials_diverge(synthetic):
+    """A fifth of the trials are lost: the curve goes through the quantiles of the others, and ends below 80 %."""
+    error = 0.1 * np.random.default_rng(3).standard_normal((200, 3))
+    error[160:] *= 1e6
+    error[199] = np.inf
+    synthetic.add(synthetic.scenario(), "one", error, estimator=Seeker())
+    analysis = analyse([synthetic.directory])
+    known = np.sqrt(((error / 0.1) ** 2).sum(axis=1))
+    rows = analysis.distributions.set_index("probability")["distance"]
+    assert rows[0.5] == pytest.approx(np.median(known), rel=1e-9)
+    assert rows[1.0] == np.inf
+    (drawing,) = (d for name, d in drawn(errors, only_view(synthetic)).items() if name == "distributions")
+    (panel,) = drawing.figure.axes
+    efficient, curve = (line.get_xydata() for line in panel.lines[:2])
+    inside = curve[curve[:, 0] < panel.get_xlim()[1]]
+    assert np.interp(0.5, inside[:, 1], inside[:, 0]) == pytest.approx(np.median(known) / np.sqrt(3), rel=1e-9)
+    assert inside[:, 1].max() == pytest.approx(0.8, abs=0.011)
+    simulated = np.sqrt((np.random.default_rng(0).normal(size=(200_000, 3)) ** 2).mean(axis=1))
+    assert np.interp(1.0, *efficient.T) == pytest.approx((simulated <= 1).mean(), abs=0.01)
+    assert "99 % quantile at scale 1: one >100." in drawing.caption
+
+
+def test_neither_the_last_iterate_nor_the_epochs_of_filters_are_drawn_as_convergence(synthetic):
+    """An iterate's distance from itself is zero; trials that have come to it count as nearer than those under way."""
+    paths = [[8.0, 4.0, 0.0], [6.0, 3.0, 2.0, 1.0, 0.0], [9.0, 0.0]]
+    histories = [History(np.zeros((len(d), 1)), np.array(d), 1.0, np.nan, np.nan) for d in paths]
+    assert median_distances(histories).tolist() == [8.0, 3.0, 0.0, 0.0, 0.0]
+    assert median_distances([*histories, histories[2]]).tolist() == [8.0, 0.0, 0.0, 0.0, 0.0]
+    iterates = {f"x_{name}": np.array([0.8, 0.4, 0.001, 0.0]) for name in "abc"}
+    history = {"trial": np.zeros(4, dtype=int), "iteration": np.arange(4)} | iterates
+    for label, estimator in (("ekf", Filter()), ("direct", Pretender()), ("newton", Seeker())):
+        synthetic.add(synthetic.scenario(), label, np.full((30, 3), 0.1), estimator=estimator, history=history)
+    (drawing,) = (d for name, d in drawn(costs, only_view(synthetic)).items() if name == "convergence")
+    (panel,) = (ax for ax in drawing.figure.axes if ax.axison)
+    assert panel.get_title() == "newton"
+    assert panel.lines[0].get_xydata() == pytest.approx(np.array([[0, 8.0], [1, 4.0], [2, 0.01]]))
+    assert "newton 2" in drawing.caption
 
 
 # Parameters ----------------------------------------------------------------------------------------------------------

@@ -83,9 +83,9 @@ def axis_labels(fig: Figure, x: str, y: str) -> None:
 
 
 def number(value: float) -> str:
-    """A number of an axis: 0.05, 200 or 5·10⁻⁷, with the minus that typography has."""
-    digits, _, exponent = f"{value:g}".partition("e")
-    words = f"{digits}·10{str(int(exponent)).translate(_RAISED)}" if exponent else digits
+    """A number of an axis: 0.05, 200, 10⁴ or 5·10⁻⁷, with the minus that typography has."""
+    digits, _, exponent = (f"{value:g}" if 1e-3 <= abs(value) < 1e4 or value == 0 else f"{value:e}").partition("e")
+    words = f"{float(digits):g}·10{str(int(exponent)).translate(_RAISED)}" if exponent else digits
     return words.removeprefix("1·").replace("-", "\N{MINUS SIGN}")
 
 

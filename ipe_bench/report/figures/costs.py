@@ -1,4 +1,5 @@
-"""What accuracy costs: simulations against error, and the data profile of problems of known minimum."""
+"""What accuracy costs: simulations against error, iterations against the distance from the limit, and the data profile
+of problems of known minimum."""
 
 from __future__ import annotations
 
@@ -11,14 +12,19 @@ from scipy.special import chdtri
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
-from ipe_bench.report.style import GREY, looks
+from ipe_bench.report.style import GREY, MARKERS, Look, looks
 from ipe_bench.report.words import enumerate_few, plain
 from ipe_bench.statistics.certified import data_profile
+from ipe_bench.statistics.sample import CLOSE
 
 LEAST_COST = 0.5
 """What does not simulate at all stands here: a logarithmic axis has no zero."""
 _HIGHEST = 1e6
 """Errors beyond this many bounds stand at the upper edge."""
+FLOOR = 1e-10
+"""Distances from the limit below this are drawn here: round-off."""
+LONG = 60
+"""Iterations from which on the axis is logarithmic."""
 
 
 def draw_costs(view: View) -> Iterator[Drawing]:
@@ -58,6 +64,58 @@ def draw_costs(view: View) -> Iterator[Drawing]:
     )
 
 
+def draw_convergence(view: View) -> Iterator[Drawing]:
+    """How iterates approach their limit, a panel per estimator."""
+    import seaborn as sns
+    from matplotlib.ticker import MaxNLocator
+
+    rows = view["convergence"]
+    rows = rows[(rows["distance"] > 0) & np.isfinite(rows["distance"])] if len(rows) else rows
+    if rows.empty or not rows["iteration"].any():
+        return
+    # An estimate that is had at once has a start and an end, and nothing between.
+    rows = rows[rows.groupby("estimator")["iteration"].transform("max") > 0]
+    look, scales = view.with_look(rows["estimator"]), sorted(set(rows["error_scale"]))
+    shown = sorted(look, key=lambda label: look[label].color == GREY)[: common.MOST_PANELS]
+    names = {scale: f"error scale {plain(scale)}" for scale in scales}
+    colors = sns.color_palette("crest", len(scales)).as_hex()
+    by_scale = {name: Look(colors[i], MARKERS[i % len(MARKERS)]) for i, name in enumerate(names.values())}
+    rows = rows.assign(scale=rows["error_scale"].map(names), distance=rows["distance"].clip(lower=FLOOR))
+    style = {**common.seaborn_style(by_scale, "scale"), "dashes": False, "estimator": None, "linewidth": 1.2}
+    fig, axes = common.panels(len(shown), by_scale)
+    bottom, top = rows["distance"].min() / 3, rows["distance"].max() * 3
+    for label, ax in zip(shown, axes, strict=True):
+        part = rows[rows["estimator"] == label]
+        end = int(part["iteration"].max())
+        sns.lineplot(part, x="iteration", y="distance", ax=ax, markevery=1 + end // 12, **style)
+        ax.set_yscale("log")
+        ax.set_ylim(bottom, top)
+        common.log_ticks(ax.yaxis, bottom, top)
+        common.bound_line(ax, CLOSE, f"{CLOSE:g} standard deviations")
+        ax.set_xlim(-0.03 * end - 0.2, 1.03 * end + 0.2)
+        if end > LONG:
+            ax.set_xscale("symlog", linthresh=10)
+        else:
+            ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+        common.title(ax, f"{label}, logarithmic from 10" if end > LONG else label)
+    common.axis_labels(fig, "iteration", "distance to own limit [σ]")
+    common.legend(fig, axes, by_scale)
+    last = rows[rows["error_scale"] == scales[-1]]
+    arrived = last[last["distance"] > CLOSE].groupby("estimator", sort=False)["iteration"].max().add(1)
+    seen = [f"{label} {arrived.get(label, 0):g}" for label in look if label in set(last["estimator"])]
+    yield view.drawing(
+        fig,
+        "convergence",
+        "Convergence, converged trials",
+        "Median over the first converged trials of the largest component of the distance between an iterate and the"
+        " last one, in standard deviations of the Cramér-Rao bound. The last iterate is not drawn, since its distance"
+        " is zero by definition; a curve ends when half of the trials have ended.",
+        f"Iterations until the median is within {CLOSE:g} standard deviations at scale {plain(scales[-1])}:"
+        f" {enumerate_few(seen, 20)}.",
+        f"{len(look) - len(shown)} further estimators are not shown." * (len(look) > len(shown)),
+    )
+
+
 def draw_known_minima(view: View) -> Iterator[Drawing]:
     table = view["attained"]
     rows = data_profile(table)
@@ -92,5 +150,6 @@ def draw_known_minima(view: View) -> Iterator[Drawing]:
 
 FIGURES = (
     Figure(draw_costs, ("summary",), main=True),
+    Figure(draw_convergence, ("convergence",)),
     Figure(draw_known_minima, ("attained",), together=True, main=True),
 )

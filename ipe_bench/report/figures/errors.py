@@ -1,4 +1,5 @@
-"""The headline of success, error and honesty of all trials, the calibration of NEES, and residuals of readings."""
+"""The headline of success, error and honesty of all trials, the distribution of errors, the calibration of NEES, and
+residuals of readings."""
 
 from __future__ import annotations
 
@@ -7,14 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from scipy.special import gammainc
 
 from ipe_bench.basics.linalg import Array
 from ipe_bench.real.residuals import LEAST_P
 from ipe_bench.report.figures import common
 from ipe_bench.report.figures.drawing import Drawing, Figure
 from ipe_bench.report.figures.views import View
-from ipe_bench.report.style import BOUND_COLOR, looks
-from ipe_bench.report.words import enumerate_few, p_value, percent, plain
+from ipe_bench.report.style import BOUND_COLOR, BOUND_DASH, looks
+from ipe_bench.report.words import brief, enumerate_few, p_value, percent, plain
 
 if TYPE_CHECKING:
     from ipe_bench.measurements.base import Measurement
@@ -71,6 +73,42 @@ def draw(view: View) -> Iterator[Drawing]:
         " quantile. Right: squared error over the variance that the estimator claims; 1 is right.",
         f"{most}, stands at the top." if beyond else "",
         f"At scale {plain(view.scales[-1])} succeed: {enumerate_few(ranked, 20)}.",
+    )
+
+
+def draw_distributions(view: View) -> Iterator[Drawing]:
+    """Distribution functions of the error, a panel per error scale."""
+    rows = view["distributions"]
+    if rows.empty:
+        return
+    look, most = view.with_look(rows["estimator"]), CEILING["error_q95"]
+    rows = rows.assign(error=rows["distance"] / np.sqrt(view.n))
+    low, high = 0.7 * rows["error"].clip(0.1, 1.0).min(), 1.5 * rows["error"].clip(2.0, most / 1.5).max()
+    # Each curve rises from none within the panel, and what lies beyond its edge is not seen.
+    rows["error"] = rows["error"].clip(low / 2, 2 * most)
+    fig, panels = common.panels_of_scales(rows, look)
+    at = np.geomspace(low, high, 200)
+    for ax, part in panels:
+        common.shares(ax)
+        efficient: dict[str, Any] = {"color": BOUND_COLOR, "linestyle": BOUND_DASH, "label": "efficient estimator"}
+        ax.plot(at, gammainc(view.n / 2, view.n * at**2 / 2), linewidth=1.0, zorder=1, **efficient)
+        common.lines(ax, part, "error", "probability", look)
+        ax.set_xscale("log")
+        ax.set_xlim(low, high)
+        common.log_ticks(ax.xaxis, low, high)
+    common.axis_labels(fig, "error / bound", "share of all trials")
+    common.legend(fig, fig.axes, look)
+    top = view.scales[-1]
+    last = rows[(rows["error_scale"] == top) & (rows["probability"] == 0.99)]
+    seen = [f"{e} {brief(v) if v <= most else f'>{most:g}'}" for e, v in last[["estimator", "error"]].to_numpy()]
+    yield view.drawing(
+        fig,
+        "distributions",
+        "Distribution of errors, all trials",
+        "Share of all trials whose error is at most that many times the bound at the truth; dotted: the law of an"
+        " efficient estimator, chi over the square root of its degrees of freedom. A curve that ends below 100 % has"
+        " trials beyond the panel.",
+        f"99 % quantile at scale {plain(top)}: {enumerate_few(seen, 20)}.",
     )
 
 
@@ -167,4 +205,8 @@ def _abscissa(model: Measurement) -> tuple[Array, str]:
     return np.arange(1.0, model.m + 1), "reading"
 
 
-FIGURES = (Figure(draw, ("summary",), main=True), Figure(draw_calibration, ("summary", "calibration")))
+FIGURES = (
+    Figure(draw, ("summary",), main=True),
+    Figure(draw_distributions, ("distributions",)),
+    Figure(draw_calibration, ("summary", "calibration")),
+)
