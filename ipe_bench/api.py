@@ -19,7 +19,7 @@ from ipe_bench.noise.base import Noise
 from ipe_bench.priors import Prior
 from ipe_bench.runs.bundles import BUNDLES, is_bundle, opened
 from ipe_bench.runs.execution import Execution
-from ipe_bench.runs.results import Results, require_results
+from ipe_bench.runs.results import Results
 from ipe_bench.runs.run import compute, validate
 from ipe_bench.runs.schedule import Watcher
 from ipe_bench.states.base import StateModel
@@ -132,7 +132,6 @@ def load(directories: Directories) -> pd.DataFrame:
     from ipe_bench.statistics.collect import collect, trials_frame
 
     with opened(_paths(directories)) as paths:
-        require_results(paths)
         collection = collect(paths)
         frame = trials_frame(collection)
     _warn(collection.problems)
@@ -154,7 +153,7 @@ def report(
     >>> import ipe_bench as ib
     >>> ib.report("outputs/nowhere")
     Traceback (most recent call last):
-    ipe_bench.basics.errors.UserError: outputs/nowhere: there is no such directory; give one that a run wrote to
+    ipe_bench.basics.errors.UserError: outputs/nowhere: holds no results of ipe-bench; give the output folder of a run
     """
     from ipe_bench.report.run import begin_report
 
@@ -162,7 +161,6 @@ def report(
     if output is None and any(map(is_bundle, paths)):
         raise UserError(f"{paths[0]}: a bundle is read and not written to; give output=, where the report goes")
     with opened(paths, None if output is None else Path(output) / BUNDLES) as folders:
-        require_results(folders)
         return begin_report(folders, output, figures=figures, formats=formats).written()
 
 
@@ -219,8 +217,6 @@ def compare(
         label = "one folder" if first is None else f"{first} of one folder"
         raise UserError(f"compare: {label} is compared with itself; name another, or first=LABEL and second=LABEL")
     with opened(paths[0]) as one, opened(paths[1]) as other:
-        for part in (one, other):
-            require_results(part)
         collections = collect(one), collect(other)
         frame = pd.DataFrame(compared(*collections, (first, second), alpha=alpha, anytime=anytime, plan=plan))
     if plan is not None:
@@ -283,7 +279,6 @@ def status(directories: Directories) -> pd.DataFrame:
     import pandas as pd
 
     with opened(_paths(directories)) as paths:
-        require_results(paths)
         results = Results.read(paths)
     counts = ("expected", "done", "missing", "failed", "stale")
     rows = [{**cell.names, **{name: getattr(cell, name) for name in counts}} for cell in results.cells]

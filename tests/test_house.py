@@ -34,12 +34,12 @@ BUDGETS = {
     "solvers": 1197,
     "baselines": 1957,
     "trials": 2010,
-    "runs": 2105,
+    "runs": 2049,
     "statistics": 3989,
     "real": 2368,
-    "plugins": 1120,
-    "report": 4175,
-    "cli": 2495,
+    "plugins": 1118,
+    "report": 4174,
+    "cli": 2494,
 }
 """Lines of Python that a room may hold: who raises one lowers another in the same commit."""
 PLACE = {room: place for place, rooms in enumerate(LINE) for room in rooms}

@@ -71,8 +71,9 @@ def _state(progress: Progress) -> str:
         state += f", {len(progress.failures)} failed"
     if progress.preparing:
         return f"{state}, compiling, once"
-    if progress.rate:
-        state += f", {progress.rate:.0f} estimates/s" if progress.rate >= 10 else f", {progress.rate:.2g} estimates/s"
-    if progress.seconds_left is not None and progress.done < progress.tasks:
-        state += f", {timedelta(seconds=round(progress.seconds_left))} left"
+    seconds = progress.seconds
+    if rate := progress.trials / seconds if seconds else 0.0:
+        state += f", {rate:.0f} estimates/s" if rate >= 10 else f", {rate:.2g} estimates/s"
+    if 0 < progress.done < progress.tasks:
+        state += f", {timedelta(seconds=round(seconds * (progress.tasks / progress.done - 1)))} left"
     return state

@@ -14,7 +14,7 @@ from ipe_bench.report.style import PAGE, Which
 from ipe_bench.report.table import Table, texts, words
 from ipe_bench.runs.bundles import BUNDLES, SUFFIX, is_bundle, opened, read_bundle, write_bundle
 from ipe_bench.runs.parts import TRUTH
-from ipe_bench.runs.results import CellState, Results, require_results
+from ipe_bench.runs.results import CellState, Results
 
 _REPORT = {"output": str, "figures": str, "formats": str}
 _PAPER = {"output": str, "paper": NAMES, "columns": NAMES, "width": float}
@@ -92,7 +92,6 @@ def status_command(arguments: Sequence[str], verbose: bool = False) -> int:
     if not arguments:
         raise UserError("status: name at least one directory of results, such as outputs/paper")
     with opened(arguments) as folders:
-        require_results(folders)
         found = [Results.read([folder]) for folder in folders]
     for folder, results in zip(folders, found, strict=True):
         # A bundle's folders are called as they were, not as where they are unpacked.
@@ -133,7 +132,6 @@ def report_command(arguments: Sequence[str]) -> int:
     if output is None and len(named) > 1 and not for_paper:
         raise UserError("report: several directories need output=DIR, as the report on all is not that of the first")
     with opened(named, None if output is None else output / BUNDLES) as folders:
-        require_results(folders)
         if for_paper:
             return _paper(folders, keys)
         return show_report(folders, output or folders[0], keys.get("figures", "main"), keys.get("formats", PAGE))

@@ -93,11 +93,9 @@ def instantiate(cls: type, options: Mapping[str, Any], where: str) -> Any:
         return cls(**options)
     except UserError as error:
         raise UserError(f"{prefix}{error}") from None
-    except KeyboardInterrupt:
-        raise
     except ValueError as error:  # how classes that know nothing of ours refuse an option
         raise UserError(f"{where}: {' '.join(str(error).split())}") from error
-    except BaseException as error:
+    except (Exception, SystemExit) as error:
         if cls.__module__.startswith("ipe_bench."):
             raise
         raise UserError(f"{where}: {cls.__name__} cannot be made: {place_of(error)}") from None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import resources
 from typing import TYPE_CHECKING, Any
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from ipe_bench.report.figures import Drawn
     from ipe_bench.report.sections import Written
     from ipe_bench.statistics.analysis import Analysis
-    from ipe_bench.statistics.collect import Run
 
 MOST_RUNS = 20
 MOST_COMMANDS = 3
@@ -55,7 +54,7 @@ def render_page(
             headline=headline(analysis),
             collection=collection,
             title=", ".join(d.resolve().name or str(d) for d in collection.directories),
-            computed=_minute(collection.runs[-1].started) if collection.runs else "",
+            computed=_minute(collection.runs[-1]["started"]) if collection.runs else "",
             commands=list(commands)[:MOST_COMMANDS],
             tables=[table for table in tables if not table.appendix],
             written=written,
@@ -73,18 +72,18 @@ def render_page(
     )
 
 
-def _runs(runs: Sequence[Run]) -> list[dict[str, Any]]:
+def _runs(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """What was computed, by command, the last first: all that its jobs have in common, and the configuration of each;
     a run that found everything stored computed nothing."""
-    commands: dict[tuple[str, str], list[Run]] = {}
-    for run in (run for run in runs if run.record.get("blocks", 1)):
-        command = run.record.get("command", _UNKNOWN)
-        commands.setdefault((_PYTHON, run.path.name) if command is None else (str(command), ""), []).append(run)
+    commands: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for run in (run for run in runs if run.get("blocks", 1)):
+        command = run.get("command", _UNKNOWN)
+        commands.setdefault((_PYTHON, run["file"]) if command is None else (str(command), ""), []).append(run)
     found = []
-    for (command, _), own in reversed(commands.items()):
-        records, last = [run.record for run in own], own[-1].record
+    for (command, _), records in reversed(commands.items()):
+        last = records[-1]
         facts = {
-            "runs": ", ".join(run.path.stem for run in own),
+            "runs": ", ".join(record["file"] for record in records),
             "trials": ", ".join(dict.fromkeys(str(record.get("trials")) for record in records)),
             "cells": sum(len(record.get("cells", ())) for record in records),
             "git commit": last.get("git_commit") or "unknown",
@@ -95,7 +94,7 @@ def _runs(runs: Sequence[Run]) -> list[dict[str, Any]]:
         scenarios = [scenario for record in records for scenario in record.get("scenarios", ())]
         config = {"scenarios": scenarios, "estimators": last.get("estimators", {})}
         text = json.dumps(config, indent=1, ensure_ascii=False)
-        found.append({"command": command, "started": _minute(own[0].started), "facts": facts, "config": text})
+        found.append({"command": command, "started": _minute(records[0]["started"]), "facts": facts, "config": text})
     return found
 
 

@@ -20,7 +20,7 @@ from typing import Any
 from ipe_bench import __version__
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.files import write_atomically
-from ipe_bench.runs.results import Results, require_results
+from ipe_bench.runs.results import Results
 from ipe_bench.runs.store import Store
 
 SCHEMA = 3
@@ -59,9 +59,9 @@ def write_bundle(directories: Sequence[Path | str], path: Path, further: Mapping
         UserError: a directory holds no results, two have one name, nothing is whole, or the archive is there and
             holds something else.
     """
-    require_results(directories)
     contents: dict[str, bytes] = {}
     for directory in map(Path, directories):
+        _require_results(directory)
         name = directory.resolve().name
         if any(known.startswith(f"{name}/") for known in contents):
             raise UserError(f"{directory}: another folder has the name {name} too; bundle them apart, or rename one")
@@ -128,10 +128,10 @@ def read_bundle(path: Path) -> Bundle:
 
 @contextlib.contextmanager
 def opened(paths: Sequence[Path | str], into: Path | None = None) -> Iterator[list[Path]]:
-    """The paths, with the folders of every bundle among them in its place: below `into`, or for as long as this lasts.
+    """Folders of results, with those of every bundle in its place: below `into`, or for as long as this lasts.
 
     Raises:
-        UserError: one is a file and not a whole bundle.
+        UserError: one is a file and not a whole bundle, or a folder that no run ever wrote to.
     """
     with contextlib.ExitStack() as stack:
         found: list[Path] = []
@@ -145,7 +145,15 @@ def opened(paths: Sequence[Path | str], into: Path | None = None) -> Iterator[li
             with zipfile.ZipFile(path) as archive:
                 archive.extractall(place, bundle.files)
             found += [place / folder for folder in bundle.folders]
+        for folder in found:
+            _require_results(folder)
         yield found
+
+
+def _require_results(folder: Path) -> None:
+    store = Store(folder)
+    if not (store.runs.is_dir() or store.trials.is_dir()):
+        raise UserError(f"{folder}: holds no results of ipe-bench; give the output folder of a run")
 
 
 def _digest(content: bytes) -> str:

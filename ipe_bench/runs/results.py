@@ -121,23 +121,6 @@ class CellState:
             yield f"missing: {who}: {self.done} of {self.expected} expected trials are there{why}"
 
 
-@dataclass(frozen=True)
-class Run:
-    """One record of runs/: what was going to be computed, or was refused."""
-
-    path: Path
-    record: Mapping[str, Any]
-
-    @property
-    def started(self) -> str:
-        return str(self.record["started"])
-
-    @property
-    def refused(self) -> str:
-        """Why it was, or empty."""
-        return str(self.record.get("refused", ""))
-
-
 class _Asked(NamedTuple):
     """What the newest run that asked for a cell said of it."""
 
@@ -152,7 +135,8 @@ class Results:
     """Everything stored under some directories; `Results.read` finds it."""
 
     directories: tuple[Path, ...]
-    runs: tuple[Run, ...] = ()
+    runs: tuple[Mapping[str, Any], ...] = ()
+    """The records of what was going to be computed, or was `refused`, by ascending start."""
     stored: dict[str, StoredCell] = field(default_factory=dict)
     """The usable cells by key, stale ones included."""
     attempts: list[Mapping[str, Any]] = field(default_factory=list)
@@ -176,7 +160,7 @@ class Results:
             if not path.is_dir():
                 raise UserError(f"{path}: there is no such directory; give one that a run wrote to")
             results._read_directory(Store(path), keys)
-        results.runs = tuple(sorted(results.runs, key=lambda run: (run.started, run.path.name)))
+        results.runs = tuple(sorted(results.runs, key=lambda run: (run["started"], run["file"])))
         return results
 
     def _read_directory(self, store: Store, keys: Keys[str] | None) -> None:
@@ -193,17 +177,17 @@ class Results:
                     footer, _ = part.read()
                     known = self.stored[part.key].parts if part.key in self.stored else ()
                     self.stored[part.key] = StoredCell(footer, tuple(sorted([*known, part], key=lambda p: p.order)))
-        self.runs += tuple(Run(path, record) for path, record in self._records(store.runs))
-        self.attempts += [record for _, record in self._records(store.failed)]
+        self.runs += tuple(self._records(store.runs))
+        self.attempts += self._records(store.failed)
         if keys is None and not listed and not self.runs:
             self.extra_problems.append(f"{store.directory}: holds no results of ipe-bench")
         if self.outdated and not self.stored and keys is None:
             self.extra_problems.append(f"{store.directory}: was written by an older version of ipe-bench; {_AGAIN}")
 
-    def _records(self, folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
+    def _records(self, folder: Path) -> Iterator[dict[str, Any]]:
         for path in sorted(folder.glob("[!.]*.json")):
             with self._naming(path):
-                yield path, read_record(path)
+                yield read_record(path)
 
     @contextlib.contextmanager
     def _naming(self, path: Path) -> Iterator[None]:
@@ -219,7 +203,7 @@ class Results:
     def problems(self) -> list[str]:
         """A line for everything that is missing, failed, refused or damaged."""
         lines = [f"{path}: {reason}; left out" for path, reason in self.damaged.items()]
-        lines += [f"refused: {run.record.get('job', run.path.stem)}: {run.refused}" for run in self.runs if run.refused]
+        lines += [f"refused: {run.get('job', run['file'])}: {why}" for run in self.runs if (why := run.get("refused"))]
         lines += [line for cell in self.cells for line in cell.problems if not cell.refused]
         truths = {cell.scenario_id for cell in self.current if cell.label == TRUTH}
         lines += [
@@ -247,7 +231,7 @@ class Results:
     @property
     def expected(self) -> int:
         """Cells that the records of runs announce, and refused jobs that came to none."""
-        return len(self._asked_for) + sum(not run.record["cells"] for run in self.runs if run.refused)
+        return len(self._asked_for) + sum(not run["cells"] for run in self.runs if run.get("refused"))
 
     @property
     def complete(self) -> int:
@@ -264,8 +248,8 @@ class Results:
         """What runs asked for, by identity: the newest decides on the key, the largest number of trials counts."""
         asked: dict[str, _Asked] = {}
         for run in self.runs:
-            for cell in run.record["cells"]:
-                new = _Asked(cell["key"], int(run.record["trials"]), cell["names"], run.refused)
+            for cell in run["cells"]:
+                new = _Asked(cell["key"], run["trials"], cell["names"], run.get("refused", ""))
                 known = asked.get(cell["identity_key"], new)
                 trials = max(new.trials, known.trials) if known.key == new.key else new.trials
                 asked[cell["identity_key"]] = new._replace(trials=trials)
@@ -292,20 +276,16 @@ class Results:
         return [cell for cell, _ in self._rivals.values() if cell is not None]
 
     @cached_property
-    def failures(self) -> list[Mapping[str, Any]]:
-        """Records of what could not be computed and has not been computed since."""
-        return [f for f in self.attempts if gaps(self._covered(f["key"]), f["start"], f["stop"])]
-
-    @cached_property
     def cells(self) -> tuple[CellState, ...]:
         """How far every cell is: those that runs asked for in their order, then others that are there."""
         found = {identity: cell for identity, (cell, _) in self._rivals.items() if cell is not None}
         asked = {identity: _Asked(cell.key, 0, cell.names, "") for identity, cell in found.items()}
         asked, states = self._asked_for | {i: of for i, of in asked.items() if i not in self._asked_for}, []
         for identity, (key, trials, names, refused) in asked.items():
-            lost = [failure for failure in self.failures if failure["key"] == key]
-            tried = [*self._covered(key), *((failure["start"], failure["stop"]) for failure in lost)]
-            missing, lacking = _count(gaps(tried, 0, trials)), _count(self.missing(key, trials))
+            covered, tried = self._covered(key), [f for f in self.attempts if f["key"] == key]
+            lost = [f for f in tried if gaps(covered, f["start"], f["stop"])]
+            missing = _count(gaps([*covered, *((f["start"], f["stop"]) for f in lost)], 0, trials))
+            lacking = _count(gaps(covered, 0, trials))
             done = trials - lacking if trials else found[identity].trials
             stale = sum(cell.trials for cell in self._rivals.get(identity, (None, []))[1])
             messages = tuple(dict.fromkeys(f"{f['status']}: {f['message']}" for f in lost))
@@ -342,19 +322,18 @@ class Results:
         if sum(map(len, tables)) < cell.trials and self.damaged.keys().isdisjoint(p.path for p in cell.parts):
             self.extra_problems.append(f"missing: {describe_names(cell.names)}: trials went away while they were read")
         if not tables:
-            return {name: np.empty(0) for name in ("trial", *(columns or ()), *optional)}
+            return {name: np.empty(0) for name in names or ("trial",)}
         table = pa.concat_tables(tables, promote_options="default")
         return {name: as_array(table[name]) for name in names or table.column_names if name in table.column_names}
 
     def load_history(self, cell: StoredCell) -> dict[str, Array] | None:
         """The iterates of a cell's first trials, by column; None if none are stored."""
+        return self._of_parts(cell, self._first_history)
 
-        def first(parts: Sequence[Part]) -> dict[str, Array] | None:
-            for part in parts[:1]:
-                with self._naming(part.path):
-                    return part.history() if part.start == 0 else None
-
-        return self._of_parts(cell, first)
+    def _first_history(self, parts: Sequence[Part]) -> dict[str, Array] | None:
+        for part in (part for part in parts[:1] if part.start == 0):
+            with self._naming(part.path):
+                return part.history()
 
     def _of_parts(self, cell: StoredCell, read: Callable[[Sequence[Part]], T]) -> T:
         """What `read` makes of the parts of a cell; of those that are there now, if some were merged meanwhile."""
@@ -377,18 +356,6 @@ class Results:
                         raise Unusable(f"damaged: has no column {lacking[0]}")
                     yield table.slice(max(0, reached - part.start))
                     reached = part.stop
-
-
-def require_results(directories: Iterable[Path | str]) -> None:
-    """Refuses directories that no run ever wrote to.
-
-    Raises:
-        UserError: naming the first of them.
-    """
-    for directory in directories:
-        store = Store(directory)
-        if not (store.runs.is_dir() or store.trials.is_dir()):
-            raise UserError(f"{directory}: holds no results of ipe-bench; give the output folder of a run")
 
 
 def _count(ranges: Iterable[tuple[int, int]]) -> int:

@@ -10,7 +10,6 @@ import contextlib
 import functools
 import itertools
 import logging
-import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -93,17 +92,8 @@ class Progress:
         return self._began is None and bool(self._left)
 
     @property
-    def rate(self) -> float:
-        """Estimates per second since the first estimator began."""
-        return self.trials / seconds if (seconds := self._seconds) else 0.0
-
-    @property
-    def seconds_left(self) -> float | None:
-        """Forecast from what the tasks that have ended took; None before one has."""
-        return self._seconds * (self.tasks - self.done) / self.done if self.done else None
-
-    @property
-    def _seconds(self) -> float:
+    def seconds(self) -> float:
+        """Since the first estimator began."""
         return 0.0 if self._began is None else time.monotonic() - self._began
 
 
@@ -134,18 +124,17 @@ def run_task(task: Task) -> Iterator[str | tuple[int, Failure | None]]:
     import a library or to compile a model, it does before its time is taken.
     """
     store, cells = Store(task.directory), _recalled(task)
-    _check_source(cells)
+    if any(fingerprint(cell.components) != cell.made_by for cell in cells):
+        raise RuntimeError(
+            "the numerical source of ipe-bench or of a plugin is not what it was where the run began: "
+            "install the same versions on all machines, or start the run again"
+        )
     with _alone():
         block = block_of(cells[0].scenario, task.start, task.stop)
         block.share()  # which is not to be charged to the first of the cells
     for index, cell in enumerate(cells):
-        try:
-            with _alone():
-                _prepare(block, cell)
-        except KeyboardInterrupt:
-            raise
-        except BaseException:  # what it raises now, it raises again where that is its own failure
-            log.debug("%s: raised while it was prepared", describe_names(cell.names), exc_info=True)
+        with contextlib.suppress(Exception, SystemExit), _alone():  # what it raises now, it raises again below
+            _prepare(block, cell)
         yield PREPARED
         failure = None
         try:
@@ -153,9 +142,7 @@ def run_task(task: Task) -> Iterator[str | tuple[int, Failure | None]]:
                 _compute_cell(store, block, cell)
         except FATAL:
             raise
-        except BaseException as error:  # an estimator may raise anything, sys.exit() and KeyboardInterrupt too
-            if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-                raise  # a user's Ctrl-C; where it is ignored, in worker processes, there can be none
+        except (Exception, SystemExit) as error:
             failure = Failure.of(error)
         yield index, failure
 
@@ -217,15 +204,6 @@ def _compute_cell(store: Store, block: Any, cell: ResultKey) -> None:
     if not store.trials.is_dir():  # what it held is missing, and would not be missed
         raise StorageError(f"{store.directory}: went away while it was being filled; the same command starts anew")
     store.write(cell, start, stop, columns, history)
-
-
-def _check_source(cells: Sequence[ResultKey]) -> None:
-    """Refuses to compute under a key that stands for other source than is installed here."""
-    if any(fingerprint(cell.components) != cell.made_by for cell in cells):
-        raise RuntimeError(
-            "the numerical source of ipe-bench or of a plugin is not what it was where the run began: "
-            "install the same versions on all machines, or start the run again"
-        )
 
 
 def run_tasks(tasks: Sequence[Task], execution: Execution, store: Store, watch: Watcher) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from ipe_bench.runs.parts import TRUTH
 from ipe_bench.runs.provenance import TARGET, canonical_json, digest
-from ipe_bench.runs.results import Results, Run, StoredCell
+from ipe_bench.runs.results import Results, StoredCell
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -125,7 +125,7 @@ def differing(descriptions: Sequence[Mapping[str, Any]]) -> list[str]:
     return [key for key, holders in by_key.items() if any(len(values) > 1 for values in holders.values())]
 
 
-def _groups(cells: Sequence[StoredCell], runs: Sequence[Run]) -> tuple[Group, ...]:
+def _groups(cells: Sequence[StoredCell], runs: Sequence[Mapping[str, Any]]) -> tuple[Group, ...]:
     """One group per scenario and estimator: what was constructed decides which those are, and names only show it."""
     truths = {cell.scenario_id: cell for cell in cells if cell.label == TRUTH}
     found: dict[tuple[str, str, str], list[StoredCell]] = {}
@@ -140,7 +140,7 @@ def _groups(cells: Sequence[StoredCell], runs: Sequence[Run]) -> tuple[Group, ..
     extra = [k for k in differing([scenario_of(cell) for cell in firsts]) if k != "error_scale"]
     extra = [k for k in extra if not _stands_in_a_name(k, firsts)]
     options = {label: differing(list(several.values())) for label, several in configs.items()}
-    labels = dict.fromkeys(str(cell["names"].get("estimator")) for run in runs for cell in run.record["cells"])
+    labels = dict.fromkeys(str(cell["names"].get("estimator")) for run in runs for cell in run["cells"])
     order = {label: i for i, label in enumerate(labels)}
     groups = []
     for members in found.values():

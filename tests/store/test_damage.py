@@ -98,11 +98,6 @@ def other_text(path: Path, rng: random.Random) -> None:
     path.write_text(rng.choice(texts), encoding="utf-8")
 
 
-def pipe(path: Path, rng: random.Random) -> None:
-    path.unlink()
-    os.mkfifo(path)
-
-
 def directory(path: Path, rng: random.Random) -> None:
     path.unlink()
     path.mkdir()
@@ -110,7 +105,7 @@ def directory(path: Path, rng: random.Random) -> None:
 
 
 Harm = Callable[[Path, random.Random], None]
-HARMS: tuple[Harm, ...] = (truncate, swap, zeros, other_text, pipe, directory)
+HARMS: tuple[Harm, ...] = (truncate, swap, zeros, other_text, directory)
 SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.campaign) for seed in range(1, 8))]
 
 
