@@ -28,6 +28,7 @@ from ipe_bench.real.profiles import (
     profiles,
     wald_interval,
 )
+from ipe_bench.real.residuals import tested
 
 BOOTSTRAPS = 500
 STARTS = 64
@@ -175,20 +176,20 @@ class Examination:
         """Standard errors (m,) of a further reading, with its noise; NaN if that is not known."""
         known = self.problem.R.deviations
         # If all readings are as good, so is one that is missing.
-        same = np.ptp(known) == 0
+        same = np.ptp(known) <= 1e-12 * known[0]
         return np.hypot(self.fitted_errors, known[0] if same else at_rows(self.rows, known, self.whole.R.m))
 
     @cached_property
     def shift(self) -> Array:
         """The move (m,) without a reading of the parameter that moves most, in standard errors, by the linear model
         about the estimate (Cook and Weisberg, Residuals and Influence in Regression, 1982); NaN if it is missing."""
-        n, m = self._J.shape[1], self.whole.R.m
-        P, Q = self.P[:n, :n], np.linalg.qr(self._J)[0]
-        leverage = np.sum(Q**2, axis=1)
+        n, R = self._J.shape[1], self.problem.R
+        P, w = self.P[:n, :n], R.whiten(self.z - self._present)
+        statistic, variance = tested(w, np.linalg.qr(self._J)[0], R)
+        slopes = self._J if R.factor.ndim == 1 else R.whiten(np.eye(len(w))) @ self._J
         with np.errstate(all="ignore"):
-            left = np.where(leverage < 1 - 1e-9, 1 - leverage, np.nan)
-            moved = P @ self._J.T * (self.problem.R.whiten(self.z - self._present) / left)
-        return at_rows(self.rows, np.abs(moved / np.sqrt(np.diag(P))[:, None]).max(axis=0), m)
+            moved = P @ slopes.T * (statistic / variance)
+            return at_rows(self.rows, np.abs(moved / np.sqrt(np.diag(P))[:, None]).max(axis=0), self.whole.R.m)
 
     @cached_property
     def bootstrap(self) -> Bootstrap:

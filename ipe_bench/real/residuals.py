@@ -32,22 +32,29 @@ def explained(J: Array, R: Covariance) -> Array:
     return U[:, s > np.finfo(float).eps * max(J.shape) * s.max(initial=0.0)]
 
 
-def normalised(w: Array, Q: Array, R: Covariance) -> Array:
-    """Residuals (m,) in their own standard deviations: N(0, 1) each if the model and R are right.
+def tested(w: Array, Q: Array, R: Covariance) -> tuple[Array, Array]:
+    """The statistics (m,) of Baarda's w-test and their variances (m,), of which the first over the second is the
+    estimated error of a reading that is taken for an outlier (A testing procedure for use in geodetic networks,
+    Netherlands Geodetic Commission, 1968).
 
-    w = R^-1/2 r (m,) are the whitened residuals, Q (m, rank) is the basis of `explained`. For independent readings this
-    is r_i / (sigma_i sqrt(1 - leverage_i)); in general Baarda's w-test, (R^-1 r)_i over its deviation (A testing
-    procedure for use in geodetic networks, Netherlands Geodetic Commission, 1968). NaN where the parameters absorb a
-    reading's error completely, so that nothing can be said of it.
+    w = R^-1/2 r (m,) are the whitened residuals, Q (m, rank) is the basis of `explained`. The statistics are (R^-1 r)_i
+    of correlated readings, and w_i of independent ones. Variances are NaN where the parameters absorb a reading's error
+    completely, so that nothing can be said of it.
     """
     if R.factor.ndim == 1:
-        numerator, before, taken = w, np.ones(len(w)), np.sum(Q**2, axis=1)
+        statistic, before, taken = w, np.ones(len(w)), np.sum(Q**2, axis=1)
     else:
         A = R.whiten(np.eye(len(w)))  # R^-T/2
-        numerator, before, taken = A @ w, np.sum(A**2, axis=1), np.sum((A @ Q) ** 2, axis=1)
+        statistic, before, taken = A @ w, np.sum(A**2, axis=1), np.sum((A @ Q) ** 2, axis=1)
     left = before - taken
-    with np.errstate(all="ignore"):
-        return np.where(left > 1e-9 * before, numerator / np.sqrt(left), np.nan)
+    return statistic, np.where(left > 1e-9 * before, left, np.nan)
+
+
+def normalised(w: Array, Q: Array, R: Covariance) -> Array:
+    """Residuals (m,) in their own standard deviations, as `tested`: N(0, 1) each if the model and R are right, such as
+    r_i / (sigma_i sqrt(1 - leverage_i)) of independent readings."""
+    statistic, variance = tested(w, Q, R)
+    return statistic / np.sqrt(variance)
 
 
 def outlier_limit(m: int, level: float = OUTLIER_LEVEL) -> float:

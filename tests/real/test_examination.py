@@ -9,7 +9,7 @@ from ipe_bench.baselines import LevenbergMarquardt, LinearLSE
 from ipe_bench.measurements import Formula, Mgh, Polynomial, Sir
 from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.noise import Gaussian, Unknown
+from ipe_bench.noise import Correlated, Gaussian, Unknown
 from ipe_bench.real.examination import examine
 from ipe_bench.real.fits import fit, scaled
 from ipe_bench.real.profiles import CONFIDENCE, half_width, profiles, wald_interval
@@ -107,16 +107,18 @@ def test_profile_intervals_cover_the_truth_as_often_as_they_say(unknown):
     assert short.min() < 0.93
 
 
-def test_the_reading_that_carries_the_answer_is_named():
+@pytest.mark.parametrize("noise", [Gaussian(0.5), Correlated(0.5, correlation=0.6)])
+def test_the_reading_that_carries_the_answer_is_named(noise):
     """Without it the estimate moves by as much as leaving it out and fitting again moves it (a linear model)."""
     t = np.array([0.0, 1.0, 2.0, 3.0, 20.0])
     model = Formula("a+b*t", {"a": 1.0, "b": 1.0}, {"t": tuple(t)})
     z = 1 + t + np.array([0.3, -0.2, 0.1, -0.3, 2.0])
-    found = examined(model, z, Gaussian(0.5))
+    found, X, R = examined(model, z, noise), np.column_stack([np.ones(5), t]), noise.covariance(5).matrix()
     assert np.argmax(found.shift) == 4
     for i in range(5):
         rest = np.delete(np.arange(5), i)
-        without = np.polyfit(t[rest], z[rest], 1)[::-1]
+        weights = np.linalg.inv(R[np.ix_(rest, rest)])
+        without = np.linalg.solve(X[rest].T @ weights @ X[rest], X[rest].T @ weights @ z[rest])
         moved = np.abs((without - found.x) / found.standard_errors).max()
         assert found.shift[i] == pytest.approx(moved, rel=1e-6)
 
