@@ -85,6 +85,11 @@ class Claims:
         values, vectors = np.linalg.eigh(self.correlation)
         return np.einsum("rij,rj,rkj,rk->ri", vectors, values**-0.5, vectors, self.z, optimize=True)
 
+    @property
+    def parts(self) -> list[Array]:
+        """The errors whose law is stated: the whitened ones (rows, n), or those of each parameter (rows, 1)."""
+        return [self.w] if self.joint else np.split(self.z, self.n, axis=1)
+
     def per_run(self, values: Array) -> Array:
         """Means over the rows of each run (runs, k)."""
         _, run = np.unique(self.run, return_inverse=True)
@@ -163,6 +168,11 @@ def audit(claims: Claims) -> Audit:
     if claims.runs < FEWEST_RUNS:
         one = "one log of dependent rows says too little; " if claims.runs == 1 and len(claims.run) > 1 else ""
         raise UserError(f"audit: there are {claims.runs} independent runs; {one}give at least {FEWEST_RUNS}")
+    if any(np.linalg.matrix_rank(part) < part.shape[1] for part in claims.parts):
+        raise UserError(
+            f"audit: the errors of {', '.join(claims.names)} are 0 in every run, or follow from one another; leave out"
+            " the parameters that are known or are made of others"
+        )
     nees = np.sum(claims.w**2, axis=1)
     each = _factors(claims, claims.z**2, 1 - ALPHA / 2 / claims.n)
     for name, factor in zip(claims.names, each, strict=True):
@@ -256,7 +266,7 @@ def _extremes(w: Array) -> Array:
 def _tails(claims: Claims) -> tuple[float, str]:
     """How often normal errors of any covariance have as large a fourth moment E[d^2] with d = w' S^-1 w and S the
     scatter of w (Mardia, Biometrika 57, 1970, for a known mean); without covariances, any parameter's."""
-    parts = [claims.w] if claims.joint else np.split(claims.z, claims.n, axis=1)
+    parts = claims.parts
     rows, n = parts[0].shape
     usual = n * (n + 2)
     largest = max(map(_fourth_moment, parts))
@@ -309,10 +319,10 @@ def read_claims(table: Path | str | pd.DataFrame) -> Claims:
     there = np.isfinite(error).all(axis=1) & np.isfinite(deviation).all(axis=1)
     if len(bad := np.argwhere(there[:, None] & ~(deviation > 0))):
         raise UserError(f"{name}: row {bad[0, 0] + 2}: the deviation of {names[bad[0, 1]]} is not above 0")
-    rows = np.flatnonzero(there)
+    rows, correlation = np.flatnonzero(there), _correlation(frame, names, deviation, name)
     frame, error, deviation = frame.iloc[rows], error[rows], deviation[rows]
-    correlation = _correlation(frame, names, deviation)
     if correlation is not None:
+        correlation = correlation[rows]
         good = np.array(np.isfinite(correlation).all(axis=(1, 2)))
         good[good] = np.linalg.eigvalsh(correlation[good])[:, 0] > 1e-12
         if not good.all():
@@ -332,6 +342,21 @@ def _read(path: Path) -> pd.DataFrame:
         raise UserError(f"{path}: cannot be read as a table ({str(error).splitlines()[0]})") from None
 
 
+def _numbers(frame: pd.DataFrame, column: str, name: str) -> Array:
+    """The numbers (rows,) of a column; NaN where a cell is empty.
+
+    Raises:
+        UserError: a cell says something else.
+    """
+    import pandas as pd
+
+    values = pd.to_numeric(frame[column], errors="coerce").to_numpy(float)
+    if len(bad := np.flatnonzero(np.isnan(values) & frame[column].notna().to_numpy())):
+        said = f"'{frame[column].iloc[bad[0]]}' is not a number; write it with a decimal point, or leave the cell empty"
+        raise UserError(f"{name}: row {bad[0] + 2}, column {column}: {said}")
+    return values
+
+
 def _widened(frame: pd.DataFrame, name: str) -> pd.DataFrame:
     """A row per run of a table that has one per run and parameter."""
     values = [c for c in ("true", "estimate", "error", "std", "var") if c in frame]
@@ -341,6 +366,7 @@ def _widened(frame: pd.DataFrame, name: str) -> pd.DataFrame:
     if (twice := frame.duplicated([*index, "parameter"]).to_numpy()).any():
         row = int(np.argmax(twice)) + 2
         raise UserError(f"{name}: row {row}: a parameter stands there a second time in {', '.join(index)}")
+    frame = frame.assign(**{c: _numbers(frame, c, name) for c in values})
     wide = frame.pivot_table(index=index, columns="parameter", values=values, sort=False)
     wide.columns = [p if value == "estimate" else f"{p}_{value}" for value, p in wide.columns]
     return wide.reset_index()
@@ -348,28 +374,32 @@ def _widened(frame: pd.DataFrame, name: str) -> pd.DataFrame:
 
 def _error_and_deviation(frame: pd.DataFrame, parameter: str, name: str) -> tuple[Array, Array]:
     if f"{parameter}_error" in frame:
-        error = frame[f"{parameter}_error"]
+        error = _numbers(frame, f"{parameter}_error", name)
     elif parameter in frame:
-        error = frame[parameter] - frame[f"{parameter}_true"]
+        error = _numbers(frame, parameter, name) - _numbers(frame, f"{parameter}_true", name)
     else:
         raise UserError(f"{name}: has {parameter}_true, but no column {parameter} with the estimates")
     if f"{parameter}_std" in frame:
-        return error.to_numpy(float), frame[f"{parameter}_std"].to_numpy(float)
+        return error, _numbers(frame, f"{parameter}_std", name)
     for variance in (f"{parameter}_var", f"cov_{parameter}_{parameter}"):
         if variance in frame:
-            return error.to_numpy(float), np.sqrt(np.maximum(frame[variance].to_numpy(float), 0.0))
+            return error, np.sqrt(np.maximum(_numbers(frame, variance, name), 0.0))
     raise UserError(
         f"{name}: does not say how sure {parameter} is; give {parameter}_std, {parameter}_var or "
         f"cov_{parameter}_{parameter}"
     )
 
 
-def _correlation(frame: pd.DataFrame, names: Sequence[str], deviation: Array) -> Array | None:
+def _correlation(frame: pd.DataFrame, names: Sequence[str], deviation: Array, name: str) -> Array | None:
     """(rows, n, n), 0 where a pair has no covariance; None if there is no covariance at all."""
     found = np.tile(np.eye(len(names)), (len(frame), 1, 1))
-    pairs = [(i, j) for i in range(len(names)) for j in range(len(names)) if i != j]
-    stated = [(i, j) for i, j in pairs if f"cov_{names[i]}_{names[j]}" in frame]
+    stated = [(i, j) for i, a in enumerate(names) for j, b in enumerate(names) if i != j and f"cov_{a}_{b}" in frame]
     for i, j in stated:
-        covariance = frame[f"cov_{names[i]}_{names[j]}"].to_numpy(float)
-        found[:, i, j] = found[:, j, i] = covariance / (deviation[:, i] * deviation[:, j])
+        with np.errstate(all="ignore"):
+            value = _numbers(frame, f"cov_{names[i]}_{names[j]}", name) / (deviation[:, i] * deviation[:, j])
+        # The other half of the matrix may have stated it already.
+        if (i, j)[::-1] in stated and j < i and len(bad := np.flatnonzero(np.abs(found[:, i, j] - value) > 1e-6)):
+            row, columns = bad[0] + 2, f"cov_{names[j]}_{names[i]} and cov_{names[i]}_{names[j]}"
+            raise UserError(f"{name}: row {row}: {columns} differ; a covariance is symmetric, so give one of them")
+        found[:, i, j] = found[:, j, i] = value
     return found if stated else None
