@@ -24,11 +24,11 @@ from ipe_bench.measurements.counted import cost
 from ipe_bench.measurements.problem import Problem
 from ipe_bench.noise import Gaussian, ModelNoise
 from ipe_bench.noise.base import Noise
-from ipe_bench.plugins.construct import construct
+from ipe_bench.plugins.construct import construct, find_class
 from ipe_bench.plugins.discovery import COMPONENT_GROUPS, Option, blame, composed
 from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.runs.execution import Execution, Serial
-from ipe_bench.runs.provenance import describe
+from ipe_bench.runs.provenance import TARGET, describe
 from ipe_bench.states import Formulas
 from ipe_bench.states.base import StateModel, require_sound
 from ipe_bench.states.trackers import Tracker
@@ -96,7 +96,7 @@ def check_option(option: Option) -> Iterator[Finding]:
         return
     try:
         config = composed(option)
-        if required := [name for name, value in config.items() if value == "???"]:
+        if required := _required(config, option.package or option.group):
             yield Finding(name, f"Names what is to be given, {', '.join(required)}, and is tried where it is")
             return
         yield from check_component(name, construct(config, option.package or option.group))
@@ -107,6 +107,17 @@ def check_option(option: Option) -> Iterator[Finding]:
         if complaint is None:
             raise
         yield Finding(name, "Can be used", complaint)
+
+
+def _required(config: dict[str, Any], where: str) -> list[str]:
+    """The options without a value for which the class has no default."""
+    if "???" not in config.values():
+        return []
+    return [
+        f.name
+        for f in fields(find_class(config[TARGET], where))
+        if config.get(f.name) == "???" and f.default is f.default_factory
+    ]
 
 
 def describes_itself(component: Any) -> None:
