@@ -80,7 +80,7 @@ class EsMda(Estimator):
             if len(going):
                 h = read_members(objective.model, objective.R, objective.x0 + s[going] * d, objective.rows[going])
                 noise = normals([generators[i] for i in going], *h.shape[1:]) / np.sqrt(weight)
-                lost = ~np.isfinite(h).all(axis=2)
+                lost: Mask = ~np.asarray(np.isfinite(h).all(axis=2))
                 s[going] = assimilated(s[going], h, z[going, None] + noise, 1.0 / weight)
                 for k in np.flatnonzero(np.any(lost, axis=1) & ~np.all(lost, axis=1)):
                     i, j = going[k], lost[k]
@@ -107,7 +107,7 @@ def assimilated(s: Array, h: Array, z: Array, inflation: float) -> Array:
     The system is as large as the readings or the ensemble, whichever is smaller, since with anomalies S and D
     S' D (D' D + c I)^-1 = S' (D D' + c I)^-1 D, c = (members - 1) alpha.
     """
-    usable = np.isfinite(h).all(axis=2)
+    usable: Mask = np.asarray(np.isfinite(h).all(axis=2))
     count = np.maximum(usable.sum(axis=1), 2)[:, None, None]
     S, D = (_anomalies(a, usable) for a in (s, h))
     c = (count - 1) * inflation

@@ -34,8 +34,8 @@ from ipe_bench.runs.execution import Failure
 from ipe_bench.runs.parts import SCHEMA, TRUTH, Part
 from ipe_bench.runs.provenance import describe, digest, fingerprint
 from ipe_bench.states.trackers import Tracker
-from ipe_bench.trials.bounds import linear_correlation
 from ipe_bench.trials.scenario import AnyScenario, Tracking
+from ipe_bench.trials.theory import linear_correlation
 
 _ABANDONED_S = 3600.0
 """Age in s from which a temporary file counts as abandoned."""

@@ -139,8 +139,7 @@ class Stages(Attempts):
         if k in _HALVING:
             return self._halved(k, rows)
         assert before is not None
-        x = self._on_a_ray(k, rows) if k < _RANDOM else self._at_random(k, rows)
-        found = self.minimize(rows, _FROM_AFAR, x, max(_SHORT, self.limits.max_iterations))
+        found = self.minimize(rows, _FROM_AFAR, self._start(k, rows), max(_SHORT, self.limits.max_iterations))
         promising = ~found.converged & (found.chi_square < before.chi_square * (1 - _PROMISING))
         if promising.any():
             first = take(found, promising)
@@ -148,10 +147,14 @@ class Stages(Attempts):
             found = put(found, promising, continued(first, on))
         return found
 
-    def _on_a_ray(self, k: int, rows: Rows) -> Array:
-        """The best of the points on the ray, and in attempt 3 the best that is not about the same."""
+    def _start(self, k: int, rows: Rows) -> Array:
+        """The best of the points on the ray, in attempt 3 the best that is not about the same, and later the best of 20
+        random points."""
         x0 = self.problem.x0
-        points = np.multiply.outer(_RAYS, x0 if x0.any() else np.ones(len(x0)))
+        if k >= _RANDOM:
+            points = self._points(k if k < min(_HALVING) else k - 1)
+        else:
+            points = np.multiply.outer(_RAYS, x0 if x0.any() else np.ones(len(x0)))
         cost = self._look(rows, points)
         chosen = np.argmin(cost, axis=1)
         if k == 3:
@@ -159,11 +162,6 @@ class Stages(Attempts):
             alike = (np.sign(best) == np.sign(_RAYS)) & (np.abs(np.log10(np.abs(_RAYS / best))) < _APART)
             chosen = np.argmin(np.where(alike, np.inf, cost), axis=1)
         return points[chosen]
-
-    def _at_random(self, k: int, rows: Rows) -> Array:
-        """The best of 20 random points."""
-        points = self._points(k if k < min(_HALVING) else k - 1)
-        return points[np.argmin(self._look(rows, points), axis=1)]
 
     def _points(self, k: int, *, wide: bool = False) -> Array:
         """20 random points (20, n): of the prior if one is known, else of any size in the quadrant of the nominal point
@@ -185,9 +183,7 @@ class Stages(Attempts):
         found = Minima.nowhere(x, False)
         for steps, kept in _HALVINGS:
             found = self.minimize(owner, _FROM_AFAR, found.x, steps)
-            order = np.lexsort((_finite(found.chi_square), owner))
-            rank = np.arange(len(owner)) - np.searchsorted(owner[order], owner[order])
-            chosen = np.sort(order[rank < kept])
+            chosen = _kept(owner, found.x, _finite(found.chi_square), np.full(len(owner), np.inf), most=kept)
             found, owner = take(found, chosen), owner[chosen]
         return found
 
@@ -281,7 +277,12 @@ class Windows(Attempts):
         if prior is None and before is not None:
             distance = np.abs(before.x - problem.x0)
             spread = np.maximum(1.0, np.where(np.isfinite(distance), distance, 1.0))
-        start, owner = self._starts(k, rows, spread), np.repeat(rows, _draws(k))
+        # The nominal point in the first two attempts, then draws about it.
+        draws, n = np.zeros((1, len(metric))), len(metric)
+        if k > 1:
+            draws = np.random.Generator(np.random.Philox(k)).standard_normal((_draws(k), n))
+        start = (problem.x0 + np.broadcast_to(spread, (len(rows), n))[:, None] * draws).reshape(-1, n)
+        owner = np.repeat(rows, _draws(k))
         found = Minima.nowhere(start, self.limits.history)
         method = LevenbergMarquardtMethod(_DAMPING, metric, by_residual=k > 0, geodesic=k > 0)
         known = np.zeros(len(self.z))
@@ -296,23 +297,21 @@ class Windows(Attempts):
             fit = minima.chi_square
             if prior is not None:
                 fit = fit + np.sum(((minima.x - centre) / prior) ** 2, axis=1)
-            per_reading = _finite(fit) / objective.readings
-            useless = np.maximum(known[owner], _GIVEN_UP[min(number, len(_GIVEN_UP) - 1)])
-            most = max(1, _draws(k) // _THINNING[min(number, len(_THINNING) - 1)])
-            alike = _ONE[min(number, 1)]
-            kept = _kept(owner, minima.x / metric, per_reading, useless, most=most, alike=alike, last=last)
+            fit = _finite(fit) / objective.readings
+            useless = np.maximum(known[owner], _GIVEN_UP[min(number, 2)])
+            most = max(1, _draws(k) // _THINNING[min(number, 6)])
+            kept = _kept(owner, minima.x / metric, fit, useless, most=most, alike=_ONE[min(number, 1)], last=last)
             found, start, owner = take(continued(found, minima), kept), start[kept], owner[kept]
         method = LevenbergMarquardtMethod(_DAMPING, metric)
         found = continued(found, self.minimize(owner, method, found.x, self.limits.max_iterations))
         return self._best(rows, owner, found)
 
-    def _starts(self, k: int, rows: Rows, spread: Array) -> Array:
-        """The nominal point in the first two attempts, then draws about it, for each of the trials `rows`."""
-        x0, n = self.problem.x0, self.problem.measurement.n
-        draws = np.zeros((1, n))
-        if k > 1:
-            draws = np.random.Generator(np.random.Philox(k)).standard_normal((_draws(k), n))
-        return (x0 + np.broadcast_to(spread, (len(rows), n))[:, None] * draws).reshape(-1, n)
+    def _best(self, rows: Rows, owner: Rows, found: Minima) -> Minima:
+        """Of each trial's candidates the best; a trial that has none left has not arrived."""
+        result = Minima.nowhere(np.repeat(self.problem.x0[None], len(rows), axis=0), self.limits.history)
+        order = np.lexsort((_finite(found.chi_square), ~found.converged, owner))
+        owners, first = np.unique(owner[order], return_index=True)
+        return put(result, np.searchsorted(rows, owners), take(found, order[first]))
 
     def _window(self, owner: Rows, stop: int, centre: Array) -> Objective:
         """The objective of each candidate on the first epochs, with the prior about `centre`."""
@@ -324,27 +323,20 @@ class Windows(Attempts):
         prior = None if self.prior is None else Covariance(self.prior)
         return Objective(window, R, z, np.arange(len(owner)), centre, prior).coarsened(0.0)
 
-    def _best(self, rows: Rows, owner: Rows, found: Minima) -> Minima:
-        """Of each trial's candidates the best; a trial that has none left has not arrived."""
-        result = Minima.nowhere(np.repeat(self.problem.x0[None], len(rows), axis=0), self.limits.history)
-        order = np.lexsort((_finite(found.chi_square), ~found.converged, owner))
-        owners, first = np.unique(owner[order], return_index=True)
-        return put(result, np.searchsorted(rows, owners), take(found, order[first]))
-
 
 def _kept(
-    owner: Rows, x: Array, per_reading: Array, useless: Array, *, most: int, alike: float, last: bool
-) -> NDArray[np.intp]:
-    """The candidates that go on after a window: of each trial the best few that are not alike and whose mean squared
-    residual is not above `useless` (candidates,); one in any case in the `last` attempt, and where there is no fit at
-    all: that ends with its own status."""
+    owner: Rows, x: Array, fit: Array, useless: Array, *, most: int, alike: float = -1.0, last: bool = False
+) -> Rows:
+    """The candidates that go on: of each trial the best few that are not alike and whose `fit` (candidates,) is not
+    above `useless` (candidates,); one in any case in the `last` attempt, and where there is no fit at all: that ends
+    with its own status."""
     if len(np.unique(owner)) == len(owner):  # nothing to choose among
-        return np.flatnonzero((per_reading <= useless) | last | np.isinf(per_reading))
+        return np.flatnonzero((fit <= useless) | last | np.isinf(fit))
     kept: list[int] = []
-    for _, group in itertools.groupby(np.lexsort((per_reading, owner)).tolist(), key=lambda i: owner[i]):
+    for _, group in itertools.groupby(np.lexsort((fit, owner)).tolist(), key=lambda i: owner[i]):
         chosen: list[int] = []
         for i in group:
-            good = per_reading[i] <= useless[i] or (not chosen and (last or np.isinf(per_reading[i])))
+            good = fit[i] <= useless[i] or (not chosen and (last or np.isinf(fit[i])))
             if len(chosen) < most and good and not any(np.abs(x[i] - x[j]).max() <= alike for j in chosen):
                 chosen.append(i)
         kept += chosen

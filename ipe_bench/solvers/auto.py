@@ -78,14 +78,11 @@ class Auto(Estimator):
             tally.jacobians[left] += spent.jacobians
             tally.messages.update({int(left[i]): message for i, message in spent.messages.items()})
         fits[left] = fitting.note(take(best, left), left)
-        count = self.confirmations
-        if count is None:
-            dear = problem.measurement.by_differential_equations or problem.prior_deviation is None
-            count = 0 if dear else _CONFIRMATIONS
+        dear = problem.measurement.by_differential_equations or problem.prior_deviation is None
+        count = (0 if dear else _CONFIRMATIONS) if self.confirmations is None else self.confirmations
         looked = fits & ~(answered & contracts) & (count > 0)
         if looked.any():
-            rows = np.flatnonzero(looked)
-            model = CountingModel(problem.measurement, tally)
+            rows, model = np.flatnonzero(looked), CountingModel(problem.measurement, tally)
             whole = Objective(model, problem.R, z[rows], rows, problem.x0)
             best = self._confirmed(problem, whole, best, fitting, count, history)
         estimates = fitting.report(best.estimates(tally, m))
@@ -113,9 +110,8 @@ def _improbability(problem: Problem, minima: Minima) -> Array:
     """Minus twice the logarithm (trials,) of the posterior density, or of the likelihood without a prior, but for a
     constant."""
     prior = problem.prior_covariance()
-    if prior is None:
-        return minima.chi_square
-    return minima.chi_square + np.sum(prior.whiten(minima.x - problem.x0) ** 2, axis=1)
+    of_prior = 0.0 if prior is None else np.sum(prior.whiten(minima.x - problem.x0) ** 2, axis=1)
+    return minima.chi_square + of_prior
 
 
 # Chords
@@ -206,7 +202,6 @@ class Chord(Solver[OnChord]):
         r = objective.residual(x)
         slope = state.slope.towards(r)
         seen = np.where(state.slope.size > self.bent, slope.size / state.slope.size, 0.0)
-        bend = np.where(np.isnan(state.bend), seen, state.bend)
         return replace(
             state,
             x=x,
@@ -215,7 +210,7 @@ class Chord(Solver[OnChord]):
             dx=push(state.dx, x - state.x),
             dF=push(state.dF, -slope.newton - F),
             moved=np.abs((x - state.x) * slope.columns).max(axis=1),
-            bend=bend,
+            bend=np.where(np.isnan(state.bend), seen, state.bend),
             begun=np.where(np.isnan(state.begun), slope.size, state.begun),
             steps=state.steps + 1,
         )

@@ -6,9 +6,8 @@ take, one after another, the readings that gain most. What readings say about ea
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -44,10 +43,6 @@ class Units:
     """Which units today's set-up has (units,)."""
     slopes: Array
     """(truths, units, r, n): whitened, in units of today's bounds; r rows say what all readings of the unit say."""
-
-    @cached_property
-    def sizes(self) -> Array:
-        return np.array([float(len(rows)) for rows in self.rows])
 
     def information(self, taken: Mask) -> Array:
         """(truths, n, n) of the units that are taken (units,)."""
@@ -129,10 +124,9 @@ def design(
         )
     model, R, x = scenario.measurement, scenario.problem.R, scenario.truths(0, truths)
     today = Observability.at(model, R, x)
+    found = [one for error in errors for one in suspects(model, R, error, x[:SUSPECTED])]
     worst: dict[str, Suspect] = {}
-    for one in sorted(
-        (s for error in errors for s in suspects(model, R, error, x[:SUSPECTED])), key=lambda s: -s.bounds
-    ):
+    for one in sorted(found, key=lambda s: -s.bounds):
         worst.setdefault(one.name, one)
     candidates = model.candidates
     columns = _columns(model, by)
@@ -160,7 +154,7 @@ def design(
     judge = _Judge(criterion, np.matmul(slopes.swapaxes(1, 2), slopes))
     if np.isfinite(value := judge.value(np.matmul(own.swapaxes(1, 2), own))):
         judge = replace(judge, today=value)
-    tried = [_way(judge, _units(model, candidates, chosen, slopes), model.m, most) for chosen in columns]
+    tried = (_way(judge, _units(model, candidates, chosen, slopes), model.m, most) for chosen in columns)
     ways = tuple(way for way in tried if way is not None)
     if readings is not None and not ways:
         titles = " or ".join("by " + " and ".join(chosen) for chosen in columns)
@@ -187,16 +181,15 @@ def _columns(model: Measurement, by: Sequence[str] | None) -> list[tuple[str, ..
 
 def _entries(model: Measurement, columns: Sequence[str]) -> list[tuple[Any, ...]]:
     """What each reading (m,) has in these columns."""
-    return list(zip(*(model.index[c] for c in columns), strict=True))
+    return list(zip(*(model.index[c] for c in columns), strict=True)) if columns else [()] * model.m
 
 
 def _units(model: Measurement, candidates: Measurement, by: tuple[str, ...], slopes: Array) -> Units:
     """The units of the candidates; in all other columns they have what today's readings have."""
     others = [c for c in model.index if c not in by]
-    as_today = set(_entries(model, others)) if others else {()}
-    rest = _entries(candidates, others) if others else [()] * candidates.m
+    as_today = set(_entries(model, others))
     groups: dict[tuple[Any, ...], list[int]] = {}
-    for row, (entry, other) in enumerate(zip(_entries(candidates, by), rest, strict=True)):
+    for row, (entry, other) in enumerate(zip(_entries(candidates, by), _entries(candidates, others), strict=True)):
         if other in as_today:
             groups.setdefault(entry, []).append(row)
     had, rows = set(_entries(model, by)), tuple(np.array(one, dtype=np.intp) for one in groups.values())
@@ -245,7 +238,7 @@ def _way(judge: _Judge, units: Units, today: int, most: int) -> Way | None:
     choose."""
     if len(units.rows) < _FEW:
         return None
-    sizes, taken, found = units.sizes, np.zeros(len(units.rows), dtype=bool), []
+    sizes, taken, found = np.array([*map(len, units.rows)]), np.zeros(len(units.rows), dtype=bool), []
     while (free := ~taken & (sizes <= max(today, most) - sizes[taken].sum())).any():
         gains = judge.gains(units.information(taken), units.slopes) / sizes
         taken[int(np.argmax(np.where(free, gains, -np.inf)))] = True
@@ -269,6 +262,6 @@ def _choice(judge: _Judge, units: Units, taken: Mask) -> Choice:
 
 def levels_of(model: Measurement, column: str, entry: Any) -> str:
     """An entry of the index with what it stands for, if the model has words for it."""
-    words: Mapping[Any, str] = model.levels.get(column, {})
+    words = model.levels.get(column, {})
     shown = f"{entry:g}" if isinstance(entry, float) else str(entry)
     return f"{shown} ({words[entry]})" if entry in words else shown

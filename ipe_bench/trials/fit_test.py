@@ -50,23 +50,19 @@ class Spread:
 
 def spread_of(estimator: Estimator, problem: Problem, J: Array) -> Spread:
     """How the residuals scatter that an estimator leaves, with dh/dx = J (trials, m, n) near its estimates."""
-    m, n = J.shape[1:]
+    trials, m, n = J.shape
     prior = problem.prior_covariance()
     with np.errstate(all="ignore"):
         if "prior" in estimator.needs and prior is not None:
             return prior_spread(information(J, problem.R), m, prior.factor, inflation_of(estimator))
         if estimator.equation == "frozen" and np.isfinite(problem.H).all():
             return frozen_spread(J, problem.H, problem.R)
-    return least_squares_spread(m, n, len(J))
+    return Spread(m - n, np.empty((trials, 0)))
 
 
 def inflation_of(estimator: Estimator) -> float:
     """The factor by which an estimator widens the prior: one that does solves an equation of its own."""
     return float(getattr(estimator, "prior_inflation", 1.0)) if "prior" in estimator.needs else 1.0
-
-
-def least_squares_spread(m: int, n: int, trials: int) -> Spread:
-    return Spread(m - n, np.empty((trials, 0)))
 
 
 def frozen_spread(J: Array, H: Array, R: Covariance) -> Spread:

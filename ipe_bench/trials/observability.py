@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ipe_bench.basics.linalg import Array, Covariance, multiply
+from ipe_bench.basics.linalg import Array, Covariance, deviations, multiply
 from ipe_bench.measurements.base import Measurement, Parameter
 from ipe_bench.trials.thresholds import FIT_LEVEL
 
@@ -47,8 +47,13 @@ class Observability:
     @cached_property
     def observable(self) -> bool:
         """Whether the readings determine every parameter at every truth, to working precision."""
-        s, n = self.singular_values, len(self.parameters)
-        return s.shape[1] == n and bool((s[:, -1] > np.finfo(float).eps * 1e3 * s[:, 0]).all())
+        return self.singular_values.shape[1] == len(self.parameters) and not self._lost.any()
+
+    @property
+    def _lost(self) -> NDArray[np.bool_]:
+        """Directions (truths, n) that the readings do not determine."""
+        s = self.singular_values
+        return ~(s > np.finfo(float).eps * 1e3 * s[:, :1])
 
     @cached_property
     def covariance(self) -> Array:
@@ -60,22 +65,14 @@ class Observability:
     @cached_property
     def bound(self) -> Array:
         """Root mean square over the truths (n,) of each parameter's bound; infinite where readings leave it open."""
-        P = self.covariance.mean(axis=0)
-        return np.where(self._open, np.inf, np.sqrt(np.diag(P)))
-
-    @property
-    def _open(self) -> NDArray[np.bool_]:
-        """Parameters (n,) with a part in a direction that the readings do not determine at some truth."""
-        s = self.singular_values
-        lost = s <= np.finfo(float).eps * 1e3 * s[:, :1]
-        return np.asarray((np.abs(self.right) > 1e-6)[lost].any(axis=0))
+        partly_lost = (np.abs(self.right) > 1e-6)[self._lost].any(axis=0)
+        return np.where(partly_lost, np.inf, deviations(self.covariance.mean(axis=0)))
 
     @cached_property
     def correlation(self) -> Array:
         """Of the errors of efficient estimates (n, n), over the truths."""
         P = self.covariance.mean(axis=0)
-        d = np.sqrt(np.diag(P))
-        return P / np.outer(d, d)
+        return P / np.outer(deviations(P), deviations(P))
 
     @cached_property
     def multiple_correlation(self) -> Array:
@@ -88,7 +85,8 @@ class Observability:
     @cached_property
     def least_observable(self) -> Array:
         """The unit vector (n,) along which an efficient estimate scatters most: the first axis of the mean bound."""
-        return _signed(np.linalg.eigh(self.covariance.mean(axis=0))[1][:, -1])
+        axis = np.linalg.eigh(self.covariance.mean(axis=0))[1][:, -1]
+        return axis * np.sign(axis[np.argmax(np.abs(axis))])
 
     @property
     def words(self) -> str:
@@ -108,10 +106,6 @@ def in_words(names: Sequence[str], direction: Array) -> str:
         size = f"{abs(coefficients[i]):.2f}"
         text += f" {'+' if coefficients[i] > 0 else '-'} {'' if size == '1.00' else size + ' '}{names[i]}"
     return text
-
-
-def _signed(v: Array) -> Array:
-    return v * np.sign(v[np.argmax(np.abs(v))])
 
 
 @dataclass(frozen=True)
@@ -161,22 +155,14 @@ def suspects(model: Measurement, R: Covariance, truth: Measurement, x: Array) ->
         moved, kept, whole = shift[:, :, columns], left[:, :, columns], G[:, :, columns]
         rms = np.sqrt(np.mean(np.sum(moved**2, axis=2), axis=0))
         relative = np.sqrt(np.mean(np.sum((moved / bound[:, :, None]) ** 2, axis=2), axis=0))
-        worst = int(np.argmax(relative))
-        single = len(columns) == 1
-        sign = np.sign(moved[:, :, 0].mean(axis=0)) if single else 1.0
-        found.append(
-            Suspect(
-                name=name,
-                unit=unit,
-                deviation=deviation,
-                shift=rms * sign,
-                bounds=float(relative[worst]),
-                parameter=names[worst],
-                visible=float(np.sum(kept**2) / np.sum(whole**2)) if np.any(whole) else 0.0,
-                noticed=_noticed(kept, model.m - model.n),
-                words=in_words([name, *names], np.concatenate([[1.0], -rms * sign])) if single else "",
-            )
-        )
+        worst, words = int(np.argmax(relative)), ""
+        if len(columns) == 1:
+            rms = rms * np.sign(moved[:, :, 0].mean(axis=0))
+            words = in_words([name, *names], np.concatenate([[1.0], -rms]))
+        visible = float(np.sum(kept**2) / np.sum(whole**2)) if np.any(whole) else 0.0
+        noticed = _noticed(kept, model.m - model.n)
+        bounds = float(relative[worst])
+        found.append(Suspect(name, unit, deviation, rms, bounds, names[worst], visible, noticed, words))
     return tuple(sorted(found, key=lambda suspect: -suspect.bounds))
 
 

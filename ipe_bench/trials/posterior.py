@@ -8,6 +8,7 @@ The likelihood is the one that estimators assume: normal errors of covariance R,
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -120,10 +121,9 @@ def reference(
         raise UserError(f"prior={scenario.prior.name}: is not normal, as the posterior here takes it to be")
     drawn = scenario.draw(trial, trial + 1)
     sampled = sample_posterior(scenario.problem, drawn.z[0], particles=particles, seed=trial)
-    estimates = {label: estimate_safely(e, scenario.problem, drawn.z, history=False) for label, e in estimators.items()}
-    return Reference(
-        trial, drawn.x[0], sampled, estimates, {label: divergence(sampled, e) for label, e in estimates.items()}
-    )
+    estimates = {label: estimate_safely(e, scenario.problem, drawn.z) for label, e in estimators.items()}
+    divergences = {label: divergence(sampled, e) for label, e in estimates.items()}
+    return Reference(trial, drawn.x[0], sampled, estimates, divergences)
 
 
 def require_particles(problem: Problem, particles: int) -> None:
@@ -151,14 +151,9 @@ def sample_posterior(problem: Problem, z: Array, *, particles: int = PARTICLES, 
     x = np.concatenate(spaced)
     means, widths = np.stack([p.mean(axis=0) for p in parts]), np.stack([p.std(axis=0) for p in parts])
     moved = np.ptp(means, axis=0) / widths.max(axis=0)
+    apart = float(max(moved.max(), 0.5 * np.ptp(np.log(widths), axis=0).max()))
     one, other = (np.atleast_2d(np.cov(p.T)) for p in parts)
-    return Posterior(
-        x,
-        *_modes(problem, z, x),
-        apart=float(max(moved.max(), 0.5 * np.ptp(np.log(widths), axis=0).max())),
-        noise=_kl(means[1] - means[0], other, one),
-        evidence=evidence,
-    )
+    return Posterior(x, *_modes(problem, z, x), apart, _kl(means[1] - means[0], other, one), evidence)
 
 
 def _kl(d: Array, S: Array, P: Array) -> float:
@@ -176,12 +171,11 @@ def _modes(problem: Problem, z: Array, x: Array) -> tuple[Array, Array]:
     if not len(ends):
         return np.empty((0, x.shape[1])), np.empty(0)
     width = deviations(inverse(_tempered(problem, ends, 1.0))[0])
-    counts: dict[int, int] = {}
+    counts: Counter[int] = Counter()
     for i, end in enumerate(ends):
-        mode = next((k for k in counts if (np.abs(end - ends[k]) / width[k]).max() < _SAME_MODE), i)
-        counts[mode] = counts.get(mode, 0) + 1
-    order = sorted(counts, key=lambda k: -counts[k])
-    return ends[order], np.array([counts[k] for k in order]) / len(ends)
+        counts[next((k for k in counts if (np.abs(end - ends[k]) / width[k]).max() < _SAME_MODE), i)] += 1
+    order, numbers = zip(*counts.most_common(), strict=True)
+    return ends[list(order)], np.array(numbers) / len(ends)
 
 
 def _tempered(problem: Problem, x: Array, beta: float) -> Array:
@@ -219,11 +213,9 @@ class _Population:
         for _ in range(_MOST_STAGES):
             self._stage()
             if self.beta == 1:
-                break
-        else:
-            raise UserError(f"particles={count}: do not reach the posterior in {_MOST_STAGES} stages; give more")
-        self.x = self._final()
-        return self
+                self.x = self._final()
+                return self
+        raise UserError(f"particles={count}: do not reach the posterior in {_MOST_STAGES} stages; give more")
 
     def _log_likelihood(self, x: Array) -> Array:
         """The logarithm of the likelihood of each, less its constant."""
@@ -299,9 +291,9 @@ class _Population:
         shapes = self._shapes()
         for _ in range(_SETTLE):
             self._move(shapes)
-        kept = []
+        kept, reach = [], self.reach
         for _ in range(_SNAPSHOTS):
-            shapes, reach = self._shapes(), self.reach
+            shapes = self._shapes()
             for _ in range(_BETWEEN):
                 self._move(shapes)
                 self.reach = reach
@@ -309,22 +301,21 @@ class _Population:
         return np.concatenate(kept)
 
 
-def divergence(posterior: Posterior, estimates: Estimates, seed: int = 0) -> Divergence:
+def divergence(posterior: Posterior, estimates: Estimates) -> Divergence:
     """How far the Gaussian of the first trial of `estimates` is from the posterior."""
-    x, n = estimates.x[0], posterior.x.shape[1]
-    scale = posterior.deviation
-    S = posterior.covariance / np.outer(scale, scale)
-    d = (x - posterior.mean) / scale
-    shift = float(np.sqrt(d @ np.linalg.solve(S, d) / n)) if np.isfinite(d).all() else float("inf")
-    P = None if estimates.covariance is None else estimates.covariance[0] / np.outer(scale, scale)
-    nothing = Divergence(float("inf"), shift, float("nan"), float("nan"))
-    if P is None or not np.isfinite(P).all() or not np.isfinite(d).all():
+    scale, n = posterior.deviation, posterior.x.shape[1]
+    d, S = (estimates.x[0] - posterior.mean) / scale, posterior.covariance / np.outer(scale, scale)
+    shift = float(np.sqrt(d @ np.linalg.solve(S, d) / n)) if np.isfinite(d).all() else np.inf
+    nothing = Divergence(np.inf, shift, np.nan, np.nan)
+    P = np.full((n, n), np.nan) if estimates.covariance is None else estimates.covariance[0] / np.outer(scale, scale)
+    if not (np.isfinite(P).all() and np.isfinite(d).all()):
         return nothing
     values, axes = np.linalg.eigh(P)
     if values[0] <= 0:
         return nothing
     log_ratio = float(np.sum(np.log(values)) - np.linalg.slogdet(S)[1])
-    draws = d + (np.random.Generator(np.random.Philox(seed)).standard_normal((_COMPARED, n)) * np.sqrt(values)) @ axes.T
+    white = np.random.Generator(np.random.Philox(0)).standard_normal((_COMPARED, n))
+    draws = d + (white * np.sqrt(values)) @ axes.T
     theirs = (posterior.x - posterior.mean) / scale
     theirs = theirs[np.linspace(0, len(theirs) - 1, _COMPARED).round().astype(int)]
     return Divergence(_kl(d, S, P), shift, float(np.exp(0.5 * log_ratio / n)), _energy(draws, theirs, S))

@@ -18,7 +18,7 @@ from ipe_bench.priors import GaussianPrior, Prior
 from ipe_bench.states.base import Paths, StateModel, require_sound
 from ipe_bench.states.bounds import bound_at_truth
 from ipe_bench.states.formulas import Recorded
-from ipe_bench.trials.bounds import linear_bound
+from ipe_bench.trials.theory import linear_bound
 
 TRIALS = 1000
 """Number of trials if neither a number nor a precision is given."""
@@ -110,8 +110,10 @@ class Scenario:
 
         One seed gives the same draws, in units of the error scale, at every error scale.
         """
-        if self.noise.real:
-            return _recorded_trial(self.measurement, start, stop)
+        if (recorded := self.measurement.recorded) is not None and self.noise.real:
+            if (start, stop) != (0, 1):
+                raise UserError("noise=certified: has one trial; set trials=1")
+            return Trials(0, recorded.x[None], recorded.z[None])
         drawn, offset = self._drawn(start, stop), self.simulator.offset
         h = self.simulator.simulate(read_only(drawn))
         kept = read_only(h.copy()) if self.truth is None else None  # a noise may write into what it is given
@@ -142,13 +144,6 @@ def check_seed(seed: int) -> None:
         raise UserError(f"seed={seed}: give a whole number from 0 to {_SEEDS - 1}")
 
 
-def _recorded_trial(measurement: Measurement, start: int, stop: int) -> Trials:
-    if (start, stop) != (0, 1):
-        raise UserError("noise=certified: has one trial; set trials=1")
-    assert measurement.recorded is not None
-    return Trials(0, measurement.recorded.x[None], measurement.recorded.z[None])
-
-
 @dataclass(frozen=True)
 class Tracking:
     """Everything that determines the trials of a state model. Paths and readings are drawn by the model's own prior, Q
@@ -174,21 +169,17 @@ class Tracking:
         """The model, as the other scenario calls it."""
         return self.model
 
-    @property
+    @cached_property
     def linear_bound(self) -> Array:
         """Standard deviations (n,) of the states at the last epoch in a filter that is linearised along the path
         without process noise from the mean of the prior."""
-        return deviations(self._nominal)
-
-    @cached_property
-    def _nominal(self) -> Array:
         model = self.model
         start = x = model.prior.mean[None]
         path = np.empty((1, model.epochs, model.n))
         for k in range(model.epochs):
             x = path[:, k] = model.transition(x, k) if model.moves(k) else x
         with np.errstate(all="ignore"):
-            return bound_at_truth(model, Paths(start, path, np.empty(0)))[0, -1]
+            return deviations(bound_at_truth(model, Paths(start, path, np.empty(0)))[0, -1])
 
     def draw(self, start: int, stop: int) -> Paths:
         """Paths of trials start to stop."""

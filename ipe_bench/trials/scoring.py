@@ -14,7 +14,6 @@ import numpy as np
 from ipe_bench.basics.linalg import (
     Array,
     Covariance,
-    Mask,
     definite_factor,
     deviations,
     finite,
@@ -28,14 +27,15 @@ from ipe_bench.basics.statuses import Status
 from ipe_bench.estimators.base import Equation, Estimates, Estimator, estimate_safely
 from ipe_bench.measurements.counted import CountingModel
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.trials.bounds import bound_deviations, informative_rows
 from ipe_bench.trials.fit_test import Spread, fit_probability, inflation_of, spread_of
 from ipe_bench.trials.roots import frozen_root, least_squares_root
 from ipe_bench.trials.scenario import Scenario, Trials
 from ipe_bench.trials.theory import (
+    bound_deviations,
     box_bias,
     contraction,
     curvature,
+    informative_rows,
     misspecified,
     relative_curvatures,
     second_derivatives,
@@ -80,18 +80,15 @@ class Block:
         """h (trials, m) at the truth, of the model that estimators are told; NaN where it fails."""
         return self.readings_at(self.trials.x) if self.trials.h is None else self.trials.h
 
-    def _rows(self, J: Array, h: Array) -> Array:
-        """R^-1/2 J (trials, m, n), or what else makes the information in readings h (trials, m) of slopes J."""
-        with np.errstate(all="ignore"):
-            return informative_rows(self.scenario.noise, self.problem.R, J, h)
-
     @cached_property
     def _white(self) -> Array:
-        return self._rows(self.jacobian, self.readings)
+        """R^-1/2 J (trials, m, n) at the truth; see `informative_rows`."""
+        with np.errstate(all="ignore"):
+            return informative_rows(self.scenario.noise, self.problem.R, self.jacobian, self.readings)
 
     @cached_property
     def crlb_information(self) -> Array:
-        """J' R^-1 J at the truth (trials, n, n), the inverse of the Cramér-Rao bound; see `informative_rows`."""
+        """J' R^-1 J at the truth (trials, n, n), the inverse of the Cramér-Rao bound."""
         return _squared(self._white)
 
     @cached_property
@@ -110,10 +107,8 @@ class Block:
     def bayes_deviation(self) -> Array:
         """Standard deviations (trials, n) of the Bayesian bound at the truth."""
         prior = self.problem.prior_covariance()
-        if prior is None:
-            return self.crlb_deviation
         with np.errstate(all="ignore"):
-            return bound_deviations(self.bayes_information, _below(self._white, prior))
+            return bound_deviations(self.bayes_information, _below(self._white, prior) if prior else self._white)
 
     def truth_columns(self) -> Columns:
         """The truth and its bounds, in multiples of the parameters' units, what the noise alone makes of the linear
@@ -147,7 +142,8 @@ class Block:
         if self.trials.start == 0 and len(bound) and prior is not None and not self.scenario.noise.real:
             x = self.scenario.truths(0, EXPECTED)
             with np.errstate(all="ignore"):
-                rows = self._rows(self.problem.measurement.jacobian(x), self.readings_at(x))
+                J = self.problem.measurement.jacobian(x)
+                rows = informative_rows(self.scenario.noise, self.problem.R, J, self.readings_at(x))
                 each = _squared(rows)
                 mean = each.mean(axis=0)
                 expected = (mean + prior.inverse())[None]
@@ -236,46 +232,35 @@ class Block:
 
     def _fit_probability(self, estimator: Estimator, x: Array) -> Array:
         """The test of fit at x (trials, n); see `fit_test`."""
-        problem = self.problem
+        problem, key = self.problem, (estimator.equation, "prior" in estimator.needs, inflation_of(estimator))
+        if key not in self._spreads:
+            self._spreads[key] = spread_of(estimator, problem, self.jacobian)
         r = problem.R.whiten(self.trials.z - self.readings_at(x))
         with np.errstate(all="ignore"):
             squares = np.sum(r**2, axis=1)
-        return fit_probability(squares, self._spread(estimator), self.scenario.noise, problem.H, problem.R)
-
-    def _spread(self, estimator: Estimator) -> Spread:
-        """How the residuals that an estimator leaves scatter, with the slopes at the truth."""
-        key = (estimator.equation, "prior" in estimator.needs, inflation_of(estimator))
-        if key not in self._spreads:
-            self._spreads[key] = spread_of(estimator, self.problem, self.jacobian)
-        return self._spreads[key]
+        return fit_probability(squares, self._spreads[key], self.scenario.noise, problem.H, problem.R)
 
     def score(self, estimator: Estimator, estimates: Estimates) -> Columns:
         """Each trial's error, cost, status and distances, as columns."""
         model = self.problem.measurement
         names = [p.name for p in model.parameters]
-        error = estimates.x - self.trials.x
+        error, trials = estimates.x - self.trials.x, len(self)
         # An estimate that is not finite has not converged, even if the estimator says so.
-        usable = np.isfinite(error).all(axis=1)
-        status = np.where((estimates.status == Status.CONVERGED) & ~usable, Status.NONFINITE, estimates.status)
-        unread = ~np.isfinite(self.trials.z).all(axis=1)
-        status = np.where(unread, Status.NO_READINGS, status)
-        converged = status == Status.CONVERGED
-        bound = self.bayes_information if "prior" in estimator.needs else self.crlb_information
-        distance = np.maximum(quadratic_form(bound, error), 0.0)  # round-off where J lacks rank
-        solved = converged
-        apart = np.full(len(error), np.nan)
+        lost = (estimates.status == Status.CONVERGED) & ~finite(error)
+        status = np.where(lost, Status.NONFINITE, estimates.status)
+        status = np.where(finite(self.trials.z), status, Status.NO_READINGS)
+        solved, apart = status == Status.CONVERGED, np.full(trials, np.nan)
         if estimator.equation is not None:
             root = self.reference_root(estimator.equation, inflation_of(estimator))
             apart = (np.abs(estimates.x - root) / self.crlb_deviation).max(axis=1)
             solved = solved & (apart <= SAME_ROOT)
-        trials, labels = len(error), {s: Status(s).label for s in np.unique(status).tolist()}
-        P = estimates.covariance
-        squared = np.full(trials, np.nan) if P is None else nees(error, P)
-        deviation = np.full(error.shape, np.nan) if P is None else deviations(P)
+        bound = self.bayes_information if "prior" in estimator.needs else self.crlb_information
+        labels = {s: Status(s).label for s in np.unique(status).tolist()}
+        P = np.full((trials, model.n, model.n), np.nan) if estimates.covariance is None else estimates.covariance
         return {
             "trial": np.arange(self.trials.start, self.trials.stop),
             **by_parameter("error", names, error),
-            **by_parameter("deviation", names, deviation),
+            **by_parameter("deviation", names, deviations(P)),
             "status": np.array([labels[s] for s in status.tolist()], dtype=object),
             "message": np.array([estimates.messages.get(i, "") for i in range(trials)], dtype=object),
             "iterations": estimates.iterations,
@@ -283,11 +268,11 @@ class Block:
             "jacobians": estimates.jacobians,
             "time_s": estimates.seconds,
             "crlb_distance": np.maximum(quadratic_form(self.crlb_information, error), 0.0),
-            "nees": squared,
+            "nees": nees(error, P),
             "fit_p": self._fit_probability(estimator, estimates.x),
             "root_distance": apart,
             "solved": solved,
-            "success": distance <= gate(model.n),
+            "success": np.maximum(quadratic_form(bound, error), 0.0) <= gate(model.n),  # round-off where J lacks rank
             **{f"extra_{name}": values for name, values in estimates.extras.items()},
         }
 
@@ -311,23 +296,20 @@ def nees(error: Array, P: Array) -> Array:
     error (trials, n) and P (trials, n, n). Infinite where P is not a covariance (not positive definite) or the error is
     not finite; NaN where no P is reported.
     """
-    reported = np.isfinite(P).all(axis=(1, 2))
     with np.errstate(all="ignore"):
         # Scaled by the deviations first: parameters' units must not decide what is singular.
-        deviation = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+        deviation = deviations(P)
         e, C = error / deviation, P / (deviation[:, :, None] * deviation[:, None, :])
-    usable: Mask = np.asarray(np.isfinite(e).all(axis=1) & np.isfinite(C).all(axis=(1, 2)))
-    C = np.where(usable[:, None, None], C, np.eye(error.shape[1]))
-    e = np.where(usable[:, None], e, 0.0)
-    _, inverse_U, definite = definite_factor(C)
-    with np.errstate(all="ignore"):
+        usable = finite(e) & finite(C)
+        C, e = np.where(usable[:, None, None], C, np.eye(error.shape[1])), np.where(usable[:, None], e, 0.0)
+        _, inverse_U, definite = definite_factor(C)
         squared = np.sum(multiply(inverse_U.swapaxes(1, 2), e) ** 2, axis=1)
     if not definite.all():
         ill, e = C[~definite], e[~definite]
         x, singular = solve(ill, e)
         covariance = ~singular & (np.linalg.eigvalsh(ill)[:, 0] > 0)
         squared[~definite] = np.where(covariance, np.einsum("ti,ti->t", e, x), np.inf)
-    return np.where(reported, np.where(usable, squared, np.inf), np.nan)
+    return np.where(finite(P), np.where(usable, squared, np.inf), np.nan)
 
 
 def by_parameter(prefix: str, names: list[str], values: Array) -> Columns:

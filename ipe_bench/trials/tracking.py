@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from ipe_bench.basics.batches import take
 from ipe_bench.basics.errors import UserError, describe_exception
 from ipe_bench.basics.linalg import Array, Mask, deviations, finite, read_only
 from ipe_bench.basics.statuses import Status
@@ -25,7 +26,7 @@ from ipe_bench.states.bounds import bound_at_truth, posterior_bounds
 from ipe_bench.states.trackers import Tracker, Tracks
 from ipe_bench.trials.scenario import AnyScenario, Tracking
 from ipe_bench.trials.scoring import Block, Columns, by_parameter, nees
-from ipe_bench.trials.thresholds import EXPECTED, GATE
+from ipe_bench.trials.thresholds import EXPECTED, gate
 from ipe_bench.trials.whiteness import lags_of, ljung_box
 
 _PARTS = 10
@@ -91,8 +92,9 @@ class PathBlock:
             # Without a density of paths there is no such bound.
             with np.errstate(all="ignore"), suppress(UserError, np.linalg.LinAlgError):
                 filtered, smoothed = posterior_bounds(model, drawn)
-                parts = [posterior_bounds(model, _some(drawn, i))[0][-1] for i in range(_PARTS)]
-                posterior[0] = deviations(filtered[-1:])[0]
+                groups = [take(drawn, np.arange(i, EXPECTED, _PARTS)) for i in range(_PARTS)]
+                parts = [posterior_bounds(model, group)[0][-1] for group in groups]
+                posterior[0] = deviations(filtered[-1])
                 error[0] = deviations(np.array(parts)).std(axis=0, ddof=1) / np.sqrt(_PARTS)
                 curves = np.stack([np.diagonal(P, axis1=1, axis2=2) for P in (filtered, smoothed)])
         sums = [self.variances.sum(axis=0), np.full((model.epochs, 1), len(self)), *curves]
@@ -116,14 +118,16 @@ class PathBlock:
             return self._scored(tracks, messages, seconds)
 
     def _scored(self, tracks: Tracks, messages: dict[int, str], seconds: Array) -> tuple[Estimates, Columns]:
+        from scipy.special import chdtrc
+
         trials, K, n = tracks.mean.shape
         e, P = tracks.mean - self.paths.x, tracks.covariance
         known: Mask = np.asarray(np.isfinite(e).all(axis=2) & np.isfinite(P).all(axis=(2, 3)))
+        status = np.where(known.all(axis=1), Status.CONVERGED, Status.NONFINITE).astype(np.int8)
+        status[list(messages)] = Status.ERROR
         for i in np.flatnonzero(~known.all(axis=1)):
             messages.setdefault(int(i), f"the track is not finite from epoch {int(np.argmin(known[i])) + 1} on")
-        status = np.where(known.all(axis=1), Status.CONVERGED, Status.NONFINITE).astype(np.int8)
-        status[[i for i in messages if not messages[i].startswith("the track is not finite")]] = Status.ERROR
-        status[~np.isfinite(self.paths.x).all(axis=(1, 2))] = Status.NO_READINGS
+        status[~finite(self.paths.x)] = Status.NO_READINGS
         converged = status == Status.CONVERGED
         estimates = Estimates(
             x=tracks.mean[:, -1],
@@ -134,17 +138,14 @@ class PathBlock:
             messages=messages,
             seconds=seconds,
         )
-        from scipy.special import chdtrc, chdtri
-
         each = nees(e.reshape(-1, n), P.reshape(-1, n, n)).reshape(trials, K)
         each[~self.definite] = np.nan
         normalised = np.sum(np.where(self.variances > 0, e**2 / self.variances, 0.0), axis=2)
         distance = normalised.mean(axis=1)
-        lost = ~(normalised <= chdtri(n, GATE))
+        lost = ~(normalised <= gate(n))
         read = tracks.degrees.sum(axis=1)
-        sums = [e[converged] ** 2, each[converged, :, None], tracks.nis[converged, :, None]]
-        sums = [part.sum(axis=0) for part in [*sums, tracks.degrees[converged, :, None]]]
-        kept = converged & (distance <= chdtri(n, GATE))
+        by_epoch = [e**2, *(a[:, :, None] for a in (each, tracks.nis, tracks.degrees))]
+        sums = [a[converged].sum(axis=0) for a in by_epoch]
         columns = {
             "trial": np.arange(self.start, self.start + len(self)),
             **by_parameter("error", self.names, e[:, -1]),
@@ -159,7 +160,7 @@ class PathBlock:
             "crlb_distance": distance,
             "nees": each[:, -1],
             "solved": converged,
-            "success": kept,
+            "success": converged & (distance <= gate(n)),
             "path_nees": each.mean(axis=1),
             "extra_nis": np.where(read > 0, tracks.nis.sum(axis=1) / np.maximum(read, 1), np.nan),
             "log_likelihood": np.where(read > 0, tracks.log_likelihood, np.nan),
@@ -200,7 +201,3 @@ def unpacked(texts: Array, epochs: int) -> Array:
     """The sums (blocks, K, columns) that `packed` wrote."""
     found = [np.frombuffer(base64.b64decode(text), "<f8").reshape(epochs, -1) for text in texts if text]
     return np.array(found).reshape(len(found), epochs, -1)
-
-
-def _some(paths: Paths, part: int) -> Paths:
-    return Paths(*(a[part::_PARTS] for a in (paths.start, paths.x, paths.z)))

@@ -10,13 +10,7 @@ from ipe_bench.basics.linalg import Covariance, information
 from ipe_bench.measurements import Formula, Polynomial
 from ipe_bench.noise import Colored, Correlated, Gaussian, NoNoise, Outliers, Quantization, StudentT
 from ipe_bench.solvers import Newton
-from ipe_bench.trials.fit_test import (
-    DRAWS,
-    fit_probability,
-    frozen_spread,
-    least_squares_spread,
-    prior_spread,
-)
+from ipe_bench.trials.fit_test import DRAWS, Spread, fit_probability, frozen_spread, prior_spread
 from ipe_bench.trials.scenario import Scenario
 from ipe_bench.trials.scoring import Block
 
@@ -75,7 +69,7 @@ def test_p_is_uniform_for_the_frozen_root_where_its_projection_is_oblique():
 def test_least_squares_and_normal_noise_is_chi_square():
     H = np.random.default_rng(0).normal(size=(12, 3))
     squares = np.array([0.0, 3.0, 9.0, 40.0, np.inf, np.nan])
-    p = fit_probability(squares, least_squares_spread(12, 3, 6), Gaussian(1.0), H, Covariance(np.ones(12)))
+    p = fit_probability(squares, Spread(9, np.empty((6, 0))), Gaussian(1.0), H, Covariance(np.ones(12)))
     np.testing.assert_allclose(p[:5], chi2.sf(squares[:5], 9), rtol=1e-12)
     assert np.isnan(p[5])
 
@@ -83,7 +77,7 @@ def test_least_squares_and_normal_noise_is_chi_square():
 def test_a_simulated_law_has_a_floor_and_ends_at_nothing():
     H = np.random.default_rng(0).normal(size=(12, 3))
     squares = np.array([0.0, 1e9, np.inf, np.nan])
-    spread = least_squares_spread(12, 3, 4)
+    spread = Spread(9, np.empty((4, 0)))
     p = fit_probability(squares, spread, Quantization(1.0), H, Covariance(np.ones(12)))
     assert p[0] == 1.0
     assert p[1] == 1 / (DRAWS + 1)
@@ -93,7 +87,7 @@ def test_a_simulated_law_has_a_floor_and_ends_at_nothing():
 
 def test_nothing_to_spare_is_nothing_to_test():
     H = np.eye(3)
-    p = fit_probability(np.zeros(2), least_squares_spread(3, 3, 2), Gaussian(1.0), H, Covariance(np.ones(3)))
+    p = fit_probability(np.zeros(2), Spread(0, np.empty((2, 0))), Gaussian(1.0), H, Covariance(np.ones(3)))
     assert np.isnan(p).all()
 
 
