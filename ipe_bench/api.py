@@ -229,9 +229,11 @@ def compare(
         frame.attrs[name] = list(dict.fromkeys(line for c in collections for line in getattr(c, name)))
     frame.attrs["notes"] = left_out(*collections)
     if output is not None:
-        from ipe_bench.report.questions import write_comparison
+        from ipe_bench.report.questions import comparison_parts
+        from ipe_bench.report.writer import write
 
-        write_comparison(frame, Path(output), alpha)
+        parts = comparison_parts(frame, alpha)
+        write(Path(output), "comparison", "Comparison", parts, ("comparison.csv", frame))
     return frame
 
 
@@ -256,9 +258,10 @@ def audit(table: Path | str | pd.DataFrame, *, output: Path | str | None = None)
 
     found = examined(read_claims(table))
     if output is not None:
-        from ipe_bench.report.questions import write_audit
+        from ipe_bench.report.questions import audit_parts
+        from ipe_bench.report.writer import write
 
-        write_audit(found, Path(output))
+        write(Path(output), "audit", "Audit", audit_parts(found), ("audit.csv", found.table()))
     return found
 
 
@@ -388,8 +391,7 @@ def _tracked(
     ignored: Sequence[str],
     find: str | Sequence[str],
 ) -> TrackAnswer:
-    from ipe_bench.real.likelihood import found_and_tracked
-    from ipe_bench.real.tracks import Log, Tracked
+    from ipe_bench.real.tracks import Log, Tracked, found_and_tracked
     from ipe_bench.report.tracked import TrackAnswer
     from ipe_bench.states.trackers import ckf, ekf, ukf
 

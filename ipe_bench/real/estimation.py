@@ -1,8 +1,4 @@
-"""Parameters from real readings, by one path: question -> readings -> model -> noise and prior -> problem -> fits.
-
-The order follows the data: the inputs in a file complete the model, what is known of parameters constrains it, its
-noise and prior make the problem, and only the problem tells whether an estimator has all that it needs.
-"""
+"""Parameters from real readings, by one path: question -> readings -> model -> noise and prior -> problem -> fits."""
 
 from __future__ import annotations
 
@@ -28,7 +24,7 @@ from ipe_bench.trials.scenario import Scenario
 
 @dataclass(frozen=True, kw_only=True)
 class Question:
-    """All that is stated about an estimate from real readings; None if nothing is."""
+    """All that is stated about an estimate from real readings."""
 
     model: Measurement
     readings: tuple[Path, ...] | Array | None

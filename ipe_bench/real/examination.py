@@ -1,8 +1,5 @@
-"""What can be signed of an answer beyond its standard errors: intervals that follow the bends of the model, which
-readings carry the answer, and whether another answer fits as well.
-
-The least-squares minimum is examined, whichever estimator found it.
-"""
+"""What can be said of a least-squares minimum beyond its standard errors: intervals that follow the bends of the model,
+which readings carry the answer, and whether another answer fits as well."""
 
 from __future__ import annotations
 
@@ -61,8 +58,8 @@ class Bootstrap:
     """Answers to simulated readings of the model as estimated."""
 
     low: Array
+    """Lower ends (n,) of percentile intervals, in the parameters' own units."""
     high: Array
-    """Percentile intervals (n,) in the parameters' own units."""
     converged: int
     drawn: int
 
@@ -79,8 +76,7 @@ class OnBound:
 
 @dataclass(frozen=True, kw_only=True)
 class Examination:
-    """A least-squares minimum of the readings that are present, and all that is known of it; intervals and estimates
-    are in the parameters' own units."""
+    """A least-squares minimum; intervals and estimates are in the parameters' own units."""
 
     label: str
     """The estimator whose answer it is."""
@@ -97,8 +93,7 @@ class Examination:
     """Its covariance (n, n)."""
     chi_square: float
     freedom: int | Array | None
-    """Degrees of freedom that the level of the noise is estimated from, or (n,) those behind the variances if x has
-    several levels; None if it is known."""
+    """Degrees of freedom behind the level of the noise, or (n,) behind each variance; None if R is known."""
     bootstraps: int
     released: Released | None = None
     """The problem in which parameters that are held on bounds may leave them."""
@@ -193,27 +188,21 @@ class Examination:
 
     @cached_property
     def bootstrap(self) -> Bootstrap:
-        """Estimates from readings simulated at the estimate, started there, with noise of R; the draws are always the
-        same ones (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 6.5).
+        """Estimates within the bounds from readings simulated at the estimate with noise of R, always the same draws
+        (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 6.5).
 
-        If the level of the noise is estimated, each set has a level of its own: what the true one may be, given the
-        estimate, so that intervals are those of Student's t if the model is linear. A set whose minimum is on a bound
-        has its answer there, and parameters that are held on bounds may leave them.
+        If the level of the noise is estimated, each set has a level that the true one may be, given the estimate, so
+        that intervals are those of Student's t if the model is linear.
         """
-        rng = np.random.Generator(np.random.Philox(0))
-        draws = self._affordable(self.bootstraps)
+        rng, draws, free = np.random.Generator(np.random.Philox(0)), self._affordable(self.bootstraps), self.released
         e = rng.standard_normal((draws, len(self.z)))
-        level = np.ones(draws)
         if isinstance(self.freedom, int):
-            level = np.sqrt(self.freedom / rng.chisquare(self.freedom, draws))
-        factor, e = self.problem.R.factor, e * level[:, None]
+            e *= np.sqrt(self.freedom / rng.chisquare(self.freedom, draws))[:, None]
+        factor = self.problem.R.factor
         z = self._present + (e * factor if factor.ndim == 1 else e @ factor.T)
-        if (free := self.released) is None:
-            values, answered = answers(self.problem, z, np.repeat(self.inner[None], draws, axis=0))
-        else:
-            values, answered = answers(free.problem, z, np.repeat(free.x[None], draws, axis=0), free)
-            values = np.delete(values, free.places, axis=1)
-        values = values[answered]
+        problem, x = (self.problem, self.inner) if free is None else (free.problem, free.x)
+        values, answered = answers(problem, z, np.repeat(x[None], draws, axis=0), free)
+        values = np.delete(values, [] if free is None else free.places, axis=1)[answered]
         if len(values) < draws / 2:
             unknown = np.full(len(self.x), np.nan)
             return Bootstrap(unknown, unknown, len(values), draws)
@@ -226,8 +215,7 @@ class Examination:
 
     @cached_property
     def minima(self) -> list[Minimum]:
-        """Minima reached from starts that the prior draws about the nominal point, and the estimate; the least
-        first."""
+        """Minima, the least first, reached from the estimate and from starts that the prior draws."""
         n, problem = len(self.inner), self.problem
         rng = np.random.Generator(np.random.Philox(1))
         spread = np.ones(n) if problem.prior_deviation is None else problem.prior_deviation
@@ -264,13 +252,11 @@ class Examination:
 def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BOOTSTRAPS) -> Examination | None:
     """Examines the least of the minima that estimators without a prior found; None if none of them found one."""
     told = [one for one in fits if one.status is Status.CONVERGED and np.isfinite(one.chi_square)]
-    told = [one for one in told if not one.with_prior]
-    if not told:
+    best = min((one for one in told if not one.with_prior), key=lambda one: one.deviance, default=None)
+    if best is None:
         return None
-    best = min(told, key=lambda one: one.deviance)
     values, rows = best.held_at, np.flatnonzero(np.isfinite(z))
     if values:
-        # A parameter on its bound has no error; the others are examined with it held there.
         problem = holding(problem, values)
     if best.estimated is not None:
         levelled = maximum(best.estimated, z[rows])
@@ -308,7 +294,7 @@ def examine(problem: Problem, z: Array, fits: list[Fit], *, bootstraps: int = BO
 
 
 def _released(problem: Problem, found: Examination, values: Mapping[int, float]) -> Released | None:
-    """The problem in which parameters that are held at bounds may leave them; None if nothing is known of it there."""
+    """The problem in which parameters that are held at `values` may leave them; None if it has no covariance there."""
     places, bounds = np.array(list(values)), np.array(list(values.values()))
     start = problem.measurement.physical(problem.measurement.nominal[None])[0]
     given = replace(problem, measurement=problem.measurement.stating("nominal", values))
@@ -339,7 +325,7 @@ def _on_bounds(problem: Problem, found: Examination, values: Mapping[int, float]
 
 def answers(problem: Problem, z: Array, x: Array, released: Released | None = None) -> tuple[Array, Mask]:
     """The least-squares estimates (sets, n) within the bounds, in the parameters' own units, for readings z (sets, m)
-    from x (sets, n), and the sets that have one; parameters that are `released` have the bounds where they stood."""
+    from x (sets, n), and the sets that have one; `released` are parameters whose bounds are where they stood."""
     minima, model = minimise(problem, z, x), problem.measurement
     values, found = model.physical(minima.x), minima.converged.copy()
     outside, bounds = np.zeros((len(x), 0), dtype=bool), np.zeros(0)

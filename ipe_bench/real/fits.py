@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri, fdtri, ndtri, stdtr
+from scipy.special import ndtri, stdtr
 
 from ipe_bench.basics.errors import UserError
 from ipe_bench.basics.linalg import Array, Covariance, Mask
@@ -21,7 +21,7 @@ from ipe_bench.noise import Gaussian
 from ipe_bench.noise.base import Noise
 from ipe_bench.noise.unknown import Levels
 from ipe_bench.real.levels import Estimated, first_levels, levels_at, maximum, objective_of
-from ipe_bench.real.profiles import Released, half_width, wald_interval
+from ipe_bench.real.profiles import Released, half_width, joint_region, wald_interval
 from ipe_bench.real.residuals import explained, normalised, outlier_limit, whiteness
 from ipe_bench.trials.fit_test import fit_probability, spread_of
 from ipe_bench.trials.observability import in_words
@@ -45,25 +45,19 @@ _DOUBTED = 0.05
 
 @dataclass(frozen=True)
 class Given:
-    """Readings to estimate from, and what is known of them."""
+    """The readings z (present,) at `rows` of those of a model, and their problem."""
 
     problem: Problem
-    """The problem of the readings that are present."""
     model: Measurement
-    """The model with those that are missing."""
+    """The model of all readings, with those that are missing."""
     rows: NDArray[np.intp]
-    """The places of those that are present among all."""
     z: Array
-    """Those that are present."""
     noise: Noise
 
     @cached_property
     def series(self) -> NDArray[np.intp]:
-        """The succession of the present readings at one instrument: (channels, length), -1 if one is missing.
-
-        The k-th readings of all epochs are one instrument's if every epoch has as many; otherwise, and without epochs,
-        the readings are one succession in the order of the file.
-        """
+        """The readings of each instrument in their order (channels, length), -1 if one is missing: the k-th of all
+        epochs, if every epoch has as many; otherwise all in the order of the file."""
         place = np.full(self.model.m, -1, dtype=np.intp)
         place[self.rows] = np.arange(len(self.rows))
         epochs = self.model.epochs
@@ -82,7 +76,7 @@ class Fit:
     status: Status
     message: str
     model: Measurement
-    """The model without the readings that are missing, and with the levels of the noise that are estimated."""
+    """The model of the readings that are present, with the levels of the noise that are estimated."""
     assumed: Problem
     """The problem that was solved: R is known or estimated, and parameters on their bounds are held there."""
     inner: Array
@@ -103,13 +97,11 @@ class Fit:
     beaten_by: str = ""
     """The estimator with the least sum of squares, if that is so much smaller that chance does not explain it."""
 
-    def _all(self, free: Array, fill: Array | float = np.nan) -> Array:
-        """Values (n,) or (n, n) of all parameters, from those of the parameters that are not held."""
+    def _all(self, free: Array) -> Array:
+        """Values (n,) or (n, n) of all parameters, NaN for those that are held on bounds."""
         n = len(free) + len(self.held_at)
         kept, found = [k for k in range(n) if k not in self.held_at], np.full((n,) * free.ndim, np.nan)
         found[np.ix_(*[kept] * free.ndim)] = free
-        if free.ndim == 1:
-            found[list(self.held_at)] = fill
         return found
 
     @property
@@ -120,7 +112,9 @@ class Fit:
     @cached_property
     def x(self) -> Array:
         """Estimates (n,) in physical units."""
-        return self._all(self._free.physical(self.inner[None])[0], np.array(list(self.held_at.values())))
+        x = self._all(self._free.physical(self.inner[None])[0])
+        x[list(self.held_at)] = list(self.held_at.values())
+        return x
 
     @cached_property
     def covariance(self) -> Array:
@@ -150,7 +144,6 @@ class Fit:
 
     @property
     def with_prior(self) -> bool:
-        """Whether the estimator was told a prior, so that x is not the least-squares estimate."""
         return "prior" in self.estimator.needs
 
     @property
@@ -193,9 +186,10 @@ class Fit:
         values = np.full(len(self.residual), np.nan)
         if self._explained is not None:
             values = normalised(self._whitened, self._explained, self.assumed.R)
-            if self.level is not None:
-                one = self.estimated
-                values = _deviates(values, self.degrees_of_freedom if one is None else one.reading_freedom)
+            if self.estimated is not None:
+                values = _deviates(values, self.estimated.reading_freedom)
+            elif self.level is not None:
+                values = _deviates(values, self.degrees_of_freedom)
         return at_rows(self.given.rows, values, self.given.model.m)
 
     @cached_property
@@ -215,8 +209,7 @@ class Fit:
 
     @cached_property
     def p_value(self) -> float:
-        """Chance of a chi-square at least this large if the model and R are right (`ipe_bench.trials.fit_test`); NaN if
-        that cannot be tested."""
+        """Chance of a larger chi-square if the model and R are right (`ipe_bench.trials.fit_test`); NaN if unknown."""
         if self.level is not None:
             return np.nan
         spread = spread_of(self.estimator, self.assumed, self._J[None])
@@ -239,21 +232,19 @@ class Fit:
 
     @property
     def passes(self) -> bool:
-        """Whether this is an answer: the estimator converged, and nothing says that the model does not fit."""
+        """Whether the estimator converged, and nothing says that the model does not fit."""
         return self.status is Status.CONVERGED and self.fits is not False
 
     @property
     def _freedom(self) -> float | Array | None:
-        """The degrees of freedom that the level of the noise is estimated from, or (n,) those behind the variance of
-        each parameter; None if it is known."""
+        """Degrees of freedom behind the level of the noise, or (n,) behind each variance; None if R is known."""
         if self.estimated is not None:
             return self.estimated.freedom
         return None if self.level is None else self.degrees_of_freedom
 
     @property
     def deviance(self) -> float:
-        """What tells fits to the same readings apart: the sum of squares, whitened by R as it was stated; with several
-        levels, twice the negative logarithm of the likelihood."""
+        """The sum of squares, whitened by R as it was stated; with several levels, -2 times the log likelihood."""
         if self.estimated is not None:
             return self.estimated.deviance
         return self.chi_square * (1.0 if self.level is None else self.level**2)
@@ -283,11 +274,8 @@ class Fit:
 
 
 def fit(problem: Problem, z: Array, estimators: Mapping[str, Estimator], noise: Noise = _NORMAL) -> list[Fit]:
-    """Has every estimator estimate from the readings z (m,), of which those that are NaN are missing.
-
-    `noise` states the law of their whitened errors; or that R is known up to a factor, which is then estimated from the
-    residuals of each fit.
-    """
+    """A fit of every estimator to the readings z (m,), NaN if missing; `noise` is the law of their whitened errors, or
+    says that R is known up to levels, which are then estimated."""
     rows, present = np.flatnonzero(~np.isnan(z)), replace(problem, doubted=1.0 if noise.estimated else _DOUBTED)
     if len(rows) < len(z):
         model = SubsetModel(problem.measurement, tuple(rows.tolist()))
@@ -309,15 +297,15 @@ def _compared(fits: list[Fit]) -> list[Fit]:
     if np.isinf(least):
         return fits
     if fits[0].level is None or fits[0].estimated is not None:
-        limit = least + float(chdtri(n, FIT_LEVEL))
+        limit = least + joint_region(n, 1 - FIT_LEVEL, None)
     else:
-        limit = least * (1 + n / free * float(fdtri(n, free, 1 - FIT_LEVEL))) if free > 0 else np.inf
+        limit = least + least / free * joint_region(n, 1 - FIT_LEVEL, free) if free > 0 else np.inf
     label = fits[best].label
     return [replace(one, beaten_by=label) if one.deviance > limit else one for one in fits]
 
 
 def _fit_with_level(given: Given, label: str, estimator: Estimator, problem: Problem) -> Fit:
-    """Fits until the level that R assumes is that of the residuals, since estimators measure their steps by it."""
+    """The fit at which the level that R assumes is that of the residuals."""
     spread = float(np.sqrt(np.mean(problem.R.whiten(given.z) ** 2)))
     level, found = spread or 1.0, None
     for _ in range(_MOST_LEVELS):
@@ -348,12 +336,9 @@ def scaled(problem: Problem, level: float) -> Problem:
 
 
 def _deviates(r: Array, free: Array | int) -> Array:
-    """The normal deviates (m,) that are as probable as residuals r (m,) in deviations that are estimated from `free`
-    degrees of freedom.
-
-    An internally studentised residual r becomes t = r sqrt((f - 1) / (f - r^2)), Student's t with f - 1 degrees of
-    freedom (Cook and Weisberg, Residuals and Influence in Regression, 1982, eq. 2.2.8), and that the deviate.
-    """
+    """The normal deviates (m,) that are as probable as internally studentised residuals r (m,) of f = `free` degrees of
+    freedom, by r sqrt((f - 1) / (f - r^2)), which is Student's t with f - 1 (Cook and Weisberg, Residuals and Influence
+    in Regression, 1982, eq. 2.2.8)."""
     with np.errstate(all="ignore"):
         t = r * np.sqrt((free - 1) / np.maximum(free - r**2, 0.0))
         deviates = np.where(np.asarray(free) > 1, -np.sign(r) * ndtri(stdtr(free - 1, -np.abs(t))), np.nan)
@@ -362,8 +347,8 @@ def _deviates(r: Array, free: Array | int) -> Array:
 
 
 def _fit_with_levels(given: Given, label: str, estimator: Estimator, levels: Levels) -> Fit:
-    """Fits until the levels that R assumes are those of the residuals; if an estimator minimises the sum of squares,
-    the maximum of the restricted likelihood near there."""
+    """The fit at which the levels that R assumes are those of the residuals; of least squares, the maximum of the
+    restricted likelihood near there."""
     theta, h, z = first_levels(levels, given.z), given.z, given.z
     found: tuple[Fit, Estimated] | None = None
     for _ in range(_MOST_LEVELS):
@@ -421,9 +406,8 @@ def holding(problem: Problem, values: Mapping[int, float]) -> Problem:
 def falls_beyond(
     problem: Problem, held: Array, near: Mapping[int, float], z: Array, released: Released | None = None
 ) -> Mask:
-    """The sets of readings z (sets, m) whose sum of squares falls on beyond every bound, so that its minimum within
-    them is on them, where it is `held` (sets, free) (Nocedal and Wright, Numerical Optimization, 2nd ed., 2006, theorem
-    12.1)."""
+    """The sets of readings z (sets, m) whose sum of squares at `held` (sets, free) falls beyond every bound (Nocedal
+    and Wright, Numerical Optimization, 2nd ed., 2006, theorem 12.1)."""
     model, places = problem.measurement.stating("nominal", near), list(near)
     x = np.repeat(np.array(model.nominal, dtype=float)[None], len(z), axis=0)
     x[:, [k for k in range(model.n) if k not in near]] = held
@@ -433,14 +417,12 @@ def falls_beyond(
     start = problem.measurement.physical(problem.measurement.nominal[None])[0]
     outward = np.sign(np.array(list(near.values())) - start[places])
     if released is not None:
-        # These start on their bounds, and have been told which way leads inwards.
         inwards = dict(zip(released.places.tolist(), released.inwards.tolist(), strict=True))
         outward = np.array([-inwards.get(k, -out) for k, out in zip(places, outward, strict=True)])
     return np.asarray((downhill * outward > 0).all(axis=1))
 
 
 def _fit_inside(given: Given, label: str, estimator: Estimator, problem: Problem) -> Fit:
-    """The fit, wherever it is."""
     estimates, model, n = estimate_safely(estimator, problem, given.z[None]), problem.measurement, problem.measurement.n
     tally, residual = EvaluationCount.zeros(1), np.full(len(given.z), np.nan)
     if np.isfinite(estimates.x).all():
@@ -465,8 +447,8 @@ def _fit_inside(given: Given, label: str, estimator: Estimator, problem: Problem
 
 
 def undetermined(model: Measurement, J: Array, x: Array) -> tuple[str, ...]:
-    """The combinations of parameters that whitened readings of slopes J (m, n) do not determine at x (n,): they hardly
-    change the readings, and errors of the parameters along them are larger than the parameters."""
+    """The combinations of parameters that whitened readings of slopes J (m, n) do not determine at x (n,): errors along
+    them are larger than the parameters."""
     size = np.linalg.norm(J, axis=0)
     size = np.where(size > 0, size, 1.0)
     missing = max(len(x) - len(J), 0)

@@ -39,9 +39,9 @@ _LEAST_SHARE = 1e-8
 _HOLD = 1e-2
 """The weight with which the logarithm of a level is held where a search begins: that of a level of zero is infinite."""
 _SHIFT = 3.0
-"""What is added to the logarithm of sigma over R's in the objective, which the methods want to be positive."""
+"""What is added to the logarithm of sigma over R's, since the methods need a positive objective."""
 _LEAST_SPARE = 1e-9
-"""The least that a reading counts for in the likelihood of a level, so that its residual may be divided by it."""
+"""The least degree of freedom of a reading, by which its residual is divided."""
 
 
 @dataclass(frozen=True)
@@ -127,13 +127,12 @@ class _Known(Measurement):
 
 @dataclass(frozen=True, kw_only=True)
 class Likelihood(Objective):
-    """The objective of this page, with sigma in multiples of R's that are small."""
+    """-2 times the log likelihood, as a sum of squares."""
 
     levelled: Levelled
 
     def _split(self, x: Array) -> tuple[Array, Array, Array]:
-        """Whitened residuals (trials, m), the logarithms of standard deviations, and how far those of the levels are
-        from their start (trials, k)."""
+        """Whitened residuals (trials, m), log sigma, and how far the levels' logarithms are from their start."""
         h, log, theta = np.split(self.model.simulate(x, self.rows), [self.readings, 2 * self.readings], axis=1)
         return (h - self.z) * np.exp(-log), log, theta - self.levelled.theta
 
@@ -156,16 +155,15 @@ class Likelihood(Objective):
 
 
 def objective_of(problem: Problem, z: Array, model: CountingModel | None = None) -> Objective:
-    """What is minimised for readings z (trials, m): the likelihood where levels are among the parameters, else the sum
-    of squares. `model` replaces the problem's."""
+    """What is minimised for readings z (trials, m): -2 times the log likelihood if x has levels, else the sum of
+    squares. `model` replaces the problem's."""
     model, whole = model or CountingModel(problem.measurement, EvaluationCount.zeros(len(z))), problem.measurement
     given = model, problem.R, z, np.arange(len(z)), problem.x0
     return Likelihood(*given, levelled=whole) if isinstance(whole, Levelled) else Objective(*given)
 
 
 def minimise(problem: Problem, z: Array, x: Array) -> Minima:
-    """The minima of the objective for readings z (trials, m), from x (trials, n); their `chi_square` is its value, less
-    the sum of all 2 f log sigma at R's."""
+    """The minima of `objective_of` for readings z (trials, m) from x (trials, n), with its values as `chi_square`."""
     with np.errstate(all="ignore"):
         objective = objective_of(problem, z)
         minima = minimize(objective, LevenbergMarquardtMethod(1e-3), x, Limits(_TOLERANCE, _MOST_STEPS))
@@ -182,7 +180,7 @@ class Estimated:
     problem: Problem
     """Its measurement is `Levelled`, its R is that of the levels."""
     x: Array
-    """(n + k,): the parameters, and the logarithms of the levels."""
+    """The parameters, and the logarithms of the levels (n + k,)."""
     converged: bool
     P: Array
     """Covariance (n + k, n + k): the inverse of Fisher's information."""
@@ -190,7 +188,7 @@ class Estimated:
     """Degrees of freedom (n + k,) behind each variance of a parameter (Satterthwaite, Biometrics Bulletin 2, 1946);
     infinite for levels."""
     deviance: float
-    """Twice the negative logarithm of the likelihood, less a constant of the readings."""
+    """-2 times the log likelihood, less a constant of the readings."""
     maximal: bool = False
     """Whether the parameters, too, are those of maximum likelihood."""
 
@@ -213,8 +211,7 @@ class Estimated:
 
 
 def levels_at(problem: Problem, levels: Levels, theta: Array, z: Array, x: Array) -> Estimated:
-    """The levels of maximum restricted likelihood at x (n,), from theta (k,), NaN if the readings there are not known;
-    R is taken for the leverages.
+    """The levels of maximum restricted likelihood at x (n,), from theta (k,), with R's leverages; NaN if h is unknown.
 
     Raises:
         UserError: a group has too few readings for its levels, or residuals of zero.

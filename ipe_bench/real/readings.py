@@ -1,9 +1,8 @@
 """Files of readings, and the model completed by what stands in them.
 
-A file has one row per reading, with columns that say which reading it is, and the reading with its unit. The header for
-GINS is `case,time [min],axis,reading [m/s]`. Rows may stand in any order; an empty reading is missing. Cells are
-separated by commas or tabs; or by semicolons, and then a comma is a decimal point, as European spreadsheets write it.
-Nothing is guessed: what is not plainly a number, or not part of the table, is refused with its row.
+A file has one row per reading, in any order, with columns that say which reading it is, and the reading with its unit:
+`case,time [min],axis,reading [m/s]` for GINS. An empty reading is missing. Cells are separated by commas or tabs; or by
+semicolons, and then a comma is a decimal point. What is not plainly a number is refused with its row.
 """
 
 from __future__ import annotations
@@ -55,8 +54,7 @@ class Readings:
 
 @dataclass(frozen=True)
 class Table:
-    """A file as text: its header, and its rows with their numbers in the file. Every row has as many cells as the
-    header, and no two columns have one name."""
+    """A file as text: its header, and its rows with their numbers in the file."""
 
     path: Path
     heading: Sequence[str] = ()
@@ -69,16 +67,11 @@ class Table:
         return UserError(f"readings={self.path}: {text}")
 
     def number(self, text: str) -> float | None:
-        """The number that a cell says in digits that everybody reads alike; None if it says something else."""
-        # A point among decimal commas would be one between thousands, or one of another country: nobody can tell.
+        """The number in a cell, or None; a point among decimal commas is ambiguous, and none."""
         return _number(text.replace(".", "?").replace(",", ".") if self.decimal == "," else text)
 
     def value(self, text: str, where: str) -> float:
-        """The finite number in a cell, NaN if it is empty; `where` names the row and the column.
-
-        Raises:
-            UserError: the cell says something else.
-        """
+        """The finite number in a cell, NaN if it is empty; a UserError at `where`, its row and column, otherwise."""
         if not text.strip():
             return math.nan
         value = self.number(text)
@@ -101,7 +94,7 @@ class Table:
         return next((name for name in self.heading if " [" not in wanted and _quantity(name) == wanted), None)
 
     def require_known(self, known: Collection[str], wanted: Sequence[str]) -> None:
-        """Refuses columns that are not known, as what they say would be left out without a word."""
+        """Refuses columns that are not known."""
         for name in self.heading:
             if name not in known:
                 meant = did_you_mean(name, [one for one in wanted if one not in self.heading])
@@ -131,10 +124,10 @@ def _unit(heading: str) -> str:
 
 
 def read_tables(paths: Sequence[Path], without: Sequence[str] = ()) -> list[Table]:
-    """The tables of files, without the columns of these headings; a file need not have all of them.
+    """The tables of files, without the columns of these headings.
 
     Raises:
-        UserError: a file is absent or not a table, or none has such a column.
+        UserError: a file is absent or not a table, or no file has such a column.
     """
     tables = [_read_table(path) for path in paths]
     for name in without:
@@ -151,12 +144,11 @@ def read_tables(paths: Sequence[Path], without: Sequence[str] = ()) -> list[Tabl
 
 
 def _read_table(path: Path) -> Table:
-    """The header and the rows of a CSV or Parquet file."""
-    table = Table(path)
+    """The table of a CSV or Parquet file, in which every row has as many cells as the header."""
     if not path.is_file():
-        raise table.error("there is no such file")
+        raise Table(path).error("there is no such file")
     data = path.read_bytes()
-    table = replace(table, digest=hashlib.sha256(data).hexdigest())
+    table = Table(path, digest=hashlib.sha256(data).hexdigest())
     table = (_with_parquet if path.suffix == ".parquet" else _with_text)(table, data)
     if all(table.number(name) is not None for name in table.heading):
         raise table.error("the first row has only numbers and is no header; write the names of the columns above it")
@@ -251,10 +243,10 @@ def _write(path: Path, rows: Sequence[Sequence[Any]]) -> None:
 def open_together(
     paths: Sequence[Path], model: Measurement, known: Sequence[ParameterInfo] = (), without: Sequence[str] = ()
 ) -> Readings:
-    """The readings of one file or of several; the latter share the parameters that are not a file's own.
+    """The readings of one file or of several, which share the parameters that are not a file's own.
 
-    `known` is what is known of the parameters of all files together, which have names of their own if each file has
-    one. `without` are columns that are left out on purpose, by their headings with their units or without.
+    `known` is what is known of all their parameters. `without` are columns that are left out, by their headings with
+    their units or without.
 
     Raises:
         UserError: a file is absent or does not hold readings of this model, files differ in what they know, or there
@@ -322,7 +314,6 @@ def _readings_in(table: Table, model: Measurement) -> Readings:
     table.require_known((*used, *sampled.index), tuple(dict.fromkeys((*headings, _shown_as(model)[0], SIGMA))))
     for name, values in sampled.index.items():
         if name not in headings and name in table.heading:
-            # Outliers would be told by other labels than those that the model gives to the rows in their order.
             for (text, where), label in zip(table.column(name), values, strict=True):
                 if _label(text, table.number(text)) != _label_of(label):
                     said = f"'{text}' stands where the order of the rows says {label}; leave the column out"
@@ -407,10 +398,10 @@ def _sigmas(table: Table, column: str | None, rows: Sequence[int], z: Array, sho
         return None
     if _unit(column) and _unit(column) != _unit(shown):
         raise table.error(f"column {column}: the unit must be that of {shown}; convert the values")
-    cells, values = table.column(column), np.full(len(z), np.nan)
-    for i, row in enumerate(rows):
+    cells, values = table.column(column), []
+    for row, reading in zip(rows, z, strict=True):
         text, where = cells[row]
-        values[i] = table.value(text, where)
-        if (not math.isnan(values[i]) and values[i] <= 0) or (math.isnan(values[i]) and not math.isnan(z[i])):
+        values.append(table.value(text, where))
+        if values[-1] <= 0 or (math.isnan(values[-1]) and not math.isnan(reading)):
             raise table.error(f"{where}: '{text}' is not a standard deviation; give a number above 0")
-    return values
+    return np.array(values)

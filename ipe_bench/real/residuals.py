@@ -14,17 +14,14 @@ OUTLIER_LEVEL = 0.01
 DRAWS = 1999
 """Simulated fits behind the test of whiteness."""
 LEAST_P = 1 / (DRAWS + 1)
-"""Its p is a multiple of this; the least says only that no simulated fit was as extreme."""
+"""Its least p, which says only that no simulated fit was as extreme."""
 _DRAWS_AT_ONCE = 250
 _MANY = 20_000
-"""Of more readings than these a fit takes out too little to matter: Q is chi-square, and nothing need be simulated."""
+"""Readings from which on the statistic is taken for chi-square, as a fit hardly changes it."""
 
 
 def explained(J: Array, R: Covariance) -> Array:
-    """An orthonormal basis (m, rank) of what the parameters explain of whitened readings, for J = dh/dx (m, n).
-
-    Whitened residuals of a least-squares fit are, to first order, what this basis leaves of the whitened noise.
-    """
+    """An orthonormal basis (m, rank) of the range of R^-1/2 J, for J = dh/dx (m, n): a fit takes it from the noise."""
     Jw = R.whiten_jacobian(J)
     size = np.linalg.norm(Jw, axis=0)
     # Scaled first: the parameters' units must not decide what is singular.
@@ -67,11 +64,9 @@ def whiteness(w: Array, Q: Array, series: NDArray[np.intp], draws: int = DRAWS) 
     """The p of Ljung and Box's test (Biometrika 65, 1978) that successive residuals w (m,), whitened, of one instrument
     do not resemble each other; NaN if they are not finite, or too few to have neighbours or to vary.
 
-    series (channels, length) says which residual stands where in each instrument's succession, -1 where a reading is
-    missing. Fitted residuals are not white even when the noise is: the fit has taken out what the basis Q (m, rank)
-    explains. So p is not that of chi-square but is counted among as many simulated fits of white noise (a Monte Carlo
-    test: Davison and Hinkley, Bootstrap Methods and their Application, 1997, section 4.2). The draws are always the
-    same ones.
+    series (channels, length) has the residuals of each instrument in their order, -1 where a reading is missing. Since
+    the fit takes the basis Q (m, rank) out of the noise, p is counted among simulated fits of white noise, always the
+    same ones (Davison and Hinkley, Bootstrap Methods and their Application, 1997, section 4.2).
     """
 
     def statistic(w: Array) -> Array:

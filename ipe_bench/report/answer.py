@@ -47,7 +47,7 @@ _MOST_READINGS, _MOST_MINIMA = 5, 3
 
 @dataclass(frozen=True)
 class Answer:
-    """What estimators make of real readings, and what can be signed of it."""
+    """The fits of estimators to real readings, and the examination of the least minimum."""
 
     name: str
     """Name of the model in titles."""
@@ -55,19 +55,17 @@ class Answer:
     z: Array
     """Readings (m,); NaN if one is missing."""
     fits: list[Fit]
-    """One for each estimator, in the order in which they were given."""
+    """A fit of each estimator, in their order."""
     examination: Examination | None
-    """That of the least minimum that was found; None if no estimator without a prior found any."""
+    """That of the least minimum; None if no estimator without a prior found any."""
     left_out: str = ""
     """The columns of the files that were left out on purpose."""
 
     @classmethod
     def to(cls, opened: Opened, name: str = "") -> Answer:
-        """The answer to a question; `name` is what the model is called if that is not its own name."""
-        model, fits_and_examination = opened.scenario.measurement, opened.fitted()
-        return cls(
-            name or model.name, model, opened.readings.z, *fits_and_examination, ", ".join(opened.question.ignored)
-        )
+        """The answer to a question, by its model's name or another `name`."""
+        model, left_out = opened.scenario.measurement, ", ".join(opened.question.ignored)
+        return cls(name or model.name, model, opened.readings.z, *opened.fitted(), left_out)
 
     @property
     def passes(self) -> bool:
@@ -108,9 +106,9 @@ def contents(answer: Answer) -> Iterator[Part]:
     """The tables and sentences of an answer, in order."""
     found, one = structure(answer.model), answer.examination
     yield from (Strong(f"No data can tell: {sentence}.") for sentence in (found.sentences if found else ()))
-    x = answer[one.label].inner if one else answer.model.nominal
-    remarked = answer.model.remarks(x if np.isfinite(x).all() else answer.model.nominal)
-    yield from (f"Note: {sentence}." for sentence in remarked)
+    # Without the parameters that are held on bounds, and the levels.
+    model = one.whole.measurement if one else answer.model
+    yield from (f"Note: {sentence}." for sentence in model.remarks(one.inner[: model.n] if one else model.nominal))
     yield _estimates(answer)
     yield _verdicts(answer)
     yield from _outliers(answer)
@@ -129,8 +127,7 @@ def _estimates(answer: Answer) -> Table:
     columns = [words("parameter", [p.name for p in parameters]), words("unit", [p.unit for p in parameters])]
     for one in answer.fits:
         if one.passes:
-            cells = [with_error(*pair) for pair in zip(one.x, one.standard_errors, strict=True)]
-            columns.append(texts(one.label, cells))
+            columns.append(texts(one.label, map(with_error, one.x, one.standard_errors)))
         else:
             failing = "MISFIT" if one.status is Status.CONVERGED else one.status.label.replace("_", " ").upper()
             cells = [f"({value:.4g})" if math.isfinite(value) else "-" for value in one.x]
@@ -247,9 +244,8 @@ def _outliers(answer: Answer) -> Iterator[Table]:
     told = [f for f in answer.fits if 0 < f.outliers.sum() <= max(3, _FEW * len(f.outliers))]
     if not told:
         return
-    worst = {
-        i: max((float(f.normalised[i]) for f in told), key=abs) for i in np.flatnonzero(sum(f.outliers for f in told))
-    }
+    beyond = np.flatnonzero(np.any([f.outliers for f in told], axis=0))
+    worst = {i: max((float(f.normalised[i]) for f in told), key=abs) for i in beyond}
     listed, labels = sorted(worst, key=lambda i: -abs(worst[i]))[:_MOST_OUTLIERS], _reading_labels(answer.model)
     columns = [
         words("reading", [_where(labels[i]) for i in listed]),
@@ -288,8 +284,7 @@ def _intervals(found: Examination) -> Table:
 
 
 def _interval(low: float, high: float, middle: float) -> str:
-    """Each end to a hundredth of twice its distance to the estimate `middle`, if that lies between them, or of the
-    width; infinite ends as such."""
+    """Each end to a hundredth of twice its distance to the estimate `middle`, or of the width if that is not inside."""
     if not math.isfinite(high - low) or high <= low:
         text = f"{low:.6g} … {high:.6g}".replace("-inf", "−∞").replace("inf", "∞").replace("nan", "-")
         return "-" if text == "- … -" else text
@@ -337,10 +332,7 @@ def remarks(found: Examination, labels: Sequence[Mapping[str, Any]]) -> Iterator
 def write_answer(
     folder: Path, answer: Answer, command: Any, provenance: Mapping[str, Any], *, figures: bool = True
 ) -> list[Path]:
-    """Writes estimate.json, the page, residuals.csv and the figure; returns the files.
-
-    `command` tells one command from another; `provenance` overrides what stands in the JSON file of the same name.
-    """
+    """Writes estimate.json, the page, residuals.csv and the figure; returns the files."""
     from ipe_bench.report.figures.errors import draw_residuals
 
     content = {"schema": SCHEMA, "command": command, **described(answer), **provenance}
@@ -417,8 +409,7 @@ def _by_name(names: Sequence[str], values: Any) -> dict[str, Any]:
 
 
 def _residuals(answer: Answer) -> pd.DataFrame:
-    """A row per estimator and reading; of the estimator that is examined, with the influence of each reading, and with
-    predictions of those that are missing."""
+    """A row per estimator and reading; of the one that is examined, with influences, and predictions where missing."""
     import pandas as pd
 
     model, z, found = answer.model, answer.z, answer.examination

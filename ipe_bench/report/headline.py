@@ -21,8 +21,7 @@ BROKEN = 0.9
 
 
 def headline(analysis: Analysis) -> list[str]:
-    """Who solves most on certified readings and on problems of known minimum; on simulated ones, who agrees with whom,
-    who is honest, who breaks where, and what that costs."""
+    """Who solves most certified problems; of simulated trials, who agrees, is honest, breaks where, at what cost."""
     found = [*_certified(analysis), *_attained(analysis), *_simulated(without_certified(analysis))]
     # A number and its sign stay on one line.
     return [s.replace(" %", "\u00a0%") for s in found] or ["Nothing is stored yet, so there is nothing to find."]
@@ -154,11 +153,8 @@ def _ranked(analysis: Analysis, rows: pd.DataFrame, scales: Sequence[float]) -> 
     reach = f"scale{'s' * (len(scales) > 1)} {' to '.join(dict.fromkeys(plain(s) for s in (scales[0], scales[-1])))}"
     scenarios = len(set(analysis.scores["scenario"]))
     number = f"{int(sums['trials'].max()):,} trials" + (f" in {scenarios} scenarios" if scenarios > 1 else "")
-    sentence, worst = (
-        f"At error {reach}, of {number} succeed: {enumerate_few(listed)}.",
-        sums.sort_values("silent").iloc[-1],
-    )
-    if worst["silent"] > 0:
+    sentence = f"At error {reach}, of {number} succeed: {enumerate_few(listed)}."
+    if (worst := sums.sort_values("silent").iloc[-1])["silent"] > 0:
         sentence += f" Failures that look right: {percent(worst['silent'])} at most ({worst.name})."
     return sentence
 

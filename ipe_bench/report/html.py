@@ -42,39 +42,32 @@ def render_page(
 
     collection, runs = analysis.collection, _runs(analysis.collection.runs)
     commands = dict.fromkeys(run["command"] for run in runs if run["command"] not in (_PYTHON, _UNKNOWN))
-    templates = resources.files("ipe_bench.report") / "templates"
-    return (
-        environment()
-        .get_template("report.html.j2")
-        .render(
-            version=__version__,
-            script=Markup((templates / "report.js").read_text(encoding="utf-8")),
-            style=Markup((templates / "report.css").read_text(encoding="utf-8")),
-            about=about(analysis),
-            headline=headline(analysis),
-            collection=collection,
-            title=", ".join(d.resolve().name or str(d) for d in collection.directories),
-            computed=_minute(collection.runs[-1]["started"]) if collection.runs else "",
-            commands=list(commands)[:MOST_COMMANDS],
-            tables=[table for table in tables if not table.appendix],
-            written=written,
-            appendix=[table for table in tables if table.appendix],
-            figures=[
-                vars(figure) | {"data": base64.b64encode(figure.files[0].read_bytes()).decode()} for figure in figures
-            ],
-            charts=list(charts(views(without_certified(analysis))[0])),
-            nothing_failed=analysis.endings.empty and not analysis.summary.empty,
-            runs=runs[:MOST_RUNS],
-            older_runs=max(0, len(runs) - MOST_RUNS),
-            citation=CITATION,
-            definitions=[*DEFINITIONS, *((one.title, one.definition) for one in all_statistics()[len(STATISTICS) :])],
-        )
+    templates, page = resources.files("ipe_bench.report") / "templates", environment().get_template("report.html.j2")
+    return page.render(
+        version=__version__,
+        script=Markup((templates / "report.js").read_text(encoding="utf-8")),
+        style=Markup((templates / "report.css").read_text(encoding="utf-8")),
+        about=about(analysis),
+        headline=headline(analysis),
+        collection=collection,
+        title=", ".join(d.resolve().name or str(d) for d in collection.directories),
+        computed=_minute(collection.runs[-1]["started"]) if collection.runs else "",
+        commands=list(commands)[:MOST_COMMANDS],
+        tables=[table for table in tables if not table.appendix],
+        written=written,
+        appendix=[table for table in tables if table.appendix],
+        figures=[vars(one) | {"data": base64.b64encode(one.files[0].read_bytes()).decode()} for one in figures],
+        charts=list(charts(views(without_certified(analysis))[0])),
+        nothing_failed=analysis.endings.empty and not analysis.summary.empty,
+        runs=runs[:MOST_RUNS],
+        older_runs=max(0, len(runs) - MOST_RUNS),
+        citation=CITATION,
+        definitions=[*DEFINITIONS, *((one.title, one.definition) for one in all_statistics()[len(STATISTICS) :])],
     )
 
 
 def _runs(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """What was computed, by command, the last first: all that its jobs have in common, and the configuration of each;
-    a run that found everything stored computed nothing."""
+    """What was computed, by command, the last first; a run that found everything stored computed nothing."""
     commands: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for run in (run for run in runs if run.get("blocks", 1)):
         command = run.get("command", _UNKNOWN)
@@ -107,8 +100,7 @@ def _minute(started: str) -> str:
 
 @dataclass(frozen=True)
 class Axis:
-    """A column that an axis may show, logarithmic at first or as a share from none to all; the columns of the ends of
-    its interval; and where a line says what is best."""
+    """A column that an axis may show, with the ends of its interval and a line at what is best."""
 
     column: str
     title: str
@@ -135,13 +127,12 @@ _AXES = (
 
 
 def charts(views: Sequence[View]) -> Iterator[dict[str, str]]:
-    """The chart of each setting, over all trials: its name, title and caption, and as JSON what the script draws."""
+    """The chart of each setting: its name, title and caption, and as JSON what the script draws."""
     for view in views:
         rows = view.totals
         shown = [axis for axis in _AXES if len(rows) and rows[axis.column].map(math.isfinite).any()]
         if not shown:
             continue
-        # With one scale alone there is nothing to see against it.
         across = (_SCALE, _COST) if len(view.scales) > 1 else (_COST, _SCALE)
         columns = {name for axis in (*across, *shown) for name in (axis.column, axis.low, axis.high) if name}
         series = [

@@ -1,8 +1,4 @@
-"""Tables and figures as a paper wants them: chosen columns, in the width of one column of print or of two.
-
-A table is a complete LaTeX environment of booktabs and siunitx; a figure is drawn anew at its final size, so that
-nothing is scaled. What they say is what the report says.
-"""
+"""Tables and figures for a paper: chosen columns, and figures drawn in the width of one column of print or of two."""
 
 from __future__ import annotations
 

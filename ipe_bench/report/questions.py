@@ -29,8 +29,7 @@ if TYPE_CHECKING:
 READINGS = "readings.csv"
 """What the choices of a design take, a row per reading."""
 HONEST = 0.1
-"""Nats below which a Gaussian may stand for another: a deviation 40 % too large in one direction, or a mean that is
-half a deviation off, are about a tenth."""
+"""Nats up to which a Gaussian may stand for another: a deviation is 40 % too large, or a mean half a deviation off."""
 ALIKE = 0.05
 """Energy distance up to which draws may come from one law: of Gaussians in few dimensions, some tenths of a nat."""
 _MOST_SUSPECTS = 12
@@ -42,15 +41,15 @@ _UNSEEN = 0.05
 
 
 def design_parts(name: str, design: Design) -> Iterator[Part]:
-    """The tables and sentences of a design; `name` is what the model is called in the title."""
+    """The tables and sentences of a design, under the `name` of its model."""
     yield _parameters(name, design)
     seen = design.observability
     direction = "Least observable direction" if seen.observable else "The readings do not determine"
     yield Strong(f"{direction}: {seen.words}")
-    told = structure(design.scenario.measurement)
-    if told is not None and not told.lost:
-        yield f"Exact readings would tell all {len(told.unknowns)} parameters from their neighbours."
-    yield from (Strong(f"No data can tell: {sentence}.") for sentence in (told.sentences if told else ()))
+    if told := structure(design.scenario.measurement):
+        if not told.lost:
+            yield f"Exact readings would tell all {len(told.unknowns)} parameters from their neighbours."
+        yield from (Strong(f"No data can tell: {sentence}.") for sentence in told.sentences)
     yield from _suspects(design)
     yield from _ways(design)
 
@@ -96,8 +95,7 @@ def _suspects(design: Design) -> Iterator[Part]:
         words("looks like", [s.words for s in shown]),
     ]
     yield Table("suspects", "Errors that the model leaves out", "", columns, notes=[note])
-    unseen = [s for s in design.suspects if s.hidden and s.noticed < _UNSEEN]
-    if unseen:
+    if unseen := [s for s in design.suspects if s.hidden and s.noticed < _UNSEEN]:
         yield Strong(
             f"No test of residuals will detect {enumerate_few([s.name for s in unseen])}: the parameters imitate it."
             f" {unseen[0].parameter} will be wrong by {unseen[0].bounds:.3g} bounds where {unseen[0].name} is"
@@ -151,7 +149,7 @@ def write_design(folder: Path, name: str, design: Design) -> list[Path]:
 
 
 def posterior_parts(name: str, found: Sequence[Reference]) -> list[Table]:
-    """A row per trial and estimator; `name` is what the scenario is called in the title."""
+    """A row per trial and estimator, under the `name` of the scenario."""
     rows = [(one, label, d) for one in found for label, d in one.divergences.items()]
     columns = [
         texts("trial", [str(one.trial) for one, *_ in rows]),
@@ -198,23 +196,17 @@ def honesty(d: Divergence, sampled: Posterior) -> str:
 def write_posteriors(
     folder: Path, name: str, scenario: str, model: Measurement, found: Sequence[Reference]
 ) -> list[Path]:
-    """Writes a page, and posterior.csv with a row per trial and parameter; returns the files. `name` is the model's and
-    `scenario` says what was sampled."""
+    """Writes a page, and posterior.csv with a row per trial and parameter; returns the files."""
     import pandas as pd
 
-    rows = [
-        (
-            one.trial,
-            p.name,
-            p.unit,
-            *(p.size * np.array([one.truth[k], one.posterior.mean[k], one.posterior.deviation[k]])),
-        )
-        for one in found
-        for k, p in enumerate(model.parameters)
-    ]
-    table = pd.DataFrame(rows, columns=["trial", "parameter", "unit", "truth", "mean", "deviation"])
+    frames = []
+    for one in found:
+        names = {"parameter": [p.name for p in model.parameters], "unit": [p.unit for p in model.parameters]}
+        values = {"truth": one.truth, "mean": one.posterior.mean, "deviation": one.posterior.deviation}
+        sized = {key: model.sizes * value for key, value in values.items()}
+        frames.append(pd.DataFrame({"trial": one.trial, **names, **sized}))
     parts = posterior_parts(scenario, found)
-    return write(folder, "posterior", f"{name}: posteriors", parts, ("posterior.csv", table))
+    return write(folder, "posterior", f"{name}: posteriors", parts, ("posterior.csv", pd.concat(frames)))
 
 
 # Comparison ----------------------------------------------------------------------------------------------------------
@@ -279,11 +271,6 @@ def _ratio(value: float) -> str:
     return f"{value:.3f}" if 0.1 <= value < 9.9995 else compact(value)
 
 
-def write_comparison(frame: pd.DataFrame, output: Path, alpha: float) -> list[Path]:
-    """Writes comparison.csv and a page of all tables; returns the files."""
-    return write(output, "comparison", "Comparison", comparison_parts(frame, alpha), ("comparison.csv", frame))
-
-
 # Audit ---------------------------------------------------------------------------------------------------------------
 
 
@@ -307,8 +294,3 @@ def audit_parts(found: Audit) -> list[Part]:
         notes.append("No covariances are reported, so directions are not judged.")
     title = f"Audit of {runs} runs" + (f", {left_out} rows without an estimate left out" if left_out else "")
     return [*found.sentences, Table("audit", title, "", columns, notes=notes)]
-
-
-def write_audit(found: Audit, output: Path) -> list[Path]:
-    """Writes audit.csv and audit.html, and returns them."""
-    return write(output, "audit", "Audit", audit_parts(found), ("audit.csv", found.table()))

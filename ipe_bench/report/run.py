@@ -133,10 +133,7 @@ def begin_report(
 
 
 def _made_from(directories: Sequence[Path], output: Path, *choices: object) -> str:
-    """A digest of what a report on these directories with these choices is made from.
-
-    It is taken before anything is read, so that results written meanwhile make the next report another one.
-    """
+    """A digest of what a report is made from, taken before that is read: results that come meanwhile change it."""
     sources = [p for p in Path(__file__).parents[1].rglob("*") if p.suffix in {".py", ".j2", ".css", ".js"}]
     stores = [Store(directory) for directory in directories]
     stored = [p for s in stores for folder in (s.trials, s.runs, s.failed) for p in folder.glob("*")]
@@ -155,7 +152,7 @@ def _is_current(output: Path, made: str) -> bool:
 
 
 def _digests(paths: Iterable[Path]) -> dict[str, str]:
-    """By absolute path; a file that another command removes at this moment is left out."""
+    """SHA-256 by absolute path, without files that another command removes at this moment."""
     found = {}
     for path in sorted(paths):
         with contextlib.suppress(FileNotFoundError):

@@ -1,7 +1,4 @@
-"""Tables and sections that plugins write: paragraphs of text, and tables, which are written to files as ours are.
-
-A report is complete without them: one that raises, or gives something else, is left out with a line that says so.
-"""
+"""Tables and sections that plugins write; one that raises, or gives something else, is left out with a line."""
 
 from __future__ import annotations
 
@@ -30,7 +27,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Written:
-    """What a section, or a table of a plugin, came to."""
+    """The parts that a section or a table of a plugin gives."""
 
     name: str
     title: str
@@ -48,7 +45,7 @@ def report_tables(analysis: Analysis) -> list[Table]:
 
 
 def written(group: str, analysis: Analysis, tables: Iterable[Table]) -> list[Written]:
-    """What the tables or the sections of plugins come to, none of them under the name of one of these tables."""
+    """What the tables or the sections of plugins give, with tables that have names of their own."""
     names = {*CURVES, *(table.name for table in tables)}
 
     def make(record: Any) -> tuple[str, list[Part]]:

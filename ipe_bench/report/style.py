@@ -1,5 +1,5 @@
 """Which figures a report has, as what files, and how they look: a colour family for each kind of estimator, a marker
-and a dash for each member, one theme. No library that draws is imported until something is drawn."""
+and a dash for each member, one theme."""
 
 from __future__ import annotations
 

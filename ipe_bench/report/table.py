@@ -9,6 +9,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -184,7 +185,7 @@ def _taken(columns: Iterable[Column], table: Table) -> tuple[int, int]:
 
 
 def _rich(columns: Sequence[Column], table: Table, width: int) -> Any:
-    """Some columns of a table; titles are folded where they have no room otherwise."""
+    """Some columns of a table, with titles that are folded if they have no room."""
     from rich import box
     from rich.table import Table as RichTable
     from rich.text import Text
@@ -198,15 +199,13 @@ def _rich(columns: Sequence[Column], table: Table, width: int) -> Any:
             shown.add_column(title, justify="right", no_wrap=True)
         else:
             shown.add_column(title, overflow="fold", min_width=letters)
-    group: list[Cell] = []
-    for row in zip(*(c.cells for c in columns), strict=True):
-        first = list(row[: table.grouped])
-        repeated = bool(group) and first == group
-        if group and not repeated:
+    rows = zip(*(c.cells for c in columns), strict=True)
+    for group, members in groupby(rows, key=lambda row: row[: table.grouped]):
+        for k, row in enumerate(members):
+            first = [Cell("")] * len(group) if k and group else group
+            shown.add_row(*(Text(c.text, style="bold" if c.best else "") for c in (*first, *row[len(group) :])))
+        if group:
             shown.add_section()
-        group = first
-        cells = [Cell("")] * len(first) if repeated else first
-        shown.add_row(*(Text(c.text, style="bold" if c.best else "") for c in (*cells, *row[table.grouped :])))
     return shown
 
 
@@ -240,11 +239,10 @@ def html(parts: Iterable[Part]) -> str:
 
 def write_table(table: Table, folder: Path) -> list[Path]:
     """Writes one table as CSV, Markdown and LaTeX."""
-    files = []
-    for suffix, write in ((".csv", comma_separated), (".md", markdown), (".tex", latex)):
-        files.append(folder / f"{table.name}{suffix}")
-        write_text(files[-1], write(table))
-    return files
+    contents = {"csv": comma_separated(table), "md": markdown(table), "tex": latex(table)}
+    for suffix, text in contents.items():
+        write_text(folder / f"{table.name}.{suffix}", text)
+    return [folder / f"{table.name}.{suffix}" for suffix in contents]
 
 
 def comma_separated(table: Table) -> str:
@@ -288,8 +286,8 @@ _NUMBER = re.compile(r"-?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
 def latex(table: Table, width: float | None = None) -> str:
-    """To be read into a document with `\\input`, with booktabs and siunitx: the bare table, or one that floats with its
-    caption in a column of that many inches; a longtable if it has more than `LONG` rows."""
+    """A table for `\\input`, by booktabs and siunitx: bare, or floating with its caption in a column of `width` inches;
+    a longtable if it has more than `LONG` rows."""
     shape = "@{}" + "".join("r" if c.numeric else "l" for c in table.columns) + "@{}"
     titles, *rows = [
         f"{' & '.join(cells)} \\\\"

@@ -93,8 +93,7 @@ _APPENDIX = ("all_trials", "solved_trials", "contraction", "covariances", "theor
 
 
 def all_tables(analysis: Analysis, whole: Analysis | None = None) -> list[Table]:
-    """Every table that the data allow, in the order of the report; `whole` is the analysis whose endings are listed
-    if this one leaves some trials out."""
+    """Every table that the data allow, in the order of the report, with the endings of the `whole` analysis."""
     found = {"endings": endings(whole or analysis)}
     if not analysis.summary.empty:
         rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
@@ -124,18 +123,16 @@ def _recorded(analysis: Analysis, where: Where, totals: pd.DataFrame) -> Table |
         return None
     columns = [*head(analysis, rows), *(words(name, rows[name]) for name in ("estimator", *names))]
     stored = [name for r in (*all_statistics(), *SCORES) if where in r.where for name in r.columns]
-    data, told = rows[[*analysis.setting_columns, "error_scale", "estimator", *names, *stored]], _told(rows)
+    data = rows[[*analysis.setting_columns, "error_scale", "estimator", *names, *stored]]
+    told: Any = rows.to_dict("records")
     return Table(where, title, caption, [*columns, *statistics(where, told)], data)
-
-
-def _told(rows: pd.DataFrame) -> list[dict[str, Any]]:
-    return [{str(name): value for name, value in row.items()} for row in rows.to_dict("records")]
 
 
 def overview(analysis: Analysis) -> Table:
     """How each estimator does over all trials: one population for everybody."""
     rows = analysis.summary[analysis.summary["parameter"] == ALL].reset_index(drop=True)
-    first, told = head(analysis, rows), _told(rows)
+    first = head(analysis, rows)
+    told: Any = rows.to_dict("records")
     columns = [*first, *overview_columns(told, leading(told, [*analysis.setting_columns, "error_scale"]))]
     columns += statistics("overview", told)
     return Table("overview", "Overview", "", columns, rows, notes=legend(rows["noise"].tolist()), grouped=len(first))
@@ -218,8 +215,8 @@ def endings(analysis: Analysis) -> Table | None:
 
 
 def certified_tables(collection: Collection) -> list[Table]:
-    """Digits per data set and their averages, who attains known minima in all and problem by problem; those tables
-    that there are data for. What a terminal shows of them is what names the file that holds the whole."""
+    """Digits per data set and their averages, published errors, and who attains known minima, as far as there are data;
+    a terminal shows those that name the file with the `whole`."""
     digits, minima = certified_table(collection), attained_table(collection)
     found = [] if digits.empty else _digits(digits)
     if len(rows := published_table(collection)):

@@ -22,10 +22,8 @@ if TYPE_CHECKING:
 
 
 def reserve_output_folder(folder: Path, name: str, command: Any, *, elsewhere: bool, files: Sequence[str] = ()) -> Path:
-    """Reserves the folder that a command writes to: it is new, or holds what the same command wrote before.
-
-    `name`.json says which command that was, `files` are further files of its kind. If the folder holds anything else of
-    ours, `elsewhere` allows folder-2, folder-3 and so on in its place.
+    """Reserves the folder that a command writes to: a new one, or that of the same command, by `name`.json; with
+    `elsewhere` folder-2, folder-3 and so on, if it has `files` of another one.
 
     Raises:
         UserError: the folder is taken.
@@ -62,11 +60,8 @@ def write(
     lead: str = "",
     drawings: Iterable[Drawing] = (),
 ) -> list[Path]:
-    """Writes the files of a command, each of which appears whole or not at all, and returns them.
-
-    They are the `table` under its name, the `drawings`, which are drawn here in our style, and the page `name`.html of
-    all tables, sentences and figures below the sentence `lead`.
-    """
+    """Writes the files of a command and returns them: the `table` under its name, the `drawings`, and the page
+    `name`.html of all tables, sentences and figures below the sentence `lead`."""
     files, figures = [folder / table[0], folder / f"{name}.html"], []
     write_text(files[0], table[1].to_csv(index=False))
     with house_style() if drawings else nullcontext():

@@ -12,7 +12,7 @@ from ipe_bench.basics.linalg import Covariance
 from ipe_bench.measurements import Formula, Nist
 from ipe_bench.measurements.known import ParameterInfo, informed
 from ipe_bench.measurements.problem import Problem
-from ipe_bench.noise import Unknown
+from ipe_bench.noise import Gaussian, Unknown
 from ipe_bench.real.examination import examine
 from ipe_bench.real.fits import fit
 from ipe_bench.real.levels import Levelled, minimise
@@ -218,6 +218,8 @@ def test_a_parameter_on_its_bound_is_held_there_beside_the_levels():
     fixed = informed(DECAY, (ParameterInfo("k", fixed=1.0),))
     alone = ib.estimate(fixed, z, LM, noise=Unknown(by="second"))["lm"]
     assert answer["lm"].held_at == {1: 1.0}
+    for one in (answer, ib.estimate(model, z, LM, noise=Gaussian(0.2))):
+        assert "lm: on its bound: k = 1; the readings want it beyond." in str(one)
     assert answer["lm"].x[[0, 2, 3, 4]] == pytest.approx(alone.x, rel=1e-6)
     assert np.isnan(np.array(answer["lm"].interval())[:, 1]).all()
     assert np.array(answer["lm"].interval())[:, [0, 2, 3, 4]] == pytest.approx(np.array(alone.interval()), rel=1e-4)

@@ -1,8 +1,7 @@
 """The documentation: pages about ipe-bench, a reference read from the code, and a gallery of executed experiments.
 
-`make docs` builds the site into outputs/docs/html; what a page says of options, statuses and statistics is taken from
-where the program itself takes it. Needs the extra `docs`. As an extension of Sphinx this package writes formulas as
-MathML, which browsers draw by themselves: no script and no network.
+`make docs` builds the site into outputs/docs/html by the extra `docs`. As an extension of Sphinx this package writes
+formulas as MathML, which needs no script and no network.
 """
 
 from __future__ import annotations

@@ -81,10 +81,7 @@ _PARTS = {
 
 
 def build(output: Path, trials: int) -> int:
-    """Writes the site to OUTPUT/html and what it is made of beside it; returns Sphinx's exit code.
-
-    Experiments that were run before with as many trials are not run again.
-    """
+    """Writes the site to OUTPUT/html and what it is made of beside it; returns Sphinx's exit code."""
     from sphinx.application import Sphinx  # pyright: ignore[reportMissingImports]
 
     source = output / "source"
@@ -101,11 +98,7 @@ def build(output: Path, trials: int) -> int:
 
 
 def printed_by(command: Sequence[str], columns: int = 80) -> str:
-    """What `ipe-bench COMMAND` prints, without blanks at the ends of lines.
-
-    Raises:
-        UserError: it failed.
-    """
+    """What `ipe-bench COMMAND` prints, without blanks at the ends of lines; a UserError if it fails."""
     program = [sys.executable, "-m", "ipe_bench", *command]
     environment = os.environ | {"COLUMNS": str(columns), "NO_COLOR": "1"}
     done = subprocess.run(program, capture_output=True, text=True, env=environment, check=False)
@@ -149,7 +142,7 @@ def write_reference(folder: Path) -> None:
 
 def write_gallery(folder: Path, results: Path, trials: int) -> None:
     """A page for each experiment, one that lists them, and a table of the best estimators by model; `trials` is for an
-    experiment that has 1000 by itself, and others have as large a part of theirs."""
+    experiment that has 1000 by itself."""
     chosen, found, began = _ours("experiment"), {}, time.perf_counter()
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         running = {pool.submit(_executed, option, folder, results / option.name, trials): option for option in chosen}
