@@ -287,13 +287,13 @@ class RicherGins(Gins):
             stop = z.shape[1] // (2 * len(self.cases))
             z[rows] = self._walked(x[rows], steps, stop) - offset[self.rows(stop)]
 
-    def _rates(self, x: Array) -> tuple[Array, float]:
+    def _rates(self, x: Array) -> Array:
         """With the farthest that the drifts walk; such a trial is tested however slowly it turns."""
         if x.shape[1] == self.n:
             return super()._rates(x)
         walk = np.abs(self._walk(x)).reshape(len(x), -1).max(axis=1)
-        rates = super()._rates(np.ascontiguousarray(x[:, : self.n]))[0] + np.sqrt(3.0) * walk
-        return np.maximum(rates, np.nextafter(self.trusted_angle / self._longest, np.inf)), np.inf
+        rates = super()._rates(np.ascontiguousarray(x[:, : self.n])) + np.sqrt(3.0) * walk
+        return np.maximum(rates, np.nextafter(self.trusted_angle / self._longest, np.inf))
 
     def _walk(self, x: Array) -> Array:
         """How far the drifts have walked: (trials x cases, intervals, axes) in rad/s."""

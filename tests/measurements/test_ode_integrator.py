@@ -128,7 +128,7 @@ def test_steps_that_follow_the_parameters_hold_the_tolerance_of_each_output():
     off = np.abs(model.simulate(x) - Cases(1 / 64).simulate(x)).reshape(60, -1, 2)
     assert off[..., 0].max() < 1e-9
     assert off[..., 1].max() < 1e-6
-    assert len(set(model._search(x, np.zeros(12)).places.tolist())) >= 3
+    assert len(set(model._levels(x, np.zeros(12)).places.tolist())) >= 3
 
 
 def test_a_coarse_jacobian_contracts_where_it_was_measured_and_beyond():

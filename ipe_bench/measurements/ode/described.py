@@ -415,7 +415,7 @@ class _Engine(OdeMeasurement):
         """By how many tolerances the explicit method differs from the implicit one in a reading at x (n,); 0 where few
         explicit steps do."""
         x = own(x[None, : self.n])
-        if self.stiff or self.step is not None or self._ladder[self._search(x, self._zeros).places[0]] <= _EASY:
+        if self.stiff or self.step is not None or self._ladder[self._levels(x, self._zeros).places[0]] <= _EASY:
             return 0.0
         difference = np.abs(self.simulate(x) - self._implicit.simulate(x, len(self.times)))
         return float(np.nan_to_num(difference / self._tolerances, nan=0.0, posinf=0.0).max())
@@ -436,8 +436,8 @@ class _Engine(OdeMeasurement):
         largest = float(np.nanmax(np.abs(self.shape[0]), initial=0.0)) or 1.0
         return Rodas5P(self, float(np.clip(_IN_HAND * np.min(self._tolerances) / largest, 1e-10, 1e-4)))
 
-    def _shown(self, x: Array, stop: int, offset: Array, *, coarse: bool = False) -> Array:
-        return self._implicit.simulate(x, stop) if self.stiff else super()._shown(x, stop, offset, coarse=coarse)
+    def _shown(self, x: Array, stop: int, offset: Array, *, guess: bool = False) -> Array:
+        return self._implicit.simulate(x, stop) if self.stiff else super()._shown(x, stop, offset, guess=guess)
 
     def jacobian_until(self, x: Array, stop: int) -> Array:
         return self._implicit.jacobian(x, stop) if self.stiff else super().jacobian_until(x, stop)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipe_bench.basics.errors import UserError
-from ipe_bench.basics.linalg import Array, own
+from ipe_bench.basics.linalg import Array, Mask, own
 from ipe_bench.measurements.base import Measurement
 from ipe_bench.measurements.ode.integrator import Kernel, rates
 from ipe_bench.measurements.ode.plan import DOP853, RK4, Equations, Variation, jumps
@@ -153,50 +153,26 @@ class OdeMeasurement(Measurement):
         On GINS at an error scale of 30,000, with readings of 7e-3 m/s, the median trial is off by 4e-7 m/s at most, the
         worst of 100 by 7e-3; at 2,000 the worst is off by 1e-4.
         """
-        return self._shown(x, stop, self._origin, coarse=True)
+        return self._shown(x, stop, self._origin, guess=True)
 
     @property
     def _origin(self) -> Array:
         """What readings (m,) are counted from."""
         return self._zeros
 
-    def _shown(self, x: Array, stop: int, offset: Array, *, coarse: bool = False) -> Array:
+    def _shown(self, x: Array, stop: int, offset: Array, *, guess: bool = False) -> Array:
         """Readings less the offset (m,)."""
         x = own(x)
-        z = np.empty((len(x), len(self._cases) * stop * len(self.outputs)))
-        for rows, steps in self._groups(x, offset, guess=coarse, z=z):
-            self._simulate(x, rows, steps, offset, z)
+        cases, outputs = len(self._cases), len(self.outputs)
+        z = np.empty((len(x), cases * stop * outputs))
+        found, rows = self._levels(x, offset, guess=guess), np.arange(len(x))
+        if len(found.computed):
+            readings = found.z.reshape(-1, cases, len(self.times), outputs)[:, :, :stop]
+            z[found.computed] = readings.reshape(len(readings), -1)
+            rows = np.delete(rows, found.computed)
+        for place, group in grouped(found.places[rows], rows):
+            self._simulate(x, group, self._ladder[place] * self._parts, offset, z)
         return z
-
-    def _groups(
-        self, x: Array, offset: Array, *, guess: bool = False, z: Array | None = None
-    ) -> list[tuple[Indices, NDArray[np.int64]]]:
-        """The trials that share a level, and their steps to each time; those whose readings the search for their level
-        has left in z (trials, readings) are left out."""
-        rows, common = np.arange(len(x)), self._common_steps(x)
-        if common is not None:
-            return [(rows, common)]
-        if guess and self._guessed:
-            places = self._guess(x)
-        else:
-            found = self._search(x, offset)
-            places = found.places
-            if z is not None:
-                shape = len(self._cases), len(self.times), len(self.outputs)
-                shown = z.reshape(len(x), shape[0], -1, shape[2])
-                shown[found.computed] = found.z.reshape(len(found.z), *shape)[:, :, : shown.shape[2]]
-                rows = np.delete(rows, found.computed)
-        return [(group, self._ladder[place] * self._parts) for place, group in grouped(places[rows], rows)]
-
-    @property
-    def _guessed(self) -> bool:
-        """Whether the rate says with which steps to integrate."""
-        return self.trusted_angle > 0 and self._rate_function is not None
-
-    def _guess(self, x: Array) -> Indices:
-        """The level of each trial by its rate alone."""
-        trusted = self._trusted(x)
-        return np.where(trusted < 0, self._first_guess(x), trusted)
 
     def hindrance(self, x: Array) -> str:
         x = own(x[None, : self.n])
@@ -212,11 +188,6 @@ class OdeMeasurement(Measurement):
             shortest, held = self._usual_interval / self._ladder[top], bool((left <= _FAR * self._tolerances).all())
         return "" if held else diagnose(self, x[0], float(shortest))
 
-    def _common_steps(self, x: Array) -> NDArray[np.int64] | None:
-        """The steps to each time that are the same for all trials, fixed or known to do; None where trials differ."""
-        trusted = self.trusted_angle and self._rates(x)[1] * self._longest <= self.trusted_angle
-        return self._parts if self.step is not None or trusted else None
-
     def _simulate(self, x: Array, rows: Indices, steps: NDArray[np.int64], offset: Array, z: Array) -> None:
         """Fills these rows of z (trials, readings), as many times as it has room for, with so many steps to each."""
         times = self._times[: z.shape[1] // (len(self._cases) * len(self.outputs))]
@@ -228,11 +199,14 @@ class OdeMeasurement(Measurement):
     _times = cached_property(lambda self: own(self.times))
     _remembered = cached_property(lambda self: dict[bytes, int]())
 
-    def _search(self, x: Array, offset: Array) -> Found:
-        """The level of each trial, and the readings of those whose level had to be looked for."""
-        places, remembered = self._trusted(x), self._remembered
-        unknown = np.flatnonzero(places < 0)
-        bits = np.ascontiguousarray(x[unknown]).view(f"V{8 * x.shape[1]}").ravel().tolist() if len(unknown) else []
+    def _levels(self, x: Array, offset: Array, *, guess: bool = False) -> Found:
+        """The level of each trial, and the readings of those whose level had to be looked for; with `guess` the rates
+        say the level, where the model has them."""
+        trusted, remembered = self._trusted(x), self._remembered
+        places, unknown = trusted.astype(np.intp) - 1, np.flatnonzero(~trusted)
+        if guess and len(unknown) and self.trusted_angle > 0 and self._rate_function is not None:
+            places[unknown], unknown = self._first_guess(x[unknown]), unknown[:0]
+        bits = [row.tobytes() for row in x[unknown]]
         places[unknown] = [remembered.get(key, -1) for key in bits]
         new = np.flatnonzero(places[unknown] < 0)
         unknown = unknown[new]
@@ -251,19 +225,18 @@ class OdeMeasurement(Measurement):
 
         return search(self._ladder, self._tolerances, simulate, start)
 
-    def _trusted(self, x: Array) -> Indices:
-        """The coarsest level for trials of which it is known to do, -1 for the others."""
-        if self.trusted_angle == 0:
-            return np.full(len(x), -1)
-        return np.where(self._rates(x)[0] * self._longest <= self.trusted_angle, 0, -1)
+    def _trusted(self, x: Array) -> Mask:
+        """The trials whose steps are fixed, or of which the coarsest level is known to do."""
+        if self.step is not None or self.trusted_angle == 0:
+            return np.full(len(x), self.step is not None)
+        return self._rates(x) * self._longest <= self.trusted_angle
 
-    def _rates(self, x: Array) -> tuple[Array, float]:
-        """The rate of each trial, and the fastest of all; not a number where nothing is known."""
+    def _rates(self, x: Array) -> Array:
+        """The rate of each trial; not a number where nothing is known."""
         rates = np.full(len(x), np.nan)
-        if self._rate_function is None:
-            return rates, np.inf
-        self._rate_function(x, self._si_sizes, rates)
-        return rates, float(rates.max(initial=0.0))
+        if self._rate_function is not None:
+            self._rate_function(x, self._si_sizes, rates)
+        return rates
 
     @cached_property
     def _rate_function(self) -> Callable[[Array, Array, Array], None] | None:
@@ -282,7 +255,7 @@ class OdeMeasurement(Measurement):
         top = len(self._ladder) - 1
         if self._rate_function is None:
             return np.where(np.isfinite(x).all(axis=1), self._nominal_place, top)
-        wanted = np.nan_to_num(self._rates(x)[0] * self._longest / _ANGLE_AT_START, nan=np.inf)
+        wanted = np.nan_to_num(self._rates(x) * self._longest / _ANGLE_AT_START, nan=np.inf)
         return np.clip(np.searchsorted(self._ladder, wanted), 1, top)
 
     @cached_property
@@ -324,32 +297,29 @@ class OdeMeasurement(Measurement):
     def jacobian_until(self, x: Array, stop: int) -> Array:
         """dh/dx by the variational equations, integrated by the same formula and steps as the readings of that x."""
         x = own(x)
-        groups = self._groups(x, self._zeros)
-        return self._tangents(x, stop, [(self._jacobian_kernel, rows, steps) for rows, steps in groups])
+        groups = grouped(self._levels(x, self._zeros).places, np.arange(len(x)))
+        given = ((self._jacobian_kernel, int(self._ladder[place]), rows) for place, rows in groups)
+        return self._tangents(x, stop, given)
 
     def coarse_jacobian_until(self, x: Array, stop: int) -> Array:
         """dh/dx with longer steps, or by a cheaper formula, where that was measured to contract; see `coarse`."""
         if not self._coarsens:
             return self.jacobian_until(x, stop)
         x = own(x)
-        guessed = self._guessed and stop < len(self.times)
-        places = self._guess(x) if guessed else self._search(x, self._zeros).places
-        groups = []
-        for place, rows in grouped(np.where(self._trusted(x) == 0, -1, places), np.arange(len(x))):
-            kernel, level = self._coarsened(place)
-            groups.append((kernel, rows, level * self._parts))
-        return self._tangents(x, stop, groups)
+        places = self._levels(x, self._zeros, guess=stop < len(self.times)).places
+        groups = grouped(np.where(self._trusted(x), -1, places), np.arange(len(x)))
+        return self._tangents(x, stop, ((*self._coarsened(place), rows) for place, rows in groups))
 
     @property
     def _coarsens(self) -> bool:
         """Whether there are longer steps for tangents."""
         return self.step is None
 
-    def _tangents(self, x: Array, stop: int, groups: Iterable[tuple[Kernel, Indices, NDArray[np.int64]]]) -> Array:
-        """J (trials, readings, n) at the first times, each group of trials by its kernel and its steps."""
+    def _tangents(self, x: Array, stop: int, groups: Iterable[tuple[Kernel, int, Indices]]) -> Array:
+        """J (trials, readings, n) at the first times, each group of trials by its kernel at its level."""
         J = np.empty((len(x), len(self._cases) * stop * len(self.outputs), self.n))
-        for kernel, rows, steps in groups:
-            kernel.run(x, self._si_sizes, self.tables, rows, self._times[:stop], steps, J.reshape(-1))
+        for kernel, level, rows in groups:
+            kernel.run(x, self._si_sizes, self.tables, rows, self._times[:stop], level * self._parts, J.reshape(-1))
         return J
 
     def _coarsened(self, place: int) -> tuple[Kernel, int]:
@@ -366,13 +336,12 @@ class OdeMeasurement(Measurement):
         contract enough at the coarsest level, None if none do; and how many times longer steps of that of eighth order
         may be where readings are within a sixteenth of the tolerance."""
         x, everything = own(self.nominal[None]), len(self.times)
-        level, J = int(self._ladder[self._search(x, self._zeros).places[0]]), self.jacobian(x)
-        rk4 = None
-        for k in range(1, MOST_RK4 + 1) if level <= 2 else ():
-            tangents = self._tangents(x, everything, [(self._rk4_kernel, np.arange(1), k * self._parts)])
-            if contraction(tangents[0], J[0]) <= CONTRACTION:
-                rk4 = k
-                break
+        level, J = int(self._ladder[self._levels(x, self._zeros).places[0]]), self.jacobian(x)
+        tried = (
+            (k, self._tangents(x, everything, [(self._rk4_kernel, k, np.arange(1))])) for k in range(1, MOST_RK4 + 1)
+        )
+        enough = (k for k, tangents in tried if contraction(tangents[0], J[0]) <= CONTRACTION)
+        rk4 = next(enough, None) if level <= 2 else None
         # Half the level; where that is half a step, every second reading.
         if level == 1 and (len(self._times) == 1 or self.driven is not None):
             return rk4, 1.0
@@ -402,8 +371,8 @@ class OdeMeasurement(Measurement):
         if not self._coarsens:
             return self.jacobian_cost
         x = own(self.nominal[None])
-        place = int(self._search(x, self._zeros).places[0])
-        kernel, level = self._coarsened(-1 if self._trusted(x)[0] == 0 else place)
+        place = int(self._levels(x, self._zeros).places[0])
+        kernel, level = self._coarsened(-1 if self._trusted(x)[0] else place)
         return kernel.plan.operations * level / (self._readings_kernel.plan.operations * int(self._ladder[place]))
 
     def __getstate__(self) -> dict[str, Any]:

@@ -47,8 +47,8 @@ def coarser(place: int) -> int:
 
 def grouped(places: Indices, rows: Indices) -> Iterator[tuple[int, Indices]]:
     """The rows at each place, in order."""
-    for place in np.unique(places):
-        yield int(place), rows[places == place]
+    for place in sorted(set(places.tolist())):
+        yield place, rows[places == place]
 
 
 class Found(NamedTuple):
